@@ -1,0 +1,53 @@
+# Every target sets up what it needs: .venv with the locked packages and this project, editable.
+# A warm run only compares time stamps.  PYTHON=/path/to/python3.12 chooses the interpreter.
+
+PYTHON ?= python3
+PIP = .venv/bin/python -m pip --disable-pip-version-check
+READY = .venv/.ready
+
+.PHONY: demo test bench lint campaign pictures lock clean
+
+demo: $(READY)
+	.venv/bin/rtid demo
+
+test: $(READY)
+	.venv/bin/python -m pytest -q -n 2 -p no:benchmark
+
+bench: $(READY)
+	.venv/bin/python -m pytest -q -s benchmarks
+	.venv/bin/python -m benchmarks.table
+
+lint: $(READY)
+	.venv/bin/ruff check
+	.venv/bin/ruff format --check
+	.venv/bin/mypy
+
+campaign: $(READY)
+	.venv/bin/python -m pytest -q -n 2 -p no:benchmark -m "campaign or soak"
+
+pictures: $(READY)
+	.venv/bin/rtid demo --pictures out/pictures
+
+$(READY): requirements.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
+	  echo "rtid needs Python 3.11 or newer, and $(PYTHON) is not:" \
+	       "run make again with PYTHON=/path/to/python3.12"; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
+	  echo "$(PYTHON) cannot make virtual environments: install its venv package" \
+	       "(Debian: apt install python3-venv)"; exit 1; }
+	@echo "Setting up .venv (once; about a minute) ..."
+	@$(PYTHON) -m venv --clear .venv
+	@$(PIP) install --quiet -r requirements.lock
+	@$(PIP) install --quiet --no-deps --no-build-isolation --editable .
+	@touch $@
+
+# The newest versions that pyproject.toml admits, for the core and [dev].
+lock:
+	$(PYTHON) -m venv --clear .venv
+	$(PIP) install --upgrade ".[dev]"
+	$(PIP) uninstall --yes rtid
+	$(PIP) freeze --all --exclude pip > requirements.lock
+
+clean:
+	rm -rf .venv build dist out *.egg-info .pytest_cache .mypy_cache .ruff_cache .benchmarks
+	find . -name __pycache__ -prune -exec rm -rf {} +

@@ -1,0 +1,5 @@
+"""`python -m rtid` is `rtid`."""
+
+from rtid.cli.main import main
+
+main()

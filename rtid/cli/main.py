@@ -1,0 +1,97 @@
+"""`rtid`: one command per module of `rtid.cli`, imported only when it is called.
+
+A help text or a wrong argument must not wait for numba and python-can, so only the named command
+is loaded; the others stand in the list with their summary.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Annotated, Any, NoReturn
+
+import typer
+
+import rtid
+from rtid.cli.exits import Exit
+
+COMMANDS = {
+    "demo": "Learn the maps of a simulated machine from its CAN frames: the whole story.",
+    "init": "Write a project file from a DBC or a table, with proposed roles.",
+    "check": "Judge a project file against a trace: rates, gaps, ranges, signs, units.",
+    "simulate": "Record a simulated machine as a trace, with its project file.",
+    "replay": "Learn from a recorded trace: gates, blocks, bulk modulus, flow maps.",
+    "compare": "Compare the learned maps with a data sheet.",
+    "export": "Write the learned maps as CSV, JSON or npz.",
+}
+
+EPILOG = "Exit codes: 0 ok, 1 internal error, 2 usage or project file, 3 input, 4 negative result."
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"rtid {rtid.__version__}")
+        raise typer.Exit()
+
+
+def _top(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Version.")
+    ] = False,
+) -> None:
+    """Learn the flow maps of hydraulic valves and the bulk modulus from CAN frames."""
+
+
+def _unloaded() -> None:
+    """Stand in for a command that was not asked for."""
+
+
+def _function(name: str) -> Callable[..., Any]:
+    function: Callable[..., Any] = getattr(import_module(f"rtid.cli.{name}"), name)
+    return function
+
+
+def build(arguments: Sequence[str]) -> typer.Typer:
+    """Typer application in which only the command that `arguments` name is loaded."""
+    app = typer.Typer(
+        add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, epilog=EPILOG
+    )
+    app.callback()(_top)
+    called = next((a for a in arguments if not a.startswith("-")), "")
+    for name, summary in COMMANDS.items():
+        if find_spec(f"rtid.cli.{name}"):
+            function = _function(name) if name == called else _unloaded
+            app.command(name, short_help=summary)(function)
+    return app
+
+
+def _refuse(message: str, remedy: str, code: int) -> NoReturn:
+    print(f"rtid: {message}", file=sys.stderr)
+    if remedy:
+        print(f"  -> {remedy}", file=sys.stderr)
+    sys.exit(code)
+
+
+def run(arguments: Sequence[str]) -> NoReturn:
+    """Run one command line and exit; an expected error is one plain message, no traceback."""
+    try:
+        typer.main.get_command(build(arguments)).main(args=list(arguments), prog_name="rtid")
+    except KeyboardInterrupt:
+        sys.exit(Exit.INTERRUPTED)
+    except OSError as error:
+        if error.filename is None:
+            raise
+        _refuse(f"{error.filename}: {error.strerror}", "", Exit.INPUT)
+    except Exception as error:
+        # Any error that carries an exit code is meant for the user, of whichever package it is.
+        if not hasattr(error, "exit_code"):
+            raise
+        _refuse(str(error), getattr(error, "remedy", ""), error.exit_code)
+    sys.exit(Exit.OK)
+
+
+def main() -> NoReturn:
+    """Entry point of the `rtid` script."""
+    run(sys.argv[1:])
