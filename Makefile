@@ -14,7 +14,8 @@ test: $(READY)
 	.venv/bin/python -m pytest -q -n 2 -p no:benchmark
 
 bench: $(READY)
-	.venv/bin/python -m pytest -q -s benchmarks
+	@mkdir -p out
+	.venv/bin/python -m pytest -q -s benchmarks --benchmark-json=out/bench.json
 	.venv/bin/python -m benchmarks.table
 
 lint: $(READY)
