@@ -19,6 +19,8 @@ class SignalSource:
     `message` and `signal` name the DBC message and signal; for a table source `signal` is the
     column.  `constant` replaces the measurement (a tank pressure nobody measures).  hold = "zero"
     for a command that acts until the next one, "linear" for a quantity sampled between instants.
+    A `command` with hold = "linear" is a sampled monitor of a faster signal: a sample carries its
+    mean over the interval up to the next sample.
     """
 
     name: str
@@ -29,6 +31,7 @@ class SignalSource:
     table: tuple[tuple[float, ...], tuple[float, ...]] | None = None
     constant: float | None = None
     hold: str = "linear"
+    command: bool = False
 
 
 @dataclass(frozen=True)

@@ -103,6 +103,7 @@ class Gates:
     max_gap_s: float = 0.05  # a longer step between samples restarts the integrals
     hysteresis: float = 0.05  # share of a block's width that the working point must leave it by
     min_rows: int = 20  # rows that a block needs before it can become valid
+    max_sd_share: float = 0.02  # of the rated flow: known worse than this is not valid
 
 
 @dataclass(frozen=True)
@@ -119,6 +120,7 @@ class Model:
     filter: Filter = field(default_factory=Filter)
     gates: Gates = field(default_factory=Gates)
     form: str = "integral"  # or "carry"
+    pressure_period_s: float = 0.0  # sampling period of the pressures; 0: every sample
 
     def column(self, name: str) -> int:
         """Column of the signal `name` in `Samples.values`; KeyError if the model has none."""

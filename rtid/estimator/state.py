@@ -1,0 +1,159 @@
+"""The estimator's memory: five structured arrays built from a model, that copy, save and grow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtid.kernels import engine as kernel
+from rtid.kernels import layout
+from rtid.kernels.information import move_pairs
+from rtid.model import Edge, FloatArray, Model
+
+RecordArray = NDArray[np.void]
+
+RING_FLOOR = 1e-10  # a closed block is silent when its state has decayed to this share
+FLOW_NOISE_FLOOR = 0.01  # least flow noise, share of the variance that the rated slope gives
+FIRST_BLOCKS, FIRST_PAIRS = 64, 4096
+MAX_CLOSED = 64
+
+
+@dataclass
+class State:
+    """engine (1,), cells (all grid cells), closed, blocks (visited), pairs (power of two)."""
+
+    engine: RecordArray
+    cells: RecordArray
+    closed: RecordArray
+    blocks: RecordArray
+    pairs: RecordArray
+
+    def advance(self, chunk: FloatArray) -> None:
+        """Take samples (n, 2 + signals), rows [t_s, flags, values...]; tables grow as needed."""
+        taken = kernel.advance(*self.arrays, chunk)
+        while taken < len(chunk):
+            self.make_room()
+            chunk = chunk[taken:]
+            taken = kernel.advance(*self.arrays, chunk)
+
+    @property
+    def arrays(self) -> tuple[RecordArray, RecordArray, RecordArray, RecordArray, RecordArray]:
+        """The records in the order in which the kernels take them."""
+        return self.engine, self.cells, self.closed, self.blocks, self.pairs
+
+    @property
+    def form_is_integral(self) -> bool:
+        """True for the integral form, False for the carry form."""
+        return bool(self.engine[0]["form"] == layout.INTEGRAL)
+
+    def make_room(self) -> None:
+        """Double the tables of blocks and pairs; nothing else changes."""
+        extra = np.zeros(len(self.blocks), layout.BLOCK)
+        self.blocks = np.concatenate([self.blocks, extra])
+        self.pairs = _rehash(self.engine[0], self.pairs)
+
+    def settled(self) -> State:
+        """A copy in which all sums are complete; this state is not changed."""
+        copy = self.copy()
+        while kernel.needs_room(copy.engine[0], copy.closed, copy.blocks, copy.pairs):
+            copy.make_room()
+        kernel.settle(copy.engine, copy.closed, copy.blocks, copy.pairs)
+        return copy
+
+    def copy(self) -> State:
+        """An independent copy that continues bit for bit like this one."""
+        return State(*(array.copy() for array in self.arrays))
+
+
+def _rehash(e: np.void, pairs: RecordArray) -> RecordArray:
+    larger = np.zeros(2 * len(pairs), layout.PAIR)
+    e["n_pairs"] = 0
+    move_pairs(e, pairs, larger)
+    return larger
+
+
+def build(model: Model, slopes: FloatArray | None = None, lag_s: float | None = None) -> State:
+    """Empty state for a model.
+
+    slopes: (cells,) dQ/ddp in m3/s/Pa that weighs the pressure noise, one per grid cell in the
+    order of the edges; nominal orifice values when not given.  lag_s replaces the nominal lag.
+    """
+    n_cells = sum(edge.grid.shape[0] * edge.grid.shape[1] for edge in model.edges)
+    cells = np.zeros(n_cells, layout.CELL)
+    cells["slope"] = nominal_slopes(model) if slopes is None else slopes
+    engine = np.zeros(1, layout.ENGINE)
+    _configure(engine[0], model)
+    if lag_s is not None:
+        engine[0]["lag_s"] = lag_s
+    kernel.clear(engine, cells)
+    return State(
+        engine,
+        cells,
+        np.zeros(MAX_CLOSED, layout.CLOSED),
+        np.zeros(FIRST_BLOCKS, layout.BLOCK),
+        np.zeros(FIRST_PAIRS, layout.PAIR),
+    )
+
+
+def nominal_slopes(model: Model) -> FloatArray:
+    """dQ/ddp at the centre of each cell for Q = K(w) sqrt(dp), K rising linearly to its rated value."""
+    return np.concatenate([_edge_slopes(edge) for edge in model.edges])
+
+
+def _edge_slopes(edge: Edge) -> FloatArray:
+    u, dp = edge.grid.u_v, edge.grid.dp_pa
+    w, pressure = 0.5 * (u[1:] + u[:-1]), np.abs(0.5 * (dp[1:] + dp[:-1]))
+    foot = edge.safe_band_v if np.isfinite(edge.safe_band_v) else u[0]
+    gain = edge.rated_q_m3s / np.sqrt(edge.rated_dp_pa) * np.clip((w - foot) / (u[-1] - foot), 0.02, 1)
+    floor = 0.5 * np.diff(dp)
+    return np.outer(gain, 0.5 / np.sqrt(np.maximum(pressure, floor))).ravel()
+
+
+def _configure(e: np.void, model: Model) -> None:
+    e["form"] = layout.CARRY if model.form == "carry" else layout.INTEGRAL
+    n_chambers = len(model.chambers)
+    e["n_chambers"], e["n_edges"] = n_chambers, len(model.edges)
+    e["n_shared"], e["n_signals"] = n_chambers, len(model.signals)
+    e["n_state"] = n_chambers * (2 if model.form == "carry" else 1)
+    for j, signal in enumerate(model.signals):
+        e["minimum"][j], e["maximum"][j] = signal.minimum, signal.maximum
+    e["x_column"] = model.column(model.position)
+    e["x_var_m2"] = _variance(model, model.position)
+    for c, chamber in enumerate(model.chambers):
+        e["p_column"][c] = model.column(chamber.pressure)
+        e["p_var_pa2"][c] = _variance(model, chamber.pressure)
+        e["area_m2"][c], e["v0_m3"][c] = chamber.sign * chamber.area_m2, chamber.v0_m3
+        e["compliance"][c] = 1.0 / model.beta_nominal_pa
+    first = 0
+    for i, edge in enumerate(model.edges):
+        first = _configure_edge(e, model, i, edge, first)
+    e["hysteresis"], e["max_gap_s"] = model.gates.hysteresis, model.gates.max_gap_s
+    e["ring_floor"], e["lag_s"] = RING_FLOOR, model.lag.nominal_s
+    e["wn_rad_s"], e["zeta"] = model.filter.wn_rad_s, model.filter.zeta
+    e["row_period_s"] = 1.0 / model.filter.rows_per_s
+    e["p_period_s"] = model.pressure_period_s
+
+
+def _configure_edge(e: np.void, model: Model, i: int, edge: Edge, first_cell: int) -> int:
+    e["source"][i], e["sink"][i] = model.column(edge.source), model.column(edge.sink)
+    e["command"][i], e["direction"][i] = model.column(edge.command), edge.direction
+    e["safe_v"][i], e["scale_m3s"][i] = edge.safe_band_v, edge.rated_q_m3s
+    e["dp_var_pa2"][i] = _variance(model, edge.source) + _variance(model, edge.sink)
+    nu, nd = edge.grid.shape
+    e["n_u"][i], e["n_dp"][i], e["first_cell"][i] = nu, nd, first_cell
+    e["u_border"][i, : nu + 1], e["dp_border"][i, : nd + 1] = edge.grid.u_v, edge.grid.dp_pa
+    slope = 0.5 * edge.rated_q_m3s / edge.rated_dp_pa
+    for c, chamber in enumerate(model.chambers):
+        e["sign"][i, c] = (edge.sink == chamber.pressure) - int(edge.source == chamber.pressure)
+        if e["sign"][i, c] != 0:
+            period = model.pressure_period_s or 1e-3
+            noise = slope**2 * e["dp_var_pa2"][i] * period
+            e["q_floor"][c] = max(e["q_floor"][c], FLOW_NOISE_FLOOR * noise)
+    return first_cell + nu * nd
+
+
+def _variance(model: Model, name: str) -> float:
+    signal = model.signals[model.column(name)]
+    return signal.noise**2 + signal.resolution**2 / 12.0

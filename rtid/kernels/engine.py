@@ -1,0 +1,375 @@
+"""The estimator's one hot path: samples in, information sums changed in place.
+
+Per interval [t_k, t_k+1] and chamber c, eq. (14) integrated over it:
+
+    s_c A_c (x_k+1 - x_k) = - V_mid (P_k+1 - P_k) theta_beta_c + sum of sigma * int phi dt theta + ...
+
+Replay calls `advance` with a whole trace, the daemon with one sample: same code, same bits.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from rtid.kernels.basis import relocate
+from rtid.kernels.holds import lagged_moments, second_order
+from rtid.kernels.information import (
+    close_block,
+    drop_open,
+    first_ring,
+    flush_local,
+    forget_ring,
+    open_block,
+    rebase,
+    ring_needs_rebase,
+)
+from rtid.kernels.layout import (
+    BLOCK_CHANGES,
+    CARRY,
+    MAX_EDGES,
+    MAX_OPEN,
+    NOT_FINITE,
+    OUT_OF_RANGE,
+    OUTSIDE_GRID,
+    RESTART_GAP,
+    RESTART_MEMORY,
+    SAMPLES,
+    TERMS,
+)
+from rtid.kernels.rows import (
+    carry_row,
+    carry_step,
+    integral_row_one,
+    integral_row_two,
+    start_whitener,
+)
+
+FloatArray = NDArray[np.float64]
+
+ROW_FLAG, GAP_FLAG = 1, 2  # as in firmware_bridge.samples
+SHUT, OUTSIDE = -1, -2  # cell of an edge that passes nothing / whose working point is off the grid
+
+
+@njit(cache=True)
+def advance(
+    engine: Any, cells: Any, closed: Any, blocks: Any, pairs: Any, chunk: FloatArray
+) -> int:
+    """Take samples, rows of chunk (n, 2 + signals): [t_s, flags, values...], SI units.
+
+    engine (1,), cells, closed, blocks and pairs are the records of `layout`, changed in place.
+    Returns the number of samples taken: fewer than n when `blocks` or `pairs` must be enlarged
+    first (see `needs_room`).
+    """
+    e = engine[0]
+    for k in range(len(chunk)):
+        if needs_room(e, closed, blocks, pairs):
+            return k
+        _take(e, cells, closed, blocks, pairs, chunk[k])
+    return len(chunk)
+
+
+@njit(cache=True)
+def needs_room(e: Any, closed: Any, blocks: Any, pairs: Any) -> bool:
+    """True when the next sample could overflow the tables: blocks, or pairs more than 60 % full."""
+    if e.n_slots + MAX_EDGES > len(blocks):
+        return True
+    ringing = e.n_closed + MAX_OPEN
+    return 10 * (e.n_pairs + ringing * ringing // 2) > 6 * len(pairs)
+
+
+@njit(cache=True)
+def _take(e: Any, cells: Any, closed: Any, blocks: Any, pairs: Any, sample: FloatArray) -> None:
+    """One sample: gate it, then integrate the interval that it closes."""
+    e.counters[SAMPLES] += 1
+    flags = int(sample[1])
+    if not _acceptable(e, sample):
+        _stop(e, closed, blocks, pairs)
+        return
+    dt = sample[0] - e.t_s
+    if e.running and ((flags & GAP_FLAG) != 0 or dt > e.max_gap_s or dt <= 0.0):
+        e.counters[RESTART_GAP] += 1
+        _stop(e, closed, blocks, pairs)
+    if e.running:
+        _interval(e, cells, closed, blocks, pairs, sample, dt, (flags & ROW_FLAG) != 0)
+    elif (flags & ROW_FLAG) != 0:
+        _start(e, sample)
+    _remember(e, sample)
+
+
+@njit(cache=True)
+def _acceptable(e: Any, sample: FloatArray) -> bool:
+    """Finite first (NaN passes no comparison), then the declared range of each signal."""
+    for j in range(2 + e.n_signals):
+        if not math.isfinite(sample[j]):
+            e.counters[NOT_FINITE] += 1
+            return False
+    for j in range(e.n_signals):
+        if sample[2 + j] < e.minimum[j] or sample[2 + j] > e.maximum[j]:
+            e.counters[OUT_OF_RANGE] += 1
+            return False
+    return True
+
+
+@njit(cache=True)
+def _remember(e: Any, sample: FloatArray) -> None:
+    e.t_s = sample[0]
+    for j in range(e.n_signals):
+        e.values[j] = sample[2 + j]
+
+
+@njit(cache=True)
+def _start(e: Any, sample: FloatArray) -> None:
+    """Begin at a measured position: spools at rest, whitener at R, filters at zero."""
+    _remember(e, sample)
+    e.running = 1
+    e.next_row_s = sample[0] + e.row_period_s
+    for i in range(e.n_edges):
+        e.w_v[i] = e.direction[i] * e.values[e.command[i]]
+    start_whitener(e)
+
+
+@njit(cache=True)
+def _stop(e: Any, closed: Any, blocks: Any, pairs: Any) -> None:
+    """End all memory at a break of continuity; learned sums stay."""
+    if e.running:
+        forget_ring(e, closed, blocks, pairs)
+        while e.n_open > 0:
+            drop_open(e, e.n_open - 1)
+    for i in range(e.n_edges):
+        e.cell[i, 0] = SHUT
+    e.running = 0
+
+
+@njit(cache=True)
+def _interval(
+    e: Any, cells: Any, closed: Any, blocks: Any, pairs: Any, sample: FloatArray, dt: float, row: bool
+) -> None:
+    """Integrate the columns over [t, t + dt]; make a row where the position was measured."""
+    if dt != e.dt_s:
+        _set_step(e, dt)
+    if not _working_points(e, sample, dt):
+        e.counters[OUTSIDE_GRID] += 1
+        _stop(e, closed, blocks, pairs)
+        return
+    _change_blocks(e, cells, closed, blocks, pairs)
+    _shared_increments(e, sample, dt)
+    for k in range(e.n_open):
+        _block_increments(e, cells, blocks, k, sample[0], dt, row)
+    if e.form == CARRY:
+        carry_step(e)
+        _remember(e, sample)
+        if e.t_s > e.next_row_s - 0.5 * dt:
+            e.next_row_s += e.row_period_s * max(1.0, math.ceil((e.t_s - e.next_row_s) / e.row_period_s))
+            carry_row(e)
+    else:
+        _remember(e, sample)
+        _integral_step(e, row)
+    if ring_needs_rebase(e):
+        flush_local(e, closed, blocks, pairs)
+        rebase(e, closed, blocks, pairs)
+
+
+@njit(cache=True)
+def _set_step(e: Any, dt: float) -> None:
+    """Factors that depend on the length of the step alone."""
+    e.dt_s = dt
+    e.lag_decay = math.exp(-dt / e.lag_s) if e.lag_s > 0.0 else 0.0
+    second_order(e.wn_rad_s, e.zeta, dt, e.filter_a, e.filter_b)
+
+
+@njit(cache=True)
+def _working_points(e: Any, sample: FloatArray, dt: float) -> bool:
+    """Per edge: moments of the lagged command, dp at both ends, and the block of its mean point.
+
+    False when an edge that is open lies outside its grid: its flow is unknown.
+    """
+    inside, moments, dp, target = True, e.moments, e.dp_pa, e.target
+    for i in range(e.n_edges):
+        held = e.direction[i] * e.values[e.command[i]]
+        end, m1, m2, mt = lagged_moments(held, e.w_v[i], e.lag_s, e.lag_decay, dt)
+        e.w_v[i] = end
+        target[i, 0] = SHUT
+        if m1 <= e.safe_v[i]:
+            continue
+        dp[i, 0] = e.values[e.source[i]] - e.values[e.sink[i]]
+        dp[i, 1] = sample[2 + e.source[i]] - sample[2 + e.sink[i]]
+        moments[i, 0], moments[i, 1], moments[i, 2] = m1, m2, mt
+        mid = 0.5 * (dp[i, 0] + dp[i, 1])
+        target[i, 0] = relocate(e.u_border[i], e.n_u[i], m1, e.cell[i, 0], e.hysteresis)
+        before = e.cell[i, 1] if e.cell[i, 0] != SHUT else SHUT
+        target[i, 1] = relocate(e.dp_border[i], e.n_dp[i], mid, before, e.hysteresis)
+        if target[i, 0] < 0 or target[i, 1] < 0:
+            inside = False
+    return inside
+
+
+@njit(cache=True)
+def _change_blocks(e: Any, cells: Any, closed: Any, blocks: Any, pairs: Any) -> None:
+    """Close the blocks that the working points left, open those that they entered."""
+    flushed, target = False, e.target
+    for i in range(e.n_edges):
+        same = target[i, 0] == e.cell[i, 0]
+        if same and (target[i, 0] == SHUT or target[i, 1] == e.cell[i, 1]):
+            continue
+        if not flushed:
+            _prepare_change(e, closed, blocks, pairs)
+            flushed = True
+        e.counters[BLOCK_CHANGES] += 1
+        if e.place[i] >= 0:
+            k = e.place[i]
+            close_block(e, closed, k)
+            drop_open(e, k)
+        e.cell[i, 0], e.cell[i, 1] = target[i, 0], target[i, 1]
+        if target[i, 0] != SHUT:
+            open_block(e, closed, blocks, pairs, i, _slot(e, cells, blocks, i))
+
+
+@njit(cache=True)
+def _prepare_change(e: Any, closed: Any, blocks: Any, pairs: Any) -> None:
+    """Flush the local sums; where too many blocks ring at once, begin a new memory.
+
+    A new memory costs one unknown start position per chamber, and bounds the work per change.
+    """
+    if e.n_closed + MAX_OPEN > len(closed):
+        e.counters[RESTART_MEMORY] += 1
+        forget_ring(e, closed, blocks, pairs)
+        start_whitener(e)
+    else:
+        flush_local(e, closed, blocks, pairs)
+
+
+@njit(cache=True)
+def _slot(e: Any, cells: Any, blocks: Any, edge: int) -> int:
+    """Slot of the edge's current cell, given out at its first visit."""
+    at = e.first_cell[edge] + e.cell[edge, 0] * e.n_dp[edge] + e.cell[edge, 1]
+    if cells[at].slot < 0:
+        cells[at].slot = e.n_slots
+        blocks[e.n_slots].cell = at
+        blocks[e.n_slots].edge = edge
+        e.n_slots += 1
+    return int(cells[at].slot)
+
+
+@njit(cache=True)
+def _shared_increments(e: Any, sample: FloatArray, dt: float) -> None:
+    """y: s A dx; theta_beta: -V dP (scaled by the nominal compliance), exact for linear x and P.
+
+    Carry form: the rates at both ends of the interval instead of the integrals.
+    """
+    x0, x1 = e.values[e.x_column], sample[2 + e.x_column]
+    for c in range(e.n_chambers):
+        dx = e.area_m2[c] * (x1 - x0)
+        dp = -e.compliance[c] * (sample[2 + e.p_column[c]] - e.values[e.p_column[c]])
+        v0, v1 = e.v0_m3[c] + e.area_m2[c] * x0, e.v0_m3[c] + e.area_m2[c] * x1
+        if e.form == CARRY:
+            e.inc[c, 0], e.end[c, 0] = dx / dt, dx / dt
+            e.inc[c, 1 + c], e.end[c, 1 + c] = dp * v0 / dt, dp * v1 / dt
+        else:
+            e.d[c, 0] += dx
+            e.d[c, 1 + c] += 0.5 * (v0 + v1) * dp
+
+
+@njit(cache=True)
+def _block_increments(
+    e: Any, cells: Any, blocks: Any, k: int, t: float, dt: float, row: bool
+) -> None:
+    """Integrals (carry form: end values) of the six terms of open block k over the interval."""
+    i = e.open_edge[k]
+    block = blocks[e.open_slot[k]]
+    u, p = e.u_border[i], e.dp_border[i]
+    iu, ip = e.cell[i, 0], e.cell[i, 1]
+    hu, hp = 2.0 / (u[iu + 1] - u[iu]), 2.0 / (p[ip + 1] - p[ip])
+    uc, pc = 0.5 * (u[iu + 1] + u[iu]), 0.5 * (p[ip + 1] + p[ip])
+    m1, m2, mt = e.moments[i, 0], e.moments[i, 1], e.moments[i, 2]
+    eta0, eta1 = (e.dp_pa[i, 0] - pc) * hp, (e.dp_pa[i, 1] - pc) * hp
+    phi = e.phi
+    phi[0] = 1.0
+    phi[1] = (m1 - uc) * hu
+    phi[2] = 0.5 * (eta0 + eta1)
+    phi[3] = (m2 - 2.0 * uc * m1 + uc * uc) * hu * hu
+    phi[4] = (eta0 * eta0 + eta0 * eta1 + eta1 * eta1) / 3.0
+    phi[5] = phi[1] * phi[2] + mt * hu * (eta1 - eta0)
+    first = 1 + e.n_shared + TERMS * k
+    block.dwell_s += dt
+    block.last_s = t
+    if row:
+        block.rows += 1
+    for j in range(TERMS):
+        block.phi_sum[j] += phi[j] * dt
+    if e.form == CARRY:
+        _carry_ends(e, i, first, phi, eta0, eta1)
+    else:
+        for c in range(e.n_chambers):
+            scale = e.sign[i, c] * e.scale_m3s[i] * dt
+            for j in range(TERMS):
+                e.d[c, first + j] += scale * phi[j]
+    _flow_noise(e, i, cells[block.cell].slope, dt)
+
+
+@njit(cache=True)
+def _carry_ends(
+    e: Any, i: int, first: int, phi: FloatArray, eta0: float, eta1: float
+) -> None:
+    """Start and end values: the regressor runs from phi(u_k, dp_k) to phi(u_k, dp_k+1)."""
+    for c in range(e.n_chambers):
+        scale = e.sign[i, c] * e.scale_m3s[i]
+        for j in range(TERMS):
+            e.inc[c, first + j] = scale * phi[j]
+            e.end[c, first + j] = scale * phi[j]
+        half = 0.5 * scale * (eta1 - eta0)
+        e.inc[c, first + 2] -= half
+        e.end[c, first + 2] += half
+        e.inc[c, first + 4] -= half * (eta0 + eta1)
+        e.end[c, first + 4] += half * (eta0 + eta1)
+        e.inc[c, first + 5] -= half * phi[1]
+        e.end[c, first + 5] += half * phi[1]
+
+
+@njit(cache=True)
+def _flow_noise(e: Any, i: int, slope: float, dt: float) -> None:
+    """Random walk of the integral: pressure noise through dQ/ddp, (m3)^2 per step."""
+    period = e.p_period_s if e.p_period_s > 0.0 else dt
+    q = slope * slope * e.dp_var_pa2[i] * period * dt
+    for a in range(e.n_chambers):
+        for b in range(e.n_chambers):
+            e.cov[a, b] += e.sign[i, a] * e.sign[i, b] * q
+
+
+@njit(cache=True)
+def _integral_step(e: Any, row: bool) -> None:
+    for c in range(e.n_chambers):
+        e.cov[c, c] += e.q_floor[c] * e.dt_s
+    if row and e.n_chambers == 2:
+        integral_row_two(e)
+    elif row:
+        integral_row_one(e)
+
+
+@njit(cache=True)
+def settle(engine: Any, closed: Any, blocks: Any, pairs: Any) -> None:
+    """Bring all sums up to date without ending the memory, so that they can be read."""
+    e = engine[0]
+    if e.running:
+        flush_local(e, closed, blocks, pairs)
+        rebase(e, closed, blocks, pairs)
+
+
+@njit(cache=True)
+def clear(engine: Any, cells: Any) -> None:
+    """Set the state (not the configuration) to its beginning."""
+    e = engine[0]
+    e.running, e.n_open, e.n_closed, e.n_slots, e.n_pairs = 0, 0, 0, 0, 0
+    e.dt_s, e.ring_log = 0.0, 0.0
+    for i in range(MAX_EDGES):
+        e.place[i] = -1
+        e.cell[i, 0], e.cell[i, 1] = SHUT, SHUT
+    ring = first_ring(e)
+    for s in range(e.n_state):
+        e.d[s, ring + s] = 1.0
+    for c in range(len(cells)):
+        cells[c].slot = -1

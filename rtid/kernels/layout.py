@@ -1,0 +1,154 @@
+"""Memory layout of the estimator's state: plain structured arrays, one object to save or copy.
+
+The sizes are fixed, so that one compiled kernel serves every machine.  A *column* is one regressor
+of the joint regression; its state is a short vector d (see `information`).  Local columns, those
+that move at every sample, are ordered
+
+    [ y | shared (theta_beta per chamber, effects) | 6 terms per open block | ring ]
+
+`ring` are unit vectors that stand for all closed blocks, whose states decay together.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+MAX_CHAMBERS = 2
+MAX_EDGES = 8
+MAX_BORDERS = 129
+MAX_SIGNALS = 24
+MAX_SHARED = 24
+MAX_OPEN = 4
+TERMS = 6  # Taylor terms of one block, eq. (6)
+MAX_STATE = 4  # length of a column's state: chambers (integral form), 2 x chambers (carry form)
+MAX_LOCAL = 56  # 1 + MAX_SHARED + MAX_OPEN * TERMS + MAX_STATE, rounded up to whole vectors
+
+INTEGRAL, CARRY = 0, 1  # the forms of the regression
+
+# counters[...]: how often a sample was refused or an estimate restarted, by reason
+COUNTERS = (
+    "samples",
+    "rows",
+    "restart_gap",
+    "not_finite",
+    "out_of_range",
+    "outside_grid",
+    "block_changes",
+    "restart_memory",
+)
+SAMPLES, ROWS, RESTART_GAP, NOT_FINITE, OUT_OF_RANGE, OUTSIDE_GRID, BLOCK_CHANGES, RESTART_MEMORY = (
+    range(len(COUNTERS))
+)
+
+_F, _I = np.float64, np.int64
+
+ENGINE = np.dtype(
+    [
+        # --- configuration, constant after `estimator.build` ---
+        ("form", _I),
+        ("n_chambers", _I),
+        ("n_edges", _I),
+        ("n_shared", _I),
+        ("n_signals", _I),
+        ("n_state", _I),
+        ("x_column", _I),
+        ("p_column", _I, (MAX_CHAMBERS,)),
+        ("area_m2", _F, (MAX_CHAMBERS,)),  # signed: s_c A_c
+        ("v0_m3", _F, (MAX_CHAMBERS,)),
+        ("x_var_m2", _F),
+        ("p_var_pa2", _F, (MAX_CHAMBERS,)),
+        ("compliance", _F, (MAX_CHAMBERS,)),  # nominal 1 / beta: weights and scale of theta_beta
+        ("q_floor", _F, (MAX_CHAMBERS,)),  # least intensity of the flow noise, m6/s
+        ("p_period_s", _F),  # sampling period of the pressures; 0: every sample
+        ("source", _I, (MAX_EDGES,)),
+        ("sink", _I, (MAX_EDGES,)),
+        ("command", _I, (MAX_EDGES,)),
+        ("direction", _F, (MAX_EDGES,)),
+        ("safe_v", _F, (MAX_EDGES,)),
+        ("sign", _F, (MAX_EDGES, MAX_CHAMBERS)),
+        ("dp_var_pa2", _F, (MAX_EDGES,)),
+        ("scale_m3s", _F, (MAX_EDGES,)),
+        ("n_u", _I, (MAX_EDGES,)),
+        ("n_dp", _I, (MAX_EDGES,)),
+        ("first_cell", _I, (MAX_EDGES,)),
+        ("u_border", _F, (MAX_EDGES, MAX_BORDERS)),
+        ("dp_border", _F, (MAX_EDGES, MAX_BORDERS)),
+        ("minimum", _F, (MAX_SIGNALS,)),
+        ("maximum", _F, (MAX_SIGNALS,)),
+        ("hysteresis", _F),
+        ("max_gap_s", _F),
+        ("ring_floor", _F),
+        ("wn_rad_s", _F),
+        ("zeta", _F),
+        ("row_period_s", _F),
+        ("lag_s", _F),
+        # --- state ---
+        ("running", _I),
+        ("t_s", _F),
+        ("next_row_s", _F),
+        ("dt_s", _F),  # step for which the filter and lag factors below hold
+        ("lag_decay", _F),
+        ("filter_a", _F, (2, 2)),
+        ("filter_b", _F, (2, 2)),
+        ("values", _F, (MAX_SIGNALS,)),
+        ("w_v", _F, (MAX_EDGES,)),  # lagged opening command per edge
+        ("cell", _I, (MAX_EDGES, 2)),  # current block of each edge
+        ("place", _I, (MAX_EDGES,)),  # its position among the open blocks, -1 when shut
+        ("n_open", _I),
+        ("open_edge", _I, (MAX_OPEN,)),
+        ("open_slot", _I, (MAX_OPEN,)),
+        ("cov", _F, (MAX_CHAMBERS, MAX_CHAMBERS)),  # Kalman whitener: variance of the gap, m6
+        ("d", _F, (MAX_STATE, MAX_LOCAL)),
+        ("inc", _F, (MAX_CHAMBERS, MAX_LOCAL)),  # increments (integral) or start values (carry)
+        ("end", _F, (MAX_CHAMBERS, MAX_LOCAL)),  # end values (carry)
+        ("row", _F, (MAX_CHAMBERS, MAX_LOCAL)),
+        ("moments", _F, (MAX_EDGES, 3)),  # of the opening command over the interval
+        ("dp_pa", _F, (MAX_EDGES, 2)),  # at its start and end
+        ("target", _I, (MAX_EDGES, 2)),  # the blocks that the working points are in
+        ("phi", _F, (TERMS,)),
+        ("gram", _F, (MAX_LOCAL, MAX_LOCAL)),
+        ("ring_w", _F, (MAX_STATE, MAX_STATE)),
+        ("owed", _F, (MAX_STATE, TERMS)),
+        ("ring_log", _F),  # log det of the ring columns since the last rebase
+        ("n_closed", _I),
+        ("n_slots", _I),
+        ("n_pairs", _I),
+        ("shared", _F, (1 + MAX_SHARED, 1 + MAX_SHARED)),
+        ("noise_gram", _F, (MAX_CHAMBERS,)),
+        ("counters", _I, (len(COUNTERS),)),
+    ],
+    align=True,
+)
+
+# One record per cell of a grid: the slot of its block (-1 before the first visit) and the nominal
+# dQ/ddp, which weighs the pressure noise.
+CELL = np.dtype([("slot", _I), ("slope", _F)], align=True)
+
+# One record per visited block.
+BLOCK = np.dtype(
+    [
+        ("cell", _I),
+        ("edge", _I),
+        ("rows", _I),
+        ("dwell_s", _F),
+        ("last_s", _F),
+        ("phi_sum", _F, (TERMS,)),  # integral of the basis over the time spent in the block
+        ("gram", _F, (TERMS, TERMS)),
+        ("shared", _F, (TERMS, 1 + MAX_SHARED)),  # products with y and the shared columns
+    ],
+    align=True,
+)
+
+# One record per pair of blocks (low < high slot) that ever rang together; open addressing.
+PAIR = np.dtype([("key", _I), ("gram", _F, (TERMS, TERMS))], align=True)
+
+# One record per block that is closed but still rings, in the order of closing.
+CLOSED = np.dtype(
+    [
+        ("slot", _I),
+        ("size", _F),
+        ("d", _F, (MAX_STATE, TERMS)),
+        ("w_start", _F, (MAX_STATE, MAX_STATE)),
+    ],
+    align=True,
+)

@@ -1,0 +1,124 @@
+"""The two forms of the regression as linear filters of the columns: what makes a row, what fades.
+
+Integral form (design: one row per measured position).  The gap d = z - m between a column's
+integral and its prediction is followed by a Kalman whitener: position noise (with the pressure
+noise that enters through V dP) is white with covariance R, flow noise (pressure noise through
+dQ/ddp) is a random walk with covariance Q per step:
+
+    P <- P + Q;  S = P + R;  row = L^-1 d, S = L L';  d <- R S^-1 d;  P <- P S^-1 R
+
+Carry form, eq. (10)-(11): every column passes H_f; a row is the filter's output at the row instants,
+divided by the Cholesky factor of the two chambers' position noise; d is the filter's state.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from numba import njit
+
+from rtid.kernels.information import add_products, first_ring, local_width
+from rtid.kernels.layout import ROWS
+
+
+@njit(cache=True)
+def start_whitener(e: Any) -> None:
+    """The first position is known as well as it was measured: P = R."""
+    for a in range(e.n_chambers):
+        for b in range(e.n_chambers):
+            e.cov[a, b] = _position_noise(e, a, b)
+
+
+@njit(cache=True)
+def _position_noise(e: Any, a: int, b: int) -> float:
+    """Covariance R of the rows' white noise, m6: one x for both chambers, one p for each."""
+    r = e.area_m2[a] * e.area_m2[b] * e.x_var_m2
+    if a == b:
+        v = e.v0_m3[a] + e.area_m2[a] * e.values[e.x_column]
+        r += (v * e.compliance[a]) ** 2 * e.p_var_pa2[a]
+    return r
+
+
+@njit(cache=True)
+def integral_row_one(e: Any) -> None:
+    """Row and decay for one chamber."""
+    d, row, n = e.d, e.row, local_width(e)
+    r = _position_noise(e, 0, 0)
+    s = e.cov[0, 0] + r
+    scale, keep = 1.0 / math.sqrt(s), r / s
+    for j in range(n):
+        row[0, j] = scale * d[0, j]
+        d[0, j] *= keep
+    v = e.v0_m3[0] + e.area_m2[0] * e.values[e.x_column]
+    e.noise_gram[0] += (v * e.compliance[0]) ** 2 * e.p_var_pa2[0] / s
+    e.cov[0, 0] *= keep
+    e.ring_log += math.log(keep)
+    e.counters[ROWS] += 1
+    add_products(e, 1)
+
+
+@njit(cache=True)
+def integral_row_two(e: Any) -> None:
+    """Rows and decay for two chambers that share the noise of x: whitened jointly."""
+    d, row, cov, n = e.d, e.row, e.cov, local_width(e)
+    r00, r01, r11 = _position_noise(e, 0, 0), _position_noise(e, 0, 1), _position_noise(e, 1, 1)
+    s00, s01, s11 = cov[0, 0] + r00, cov[0, 1] + r01, cov[1, 1] + r11
+    i0 = 1.0 / math.sqrt(s00)
+    c = s01 * i0
+    i1 = 1.0 / math.sqrt(s11 - c * c)
+    det = 1.0 / (s00 * s11 - s01 * s01)
+    k00, k01 = (r00 * s11 - r01 * s01) * det, (r01 * s00 - r00 * s01) * det
+    k10, k11 = (r01 * s11 - r11 * s01) * det, (r11 * s00 - r01 * s01) * det
+    for j in range(n):
+        d0, d1 = d[0, j], d[1, j]
+        row[0, j] = i0 * d0
+        row[1, j] = i1 * (d1 - c * i0 * d0)
+        d[0, j] = k00 * d0 + k01 * d1
+        d[1, j] = k10 * d0 + k11 * d1
+    v0 = e.v0_m3[0] + e.area_m2[0] * e.values[e.x_column]
+    v1 = e.v0_m3[1] + e.area_m2[1] * e.values[e.x_column]
+    e.noise_gram[0] += (v0 * e.compliance[0]) ** 2 * e.p_var_pa2[0] * s11 * det
+    e.noise_gram[1] += (v1 * e.compliance[1]) ** 2 * e.p_var_pa2[1] * s00 * det
+    p00, p01, p11 = cov[0, 0], cov[0, 1], cov[1, 1]
+    cov[0, 0] = k00 * p00 + k01 * p01
+    cov[1, 1] = k10 * p01 + k11 * p11
+    cov[0, 1] = 0.5 * (k00 * p01 + k01 * p11 + k10 * p00 + k11 * p01)
+    cov[1, 0] = cov[0, 1]
+    e.ring_log += math.log(k00 * k11 - k01 * k10)
+    e.counters[ROWS] += 1
+    add_products(e, 2)
+
+
+@njit(cache=True)
+def carry_step(e: Any) -> None:
+    """All filters over one interval: x+ = a x + b [start, end] per chamber and column."""
+    a, b, d, inc, end = e.filter_a, e.filter_b, e.d, e.inc, e.end
+    ring, n = first_ring(e), local_width(e)
+    a00, a01, a10, a11 = a[0, 0], a[0, 1], a[1, 0], a[1, 1]
+    b00, b01, b10, b11 = b[0, 0], b[0, 1], b[1, 0], b[1, 1]
+    for c in range(e.n_chambers):
+        for j in range(n):
+            x0, x1 = d[2 * c, j], d[2 * c + 1, j]
+            d[2 * c, j] = a00 * x0 + a01 * x1
+            d[2 * c + 1, j] = a10 * x0 + a11 * x1
+        for j in range(ring):
+            d[2 * c, j] += b00 * inc[c, j] + b01 * end[c, j]
+            d[2 * c + 1, j] += b10 * inc[c, j] + b11 * end[c, j]
+    e.ring_log -= 2.0 * e.zeta * e.wn_rad_s * e.dt_s
+
+
+@njit(cache=True)
+def carry_row(e: Any) -> None:
+    """Rows at a row instant: outputs of the filters, weighted by the position noise."""
+    d, row, n = e.d, e.row, local_width(e)
+    i0 = 1.0 / math.sqrt(_position_noise(e, 0, 0))
+    for j in range(n):
+        row[0, j] = i0 * d[0, j]
+    if e.n_chambers == 2:
+        c = _position_noise(e, 0, 1) * i0
+        i1 = 1.0 / math.sqrt(_position_noise(e, 1, 1) - c * c)
+        for j in range(n):
+            row[1, j] = i1 * (d[2, j] - c * i0 * d[0, j])
+    e.counters[ROWS] += 1
+    add_products(e, e.n_chambers)
