@@ -1,0 +1,223 @@
+"""From valid sections to the machine (`rtid.model.Model`) and the bridge's `Assembly`."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import fields, is_dataclass
+
+import numpy as np
+
+from firmware_bridge.catalog import Catalog
+from firmware_bridge.config import CYCLE, MULTIRATE, Assembly, MessageSource, SignalSource
+from rtid.model import Chamber, Edge, Filter, Gates, Grid, Lag, Model, Signal
+from rtid.project.project import Sections
+from rtid.project.references import KINDS
+from rtid.project.schema import EdgeSection, SignalSection
+from rtid.units import Unit, find_unit
+
+MIN_GAP_S = 0.05
+_SI_UNIT = {"pressure": "Pa", "position": "m", "velocity": "m/s"}
+
+
+def build_model(sections: Sections, catalog: Catalog | None) -> Model:
+    """The declared machine, SI."""
+    signals = tuple(_signal(n, s, catalog) for n, s in sections.signals.items())
+    gates, lag = sections.gates, sections.dynamics.spool_lag
+    return Model(
+        signals=signals,
+        chambers=tuple(_chamber(name, sections) for name in sections.chambers),
+        edges=tuple(_edge(name, edge, sections, signals) for name, edge in sections.edges.items()),
+        position=_position(sections, signals),
+        beta_nominal_pa=sections.beta.nominal_pa,
+        beta_bounds_pa=sections.beta.bounds_pa,
+        lag=Lag(lag.nominal_s, lag.tolerance_s),
+        filter=Filter(
+            wn_rad_s=2 * np.pi * sections.filter.natural_frequency_hz,
+            zeta=sections.filter.damping,
+            rows_per_s=sections.filter.rows_per_s,
+        ),
+        gates=Gates(
+            condition_limit=gates.condition_limit,
+            max_gap_s=_max_gap_s(sections, catalog),
+            hysteresis=gates.hysteresis,
+            min_rows=gates.min_rows,
+        ),
+        form=sections.estimator.form,
+    )
+
+
+def build_assembly(
+    sections: Sections, model: Model, catalog: Catalog | None, *, table: bool
+) -> Assembly:
+    """What the assembler needs for a CAN trace, or with `table` for the columns of a table."""
+    used = [] if table else _used(sections, catalog)
+    messages = tuple(_message(name, sections, catalog) for name in used)
+    same = len({message.period_s for message in messages}) <= 1
+    return Assembly(
+        mode=sections.source.mode or (CYCLE if same else MULTIRATE),
+        signals=tuple(_source(n, s, catalog, table) for n, s in sections.signals.items()),
+        messages=messages,
+        row_signal=model.position,
+        max_gap_s=model.gates.max_gap_s,
+    )
+
+
+def digest(value: object) -> str:
+    """Restore key: a hash of the model, exact to the last bit of each number."""
+    return hashlib.sha256(_canonical(value).encode()).hexdigest()[:16]
+
+
+def _canonical(value: object) -> str:
+    if isinstance(value, np.ndarray):
+        return _canonical(tuple(value.tolist()))
+    if isinstance(value, tuple):
+        return "(" + ",".join(_canonical(entry) for entry in value) + ")"
+    if is_dataclass(value):
+        parts = (f"{f.name}={_canonical(getattr(value, f.name))}" for f in fields(value))
+        return type(value).__name__ + "(" + ",".join(parts) + ")"
+    return value.hex() if isinstance(value, float) else repr(value)
+
+
+def unit_of(signal: SignalSection, catalog: Catalog | None) -> Unit:
+    """Unit of the raw signal, from the file or the DBC; only for checked sections."""
+    name = signal.unit
+    if name is None and catalog is not None and signal.message and signal.signal:
+        name = catalog.signal(signal.message, signal.signal).unit
+    unit = find_unit(name or "")
+    assert unit is not None, "sections are checked before they are built"
+    return unit
+
+
+def _dbc(signal: SignalSection, catalog: Catalog | None) -> tuple[float, tuple[float, float]]:
+    """Resolution and range of the DBC signal; 0 and infinite where it is none or says nothing."""
+    everything = (-math.inf, math.inf)
+    if catalog is None or not signal.message or not signal.signal or signal.constant is not None:
+        return 0.0, everything
+    found = catalog.signal(signal.message, signal.signal)
+    step = 0.0 if found.is_float else abs(float(found.scale))
+    low, high = found.minimum, found.maximum
+    if low is None or high is None or not low < high:
+        return step, everything
+    return step, (float(low) - step / 2, float(high) + step / 2)
+
+
+def _signal(name: str, signal: SignalSection, catalog: Catalog | None) -> Signal:
+    unit = unit_of(signal, catalog)
+    scale = 1.0 if signal.scale is None else signal.scale
+    step, limits = _dbc(signal, catalog)
+    ends = sorted(scale * limit + signal.offset for limit in limits)
+    low, high = _to_si(signal.range or (ends[0], ends[1]), signal, unit)
+    kind = signal.kind or ("position" if signal.table else KINDS[unit.dimension])
+    slope = _slope(signal, unit)
+    resolution = abs(scale) * step if signal.resolution is None else signal.resolution
+    return Signal(
+        name=name,
+        kind=kind,
+        unit=_SI_UNIT.get(kind, unit.name if unit.factor == 1.0 else unit.name[-1]),
+        noise=slope * (signal.noise or 0.0),
+        resolution=slope * resolution,
+        minimum=low,
+        maximum=high,
+    )
+
+
+def _slope(signal: SignalSection, unit: Unit) -> float:
+    """SI change per change of the signal; of an angle table the median slope."""
+    if signal.table is None:
+        return unit.factor
+    return float(np.median(np.abs(np.diff(signal.table.position_m) / np.diff(signal.table.angle))))
+
+
+def _to_si(limits: tuple[float, float], signal: SignalSection, unit: Unit) -> tuple[float, float]:
+    if signal.table is None:
+        return unit.factor * limits[0], unit.factor * limits[1]
+    angle, position_m = np.array(signal.table.angle), np.array(signal.table.position_m)
+    inside = np.clip(angle, limits[0], limits[1])
+    values = np.interp(inside, angle, position_m)
+    return float(values.min()), float(values.max())
+
+
+def _source(
+    name: str, signal: SignalSection, catalog: Catalog | None, column: bool
+) -> SignalSource:
+    unit = unit_of(signal, catalog)
+    scale = 1.0 if signal.scale is None else signal.scale
+    table = None
+    if signal.table is not None:  # the table takes the raw signal: undo scale and offset
+        raw = tuple((angle - signal.offset) / scale for angle in signal.table.angle)
+        table = (raw, signal.table.position_m)
+        table = table if scale > 0 else (raw[::-1], signal.table.position_m[::-1])
+    command = (signal.kind or KINDS.get(unit.dimension)) == "command"
+    return SignalSource(
+        name=name,
+        message="" if column else signal.message or "",
+        signal=(signal.column if column else signal.signal) or "",
+        factor=unit.factor * scale,
+        offset=unit.factor * signal.offset,
+        table=table,
+        constant=None if signal.constant is None else unit.factor * signal.constant,
+        hold=signal.hold or ("zero" if command else "linear"),
+    )
+
+
+def _used(sections: Sections, catalog: Catalog | None) -> list[str]:
+    """Messages that carry a signal, in the order of the file."""
+    signals = sections.signals.values() if catalog else ()
+    names = [s.message for s in signals if s.message and s.constant is None]
+    return list(dict.fromkeys(names))
+
+
+def _message(name: str, sections: Sections, catalog: Catalog | None) -> MessageSource:
+    declared = sections.messages.get(name)
+    known = catalog.message_source(name) if catalog else MessageSource(name, 0.0)
+    if declared is None:
+        return known
+    given = declared.model_fields_set
+    return MessageSource(
+        name=name,
+        period_s=declared.period_s or known.period_s,
+        offset_s=declared.offset_s or 0.0,
+        counter=declared.counter if "counter" in given else known.counter,
+        crc=declared.crc if "crc" in given else known.crc,
+        data_id=declared.data_id if "data_id" in given else known.data_id,
+        channel=declared.channel,
+    )
+
+
+def _max_gap_s(sections: Sections, catalog: Catalog | None) -> float:
+    """As given, else 50 ms, but never less than 2.5 periods of the slowest message."""
+    if sections.gates.max_gap_s is not None:
+        return sections.gates.max_gap_s
+    periods = [_message(name, sections, catalog).period_s for name in _used(sections, catalog)]
+    return max([MIN_GAP_S, *(2.5 * period for period in periods)])
+
+
+def _position(sections: Sections, signals: tuple[Signal, ...]) -> str:
+    named = sections.geometry.position
+    return named or next(signal.name for signal in signals if signal.kind == "position")
+
+
+def _chamber(name: str, sections: Sections) -> Chamber:
+    """V(x) = v0 + sign A x; the dead volume is what is left at the end where V is smallest."""
+    chamber = sections.chambers[name]
+    area_m2 = chamber.net_area_m2()
+    swept_m3 = area_m2 * sections.geometry.stroke_m if chamber.sign < 0 else 0.0
+    return Chamber(name, chamber.pressure, area_m2, chamber.sign, chamber.dead_volume_m3 + swept_m3)
+
+
+def _edge(name: str, edge: EdgeSection, sections: Sections, signals: tuple[Signal, ...]) -> Edge:
+    given = sections.edge_defaults.model_dump(exclude_none=True)
+    given |= edge.model_dump(exclude_none=True)
+    command = next(signal.name for signal in signals if signal.kind == "command")
+    return Edge(
+        name=name,
+        source=edge.source,
+        sink=edge.sink,
+        command=given.get("command", command),
+        direction=edge.direction,
+        grid=Grid(np.array(given["u_grid_v"]), np.array(given["dp_grid_pa"])),
+        safe_band_v=given.get("safe_band_v", -math.inf),
+        rated_q_m3s=given["rated_flow_m3s"],
+        rated_dp_pa=given["rated_dp_pa"],
+    )

@@ -1,0 +1,181 @@
+"""Read a project file: TOML -> sections -> checks -> `Project`, all errors named at once."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from firmware_bridge import catalog as catalogs
+from firmware_bridge.catalog import Catalog
+from rtid.model import Model
+from rtid.project import build, references, schema
+from rtid.project.errors import Problem, ProjectError
+from rtid.project.project import Project, Sections
+from rtid.project.sections import Raw, read_section
+from rtid.units import find_unit, nearest, units_of
+
+BUILTIN = "builtin:"
+MAX_FILE_BYTES = 4 << 20
+SINGLE: dict[str, type[schema.Section]] = {
+    "project": schema.ProjectSection,
+    "source": schema.SourceSection,
+    "geometry": schema.GeometrySection,
+    "edge_defaults": schema.EdgeDefaults,
+    "beta": schema.BetaSection,
+    "filter": schema.FilterSection,
+    "gates": schema.GatesSection,
+    "dynamics": schema.DynamicsSection,
+    "estimator": schema.EstimatorSection,
+    "record": schema.RecordSection,
+}
+NAMED: dict[str, type[schema.Section]] = {
+    "messages": schema.MessageSection,
+    "signals": schema.SignalSection,
+    "chambers": schema.ChamberSection,
+    "edges": schema.EdgeSection,
+}
+REQUIRED = ("project", "source", "signals", "geometry", "chambers", "edges")
+
+
+def load(path: str | Path) -> Project:
+    """Read and check a project file; `ProjectError` names every problem."""
+    path = Path(path)
+    raw = _parse(path)
+    parts, problems = _read_sections(raw)
+    dbc, catalog = _open_dbc(raw, path.parent, problems)
+    problems += references.check(raw, catalog, path.parent)
+    problems += _across(parts)
+    if problems:
+        raise ProjectError(path, list(dict.fromkeys(problems)))
+    return _assemble(path, Sections(**parts), dbc, catalog)
+
+
+def _parse(path: Path) -> Raw:
+    try:
+        if path.stat().st_size > MAX_FILE_BYTES:
+            problem = Problem("file", f"larger than {MAX_FILE_BYTES >> 20} MiB", "is it a project?")
+            raise ProjectError(path, [problem])
+        return tomllib.loads(path.read_text("utf-8"))
+    except FileNotFoundError:
+        problem = Problem("file", "does not exist", "name a project file; `rtid init` writes one")
+        raise ProjectError(path, [problem]) from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        problem = Problem("file", f"not valid TOML: {error}", "correct this place first")
+        raise ProjectError(path, [problem]) from None
+
+
+def _read_sections(raw: Raw) -> tuple[dict[str, Any], list[Problem]]:
+    known = [*SINGLE, *NAMED, "modes"]
+    problems = [
+        Problem(name, "unknown section", nearest(name, known)) for name in raw if name not in known
+    ]
+    problems += [
+        Problem(name, "missing", f"add a section [{name}]") for name in REQUIRED if name not in raw
+    ]
+    parts: dict[str, Any] = {"messages": {}}
+    for name, kind in SINGLE.items():
+        if name in raw:
+            parts[name], found = read_section(kind, raw[name], name)
+            problems += found
+    for name, kind in NAMED.items():
+        if name in raw:
+            parts[name], found = _read_named(kind, raw[name], name)
+            problems += found
+    modes = raw.get("modes", {})
+    if isinstance(modes, dict):
+        parts["modes"] = {mode: tuple(edges) for mode, edges in modes.items()}
+    else:
+        problems.append(Problem("modes", "must be a table", "write [modes]"))
+    return parts, problems
+
+
+def _read_named(
+    kind: type[schema.Section], raw: Any, name: str
+) -> tuple[dict[str, Any], list[Problem]]:
+    if not isinstance(raw, dict) or not raw:
+        return {}, [Problem(name, "must hold named tables", f"write [{name}.NAME]")]
+    found: dict[str, Any] = {}
+    problems: list[Problem] = []
+    for key, table in raw.items():
+        found[key], more = read_section(kind, table, f"{name}.{key}")
+        problems += more
+    return found, problems
+
+
+def _open_dbc(
+    raw: Raw, folder: Path, problems: list[Problem]
+) -> tuple[Path | None, Catalog | None]:
+    """The DBC of [source]; what is wrong with it joins `problems` (changed in place)."""
+    source = raw.get("source")
+    name = source.get("dbc") if isinstance(source, dict) else None
+    if not isinstance(name, str):
+        if isinstance(source, dict) and "dbc" not in source and "time_column" not in source:
+            remedy = 'add dbc = "machine.dbc" for CAN, or time_column = "t" for a table'
+            problems.append(Problem("source.dbc", "missing", remedy))
+        return None, None
+    path = folder / name
+    if name.startswith(BUILTIN):
+        path = catalogs.CONTROLLER_DBC.with_name(name.removeprefix(BUILTIN))
+    try:
+        return path, catalogs.load(path)
+    except catalogs.CatalogError as error:
+        remedy = f'name a DBC relative to this file, or "{BUILTIN}controller.dbc"'
+        problems.append(Problem("source.dbc", str(error), remedy))
+        return None, None
+
+
+def _across(parts: dict[str, Any]) -> list[Problem]:
+    """Checks of values that need more than one field; only for sections that are valid."""
+    problems: list[Problem] = []
+    for name, chamber in parts.get("chambers", {}).items():
+        if chamber is not None and not chamber.net_area_m2() > 0:
+            remedy = "give area_cm2, or a piston diameter larger than the rod"
+            problems.append(Problem(f"chambers.{name}", "has no positive area", remedy))
+    beta = parts.get("beta") or schema.BetaSection()
+    if not beta.bounds_pa[0] <= beta.nominal_pa <= beta.bounds_pa[1]:
+        problems.append(
+            Problem("beta", "nominal lies outside bounds", "give bounds around nominal, one unit")
+        )
+    source = parts.get("source")
+    unit = find_unit(source.time_unit) if source else None
+    if source and (unit is None or unit.dimension != "time"):
+        remedy = "use " + " or ".join(u.name for u in units_of("time"))
+        problems.append(Problem("source.time_unit", f"{source.time_unit!r} is no time", remedy))
+    return problems
+
+
+def _assemble(path: Path, sections: Sections, dbc: Path | None, catalog: Catalog | None) -> Project:
+    model = build.build_model(sections, catalog)
+    signals = sections.signals
+    has_columns = all(s.column or s.constant is not None for s in signals.values())
+    bus = build.build_assembly(sections, model, catalog, table=False) if catalog else None
+    table = build.build_assembly(sections, model, catalog, table=True) if has_columns else None
+    assembly = bus or table
+    assert assembly is not None, "checked: without a DBC every signal has a column"
+    edges = sections.edges.items()
+    return Project(
+        path=path,
+        sections=sections,
+        model=model,
+        assembly=assembly,
+        table_assembly=table,
+        dbc=dbc,
+        reference_maps={n: path.parent / e.reference_map for n, e in edges if e.reference_map},
+        noise_unknown=_noise_unknown(sections, model),
+        offset_tolerance_s={
+            m.name: sections.messages[m.name].tolerance_s or m.period_s
+            for m in assembly.messages
+            if m.name in sections.messages and sections.messages[m.name].offset_s is None
+        },
+        digest=build.digest(model),
+    )
+
+
+def _noise_unknown(sections: Sections, model: Model) -> tuple[str, ...]:
+    kinds = {signal.name: signal.kind for signal in model.signals}
+    return tuple(
+        name
+        for name, signal in sections.signals.items()
+        if signal.noise is None and signal.constant is None and kinds[name] != "command"
+    )

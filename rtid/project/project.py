@@ -1,0 +1,72 @@
+"""A loaded project: its sections, and the machine and bridge configuration built from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from firmware_bridge.config import Assembly
+from rtid.model import Model
+from rtid.project.schema import (
+    BetaSection,
+    ChamberSection,
+    DynamicsSection,
+    EdgeDefaults,
+    EdgeSection,
+    EstimatorSection,
+    FilterSection,
+    GatesSection,
+    GeometrySection,
+    MessageSection,
+    ProjectSection,
+    RecordSection,
+    SignalSection,
+    SourceSection,
+)
+
+
+@dataclass(frozen=True)
+class Sections:
+    """The project file as read, values in SI; the keys of the dicts are the user's names."""
+
+    project: ProjectSection
+    source: SourceSection
+    geometry: GeometrySection
+    messages: dict[str, MessageSection]
+    signals: dict[str, SignalSection]
+    chambers: dict[str, ChamberSection]
+    edges: dict[str, EdgeSection]
+    edge_defaults: EdgeDefaults = field(default_factory=EdgeDefaults)
+    modes: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    beta: BetaSection = field(default_factory=BetaSection)
+    filter: FilterSection = field(default_factory=FilterSection)
+    gates: GatesSection = field(default_factory=GatesSection)
+    dynamics: DynamicsSection = field(default_factory=DynamicsSection)
+    estimator: EstimatorSection = field(default_factory=EstimatorSection)
+    record: RecordSection = field(default_factory=RecordSection)
+
+
+@dataclass(frozen=True)
+class Project:
+    """Everything a command needs to know about the machine and where its signals come from.
+
+    `assembly` serves a CAN trace, or a table if the project has no DBC; `table_assembly` serves a
+    table, None unless every signal names a `column` or is constant.  `noise_unknown` and
+    `offset_tolerance_s` list what the file leaves to be estimated.
+    """
+
+    path: Path
+    sections: Sections
+    model: Model
+    assembly: Assembly
+    table_assembly: Assembly | None
+    dbc: Path | None
+    reference_maps: dict[str, Path]
+    noise_unknown: tuple[str, ...]
+    offset_tolerance_s: dict[str, float]
+    digest: str
+
+    @property
+    def name(self) -> str:
+        """What the machine is called."""
+        return self.sections.project.name

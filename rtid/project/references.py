@@ -1,0 +1,251 @@
+"""Checks across sections: every name that one section uses must exist in another, and fit.
+
+They work on the tables as written, so that a section with another error is still checked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from firmware_bridge.catalog import Catalog
+from rtid.project.errors import Problem
+from rtid.project.sections import Raw, key_of
+from rtid.units import COMMAND_DIMENSIONS, UNITS, find_unit, nearest, units_of
+
+KINDS = {"pressure": "pressure", "length": "position", "velocity": "velocity"} | {
+    dimension: "command" for dimension in COMMAND_DIMENSIONS
+}
+KIND_DIMENSIONS = {
+    "command": COMMAND_DIMENSIONS,
+    "pressure": ("pressure",),
+    "position": ("length", "angle"),
+    "velocity": ("velocity",),
+}
+# Which signal kind each reference needs: (section, key) -> kind.
+REFERENCES = {
+    ("chambers", "pressure"): "pressure",
+    ("edges", "source"): "pressure",
+    ("edges", "sink"): "pressure",
+    ("edges", "command"): "command",
+}
+EDGE_NEEDS = {
+    "u_grid": "u_grid_v = [1.0, {start = 1.5, stop = 4.0, step = 0.25}, 7.0]",
+    "dp_grid": "dp_grid_mpa = [0.0, 1.0, 2.0, 4.0, 7.0]",
+    "rated_flow": "rated_flow_lpm = 30, the flow at rated_dp",
+    "rated_dp": "rated_dp_mpa = 0.5",
+}
+
+
+def tables(raw: Raw, section: str) -> dict[str, Raw]:
+    """The well-formed sub-tables of a section, e.g. all [edges.NAME]."""
+    found = raw.get(section, {})
+    entries = found.items() if isinstance(found, dict) else ()
+    return {name: entry for name, entry in entries if isinstance(entry, dict)}
+
+
+def kind_of(signal: Raw, dbc_unit: str | None = None) -> str | None:
+    """The kind as given, or as the unit tells; None if neither does."""
+    kind, unit = signal.get("kind"), find_unit(str(signal.get("unit") or dbc_unit or ""))
+    if isinstance(kind, str):
+        return kind
+    if signal.get("table"):
+        return "position"
+    return KINDS.get(unit.dimension) if unit else None
+
+
+def find_dbc_unit(signal: Raw, catalog: Catalog | None) -> str | None:
+    """Unit that the DBC gives for this signal."""
+    if catalog is None or not {"message", "signal"} <= set(signal):
+        return None
+    if signal["message"] not in catalog.names:
+        return None
+    names = {s.name: s.unit for s in catalog.message(signal["message"]).signals}
+    return names.get(signal["signal"])
+
+
+def check(raw: Raw, catalog: Catalog | None, folder: Path) -> Iterator[Problem]:
+    """All problems between sections."""
+    kinds = {n: kind_of(s, find_dbc_unit(s, catalog)) for n, s in tables(raw, "signals").items()}
+    for name, signal in tables(raw, "signals").items():
+        yield from _signal(f"signals.{name}", signal, kinds[name], catalog, raw)
+    yield from _named_signals(raw, kinds)
+    yield from _position(raw, kinds)
+    for name, chamber in tables(raw, "chambers").items():
+        yield from _chamber(f"chambers.{name}", chamber)
+    for name, edge in tables(raw, "edges").items():
+        yield from _edge(f"edges.{name}", edge, raw, kinds, catalog, folder)
+    yield from _modes(raw)
+    yield from _messages(raw, catalog)
+
+
+def _signal(
+    path: str, signal: Raw, kind: str | None, catalog: Catalog | None, raw: Raw
+) -> Iterator[Problem]:
+    yield from _signal_source(path, signal, catalog, raw)
+    dbc_unit = find_dbc_unit(signal, catalog)
+    name = signal.get("unit", dbc_unit)
+    unit = find_unit(str(name)) if name else None
+    names = [u.name for u in UNITS]
+    if name is None:
+        yield Problem(f"{path}.unit", "missing", 'add e.g. unit = "bar"')
+    elif unit is None:
+        yield Problem(f"{path}.unit", f"{name!r} is no known unit", nearest(str(name), names))
+    elif kind is None:
+        yield Problem(f"{path}.unit", f"{name!r} fits no kind of signal", "add kind or correct it")
+    elif kind in KIND_DIMENSIONS and unit.dimension not in KIND_DIMENSIONS[kind]:
+        fit = [u.name for d in KIND_DIMENSIONS[kind] for u in units_of(d)]
+        yield Problem(f"{path}.unit", f"{name!r} is no unit of {kind}", f"use {' or '.join(fit)}")
+    elif unit.dimension == "angle" and "table" not in signal:
+        remedy = "add table = {angle = [...], position_mm = [...]}"
+        yield Problem(f"{path}.table", "missing: an angle is not yet a position", remedy)
+    declared = find_unit(dbc_unit or "")
+    if unit and declared and unit != declared and "scale" not in signal:
+        remedy = f"use {dbc_unit!r}, or add scale = 1.0 to insist"
+        yield Problem(f"{path}.unit", f"{name!r}, but the DBC says {dbc_unit!r}", remedy)
+
+
+def _signal_source(path: str, signal: Raw, catalog: Catalog | None, raw: Raw) -> Iterator[Problem]:
+    """A signal comes from a DBC signal, a column, or is a constant."""
+    if "constant" in signal:
+        return
+    needed = [] if "dbc" in raw.get("source", {}) else ["column"]
+    if "dbc" in raw.get("source", {}):
+        needed = ["message", "signal"]
+    for key in needed:
+        if key not in signal:
+            yield Problem(f"{path}.{key}", "missing", f'add {key} = "...", or constant = ...')
+    message, wanted = signal.get("message"), signal.get("signal")
+    if catalog is None or message is None:
+        return
+    if message not in catalog.names:
+        near = nearest(str(message), list(catalog.names))
+        yield Problem(f"{path}.message", f"the DBC has no message {message!r}", near)
+    elif wanted is not None:
+        names = [s.name for s in catalog.message(message).signals]
+        if wanted not in names:
+            near = nearest(str(wanted), names)
+            yield Problem(f"{path}.signal", f"{message} has no signal {wanted!r}", near)
+
+
+def _reference(path: str, name: Any, kind: str, kinds: dict[str, str | None]) -> Iterator[Problem]:
+    fitting = [n for n, k in kinds.items() if k == kind]
+    if not isinstance(name, str):
+        return
+    if name not in kinds:
+        yield Problem(path, f"there is no signal {name!r}", nearest(name, fitting))
+    elif kinds[name] not in (kind, None):
+        remedy = nearest(name, fitting)
+        yield Problem(path, f"{name!r} is no {kind} signal but a {kinds[name]}", remedy)
+
+
+def _named_signals(raw: Raw, kinds: dict[str, str | None]) -> Iterator[Problem]:
+    for (section, key), kind in REFERENCES.items():
+        for name, table in tables(raw, section).items():
+            yield from _reference(f"{section}.{name}.{key}", table.get(key), kind, kinds)
+    defaults = raw.get("edge_defaults", {})
+    if isinstance(defaults, dict):
+        path = "edge_defaults.command"
+        yield from _reference(path, defaults.get("command"), "command", kinds)
+
+
+def _position(raw: Raw, kinds: dict[str, str | None]) -> Iterator[Problem]:
+    geometry = raw.get("geometry", {})
+    named = geometry.get("position") if isinstance(geometry, dict) else None
+    positions = [name for name, kind in kinds.items() if kind == "position"]
+    if named is not None:
+        yield from _reference("geometry.position", named, "position", kinds)
+    elif not positions:
+        yield Problem("signals", "no position signal", 'add one with unit = "mm"')
+    elif len(positions) > 1:
+        remedy = f"add position = {positions[0]!r}"
+        yield Problem("geometry.position", f"several positions: {', '.join(positions)}", remedy)
+
+
+def _chamber(path: str, chamber: Raw) -> Iterator[Problem]:
+    area, piston = (key_of(chamber, stem) for stem in ("area", "piston_diameter"))
+    if (area in chamber) == (piston in chamber):
+        both = "given twice" if area in chamber else "missing"
+        remedy = "give either area_cm2 or piston_diameter_mm (and rod_diameter_mm)"
+        yield Problem(f"{path}.{area}", both, remedy)
+
+
+def _edge(
+    path: str,
+    edge: Raw,
+    raw: Raw,
+    kinds: dict[str, str | None],
+    catalog: Catalog | None,
+    folder: Path,
+) -> Iterator[Problem]:
+    defaults = raw.get("edge_defaults", {})
+    merged = (defaults if isinstance(defaults, dict) else {}) | edge
+    for stem, example in EDGE_NEEDS.items():
+        if key_of(merged, stem) == stem:
+            yield Problem(f"{path}.{stem}", "missing", f"add {example} here or in [edge_defaults]")
+    commands = [name for name, kind in kinds.items() if kind == "command"]
+    command = merged.get("command", commands[0] if len(commands) == 1 else None)
+    if command is None:
+        remedy = f"add command = {commands[0]!r}" if commands else 'add a signal in "V" or "A"'
+        yield Problem(f"{path}.command", "missing", remedy)
+    elif command in kinds:
+        signal = tables(raw, "signals")[command]
+        unit = find_unit(str(signal.get("unit") or find_dbc_unit(signal, catalog) or ""))
+        yield from _command_unit(path, merged, command, unit.dimension if unit else "")
+    if edge.get("source") is not None and edge.get("source") == edge.get("sink"):
+        yield Problem(f"{path}.sink", "is the same signal as source", "name the other side")
+    pressures = {table.get("pressure") for table in tables(raw, "chambers").values()}
+    if pressures and not {edge.get("source"), edge.get("sink")} & pressures:
+        known = ", ".join(sorted(str(p) for p in pressures))
+        yield Problem(path, "touches no chamber", f"source or sink must be one of: {known}")
+    file = edge.get("reference_map")
+    if isinstance(file, str) and not (folder / file).is_file():
+        yield Problem(f"{path}.reference_map", f"no file {file!r}", "give an existing CSV file")
+
+
+def _command_unit(path: str, edge: Raw, command: str, dimension: str) -> Iterator[Problem]:
+    """The command grid must be in the unit of the command."""
+    fitting = [unit.key for unit in units_of(dimension)] if dimension else []
+    for stem in ("u_grid", "safe_band"):
+        key = key_of(edge, stem)
+        suffix = key.rpartition("_")[2]
+        known = suffix in [unit.key for unit in units_of("command")]
+        if key != stem and known and fitting and suffix not in fitting:
+            remedy = "write " + " or ".join(f"{stem}_{k}" for k in fitting)
+            yield Problem(f"{path}.{key}", f"does not fit the {dimension} {command!r}", remedy)
+
+
+def _modes(raw: Raw) -> Iterator[Problem]:
+    edges = list(tables(raw, "edges"))
+    modes = raw.get("modes", {})
+    for mode, names in modes.items() if isinstance(modes, dict) else ():
+        if not isinstance(names, list):
+            yield Problem(f"modes.{mode}", "must be a list of edges", f"write {mode} = {edges[:2]}")
+            continue
+        for k, name in enumerate(names):
+            if name not in edges:
+                near = nearest(str(name), edges)
+                yield Problem(f"modes.{mode}[{k}]", f"there is no edge {name!r}", near)
+
+
+def _messages(raw: Raw, catalog: Catalog | None) -> Iterator[Problem]:
+    messages = tables(raw, "messages")
+    if catalog is None:
+        return
+    for name, message in messages.items():
+        if name not in catalog.names:
+            near = nearest(name, list(catalog.names))
+            yield Problem(f"messages.{name}", f"the DBC has no message {name!r}", near)
+            continue
+        signals = [s.name for s in catalog.message(name).signals]
+        for key in ("counter", "crc"):
+            if message.get(key, signals[0]) not in signals:
+                problem = f"{name} has no signal {message[key]!r}"
+                yield Problem(f"messages.{name}.{key}", problem, nearest(message[key], signals))
+    used = {signal.get("message") for signal in tables(raw, "signals").values()}
+    for name in sorted(str(m) for m in used if m in catalog.names):
+        period = key_of(messages.get(name, {}), "period")
+        if period == "period" and not catalog.message_source(name).period_s:
+            problem = "missing, and the DBC gives no cycle time"
+            yield Problem(f"messages.{name}.period", problem, "add period_ms = 10")

@@ -1,0 +1,258 @@
+"""The sections of a project file as pydantic models, values in SI.
+
+A key that holds a quantity ends in its unit, and any unit of the right dimension will do: the field
+`area_m2` is written `area_cm2 = 19.63` or `area_mm2 = 1963`.  `rtid.project.sections` converts.
+`None` stands for "estimate" where a field allows it, else for "not given".
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic_core import PydanticCustomError
+
+MAX_BORDERS = 10_000
+
+
+@dataclass(frozen=True)
+class Dimension:
+    """Marks a field as a quantity of this dimension."""
+
+    name: str
+
+
+def _estimate(value: Any) -> Any:
+    if isinstance(value, str) and value != "estimate":
+        raise PydanticCustomError("estimate", 'must be a number or "estimate"')
+    return None if value == "estimate" else value
+
+
+def _piece(value: Any, index: int) -> list[float]:
+    """One entry of a grid: a border, or {start, stop, step} with both ends included."""
+    if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+        return [float(value)]
+    if not isinstance(value, dict) or set(value) != {"start", "stop", "step"}:
+        raise _grid_error(index, "must be a number or {start, stop, step}")
+    start, stop, step = (float(value[key]) for key in ("start", "stop", "step"))
+    count = (stop - start) / step if step > 0 else 0.0
+    if not 0.5 < count < MAX_BORDERS:
+        raise _grid_error(index, "needs step > 0, stop > start and a sane number of steps")
+    n = round(count)
+    if abs(count - n) > 1e-6 * n:
+        raise _grid_error(index, "stop is not a whole number of steps away from start")
+    return [start + (stop - start) * k / n for k in range(n + 1)]
+
+
+def _grid_error(index: int, problem: str) -> PydanticCustomError:
+    return PydanticCustomError("grid", "{problem}", {"problem": problem, "index": index})
+
+
+def _borders(value: Any) -> Any:
+    """Borders from a list of numbers and pieces; the shared end of two pieces counts once."""
+    if not isinstance(value, list):
+        raise PydanticCustomError("grid", "must be a list of borders")
+    borders: list[float] = []
+    for index, entry in enumerate(value):
+        piece = _piece(entry, index)
+        if borders and isinstance(entry, dict) and math.isclose(piece[0], borders[-1]):
+            piece = piece[1:]
+        if borders and piece[0] <= borders[-1]:
+            raise _grid_error(index, "is out of order: borders must increase")
+        borders += piece
+    if len(borders) < 2:
+        raise PydanticCustomError("grid", "needs at least two borders")
+    return tuple(borders)
+
+
+def _pair(value: Any) -> Any:
+    if not isinstance(value, list) or len(value) != 2:
+        raise PydanticCustomError("pair", "must be a list of two numbers, [low, high]")
+    return tuple(value)
+
+
+def _ordered(value: tuple[float, float]) -> tuple[float, float]:
+    if value[0] >= value[1]:
+        raise PydanticCustomError("order", "is reversed or empty: low must be below high")
+    return value
+
+
+def _increasing(value: tuple[float, ...]) -> tuple[float, ...]:
+    for index, (left, right) in enumerate(pairwise(value)):
+        if right <= left:
+            raise _grid_error(index + 1, "is out of order: values must increase")
+    return value
+
+
+def _tuple(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+Estimable = Annotated[float | None, BeforeValidator(_estimate)]
+Interval = Annotated[tuple[float, float], BeforeValidator(_pair), AfterValidator(_ordered)]
+Borders = Annotated[tuple[float, ...], BeforeValidator(_borders)]
+Numbers = Annotated[tuple[float, ...], BeforeValidator(_tuple), Field(min_length=2)]
+Sign = Literal[1, -1]
+
+LENGTH, AREA, VOLUME = Dimension("length"), Dimension("area"), Dimension("volume")
+PRESSURE, TIME, FLOW = Dimension("pressure"), Dimension("time"), Dimension("flow")
+COMMAND, FREQUENCY = Dimension("command"), Dimension("frequency")
+
+
+class Section(BaseModel):
+    """Strict and frozen; the description of a required field is the remedy when it is missing."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+class ProjectSection(Section):
+    """[project]: what the machine is called."""
+
+    name: str = Field(min_length=1, description='name = "boom cylinder"')
+
+
+class SourceSection(Section):
+    """[source]: where frames or tables come from.  `builtin:controller.dbc` is rtid's own DBC."""
+
+    dbc: str | None = None
+    time_column: str | None = None
+    time_unit: str = "s"
+    interface: str | None = None
+    channel: str | None = None
+    bitrate: int | None = Field(default=None, gt=0)
+    mode: Literal["cycle", "multirate"] | None = None
+
+
+class MessageSection(Section):
+    """[messages.NAME]: period and age of a CAN message, its end-to-end protection."""
+
+    period_s: Annotated[float | None, TIME] = Field(default=None, gt=0)
+    offset_s: Annotated[Estimable, TIME] = 0.0
+    tolerance_s: Annotated[float | None, TIME] = Field(default=None, gt=0)
+    counter: str | None = None
+    crc: str | None = None
+    data_id: int = Field(default=0, ge=0, le=0xFFFF)
+    channel: int | None = Field(default=None, ge=0)
+
+
+class AngleTable(Section):
+    """[signals.x.table]: joint angle, in the signal's unit, to cylinder position."""
+
+    angle: Annotated[Numbers, AfterValidator(_increasing)] = Field(description="angle = [...]")
+    position_m: Annotated[Numbers, LENGTH] = Field(description="position_mm = [...]")
+
+
+class SignalSection(Section):
+    """[signals.ROLE]: one column of the samples.  Numbers are in `unit`."""
+
+    message: str | None = None
+    signal: str | None = None
+    column: str | None = None
+    unit: str | None = None
+    kind: Literal["command", "pressure", "position", "velocity"] | None = None
+    hold: Literal["zero", "linear"] | None = None
+    scale: float | None = None
+    offset: float = 0.0
+    noise: Estimable = Field(default=None, ge=0)
+    resolution: float | None = Field(default=None, ge=0)
+    range: Interval | None = None
+    constant: float | None = None
+    table: AngleTable | None = None
+
+
+class GeometrySection(Section):
+    """[geometry]: stroke, and which signal is the position (the only one, unless named)."""
+
+    stroke_m: Annotated[float, LENGTH] = Field(gt=0, description="stroke_mm = 500")
+    position: str | None = None
+
+
+class ChamberSection(Section):
+    """[chambers.NAME]: area and dead volume, the volume left where the chamber is smallest."""
+
+    pressure: str = Field(description='pressure = "p_a", a pressure of [signals]')
+    sign: Sign = Field(description="sign = 1 if the volume grows with x, -1 if it shrinks")
+    area_m2: Annotated[float | None, AREA] = Field(default=None, gt=0)
+    piston_diameter_m: Annotated[float | None, LENGTH] = Field(default=None, gt=0)
+    rod_diameter_m: Annotated[float, LENGTH] = Field(default=0.0, ge=0)
+    dead_volume_m3: Annotated[float, VOLUME] = Field(gt=0, description="dead_volume_l = 0.6")
+
+    def net_area_m2(self) -> float:
+        """The area, given or from the diameters; not positive if the diameters are wrong."""
+        if self.area_m2 is not None:
+            return self.area_m2
+        piston_m = self.piston_diameter_m or 0.0
+        return math.pi / 4 * (piston_m**2 - self.rod_diameter_m**2)
+
+
+class EdgeDefaults(Section):
+    """[edge_defaults]: what several metering edges have in common."""
+
+    command: str | None = None
+    u_grid_v: Annotated[Borders | None, COMMAND] = None
+    dp_grid_pa: Annotated[Borders | None, PRESSURE] = None
+    safe_band_v: Annotated[float | None, COMMAND] = Field(default=None, ge=0)
+    rated_flow_m3s: Annotated[float | None, FLOW] = Field(default=None, gt=0)
+    rated_dp_pa: Annotated[float | None, PRESSURE] = Field(default=None, gt=0)
+
+
+class EdgeSection(EdgeDefaults):
+    """[edges.NAME]: a metering edge from the pressure `source` to the pressure `sink`."""
+
+    source: str = Field(description='source = "p_supply", a pressure of [signals]')
+    sink: str = Field(description='sink = "p_a", a pressure of [signals]')
+    direction: Sign = Field(description="direction = 1 if it opens with u > 0, -1 with u < 0")
+    reference_map: str | None = None
+
+
+class BetaSection(Section):
+    """[beta]: effective bulk modulus, first guess and what is physically possible."""
+
+    nominal_pa: Annotated[float, PRESSURE] = Field(default=800e6, gt=0)
+    bounds_pa: Annotated[Interval, PRESSURE] = (100e6, 2000e6)
+
+
+class FilterSection(Section):
+    """[filter]: H_f of eq. (10)."""
+
+    natural_frequency_hz: Annotated[float, FREQUENCY] = Field(default=10.0, gt=0)
+    damping: float = Field(default=0.8, gt=0)
+    rows_per_s: float = Field(default=50.0, gt=0)
+
+
+class GatesSection(Section):
+    """[gates]: when a row or a block is refused."""
+
+    condition_limit: float = Field(default=1e8, gt=1)
+    max_gap_s: Annotated[float | None, TIME] = Field(default=None, gt=0)
+    hysteresis: float = Field(default=0.05, ge=0, lt=0.5)
+    min_rows: int = Field(default=20, ge=6)
+
+
+class LagSection(Section):
+    """[dynamics.spool_lag]: first-order lag behind the command, with its tolerance."""
+
+    nominal_s: Annotated[float, TIME] = Field(default=0.0, ge=0)
+    tolerance_s: Annotated[float, TIME] = Field(default=0.0, ge=0)
+
+
+class DynamicsSection(Section):
+    """[dynamics]: declared dynamics."""
+
+    spool_lag: LagSection = LagSection()
+
+
+class EstimatorSection(Section):
+    """[estimator]: which exact form of the regression."""
+
+    form: Literal["integral", "carry"] = "integral"
+
+
+class RecordSection(Section):
+    """[record]: parts of a trace, seconds from its first sample; None = not set apart."""
+
+    identification_s: Annotated[Interval | None, TIME] = None
+    validation_s: Annotated[Interval | None, TIME] = None
