@@ -1,0 +1,179 @@
+"""Which frame is admitted: identifier, length, CRC, alive counter, order, availability.
+
+Every refusal has a reason and a counter.  A counter of 2^b values cannot see a loss of a multiple
+of 2^b frames, so it is judged together with the time since the message's last good frame:
+
+    step = (counter - last) mod 2^b,  dt <= 1.5 periods:  step 0 repeated, step > 2^(b-1) late
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from firmware_bridge import bits, e2e
+
+REASONS = (
+    "unknown_id",  # not a declared message: foreign traffic
+    "wrong_length",
+    "crc",
+    "counter_repeat",  # a frame seen before
+    "counter_jump",  # accepted, but frames before it were lost
+    "out_of_order",  # older than the frame before it
+    "not_available",  # a wanted signal is absent, NaN or out of its declared range
+    "other_page",  # a multiplexed message that carries other signals
+    "incomplete_cycle",  # cycles of which a message never came
+    "gap",  # accepted samples that do not continue the one before
+    "silent",  # instants without a sample because a message was silent for too long
+    "unpaired",  # instants before the first or after the last frame of another message
+)
+OK = -1
+UNKNOWN_ID, WRONG_LENGTH, CRC, COUNTER_REPEAT, COUNTER_JUMP, OUT_OF_ORDER = 0, 1, 2, 3, 4, 5
+NOT_AVAILABLE, OTHER_PAGE, INCOMPLETE_CYCLE, GAPS, SILENT, UNPAIRED = 6, 7, 8, 9, 10, 11
+
+ZERO, LINEAR, MEAN = 0, 1, 2  # how a role runs between its samples
+
+MESSAGE = np.dtype(
+    [
+        ("can_id", np.uint32),
+        ("channel", np.int16),  # -1: any
+        ("length", np.uint8),
+        ("crc_byte", np.int8),  # -1: no CRC
+        ("data_id", np.uint16),
+        ("counter", np.int16),  # row of its layout, -1: no alive counter
+        ("counter_mask", np.uint64),
+        ("first_role", np.int16),
+        ("n_roles", np.int16),
+        ("period_us", np.int64),
+        ("late_us", np.int64),  # 1.5 periods
+        ("offset_us", np.int64),
+        ("limit_us", np.int64),  # silent for longer than this: a gap
+    ]
+)
+ROLE = np.dtype(
+    [
+        ("layout", np.int16),
+        ("column", np.int16),
+        ("hold", np.uint8),
+        ("factor", np.float64),
+        ("offset", np.float64),
+        ("table_first", np.int32),
+        ("table_count", np.int32),  # 0: factor and offset
+    ]
+)
+LAST = np.dtype([("t_us", np.int64), ("counter", np.int64), ("seen", np.bool_)])
+
+
+class Plan(NamedTuple):
+    """What does not change while frames run through: declared messages and roles.
+
+    messages: MESSAGE (m,); roles: ROLE (r,), grouped by message; layouts, codes: see
+    `firmware_bridge.bits`; table_x, table_y: float64, all role tables one after the other.
+    """
+
+    messages: NDArray[np.void]
+    roles: NDArray[np.void]
+    layouts: NDArray[np.void]
+    codes: NDArray[np.uint64]
+    table_x: NDArray[np.float64]
+    table_y: NDArray[np.float64]
+
+
+@njit(cache=True)
+def find_message(messages: NDArray[np.void], can_id: np.uint32, channel: np.uint8) -> int:
+    """Index of the declared message with this identifier and channel; -1 if there is none."""
+    for m in range(len(messages)):
+        row = messages[m]
+        if row.can_id == can_id and (row.channel < 0 or row.channel == channel):
+            return m
+    return -1
+
+
+@njit(cache=True)
+def check_sequence(
+    row: np.void, last: np.void, t_us: int, counter: int, counts: NDArray[np.int64]
+) -> int:
+    """OK or the reason against this frame, by its counter (-1: none) and time stamp."""
+    if not last.seen:
+        return OK
+    dt = t_us - last.t_us
+    if counter >= 0:
+        step = (counter - last.counter) & np.int64(row.counter_mask)
+        if dt <= row.late_us and step == 0:
+            return COUNTER_REPEAT
+        if dt <= row.late_us and 2 * step > np.int64(row.counter_mask) + 1:
+            return OUT_OF_ORDER
+        if dt > 0 and step != 1:
+            counts[COUNTER_JUMP] += 1
+    return OUT_OF_ORDER if dt <= 0 else OK
+
+
+@njit(cache=True)
+def interpolate(x: float, xs: NDArray[np.float64], ys: NDArray[np.float64]) -> float:
+    """`numpy.interp` of one value; NaN stays NaN."""
+    if x <= xs[0]:
+        return ys[0]
+    if x >= xs[-1]:
+        return ys[-1]
+    k = np.searchsorted(xs, x, side="right") - 1
+    if k >= len(xs) - 1 or np.isnan(x):
+        return np.nan
+    return ys[k] + (ys[k + 1] - ys[k]) / (xs[k + 1] - xs[k]) * (x - xs[k])
+
+
+@njit(cache=True)
+def read_roles(plan: Plan, row: np.void, word: np.uint64, values: NDArray[np.float64]) -> int:
+    """SI values of the message's roles into values[:n_roles] (changed in place); OK or reason."""
+    for i in range(row.n_roles):
+        role = plan.roles[row.first_role + i]
+        if not bits.selected(word, plan.layouts, role.layout, plan.codes):
+            return OTHER_PAGE
+        x = bits.decode_one(word, plan.layouts, role.layout, plan.codes)
+        if not np.isfinite(x):
+            return NOT_AVAILABLE
+        a, n = role.table_first, role.table_count
+        if n:
+            values[i] = interpolate(x, plan.table_x[a : a + n], plan.table_y[a : a + n])
+        else:
+            values[i] = role.factor * x + role.offset
+    return OK
+
+
+@njit(cache=True)
+def admit(
+    plan: Plan,
+    m: int,
+    last: NDArray[np.void],
+    t_us: int,
+    length: int,
+    word: np.uint64,
+    values: NDArray[np.float64],
+    counts: NDArray[np.int64],
+) -> int:
+    """Check one frame of message m; OK, or the reason against it (counted).
+
+    Changed in place: last (LAST, per message), values (roles of m, SI), counts.  A frame whose
+    values are not available still moves the counter on: it was received.
+    """
+    row = plan.messages[m]
+    if length != row.length:
+        counts[WRONG_LENGTH] += 1
+        return WRONG_LENGTH
+    if row.crc_byte >= 0:
+        expected = e2e.crc8(word, row.length, row.crc_byte, row.data_id)
+        if expected != (word >> np.uint64(8 * row.crc_byte)) & np.uint64(0xFF):
+            counts[CRC] += 1
+            return CRC
+    counter = np.int64(-1)
+    if row.counter >= 0:
+        counter = np.int64(bits.raw_bits(word, plan.layouts[row.counter]))
+    reason = check_sequence(row, last[m], t_us, counter, counts)
+    if reason == OK:
+        last[m].t_us, last[m].counter, last[m].seen = t_us, counter, True
+        reason = read_roles(plan, row, word, values)
+    if reason != OK:
+        counts[reason] += 1
+    return reason

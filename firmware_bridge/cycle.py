@@ -1,0 +1,145 @@
+"""Mode "cycle": all messages belong to one controller cycle, one sample per complete cycle.
+
+Frames of the same cycle carry the same alive counter.  Several cycles may be open at once, because
+the bus may delay a frame of low priority into the next cycle; each has a slot, found by its
+counter.  Per message frames arrive in order, so once a cycle is complete no older one can be.
+Without counters there is one slot, and a cycle lasts half a period from its first frame.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from firmware_bridge import checks
+from firmware_bridge.samples import GAP, ROW
+
+SLOT = np.dtype(
+    [
+        ("open", np.bool_),
+        ("jump", np.bool_),  # frames were lost before this cycle
+        ("mask", np.uint64),  # messages that have arrived
+        ("order", np.int64),  # cycles are numbered as they open
+        ("first_us", np.int64),  # stamp of the first frame
+        ("row_us", np.int64),  # time of the sample
+    ]
+)
+PROGRESS = np.dtype([("opened", np.int64), ("t_us", np.int64), ("started", np.bool_)])
+
+
+class State(NamedTuple):
+    """Everything that a cycle in the making consists of; all arrays are changed in place.
+
+    last: LAST (m,); slots: SLOT (s,); values: float64 (s, columns), constants filled in;
+    progress: PROGRESS (1,); scratch: float64 (roles,).
+    """
+
+    last: NDArray[np.void]
+    slots: NDArray[np.void]
+    values: NDArray[np.float64]
+    progress: NDArray[np.void]
+    scratch: NDArray[np.float64]
+
+
+@njit(cache=True)
+def _open_slot(slot: np.void, progress: np.void, t_us: int) -> None:
+    progress.opened += 1
+    slot.open, slot.jump, slot.mask = True, False, np.uint64(0)
+    slot.order, slot.first_us, slot.row_us = progress.opened, t_us, t_us
+
+
+@njit(cache=True)
+def _is_stale(slot: np.void, bit: np.uint64, t_us: int, lifetime_us: int) -> bool:
+    """Whether an open slot belongs to an earlier cycle than this frame."""
+    return abs(t_us - slot.first_us) > lifetime_us or (slot.mask & bit) != 0
+
+
+@njit(cache=True)
+def _close_older(slots: NDArray[np.void], order: int, counts: NDArray[np.int64]) -> None:
+    for k in range(len(slots)):
+        if slots[k].open and slots[k].order < order:
+            slots[k].open = False
+            counts[checks.INCOMPLETE_CYCLE] += 1
+
+
+@njit(cache=True)
+def _flags(
+    progress: np.void, slot: np.void, late_us: int, counts: NDArray[np.int64]
+) -> int:
+    """Flags of the sample that this slot yields."""
+    if progress.started:
+        if slot.row_us - progress.t_us <= late_us and not slot.jump:
+            return ROW
+        counts[checks.GAPS] += 1
+    return ROW | GAP
+
+
+@njit(cache=True)
+def push(
+    plan: checks.Plan,
+    state: State,
+    t_us: NDArray[np.int64],
+    channel: NDArray[np.uint8],
+    can_id: NDArray[np.uint32],
+    length: NDArray[np.uint8],
+    words: NDArray[np.uint64],
+    row_message: int,
+    lifetime_us: int,
+    counts: NDArray[np.int64],
+    out_t_us: NDArray[np.int64],
+    out_values: NDArray[np.float64],
+    out_flags: NDArray[np.uint8],
+) -> int:
+    """Run n frames through the assembly; the number of samples written to out_*.
+
+    Changed in place: state, counts (REASONS,), out_* (room for n samples).
+    """
+    full = (np.uint64(1) << np.uint64(len(plan.messages))) - np.uint64(1)
+    progress, late_us = state.progress[0], plan.messages[row_message].late_us
+    n_out = 0
+    for i in range(len(t_us)):
+        m = checks.find_message(plan.messages, can_id[i], channel[i])
+        if m < 0:
+            counts[checks.UNKNOWN_ID] += 1
+            continue
+        jumps = counts[checks.COUNTER_JUMP]
+        admitted = checks.admit(
+            plan, m, state.last, t_us[i], length[i], words[i], state.scratch, counts
+        )
+        if admitted != checks.OK:
+            continue
+        row, bit = plan.messages[m], np.uint64(1) << np.uint64(m)
+        k = state.last[m].counter if row.counter >= 0 and len(state.slots) > 1 else 0
+        slot = state.slots[k]
+        if slot.open and _is_stale(slot, bit, t_us[i], lifetime_us):
+            slot.open = False
+            counts[checks.INCOMPLETE_CYCLE] += 1
+        if not slot.open:
+            _open_slot(slot, progress, t_us[i])
+        slot.mask |= bit
+        slot.jump |= counts[checks.COUNTER_JUMP] > jumps
+        if m == row_message:
+            slot.row_us = t_us[i] - row.offset_us
+        for j in range(row.n_roles):
+            state.values[k, plan.roles[row.first_role + j].column] = state.scratch[j]
+        if slot.mask != full:
+            continue
+        slot.open = False
+        _close_older(state.slots, slot.order, counts)
+        if progress.started and slot.row_us <= progress.t_us:
+            counts[checks.OUT_OF_ORDER] += 1
+            continue
+        out_flags[n_out] = _flags(progress, slot, late_us, counts)
+        out_t_us[n_out], out_values[n_out] = slot.row_us, state.values[k]
+        progress.t_us, progress.started = slot.row_us, True
+        n_out += 1
+    return n_out
+
+
+@njit(cache=True)
+def finish(state: State, counts: NDArray[np.int64]) -> None:
+    """Count the cycles that are still open and close them; state and counts changed in place."""
+    _close_older(state.slots, np.iinfo(np.int64).max, counts)

@@ -1,0 +1,5 @@
+"""Sources of frames: log files, live buses, serial lines; and tables, which yield samples."""
+
+from firmware_bridge.sources.log_file import LogError, open_log
+
+__all__ = ["LogError", "open_log"]
