@@ -1,0 +1,65 @@
+"""Write the speed table of README between its markers, from what `make bench` measured.
+
+python -m benchmarks.table [MEASURED.json README.md]
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+BEGIN, END = "<!-- speed:begin -->", "<!-- speed:end -->"
+
+
+def human_time(seconds: float) -> str:
+    """Three digits and the unit that suits: 31.4 ns, 5.30 us, 12.0 ms, 1.25 s."""
+    for limit, factor, unit in ((1e-6, 1e9, "ns"), (1e-3, 1e6, "us"), (1.0, 1e3, "ms")):
+        if seconds < limit:
+            return f"{seconds * factor:.3g} {unit}"
+    return f"{seconds:.3g} s"
+
+
+def _lines(runs: list[dict[str, Any]]) -> Iterator[str]:
+    yield "| | time | ratio |"
+    yield "|---|---|---|"
+    for run in runs:
+        info = run["extra_info"]
+        yield f"| **{info['title']}** | per {info['unit']} | |"
+        for row in info["rows"]:
+            time = row.get("text") or human_time(row["seconds"])
+            times = f"{row['ratio']:.3g} x" if "ratio" in row else ""
+            yield f"| {row['name']} | {time} | {times} |"
+
+
+def markdown(measured: dict[str, Any]) -> str:
+    """Table of all benchmarks that ran, and the machine they ran on."""
+    machine = measured["machine_info"]
+    cpu = machine["cpu"].get("brand_raw", machine["machine"])
+    head = (
+        f"Measured by `make bench` on {cpu}, Python {machine['python_version']}; every group was "
+        "timed interleaved in one run, ratios are medians over its rounds.\n"
+    )
+    return "\n".join([head, *_lines([r for r in measured["benchmarks"] if r["extra_info"]])])
+
+
+def insert(text: str, table: str) -> str:
+    """Text with everything between the two markers replaced by table."""
+    before, rest = text.split(BEGIN)
+    after = rest.split(END)[1]
+    return f"{before}{BEGIN}\n{table}\n{END}{after}"
+
+
+def main(arguments: list[str]) -> None:
+    """Read the measurement, rewrite the README."""
+    source, target = arguments or ("out/bench.json", "README.md")
+    table = markdown(json.loads(Path(source).read_text()))
+    readme = Path(target)
+    readme.write_text(insert(readme.read_text(), table))
+    print(f"{target}: speed table written")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

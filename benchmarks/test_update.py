@@ -1,0 +1,115 @@
+"""Update per sample: rtid beside the same work in C by hand, and beside other libraries."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from time import perf_counter, sleep
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from benchmarks import rls
+from benchmarks.compiler import compile_c
+from benchmarks.interleave import Job, report, side_by_side
+from benchmarks.machine import chunk, empty, model, one_chamber, record, warmed
+from benchmarks.reference import Reference
+from rtid.estimator.state import State
+from rtid.kernels.normal import assemble
+from rtid.model import Model
+
+FloatArray = NDArray[np.float64]
+
+C_BY_HAND, ARRAYS, PER_SAMPLE = "hand-written C", "rtid, over arrays", "rtid, called per sample"
+ALL = len(record())
+FEW = 2000  # samples for the slow ones
+BLOCK = 3000  # samples of the calls one by one
+
+
+def normal_equations(state: State) -> tuple[FloatArray, FloatArray]:
+    """Gram matrix scaled to a unit diagonal, and right-hand side in the same scale."""
+    done = state.settled()
+    n = int(done.engine[0]["n_shared"] + 6 * done.engine[0]["n_slots"])
+    gram, right = np.zeros((n, n)), np.zeros(n)
+    square = assemble(done.engine, done.blocks, done.pairs, gram, right)
+    scale = np.sqrt(np.where(np.diag(gram) > 0, np.diag(gram), 1.0))
+    return gram / np.outer(scale, scale), right / scale / np.sqrt(square)
+
+
+@pytest.mark.parametrize("chambers", [1, 2])
+def test_c_by_hand_gives_the_same_sums(chambers: int) -> None:
+    machine = model() if chambers == 2 else one_chamber(model())
+    ours, theirs, reference, data = empty(machine), empty(machine), Reference(), chunk(record())
+    ours.advance(data)
+    reference.advance(theirs, data)
+    assert ours.engine[0]["counters"].tolist() == theirs.engine[0]["counters"].tolist()
+    for a, b in zip(normal_equations(ours), normal_equations(theirs), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-9)
+
+
+def test_the_other_libraries_find_the_same_parameters() -> None:
+    data = rls.samples(FEW)
+    expected = rls.by_numpy(data)
+    library = compile_c("rls")
+    for found in (rls.by_c(library, data), rls.by_filterpy(data), rls.by_padasip(data)):
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def joint_jobs(machine: Model) -> list[Job]:
+    """The joint update by C, by rtid over arrays and by rtid one sample at a time."""
+    data, reference = chunk(record()), Reference()
+    by_c, by_arrays, by_calls = (warmed(machine, data) for _ in range(3))
+    rows = [data[k : k + 1] for k in range(BLOCK)]
+    return [
+        Job(C_BY_HAND, lambda: reference.advance(by_c, data), ALL),
+        Job(ARRAYS, lambda: by_arrays.advance(data), ALL),
+        Job(PER_SAMPLE, lambda: one_by_one(by_calls.advance, rows), BLOCK),
+    ]
+
+
+def one_by_one(advance: Callable[[FloatArray], None], rows: list[FloatArray]) -> None:
+    """Call advance once per sample."""
+    for row in rows:
+        advance(row)
+
+
+def test_update_of_one_chamber(benchmark: Any) -> None:
+    data, library = rls.samples(ALL), compile_c("rls")
+    few = data[:FEW]
+    jobs = [
+        *joint_jobs(one_chamber(model())),
+        Job("C, one block alone, classical RLS", lambda: rls.by_c(library, data), ALL),
+        Job("numpy, one block alone", lambda: rls.by_numpy(few), FEW),
+        Job("padasip, one block alone", lambda: rls.by_padasip(few), FEW),
+        Job("filterpy, one block alone", lambda: rls.by_filterpy(few), FEW),
+    ]
+    title = "Update, one chamber, two edges, one shared parameter, 30 x 20 blocks per edge"
+    side_by_side(benchmark, title, "sample", jobs, C_BY_HAND)
+
+
+def test_update_of_two_chambers(benchmark: Any) -> None:
+    title = "Update, two chambers whitened jointly, four edges, 30 x 20 blocks per edge"
+    side_by_side(benchmark, title, "sample", joint_jobs(model()), C_BY_HAND)
+
+
+def test_update_cold_inside_a_1_khz_loop(benchmark: Any) -> None:
+    """Each call finds the caches as 1 ms of sleep left them."""
+    data = chunk(record())
+    state = warmed(one_chamber(model()), data)
+
+    def loop() -> list[float]:
+        times = []
+        for k in range(2000):
+            sleep(1e-3)
+            start = perf_counter()
+            state.advance(data[k : k + 1])
+            times.append(perf_counter() - start)
+        return times
+
+    times = benchmark.pedantic(loop, rounds=1)
+    rows = [
+        {"name": name, "seconds": float(np.percentile(times, share))}
+        for name, share in (("p50", 50), ("p99", 99), ("p99.9", 99.9))
+    ]
+    report(benchmark, "Update, one chamber, once per ms in a sleeping loop (cold)", "sample", rows)
