@@ -42,8 +42,10 @@ def build_model(sections: Sections, catalog: Catalog | None) -> Model:
             max_gap_s=_max_gap_s(sections, catalog),
             hysteresis=gates.hysteresis,
             min_rows=gates.min_rows,
+            max_sd_share=gates.max_sd_share,
         ),
         form=sections.estimator.form,
+        pressure_period_s=_pressure_period_s(sections, signals, catalog),
     )
 
 
@@ -53,9 +55,8 @@ def build_assembly(
     """What the assembler needs for a CAN trace, or with `table` for the columns of a table."""
     used = [] if table else _used(sections, catalog)
     messages = tuple(_message(name, sections, catalog) for name in used)
-    same = len({message.period_s for message in messages}) <= 1
     return Assembly(
-        mode=sections.source.mode or (CYCLE if same else MULTIRATE),
+        mode=CYCLE if table else _mode(sections, catalog),
         signals=tuple(_source(n, s, catalog, table) for n, s in sections.signals.items()),
         messages=messages,
         row_signal=model.position,
@@ -108,7 +109,7 @@ def _signal(name: str, signal: SignalSection, catalog: Catalog | None) -> Signal
     step, limits = _dbc(signal, catalog)
     ends = sorted(scale * limit + signal.offset for limit in limits)
     low, high = _to_si(signal.range or (ends[0], ends[1]), signal, unit)
-    kind = signal.kind or ("position" if signal.table else KINDS[unit.dimension])
+    kind = _kind(signal, unit)
     slope = _slope(signal, unit)
     resolution = abs(scale) * step if signal.resolution is None else signal.resolution
     return Signal(
@@ -120,6 +121,10 @@ def _signal(name: str, signal: SignalSection, catalog: Catalog | None) -> Signal
         minimum=low,
         maximum=high,
     )
+
+
+def _kind(signal: SignalSection, unit: Unit) -> str:
+    return signal.kind or ("position" if signal.table else KINDS[unit.dimension])
 
 
 def _slope(signal: SignalSection, unit: Unit) -> float:
@@ -148,7 +153,7 @@ def _source(
         raw = tuple((angle - signal.offset) / scale for angle in signal.table.angle)
         table = (raw, signal.table.position_m)
         table = table if scale > 0 else (raw[::-1], signal.table.position_m[::-1])
-    command = (signal.kind or KINDS.get(unit.dimension)) == "command"
+    command = _kind(signal, unit) == "command"
     return SignalSource(
         name=name,
         message="" if column else signal.message or "",
@@ -158,6 +163,7 @@ def _source(
         table=table,
         constant=None if signal.constant is None else unit.factor * signal.constant,
         hold=signal.hold or ("zero" if command else "linear"),
+        command=command,
     )
 
 
@@ -182,6 +188,27 @@ def _message(name: str, sections: Sections, catalog: Catalog | None) -> MessageS
         crc=declared.crc if "crc" in given else known.crc,
         data_id=declared.data_id if "data_id" in given else known.data_id,
         channel=declared.channel,
+    )
+
+
+def _mode(sections: Sections, catalog: Catalog | None) -> str:
+    """As given, else one cycle if all messages share a period."""
+    used = _used(sections, catalog)
+    periods = {_message(name, sections, catalog).period_s for name in used}
+    return sections.source.mode or (CYCLE if len(periods) <= 1 else MULTIRATE)
+
+
+def _pressure_period_s(
+    sections: Sections, signals: tuple[Signal, ...], catalog: Catalog | None
+) -> float:
+    """Period of the slowest measured pressure where samples come more often than pressures."""
+    if _mode(sections, catalog) == CYCLE:
+        return 0.0
+    pressures = {signal.name for signal in signals if signal.kind == "pressure"}
+    measured = [s for n, s in sections.signals.items() if n in pressures and s.constant is None]
+    return max(
+        (_message(s.message, sections, catalog).period_s for s in measured if s.message),
+        default=0.0,
     )
 
 

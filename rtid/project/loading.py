@@ -47,7 +47,8 @@ def load(path: str | Path) -> Project:
     problems += references.check(raw, catalog, path.parent)
     problems += _across(parts)
     if problems:
-        raise ProjectError(path, list(dict.fromkeys(problems)))
+        first = {problem.path: problem for problem in reversed(problems)}  # one per place
+        raise ProjectError(path, [p for p in problems if first[p.path] is p])
     return _assemble(path, Sections(**parts), dbc, catalog)
 
 
@@ -84,7 +85,8 @@ def _read_sections(raw: Raw) -> tuple[dict[str, Any], list[Problem]]:
             problems += found
     modes = raw.get("modes", {})
     if isinstance(modes, dict):
-        parts["modes"] = {mode: tuple(edges) for mode, edges in modes.items()}
+        lists = {mode: edges for mode, edges in modes.items() if isinstance(edges, list)}
+        parts["modes"] = {mode: tuple(edges) for mode, edges in lists.items()}
     else:
         problems.append(Problem("modes", "must be a table", "write [modes]"))
     return parts, problems

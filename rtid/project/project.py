@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from firmware_bridge.config import Assembly
@@ -65,6 +66,12 @@ class Project:
     noise_unknown: tuple[str, ...]
     offset_tolerance_s: dict[str, float]
     digest: str
+
+    def model_with(self, noise: Mapping[str, float]) -> Model:
+        """The model with the noise of some signals (1 sigma, SI) replaced, e.g. by an estimate."""
+        signals = self.model.signals
+        told = tuple(replace(s, noise=noise.get(s.name, s.noise)) for s in signals)
+        return replace(self.model, signals=told)
 
     @property
     def name(self) -> str:

@@ -7,16 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from firmware_bridge.catalog import Catalog
 from rtid.project.errors import Problem
 from rtid.project.sections import Raw, key_of
 from rtid.units import COMMAND_DIMENSIONS, UNITS, find_unit, nearest, units_of
 
-KINDS = {"pressure": "pressure", "length": "position", "velocity": "velocity"} | {
-    dimension: "command" for dimension in COMMAND_DIMENSIONS
-}
+KINDS = {
+    "pressure": "pressure",
+    "length": "position",
+    "angle": "position",
+    "velocity": "velocity",
+} | dict.fromkeys(COMMAND_DIMENSIONS, "command")
 KIND_DIMENSIONS = {
     "command": COMMAND_DIMENSIONS,
     "pressure": ("pressure",),
@@ -30,6 +32,10 @@ REFERENCES = {
     ("edges", "sink"): "pressure",
     ("edges", "command"): "command",
 }
+TEXT_KEYS = {
+    *("dbc", "message", "signal", "column", "unit", "kind", "counter", "crc"),
+    *("pressure", "position", "source", "sink", "command", "reference_map"),
+}
 EDGE_NEEDS = {
     "u_grid": "u_grid_v = [1.0, {start = 1.5, stop = 4.0, step = 0.25}, 7.0]",
     "dp_grid": "dp_grid_mpa = [0.0, 1.0, 2.0, 4.0, 7.0]",
@@ -38,11 +44,18 @@ EDGE_NEEDS = {
 }
 
 
+def table(raw: Raw, section: str) -> Raw:
+    """A section as written, without keys that should be text and are not (named elsewhere)."""
+    found = raw.get(section)
+    entries = found.items() if isinstance(found, dict) else ()
+    return {k: value for k, value in entries if k not in TEXT_KEYS or isinstance(value, str)}
+
+
 def tables(raw: Raw, section: str) -> dict[str, Raw]:
     """The well-formed sub-tables of a section, e.g. all [edges.NAME]."""
-    found = raw.get(section, {})
+    found = raw.get(section)
     entries = found.items() if isinstance(found, dict) else ()
-    return {name: entry for name, entry in entries if isinstance(entry, dict)}
+    return {name: table({name: entry}, name) for name, entry in entries if isinstance(entry, dict)}
 
 
 def kind_of(signal: Raw, dbc_unit: str | None = None) -> str | None:
@@ -110,10 +123,7 @@ def _signal_source(path: str, signal: Raw, catalog: Catalog | None, raw: Raw) ->
     """A signal comes from a DBC signal, a column, or is a constant."""
     if "constant" in signal:
         return
-    needed = [] if "dbc" in raw.get("source", {}) else ["column"]
-    if "dbc" in raw.get("source", {}):
-        needed = ["message", "signal"]
-    for key in needed:
+    for key in ("message", "signal") if "dbc" in table(raw, "source") else ("column",):
         if key not in signal:
             yield Problem(f"{path}.{key}", "missing", f'add {key} = "...", or constant = ...')
     message, wanted = signal.get("message"), signal.get("signal")
@@ -129,9 +139,11 @@ def _signal_source(path: str, signal: Raw, catalog: Catalog | None, raw: Raw) ->
             yield Problem(f"{path}.signal", f"{message} has no signal {wanted!r}", near)
 
 
-def _reference(path: str, name: Any, kind: str, kinds: dict[str, str | None]) -> Iterator[Problem]:
+def _reference(
+    path: str, name: str | None, kind: str, kinds: dict[str, str | None]
+) -> Iterator[Problem]:
     fitting = [n for n, k in kinds.items() if k == kind]
-    if not isinstance(name, str):
+    if name is None:
         return
     if name not in kinds:
         yield Problem(path, f"there is no signal {name!r}", nearest(name, fitting))
@@ -142,17 +154,14 @@ def _reference(path: str, name: Any, kind: str, kinds: dict[str, str | None]) ->
 
 def _named_signals(raw: Raw, kinds: dict[str, str | None]) -> Iterator[Problem]:
     for (section, key), kind in REFERENCES.items():
-        for name, table in tables(raw, section).items():
-            yield from _reference(f"{section}.{name}.{key}", table.get(key), kind, kinds)
-    defaults = raw.get("edge_defaults", {})
-    if isinstance(defaults, dict):
-        path = "edge_defaults.command"
-        yield from _reference(path, defaults.get("command"), "command", kinds)
+        for name, entry in tables(raw, section).items():
+            yield from _reference(f"{section}.{name}.{key}", entry.get(key), kind, kinds)
+    command = table(raw, "edge_defaults").get("command")
+    yield from _reference("edge_defaults.command", command, "command", kinds)
 
 
 def _position(raw: Raw, kinds: dict[str, str | None]) -> Iterator[Problem]:
-    geometry = raw.get("geometry", {})
-    named = geometry.get("position") if isinstance(geometry, dict) else None
+    named = table(raw, "geometry").get("position")
     positions = [name for name, kind in kinds.items() if kind == "position"]
     if named is not None:
         yield from _reference("geometry.position", named, "position", kinds)
@@ -179,8 +188,8 @@ def _edge(
     catalog: Catalog | None,
     folder: Path,
 ) -> Iterator[Problem]:
-    defaults = raw.get("edge_defaults", {})
-    merged = (defaults if isinstance(defaults, dict) else {}) | edge
+    inherited = table(raw, "edge_defaults").items()
+    merged = edge | {key: value for key, value in inherited if key not in edge}  # own keys first
     for stem, example in EDGE_NEEDS.items():
         if key_of(merged, stem) == stem:
             yield Problem(f"{path}.{stem}", "missing", f"add {example} here or in [edge_defaults]")
@@ -195,8 +204,12 @@ def _edge(
         yield from _command_unit(path, merged, command, unit.dimension if unit else "")
     if edge.get("source") is not None and edge.get("source") == edge.get("sink"):
         yield Problem(f"{path}.sink", "is the same signal as source", "name the other side")
-    pressures = {table.get("pressure") for table in tables(raw, "chambers").values()}
-    if pressures and not {edge.get("source"), edge.get("sink")} & pressures:
+    pressures = {chamber.get("pressure") for chamber in tables(raw, "chambers").values()}
+    if (
+        pressures
+        and pressures <= set(kinds)
+        and not {edge.get("source"), edge.get("sink")} & pressures
+    ):
         known = ", ".join(sorted(str(p) for p in pressures))
         yield Problem(path, "touches no chamber", f"source or sink must be one of: {known}")
     file = edge.get("reference_map")
@@ -218,8 +231,7 @@ def _command_unit(path: str, edge: Raw, command: str, dimension: str) -> Iterato
 
 def _modes(raw: Raw) -> Iterator[Problem]:
     edges = list(tables(raw, "edges"))
-    modes = raw.get("modes", {})
-    for mode, names in modes.items() if isinstance(modes, dict) else ():
+    for mode, names in table(raw, "modes").items():
         if not isinstance(names, list):
             yield Problem(f"modes.{mode}", "must be a list of edges", f"write {mode} = {edges[:2]}")
             continue
