@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dpotri
 
 from rtid.estimator.state import State
 from rtid.kernels.layout import COUNTERS, TERMS
@@ -15,6 +16,7 @@ from rtid.model import FloatArray, Model
 # One standard deviation of the prior on a flow term: ten times the rated flow, so that directions
 # without data stay finite and are seen as unknown by their variance.
 PRIOR_SD = 10.0
+SHARED_PRIOR = 1e-2  # information on beta_nominal / beta: worth knowing it to a factor of ten
 
 EMPTY, LEARNING, VALID = "empty", "learning", "valid"
 
@@ -121,14 +123,13 @@ def solve(model: Model, state: State) -> Solution:
     settled = state.settled()
     normal = normal_equations(settled)
     e = settled.engine[0]
-    n_shared, n_chambers = int(e["n_shared"]), int(e["n_chambers"])
-    prior = np.full(len(normal.right), PRIOR_SD**-2)
-    prior[:n_shared] = 1e-6
-    theta, cov = _solve_scaled(normal, prior)
+    n_chambers = int(e["n_chambers"])
+    factor = factorize(normal, int(e["n_shared"]))
+    theta, cov = factor.theta(normal.right), factor.cov()
     rows = int(e["counters"][1]) * n_chambers
     active = int(np.sum(np.diag(normal.gram) * np.diag(cov) > 0.5))
     dof = max(1, rows - active)
-    sse = normal.square - 2 * normal.right @ theta + theta @ normal.gram @ theta
+    sse = misfit(normal, theta)
     c0 = e["compliance"][:n_chambers]
     compliance = theta[:n_chambers] * c0
     compliance_cov = cov[:n_chambers, :n_chambers] * np.outer(c0, c0)
@@ -137,17 +138,43 @@ def solve(model: Model, state: State) -> Solution:
     return Solution(model, compliance, compliance_cov, blocks, float(sse / dof), dof, counters)
 
 
-def _solve_scaled(normal: Normal, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """theta and covariance; columns scaled to unit information, one step of refinement."""
+def misfit(normal: Normal, theta: FloatArray) -> float:
+    """Sum of squares of the rows that theta leaves."""
+    return float(normal.square - 2 * normal.right @ theta + theta @ normal.gram @ theta)
+
+
+@dataclass(frozen=True)
+class Factor:
+    """Cholesky factor of the scaled normal matrix: columns scaled to unit information."""
+
+    matrix: FloatArray
+    scale: FloatArray
+    lower: FloatArray
+
+    def theta(self, right: FloatArray) -> FloatArray:
+        """Solution for one right-hand side (n,), with one step of refinement."""
+        right = right * self.scale
+        theta = cho_solve((self.lower, True), right)
+        theta += cho_solve((self.lower, True), right - self.matrix @ theta)
+        return np.asarray(theta * self.scale)
+
+    def cov(self) -> FloatArray:
+        """Inverse of the normal matrix (n, n)."""
+        inverse, _ = dpotri(self.lower, lower=1)
+        inverse = np.tril(inverse) + np.tril(inverse, -1).T
+        return np.asarray(inverse * np.outer(self.scale, self.scale))
+
+
+def factorize(normal: Normal, n_shared: int) -> Factor:
+    """Factor of information - known bias + prior."""
+    prior = np.full(len(normal.right), PRIOR_SD**-2)
+    prior[:n_shared] = SHARED_PRIOR
     matrix = normal.gram + np.diag(prior - normal.bias)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
-    scaled = matrix * np.outer(scale, scale)
-    factor = cho_factor(scaled, lower=True)
-    right = normal.right * scale
-    theta = cho_solve(factor, right)
-    theta += cho_solve(factor, right - scaled @ theta)
-    cov = cho_solve(factor, np.eye(len(right)))
-    return theta * scale, cov * np.outer(scale, scale)
+    matrix *= scale[:, None]
+    matrix *= scale
+    lower = cho_factor(matrix, lower=True)[0]
+    return Factor(matrix, scale, lower)
 
 
 def _block(

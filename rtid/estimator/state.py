@@ -74,19 +74,35 @@ def _rehash(e: np.void, pairs: RecordArray) -> RecordArray:
     return larger
 
 
-def build(model: Model, slopes: FloatArray | None = None, lag_s: float | None = None) -> State:
-    """Empty state for a model.
+@dataclass(frozen=True)
+class Weights:
+    """What weighs the rows, frozen per revision so that recursive = batch has a meaning.
 
-    slopes: (cells,) dQ/ddp in m3/s/Pa that weighs the pressure noise, one per grid cell in the
-    order of the edges; nominal orifice values when not given.  lag_s replaces the nominal lag.
+    slopes (cells,): dQ/ddp in m3/s/Pa per grid cell, in the order of the edges; compliance
+    (chambers,): 1 / beta in 1/Pa; lag_s: first-order lag of the spools.
     """
-    n_cells = sum(edge.grid.shape[0] * edge.grid.shape[1] for edge in model.edges)
-    cells = np.zeros(n_cells, layout.CELL)
-    cells["slope"] = nominal_slopes(model) if slopes is None else slopes
+
+    slopes: FloatArray
+    compliance: FloatArray
+    lag_s: float
+
+
+def nominal_weights(model: Model) -> Weights:
+    """Weights from the declared values alone: what a start without data has."""
+    compliance = np.full(len(model.chambers), 1.0 / model.beta_nominal_pa)
+    slopes = np.concatenate([_edge_slopes(edge) for edge in model.edges])
+    return Weights(slopes, compliance, model.lag.nominal_s)
+
+
+def build(model: Model, weights: Weights | None = None) -> State:
+    """Empty state for a model; nominal weights when none are given."""
+    weights = weights or nominal_weights(model)
+    cells = np.zeros(len(weights.slopes), layout.CELL)
+    cells["slope"] = weights.slopes
     engine = np.zeros(1, layout.ENGINE)
     _configure(engine[0], model)
-    if lag_s is not None:
-        engine[0]["lag_s"] = lag_s
+    engine[0]["compliance"][: len(model.chambers)] = weights.compliance
+    engine[0]["lag_s"] = weights.lag_s
     kernel.clear(engine, cells)
     return State(
         engine,
@@ -97,12 +113,8 @@ def build(model: Model, slopes: FloatArray | None = None, lag_s: float | None = 
     )
 
 
-def nominal_slopes(model: Model) -> FloatArray:
-    """dQ/ddp at the centre of each cell for Q = K(w) sqrt(dp), K rising linearly to its rated value."""
-    return np.concatenate([_edge_slopes(edge) for edge in model.edges])
-
-
 def _edge_slopes(edge: Edge) -> FloatArray:
+    """dQ/ddp at each cell's centre for Q = K(w) sqrt(dp), K rising linearly to its rated value."""
     u, dp = edge.grid.u_v, edge.grid.dp_pa
     w, pressure = 0.5 * (u[1:] + u[:-1]), np.abs(0.5 * (dp[1:] + dp[:-1]))
     foot = edge.safe_band_v if np.isfinite(edge.safe_band_v) else u[0]
@@ -125,12 +137,11 @@ def _configure(e: np.void, model: Model) -> None:
         e["p_column"][c] = model.column(chamber.pressure)
         e["p_var_pa2"][c] = _variance(model, chamber.pressure)
         e["area_m2"][c], e["v0_m3"][c] = chamber.sign * chamber.area_m2, chamber.v0_m3
-        e["compliance"][c] = 1.0 / model.beta_nominal_pa
     first = 0
     for i, edge in enumerate(model.edges):
         first = _configure_edge(e, model, i, edge, first)
     e["hysteresis"], e["max_gap_s"] = model.gates.hysteresis, model.gates.max_gap_s
-    e["ring_floor"], e["lag_s"] = RING_FLOOR, model.lag.nominal_s
+    e["ring_floor"] = RING_FLOOR
     e["wn_rad_s"], e["zeta"] = model.filter.wn_rad_s, model.filter.zeta
     e["row_period_s"] = 1.0 / model.filter.rows_per_s
     e["p_period_s"] = model.pressure_period_s

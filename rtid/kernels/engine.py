@@ -87,7 +87,7 @@ def _take(e: Any, cells: Any, closed: Any, blocks: Any, pairs: Any, sample: Floa
     """One sample: gate it, then integrate the interval that it closes."""
     e.counters[SAMPLES] += 1
     flags = int(sample[1])
-    if not _acceptable(e, sample):
+    if not acceptable(e, sample):
         _stop(e, closed, blocks, pairs)
         return
     dt = sample[0] - e.t_s
@@ -98,11 +98,11 @@ def _take(e: Any, cells: Any, closed: Any, blocks: Any, pairs: Any, sample: Floa
         _interval(e, cells, closed, blocks, pairs, sample, dt, (flags & ROW_FLAG) != 0)
     elif (flags & ROW_FLAG) != 0:
         _start(e, sample)
-    _remember(e, sample)
+    remember(e, sample)
 
 
 @njit(cache=True)
-def _acceptable(e: Any, sample: FloatArray) -> bool:
+def acceptable(e: Any, sample: FloatArray) -> bool:
     """Finite first (NaN passes no comparison), then the declared range of each signal."""
     for j in range(2 + e.n_signals):
         if not math.isfinite(sample[j]):
@@ -116,7 +116,7 @@ def _acceptable(e: Any, sample: FloatArray) -> bool:
 
 
 @njit(cache=True)
-def _remember(e: Any, sample: FloatArray) -> None:
+def remember(e: Any, sample: FloatArray) -> None:
     e.t_s = sample[0]
     for j in range(e.n_signals):
         e.values[j] = sample[2 + j]
@@ -125,7 +125,7 @@ def _remember(e: Any, sample: FloatArray) -> None:
 @njit(cache=True)
 def _start(e: Any, sample: FloatArray) -> None:
     """Begin at a measured position: spools at rest, whitener at R, filters at zero."""
-    _remember(e, sample)
+    remember(e, sample)
     e.running = 1
     e.next_row_s = sample[0] + e.row_period_s
     for i in range(e.n_edges):
@@ -151,8 +151,8 @@ def _interval(
 ) -> None:
     """Integrate the columns over [t, t + dt]; make a row where the position was measured."""
     if dt != e.dt_s:
-        _set_step(e, dt)
-    if not _working_points(e, sample, dt):
+        set_step(e, dt)
+    if not working_points(e, sample, dt):
         e.counters[OUTSIDE_GRID] += 1
         _stop(e, closed, blocks, pairs)
         return
@@ -162,12 +162,12 @@ def _interval(
         _block_increments(e, cells, blocks, k, sample[0], dt, row)
     if e.form == CARRY:
         carry_step(e)
-        _remember(e, sample)
+        remember(e, sample)
         if e.t_s > e.next_row_s - 0.5 * dt:
             e.next_row_s += e.row_period_s * max(1.0, math.ceil((e.t_s - e.next_row_s) / e.row_period_s))
             carry_row(e)
     else:
-        _remember(e, sample)
+        remember(e, sample)
         _integral_step(e, row)
     if ring_needs_rebase(e):
         flush_local(e, closed, blocks, pairs)
@@ -175,7 +175,7 @@ def _interval(
 
 
 @njit(cache=True)
-def _set_step(e: Any, dt: float) -> None:
+def set_step(e: Any, dt: float) -> None:
     """Factors that depend on the length of the step alone."""
     e.dt_s = dt
     e.lag_decay = math.exp(-dt / e.lag_s) if e.lag_s > 0.0 else 0.0
@@ -183,7 +183,7 @@ def _set_step(e: Any, dt: float) -> None:
 
 
 @njit(cache=True)
-def _working_points(e: Any, sample: FloatArray, dt: float) -> bool:
+def working_points(e: Any, sample: FloatArray, dt: float) -> bool:
     """Per edge: moments of the lagged command, dp at both ends, and the block of its mean point.
 
     False when an edge that is open lies outside its grid: its flow is unknown.
@@ -275,26 +275,35 @@ def _shared_increments(e: Any, sample: FloatArray, dt: float) -> None:
 
 
 @njit(cache=True)
-def _block_increments(
-    e: Any, cells: Any, blocks: Any, k: int, t: float, dt: float, row: bool
-) -> None:
-    """Integrals (carry form: end values) of the six terms of open block k over the interval."""
-    i = e.open_edge[k]
-    block = blocks[e.open_slot[k]]
-    u, p = e.u_border[i], e.dp_border[i]
+def mean_terms(e: Any, i: int) -> tuple[float, float]:
+    """Means over the interval of the six terms of edge i's current block, into e.phi.
+
+    Exact for the lagged command and linear dp.  Returns the local dp at both ends.
+    """
+    u, p, phi = e.u_border[i], e.dp_border[i], e.phi
     iu, ip = e.cell[i, 0], e.cell[i, 1]
     hu, hp = 2.0 / (u[iu + 1] - u[iu]), 2.0 / (p[ip + 1] - p[ip])
     uc, pc = 0.5 * (u[iu + 1] + u[iu]), 0.5 * (p[ip + 1] + p[ip])
     m1, m2, mt = e.moments[i, 0], e.moments[i, 1], e.moments[i, 2]
     eta0, eta1 = (e.dp_pa[i, 0] - pc) * hp, (e.dp_pa[i, 1] - pc) * hp
-    phi = e.phi
     phi[0] = 1.0
     phi[1] = (m1 - uc) * hu
     phi[2] = 0.5 * (eta0 + eta1)
     phi[3] = (m2 - 2.0 * uc * m1 + uc * uc) * hu * hu
     phi[4] = (eta0 * eta0 + eta0 * eta1 + eta1 * eta1) / 3.0
     phi[5] = phi[1] * phi[2] + mt * hu * (eta1 - eta0)
-    first = 1 + e.n_shared + TERMS * k
+    return eta0, eta1
+
+
+@njit(cache=True)
+def _block_increments(
+    e: Any, cells: Any, blocks: Any, k: int, t: float, dt: float, row: bool
+) -> None:
+    """Integrals (carry form: end values) of the six terms of open block k over the interval."""
+    i = e.open_edge[k]
+    block = blocks[e.open_slot[k]]
+    eta0, eta1 = mean_terms(e, i)
+    phi, first = e.phi, 1 + e.n_shared + TERMS * k
     block.dwell_s += dt
     block.last_s = t
     if row:
@@ -302,36 +311,31 @@ def _block_increments(
     for j in range(TERMS):
         block.phi_sum[j] += phi[j] * dt
     if e.form == CARRY:
-        _carry_ends(e, i, first, phi, eta0, eta1)
+        _carry_ends(e, i, first, eta0, eta1)
     else:
         for c in range(e.n_chambers):
             scale = e.sign[i, c] * e.scale_m3s[i] * dt
             for j in range(TERMS):
                 e.d[c, first + j] += scale * phi[j]
-    _flow_noise(e, i, cells[block.cell].slope, dt)
+    flow_noise(e, i, cells[block.cell].slope, dt)
 
 
 @njit(cache=True)
-def _carry_ends(
-    e: Any, i: int, first: int, phi: FloatArray, eta0: float, eta1: float
-) -> None:
+def _carry_ends(e: Any, i: int, first: int, eta0: float, eta1: float) -> None:
     """Start and end values: the regressor runs from phi(u_k, dp_k) to phi(u_k, dp_k+1)."""
     for c in range(e.n_chambers):
         scale = e.sign[i, c] * e.scale_m3s[i]
         for j in range(TERMS):
-            e.inc[c, first + j] = scale * phi[j]
-            e.end[c, first + j] = scale * phi[j]
+            e.inc[c, first + j] = scale * e.phi[j]
+            e.end[c, first + j] = scale * e.phi[j]
         half = 0.5 * scale * (eta1 - eta0)
-        e.inc[c, first + 2] -= half
-        e.end[c, first + 2] += half
-        e.inc[c, first + 4] -= half * (eta0 + eta1)
-        e.end[c, first + 4] += half * (eta0 + eta1)
-        e.inc[c, first + 5] -= half * phi[1]
-        e.end[c, first + 5] += half * phi[1]
+        for j, change in ((2, half), (4, half * (eta0 + eta1)), (5, half * e.phi[1])):
+            e.inc[c, first + j] -= change
+            e.end[c, first + j] += change
 
 
 @njit(cache=True)
-def _flow_noise(e: Any, i: int, slope: float, dt: float) -> None:
+def flow_noise(e: Any, i: int, slope: float, dt: float) -> None:
     """Random walk of the integral: pressure noise through dQ/ddp, (m3)^2 per step."""
     period = e.p_period_s if e.p_period_s > 0.0 else dt
     q = slope * slope * e.dp_var_pa2[i] * period * dt

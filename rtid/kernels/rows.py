@@ -27,11 +27,11 @@ def start_whitener(e: Any) -> None:
     """The first position is known as well as it was measured: P = R."""
     for a in range(e.n_chambers):
         for b in range(e.n_chambers):
-            e.cov[a, b] = _position_noise(e, a, b)
+            e.cov[a, b] = position_noise(e, a, b)
 
 
 @njit(cache=True)
-def _position_noise(e: Any, a: int, b: int) -> float:
+def position_noise(e: Any, a: int, b: int) -> float:
     """Covariance R of the rows' white noise, m6: one x for both chambers, one p for each."""
     r = e.area_m2[a] * e.area_m2[b] * e.x_var_m2
     if a == b:
@@ -44,7 +44,7 @@ def _position_noise(e: Any, a: int, b: int) -> float:
 def integral_row_one(e: Any) -> None:
     """Row and decay for one chamber."""
     d, row, n = e.d, e.row, local_width(e)
-    r = _position_noise(e, 0, 0)
+    r = position_noise(e, 0, 0)
     s = e.cov[0, 0] + r
     scale, keep = 1.0 / math.sqrt(s), r / s
     for j in range(n):
@@ -62,7 +62,7 @@ def integral_row_one(e: Any) -> None:
 def integral_row_two(e: Any) -> None:
     """Rows and decay for two chambers that share the noise of x: whitened jointly."""
     d, row, cov, n = e.d, e.row, e.cov, local_width(e)
-    r00, r01, r11 = _position_noise(e, 0, 0), _position_noise(e, 0, 1), _position_noise(e, 1, 1)
+    r00, r01, r11 = position_noise(e, 0, 0), position_noise(e, 0, 1), position_noise(e, 1, 1)
     s00, s01, s11 = cov[0, 0] + r00, cov[0, 1] + r01, cov[1, 1] + r11
     i0 = 1.0 / math.sqrt(s00)
     c = s01 * i0
@@ -112,12 +112,12 @@ def carry_step(e: Any) -> None:
 def carry_row(e: Any) -> None:
     """Rows at a row instant: outputs of the filters, weighted by the position noise."""
     d, row, n = e.d, e.row, local_width(e)
-    i0 = 1.0 / math.sqrt(_position_noise(e, 0, 0))
+    i0 = 1.0 / math.sqrt(position_noise(e, 0, 0))
     for j in range(n):
         row[0, j] = i0 * d[0, j]
     if e.n_chambers == 2:
-        c = _position_noise(e, 0, 1) * i0
-        i1 = 1.0 / math.sqrt(_position_noise(e, 1, 1) - c * c)
+        c = position_noise(e, 0, 1) * i0
+        i1 = 1.0 / math.sqrt(position_noise(e, 1, 1) - c * c)
         for j in range(n):
             row[1, j] = i1 * (d[2, j] - c * i0 * d[0, j])
     e.counters[ROWS] += 1

@@ -1,0 +1,187 @@
+"""Hold a fitted model against a trace: modelled flow, whitened innovations, filtered residual.
+
+The model is given per grid cell, so that any map (estimated, calibrated, data sheet) can be held
+against any trace.  Same holds, lag and block assignment as in `engine`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from rtid.kernels.engine import (
+    GAP_FLAG,
+    ROW_FLAG,
+    SHUT,
+    acceptable,
+    flow_noise,
+    mean_terms,
+    remember,
+    set_step,
+    working_points,
+)
+from rtid.kernels.holds import second_order
+from rtid.kernels.layout import TERMS
+from rtid.kernels.rows import position_noise, start_whitener
+
+FloatArray = NDArray[np.float64]
+
+MEASURED, MODELLED = 0, 1
+
+
+@njit(cache=True)
+def explain(
+    engine: Any,
+    cells: Any,
+    theta: FloatArray,
+    compliance: FloatArray,
+    chunk: FloatArray,
+    flow: FloatArray,
+    cell: Any,
+    innovation: FloatArray,
+) -> None:
+    """Rates over each interval and innovations at each row.  All outputs are changed in place.
+
+    engine (1,), cells: a freshly built state (the engine is used up); theta (cells, 6) m3/s,
+    compliance (chambers,) 1/Pa, chunk (n, 2 + signals).  flow (n - 1, chambers, 2): measured
+    s A v and modelled right-hand side of (14), mean over the interval, m3/s; NaN where the trace
+    has a gap or the point is off the grid.  cell (n - 1, edges): grid cell, -1 shut.
+    innovation (n - 1, chambers): whitened, unit variance for a perfect model; NaN where no row.
+    """
+    e = engine[0]
+    gap = np.zeros(2)
+    for k in range(len(chunk)):
+        dt = chunk[k, 0] - e.t_s
+        flags = int(chunk[k, 1])
+        whole = acceptable(e, chunk[k])
+        joined = whole and e.running and dt > 0.0 and dt <= e.max_gap_s
+        joined = joined and (flags & GAP_FLAG) == 0
+        if k > 0:
+            flow[k - 1] = np.nan
+            innovation[k - 1] = np.nan
+            cell[k - 1] = SHUT
+            if joined:
+                joined = _one(e, cells, theta, compliance, chunk[k], dt, flow[k - 1], cell[k - 1], gap)
+        if joined:
+            remember(e, chunk[k])
+            if (flags & ROW_FLAG) != 0:
+                _innovate(e, gap, innovation[k - 1])
+        else:
+            e.running = 0
+            gap[:] = 0.0
+            if whole and (flags & ROW_FLAG) != 0:
+                _begin(e, chunk[k])
+
+
+@njit(cache=True)
+def _begin(e: Any, sample: FloatArray) -> None:
+    remember(e, sample)
+    e.running = 1
+    for i in range(e.n_edges):
+        e.w_v[i] = e.direction[i] * e.values[e.command[i]]
+        e.cell[i, 0] = SHUT
+    start_whitener(e)
+
+
+@njit(cache=True)
+def _one(
+    e: Any,
+    cells: Any,
+    theta: FloatArray,
+    compliance: FloatArray,
+    sample: FloatArray,
+    dt: float,
+    flow: FloatArray,
+    cell: Any,
+    gap: FloatArray,
+) -> bool:
+    """One interval; False where a working point is off the grid."""
+    if dt != e.dt_s:
+        set_step(e, dt)
+    if not working_points(e, sample, dt):
+        return False
+    x0, x1 = e.values[e.x_column], sample[2 + e.x_column]
+    for c in range(e.n_chambers):
+        rate = (sample[2 + e.p_column[c]] - e.values[e.p_column[c]]) / dt
+        v = e.v0_m3[c] + 0.5 * e.area_m2[c] * (x0 + x1)
+        flow[MEASURED + 2 * c] = e.area_m2[c] * (x1 - x0) / dt
+        flow[MODELLED + 2 * c] = -v * rate * compliance[c]
+        e.cov[c, c] += e.q_floor[c] * dt
+    for i in range(e.n_edges):
+        e.cell[i, 0], e.cell[i, 1] = e.target[i, 0], e.target[i, 1]
+        if e.cell[i, 0] != SHUT:
+            at = e.first_cell[i] + e.cell[i, 0] * e.n_dp[i] + e.cell[i, 1]
+            cell[i] = at
+            mean_terms(e, i)
+            q = 0.0
+            for j in range(TERMS):
+                q += e.phi[j] * theta[at, j]
+            for c in range(e.n_chambers):
+                flow[MODELLED + 2 * c] += e.sign[i, c] * q
+            flow_noise(e, i, cells[at].slope, dt)
+    for c in range(e.n_chambers):
+        gap[c] += (flow[MEASURED + 2 * c] - flow[MODELLED + 2 * c]) * dt
+    return True
+
+
+@njit(cache=True)
+def _innovate(e: Any, gap: FloatArray, out: FloatArray) -> None:
+    """Whitened innovation L^-1 gap, and the whitener's update (plain 2 x 2 algebra)."""
+    n, cov = e.n_chambers, e.cov
+    r00, s00 = position_noise(e, 0, 0), cov[0, 0] + position_noise(e, 0, 0)
+    out[0] = gap[0] / math.sqrt(s00)
+    if n == 1:
+        gap[0] *= r00 / s00
+        cov[0, 0] *= r00 / s00
+        return
+    r01, r11 = position_noise(e, 0, 1), position_noise(e, 1, 1)
+    s01, s11 = cov[0, 1] + r01, cov[1, 1] + r11
+    det = s00 * s11 - s01 * s01
+    out[1] = (gap[1] - s01 / s00 * gap[0]) / math.sqrt(det / s00)
+    k00, k01 = (r00 * s11 - r01 * s01) / det, (r01 * s00 - r00 * s01) / det
+    k10, k11 = (r01 * s11 - r11 * s01) / det, (r11 * s00 - r01 * s01) / det
+    gap[0], gap[1] = k00 * gap[0] + k01 * gap[1], k10 * gap[0] + k11 * gap[1]
+    p00, p01, p11 = cov[0, 0], cov[0, 1], cov[1, 1]
+    cov[0, 0], cov[1, 1] = k00 * p00 + k01 * p01, k10 * p01 + k11 * p11
+    cov[0, 1] = 0.5 * (k00 * p01 + k01 * p11 + k10 * p00 + k11 * p01)
+    cov[1, 0] = cov[0, 1]
+
+
+@njit(cache=True)
+def filter_rows(
+    t_s: FloatArray, rate: FloatArray, wn: float, zeta: float, period_s: float, out: FloatArray
+) -> int:
+    """Pass interval rates (n - 1, m), held over each interval, through H_f; sample every period_s.
+
+    t_s (n,) instants.  out (rows, 1 + m) = [t, outputs] is changed in place; returns the number of
+    rows.  A NaN interval restarts the filter; rows wait until it has settled again.
+    """
+    m, rows = rate.shape[1], 0
+    a, b = np.empty((2, 2)), np.empty((2, 2))
+    state = np.zeros((2, m))
+    step, due, settle = 0.0, t_s[0], 6.0 / (zeta * wn)
+    ready = t_s[0] + settle
+    for k in range(len(rate)):
+        dt = t_s[k + 1] - t_s[k]
+        if dt != step:
+            step = dt
+            second_order(wn, zeta, dt, a, b)
+        if not np.isfinite(rate[k]).all():
+            state[:] = 0.0
+            ready = t_s[k + 1] + settle
+            continue
+        for j in range(m):
+            x0, x1 = state[0, j], state[1, j]
+            state[0, j] = a[0, 0] * x0 + a[0, 1] * x1 + (b[0, 0] + b[0, 1]) * rate[k, j]
+            state[1, j] = a[1, 0] * x0 + a[1, 1] * x1 + (b[1, 0] + b[1, 1]) * rate[k, j]
+        if t_s[k + 1] > due - 0.5 * dt:
+            due += period_s * max(1.0, math.ceil((t_s[k + 1] - due) / period_s))
+            if t_s[k + 1] >= ready and rows < len(out):
+                out[rows, 0] = t_s[k + 1]
+                out[rows, 1:] = state[0]
+                rows += 1
+    return rows
