@@ -14,7 +14,7 @@ from rtid.kernels import engine as kernel
 from rtid.model import Model
 from rtid.sim.declare import declared_model, uniform_grid
 from rtid.sim.plant import Plant
-from rtid.sim.run import simulate
+from rtid.sim.run import Run, simulate
 
 FloatArray = NDArray[np.float64]
 
@@ -24,9 +24,14 @@ COARSE = (10, 8)
 
 
 @cache
-def record() -> Samples:
+def run() -> Run:
     """The swept sine at 1 kHz with sensor noise."""
-    return simulate(Plant(), "sweep", seed=1, duration_s=SECONDS).samples
+    return simulate(Plant(), "sweep", seed=1, duration_s=SECONDS)
+
+
+def record() -> Samples:
+    """Return the samples of the run."""
+    return run().samples
 
 
 def model(blocks: tuple[int, int] = (30, 20), span: bool = False) -> Model:

@@ -55,8 +55,8 @@ class Front:
         xi, eta, rate, y = sample
         self.ends[0] = self.ends[1]
         self.ends[1] = 1.0, xi, eta, xi * xi, eta * eta, xi * eta, rate, y
-        self.x = self.a @ self.x + self.b @ self.ends
-        return self.x[0]
+        self.x[:] = self.a @ self.x + self.b @ self.ends
+        return np.asarray(self.x[0])
 
 
 def by_numpy(data: FloatArray) -> FloatArray:
