@@ -18,7 +18,7 @@ SCALE = 152.59021896696422  # Pa per count
 
 def payloads() -> NDArray[np.uint8]:
     every = frames()
-    return every.data[every.can_id == catalog().can_id(MESSAGE)]
+    return np.asarray(every.data[every.can_id == catalog().can_id(MESSAGE)])
 
 
 def by_cantools(raw: list[bytes]) -> list[dict[str, Any]]:
