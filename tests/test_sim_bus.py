@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from firmware_bridge.catalog import CONTROLLER_DBC, Catalog, load
-from firmware_bridge.frames import Frames, from_messages
-from rtid.sim.bus import run_frames, send
+from firmware_bridge.frames import Frames, from_messages, to_messages
+from rtid.sim.bus import SendError, open_test_bus, run_frames, send
 from rtid.sim.frames import (
     ARBITRATION_US,
     CONTROLLER_ROUTES,
@@ -146,7 +146,7 @@ def buses() -> Iterator[tuple[can.BusABC, can.BusABC]]:
 def test_recorded_stamps_arrive(run: Run, buses: tuple[can.BusABC, can.BusABC]) -> None:
     sender, receiver = buses
     frames = run_frames(run)
-    assert send(sender, frames, float("inf")) == len(frames)
+    assert send(sender, to_messages(frames), float("inf")) == len(frames)
     received = from_messages(receiver.recv(0.0) for _ in range(len(frames)))  # type: ignore[misc]
     assert np.array_equal(received.t_us, frames.t_us)
     assert np.array_equal(received.data, frames.data)
@@ -160,10 +160,28 @@ def test_pace(run: Run, buses: tuple[can.BusABC, can.BusABC]) -> None:
     def sleep(duration_s: float) -> None:
         now[0] += duration_s
 
-    send(buses[0], run_frames(run), 4.0, clock_s=lambda: now[0], sleep=sleep)
+    send(buses[0], to_messages(run_frames(run)), 4.0, clock_s=lambda: now[0], sleep=sleep)
     assert now[0] == pytest.approx(100.0 + 0.499 / 4, abs=1e-9)
 
 
-def test_a_silly_speed_is_refused(run: Run, buses: tuple[can.BusABC, can.BusABC]) -> None:
-    with pytest.raises(ValueError, match="must be > 0"):
-        send(buses[0], run_frames(run), 0.0)
+def test_a_silly_speed_is_refused(buses: tuple[can.BusABC, can.BusABC]) -> None:
+    with pytest.raises(SendError, match="must be > 0"):
+        send(buses[0], [], 0.0)
+
+
+def test_a_stalled_receiver_is_an_error_and_no_hang(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rtid.sim.bus.SEND_TIMEOUT_S", 0.01)
+    with (
+        can.Bus("full", interface="virtual", rx_queue_size=4),
+        open_test_bus("virtual", "full") as sender,
+        pytest.raises(SendError, match="after 4 frames"),
+    ):
+        send(sender, to_messages(run_frames(run)), float("inf"))
+
+
+@pytest.mark.parametrize("interface", ["socketcan", "pcan", "slcan"])
+def test_a_real_bus_is_refused(interface: str) -> None:
+    with pytest.raises(SendError, match="must not speak here"):
+        open_test_bus(interface, "can0")

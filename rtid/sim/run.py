@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from firmware_bridge.samples import GAP, ROW, Samples
+from rtid.errors import RtidError
 from rtid.sim.loop import P_SUPPLY, P_TANK, X_REF, run_loop
 from rtid.sim.motion import DT_S, MOTIONS, Motion
 from rtid.sim.plant import EDGES, FloatArray, Plant
@@ -19,7 +20,7 @@ U, P_A, P_B, X, V = 0, 1, 2, 5, 6  # columns of NAMES that the loop computes
 COUNTS = 65535  # 16 bit
 
 
-class SimulationError(ValueError):
+class SimulationError(RtidError):
     """The machine left its stroke, cavitated or exceeded a sensor's range."""
 
 

@@ -1,0 +1,121 @@
+"""`rtid simulate`: record a simulated machine as a trace, or let it speak on a test bus."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rtid.cli.exits import Exit
+from rtid.errors import RtidError
+from rtid.sim.bus import AS_FAST_AS_POSSIBLE, open_test_bus, run_frames, send
+from rtid.sim.declare import declared_model
+from rtid.sim.log import START_US, SUFFIXES, truth_of, write_log, write_table
+from rtid.sim.motion import MOTIONS
+from rtid.sim.plant import Plant
+from rtid.sim.project_file import project_text
+from rtid.sim.random_plants import draw
+from rtid.sim.run import Run
+from rtid.sim.run import simulate as run_machine
+
+TABLE_SUFFIX = ".parquet"
+
+
+def simulate(
+    trace: Annotated[
+        Path | None, typer.Argument(help="File to write: .blf, .log (candump), .asc or .parquet.")
+    ] = None,
+    plant: Annotated[
+        int | None, typer.Option(help="Number of a random machine; the default one without it.")
+    ] = None,
+    cross_port: Annotated[
+        bool, typer.Option("--cross-port", help="A fifth valve A<->B (random machines).")
+    ] = False,
+    motion: Annotated[str, typer.Option(help=" | ".join(MOTIONS))] = "sweep",
+    duration_s: Annotated[float, typer.Option("--duration", min=0.01, help="Seconds.")] = 80.0,
+    seed: Annotated[int, typer.Option(min=0, help="Of noise and motion.")] = 0,
+    bus: Annotated[
+        str | None, typer.Option(help="Send live: udp_multicast, virtual, or socketcan with vcan.")
+    ] = None,
+    channel: Annotated[str, typer.Option(help="Channel of the bus.")] = "239.74.163.2",
+    speed: Annotated[float, typer.Option(help="Pace on the bus; 0: as fast as possible.")] = 1.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Record a simulated machine: the trace, the truth (.truth.json), a project file (.toml).
+
+    The trace then replays with `rtid replay TRACE --project TRACE.toml`.  With --bus the machine
+    speaks live instead of, or after, writing.
+    """
+    _check_arguments(trace, bus, motion, plant, cross_port)
+    machine = Plant() if plant is None else draw(plant, cross_port=cross_port)
+    run = run_machine(machine, motion, seed, duration_s)
+    result = {"samples": len(run.samples), "beta_pa": machine.beta_pa}
+    written = _write(trace, run, seed, motion) if trace else []
+    sent = _send(run, bus, channel, speed or AS_FAST_AS_POSSIBLE) if bus else 0
+    if as_json:
+        print(json.dumps(result | {"files": [str(p) for p in written], "frames_sent": sent}))
+        return
+    print(f"{len(run.samples)} samples, bulk modulus {machine.beta_pa / 1e6:.0f} MPa")
+    for path in written:
+        print(f"wrote {path}")
+    if sent:
+        print(f"sent {sent} frames on {bus} {channel}")
+
+
+def _check_arguments(
+    trace: Path | None, bus: str | None, motion: str, plant: int | None, cross_port: bool
+) -> None:
+    """Refuse at once what would fail after the simulation."""
+    known = (*SUFFIXES, TABLE_SUFFIX)
+    if trace is None and bus is None:
+        raise _usage("nothing to do", "name a file to write, or a bus with --bus")
+    if trace is not None and trace.suffix not in known:
+        raise _usage(f"{trace}: unknown kind of trace", f"use one of {', '.join(known)}")
+    if trace is not None and not trace.parent.is_dir():
+        raise _usage(f"{trace.parent}: no such folder", "create it first")
+    if motion not in MOTIONS:
+        raise _usage(f"--motion {motion}: unknown", f"use one of {', '.join(MOTIONS)}")
+    if cross_port and plant is None:
+        raise _usage("--cross-port: the default machine has four valves", "add --plant NUMBER")
+
+
+def _usage(message: str, remedy: str) -> RtidError:
+    return RtidError(message, remedy, Exit.USAGE)
+
+
+def _write(trace: Path, run: Run, seed: int, motion: str) -> list[Path]:
+    """Write trace, truth and project beside each other; their paths."""
+    if trace.suffix == TABLE_SUFFIX:
+        write_table(trace, run)
+    else:
+        write_log(trace, run_frames(run, start_us=START_US))
+    truth, project = trace.with_suffix(".truth.json"), trace.with_suffix(".toml")
+    facts = {"seed": seed, "motion": motion} | truth_of(run.plant)
+    truth.write_text(json.dumps(facts, indent=1) + "\n", "utf-8")
+    model = declared_model(run.plant, sensors=run.sensors, seed=seed)
+    stroke_m = run.plant.constants.stroke_m
+    project.write_text(project_text(model, stroke_m, "simulated cylinder"), "utf-8")
+    return [trace, truth, project]
+
+
+def _send(run: Run, interface: str, channel: str, speed: float) -> int:
+    """Speak on the bus, with a progress bar on a terminal; the number of frames sent."""
+    from rich.console import Console
+    from rich.progress import track
+
+    from firmware_bridge.frames import to_messages
+
+    frames = run_frames(run, start_us=START_US)
+    console = Console(stderr=True)
+    messages = track(
+        to_messages(frames),
+        "sending",
+        total=len(frames),
+        console=console,
+        disable=not sys.stderr.isatty(),
+    )
+    with open_test_bus(interface, channel) as bus:
+        return send(bus, messages, speed)

@@ -1,0 +1,127 @@
+"""`rtid simulate`: what it writes can be read back, and says what is true."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import can
+import numpy as np
+import pyarrow.parquet
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from firmware_bridge.assemble import Assembler
+from firmware_bridge.catalog import load as load_catalog
+from firmware_bridge.frames import from_messages
+from rtid import project
+from rtid.cli.simulate import simulate
+from rtid.errors import RtidError
+from rtid.model import Model
+from rtid.sim.declare import declared_model
+from rtid.sim.log import START_US
+from rtid.sim.plant import Plant
+from rtid.sim.random_plants import draw
+from rtid.sim.run import simulate as run_machine
+
+APP = typer.Typer()
+APP.command()(simulate)
+
+
+def call(*arguments: object) -> str:
+    result = CliRunner().invoke(APP, [str(a) for a in arguments], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def assert_same_machine(found: Model, declared: Model) -> None:
+    assert [s.name for s in found.signals] == [s.name for s in declared.signals]
+    assert [s.kind for s in found.signals] == [s.kind for s in declared.signals]
+    noise = [s.noise for s in declared.signals]
+    assert [s.noise for s in found.signals] == pytest.approx(noise)
+    for a, b in zip(found.chambers, declared.chambers, strict=True):
+        assert (a.name, a.pressure, a.sign) == (b.name, b.pressure, b.sign)
+        assert (a.area_m2, a.v0_m3) == pytest.approx((b.area_m2, b.v0_m3), rel=1e-12)
+    for e, f in zip(found.edges, declared.edges, strict=True):
+        assert (e.name, e.source, e.sink, e.command) == (f.name, f.source, f.sink, f.command)
+        assert (e.direction, e.safe_band_v) == (f.direction, f.safe_band_v)
+        assert np.array_equal(e.grid.u_v, f.grid.u_v)
+        assert np.allclose(e.grid.dp_pa, f.grid.dp_pa, rtol=1e-9, atol=1e-3)
+        assert e.rated_q_m3s == pytest.approx(f.rated_q_m3s)
+    assert found.beta_nominal_pa == pytest.approx(declared.beta_nominal_pa)
+    assert found.lag.nominal_s == pytest.approx(declared.lag.nominal_s)
+    assert found.lag.tolerance_s == pytest.approx(declared.lag.tolerance_s)
+
+
+@pytest.mark.parametrize("cross_port", [False, True])
+def test_log_and_project_give_the_samples_back(tmp_path: Path, cross_port: bool) -> None:
+    trace = tmp_path / "run.log"
+    extra = ["--cross-port"] if cross_port else []
+    call(trace, "--plant", 7, "--motion", "rich", "--duration", 1, "--seed", 3, *extra)
+    plant = draw(7, cross_port=cross_port)
+    expected = run_machine(plant, "rich", 3, 1.0).samples
+    loaded = project.load(trace.with_suffix(".toml"))
+    assert_same_machine(loaded.model, declared_model(plant, seed=3))
+    with can.LogReader(trace) as reader:
+        samples = Assembler(load_catalog(), loaded.assembly).push(from_messages(reader))
+    assert samples.names == expected.names
+    assert np.array_equal(samples.t_us, START_US + expected.t_us)
+    assert np.allclose(samples.values, expected.values, rtol=1e-12, atol=1e-12)
+    assert np.array_equal(samples.flags, expected.flags)
+
+
+def test_table(tmp_path: Path) -> None:
+    trace = tmp_path / "run.parquet"
+    call(trace, "--duration", 0.5)
+    table = pyarrow.parquet.read_table(trace)
+    expected = run_machine(Plant(), "sweep", 0, 0.5).samples
+    assert table.schema.field("p_a").metadata == {b"unit": b"Pa"}
+    for name in expected.names:
+        assert np.array_equal(table[name].to_numpy(), expected.column(name))
+    assert project.load(trace.with_suffix(".toml")).table_assembly is not None
+
+
+def test_truth(tmp_path: Path) -> None:
+    trace = tmp_path / "run.blf"
+    said = json.loads(call(trace, "--plant", 4, "--duration", 0.1, "--json"))
+    truth = json.loads((tmp_path / "run.truth.json").read_text())
+    plant = draw(4)
+    assert truth["beta_pa"] == said["beta_pa"] == plant.beta_pa
+    maps = truth["maps"]
+    for edge in plant.edges:
+        expected = plant.flow(edge, maps["u_v"][20], maps["dp_pa"][5])
+        assert maps["q_m3s"][edge][20][5] == pytest.approx(float(expected))
+    assert {Path(f).name for f in said["files"]} == {"run.blf", "run.truth.json", "run.toml"}
+
+
+def test_live_on_a_bus() -> None:
+    with can.Bus("sim-live", interface="virtual") as receiver:
+        output = call("--bus", "virtual", "--channel", "sim-live", "--duration", 0.05, "--speed", 0)
+        assert "sent 150 frames" in output
+        first = receiver.recv(0.0)
+        assert first is not None and first.timestamp == START_US * 1e-6
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ([], "nothing to do"),
+        (["run.mat"], "unknown kind of trace"),
+        (["no/such/run.blf"], "no such folder"),
+        (["run.blf", "--motion", "dance"], "--motion dance"),
+        (["run.blf", "--cross-port"], "--cross-port"),
+        (["--bus", "pcan", "--channel", "PCAN_USBBUS1", "--duration", "0.1"], "must not speak"),
+    ],
+)
+def test_wrong_arguments(arguments: list[str], said: str) -> None:
+    with pytest.raises(RtidError, match=said) as caught:
+        CliRunner().invoke(APP, arguments, catch_exceptions=False)
+    assert caught.value.exit_code == 2 and caught.value.remedy
+
+
+def test_the_command_is_listed() -> None:
+    program = "from rtid.cli.main import run; run(['simulate', '--help'])"
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0 and "--plant" in done.stdout
