@@ -38,8 +38,8 @@ $(READY): requirements.lock pyproject.toml
 	       "(Debian: apt install python3-venv)"; exit 1; }
 	@echo "Setting up .venv (once; about a minute) ..."
 	@$(PYTHON) -m venv --clear .venv
-	@$(PIP) install --quiet -r requirements.lock
-	@$(PIP) install --quiet --no-deps --no-build-isolation --editable .
+	@$(PIP) install -qq -r requirements.lock
+	@$(PIP) install -qq --no-deps --no-build-isolation --editable .
 	@touch $@
 
 # The newest versions that pyproject.toml admits, for the core and [dev].
