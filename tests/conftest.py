@@ -19,8 +19,11 @@ SHARED = Path(__file__).parents[1].parent / "shared"
 
 
 @pytest.fixture(autouse=True)
-def no_real_bus(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Fail the test that sends on anything but a virtual or udp_multicast bus, even in a thread."""
+def no_real_bus(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    """Fail the test that sends on anything but a virtual or udp_multicast bus, even in a thread.
+
+    Yields the frames that were caught.
+    """
     sent: list[str] = []
     opened = can.BusABC.__init__
 
@@ -34,7 +37,7 @@ def no_real_bus(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         raise AssertionError(f"a test sends on a real bus: {message}")
 
     monkeypatch.setattr(can.BusABC, "__init__", spied_init)
-    yield
+    yield sent
     assert not sent, f"sent on a real bus: {sent}"
 
 

@@ -27,6 +27,7 @@ COMMANDS = {
     "export": "Write the learned maps as CSV, JSON or npz.",
 }
 
+OUR_PACKAGES = ("rtid", "firmware_bridge")  # their own error classes are meant for the user
 EPILOG = "Exit codes: 0 ok, 1 internal error, 2 usage or project file, 3 input, 4 negative result."
 
 
@@ -85,10 +86,10 @@ def run(arguments: Sequence[str]) -> NoReturn:
             raise
         _refuse(f"{error.filename}: {error.strerror}", "", Exit.INPUT)
     except Exception as error:
-        # Any error that carries an exit code is meant for the user, of whichever package it is.
-        if not hasattr(error, "exit_code"):
+        if type(error).__module__.split(".")[0] not in OUR_PACKAGES:
             raise
-        _refuse(str(error), getattr(error, "remedy", ""), error.exit_code)
+        code = getattr(error, "exit_code", Exit.INPUT)
+        _refuse(str(error), getattr(error, "remedy", ""), code)
     sys.exit(Exit.OK)
 
 

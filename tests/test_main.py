@@ -1,0 +1,111 @@
+"""The command line as a whole: what it loads, how it ends, and the guard of the tests' bus."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import can
+import pytest
+
+import rtid
+from firmware_bridge.catalog import CatalogError
+from rtid.cli import main
+from rtid.cli.exits import Exit
+from rtid.errors import RtidError
+
+ROOT = Path(__file__).parents[1]
+
+
+def ends(arguments: list[str]) -> int:
+    with pytest.raises(SystemExit) as end:
+        main.run(arguments)
+    return int(end.value.code or 0)
+
+
+def test_version_and_help_load_neither_numba_nor_a_bus() -> None:
+    code = (
+        "import sys\nfrom rtid.cli.main import main\n"
+        "try: main()\n"
+        "finally: print('loaded:', sorted({'numba', 'can', 'numpy', 'scipy'} & set(sys.modules)))"
+    )
+    for argument in ("--help", "--version"):
+        command = [sys.executable, "-c", code, argument]
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+        assert done.stdout.endswith("loaded: []\n")
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert ends(["--version"]) == Exit.OK
+    assert capsys.readouterr().out == f"rtid {rtid.__version__}\n"
+
+
+@pytest.mark.parametrize("arguments", [["no-such-command"], ["--no-such-option"]])
+def test_wrong_usage(arguments: list[str]) -> None:
+    assert ends(arguments) == Exit.USAGE
+
+
+def test_every_listed_command_has_its_function() -> None:
+    for name in main.COMMANDS:
+        if find_spec(f"rtid.cli.{name}"):
+            assert main.build([name, "--help"]).registered_commands
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "message"),
+    [
+        (RtidError("no wanted frame", "name the channel"), Exit.INPUT, "-> name the channel"),
+        (RtidError("key beta: unknown", exit_code=Exit.USAGE), Exit.USAGE, "key beta: unknown"),
+        (CatalogError("the DBC has no message"), Exit.INPUT, "rtid: the DBC has no message"),
+        (FileNotFoundError(2, "No such file", "trace.blf"), Exit.INPUT, "trace.blf: No such file"),
+        (KeyboardInterrupt(), Exit.INTERRUPTED, ""),
+    ],
+)
+def test_an_expected_error_is_one_plain_message(
+    error: BaseException,
+    code: int,
+    message: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def fail() -> None:
+        raise error
+
+    monkeypatch.setattr(main, "find_spec", lambda name: name.endswith(".demo"))
+    monkeypatch.setattr(main, "_function", lambda name: fail)
+    assert ends(["demo"]) == code
+    printed = capsys.readouterr().err
+    assert message in printed
+    assert "Traceback" not in printed
+
+
+def test_an_unexpected_error_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail() -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(main, "find_spec", lambda name: name.endswith(".demo"))
+    monkeypatch.setattr(main, "_function", lambda name: fail)
+    with pytest.raises(ZeroDivisionError):
+        main.run(["demo"])
+
+
+class RealBus(can.BusABC):
+    """Stands for a bus with hardware behind it."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        self.reached_the_wire = 0
+        super().__init__(channel="can0", **kwargs)
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        self.reached_the_wire += 1
+
+
+def test_no_test_can_send_on_a_real_bus(no_real_bus: list[str]) -> None:
+    with RealBus() as bus, pytest.raises(AssertionError, match="real bus"):
+        bus.send(can.Message(arbitration_id=1))
+    assert bus.reached_the_wire == 0
+    assert len(no_real_bus) == 1
+    no_real_bus.clear()
