@@ -1,0 +1,103 @@
+"""Read a trace for judging: every signal at its own instants, and the samples that they make."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_bridge.catalog import Catalog
+from firmware_bridge.config import Assembly, MessageSource, SignalSource
+from firmware_bridge.frames import Frames
+from firmware_bridge.samples import Samples
+from firmware_bridge.sources import open_log
+from firmware_bridge.sources.table import to_samples
+from rtid.check.series import Series
+from rtid.check.timing import Timing, timing
+from rtid.errors import RtidError
+from rtid.project import Project
+from rtid.project.table import is_table, open_table
+from rtid.replay import assemble, catalog_of
+
+
+@dataclass(frozen=True)
+class Trace:
+    """A trace as declared: raw series per signal, timing per message, complete samples.
+
+    A table has one "message", called after its file.  `refused` counts by reason.
+    """
+
+    path: Path
+    series: tuple[Series, ...]
+    messages: dict[str, Timing]
+    samples: Samples
+    refused: dict[str, int]
+    is_table: bool
+
+
+def read_trace(project: Project, path: Path) -> Trace:
+    """Read a CAN log or a table; RtidError if it holds nothing wanted, or the readers' errors."""
+    return _from_table(project, path) if is_table(path) else _from_log(project, path)
+
+
+def _from_table(project: Project, path: Path) -> Trace:
+    assembly = project.table_assembly
+    if assembly is None:
+        remedy = 'add column = "..." to every signal, or give a CAN log'
+        raise RtidError(f"{path} is a table, but the project names no columns", remedy)
+    table = open_table(project, path)
+    samples, refused = to_samples(table, assembly)
+    t_us = table.t_us()
+    series = tuple(
+        Series(source.name, t_us, _si(table.column(source.signal), source))
+        for source in assembly.signals
+        if source.constant is None
+    )
+    return Trace(path, series, {path.name: timing(t_us)}, samples, refused, True)
+
+
+def _from_log(project: Project, path: Path) -> Trace:
+    catalog, frames, assembly = catalog_of(project), open_log(path), project.assembly
+    chosen = {m.name: _frames_of(frames, m, catalog) for m in assembly.messages}
+    if not any(len(found) for found in chosen.values()):
+        raise RtidError(*_nothing_wanted(path, frames, assembly, catalog))
+    series = [s for m in assembly.messages for s in _series(chosen[m.name], m, assembly, catalog)]
+    samples, refused = assemble(catalog, assembly, frames)
+    timings = {name: timing(found.t_us) for name, found in chosen.items()}
+    return Trace(path, tuple(series), timings, samples, refused, False)
+
+
+def _frames_of(frames: Frames, message: MessageSource, catalog: Catalog) -> Frames:
+    wanted = frames.can_id == catalog.can_id(message.name)
+    if message.channel is not None:
+        wanted &= frames.channel == message.channel
+    return frames[wanted & (frames.length == catalog.message(message.name).length)]
+
+
+def _series(
+    frames: Frames, message: MessageSource, assembly: Assembly, catalog: Catalog
+) -> list[Series]:
+    sources = [s for s in assembly.signals if s.message == message.name and s.constant is None]
+    layouts = catalog.layouts(message.name, list(dict.fromkeys(s.signal for s in sources)))
+    values = layouts.decode(frames.data)
+    columns = {name: values[:, k] for k, name in enumerate(layouts.names)}
+    return [Series(s.name, frames.t_us, _si(columns[s.signal], s)) for s in sources]
+
+
+def _si(value: NDArray[np.float64], source: SignalSource) -> NDArray[np.float64]:
+    if source.table is not None:
+        return np.interp(value, *source.table)
+    return source.factor * value + source.offset
+
+
+def _nothing_wanted(
+    path: Path, frames: Frames, assembly: Assembly, catalog: Catalog
+) -> tuple[str, str]:
+    """Message and remedy for a log without any frame that the project asks for."""
+    ids = [f"{m.name} 0x{catalog.can_id(m.name) & 0x1FFFFFFF:X}" for m in assembly.messages]
+    seen = sorted({int(i) & 0x1FFFFFFF for i in np.unique(frames.can_id)})
+    shown = ", ".join(f"0x{i:X}" for i in seen[:8]) + (", ..." if len(seen) > 8 else "")
+    text = f"{path}: none of {len(frames)} frames is wanted ({', '.join(ids)})"
+    return text, f"the log holds {shown or 'nothing'}: is it the right DBC, channel and log?"
