@@ -13,6 +13,7 @@ from firmware_bridge import checks, cycle, multirate
 from firmware_bridge.catalog import Catalog
 from firmware_bridge.config import CYCLE, MULTIRATE, Assembly, MessageSource, SignalSource
 from firmware_bridge.frames import Frames, add_counts
+from firmware_bridge.jit import Record, Records
 from firmware_bridge.samples import Samples
 
 MAX_MESSAGES = 63
@@ -67,7 +68,8 @@ class Assembler:
         """The samples that became complete with these frames (n frames, in order of arrival)."""
         add_counts(self._source_counts, frames.refused)
         words = np.ascontiguousarray(frames.data).view("<u8")[:, 0]
-        arrays = (frames.t_us, frames.channel, frames.can_id, frames.length, words)
+        columns = (frames.t_us, frames.channel, frames.can_id, frames.length, words)
+        arrays = tuple(np.ascontiguousarray(column) for column in columns)
         if self._cycle is not None:
             return self._push_cycle(arrays)
         return self._push_multirate(arrays)
@@ -183,7 +185,7 @@ def _plan(catalog: Catalog, assembly: Assembly) -> checks.Plan:
     )  # fmt: skip
 
 
-def _shifted(rows: NDArray[np.void], n_layouts: int, n_codes: int) -> NDArray[np.void]:
+def _shifted(rows: Records, n_layouts: int, n_codes: int) -> Records:
     """Layout rows whose references point into the common arrays."""
     rows = rows.copy()
     rows["selector"][rows["selector"] >= 0] += n_layouts
@@ -214,8 +216,8 @@ def _check_assembly(assembly: Assembly) -> None:
 
 
 def _fill_message(
-    row: np.void, catalog: Catalog, source: MessageSource, assembly: Assembly,
-    layouts: NDArray[np.void],
+    row: Record, catalog: Catalog, source: MessageSource, assembly: Assembly,
+    layouts: Records,
 ) -> None:  # fmt: skip
     """Set one MESSAGE row (changed in place)."""
     if not source.period_s > 0:
@@ -236,7 +238,7 @@ def _fill_message(
         row["counter_mask"] = (1 << length) - 1
 
 
-def _role(signal: SignalSource, assembly: Assembly, layout: int, table_first: int) -> np.void:
+def _role(signal: SignalSource, assembly: Assembly, layout: int, table_first: int) -> Record:
     role = np.zeros(1, checks.ROLE)[0]
     role["layout"], role["column"] = layout, assembly.signals.index(signal)
     role["factor"], role["offset"] = signal.factor, signal.offset

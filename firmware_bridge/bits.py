@@ -7,8 +7,9 @@ in either the signal is raw = (word >> shift) & (2^length - 1), value = raw * sc
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from firmware_bridge.jit import Integer, Record, Records, inlined, kernel
 
 UNSIGNED, SIGNED, FLOAT32, FLOAT64 = 0, 1, 2, 3
 
@@ -31,7 +32,7 @@ LAYOUT = np.dtype(
 )
 
 
-@njit(cache=True)
+@inlined
 def swap_bytes(word: np.uint64) -> np.uint64:
     """The same 8 bytes in the other order."""
     low = np.uint64(0x00FF00FF00FF00FF)
@@ -41,8 +42,8 @@ def swap_bytes(word: np.uint64) -> np.uint64:
     return (word >> np.uint64(32)) | (word << np.uint64(32))
 
 
-@njit(cache=True)
-def raw_bits(word: np.uint64, row: np.void) -> np.uint64:
+@inlined
+def raw_bits(word: np.uint64, row: Record) -> np.uint64:
     """The bits of one signal, right-aligned."""
     if row.big_endian:
         word = swap_bytes(word)
@@ -50,8 +51,8 @@ def raw_bits(word: np.uint64, row: np.void) -> np.uint64:
     return (word >> np.uint64(row.shift)) & mask
 
 
-@njit(cache=True)
-def raw_number(bits: np.uint64, row: np.void) -> float:
+@inlined
+def raw_number(bits: np.uint64, row: Record) -> float:
     """The bits as a number, before scaling."""
     if row.kind == UNSIGNED:
         return np.float64(bits)
@@ -63,8 +64,8 @@ def raw_number(bits: np.uint64, row: np.void) -> float:
     return np.float64(np.int64(bits << np.uint64(shift)) >> shift)
 
 
-@njit(cache=True)
-def contains(codes: NDArray[np.uint64], first: int, count: int, bits: np.uint64) -> bool:
+@inlined
+def contains(codes: NDArray[np.uint64], first: Integer, count: Integer, bits: np.uint64) -> bool:
     """Whether `bits` is one of codes[first : first + count]."""
     for k in range(first, first + count):
         if codes[k] == bits:
@@ -72,10 +73,8 @@ def contains(codes: NDArray[np.uint64], first: int, count: int, bits: np.uint64)
     return False
 
 
-@njit(cache=True)
-def selected(
-    word: np.uint64, layouts: NDArray[np.void], k: int, codes: NDArray[np.uint64]
-) -> bool:
+@inlined
+def selected(word: np.uint64, layouts: Records, k: Integer, codes: NDArray[np.uint64]) -> bool:
     """Whether all multiplexers above signal k select it in this payload."""
     while layouts[k].selector >= 0:
         above = layouts[k].selector
@@ -86,10 +85,8 @@ def selected(
     return True
 
 
-@njit(cache=True)
-def decode_one(
-    word: np.uint64, layouts: NDArray[np.void], k: int, codes: NDArray[np.uint64]
-) -> float:
+@inlined
+def decode_one(word: np.uint64, layouts: Records, k: Integer, codes: NDArray[np.uint64]) -> float:
     """Physical value of signal k; NaN where it is marked as not available or out of range."""
     row = layouts[k]
     bits = raw_bits(word, row)
@@ -99,23 +96,40 @@ def decode_one(
     return value if row.minimum <= value <= row.maximum else np.nan
 
 
-@njit(cache=True)
+@inlined
+def _decode_integers(words: NDArray[np.uint64], row: Record, out: NDArray[np.float64]) -> None:
+    """`decode_one` of a plain integer signal for all words, free of branches; out (n,) changed."""
+    shift, big_endian = np.uint64(row.shift), row.big_endian
+    mask = np.uint64(0xFFFFFFFFFFFFFFFF) >> np.uint64(64 - row.length)
+    sign = np.uint64(1) << np.uint64(row.length - 1) if row.kind == SIGNED else np.uint64(0)
+    scale, offset, minimum, maximum = row.scale, row.offset, row.minimum, row.maximum
+    for i in range(len(words)):
+        word = swap_bytes(words[i]) if big_endian else words[i]
+        raw = np.int64((((word >> shift) & mask) ^ sign) - sign)
+        value = raw * scale + offset
+        out[i] = value if minimum <= value <= maximum else np.nan
+
+
+@kernel
 def decode_words(
-    words: NDArray[np.uint64], layouts: NDArray[np.void], n_signals: int, codes: NDArray[np.uint64]
+    words: NDArray[np.uint64], layouts: Records, n_signals: Integer, codes: NDArray[np.uint64]
 ) -> NDArray[np.float64]:
-    """Values float64 (n, n_signals) of n payloads; NaN where absent or not selected."""
-    out = np.empty((len(words), n_signals))
+    """Values float64 (n_signals, n) of n payloads; NaN where absent or not selected."""
+    out = np.empty((n_signals, len(words)))
     for k in range(n_signals):
+        row = layouts[k]
+        plain = row.selector < 0 and row.absent_count == 0
+        if plain and (row.kind == SIGNED or (row.kind == UNSIGNED and row.length < 64)):
+            _decode_integers(words, row, out[k])
+            continue
         for i in range(len(words)):
-            if layouts[k].selector >= 0 and not selected(words[i], layouts, k, codes):
-                out[i, k] = np.nan
-            else:
-                out[i, k] = decode_one(words[i], layouts, k, codes)
+            known = selected(words[i], layouts, k, codes)
+            out[k, i] = decode_one(words[i], layouts, k, codes) if known else np.nan
     return out
 
 
-@njit(cache=True)
-def to_bits(value: float, row: np.void) -> np.uint64:
+@inlined
+def to_bits(value: float, row: Record) -> np.uint64:
     """Raw bits of a physical value: saturating; NaN becomes the code for not available."""
     ones = np.uint64(0xFFFFFFFFFFFFFFFF) >> np.uint64(64 - row.length)
     if row.kind == FLOAT64:
@@ -125,7 +139,9 @@ def to_bits(value: float, row: np.void) -> np.uint64:
     top = np.uint64(1) << np.uint64(row.length - 1)
     if np.isnan(value):
         return ones if row.kind == UNSIGNED else top
-    raw = np.rint((min(max(value, row.minimum), row.maximum) - row.offset) / row.scale)
+    low, high = (row.minimum - row.offset) / row.scale, (row.maximum - row.offset) / row.scale
+    raw = np.rint((value - row.offset) / row.scale)
+    raw = min(max(raw, np.ceil(min(low, high))), np.floor(max(low, high)))
     if row.kind == UNSIGNED:
         return ones if raw >= np.float64(ones) else np.uint64(max(raw, 0.0))
     if raw >= np.float64(top):
@@ -133,10 +149,8 @@ def to_bits(value: float, row: np.void) -> np.uint64:
     return np.uint64(np.int64(max(raw, -np.float64(top)))) & ones
 
 
-@njit(cache=True)
-def encode_words(
-    values: NDArray[np.float64], layouts: NDArray[np.void], words: NDArray[np.uint64]
-) -> None:
+@kernel
+def encode_words(values: NDArray[np.float64], layouts: Records, words: NDArray[np.uint64]) -> None:
     """Put values float64 (n, m) of the first m layouts into words uint64 (n,), changed in place."""
     for k in range(values.shape[1]):
         row = layouts[k]

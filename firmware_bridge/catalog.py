@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import cantools
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from firmware_bridge import bits
 from firmware_bridge.config import MessageSource
 from firmware_bridge.frames import EXTENDED, MAX_LENGTH
+from firmware_bridge.jit import Record, Records
 
 CONTROLLER_DBC = Path(__file__).with_name("controller.dbc")
 MAX_FILE_BYTES = 16 << 20  # a hostile file must not cost minutes or gigabytes
@@ -37,13 +39,14 @@ class Layouts:
     """
 
     names: tuple[str, ...]
-    rows: NDArray[np.void]
+    rows: Records
     codes: NDArray[np.uint64]
 
     def decode(self, data: NDArray[np.uint8]) -> NDArray[np.float64]:
         """Values float64 (n, len(names)) of payloads uint8 (n, 8); NaN where not available."""
         words = np.ascontiguousarray(data).view("<u8")[:, 0]
-        return bits.decode_words(words, self.rows, len(self.names), self.codes)
+        values = bits.decode_words(words, self.rows, len(self.names), self.codes)
+        return cast("NDArray[np.float64]", values.T)
 
     def encode(self, values: NDArray[np.float64]) -> NDArray[np.uint8]:
         """Payloads uint8 (n, 8) from values (n, len(names)): saturating, NaN = not available."""
@@ -76,7 +79,9 @@ class Catalog:
         """One signal; CatalogError with the nearest name if the message has none such."""
         known = {s.name: s for s in self.message(message).signals}
         if signal not in known:
-            raise CatalogError(f"message {message!r} has no signal {signal!r}{_nearest(signal, known)}")
+            raise CatalogError(
+                f"message {message!r} has no signal {signal!r}{_nearest(signal, known)}"
+            )
         return known[signal]
 
     def can_id(self, message: str) -> int:
@@ -151,7 +156,7 @@ def _nearest(name: str, known: Iterable[str]) -> str:
 
 
 def _fill_row(
-    row: np.void, signal: Signal, names: list[str], codes: list[int], message: str
+    row: Record, signal: Signal, names: list[str], codes: list[int], message: str
 ) -> None:
     """Set one LAYOUT row (changed in place) and append its codes."""
     where = f"{message}.{signal.name}"

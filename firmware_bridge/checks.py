@@ -11,10 +11,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from firmware_bridge import bits, e2e
+from firmware_bridge.jit import Integer, Record, Records, inlined
 
 REASONS = (
     "unknown_id",  # not a declared message: foreign traffic
@@ -74,16 +74,16 @@ class Plan(NamedTuple):
     `firmware_bridge.bits`; table_x, table_y: float64, all role tables one after the other.
     """
 
-    messages: NDArray[np.void]
-    roles: NDArray[np.void]
-    layouts: NDArray[np.void]
+    messages: Records
+    roles: Records
+    layouts: Records
     codes: NDArray[np.uint64]
     table_x: NDArray[np.float64]
     table_y: NDArray[np.float64]
 
 
-@njit(cache=True)
-def find_message(messages: NDArray[np.void], can_id: np.uint32, channel: np.uint8) -> int:
+@inlined
+def find_message(messages: Records, can_id: np.uint32, channel: np.uint8) -> Integer:
     """Index of the declared message with this identifier and channel; -1 if there is none."""
     for m in range(len(messages)):
         row = messages[m]
@@ -92,10 +92,10 @@ def find_message(messages: NDArray[np.void], can_id: np.uint32, channel: np.uint
     return -1
 
 
-@njit(cache=True)
+@inlined
 def check_sequence(
-    row: np.void, last: np.void, t_us: int, counter: int, counts: NDArray[np.int64]
-) -> int:
+    row: Record, last: Record, t_us: Integer, counter: Integer, counts: NDArray[np.int64]
+) -> Integer:
     """OK or the reason against this frame, by its counter (-1: none) and time stamp."""
     if not last.seen:
         return OK
@@ -111,7 +111,7 @@ def check_sequence(
     return OUT_OF_ORDER if dt <= 0 else OK
 
 
-@njit(cache=True)
+@inlined
 def interpolate(x: float, xs: NDArray[np.float64], ys: NDArray[np.float64]) -> float:
     """`numpy.interp` of one value; NaN stays NaN."""
     if x <= xs[0]:
@@ -124,8 +124,8 @@ def interpolate(x: float, xs: NDArray[np.float64], ys: NDArray[np.float64]) -> f
     return ys[k] + (ys[k + 1] - ys[k]) / (xs[k + 1] - xs[k]) * (x - xs[k])
 
 
-@njit(cache=True)
-def read_roles(plan: Plan, row: np.void, word: np.uint64, values: NDArray[np.float64]) -> int:
+@inlined
+def read_roles(plan: Plan, row: Record, word: np.uint64, values: NDArray[np.float64]) -> Integer:
     """SI values of the message's roles into values[:n_roles] (changed in place); OK or reason."""
     for i in range(row.n_roles):
         role = plan.roles[row.first_role + i]
@@ -142,17 +142,17 @@ def read_roles(plan: Plan, row: np.void, word: np.uint64, values: NDArray[np.flo
     return OK
 
 
-@njit(cache=True)
+@inlined
 def admit(
     plan: Plan,
-    m: int,
-    last: NDArray[np.void],
-    t_us: int,
-    length: int,
+    m: Integer,
+    last: Records,
+    t_us: Integer,
+    length: Integer,
     word: np.uint64,
     values: NDArray[np.float64],
     counts: NDArray[np.int64],
-) -> int:
+) -> Integer:
     """Check one frame of message m; OK, or the reason against it (counted).
 
     Changed in place: last (LAST, per message), values (roles of m, SI), counts.  A frame whose

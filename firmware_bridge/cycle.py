@@ -11,10 +11,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from firmware_bridge import checks
+from firmware_bridge.jit import Integer, Record, Records, inlined, kernel
 from firmware_bridge.samples import GAP, ROW
 
 SLOT = np.dtype(
@@ -37,38 +37,36 @@ class State(NamedTuple):
     progress: PROGRESS (1,); scratch: float64 (roles,).
     """
 
-    last: NDArray[np.void]
-    slots: NDArray[np.void]
+    last: Records
+    slots: Records
     values: NDArray[np.float64]
-    progress: NDArray[np.void]
+    progress: Records
     scratch: NDArray[np.float64]
 
 
-@njit(cache=True)
-def _open_slot(slot: np.void, progress: np.void, t_us: int) -> None:
+@inlined
+def _open_slot(slot: Record, progress: Record, t_us: Integer) -> None:
     progress.opened += 1
     slot.open, slot.jump, slot.mask = True, False, np.uint64(0)
     slot.order, slot.first_us, slot.row_us = progress.opened, t_us, t_us
 
 
-@njit(cache=True)
-def _is_stale(slot: np.void, bit: np.uint64, t_us: int, lifetime_us: int) -> bool:
+@inlined
+def _is_stale(slot: Record, bit: np.uint64, t_us: Integer, lifetime_us: Integer) -> bool:
     """Whether an open slot belongs to an earlier cycle than this frame."""
     return abs(t_us - slot.first_us) > lifetime_us or (slot.mask & bit) != 0
 
 
-@njit(cache=True)
-def _close_older(slots: NDArray[np.void], order: int, counts: NDArray[np.int64]) -> None:
+@inlined
+def _close_older(slots: Records, order: Integer, counts: NDArray[np.int64]) -> None:
     for k in range(len(slots)):
         if slots[k].open and slots[k].order < order:
             slots[k].open = False
             counts[checks.INCOMPLETE_CYCLE] += 1
 
 
-@njit(cache=True)
-def _flags(
-    progress: np.void, slot: np.void, late_us: int, counts: NDArray[np.int64]
-) -> int:
+@inlined
+def _flags(progress: Record, slot: Record, late_us: Integer, counts: NDArray[np.int64]) -> Integer:
     """Flags of the sample that this slot yields."""
     if progress.started:
         if slot.row_us - progress.t_us <= late_us and not slot.jump:
@@ -77,7 +75,7 @@ def _flags(
     return ROW | GAP
 
 
-@njit(cache=True)
+@kernel
 def push(
     plan: checks.Plan,
     state: State,
@@ -86,13 +84,13 @@ def push(
     can_id: NDArray[np.uint32],
     length: NDArray[np.uint8],
     words: NDArray[np.uint64],
-    row_message: int,
-    lifetime_us: int,
+    row_message: Integer,
+    lifetime_us: Integer,
     counts: NDArray[np.int64],
     out_t_us: NDArray[np.int64],
     out_values: NDArray[np.float64],
     out_flags: NDArray[np.uint8],
-) -> int:
+) -> Integer:
     """Run n frames through the assembly; the number of samples written to out_*.
 
     Changed in place: state, counts (REASONS,), out_* (room for n samples).
@@ -139,7 +137,7 @@ def push(
     return n_out
 
 
-@njit(cache=True)
+@kernel
 def finish(state: State, counts: NDArray[np.int64]) -> None:
     """Count the cycles that are still open and close them; state and counts changed in place."""
     _close_older(state.slots, np.iinfo(np.int64).max, counts)

@@ -7,8 +7,9 @@ payload bytes but its own, with start and XOR value 0.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from firmware_bridge.jit import Integer, inlined, kernel
 
 POLYNOMIAL = 0x1D
 
@@ -23,8 +24,8 @@ def _table() -> NDArray[np.uint8]:
 TABLE = _table()
 
 
-@njit(cache=True)
-def crc8(word: np.uint64, length: int, crc_byte: int, data_id: int) -> int:
+@inlined
+def crc8(word: np.uint64, length: Integer, crc_byte: Integer, data_id: Integer) -> Integer:
     """CRC of one payload (bytes as a little-endian word), leaving out byte `crc_byte`."""
     crc = TABLE[data_id & 0xFF]
     crc = TABLE[crc ^ np.uint8((data_id >> 8) & 0xFF)]
@@ -34,9 +35,9 @@ def crc8(word: np.uint64, length: int, crc_byte: int, data_id: int) -> int:
     return int(crc)
 
 
-@njit(cache=True)
+@kernel
 def crc8_bulk(
-    data: NDArray[np.uint8], length: int, crc_byte: int, data_id: int
+    data: NDArray[np.uint8], length: Integer, crc_byte: Integer, data_id: Integer
 ) -> NDArray[np.uint8]:
     """CRCs of n payloads uint8 (n, 8) of the same message; uint8 (n,)."""
     out = np.empty(data.shape[0], np.uint8)

@@ -96,11 +96,11 @@ def add_counts(total: dict[str, int], more: dict[str, int]) -> None:
             total[reason] = total.get(reason, 0) + count
 
 
-def channel_number(channel: int | str | None) -> int:
+def channel_number(channel: int | str | Sequence[int] | None) -> int:
     """0..255 for a python-can channel: 3 and "can3" are 3, a name without a number is 0."""
     if isinstance(channel, int):
         return channel & 0xFF
-    name = channel or ""
+    name = channel if isinstance(channel, str) else ""
     digits = name[len(name.rstrip("0123456789")) :]
     return int(digits) & 0xFF if digits else 0
 
@@ -115,15 +115,16 @@ def from_messages(messages: Iterable[can.Message]) -> Frames:
             refused[reason] = refused.get(reason, 0) + 1
         else:
             kept.append(message)
-    frames = empty(len(kept))
-    frames.refused.update(refused)
-    for k, message in enumerate(kept):
-        frames.t_us[k] = round(message.timestamp * 1e6)
-        frames.channel[k] = channel_number(message.channel)
-        frames.can_id[k] = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
-        frames.length[k] = len(message.data)
-        frames.data[k, : len(message.data)] = message.data
-    return frames
+    ids = [m.arbitration_id | (EXTENDED if m.is_extended_id else 0) for m in kept]
+    data = b"".join([bytes(m.data).ljust(MAX_LENGTH, b"\0") for m in kept])
+    return Frames(
+        np.array([round(m.timestamp * 1e6) for m in kept], np.int64),
+        np.array([channel_number(m.channel) for m in kept], np.uint8),
+        np.array(ids, np.uint32),
+        np.array([len(m.data) for m in kept], np.uint8),
+        np.frombuffer(bytearray(data), np.uint8).reshape(-1, MAX_LENGTH),  # writable
+        refused,
+    )
 
 
 def _refusal(message: can.Message) -> str:

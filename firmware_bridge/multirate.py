@@ -16,10 +16,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from firmware_bridge import checks
+from firmware_bridge.jit import Integer, Records, inlined, kernel
 from firmware_bridge.samples import GAP, ROW
 
 QUEUE = np.dtype([("head", np.int64), ("count", np.int64), ("left", np.int64)])
@@ -38,18 +38,20 @@ class State(NamedTuple):
     new_row: float64 (columns,), the one in the making; scratch: float64 (roles,).
     """
 
-    last: NDArray[np.void]
-    queues: NDArray[np.void]
+    last: Records
+    queues: Records
     times: NDArray[np.int64]
     values: NDArray[np.float64]
-    pending: NDArray[np.void]
+    pending: Records
     row: NDArray[np.float64]
     new_row: NDArray[np.float64]
     scratch: NDArray[np.float64]
 
 
-@njit(cache=True)
-def _append(state: State, m: int, t_us: int, n_roles: int, counts: NDArray[np.int64]) -> None:
+@inlined
+def _append(
+    state: State, m: Integer, t_us: Integer, n_roles: Integer, counts: NDArray[np.int64]
+) -> None:
     """Put the scratch values of message m into its queue; a full queue loses its oldest."""
     queue, capacity = state.queues[m], state.times.shape[1]
     if queue.count == capacity:
@@ -64,8 +66,8 @@ def _append(state: State, m: int, t_us: int, n_roles: int, counts: NDArray[np.in
     queue.count += 1
 
 
-@njit(cache=True)
-def _next_instant(state: State) -> int:
+@inlined
+def _next_instant(state: State) -> Integer:
     """Earliest sample that every message has reached; -1 while one has not."""
     earliest = np.iinfo(np.int64).max
     for m in range(len(state.queues)):
@@ -77,8 +79,8 @@ def _next_instant(state: State) -> int:
     return earliest
 
 
-@njit(cache=True)
-def _advance(state: State, m: int, t_us: int) -> bool:
+@inlined
+def _advance(state: State, m: Integer, t_us: Integer) -> bool:
     """Make message m's sample at this instant, if there is one, its left neighbour."""
     queue, capacity = state.queues[m], state.times.shape[1]
     if state.times[m, (queue.head + queue.left) % capacity] != t_us:
@@ -89,8 +91,8 @@ def _advance(state: State, m: int, t_us: int) -> bool:
     return True
 
 
-@njit(cache=True)
-def _evaluate(plan: checks.Plan, state: State, m: int, t_us: int) -> int:
+@inlined
+def _evaluate(plan: checks.Plan, state: State, m: Integer, t_us: Integer) -> Integer:
     """Values of message m at this instant into new_row; OK, UNPAIRED or SILENT."""
     queue, capacity, row = state.queues[m], state.times.shape[1], plan.messages[m]
     if queue.left == 0:
@@ -110,8 +112,8 @@ def _evaluate(plan: checks.Plan, state: State, m: int, t_us: int) -> int:
     return checks.OK
 
 
-@njit(cache=True)
-def _take_instant(plan: checks.Plan, state: State, t_us: int, row_message: int) -> int:
+@inlined
+def _take_instant(plan: checks.Plan, state: State, t_us: Integer, row_message: Integer) -> Integer:
     """Fill new_row for this instant; its flags, or -1 - reason if there is no sample."""
     flags, reason = 0, checks.OK
     for m in range(len(plan.messages)):
@@ -124,7 +126,7 @@ def _take_instant(plan: checks.Plan, state: State, t_us: int, row_message: int) 
     return flags if reason == checks.OK else -1 - reason
 
 
-@njit(cache=True)
+@inlined
 def _average(plan: checks.Plan, row: NDArray[np.float64], new_row: NDArray[np.float64]) -> None:
     """Replace the monitored commands in row by their mean over the interval to new_row."""
     for r in range(len(plan.roles)):
@@ -133,14 +135,14 @@ def _average(plan: checks.Plan, row: NDArray[np.float64], new_row: NDArray[np.fl
             row[column] = 0.5 * (row[column] + new_row[column])
 
 
-@njit(cache=True)
+@inlined
 def emit(
     state: State,
     out_t_us: NDArray[np.int64],
     out_values: NDArray[np.float64],
     out_flags: NDArray[np.uint8],
-    n_out: int,
-) -> int:
+    n_out: Integer,
+) -> Integer:
     """Write the pending sample, if there is one, to out_*[n_out]; the new number of samples."""
     pending = state.pending[0]
     if not pending.full:
@@ -151,9 +153,9 @@ def emit(
     return n_out + 1
 
 
-@njit(cache=True)
+@inlined
 def _renew_pending(
-    plan: checks.Plan, state: State, t_us: int, flags: int, counts: NDArray[np.int64]
+    plan: checks.Plan, state: State, t_us: Integer, flags: Integer, counts: NDArray[np.int64]
 ) -> None:
     """Make new_row the pending sample."""
     pending = state.pending[0]
@@ -165,7 +167,7 @@ def _renew_pending(
     pending.broken, pending.started = False, True
 
 
-@njit(cache=True)
+@kernel
 def push(
     plan: checks.Plan,
     state: State,
@@ -174,12 +176,12 @@ def push(
     can_id: NDArray[np.uint32],
     length: NDArray[np.uint8],
     words: NDArray[np.uint64],
-    row_message: int,
+    row_message: Integer,
     counts: NDArray[np.int64],
     out_t_us: NDArray[np.int64],
     out_values: NDArray[np.float64],
     out_flags: NDArray[np.uint8],
-) -> int:
+) -> Integer:
     """Run n frames through the assembly; the number of samples written to out_*.
 
     Changed in place: state, counts (REASONS,), out_* (room for n samples + all queued + 1).
@@ -212,7 +214,7 @@ def push(
     return n_out
 
 
-@njit(cache=True)
+@kernel
 def count_unpaired(state: State, counts: NDArray[np.int64]) -> None:
     """Count and drop the samples that will never have a right neighbour; changed in place."""
     for m in range(len(state.queues)):

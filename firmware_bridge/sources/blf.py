@@ -9,17 +9,18 @@ walk finds the next object by its signature.
 from __future__ import annotations
 
 import datetime
+import itertools
 import struct
 import zlib
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from firmware_bridge import frames as fr
 from firmware_bridge.frames import Frames
+from firmware_bridge.jit import Integer, inlined, kernel
 from firmware_bridge.sources.errors import LogError
 
 REASONS = (
@@ -55,8 +56,8 @@ CAN_OBJECT = np.dtype(
 )  # fmt: skip
 
 
-@njit(cache=True)
-def _number(text: NDArray[np.uint8], pos: int, n: int) -> int:
+@inlined
+def _number(text: NDArray[np.uint8], pos: Integer, n: Integer) -> Integer:
     """Little-endian number of n bytes."""
     value = np.int64(0)
     for k in range(n):
@@ -64,8 +65,8 @@ def _number(text: NDArray[np.uint8], pos: int, n: int) -> int:
     return value
 
 
-@njit(cache=True)
-def _find(text: NDArray[np.uint8], pos: int, stop: int) -> int:
+@inlined
+def _find(text: NDArray[np.uint8], pos: Integer, stop: Integer) -> Integer:
     """Next object in text[pos:stop], or stop if there is none."""
     while pos + MIN_OBJECT <= stop:
         if text[pos] == 76 and _number(text, pos, 4) == LOBJ:
@@ -74,8 +75,10 @@ def _find(text: NDArray[np.uint8], pos: int, stop: int) -> int:
     return stop
 
 
-@njit(cache=True)
-def _layout(text: NDArray[np.uint8], kind: int, body: int) -> tuple[int, int, int, bool]:
+@inlined
+def _layout(
+    text: NDArray[np.uint8], kind: Integer, body: Integer
+) -> tuple[Integer, Integer, Integer, bool]:
     """Payload length, position of the data, channel and remote flag of a frame object."""
     if kind == 100:  # CAN_FD_MESSAGE
         return text[body + 14], body + 20, _number(text, body, 2), text[body + 2] & 0x80 != 0
@@ -84,15 +87,15 @@ def _layout(text: NDArray[np.uint8], kind: int, body: int) -> tuple[int, int, in
     return text[body + 3], body + 8, _number(text, body, 2), text[body + 2] & 0x80 != 0
 
 
-@njit(cache=True)
+@inlined
 def _object(
-    text: NDArray[np.uint8], pos: int, end: int, start_us: int, t_us: NDArray[np.int64],
+    text: NDArray[np.uint8], pos: Integer, end: Integer, start_us: Integer, t_us: NDArray[np.int64],
     channel: NDArray[np.uint8], can_id: NDArray[np.uint32], length: NDArray[np.uint8],
-    data: NDArray[np.uint8], k: int,
-) -> int:  # fmt: skip
+    data: NDArray[np.uint8], k: Integer,
+) -> Integer:  # fmt: skip
     """Read the object text[pos:end] into row k of the arrays (changed in place); OK or why not."""
     kind, version = _number(text, pos + 12, 4), _number(text, pos + 6, 2)
-    if kind == 2 or kind == 73:
+    if kind in (2, 73):
         return ERROR
     if kind not in (1, 86, 100, 101):
         return OTHER
@@ -112,12 +115,12 @@ def _object(
     return OK
 
 
-@njit(cache=True)
+@kernel
 def parse(
-    text: NDArray[np.uint8], pos: int, stop: int, start_us: int, t_us: NDArray[np.int64],
-    channel: NDArray[np.uint8], can_id: NDArray[np.uint32], length: NDArray[np.uint8],
-    data: NDArray[np.uint8], n: int, counts: NDArray[np.int64],
-) -> int:  # fmt: skip
+    text: NDArray[np.uint8], pos: Integer, stop: Integer, start_us: Integer,
+    t_us: NDArray[np.int64], channel: NDArray[np.uint8], can_id: NDArray[np.uint32], length: NDArray[np.uint8],
+    data: NDArray[np.uint8], n: Integer, counts: NDArray[np.int64],
+) -> Integer:  # fmt: skip
     """Walk the objects in text[pos:stop], appending frames from row n on; the new n.
 
     Changed in place: the arrays (room for every object) and counts (REASONS,).
@@ -137,9 +140,7 @@ def parse(
             counts[BAD] += 1
             continue
         pos = found + size
-        result = _object(
-            text, found, pos, start_us, t_us, channel, can_id, length, data, n
-        )
+        result = _object(text, found, pos, start_us, t_us, channel, can_id, length, data, n)
         if result == OK:
             n += 1
         else:
@@ -218,7 +219,7 @@ def read(path: Path) -> Frames:
     text = np.frombuffer(joined, np.uint8)
     out = fr.empty(len(text) // MIN_OBJECT + 1)
     n, start_us = 0, _start_us(raw)
-    for begin, end in zip(borders[:-1], borders[1:], strict=True):
+    for begin, end in itertools.pairwise(borders):
         n = parse(
             text, begin, end, start_us, out.t_us, out.channel, out.can_id, out.length, out.data,
             n, counts,
@@ -253,7 +254,7 @@ def _container(content: bytes) -> bytes:
     return head + CONTAINER.pack(DEFLATED, len(content)) + packed + bytes(size % 4)
 
 
-def _header(sizes: tuple[int, int], n_objects: int, start_ms: int, stop_ms: int) -> bytes:
+def _header(sizes: tuple[int, int], n_objects: Integer, start_ms: int, stop_ms: Integer) -> bytes:
     head = struct.pack(
         "<4sL8BQQLL", b"LOGG", HEADER_BYTES, 5, 0, 0, 0, 2, 6, 8, 1, *sizes, n_objects, 0
     )

@@ -9,11 +9,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from firmware_bridge import frames as fr
 from firmware_bridge.frames import Frames
+from firmware_bridge.jit import Integer, inlined, kernel
 from firmware_bridge.sources.errors import LogError
 
 REASONS = ("bad_line", "remote_frame", "fd_frame", "error_frame", "truncated")
@@ -26,13 +26,15 @@ for _k, _c in enumerate(b"0123456789abcdef"):
     _HEX[_c] = _HEX[ord(chr(_c).upper())] = _k
 
 
-@njit(cache=True)
-def _time(text: NDArray[np.uint8], pos: int, end: int) -> tuple[int, int]:
+@inlined
+def _time(text: NDArray[np.uint8], pos: Integer, end: Integer) -> tuple[Integer, Integer]:
     """Microseconds of "(seconds.fraction) " and the position behind it; -1 if malformed."""
     if pos >= end or text[pos] != 40:  # (
         return 0, -1
     pos += 1
-    whole, fraction, digits, n_whole = np.int64(0), np.int64(0), 0, 0
+    digits, n_whole = 0, 0
+    whole: Integer = np.int64(0)
+    fraction: Integer = np.int64(0)
     while pos < end and 48 <= text[pos] <= 57 and n_whole < 13:
         whole, pos, n_whole = whole * 10 + (text[pos] - 48), pos + 1, n_whole + 1
     if n_whole and pos < end and text[pos] == 46:  # .
@@ -46,8 +48,8 @@ def _time(text: NDArray[np.uint8], pos: int, end: int) -> tuple[int, int]:
     return whole * 1_000_000 + (fraction + 500) // 1000, pos + 2
 
 
-@njit(cache=True)
-def _channel(text: NDArray[np.uint8], pos: int, end: int) -> tuple[int, int]:
+@inlined
+def _channel(text: NDArray[np.uint8], pos: Integer, end: Integer) -> tuple[Integer, Integer]:
     """Number at the end of the channel's name and the position behind it; -1 if malformed."""
     start, number = pos, 0
     while pos < end and text[pos] != SPACE:
@@ -57,10 +59,11 @@ def _channel(text: NDArray[np.uint8], pos: int, end: int) -> tuple[int, int]:
     return (number & 0xFF, pos + 1) if start < pos < end else (0, -1)
 
 
-@njit(cache=True)
-def _identifier(text: NDArray[np.uint8], pos: int, end: int) -> tuple[int, int]:
+@inlined
+def _identifier(text: NDArray[np.uint8], pos: Integer, end: Integer) -> tuple[Integer, Integer]:
     """Identifier with its flags in bits 29 to 31 and the position behind #; -1 if malformed."""
-    start, can_id = pos, np.int64(0)
+    start = pos
+    can_id: Integer = np.int64(0)
     while pos < end and _HEX[text[pos]] < 16 and pos - start < 8:
         can_id, pos = can_id * 16 + _HEX[text[pos]], pos + 1
     if pos >= end or text[pos] != HASH or pos - start not in (3, 8):
@@ -70,8 +73,10 @@ def _identifier(text: NDArray[np.uint8], pos: int, end: int) -> tuple[int, int]:
     return can_id, pos + 1
 
 
-@njit(cache=True)
-def _payload(text: NDArray[np.uint8], pos: int, end: int, data: NDArray[np.uint8]) -> int:
+@inlined
+def _payload(
+    text: NDArray[np.uint8], pos: Integer, end: Integer, data: NDArray[np.uint8]
+) -> Integer:
     """Number of hex bytes put into data (changed in place); -1 if malformed."""
     n = 0
     while pos < end and text[pos] != SPACE:
@@ -87,12 +92,12 @@ def _payload(text: NDArray[np.uint8], pos: int, end: int, data: NDArray[np.uint8
     return n if tail == 0 or direction else -1
 
 
-@njit(cache=True)
+@inlined
 def _line(
-    text: NDArray[np.uint8], pos: int, end: int, t_us: NDArray[np.int64],
+    text: NDArray[np.uint8], pos: Integer, end: Integer, t_us: NDArray[np.int64],
     channel: NDArray[np.uint8], can_id: NDArray[np.uint32], length: NDArray[np.uint8],
-    data: NDArray[np.uint8], k: int,
-) -> int:  # fmt: skip
+    data: NDArray[np.uint8], k: Integer,
+) -> Integer:  # fmt: skip
     """Parse text[pos:end] into row k of the arrays (changed in place); OK or why not."""
     t_us[k], pos = _time(text, pos, end)
     if pos < 0:
@@ -116,12 +121,12 @@ def _line(
     return OK if n >= 0 else BAD
 
 
-@njit(cache=True)
+@kernel
 def parse(
     text: NDArray[np.uint8], t_us: NDArray[np.int64], channel: NDArray[np.uint8],
     can_id: NDArray[np.uint32], length: NDArray[np.uint8], data: NDArray[np.uint8],
     counts: NDArray[np.int64],
-) -> int:  # fmt: skip
+) -> Integer:  # fmt: skip
     """Parse all lines into the arrays; the number of frames.
 
     Changed in place: the arrays (room for one frame per line) and counts (REASONS,).  A last line

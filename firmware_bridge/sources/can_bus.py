@@ -1,0 +1,65 @@
+"""Live frames from any bus that python-can knows: virtual, udp_multicast, socketcan, ..."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+from collections.abc import Iterable
+from typing import Any
+
+import can
+
+from firmware_bridge import frames as fr
+from firmware_bridge.frames import EXTENDED, Frames
+from firmware_bridge.sources.live import POLL_S, LiveSource, SourceError
+
+RECEIVE_BUFFER_BYTES = 4 << 20  # the default loses thousands of frames in a stall of 2 s
+
+
+class CanBus(LiveSource[can.Message]):
+    """Frames of one bus, listening only.
+
+    `can_ids` (as in `Frames.can_id`) are filtered by the driver where it can; None takes all.
+    Raises SourceError if the bus cannot be opened.
+    """
+
+    def __init__(
+        self,
+        interface: str,
+        channel: str | int | None = None,
+        can_ids: Iterable[int] | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__()
+        filters = None if can_ids is None else [_filter(can_id) for can_id in can_ids]
+        try:
+            self._bus = can.Bus(
+                interface=interface, channel=channel, can_filters=filters, **options
+            )
+        except Exception as error:  # each interface raises its own kind
+            raise SourceError(f"cannot open {interface} channel {channel!r}: {error}") from error
+        _enlarge_buffer(self._bus)
+
+    def _receive(self) -> can.Message | None:
+        return self._bus.recv(POLL_S)
+
+    def _convert(self, items: list[can.Message]) -> Frames:
+        return fr.from_messages(items)
+
+    def _close(self) -> None:
+        self._bus.shutdown()
+
+
+def _filter(can_id: int) -> can.typechecking.CanFilter:
+    extended = bool(can_id & EXTENDED)
+    mask = 0x1FFF_FFFF if extended else 0x7FF
+    return {"can_id": can_id & mask, "can_mask": mask, "extended": extended}
+
+
+def _enlarge_buffer(bus: can.BusABC) -> None:
+    """Ask the system for a large receive buffer, where the bus is a socket."""
+    with contextlib.suppress(Exception):  # not a socket, or refused: the default remains
+        twin = socket.socket(fileno=os.dup(bus.fileno()))  # type: ignore[attr-defined]
+        with twin:
+            twin.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
