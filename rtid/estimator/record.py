@@ -2,44 +2,100 @@
 
 1. one pass with nominal weights, as on board;
 2. a pass with weights from the first result (slopes dQ/ddp of the learned maps, learned beta);
-3. the declared lag as a nuisance parameter: chi2(tau), profiled over all other unknowns, has its
-   minimum where Newton steps on a parabola through three points lead.
+3. the declared lag as a nuisance parameter (`profile`), and a last pass with the value found.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rtid.estimator.solution import VALID, Solution, factorize, misfit, normal_equations, solve
+from rtid.estimator.profile import Profile, profile
+from rtid.estimator.solution import (
+    VALID,
+    Solution,
+    factorize,
+    misfit,
+    normal_equations,
+    one_thread,
+    solve,
+)
 from rtid.estimator.state import State, Weights, build, nominal_weights
+from rtid.kernels.layout import ROWS
 from rtid.model import FloatArray, Model
 
-LAG_STEPS = 4  # parabolas at the most
-LAG_PROBE = 0.15  # of the lag (plus 0.1 ms): distance of the two outer points
+LAG_PROBE = 0.1  # of the lag, plus 0.05 ms: distance of the finite differences
+OFFSET_PROBE = 0.1  # of an offset's tolerance
+
+
+Assemble = Callable[[FloatArray], FloatArray]
 
 
 @dataclass(frozen=True)
 class RecordFit:
-    """Result of the record path: the solution, its weights, the lag and its standard deviation."""
+    """Result of the record path: solution, weights (with the lag), and what was found as nuisance.
+
+    lag_sd_s is 0 where the lag is not estimated; offsets_s (m,) and offsets_sd_s (m,) are the
+    changes of the message offsets in the order in which they were asked for.
+    """
 
     solution: Solution
     state: State
     weights: Weights
-    lag_s: float
     lag_sd_s: float
+    offsets_s: FloatArray
+    offsets_sd_s: FloatArray
+
+    @property
+    def lag_s(self) -> float:
+        """The spools' lag that the record shows (or that was declared)."""
+        return self.weights.lag_s
 
 
-def fit_record(model: Model, chunk: FloatArray) -> RecordFit:
-    """Fit a whole record; chunk (n, 2 + signals) = [t_s, flags, values...] in SI units."""
+def fit_record(
+    model: Model,
+    chunk: FloatArray,
+    assemble: Assemble | None = None,
+    offset_tolerance_s: FloatArray | None = None,
+) -> RecordFit:
+    """Fit a whole record; chunk (n, 2 + signals) = [t_s, flags, values...] in SI units.
+
+    assemble, where message offsets are unknown: gives the chunk for changes of the offsets (m,)
+    in seconds, which are then estimated within offset_tolerance_s (m,).
+    """
+    tolerance = np.zeros(0) if offset_tolerance_s is None else offset_tolerance_s
     weights = refined(model, solve(model, run(model, chunk)), model.lag.nominal_s)
-    lag_s, lag_sd_s = model.lag.nominal_s, 0.0
-    if model.lag.tolerance_s > 0:
-        lag_s, lag_sd_s = profile_lag(model, chunk, weights)
-    weights = Weights(weights.slopes, weights.compliance, lag_s)
+    lag_sd_s, offsets, offsets_sd = 0.0, np.zeros(len(tolerance)), np.zeros(len(tolerance))
+    if model.lag.tolerance_s > 0 or len(tolerance):
+        found = _nuisance(model, assemble or (lambda _: chunk), weights, tolerance)
+        lag_sd_s, offsets, offsets_sd = float(found.sd[0]), found.value[1:], found.sd[1:]
+        weights = replace(weights, lag_s=float(found.value[0]))
+        chunk = assemble(offsets) if assemble else chunk
+        if len(tolerance):  # the first weights came from shifted signals
+            weights = refined(model, solve(model, run(model, chunk, weights)), weights.lag_s)
     state = run(model, chunk, weights)
-    return RecordFit(solve(model, state), state, weights, lag_s, lag_sd_s)
+    return RecordFit(solve(model, state), state, weights, lag_sd_s, offsets, offsets_sd)
+
+
+def _nuisance(
+    model: Model, assemble: Assemble, weights: Weights, tolerance_s: FloatArray
+) -> Profile:
+    """Profile chi2 over [lag, message offsets]; their tolerances are prior knowledge."""
+
+    def chi2(nu: FloatArray) -> float:
+        return excess(model, assemble(nu[1:]), replace(weights, lag_s=float(nu[0])))
+
+    lag = model.lag
+    fixed = 1e-9  # a lag that is not to be estimated
+    return profile(
+        chi2,
+        nominal=np.array([lag.nominal_s, *np.zeros(len(tolerance_s))]),
+        tolerance=np.array([lag.tolerance_s or fixed, *tolerance_s]),
+        probe=np.array([LAG_PROBE * lag.nominal_s + 5e-5, *(OFFSET_PROBE * tolerance_s)]),
+        least=np.array([0.0, *np.full(len(tolerance_s), -np.inf)]),
+    )
 
 
 def run(model: Model, chunk: FloatArray, weights: Weights | None = None) -> State:
@@ -69,32 +125,10 @@ def _first_cells(model: Model) -> list[int]:
     return [0, *np.cumsum(sizes)[:-1].tolist()]
 
 
-def profile_lag(model: Model, chunk: FloatArray, weights: Weights) -> tuple[float, float]:
-    """Lag and its standard deviation, the declared tolerance taken as prior knowledge."""
-
-    def chi2(lag_s: float) -> float:
-        state = run(model, chunk, Weights(weights.slopes, weights.compliance, lag_s)).settled()
-        normal = normal_equations(state)
-        theta = factorize(normal, int(state.engine[0]["n_shared"])).theta(normal.right)
-        prior = ((lag_s - model.lag.nominal_s) / model.lag.tolerance_s) ** 2
-        return misfit(normal, theta) + prior
-
-    lag_s = model.lag.nominal_s
-    for _ in range(LAG_STEPS):
-        h = min(LAG_PROBE * lag_s + 1e-4, 0.9 * lag_s) if lag_s > 0 else 1e-4
-        below, here, above = chi2(lag_s - h) if lag_s > h else np.inf, chi2(lag_s), chi2(lag_s + h)
-        step, sd = _parabola(below, here, above, h)
-        lag_s = max(0.0, lag_s + step)
-        if abs(step) < max(0.5 * sd, 1e-6):
-            break
-    return lag_s, sd
-
-
-def _parabola(below: float, here: float, above: float, h: float) -> tuple[float, float]:
-    """Step to the minimum, at most 3 h, and the standard deviation from the curvature."""
-    if not np.isfinite(below):
-        return (h if above < here else 0.0), h
-    curvature = (below - 2 * here + above) / h**2
-    if curvature <= 0:
-        return (h if above < below else -h), h
-    return float(np.clip((below - above) / (2 * h * curvature), -3 * h, 3 * h)), (2 / curvature) ** 0.5
+def excess(model: Model, chunk: FloatArray, weights: Weights) -> float:
+    """Misfit of the best linear fit minus its number of rows: comparable between nuisance values."""
+    state = run(model, chunk, weights).settled()
+    e, normal = state.engine[0], normal_equations(state)
+    with one_thread():
+        theta = factorize(normal, int(e["n_shared"])).theta(normal.right)
+    return misfit(normal, theta) - float(e["counters"][ROWS] * e["n_chambers"])

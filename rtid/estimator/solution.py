@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dpotri
+from threadpoolctl import ThreadpoolController
 
 from rtid.estimator.state import State
 from rtid.kernels.layout import COUNTERS, TERMS
@@ -124,8 +127,9 @@ def solve(model: Model, state: State) -> Solution:
     normal = normal_equations(settled)
     e = settled.engine[0]
     n_chambers = int(e["n_chambers"])
-    factor = factorize(normal, int(e["n_shared"]))
-    theta, cov = factor.theta(normal.right), factor.cov()
+    with one_thread():
+        factor = factorize(normal, int(e["n_shared"]))
+        theta, cov = factor.theta(normal.right), factor.cov()
     rows = int(e["counters"][1]) * n_chambers
     active = int(np.sum(np.diag(normal.gram) * np.diag(cov) > 0.5))
     dof = max(1, rows - active)
@@ -136,6 +140,20 @@ def solve(model: Model, state: State) -> Solution:
     blocks = tuple(_block(model, settled, theta, cov, normal, s) for s in range(int(e["n_slots"])))
     counters = {name: int(count) for name, count in zip(COUNTERS, e["counters"], strict=True)}
     return Solution(model, compliance, compliance_cov, blocks, float(sse / dof), dof, counters)
+
+
+@cache
+def _linear_algebra() -> ThreadpoolController:
+    return ThreadpoolController()
+
+
+def one_thread() -> AbstractContextManager[object]:
+    """Keep linear algebra on the calling thread.
+
+    Its worker threads spin while they wait: measured 40 times slower when another process computes,
+    and on the device they would take the controller's core.
+    """
+    return _linear_algebra().limit(limits=1, user_api="blas")
 
 
 def misfit(normal: Normal, theta: FloatArray) -> float:

@@ -90,7 +90,7 @@ def _take(e: Any, cells: Any, closed: Any, blocks: Any, pairs: Any, sample: Floa
     if not acceptable(e, sample):
         _stop(e, closed, blocks, pairs)
         return
-    dt = sample[0] - e.t_s
+    dt = step_s(e, sample[0])
     if e.running and ((flags & GAP_FLAG) != 0 or dt > e.max_gap_s or dt <= 0.0):
         e.counters[RESTART_GAP] += 1
         _stop(e, closed, blocks, pairs)
@@ -99,6 +99,12 @@ def _take(e: Any, cells: Any, closed: Any, blocks: Any, pairs: Any, sample: Floa
     elif (flags & ROW_FLAG) != 0:
         _start(e, sample)
     remember(e, sample)
+
+
+@njit(cache=True)
+def step_s(e: Any, t_s: float) -> float:
+    """Time since the last sample in whole microseconds, as all stamps are: equal steps are equal."""
+    return math.floor((t_s - e.t_s) * 1e6 + 0.5) * 1e-6
 
 
 @njit(cache=True)
@@ -179,7 +185,8 @@ def set_step(e: Any, dt: float) -> None:
     """Factors that depend on the length of the step alone."""
     e.dt_s = dt
     e.lag_decay = math.exp(-dt / e.lag_s) if e.lag_s > 0.0 else 0.0
-    second_order(e.wn_rad_s, e.zeta, dt, e.filter_a, e.filter_b)
+    if e.form == CARRY:
+        second_order(e.wn_rad_s, e.zeta, dt, e.filter_a, e.filter_b)
 
 
 @njit(cache=True)

@@ -22,6 +22,7 @@ from rtid.kernels.engine import (
     mean_terms,
     remember,
     set_step,
+    step_s,
     working_points,
 )
 from rtid.kernels.holds import second_order
@@ -55,7 +56,7 @@ def explain(
     e = engine[0]
     gap = np.zeros(2)
     for k in range(len(chunk)):
-        dt = chunk[k, 0] - e.t_s
+        dt = step_s(e, chunk[k, 0])
         flags = int(chunk[k, 1])
         whole = acceptable(e, chunk[k])
         joined = whole and e.running and dt > 0.0 and dt <= e.max_gap_s

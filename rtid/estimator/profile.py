@@ -1,0 +1,88 @@
+"""Nuisance parameters (spool lag, message offsets): minimise chi2 over them, outside the linear fit.
+
+chi2(nu) = misfit of the linear fit with nu held, plus the prior ((nu - nominal) / tolerance)^2.
+Newton steps on a quadratic through finite differences; chi2 is in units of the noise, so half its
+Hessian is the information, whose inverse is the covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from rtid.model import FloatArray
+
+MAX_STEPS = 5
+LONGEST_STEP = 3.0  # probes
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Minimum of chi2: value (n,), sd (n,), chi2 there, and the number of evaluations."""
+
+    value: FloatArray
+    sd: FloatArray
+    chi2: float
+    evaluations: int
+
+
+def profile(
+    chi2: Callable[[FloatArray], float],
+    nominal: FloatArray,
+    tolerance: FloatArray,
+    probe: FloatArray,
+    least: FloatArray,
+) -> Profile:
+    """Minimise chi2 + prior from `nominal`; all arguments (n,).
+
+    probe: distance of the finite differences, of the order of what chi2 can resolve but above its
+    roughness; least: lower bound.
+    """
+    known: dict[bytes, float] = {}
+
+    def cost(nu: FloatArray) -> float:
+        nu = np.maximum(nu, least)
+        key = nu.tobytes()
+        if key not in known:
+            known[key] = chi2(nu) + float(np.sum(((nu - nominal) / tolerance) ** 2))
+        return known[key]
+
+    value = np.maximum(nominal, least + probe)
+    best = cost(value)
+    for _ in range(MAX_STEPS):
+        gradient, hessian = _derivatives(cost, value, probe)
+        trial = np.maximum(value + _newton(gradient, hessian, probe), least)
+        if cost(trial) >= best:
+            break
+        inside = bool(np.all(np.abs(trial - value) <= probe))
+        value, best = trial, cost(trial)
+        if inside:  # the parabola was not extrapolated
+            break
+        value = np.maximum(value, least + probe)
+    return Profile(value, np.sqrt(2 * np.diag(np.linalg.pinv(hessian))), best, len(known))
+
+
+def _derivatives(
+    cost: Callable[[FloatArray], float], at: FloatArray, h: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Gradient (n,) and Hessian (n, n) by central differences; 1 + 2 n + n (n - 1) / 2 values."""
+    n, here, steps = len(at), cost(at), np.diag(h)
+    above = np.array([cost(at + steps[i]) for i in range(n)])
+    below = np.array([cost(at - steps[i]) for i in range(n)])
+    hessian = np.diag((above - 2 * here + below) / h**2)
+    for i in range(n):
+        for j in range(i):
+            both = cost(at + steps[i] + steps[j])
+            hessian[i, j] = hessian[j, i] = (both - above[i] - above[j] + here) / (h[i] * h[j])
+    return (above - below) / (2 * h), hessian
+
+
+def _newton(gradient: FloatArray, hessian: FloatArray, h: FloatArray) -> FloatArray:
+    """Newton step, downhill even where the Hessian is not definite, at most LONGEST_STEP probes."""
+    scaled = hessian * np.outer(h, h)
+    values, vectors = np.linalg.eigh(scaled)
+    values = np.maximum(np.abs(values), 1e-6 * np.abs(values).max() + 1e-12)
+    step = -(vectors / values) @ (vectors.T @ (gradient * h))
+    return np.asarray(np.clip(step, -LONGEST_STEP, LONGEST_STEP) * h)

@@ -1,0 +1,151 @@
+"""Which block each interval of a record belongs to: the oracle's own reading of the declared rules.
+
+Written as plain Python, independently of the kernels.  Only one thing is asked of the engine: where
+it began a new memory because too many blocks rang at once, which depends on its table size.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtid.estimator.state import Weights, build
+from rtid.kernels.layout import RESTART_MEMORY
+from rtid.model import Edge, FloatArray, Model
+
+IntArray = NDArray[np.int64]
+ROW, GAP = 1, 2  # flags of a sample, as in firmware_bridge.samples
+
+
+@dataclass(frozen=True)
+class Track:
+    """The m intervals that are used, in order of time, each between the samples end - 1 and end.
+
+    end (m,); fresh (m,): memory begins at the interval's start; started_s (m,): since when the
+    record has run without a break; row (m,): the position was measured at its end;
+    cells (m, edges, 2): block (i, j), -1 when shut;
+    opening (m, edges, 2): command held over the interval, lagged command at its start, volts.
+    """
+
+    end: IntArray
+    fresh: NDArray[np.bool_]
+    started_s: FloatArray
+    row: NDArray[np.bool_]
+    cells: IntArray
+    opening: FloatArray
+
+
+def follow(
+    model: Model, t_s: FloatArray, values: FloatArray, flags: IntArray, weights: Weights
+) -> Track:
+    """Gates, restarts and block assignment with hysteresis, sample by sample.
+
+    t_s (n,), values (n, signals) in the model's column order, flags (n,).
+    """
+    new_memory = _memory_restarts(model, t_s, values, flags, weights)
+    usable = _usable(model, t_s, values)
+    found: list[tuple[int, bool, float, bool]] = []
+    cells, openings = [], []
+    running, fresh, started = False, False, 0.0
+    cell, w = _all_shut(model), np.zeros(len(model.edges))
+    for k in range(len(t_s)):
+        broken = k == 0 or not usable[k] or bool(flags[k] & GAP)
+        broken = broken or not 0.0 < t_s[k] - t_s[k - 1] <= model.gates.max_gap_s
+        inside = True
+        if running and not broken:
+            held = _held(model, values[k - 1])
+            mean, last = _lagged(held, w, weights.lag_s, t_s[k] - t_s[k - 1])
+            cell, inside = _cells(model, values[k - 1 : k + 1], mean, cell)
+            if inside:
+                found.append((k, fresh or bool(new_memory[k]), started, bool(flags[k] & ROW)))
+                cells.append(cell)
+                openings.append(np.stack([held, w], axis=1))
+                w, fresh = last, False
+        was_running = running
+        running = running and not broken and inside
+        if not running:
+            cell = _all_shut(model)
+            if usable[k] and flags[k] & ROW and not (was_running and not broken):
+                running, fresh, started, w = True, True, t_s[k], _held(model, values[k])
+    ends, begins, since, rows = zip(*found, strict=True) if found else ((), (), (), ())
+    return Track(
+        np.array(ends, np.int64),
+        np.array(begins, bool),
+        np.array(since, float),
+        np.array(rows, bool),
+        np.array(cells, np.int64).reshape(-1, len(model.edges), 2),
+        np.array(openings, float).reshape(-1, len(model.edges), 2),
+    )
+
+
+def _usable(model: Model, t_s: FloatArray, values: FloatArray) -> NDArray[np.bool_]:
+    low = np.array([s.minimum for s in model.signals])
+    high = np.array([s.maximum for s in model.signals])
+    whole = np.isfinite(t_s) & np.isfinite(values).all(axis=1)
+    return whole & (values >= low).all(axis=1) & (values <= high).all(axis=1)
+
+
+def _held(model: Model, sample: FloatArray) -> FloatArray:
+    return np.array([edge.direction * sample[model.column(edge.command)] for edge in model.edges])
+
+
+def _lagged(
+    held: FloatArray, start: FloatArray, lag_s: float, dt: float
+) -> tuple[FloatArray, FloatArray]:
+    """Mean and last value over dt of a command that approaches `held` from `start`."""
+    if lag_s <= 0.0:
+        return held, held
+    decay = np.exp(-dt / lag_s)
+    mean = held + (start - held) * (lag_s / dt * (1.0 - decay))
+    return mean, held + (start - held) * decay
+
+
+def _all_shut(model: Model) -> IntArray:
+    return np.full((len(model.edges), 2), -1, np.int64)
+
+
+def _cells(
+    model: Model, samples: FloatArray, mean_w: FloatArray, before: IntArray
+) -> tuple[IntArray, bool]:
+    """Block per edge of the interval between two samples; False when one is off its grid."""
+    cell, inside = _all_shut(model), True
+    for i, edge in enumerate(model.edges):
+        if mean_w[i] <= edge.safe_band_v:
+            continue
+        dp = samples[:, model.column(edge.source)] - samples[:, model.column(edge.sink)]
+        point = (mean_w[i], 0.5 * (dp[0] + dp[1]))
+        cell[i] = _cell(edge, point, before[i], model.gates.hysteresis)
+        inside = inside and bool(cell[i].min() >= 0)
+    return cell, inside
+
+
+def _cell(edge: Edge, point: tuple[float, float], before: IntArray, hysteresis: float) -> IntArray:
+    """Along each axis: the block before, widened by the hysteresis, else where the point lies."""
+    out = np.full(2, -1, np.int64)
+    for axis, (border, value) in enumerate(
+        zip((edge.grid.u_v, edge.grid.dp_pa), point, strict=True)
+    ):
+        if before[axis] >= 0:
+            low, high = border[before[axis]], border[before[axis] + 1]
+            margin = hysteresis * (high - low)
+            if low - margin <= value <= high + margin:
+                out[axis] = before[axis]
+                continue
+        if border[0] <= value <= border[-1]:
+            out[axis] = min(np.searchsorted(border, value, side="right") - 1, len(border) - 2)
+    return out
+
+
+def _memory_restarts(
+    model: Model, t_s: FloatArray, values: FloatArray, flags: IntArray, weights: Weights
+) -> NDArray[np.bool_]:
+    """(n,): the engine began a new memory with the interval that ends at this sample."""
+    state = build(model, weights)
+    chunk = np.column_stack([t_s, flags, values])
+    count = np.zeros(len(t_s), np.int64)
+    for k in range(len(t_s)):
+        state.advance(chunk[k : k + 1])
+        count[k] = state.engine[0]["counters"][RESTART_MEMORY]
+    return np.diff(count, prepend=0) > 0

@@ -1,0 +1,53 @@
+"""Lapped windows, eq. (12): the smooth weights with which neighbouring blocks are blended.
+
+beta(t) rises from 0 at t <= -1 to 1 at t >= 1 with beta^2(t) + beta^2(-t) = 1.  The squares of the
+windows of all blocks sum to 1 at every point,
+
+    g_i(t) = beta^2((t - b_i) / eta_i) beta^2((b_i+1 - t) / eta_i+1),
+
+as long as the overlaps of one block do not meet: eta_i + eta_i+1 <= b_i+1 - b_i.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rtid.model import FloatArray
+
+# Half the overlap at a border, in widths of the narrower neighbour; 0.5 is the most that fits.
+OVERLAP = 0.25
+
+
+def rising(t: FloatArray) -> FloatArray:
+    """beta^2(t) for t of any shape: sin^2 of an angle that eases from 0 to pi / 2."""
+    angle = 0.25 * np.pi * (1.0 + np.sin(0.5 * np.pi * np.clip(t, -1.0, 1.0)))
+    return np.asarray(np.sin(angle) ** 2)
+
+
+def rising_slope(t: FloatArray) -> FloatArray:
+    """Derivative of `rising`; zero outside [-1, 1] and continuous."""
+    inner = np.clip(t, -1.0, 1.0)
+    angle = 0.25 * np.pi * (1.0 + np.sin(0.5 * np.pi * inner))
+    return np.asarray(np.sin(2.0 * angle) * 0.125 * np.pi**2 * np.cos(0.5 * np.pi * inner))
+
+
+def overlaps(border: FloatArray, share: float = OVERLAP) -> FloatArray:
+    """eta (n + 1,) per border of n blocks: share (<= 0.5) of the narrower neighbour's width."""
+    width = np.diff(border)
+    return share * np.minimum(np.append(width, width[-1]), np.insert(width, 0, width[0]))
+
+
+def blend(border: FloatArray, at: FloatArray) -> tuple[np.ndarray, FloatArray, FloatArray]:
+    """The two blocks that share each point, and how.
+
+    border (n + 1,), at (m,) inside it.  Returns lower (m,), the first of the blocks lower and
+    lower + 1 (n - 2 at the most; 0 where n = 1), the weight (m,) of the second, and the weight's
+    derivative (m,).
+    """
+    n, eta = len(border) - 1, overlaps(border)
+    if n == 1:
+        return np.zeros(len(at), int), np.zeros(len(at)), np.zeros(len(at))
+    middle = 0.5 * (border[1:] + border[:-1])
+    lower = np.clip(np.searchsorted(middle, at) - 1, 0, n - 2)
+    t = (at - border[lower + 1]) / eta[lower + 1]
+    return lower, rising(t), rising_slope(t) / eta[lower + 1]

@@ -1,0 +1,73 @@
+"""Snapshots: the estimator's whole memory in one npz file, with schema and restore key.
+
+A snapshot continues bit for bit; it is refused where it belongs to another project or schema.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+
+from rtid.errors import RtidError
+from rtid.estimator.estimator import Estimator
+from rtid.estimator.state import State, Weights
+from rtid.model import Model
+
+SCHEMA = 1
+ARRAYS = ("engine", "cells", "closed", "blocks", "pairs")
+
+
+class SnapshotError(RtidError):
+    """The file is no snapshot, or one of another project, schema or program version."""
+
+
+def save(path: Path, estimator: Estimator, digest: str) -> None:
+    """Write a snapshot; the file appears whole or not at all."""
+    header = {"schema": SCHEMA, "digest": digest, "origin_us": estimator.origin_us}
+    arrays = dict(zip(ARRAYS, estimator.state.arrays, strict=True))
+    weights = estimator.weights
+    if weights is not None:
+        arrays |= {"slopes": weights.slopes, "compliance": weights.compliance}
+        header["lag_s"] = weights.lag_s
+    temporary = path.with_name(path.name + ".part")
+    with temporary.open("wb") as file:
+        np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(temporary, path)
+
+
+def load(path: Path, model: Model, digest: str) -> Estimator:
+    """Restore an estimator.  Raises SnapshotError with the reason, FileNotFoundError."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            header = json.loads(str(file["header"]))
+            content = {name: file[name] for name in file.files if name != "header"}
+    except (ValueError, KeyError, OSError) as error:
+        if isinstance(error, FileNotFoundError):
+            raise
+        raise SnapshotError(f"{path}: not a snapshot of rtid ({error})") from error
+    _check(path, header, digest)
+    weights = None
+    if "slopes" in content:
+        weights = Weights(content["slopes"], content["compliance"], float(header["lag_s"]))
+    estimator = Estimator(model, weights)
+    for name, array in zip(ARRAYS, estimator.state.arrays, strict=True):
+        if content[name].dtype != array.dtype:
+            raise SnapshotError(f"{path}: {name} has another layout", "learn again with `replay`")
+    estimator.state = State(*(content[name] for name in ARRAYS))
+    estimator.origin_us = header["origin_us"]
+    return estimator
+
+
+def _check(path: Path, header: dict[str, object], digest: str) -> None:
+    if header.get("schema") != SCHEMA:
+        raise SnapshotError(f"{path}: schema {header.get('schema')}, this program reads {SCHEMA}")
+    if header.get("digest") != digest:
+        raise SnapshotError(
+            f"{path}: learned with another project (geometry, sensors or grid differ)",
+            "use the project file that made it, or learn again with `rtid replay`",
+        )
