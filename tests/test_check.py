@@ -1,0 +1,247 @@
+"""`rtid check`: clean traces pass, wrong units and signs are named, a raw capture is timed."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tomlkit
+
+from firmware_bridge.frames import EXTENDED, empty
+from rtid.check import Finding, Report, bus, judge, timing
+from rtid.check.reading import read_trace
+from rtid.check.series import Series, describe, estimate_noise, longest_frozen
+from rtid.project import load
+
+ROOT = Path(__file__).parents[1]
+Edit = Callable[[dict[str, Any]], None]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """20 s of the simulated machine as trace.parquet and trace.toml."""
+    found = tmp_path_factory.mktemp("check")
+    from rtid.sim.declare import declared_model
+    from rtid.sim.log import write_table
+    from rtid.sim.plant import Plant
+    from rtid.sim.project_file import project_text
+    from rtid.sim.run import simulate
+
+    run = simulate(Plant(), "rich", 1, 20.0)
+    write_table(found / "trace.parquet", run)
+    text = project_text(declared_model(run.plant, sensors=run.sensors), 0.5, "simulated")
+    (found / "trace.toml").write_text(text)
+    return found
+
+
+def judged(folder: Path, edit: Edit) -> Report:
+    """The trace judged by the edited project."""
+    raw = tomlkit.parse((folder / "trace.toml").read_text()).unwrap()
+    for signal in raw["signals"].values():
+        signal.pop("range", None)  # the unit must be found out without it
+        signal.setdefault("scale", 1.0)
+        signal.pop("message", None)
+        signal.pop("signal", None)
+    raw["source"] = {"time_column": "t"}
+    raw.pop("messages", None)
+    edit(raw)
+    path = folder / "edited.toml"
+    path.write_text(tomlkit.dumps(raw))
+    project = load(path)
+    trace = read_trace(project, folder / "trace.parquet")
+    return judge(
+        project.model, project.assembly, trace.samples, trace.series, trace.messages,
+        trace.refused, project.sections.geometry.stroke_m,
+    )  # fmt: skip
+
+
+def errors(report: Report) -> dict[str, Finding]:
+    return {f.subject: f for f in report.findings if f.level == "error"}
+
+
+def test_clean_trace_passes(folder: Path) -> None:
+    report = judged(folder, lambda raw: None)
+    assert report.ok and not errors(report)
+    assert report.samples.rate_hz == pytest.approx(1000)
+    assert min(one.enough for one in report.coverage) > 10
+    assert report.motion.v_slope == pytest.approx(1, abs=0.02)
+
+
+def unit(name: str, written: str) -> Edit:
+    def edit(raw: dict[str, Any]) -> None:
+        raw["signals"][name]["unit"] = written
+
+    return edit
+
+
+def all_pressures(written: str) -> Edit:
+    def edit(raw: dict[str, Any]) -> None:
+        for name in ("p_a", "p_b", "p_supply", "p_tank"):
+            raw["signals"][name]["unit"] = written
+
+    return edit
+
+
+def turned(name: str, offset: float = 0.0) -> Edit:
+    def edit(raw: dict[str, Any]) -> None:
+        raw["signals"][name] |= {"scale": -1.0, "offset": offset}
+
+    return edit
+
+
+def swapped(raw: dict[str, Any]) -> None:
+    a, b = raw["signals"]["p_a"], raw["signals"]["p_b"]
+    a["column"], b["column"] = b["column"], a["column"]
+
+
+@pytest.mark.parametrize(
+    "edit,subject,words",
+    [
+        (unit("p_supply", "kPa"), "p_supply", "looks like Pa"),
+        (unit("p_a", "bar"), "p_a", "looks like Pa"),
+        (unit("p_b", "MPa"), "p_b", "looks like Pa"),
+        (unit("p_tank", "bar"), "p_tank", "looks like Pa"),
+        (all_pressures("bar"), "p_a", "looks like Pa"),
+        (all_pressures("bar"), "chambers.a", "bulk modulus"),
+        (unit("x", "mm"), "x", "looks like m"),
+        (unit("v", "mm/s"), "v", "derivative"),
+        (turned("u"), "u", "reversed"),
+        (turned("x", 0.5), "x", "reversed"),
+        (turned("v"), "v", "derivative"),
+        (swapped, "chambers", "swapped"),
+    ],
+)  # fmt: skip
+def test_wrong_unit_or_sign_is_named(folder: Path, edit: Edit, subject: str, words: str) -> None:
+    report = judged(folder, edit)
+    assert not report.ok
+    assert words in errors(report)[subject].text
+    assert errors(report)[subject].remedy
+
+
+def test_wrong_noise_is_a_warning_with_the_right_figure(folder: Path) -> None:
+    def quiet(raw: dict[str, Any]) -> None:
+        raw["signals"]["p_a"]["noise"] = 1e3
+
+    report = judged(folder, quiet)
+    (found,) = [f for f in report.findings if f.subject == "p_a"]
+    assert report.ok and "5e+03" in found.text
+
+
+def test_grid_that_misses_the_motion_is_named(folder: Path) -> None:
+    def elsewhere(raw: dict[str, Any]) -> None:
+        for key in [k for k in raw["edges"]["pa"] if k.startswith("dp_grid")]:
+            del raw["edges"]["pa"][key]
+        raw["edges"]["pa"]["dp_grid_mpa"] = [20, 21, 22]
+
+    found = [f for f in judged(folder, elsewhere).findings if f.subject == "edges.pa"]
+    assert {f.level for f in found} == {"error", "warning"}
+    assert any("outside the grid" in f.text for f in found)
+
+
+def test_noise_is_found_under_motion_and_quantisation() -> None:
+    rng = np.random.default_rng(1)
+    t = np.arange(20_000) * 1e-3
+    motion = 0.15 * np.sin(2 * np.pi * 0.5 * t)
+    noisy = motion + rng.normal(0, 1e-5, len(t))
+    assert estimate_noise(noisy) == pytest.approx(1e-5, rel=0.03)
+    noisy[::500] += 0.01  # outliers must not count
+    assert estimate_noise(np.round(noisy / 7.6e-6) * 7.6e-6) == pytest.approx(1.02e-5, rel=0.05)
+    assert estimate_noise(motion) < 1e-9
+    assert np.isnan(estimate_noise(motion[:10]))
+
+
+def test_series_without_values_and_frozen_spans() -> None:
+    t_us = np.arange(3000, dtype=np.int64) * 1000
+    x = np.random.default_rng(2).normal(size=3000)
+    x[1000:1800] = x[1000]
+    span_s, start_s = longest_frozen(t_us, x)
+    assert [span_s, start_s] == pytest.approx([0.799, 1.0])
+    nothing = describe(Series("x", t_us, np.full(3000, np.nan)))
+    assert (nothing.count, nothing.missing) == (0, 3000)
+
+
+def test_timing_counts_gaps_and_backward_stamps() -> None:
+    t_us = np.arange(1000, dtype=np.int64) * 10_000
+    t_us[500:] += 90_000
+    found = timing(t_us)
+    assert (found.count, found.gaps, found.backward) == (1000, 1, 0)
+    assert [found.median_s, found.worst_s] == pytest.approx([0.01, 0.1])
+    assert timing(t_us[::-1]).backward == 999
+    assert np.isnan(timing(t_us[:1]).median_s)
+
+
+def test_bus_separates_channels_and_identifiers() -> None:
+    frames = empty(6)
+    frames.t_us[:] = [0, 1, 10, 11, 20, 21]
+    frames.can_id[:] = [5, 5 | EXTENDED] * 3
+    frames.channel[:] = [0, 1, 0, 1, 0, 2]
+    found = [(one.channel, one.label, one.timing.count) for one in bus(frames)]
+    assert found == [(0, "005", 3), (1, "00000005", 2), (2, "00000005", 1)]
+
+
+def rtid(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "rtid", *map(str, arguments)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+
+
+def test_command_prints_a_verdict_and_ends_with_its_code(folder: Path, tmp_path: Path) -> None:
+    done = rtid("check", folder / "trace.toml", folder / "trace.parquet")
+    assert done.returncode == 0 and "Ready to learn" in done.stdout, done.stdout + done.stderr
+    text = (folder / "trace.toml").read_text()
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text(text.replace("direction = 1", "direction = 2"))
+    done = rtid("check", wrong)
+    assert done.returncode == 2 and "edges.pa.direction" in done.stderr
+    done = rtid("check", folder / "trace.toml", tmp_path / "none.blf")
+    assert done.returncode == 3 and "none.blf" in done.stderr
+
+
+def test_command_says_negative_in_json(folder: Path) -> None:
+    judged(folder, turned("u"))  # leaves edited.toml
+    done = rtid("check", folder / "edited.toml", folder / "trace.parquet", "--json")
+    report = json.loads(done.stdout)
+    assert done.returncode == 4 and report["ok"] is False
+    assert report["signals"][0]["name"] == "u"
+
+
+def test_log_without_a_wanted_frame_says_what_it_holds(folder: Path, tmp_path: Path) -> None:
+    log = tmp_path / "foreign.log"
+    log.write_text("".join(f"(1.{k:06d}) can0 7DF#0102\n" for k in range(50)))
+    done = rtid("check", folder / "trace.toml", log)
+    assert done.returncode == 3 and "0x7DF" in done.stderr and "ValveCommand" in done.stderr
+    done = rtid("check", "--bus-only", log)
+    assert done.returncode == 0 and "50 frames, 1 ids" in done.stdout
+    shutil.copy(log, tmp_path / "copy.log")
+    assert json.loads(rtid("check", "--bus-only", log, "--json").stdout)["frames"] == 50
+
+
+def test_real_capture_is_timed_frame_by_frame(shared: Path) -> None:
+    if find_spec("asammdf") is None:
+        pytest.skip("reading MF4 needs the extra: pip install 'rtid[mf4]'")
+    capture = shared / "data" / "can_j1939"
+    done = rtid(
+        "check", "--bus-only", capture / "vehicle.mf4", "--dbc", capture / "j1939.dbc", "--json"
+    )
+    report = json.loads(done.stdout)
+    assert (report["frames"], len({one["can_id"] for one in report["timing"]})) == (150_411, 67)
+    worst_s = [one["timing"]["worst_s"] for one in report["timing"]]
+    assert any(2.0 < (worst or 0) < 2.03 for worst in worst_s)
+
+
+def test_rig_passes_and_its_sensors_are_as_told(shared: Path) -> None:
+    example = ROOT / "rtid" / "project" / "examples" / "cylinder.toml"
+    done = rtid("check", example, shared / "data/rig/measured/rig_01.parquet", "--json")
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    noise = {one["name"]: one["noise"] for one in report["signals"]}
+    assert noise["p_a"] == pytest.approx(5e3, rel=0.03)
+    assert noise["x"] == pytest.approx(1e-5, rel=0.05)
+    assert not report["findings"]
