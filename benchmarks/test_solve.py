@@ -6,7 +6,7 @@ from typing import Any
 
 from benchmarks.interleave import Job, side_by_side
 from benchmarks.machine import chunk, model, one_chamber, record, warmed
-from rtid.estimator.solution import factorize, normal_equations, solve
+from rtid.estimator.solution import factorize, normal_equations, one_thread, solve
 from rtid.model import Model
 
 
@@ -17,9 +17,10 @@ def jobs_of(machine: Model) -> list[Job]:
 
     def estimate() -> None:
         normal = normal_equations(state.settled())
-        factor = factorize(normal, n_shared)
-        factor.theta(normal.right)
-        factor.cov()
+        with one_thread():
+            factor = factorize(normal, n_shared)
+            factor.theta(normal.right)
+            factor.cov()
 
     size = f"{n_blocks} blocks, {n_shared + 6 * n_blocks} unknowns"
     return [
