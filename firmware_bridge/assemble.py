@@ -158,7 +158,8 @@ def _plan(catalog: Catalog, assembly: Assembly) -> checks.Plan:
     """The constant part of the state machine; raises AssemblyError or CatalogError."""
     _check_assembly(assembly)
     messages = np.zeros(len(assembly.messages), checks.MESSAGE)
-    roles, layouts, codes, tables = [], [], [], []
+    roles: list[Record] = []
+    layouts, codes, tables = [], [], []
     n_layouts = n_codes = n_table = 0
     for row, source in zip(messages, assembly.messages, strict=True):
         mine = [s for s in assembly.signals if s.constant is None and s.message == source.name]

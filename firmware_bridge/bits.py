@@ -67,7 +67,7 @@ def raw_number(bits: np.uint64, row: Record) -> float:
 @inlined
 def contains(codes: NDArray[np.uint64], first: Integer, count: Integer, bits: np.uint64) -> bool:
     """Whether `bits` is one of codes[first : first + count]."""
-    for k in range(first, first + count):
+    for k in range(first, first + count):  # noqa: SIM110  numba has no generators
         if codes[k] == bits:
             return True
     return False

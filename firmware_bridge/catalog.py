@@ -207,5 +207,5 @@ def _range(signal: Signal) -> tuple[float, float]:
 def _absent_codes(signal: Signal) -> list[int]:
     """Raw bit patterns of named values such as "SNA" or "not available"."""
     mask = (1 << signal.length) - 1
-    choices = (signal.choices or {}).items()
+    choices = signal.choices.items() if signal.choices else ()
     return [int(raw) & mask for raw, name in choices if _ABSENT.fullmatch(str(name).strip())]

@@ -75,6 +75,49 @@ def _flags(progress: Record, slot: Record, late_us: Integer, counts: NDArray[np.
     return ROW | GAP
 
 
+@inlined
+def _join(
+    plan: checks.Plan,
+    state: State,
+    m: Integer,
+    t_us: Integer,
+    jumped: bool,
+    row_message: Integer,
+    lifetime_us: Integer,
+    counts: NDArray[np.int64],
+) -> Integer:
+    """Put the scratch values of message m into the slot of its cycle; the slot's index."""
+    row, bit = plan.messages[m], np.uint64(1) << np.uint64(m)
+    k = state.last[m].counter if len(state.slots) > 1 else 0
+    slot = state.slots[k]
+    if slot.open and _is_stale(slot, bit, t_us, lifetime_us):
+        slot.open = False
+        counts[checks.INCOMPLETE_CYCLE] += 1
+    if not slot.open:
+        _open_slot(slot, state.progress[0], t_us)
+    slot.mask |= bit
+    slot.jump |= jumped
+    if m == row_message:
+        slot.row_us = t_us - row.offset_us
+    for j in range(row.n_roles):
+        state.values[k, plan.roles[row.first_role + j].column] = state.scratch[j]
+    return k
+
+
+@inlined
+def _complete(state: State, slot: Record, late_us: Integer, counts: NDArray[np.int64]) -> Integer:
+    """Close a full slot and all older ones; the flags of its sample, -1 if it comes too late."""
+    progress = state.progress[0]
+    slot.open = False
+    _close_older(state.slots, slot.order, counts)
+    if progress.started and slot.row_us <= progress.t_us:
+        counts[checks.OUT_OF_ORDER] += 1
+        return -1
+    flags = _flags(progress, slot, late_us, counts)
+    progress.t_us, progress.started = slot.row_us, True
+    return flags
+
+
 @kernel
 def push(
     plan: checks.Plan,
@@ -96,7 +139,7 @@ def push(
     Changed in place: state, counts (REASONS,), out_* (room for n samples).
     """
     full = (np.uint64(1) << np.uint64(len(plan.messages))) - np.uint64(1)
-    progress, late_us = state.progress[0], plan.messages[row_message].late_us
+    late_us = plan.messages[row_message].late_us
     n_out = 0
     for i in range(len(t_us)):
         m = checks.find_message(plan.messages, can_id[i], channel[i])
@@ -109,31 +152,15 @@ def push(
         )
         if admitted != checks.OK:
             continue
-        row, bit = plan.messages[m], np.uint64(1) << np.uint64(m)
-        k = state.last[m].counter if row.counter >= 0 and len(state.slots) > 1 else 0
-        slot = state.slots[k]
-        if slot.open and _is_stale(slot, bit, t_us[i], lifetime_us):
-            slot.open = False
-            counts[checks.INCOMPLETE_CYCLE] += 1
-        if not slot.open:
-            _open_slot(slot, progress, t_us[i])
-        slot.mask |= bit
-        slot.jump |= counts[checks.COUNTER_JUMP] > jumps
-        if m == row_message:
-            slot.row_us = t_us[i] - row.offset_us
-        for j in range(row.n_roles):
-            state.values[k, plan.roles[row.first_role + j].column] = state.scratch[j]
-        if slot.mask != full:
+        jumped = counts[checks.COUNTER_JUMP] > jumps
+        k = _join(plan, state, m, t_us[i], jumped, row_message, lifetime_us, counts)
+        if state.slots[k].mask != full:
             continue
-        slot.open = False
-        _close_older(state.slots, slot.order, counts)
-        if progress.started and slot.row_us <= progress.t_us:
-            counts[checks.OUT_OF_ORDER] += 1
-            continue
-        out_flags[n_out] = _flags(progress, slot, late_us, counts)
-        out_t_us[n_out], out_values[n_out] = slot.row_us, state.values[k]
-        progress.t_us, progress.started = slot.row_us, True
-        n_out += 1
+        flags = _complete(state, state.slots[k], late_us, counts)
+        if flags >= 0:
+            out_t_us[n_out], out_flags[n_out] = state.slots[k].row_us, flags
+            out_values[n_out] = state.values[k]
+            n_out += 1
     return n_out
 
 

@@ -15,9 +15,10 @@ POLYNOMIAL = 0x1D
 
 
 def _table() -> NDArray[np.uint8]:
-    table = np.arange(256, dtype=np.uint16)
+    table = np.arange(256)
     for _ in range(8):
-        table = np.where(table & 0x80, (table << 1) ^ POLYNOMIAL, table << 1) & 0xFF
+        table = (table << 1) ^ POLYNOMIAL * (table >> 7)
+        table &= 0xFF
     return table.astype(np.uint8)
 
 

@@ -81,10 +81,13 @@ def _layout(
 ) -> tuple[Integer, Integer, Integer, bool]:
     """Payload length, position of the data, channel and remote flag of a frame object."""
     if kind == 100:  # CAN_FD_MESSAGE
-        return text[body + 14], body + 20, _number(text, body, 2), text[body + 2] & 0x80 != 0
+        remote = text[body + 2] & 0x80 != 0
+        return np.int64(text[body + 14]), body + 20, _number(text, body, 2), remote
     if kind == 101:  # CAN_FD_MESSAGE_64
-        return text[body + 2], body + 40, np.int64(text[body]), text[body + 12] & 0x10 != 0
-    return text[body + 3], body + 8, _number(text, body, 2), text[body + 2] & 0x80 != 0
+        remote = text[body + 12] & 0x10 != 0
+        return np.int64(text[body + 2]), body + 40, np.int64(text[body]), remote
+    remote = text[body + 2] & 0x80 != 0
+    return np.int64(text[body + 3]), body + 8, _number(text, body, 2), remote
 
 
 @inlined
@@ -118,8 +121,8 @@ def _object(
 @kernel
 def parse(
     text: NDArray[np.uint8], pos: Integer, stop: Integer, start_us: Integer,
-    t_us: NDArray[np.int64], channel: NDArray[np.uint8], can_id: NDArray[np.uint32], length: NDArray[np.uint8],
-    data: NDArray[np.uint8], n: Integer, counts: NDArray[np.int64],
+    t_us: NDArray[np.int64], channel: NDArray[np.uint8], can_id: NDArray[np.uint32],
+    length: NDArray[np.uint8], data: NDArray[np.uint8], n: Integer, counts: NDArray[np.int64],
 ) -> Integer:  # fmt: skip
     """Walk the objects in text[pos:stop], appending frames from row n on; the new n.
 
@@ -254,7 +257,7 @@ def _container(content: bytes) -> bytes:
     return head + CONTAINER.pack(DEFLATED, len(content)) + packed + bytes(size % 4)
 
 
-def _header(sizes: tuple[int, int], n_objects: Integer, start_ms: int, stop_ms: Integer) -> bytes:
+def _header(sizes: tuple[int, int], n_objects: int, start_ms: int, stop_ms: int) -> bytes:
     head = struct.pack(
         "<4sL8BQQLL", b"LOGG", HEADER_BYTES, 5, 0, 0, 0, 2, 6, 8, 1, *sizes, n_objects, 0
     )

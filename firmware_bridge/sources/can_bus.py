@@ -60,6 +60,6 @@ def _filter(can_id: int) -> can.typechecking.CanFilter:
 def _enlarge_buffer(bus: can.BusABC) -> None:
     """Ask the system for a large receive buffer, where the bus is a socket."""
     with contextlib.suppress(Exception):  # not a socket, or refused: the default remains
-        twin = socket.socket(fileno=os.dup(bus.fileno()))  # type: ignore[attr-defined]
+        twin = socket.socket(fileno=os.dup(bus.fileno()))
         with twin:
             twin.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)

@@ -33,14 +33,14 @@ def _time(text: NDArray[np.uint8], pos: Integer, end: Integer) -> tuple[Integer,
         return 0, -1
     pos += 1
     digits, n_whole = 0, 0
-    whole: Integer = np.int64(0)
-    fraction: Integer = np.int64(0)
+    whole: Integer = 0
+    fraction: Integer = 0
     while pos < end and 48 <= text[pos] <= 57 and n_whole < 13:
-        whole, pos, n_whole = whole * 10 + (text[pos] - 48), pos + 1, n_whole + 1
+        whole, pos, n_whole = whole * 10 + np.int64(text[pos] - 48), pos + 1, n_whole + 1
     if n_whole and pos < end and text[pos] == 46:  # .
         pos += 1
         while pos < end and 48 <= text[pos] <= 57 and digits < 9:
-            fraction, pos, digits = fraction * 10 + (text[pos] - 48), pos + 1, digits + 1
+            fraction, pos, digits = fraction * 10 + np.int64(text[pos] - 48), pos + 1, digits + 1
     if n_whole == 0 or pos + 1 >= end or text[pos] != 41 or text[pos + 1] != SPACE:
         return 0, -1
     while digits < 9:
@@ -63,7 +63,7 @@ def _channel(text: NDArray[np.uint8], pos: Integer, end: Integer) -> tuple[Integ
 def _identifier(text: NDArray[np.uint8], pos: Integer, end: Integer) -> tuple[Integer, Integer]:
     """Identifier with its flags in bits 29 to 31 and the position behind #; -1 if malformed."""
     start = pos
-    can_id: Integer = np.int64(0)
+    can_id: Integer = 0
     while pos < end and _HEX[text[pos]] < 16 and pos - start < 8:
         can_id, pos = can_id * 16 + _HEX[text[pos]], pos + 1
     if pos >= end or text[pos] != HASH or pos - start not in (3, 8):
@@ -93,7 +93,7 @@ def _payload(
 
 
 @inlined
-def _line(
+def _line(  # noqa: PLR0911  each return names what is wrong with the line
     text: NDArray[np.uint8], pos: Integer, end: Integer, t_us: NDArray[np.int64],
     channel: NDArray[np.uint8], can_id: NDArray[np.uint32], length: NDArray[np.uint8],
     data: NDArray[np.uint8], k: Integer,

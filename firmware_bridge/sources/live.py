@@ -1,5 +1,6 @@
-"""What live sources share: one thread that only receives and queues, so that a slow reader loses
-nothing while the queue lasts, and an error in the thread that reaches the reader.
+"""What live sources share: a receive thread that only queues.
+
+So a slow reader loses nothing while the queue lasts; an error in the thread reaches the reader.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -187,7 +188,7 @@ def multirate(offsets_s: tuple[float, float, float] = (0, 0, 0)) -> tuple[Frames
     ):
         t_us = START_US + np.arange(start, 1_000_000, period)
         s = (t_us - START_US) * 1e-6 - offset
-        columns = {
+        columns: dict[str, Any] = {
             "ValveCommand": {"U": 5 * s, "PTank": 1e5},
             "Pressures": {"PA": 1e6 * (1 + s), "PB": 2e6, "PSupply": 7e6},
             "Motion": {"X": 0.1 + 0.2 * s, "V": 0.2},

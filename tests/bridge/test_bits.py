@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from collections import OrderedDict
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from firmware_bridge.catalog import Catalog, CatalogError, load
 from tests.bridge.machine import CATALOG
 
 
-def signal(start: int, length: int, order: str, **more: Any) -> Signal:
+def signal(start: int, length: int, order: Any, **more: Any) -> Signal:
     conversion = BaseConversion.factory(
         scale=more.pop("scale", 1), offset=more.pop("offset", 0), is_float=more.pop("float", False)
     )
@@ -53,9 +54,9 @@ def same(ours: float, theirs: float) -> bool:
 @given(one_signal(), st.binary(min_size=8, max_size=8))
 def test_decoding_equals_cantools(defined: Signal, payload: bytes) -> None:
     catalog = catalog_of(defined)
-    theirs = catalog.message("M").decode(payload, decode_choices=False)["S"]
+    theirs: Any = catalog.message("M").decode(payload, decode_choices=False)
     ours = catalog.layouts("M").decode(np.frombuffer(payload, np.uint8).reshape(1, 8))
-    assert same(float(ours[0, 0]), float(theirs))
+    assert same(float(ours[0, 0]), float(theirs["S"]))
 
 
 @settings(max_examples=200, deadline=None)
@@ -79,7 +80,7 @@ def test_all_own_messages_decode_like_cantools() -> None:
         ours = layouts.decode(payloads)
         message = CATALOG.message(name)
         for payload, row in zip(payloads, ours, strict=True):
-            theirs = message.decode(bytes(payload), decode_choices=False, scaling=True)
+            theirs: Any = message.decode(bytes(payload), decode_choices=False, scaling=True)
             for key, value in zip(layouts.names, row, strict=True):
                 assert np.isnan(value) or value == theirs[key]
 
@@ -104,7 +105,7 @@ def test_rig_counts_survive_without_extra_quantisation() -> None:
         ("Motion", "V"): (1 / 65535, -0.5),
     }
     for (message, name), (scale, offset) in columns.items():
-        value = offset + scale * counts
+        value: Any = offset + scale * counts
         layouts = CATALOG.layouts(message, [name])
         back = layouts.decode(layouts.encode(value[:, None]))[:, 0]
         np.testing.assert_allclose(back, value, rtol=1e-12, atol=1e-9 * scale)
@@ -126,7 +127,7 @@ def test_out_of_range_and_saturation_are_not_available() -> None:
 def test_named_absent_code_is_not_available() -> None:
     from cantools.database.namedsignalvalue import NamedSignalValue
 
-    conversion = BaseConversion.factory(choices={255: NamedSignalValue(255, "SNA")})
+    conversion = BaseConversion.factory(choices=OrderedDict({255: NamedSignalValue(255, "SNA")}))
     catalog = catalog_of(Signal("S", 0, 8, conversion=conversion))
     payloads = np.zeros((2, 8), np.uint8)
     payloads[1, 0] = 255

@@ -1,0 +1,103 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from scipy.io import savemat
+
+from firmware_bridge.config import Assembly, SignalSource
+from firmware_bridge.samples import GAP, ROW
+from firmware_bridge.sources import LogError
+from firmware_bridge.sources.table import read_table, to_samples
+
+ROLES = Assembly(
+    "cycle",
+    (
+        SignalSource("u_v", signal="u"),
+        SignalSource("p_pa", signal="p", factor=1e6),
+        SignalSource("tank_pa", constant=1e5),
+    ),
+    (),
+    "u_v",
+)
+
+
+def test_csv_with_units_comments_and_gaps(tmp_path: Path) -> None:
+    path = tmp_path / "t.csv"
+    path.write_text(
+        "# a comment\nt [ms],u (V),p [MPa],note\n0,1,2,a\n1,1.5,2.5,b\n2,,3,c\n"
+        "3,2,3,d\n3,2,3,e\n9,2,3,f\n"
+    )
+    table = read_table(path)
+    assert table.units == {"t": "ms", "u": "V", "p": "MPa"}
+    samples, counts = to_samples(table, ROLES)
+    assert samples.t_us.tolist() == [0, 1000, 3000, 9000]
+    assert samples.values[:2].tolist() == [[1.0, 2e6, 1e5], [1.5, 2.5e6, 1e5]]
+    assert counts == {"not_available": 1, "out_of_order": 1, "gap": 1}
+    assert samples.flags.tolist() == [ROW | GAP, ROW, ROW, ROW | GAP]
+
+
+@pytest.mark.parametrize(
+    "text", ["t;u;p\n0,0;1,5;2\n0,001;2,5;3\n", "t\tu\tp\n0\t1.5\t2\n0.001\t2.5\t3\n"]
+)
+def test_other_separators(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "t.csv"
+    path.write_text(text)
+    samples, _ = to_samples(read_table(path), ROLES)
+    assert samples.column("u_v").tolist() == [1.5, 2.5]
+    assert samples.t_us.tolist() == [0, 1000]
+
+
+def test_parquet_scale_offset_unit(tmp_path: Path) -> None:
+    fields = [
+        pa.field("t", pa.int32(), metadata={"unit": "s", "scale": "0.001", "offset": "0"}),
+        pa.field("u", pa.uint16(), metadata={"unit": "V", "scale": "0.5", "offset": "-10"}),
+        pa.field("p", pa.float32()),
+    ]
+    columns = [pa.array([0, 1, 2], f.type) for f in fields]
+    pq.write_table(pa.Table.from_arrays(columns, schema=pa.schema(fields)), tmp_path / "t.parquet")
+    table = read_table(tmp_path / "t.parquet")
+    assert table.units["u"] == "V"
+    samples, counts = to_samples(table, ROLES)
+    assert samples.column("u_v").tolist() == [-10.0, -9.5, -9.0]
+    assert samples.t_us.tolist() == [0, 1000, 2000]
+    assert counts == {}
+
+
+def test_mat(tmp_path: Path) -> None:
+    t = np.arange(5) * 1e-3
+    savemat(tmp_path / "t.mat", {"t": t[:, None], "u": t * 2, "p": t, "k": 3.0, "m": np.eye(3)})
+    table = read_table(tmp_path / "t.mat")
+    assert set(table.columns) == {"t", "u", "p"}
+    samples, _ = to_samples(table, ROLES)
+    np.testing.assert_array_equal(samples.column("u_v"), t * 2)
+
+
+def test_clear_errors(tmp_path: Path) -> None:
+    path = tmp_path / "t.csv"
+    path.write_text("t,pump,pp\n0,1,2\n")
+    with pytest.raises(LogError, match="no numeric column 'p'; did you mean 'pp'"):
+        to_samples(read_table(path), replace(ROLES, signals=ROLES.signals[1:]))
+    path.write_text("x,u,p\n0,1,2\n")
+    with pytest.raises(LogError, match="no time column"):
+        to_samples(read_table(path), ROLES)
+    for name in ("a.parquet", "a.mat", "a.csv"):
+        (tmp_path / name).write_bytes(b"\x00\x01garbage")
+        with pytest.raises(LogError, match=name):
+            read_table(tmp_path / name)
+    with pytest.raises(LogError, match="unknown suffix"):
+        read_table(tmp_path / "a.xlsx")
+
+
+def test_rig_table(shared: Path) -> None:
+    names = ("u", "x", "p_A", "p_B", "p_supply", "p_tank")
+    roles = Assembly("cycle", tuple(SignalSource(n, signal=n) for n in names), (), "x")
+    samples, counts = to_samples(read_table(shared / "data/rig/measured/rig_01.parquet"), roles)
+    assert len(samples) == 110_001
+    assert counts == {}
+    assert (np.diff(samples.t_us) == 1000).all()
+    assert 6.9e6 < samples.column("p_supply").mean() < 7.1e6
