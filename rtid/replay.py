@@ -18,15 +18,15 @@ from firmware_bridge.config import Assembly
 from firmware_bridge.frames import Frames
 from firmware_bridge.samples import Samples
 from firmware_bridge.sources import open_log
-from firmware_bridge.sources.table import read_table, to_samples
+from firmware_bridge.sources.table import to_samples
 from rtid.check.series import estimate_noise
 from rtid.errors import RtidError
 from rtid.estimator.estimator import Estimator, to_chunk
 from rtid.estimator.record import RecordFit, fit_record
 from rtid.model import FloatArray, Model, Signal
 from rtid.project import Project
+from rtid.project.table import is_table, open_table
 
-TABLES = (".parquet", ".csv", ".mat")
 Progress = Callable[[str, float], None]
 
 
@@ -77,8 +77,8 @@ def catalog_of(project: Project) -> Catalog:
 
 def read_trace(project: Project, path: Path) -> Trace:
     """All samples of a CAN log or a table.  Raises NoSamplesError, and the readers' errors."""
-    if path.suffix.lower() in TABLES and project.table_assembly is not None:
-        samples, counters = to_samples(read_table(path), project.table_assembly)
+    if is_table(path) and project.table_assembly is not None:
+        samples, counters = to_samples(open_table(project, path), project.table_assembly)
         return _not_empty(Trace(path, samples, counters, None), project)
     frames = open_log(path)
     samples, counters = assemble(catalog_of(project), project.assembly, frames)

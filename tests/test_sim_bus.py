@@ -9,7 +9,8 @@ import pytest
 
 from firmware_bridge.catalog import CONTROLLER_DBC, Catalog, load
 from firmware_bridge.frames import Frames, from_messages, to_messages
-from rtid.sim.bus import SendError, open_test_bus, run_frames, send
+from firmware_bridge.playback import SendError, send
+from rtid.sim.bus import open_test_bus, run_frames
 from rtid.sim.frames import (
     ARBITRATION_US,
     CONTROLLER_ROUTES,
@@ -172,7 +173,7 @@ def test_a_silly_speed_is_refused(buses: tuple[can.BusABC, can.BusABC]) -> None:
 def test_a_stalled_receiver_is_an_error_and_no_hang(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rtid.sim.bus.SEND_TIMEOUT_S", 0.01)
+    monkeypatch.setattr("firmware_bridge.playback.SEND_TIMEOUT_S", 0.01)
     with (
         can.Bus("full", interface="virtual", rx_queue_size=4),
         open_test_bus("virtual", "full") as sender,

@@ -9,9 +9,10 @@ from typing import Annotated
 
 import typer
 
+from firmware_bridge.playback import AS_FAST_AS_POSSIBLE, send
 from rtid.cli.exits import Exit
 from rtid.errors import RtidError
-from rtid.sim.bus import AS_FAST_AS_POSSIBLE, open_test_bus, run_frames, send
+from rtid.sim.bus import open_test_bus, run_frames
 from rtid.sim.declare import declared_model
 from rtid.sim.log import START_US, SUFFIXES, truth_of, write_log, write_table
 from rtid.sim.motion import MOTIONS
