@@ -101,12 +101,19 @@ def test_a_smooth_plant_is_declared_open_from_zero() -> None:
     assert model.edges[0].grid.shape == (20, 16)
 
 
-def test_an_80_s_run_takes_at_most_one_second_warm(sweep: Run) -> None:
+def test_an_80_s_run_takes_at_most_one_second_of_processor_warm(sweep: Run) -> None:
     best = min(_seconds() for _ in range(3))
     assert best < 1.0
 
 
+def test_a_long_rich_run_stays_sane() -> None:
+    """80 s of everything at once, on the default machine and on some that once oscillated."""
+    for plant in (Plant(), draw(35), draw(43)):
+        p = simulate(plant, "rich", seed=35).truth.signals[:, 1:3]
+        assert p.min() > 0.1e6 and p.max() < 9e6
+
+
 def _seconds() -> float:
-    start = time.perf_counter()
+    start = time.process_time()
     simulate(Plant(), "sweep")
-    return time.perf_counter() - start
+    return time.process_time() - start

@@ -71,23 +71,30 @@ def rates(c: Constants, q: FloatArray, y: FloatArray, load_n: float, dy: FloatAr
 
 @njit(cache=True)
 def runge_kutta(
-    c: Constants, gains: FloatArray, inputs: FloatArray, h_s: float, y: FloatArray, dy: FloatArray
+    c: Constants,
+    gains: FloatArray,
+    inputs: FloatArray,
+    h_s: float,
+    y: FloatArray,
+    slopes: FloatArray,
+    trial: FloatArray,
+    q: FloatArray,
 ) -> None:
     """One step of the classical fourth-order rule; y (4,) is changed in place.
 
     gains (3, 5) and inputs (3, 3) = (supply, tank, load) hold at the start, middle and end of the
-    step; dy (6, 5) is work space.
+    step; slopes (4, 4), trial (4,) and q (5,) are work space.
     """
-    trial, q = dy[4, :4], dy[5]
     for stage in range(4):
         at = (stage + 1) // 2
-        reach = 0.0 if stage == 0 else (h_s if stage == 3 else 0.5 * h_s)
+        reach = h_s if stage == 3 else 0.5 * h_s
         for i in range(4):
-            trial[i] = y[i] + reach * dy[stage - 1, i] if stage > 0 else y[i]
+            trial[i] = y[i] + reach * slopes[stage - 1, i] if stage > 0 else y[i]
         flows(c, gains[at], trial, inputs[at, 0], inputs[at, 1], q)
-        rates(c, q, trial, inputs[at, 2], dy[stage])
+        rates(c, q, trial, inputs[at, 2], slopes[stage])
     for i in range(4):
-        y[i] += h_s / 6.0 * (dy[0, i] + 2.0 * dy[1, i] + 2.0 * dy[2, i] + dy[3, i])
+        bend = slopes[1, i] + slopes[2, i]
+        y[i] += h_s / 6.0 * (slopes[0, i] + 2.0 * bend + slopes[3, i])
 
 
 @njit(cache=True)
@@ -106,7 +113,8 @@ def advance(
 
     commands (5,) are held, drive (2, 6) are its rows at both ends, decay = exp(-h / (2 lag)).
     """
-    gains, inputs, dy = np.empty((3, 5)), np.empty((3, 3)), np.zeros((6, 5))
+    gains, inputs = np.empty((3, 5)), np.empty((3, 3))
+    slopes, trial, q = np.empty((4, 4)), np.empty(4), np.empty(5)
     for e in range(5):
         gains[2, e] = flow_gain(valves[e], w[e])
     for step in range(substeps):
@@ -120,7 +128,7 @@ def advance(
             for j in range(3):
                 start = drive[0, P_SUPPLY + j]
                 inputs[half, j] = start + share * (drive[1, P_SUPPLY + j] - start)
-        runge_kutta(c, gains, inputs, h_s, y, dy)
+        runge_kutta(c, gains, inputs, h_s, y, slopes, trial, q)
 
 
 @njit(cache=True)

@@ -42,17 +42,17 @@ class Constants(NamedTuple):
     gravity_slope_npm: float = -2000.0
     coulomb_n: float = 250.0
     coulomb_width_mps: float = 4e-3  # the Coulomb friction is coulomb_n * tanh(v / width)
-    viscous_nspm: float = 2000.0
+    viscous_nspm: float = 3500.0
     dp_laminar_pa: float = 3e4
 
 
 class Controller(NamedTuple):
     """u = deadband compensation + volts_per_mps (v_ref + kp (x_ref - x)) + dither."""
 
-    kp_1ps: float = 8.0
+    kp_1ps: float = 5.0
     volts_per_mps: float = 26.0
     deadband_v: float = 1.6
-    blend_mps: float = 2e-3  # the compensation is deadband_v * tanh(demand / blend_mps)
+    blend_mps: float = 4e-3  # the compensation is deadband_v * tanh(demand / blend_mps)
     limit_v: float = 10.0
 
 
@@ -70,10 +70,10 @@ class Valve:
 
 
 DEFAULT_VALVES = (  # in the order of EDGES; one type, with the scatter of a series
-    Valve(gain=3.6e-8, deadband_v=1.85, ripple=0.12, ripple_phase_rad=0.5),
-    Valve(gain=4.1e-8, deadband_v=1.75, ripple=0.15, ripple_phase_rad=2.0),
-    Valve(gain=3.5e-8, deadband_v=1.80, ripple=0.10, ripple_phase_rad=3.5),
-    Valve(gain=3.9e-8, deadband_v=1.70, ripple=0.14, ripple_phase_rad=5.0),
+    Valve(gain=3.6e-8, deadband_v=1.70, ripple=0.12, ripple_phase_rad=0.5),
+    Valve(gain=4.1e-8, deadband_v=1.85, ripple=0.15, ripple_phase_rad=2.0),
+    Valve(gain=3.5e-8, deadband_v=1.75, ripple=0.10, ripple_phase_rad=3.5),
+    Valve(gain=3.9e-8, deadband_v=1.80, ripple=0.14, ripple_phase_rad=5.0),
     Valve(gain=1.2e-8, deadband_v=1.80, ripple=0.10, ripple_phase_rad=1.0),
 )
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rtid.sim.plant import AB, EDGES, Constants, Controller, Plant, Valve
+from rtid.sim.plant import AB, AT, BT, EDGES, PA, PB, Constants, Controller, Plant, Valve
 
 SPREAD = 0.3  # of every constant
 TYPE = 0.2  # of a valve type's gain and dead band; with the scatter of its valves within SPREAD
@@ -35,7 +35,7 @@ def draw(seed: int, *, cross_port: bool = False) -> Plant:
         gain=_vary(rng, Valve.gain, TYPE) * size, deadband_v=_vary(rng, Valve.deadband_v, TYPE)
     )
     small = replace(common, gain=CROSS_PORT_SHARE * common.gain)
-    valves = (*(_valve(rng, common) for _ in EDGES[:AB]), _valve(rng, small))
+    valves = _fill_first([*(_valve(rng, common) for _ in EDGES[:AB]), _valve(rng, small)])
     return Plant(
         constants=constants,
         controller=_controller(rng, valves, size),
@@ -59,6 +59,15 @@ def _valve(rng: np.random.Generator, common: Valve) -> Valve:
         ripple_rate_radpv=float(rng.uniform(0.8, 1.6)),
         ripple_phase_rad=float(rng.uniform(0, 2 * np.pi)),
     )
+
+
+def _fill_first(valves: list[Valve]) -> tuple[Valve, ...]:
+    """The same dead bands, dealt out so that the chamber that is filled opens first."""
+    for supply, tank in ((PA, BT), (PB, AT)):
+        low, high = sorted((valves[supply].deadband_v, valves[tank].deadband_v))
+        valves[supply] = replace(valves[supply], deadband_v=low)
+        valves[tank] = replace(valves[tank], deadband_v=high)
+    return tuple(valves)
 
 
 def _controller(rng: np.random.Generator, valves: tuple[Valve, ...], size: float) -> Controller:

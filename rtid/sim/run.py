@@ -16,7 +16,7 @@ from rtid.sim.motion import DT_S, MOTIONS, Motion
 from rtid.sim.plant import EDGES, FloatArray, Plant
 
 NAMES = ("u", "p_a", "p_b", "p_supply", "p_tank", "x", "v")
-U, P_A, P_B, X, V = 0, 1, 2, 5, 6  # columns of NAMES that the loop computes
+U, P_A, P_B, P_S, P_T, X, V = range(7)  # columns of NAMES
 COUNTS = 65535  # 16 bit
 
 
@@ -131,7 +131,7 @@ def _integrate(
     )
     signals = np.empty((n, 7))
     signals[:, [U, P_A, P_B, X, V]] = loop
-    signals[:, 3:5] = drive[:-1, [P_SUPPLY, P_TANK]]
+    signals[:, [P_S, P_T]] = drive[:-1, [P_SUPPLY, P_TANK]]
     return Truth(signals, opening_v, flow_m3s, drive[:-1, X_REF]), x_measured_m
 
 
@@ -143,7 +143,7 @@ def _resting_state(plant: Plant, x_m: float) -> FloatArray:
 
 
 def _check_sane(plant: Plant, truth: Truth, sensors: Sensors) -> None:
-    x, p = truth.signals[:, X], truth.signals[:, [P_A, P_B, 3]]
+    x, p = truth.signals[:, X], truth.signals[:, [P_A, P_B, P_S]]
     faults = {
         "leaves its stroke": ~((x > 0) & (x < plant.constants.stroke_m)),
         "cavitates": (p[:, :2] < 1e4).any(axis=1),
