@@ -138,7 +138,7 @@ BROKEN = [
     ("beta.bounds_mpa", [1600, 200], "beta.bounds_mpa", "[low, high]"),
     ("beta.nominal_mpa", 8, "beta", "around"),
     ("modes.extend", ["pa", "bb"], "modes.extend[1]", "there"),
-    ("geometry.stroke_mm", None, "geometry.stroke_m", "stroke_mm"),
+    ("geometry.stroke_mm", None, "geometry.stroke_mm", "stroke_mm"),
     ("geometry.position", "v", "geometry.position", "x"),
     ("source.dbc", "none.dbc", "source.dbc", "relative"),
     ("source.mode", "sync", "source.mode", "choose"),

@@ -147,7 +147,9 @@ def _problem(
     field = str(error["loc"][0])
     hint = kind.model_fields[field].description if field in kind.model_fields else None
     if error["type"] == "missing":
-        return Problem(_join(path, field), "missing", f"add {hint or field}")
+        key = (hint or field).partition(" ")[0]  # with a unit, as the file would have it
+        key = key if key.startswith(field.rpartition("_")[0]) else field
+        return Problem(_join(path, key), "missing", f"add {hint or field}")
     place, value = _join(path, keys.get(field, field)), raw.get(keys.get(field, field))
     context = error.get("ctx", {})
     inner: list[Any] = [*error["loc"][1:], *([context["index"]] if "index" in context else [])]

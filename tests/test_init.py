@@ -1,0 +1,95 @@
+"""`rtid init`: roles by name and unit, and a file that loads once its TODOs are filled in."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware_bridge import catalog
+from rtid.project import ProjectError, load
+from rtid.project.proposal import Candidate, from_catalog, propose
+
+ROOT = Path(__file__).parents[1]
+
+
+def init(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "rtid", "init", *map(str, arguments)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+
+
+def filled_in(path: Path) -> Path:
+    """Every commented example with a TODO taken as the truth."""
+    lines = path.read_text().splitlines()
+    kept = [line[2:] if line.startswith("# ") and "TODO" in line and "=" in line else line
+            for line in lines if not line.startswith("# Written")]  # fmt: skip
+    path.write_text("\n".join(kept))
+    return path
+
+
+def test_own_dbc_gives_a_project_that_loads_once_filled_in(tmp_path: Path) -> None:
+    path = tmp_path / "project.toml"
+    done = init("builtin:controller.dbc", "-o", path)
+    assert done.returncode == 0, done.stderr
+    with pytest.raises(ProjectError) as caught:
+        load(path)
+    missing = {problem.path for problem in caught.value.problems}
+    assert {"geometry.stroke_mm", "chambers.a.area", "edges.pa.rated_flow"} <= missing
+    assert all(problem.problem == "missing" for problem in caught.value.problems)
+    for problem in caught.value.problems:
+        assert str(problem) in done.stdout
+    project = load(filled_in(path))
+    signals = {s.name: (s.message, s.signal) for s in project.assembly.signals}
+    assert signals["p_a"] == ("Pressures", "PA")
+    assert signals["u"] == ("ValveCommand", "U")
+    assert signals["x"] == ("Motion", "X")
+    assert project.model.edges[0].grid.u_v[-1] == 10.0
+
+
+def test_existing_file_is_not_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "project.toml"
+    path.write_text("mine")
+    done = init("builtin:controller.dbc", "-o", path)
+    assert (done.returncode, path.read_text()) == (2, "mine")
+    assert init("builtin:controller.dbc", "-o", path, "--force").returncode == 0
+
+
+def test_table_with_and_without_units(tmp_path: Path) -> None:
+    t = np.arange(100) * 0.01
+    columns = {"time": t, "Valve": np.sin(t), "P1 [bar]": 50 + t, "P2 [bar]": 30 + t}
+    columns |= {"P_sup": 200 + t, "P_ret": 2 + t, "Pos_mm": 300 * t, "Pos_ref": 300 * t}
+    table = tmp_path / "run.csv"
+    rows = np.column_stack(list(columns.values()))
+    np.savetxt(table, rows, delimiter=",", header=",".join(columns), comments="")
+    path = tmp_path / "project.toml"
+    done = init(table, "-o", path)
+    assert done.returncode == 0, done.stderr
+    project = load(filled_in(path))
+    sources = {s.name: s for s in project.assembly.signals}
+    assert [sources[n].signal for n in ("u", "p_a", "p_b", "x")] == ["Valve", "P1", "P2", "Pos_mm"]
+    assert sources["p_supply"].signal == "P_sup" and sources["p_supply"].factor == 1e5
+    assert sources["x"].factor == 1e-3
+    assert "guessed" in done.stdout
+
+
+def test_dbc_without_a_machine_says_what_is_missing(shared: Path, tmp_path: Path) -> None:
+    done = init(shared / "data/can_j1939/j1939.dbc", "-o", tmp_path / "p.toml")
+    assert done.returncode == 0
+    assert "signals.p_a.message: missing" in done.stdout
+
+
+def test_unreadable_source_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "broken.dbc").write_text("this is no DBC")
+    done = init(tmp_path / "broken.dbc", "-o", tmp_path / "p.toml")
+    assert done.returncode in (2, 3) and "broken.dbc" in done.stderr
+    assert not (tmp_path / "p.toml").exists()
+
+
+def test_reference_values_are_not_taken_for_measurements() -> None:
+    roles = propose(from_catalog(catalog.load()))
+    assert "XRef" not in {found.name for found in roles.values()}
+    only_reference = [Candidate("XRef", "", "m", 0.0, 1.0)]
+    assert propose(only_reference) == {}
