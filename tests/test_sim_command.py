@@ -118,7 +118,8 @@ def test_live_on_a_bus() -> None:
 def test_wrong_arguments(arguments: list[str], said: str) -> None:
     with pytest.raises((RtidError, SendError), match=said) as caught:
         CliRunner().invoke(APP, arguments, catch_exceptions=False)
-    assert caught.value.exit_code == 2
+    error = caught.value
+    assert isinstance(error, RtidError | SendError) and error.exit_code == 2
 
 
 def test_the_command_is_listed() -> None:
