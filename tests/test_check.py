@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 import subprocess
-import sys
 from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from firmware_bridge.frames import EXTENDED, empty
 from rtid.check import Finding, Report, bus, judge, timing
 from rtid.check.reading import read_trace
 from rtid.check.series import Series, describe, estimate_noise, longest_frozen
+from rtid.cli.main import run
 from rtid.project import load
 
 ROOT = Path(__file__).parents[1]
@@ -155,6 +157,10 @@ def test_noise_is_found_under_motion_and_quantisation() -> None:
     noisy[::500] += 0.01  # outliers must not count
     assert estimate_noise(np.round(noisy / 7.6e-6) * 7.6e-6) == pytest.approx(1.02e-5, rel=0.05)
     assert estimate_noise(motion) < 1e-9
+    late = 0.02 * np.arange(4000) + rng.uniform(-2e-3, 2e-3, 4000)  # 50 Hz with jitter
+    slow = 0.15 * np.sin(2 * np.pi * 0.3 * late) + rng.normal(0, 1e-5, len(late))
+    t_us = np.rint(late * 1e6).astype(np.int64)
+    assert estimate_noise(slow, t_us) == pytest.approx(1e-5, rel=0.06)
     assert np.isnan(estimate_noise(motion[:10]))
 
 
@@ -188,8 +194,13 @@ def test_bus_separates_channels_and_identifiers() -> None:
 
 
 def rtid(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "rtid", *map(str, arguments)]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    """The command line in this process: exit code, stdout, stderr."""
+    out, err = io.StringIO(), io.StringIO()
+    words = [*map(str, arguments)]
+    with redirect_stdout(out), redirect_stderr(err), pytest.raises(SystemExit) as ended:
+        run(words)
+    code = ended.value.code
+    return subprocess.CompletedProcess(words, int(code or 0), out.getvalue(), err.getvalue())
 
 
 def test_command_prints_a_verdict_and_ends_with_its_code(folder: Path, tmp_path: Path) -> None:

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import io
 import subprocess
-import sys
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from firmware_bridge import catalog
+from rtid.cli.main import run
 from rtid.project import ProjectError, load
 from rtid.project.proposal import Candidate, from_catalog, propose
 
-ROOT = Path(__file__).parents[1]
-
 
 def init(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "rtid", "init", *map(str, arguments)]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    """The command line in this process: exit code, stdout, stderr."""
+    out, err = io.StringIO(), io.StringIO()
+    words = ["init", *map(str, arguments)]
+    with redirect_stdout(out), redirect_stderr(err), pytest.raises(SystemExit) as ended:
+        run(words)
+    code = ended.value.code
+    return subprocess.CompletedProcess(words, int(code or 0), out.getvalue(), err.getvalue())
 
 
 def filled_in(path: Path) -> Path:

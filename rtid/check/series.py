@@ -1,16 +1,15 @@
 """One measured signal judged alone: range, resolution, noise, spans in which it is frozen.
 
-Noise is what remains of a smooth signal after differences of order d,
+Noise is what remains of a smooth signal after divided differences of order d,
 
-    sigma = rms(diff^d x, outliers left out) / sqrt(C(2d, d)),
+    e_k = sum_i w_i x_(k+i) / sqrt(sum_i w_i^2),   w_i = 1 / prod_(j != i) (t_(k+i) - t_(k+j)),
 
-C(2d, d) being the gain of that difference on white noise; the order with the smallest sigma counts,
-because a low order still holds motion.
+so that white noise keeps its size at any jitter of t: sigma = rms(e, outliers left out).  The
+order with the smallest sigma counts, because a low order still holds motion.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,7 +59,7 @@ def describe(series: Series) -> SignalReport:
         minimum=float(x.min()),
         maximum=float(x.max()),
         step=smallest_step(x),
-        noise=estimate_noise(x),
+        noise=estimate_noise(x, t_us),
         frozen_s=span_s,
         frozen_from_s=start_s,
     )
@@ -73,12 +72,34 @@ def smallest_step(x: NDArray[np.float64]) -> float:
     return float(change.min()) if len(change) else 0.0
 
 
-def estimate_noise(x: NDArray[np.float64]) -> float:
-    """Standard deviation of white noise on a smooth signal; NaN from fewer than 20 values."""
+def estimate_noise(x: NDArray[np.float64], t_us: NDArray[np.int64] | None = None) -> float:
+    """Standard deviation of white noise on a smooth signal; NaN from fewer than 20 values.
+
+    Without t_us the values are taken as equally spaced.
+    """
     if len(x) < 20:
         return float("nan")
-    orders = range(1, MAX_ORDER + 1)
-    return min(_robust_rms(np.diff(x, d)) / math.sqrt(math.comb(2 * d, d)) for d in orders)
+    t = np.arange(len(x), dtype=np.float64)
+    if t_us is not None:
+        t = (t_us - t_us[0]) / max(float(np.median(np.diff(t_us))), 1.0)
+    return min(_robust_rms(_normed_difference(t, x, d)) for d in range(1, MAX_ORDER + 1))
+
+
+def _normed_difference(
+    t: NDArray[np.float64], x: NDArray[np.float64], order: int
+) -> NDArray[np.float64]:
+    """Divided difference of d + 1 neighbours, scaled to gain 1 on white noise."""
+    n = len(x) - order
+    total, gain = np.zeros(n), np.zeros(n)
+    for i in range(order + 1):
+        product = np.ones(n)
+        for j in range(order + 1):
+            if j != i:
+                product *= t[i : i + n] - t[j : j + n]
+        weight = np.divide(1.0, product, out=np.zeros(n), where=product != 0)
+        total += weight * x[i : i + n]
+        gain += weight**2
+    return np.divide(total, np.sqrt(gain), out=np.zeros(n), where=gain > 0)
 
 
 def _robust_rms(x: NDArray[np.float64]) -> float:
