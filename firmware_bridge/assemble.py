@@ -98,7 +98,7 @@ class Assembler:
         if self._cycle is not None:
             cycle.finish(self._cycle, self._counts)
             return _head(out, 0)
-        n = multirate.emit(self._multirate, out.t_us, out.values, out.flags, 0)
+        n = multirate.flush(self._multirate, out.t_us, out.values, out.flags)
         multirate.count_unpaired(self._multirate, self._counts)
         return _head(out, n)
 
@@ -182,7 +182,7 @@ def _plan(catalog: Catalog, assembly: Assembly) -> checks.Plan:
     table = np.concatenate(tables, axis=1) if tables else np.zeros((2, 0))
     return checks.Plan(
         messages, np.array(roles, checks.ROLE), np.concatenate(layouts), np.concatenate(codes),
-        np.ascontiguousarray(table[0]), np.ascontiguousarray(table[1]),
+        np.ascontiguousarray(table),
     )  # fmt: skip
 
 

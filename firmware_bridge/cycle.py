@@ -77,39 +77,31 @@ def _flags(progress: Record, slot: Record, late_us: Integer, counts: NDArray[np.
 
 @inlined
 def _join(
-    plan: checks.Plan,
-    state: State,
-    m: Integer,
+    slot: Record,
+    progress: Record,
+    bit: np.uint64,
     t_us: Integer,
     jumped: bool,
-    row_message: Integer,
     lifetime_us: Integer,
     counts: NDArray[np.int64],
-) -> Integer:
-    """Put the scratch values of message m into the slot of its cycle; the slot's index."""
-    row, bit = plan.messages[m], np.uint64(1) << np.uint64(m)
-    k = state.last[m].counter if len(state.slots) > 1 else 0
-    slot = state.slots[k]
+) -> None:
+    """Note the arrival of a message in the slot of its cycle, opened anew if it is an old one."""
     if slot.open and _is_stale(slot, bit, t_us, lifetime_us):
         slot.open = False
         counts[checks.INCOMPLETE_CYCLE] += 1
     if not slot.open:
-        _open_slot(slot, state.progress[0], t_us)
+        _open_slot(slot, progress, t_us)
     slot.mask |= bit
     slot.jump |= jumped
-    if m == row_message:
-        slot.row_us = t_us - row.offset_us
-    for j in range(row.n_roles):
-        state.values[k, plan.roles[row.first_role + j].column] = state.scratch[j]
-    return k
 
 
 @inlined
-def _complete(state: State, slot: Record, late_us: Integer, counts: NDArray[np.int64]) -> Integer:
+def _complete(
+    slots: Records, slot: Record, progress: Record, late_us: Integer, counts: NDArray[np.int64]
+) -> Integer:
     """Close a full slot and all older ones; the flags of its sample, -1 if it comes too late."""
-    progress = state.progress[0]
     slot.open = False
-    _close_older(state.slots, slot.order, counts)
+    _close_older(slots, slot.order, counts)
     if progress.started and slot.row_us <= progress.t_us:
         counts[checks.OUT_OF_ORDER] += 1
         return -1
@@ -138,28 +130,35 @@ def push(
 
     Changed in place: state, counts (REASONS,), out_* (room for n samples).
     """
-    full = (np.uint64(1) << np.uint64(len(plan.messages))) - np.uint64(1)
-    late_us = plan.messages[row_message].late_us
+    messages, roles, layouts, codes, tables = plan
+    last, slots, values, progress, scratch = state
+    full = (np.uint64(1) << np.uint64(len(messages))) - np.uint64(1)
     n_out = 0
     for i in range(len(t_us)):
-        m = checks.find_message(plan.messages, can_id[i], channel[i])
+        m = checks.find_message(messages, can_id[i], channel[i])
         if m < 0:
             counts[checks.UNKNOWN_ID] += 1
             continue
-        jumps = counts[checks.COUNTER_JUMP]
+        row, jumps = messages[m], counts[checks.COUNTER_JUMP]
         admitted = checks.admit(
-            plan, m, state.last, t_us[i], length[i], words[i], state.scratch, counts
-        )
+            row, last[m], roles, layouts, codes, tables,
+            t_us[i], length[i], words[i], scratch, counts,
+        )  # fmt: skip
         if admitted != checks.OK:
             continue
-        jumped = counts[checks.COUNTER_JUMP] > jumps
-        k = _join(plan, state, m, t_us[i], jumped, row_message, lifetime_us, counts)
-        if state.slots[k].mask != full:
+        k = last[m].counter if len(slots) > 1 else 0
+        bit, jumped = np.uint64(1) << np.uint64(m), counts[checks.COUNTER_JUMP] > jumps
+        _join(slots[k], progress[0], bit, t_us[i], jumped, lifetime_us, counts)
+        if m == row_message:
+            slots[k].row_us = t_us[i] - row.offset_us
+        for j in range(row.n_roles):
+            values[k, roles[row.first_role + j].column] = scratch[j]
+        if slots[k].mask != full:
             continue
-        flags = _complete(state, state.slots[k], late_us, counts)
+        flags = _complete(slots, slots[k], progress[0], messages[row_message].late_us, counts)
         if flags >= 0:
-            out_t_us[n_out], out_flags[n_out] = state.slots[k].row_us, flags
-            out_values[n_out] = state.values[k]
+            out_t_us[n_out], out_flags[n_out] = slots[k].row_us, flags
+            out_values[n_out] = values[k]
             n_out += 1
     return n_out
 

@@ -19,8 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge import checks
-from firmware_bridge.jit import Integer, Records, inlined, kernel
+from firmware_bridge.jit import Integer, Record, Records, inlined, kernel
 from firmware_bridge.samples import GAP, ROW
+
+NEVER = np.iinfo(np.int64).min
 
 QUEUE = np.dtype([("head", np.int64), ("count", np.int64), ("left", np.int64)])
 PENDING = np.dtype(
@@ -50,121 +52,155 @@ class State(NamedTuple):
 
 @inlined
 def _append(
-    state: State, m: Integer, t_us: Integer, n_roles: Integer, counts: NDArray[np.int64]
-) -> None:
-    """Put the scratch values of message m into its queue; a full queue loses its oldest."""
-    queue, capacity = state.queues[m], state.times.shape[1]
-    if queue.count == capacity:
+    queue: Record,
+    times: NDArray[np.int64],
+    values: NDArray[np.float64],
+    m: Integer,
+    t_us: Integer,
+    n_roles: Integer,
+    scratch: NDArray[np.float64],
+) -> bool:
+    """Put the scratch values of message m into its queue; True if it was full: the oldest goes."""
+    capacity = times.shape[1]
+    full = queue.count == capacity
+    if full:
         queue.head = (queue.head + 1) % capacity
         queue.count -= 1
         queue.left = 0
-        counts[checks.SILENT] += 1
-        state.pending[0].broken = True
     k = (queue.head + queue.count) % capacity
-    state.times[m, k] = t_us
-    state.values[m, k, :n_roles] = state.scratch[:n_roles]
+    times[m, k] = t_us
+    for j in range(n_roles):
+        values[m, k, j] = scratch[j]
     queue.count += 1
+    return full
 
 
 @inlined
-def _next_instant(state: State) -> Integer:
-    """Earliest sample that every message has reached; -1 while one has not."""
+def _next_instant(queues: Records, times: NDArray[np.int64]) -> Integer:
+    """Earliest sample that every message has reached; NEVER while one has not."""
     earliest = np.iinfo(np.int64).max
-    for m in range(len(state.queues)):
-        queue = state.queues[m]
-        if queue.count <= queue.left:
-            return np.iinfo(np.int64).min
-        k = (queue.head + queue.left) % state.times.shape[1]
-        earliest = min(earliest, state.times[m, k])
+    for m in range(len(queues)):
+        if queues[m].count <= queues[m].left:
+            return NEVER
+        k = (queues[m].head + queues[m].left) % times.shape[1]
+        earliest = min(earliest, times[m, k])
     return earliest
 
 
 @inlined
-def _advance(state: State, m: Integer, t_us: Integer) -> bool:
+def _advance(queue: Record, times: NDArray[np.int64], m: Integer, t_us: Integer) -> bool:
     """Make message m's sample at this instant, if there is one, its left neighbour."""
-    queue, capacity = state.queues[m], state.times.shape[1]
-    if state.times[m, (queue.head + queue.left) % capacity] != t_us:
+    k = (queue.head + queue.left) % times.shape[1]
+    if times[m, k] != t_us:
         return False
-    queue.head = (queue.head + queue.left) % capacity
+    queue.head = k
     queue.count -= queue.left
     queue.left = 1
     return True
 
 
 @inlined
-def _evaluate(plan: checks.Plan, state: State, m: Integer, t_us: Integer) -> Integer:
+def _evaluate(
+    row: Record,
+    roles: Records,
+    queue: Record,
+    times: NDArray[np.int64],
+    values: NDArray[np.float64],
+    m: Integer,
+    t_us: Integer,
+    new_row: NDArray[np.float64],
+) -> Integer:
     """Values of message m at this instant into new_row; OK, UNPAIRED or SILENT."""
-    queue, capacity, row = state.queues[m], state.times.shape[1], plan.messages[m]
     if queue.left == 0:
         return checks.UNPAIRED
-    a, b = queue.head, (queue.head + 1) % capacity
+    a, b = queue.head, (queue.head + 1) % times.shape[1]
     share = 0.0
-    if state.times[m, a] != t_us:
-        span_us = state.times[m, b] - state.times[m, a]
+    if times[m, a] != t_us:
+        span_us = times[m, b] - times[m, a]
         if span_us > row.limit_us:
             return checks.SILENT
-        share = (t_us - state.times[m, a]) / span_us
+        share = (t_us - times[m, a]) / span_us
     for j in range(row.n_roles):
-        role, v = plan.roles[row.first_role + j], state.values[m, a, j]
+        role, v = roles[row.first_role + j], values[m, a, j]
         if role.hold != checks.ZERO and share > 0.0:
-            v += (state.values[m, b, j] - v) * share
-        state.new_row[role.column] = v
+            v += (values[m, b, j] - v) * share
+        new_row[role.column] = v
     return checks.OK
 
 
 @inlined
-def _take_instant(plan: checks.Plan, state: State, t_us: Integer, row_message: Integer) -> Integer:
-    """Fill new_row for this instant; its flags, or -1 - reason if there is no sample."""
-    flags, reason = 0, checks.OK
-    for m in range(len(plan.messages)):
-        exact = _advance(state, m, t_us)
-        if exact and m == row_message:
-            flags |= ROW
-        verdict = _evaluate(plan, state, m, t_us)
-        if verdict != checks.OK and reason != checks.UNPAIRED:
-            reason = verdict
-    return flags if reason == checks.OK else -1 - reason
-
-
-@inlined
-def _average(plan: checks.Plan, row: NDArray[np.float64], new_row: NDArray[np.float64]) -> None:
+def _average(roles: Records, row: NDArray[np.float64], new_row: NDArray[np.float64]) -> None:
     """Replace the monitored commands in row by their mean over the interval to new_row."""
-    for r in range(len(plan.roles)):
-        if plan.roles[r].hold == checks.MEAN:
-            column = plan.roles[r].column
+    for r in range(len(roles)):
+        if roles[r].hold == checks.MEAN:
+            column = roles[r].column
             row[column] = 0.5 * (row[column] + new_row[column])
 
 
 @inlined
-def emit(
-    state: State,
+def _emit(
+    pending: Record,
+    row: NDArray[np.float64],
     out_t_us: NDArray[np.int64],
     out_values: NDArray[np.float64],
     out_flags: NDArray[np.uint8],
     n_out: Integer,
 ) -> Integer:
     """Write the pending sample, if there is one, to out_*[n_out]; the new number of samples."""
-    pending = state.pending[0]
     if not pending.full:
         return n_out
     out_t_us[n_out], out_flags[n_out] = pending.t_us, pending.flags
-    out_values[n_out] = state.row
+    out_values[n_out] = row
     pending.full = False
     return n_out + 1
 
 
 @inlined
-def _renew_pending(
-    plan: checks.Plan, state: State, t_us: Integer, flags: Integer, counts: NDArray[np.int64]
-) -> None:
-    """Make new_row the pending sample."""
-    pending = state.pending[0]
+def _renew(pending: Record, t_us: Integer, flags: Integer, counts: NDArray[np.int64]) -> None:
+    """Make the instant t_us the pending sample."""
     if pending.broken:
         flags |= GAP
         counts[checks.GAPS] += 1 if pending.started else 0
-    state.row[:] = state.new_row
     pending.t_us, pending.flags, pending.full = t_us, flags, True
     pending.broken, pending.started = False, True
+
+
+@inlined
+def _drain(
+    plan: checks.Plan,
+    state: State,
+    row_message: Integer,
+    counts: NDArray[np.int64],
+    out_t_us: NDArray[np.int64],
+    out_values: NDArray[np.float64],
+    out_flags: NDArray[np.uint8],
+    n_out: Integer,
+) -> Integer:
+    """Take all instants that every message has passed; the new number of samples in out_*."""
+    messages, roles = plan.messages, plan.roles
+    _, queues, times, values, pending, row, new_row, _ = state
+    instant_us = _next_instant(queues, times)
+    while instant_us != NEVER:
+        flags, reason = 0, checks.OK
+        for m in range(len(messages)):
+            if _advance(queues[m], times, m, instant_us) and m == row_message:
+                flags |= ROW
+            verdict = _evaluate(
+                messages[m], roles, queues[m], times, values, m, instant_us, new_row
+            )
+            if verdict != checks.OK and reason != checks.UNPAIRED:
+                reason = verdict
+        if reason != checks.OK:
+            counts[reason] += 1
+            pending[0].broken = True
+        elif not pending[0].broken:
+            _average(roles, row, new_row)
+        n_out = _emit(pending[0], row, out_t_us, out_values, out_flags, n_out)
+        if reason == checks.OK:
+            _renew(pending[0], instant_us, flags, counts)
+            row[:] = new_row
+        instant_us = _next_instant(queues, times)
+    return n_out
 
 
 @kernel
@@ -186,32 +222,38 @@ def push(
 
     Changed in place: state, counts (REASONS,), out_* (room for n samples + all queued + 1).
     """
+    messages, roles, layouts, codes, tables = plan
+    last, queues, times, values, pending, _, _, scratch = state
     n_out = 0
     for i in range(len(t_us)):
-        m = checks.find_message(plan.messages, can_id[i], channel[i])
+        m = checks.find_message(messages, can_id[i], channel[i])
         if m < 0:
             counts[checks.UNKNOWN_ID] += 1
             continue
+        row = messages[m]
         admitted = checks.admit(
-            plan, m, state.last, t_us[i], length[i], words[i], state.scratch, counts
-        )
+            row, last[m], roles, layouts, codes, tables,
+            t_us[i], length[i], words[i], scratch, counts,
+        )  # fmt: skip
         if admitted != checks.OK:
             continue
-        row = plan.messages[m]
-        _append(state, m, t_us[i] - row.offset_us, row.n_roles, counts)
-        instant_us = _next_instant(state)
-        while instant_us != np.iinfo(np.int64).min:
-            flags = _take_instant(plan, state, instant_us, row_message)
-            if flags < 0:
-                counts[-1 - flags] += 1
-                state.pending[0].broken = True
-            elif not state.pending[0].broken:
-                _average(plan, state.row, state.new_row)
-            n_out = emit(state, out_t_us, out_values, out_flags, n_out)
-            if flags >= 0:
-                _renew_pending(plan, state, instant_us, flags, counts)
-            instant_us = _next_instant(state)
+        stamp_us = t_us[i] - row.offset_us
+        if _append(queues[m], times, values, m, stamp_us, row.n_roles, scratch):
+            counts[checks.SILENT] += 1
+            pending[0].broken = True
+        n_out = _drain(plan, state, row_message, counts, out_t_us, out_values, out_flags, n_out)
     return n_out
+
+
+@kernel
+def flush(
+    state: State,
+    out_t_us: NDArray[np.int64],
+    out_values: NDArray[np.float64],
+    out_flags: NDArray[np.uint8],
+) -> Integer:
+    """Write the sample that still waits, if there is one; the number of samples in out_*."""
+    return _emit(state.pending[0], state.row, out_t_us, out_values, out_flags, 0)
 
 
 @kernel
