@@ -26,7 +26,7 @@ NEVER = np.iinfo(np.int64).min
 
 QUEUE = np.dtype([("head", np.int64), ("count", np.int64), ("left", np.int64)])
 PENDING = np.dtype(
-    [("t_us", np.int64), ("flags", np.uint8), ("full", np.bool_), ("broken", np.bool_),
+    [("t_us", np.int64), ("row_flags", np.uint8), ("full", np.bool_), ("broken", np.bool_),
      ("started", np.bool_)]
 )  # fmt: skip
 
@@ -149,7 +149,7 @@ def _emit(
     """Write the pending sample, if there is one, to out_*[n_out]; the new number of samples."""
     if not pending.full:
         return n_out
-    out_t_us[n_out], out_flags[n_out] = pending.t_us, pending.flags
+    out_t_us[n_out], out_flags[n_out] = pending.t_us, pending.row_flags
     out_values[n_out] = row
     pending.full = False
     return n_out + 1
@@ -161,7 +161,7 @@ def _renew(pending: Record, t_us: Integer, flags: Integer, counts: NDArray[np.in
     if pending.broken:
         flags |= GAP
         counts[checks.GAPS] += 1 if pending.started else 0
-    pending.t_us, pending.flags, pending.full = t_us, flags, True
+    pending.t_us, pending.row_flags, pending.full = t_us, flags, True
     pending.broken, pending.started = False, True
 
 

@@ -21,7 +21,7 @@ OK, BAD, REMOTE, FD, ERROR, TRUNCATED = -1, 0, 1, 2, 3, 4
 NEWLINE, CR, SPACE, HASH = 10, 13, 32, 35
 BYTES_PER_LINE = 20  # shortest line: "(0.0) c 001#" and its newline is longer than half of this
 
-_HEX = np.full(256, 255, np.uint8)
+_HEX = np.full(256, 255, np.int64)
 for _k, _c in enumerate(b"0123456789abcdef"):
     _HEX[_c] = _HEX[ord(chr(_c).upper())] = _k
 
@@ -54,7 +54,7 @@ def _channel(text: NDArray[np.uint8], pos: Integer, end: Integer) -> tuple[Integ
     start, number = pos, 0
     while pos < end and text[pos] != SPACE:
         digit = 48 <= text[pos] <= 57
-        number = (number * 10 + (text[pos] - 48)) & 0xFFFF if digit else 0
+        number = (number * 10 + np.int64(text[pos] - 48)) & 0xFFFF if digit else 0
         pos += 1
     return (number & 0xFF, pos + 1) if start < pos < end else (0, -1)
 
