@@ -41,6 +41,7 @@ class Assembler:
         if not rows or rows[0].message not in names:
             raise AssemblyError(f"row_signal {assembly.row_signal!r} is no signal of a message")
         self._row_message = names.index(rows[0].message)
+        self._lifetime_us = _lifetime_us(self._plan)
         self.reset()
 
     def reset(self) -> None:
@@ -77,7 +78,7 @@ class Assembler:
     def _push_cycle(self, arrays: tuple[NDArray[np.generic], ...]) -> Samples:
         out = self._room(len(arrays[0]))
         n = cycle.push(
-            self._plan, self._cycle, *arrays, self._row_message, self._lifetime_us(),
+            self._plan, self._cycle, *arrays, self._row_message, self._lifetime_us,
             self._counts, out.t_us, out.values, out.flags,
         )  # fmt: skip
         return _head(out, n)
@@ -106,13 +107,17 @@ class Assembler:
         m = len(self.names)
         return Samples(self.names, np.empty(n, np.int64), np.empty((n, m)), np.empty(n, np.uint8))
 
-    def _lifetime_us(self) -> int:
-        """How long a cycle may take from its first frame on."""
-        period_us = int(self._plan.messages["period_us"].max())
-        counted = (self._plan.messages["counter"] >= 0).all()
-        if not counted:
-            return period_us // 2
-        return period_us * (int(self._plan.messages["counter_mask"][0]) + 1) // 2
+
+def _lifetime_us(plan: checks.Plan) -> int:
+    """How long a cycle may take from its first frame on."""
+    period_us = int(plan.messages["period_us"].max())
+    if not _is_counted(plan):
+        return period_us // 2
+    return period_us * (int(plan.messages["counter_mask"][0]) + 1) // 2
+
+
+def _is_counted(plan: checks.Plan) -> bool:
+    return bool((plan.messages["counter"] >= 0).all())
 
 
 def _head(out: Samples, n: int) -> Samples:
@@ -120,8 +125,7 @@ def _head(out: Samples, n: int) -> Samples:
 
 
 def _cycle_state(plan: checks.Plan, constants: NDArray[np.float64]) -> cycle.State:
-    counted = (plan.messages["counter"] >= 0).all()
-    n_slots = int(plan.messages["counter_mask"][0]) + 1 if counted else 1
+    n_slots = int(plan.messages["counter_mask"][0]) + 1 if _is_counted(plan) else 1
     return cycle.State(
         last=np.zeros(len(plan.messages), checks.LAST),
         slots=np.zeros(n_slots, cycle.SLOT),

@@ -51,7 +51,8 @@ def _time(text: NDArray[np.uint8], pos: Integer, end: Integer) -> tuple[Integer,
 @inlined
 def _channel(text: NDArray[np.uint8], pos: Integer, end: Integer) -> tuple[Integer, Integer]:
     """Number at the end of the channel's name and the position behind it; -1 if malformed."""
-    start, number = pos, 0
+    start = pos
+    number: Integer = 0
     while pos < end and text[pos] != SPACE:
         digit = 48 <= text[pos] <= 57
         number = (number * 10 + np.int64(text[pos] - 48)) & 0xFFFF if digit else 0

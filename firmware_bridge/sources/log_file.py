@@ -5,6 +5,7 @@ BLF and candump logs have bulk readers of our own; ASC, TRC and CSV go through p
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -44,18 +45,20 @@ def open_log(path: str | Path) -> Frames:
 
 def _read_with_python_can(path: Path, suffix: str) -> Frames:
     """Frames until the end, or until the reader trips over a damaged line (counted)."""
+    text = path.read_text(encoding="utf-8", errors="replace")
+    whole = text[: text.rfind("\n") + 1]  # a cut last line may look like a shorter frame
     failures: list[Exception] = []
-    found = fr.from_messages(_messages(path, suffix, failures))
+    found = fr.from_messages(_messages(whole, suffix, failures))
     if failures and len(found) == 0:
         raise LogError(f"{path}: not a readable {suffix} log: {failures[0]}") from failures[0]
-    if failures:
+    if failures or len(whole) < len(text):
         fr.add_counts(found.refused, {"truncated": 1})
     return found
 
 
-def _messages(path: Path, suffix: str, failures: list[Exception]) -> Iterator[can.Message]:
+def _messages(text: str, suffix: str, failures: list[Exception]) -> Iterator[can.Message]:
     try:
-        with PYTHON_CAN[suffix](path) as reader:
+        with PYTHON_CAN[suffix](io.StringIO(text)) as reader:
             yield from reader
     except Exception as error:  # python-can's text readers raise whatever a damaged line causes
         failures.append(error)

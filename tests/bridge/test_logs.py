@@ -125,6 +125,20 @@ def test_cut_log_gives_a_prefix_and_says_truncated(tmp_path: Path, suffix: str) 
             assert len(part) >= 0.95 * expected - 300
 
 
+@pytest.mark.parametrize("suffix", [".asc", ".csv", ".trc"])
+def test_cut_text_log_never_gives_a_wrong_frame(tmp_path: Path, suffix: str) -> None:
+    path = write(tmp_path / f"t{suffix}", traffic(300, 9, remote=False))
+    whole, raw = open_log(path), path.read_bytes()
+    rng = np.random.default_rng(10)
+    cut = tmp_path / f"cut{suffix}"
+    for size in rng.integers(len(raw) // 10, len(raw) - 20, 40):
+        cut.write_bytes(raw[:size])
+        part = open_log(cut)
+        assert is_prefix(part, whole)
+        assert len(part) >= len(whole) * size / len(raw) * 0.9 - 25
+        assert "truncated" in part.refused or raw[size - 1] == 10
+
+
 @pytest.mark.parametrize("suffix", [".blf", ".log"])
 def test_flipped_bytes_lose_at_most_a_line_or_container(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"t{suffix}"
