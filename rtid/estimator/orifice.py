@@ -1,32 +1,44 @@
 """What the visited blocks say about the rest of the map: the orifice law as a Gaussian process.
 
-    Q(w, dp) = s(dp) [K(w) + e(w, dp)],     s(dp) = sign(dp) sqrt |dp|
+    Q(w, dp) = s(dp) |dp|^delta [K(w) + K(w) h(log |dp|) + e(w, dp)],     s(dp) = sign(dp) sqrt |dp|
 
 K(w), the flow gain, is an integrated Wiener process that starts at zero at the edge of the safe
-band: smooth where there are data, and less and less certain away from them.  e is what the law does
-not explain, in proportion to K, with a correlation that fades over the command and over log |dp|.
-How rough K is and how large e is follow from the scatter of Q / s(dp) among the blocks themselves
-(largest marginal likelihood), so a valve that does not obey the law says so by wide intervals.
+band: smooth where there are data, and less and less certain away from them.  delta is 0 unless the
+data clearly want another exponent than 1/2 (a load-compensated valve, a laminar gap).  h, another
+integrated Wiener process, is how the whole valve deviates from the law; e is what is left, in
+proportion to K, with a correlation that fades over the command and over log |dp|.  How rough K is
+and how large h and e are follow from the scatter of Q / s(dp) among the blocks themselves (largest
+marginal likelihood), so a valve that does not obey the law says so by wide intervals.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import cho_solve, cholesky, solve_triangular
-from scipy.optimize import minimize
+from scipy.optimize import OptimizeResult, minimize
 
 from rtid.model import Edge, FloatArray
 
 REACH_LOG_DP = 1.0  # e fades by 1/e over this change of log |dp| ...
 REACH_W = 0.2  # ... and over this share of the command's range
-JITTER = 1e-8
+SLOPE_SD = 2.0  # of K' before any data, in units of the rated gain per range
+LEAST_SIZE = 0.02  # of the rated gain: e does not vanish in the dead band
+BLOCK_ERROR = 3e-4  # share of K by which a block's polynomial misses its data at the least
+# Log rough, log exponent, log deviation, delta: starts (law obeyed, or not) and bounds.
+ORIFICE, OTHER_LAW = (1.0, -5.0, -5.0, 0.0), (1.0, -3.0, -4.0, 0.0)
+SEARCH = ((-8.0, 8.0), (-8.0, 1.0), (-7.0, 1.0), (-0.5, 0.5))
+CLEARLY = 10.0  # gain in log likelihood that another exponent must bring
+
+
+Strength = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
 class GainData:
-    """Measured flow gains: gain (n,) = Q / s(dp) with sd (n,), m3/s/sqrt(Pa), at w_v, dp_pa (n,)."""
+    """Measured flow gains Q / s(dp) with their sd, m3/s/sqrt(Pa), at w_v, dp_pa: all (n,)."""
 
     w_v: FloatArray
     dp_pa: FloatArray
@@ -35,47 +47,161 @@ class GainData:
 
 
 @dataclass(frozen=True)
+class Points:
+    """Arguments of the kernel, arrays of one shape, dimensionless: opening, log |dp|, size of e."""
+
+    opening: FloatArray
+    log_dp: FloatArray
+    size: FloatArray
+
+    def rows(self) -> Points:
+        """The same points with a new last axis."""
+        return Points(self.opening[..., None], self.log_dp[..., None], self.size[..., None])
+
+    def columns(self) -> Points:
+        """The same points with a new last axis but one."""
+        return Points(*(a[..., None, :] for a in (self.opening, self.log_dp, self.size)))
+
+
+@dataclass(frozen=True)
+class Scale:
+    """The edge's rated size: foot of the range, its length, gain there; mean and least |dp|."""
+
+    foot_v: float
+    range_v: float
+    gain: float
+    dp_pa: float
+    least_dp_pa: float
+
+    def points(self, w_v: FloatArray, dp_pa: FloatArray, size: FloatArray) -> Points:
+        """Kernel arguments of physical points; size in units of the rated gain."""
+        opening = np.maximum((w_v - self.foot_v) / self.range_v, 0.0)
+        log_dp = np.log((np.abs(dp_pa) + self.least_dp_pa) / self.dp_pa)
+        return Points(opening, log_dp, size)
+
+
+@dataclass(frozen=True)
 class OrificeLaw:
-    """The process of one edge conditioned on its data; see `fit_law`."""
+    """The process of one edge conditioned on its data; gains in units of the rated gain.
 
-    edge: Edge
-    data: GainData
-    rough: float  # variance rate of K'' in (rated gain per range)^2 / V
-    deviation: float  # standard deviation of e as a share of K
-    trend: FloatArray  # K at the data from a first pass: the size of e
-    lower: FloatArray
+    strength: variance rate of K'', standard deviations of h' and of e / K, and delta.
+    """
+
+    scale: Scale
+    strength: Strength
+    sizes: FloatArray  # size of e at `knots` of the opening
+    knots: FloatArray
+    points: Points
     alpha: FloatArray
-
-    def gain(self, w_v: FloatArray, dp_pa: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Mean (m,) and covariance (m, m) of Q / s(dp) at the points w_v, dp_pa (m,)."""
-        mean, cov = self.gains(w_v[None], dp_pa[None])
-        return mean[0], cov[0]
+    lower: FloatArray
 
     def gains(self, w_v: FloatArray, dp_pa: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """As `gain` for c separate sets of m points (c, m): mean (c, m), covariance (c, m, m)."""
-        size = self._size(w_v)
-        cross = _kernel(self, w_v[..., None], dp_pa[..., None], size[..., None], *self._at_data)
-        mean = _prior_gain(self.edge, w_v) + cross @ self.alpha
-        flat = solve_triangular(self.lower, cross.reshape(-1, cross.shape[-1]).T, lower=True)
-        half = flat.T.reshape(cross.shape)
-        points = (w_v[:, :, None], dp_pa[:, :, None], size[:, :, None])
-        others = (w_v[:, None, :], dp_pa[:, None, :], size[:, None, :])
-        return mean, _kernel(self, *points, *others) - half @ half.transpose(0, 2, 1)
+        """Q / s(dp) at c separate sets of m points (c, m): mean (c, m) and covariance (c, m, m)."""
+        opening = np.maximum((w_v - self.scale.foot_v) / self.scale.range_v, 0.0)
+        points = self.scale.points(w_v, dp_pa, np.interp(opening, self.knots, self.sizes))
+        flat = points.rows()
+        cross = self._kernel(flat, self.points)
+        solved = solve_triangular(self.lower, cross.reshape(w_v.size, -1).T, lower=True)
+        half = np.asarray(solved).T.reshape(cross.shape)
+        own = self._kernel(flat, points.columns())
+        mean = opening + cross @ self.alpha
+        unit = self.scale.gain * np.exp(self.strength[3] * points.log_dp)
+        cov = own - half @ half.transpose(0, 2, 1)
+        return mean * unit, cov * unit[:, :, None] * unit[:, None, :]
 
-    def _size(self, w_v: FloatArray) -> FloatArray:
-        """K from the first pass, which scales e."""
-        order = np.argsort(self.data.w_v)
-        if len(order) == 0:
-            return _prior_gain(self.edge, w_v)
-        known = np.interp(w_v, self.data.w_v[order], self.trend[order])
-        beyond = np.maximum(w_v / self.data.w_v[order[-1]], 1.0)
-        return known * beyond
+    def _kernel(self, a: Points, b: Points) -> FloatArray:
+        return kernel(a, b, *self.strength[:3])
 
-    @property
-    def _at_data(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        return self.data.w_v, self.data.dp_pa, self.trend
+
+def kernel(a: Points, b: Points, rough: float, exponent: float, deviation: float) -> FloatArray:
+    """Covariance of Q / s(dp) between points, broadcast; in squares of the rated gain."""
+    low, high = np.minimum(a.opening, b.opening), np.maximum(a.opening, b.opening)
+    both = np.abs(a.log_dp), np.abs(b.log_dp)
+    smooth = SLOPE_SD**2 * low * high + rough * wiener(low, high)
+    shared = a.log_dp * b.log_dp + np.where(
+        a.log_dp * b.log_dp > 0.0, wiener(np.minimum(*both), np.maximum(*both)), 0.0
+    )
+    far = (high - low) / REACH_W + np.abs(a.log_dp - b.log_dp) / REACH_LOG_DP
+    deviations = exponent**2 * shared + deviation**2 * np.exp(-far)
+    return np.asarray(smooth + a.size * b.size * deviations)
+
+
+def _descend(
+    surprise: Callable[[FloatArray], float],
+    start: tuple[float, ...],
+    bounds: tuple[tuple[float, float], ...],
+) -> OptimizeResult:
+    steps = np.diag([1.5, 1.5, 1.5, 0.2][: len(start)])
+    simplex = np.vstack([start, np.array(start) + steps])
+    return minimize(
+        surprise,
+        np.array(start),
+        method="Nelder-Mead",
+        bounds=bounds,
+        options={"xatol": 0.05, "fatol": 0.05, "initial_simplex": simplex},
+    )
+
+
+def wiener(low: FloatArray, high: FloatArray) -> FloatArray:
+    """Covariance of a once integrated Wiener process between 0 <= low <= high."""
+    return np.asarray(low**2 * (3.0 * high - low) / 6.0)
+
+
+def fit_law(edge: Edge, data: GainData) -> OrificeLaw:
+    """The law of one edge from the flow gains of its blocks (n >= 0 of them)."""
+    scale = scale_of(edge, data)
+    knots = np.linspace(0.0, 1.0, 65)
+    first = _condition(scale, data, knots, np.full(65, 0.3), (10.0, 0.01, 0.1, 0.0))
+    gain, _ = first.gains(scale.foot_v + scale.range_v * knots[:, None], np.full((65, 1), 1e6))
+    sizes = np.maximum(gain[:, 0] / scale.gain, LEAST_SIZE)
+    if len(data.gain) < 3:
+        return replace(first, sizes=sizes)
+
+    def surprise(x: FloatArray) -> float:
+        law = _condition(scale, data, knots, sizes, _strength(x))
+        tilt = np.exp(-law.strength[3] * law.points.log_dp)
+        y = tilt * data.gain / scale.gain - law.points.opening
+        return float(0.5 * y @ law.alpha + np.log(np.diag(law.lower)).sum() - np.log(tilt).sum())
+
+    orifice = _descend(lambda x: surprise(np.append(x, 0.0)), ORIFICE[:3], SEARCH[:3])
+    other = _descend(surprise, OTHER_LAW, SEARCH)
+    clear = other.fun < orifice.fun - CLEARLY
+    best = other.x if clear else np.append(orifice.x, 0.0)
+    return _condition(scale, data, knots, sizes, _strength(best))
+
+
+def scale_of(edge: Edge, data: GainData) -> Scale:
+    """Rated size of an edge, and where its data lie."""
+    u, dp = edge.grid.u_v, edge.grid.dp_pa
+    foot = edge.safe_band_v if np.isfinite(edge.safe_band_v) else u[0]
+    gain = edge.rated_q_m3s / np.sqrt(edge.rated_dp_pa)
+    least = float(0.01 * np.diff(dp).min())
+    usual = np.median(np.abs(data.dp_pa)) if len(data.dp_pa) else edge.rated_dp_pa
+    return Scale(float(foot), float(u[-1] - foot), float(gain), float(usual), least)
 
 
 def root(dp_pa: FloatArray) -> FloatArray:
     """s(dp) = sign(dp) sqrt |dp|."""
     return np.asarray(np.sign(dp_pa) * np.sqrt(np.abs(dp_pa)))
+
+
+def _strength(x: FloatArray) -> Strength:
+    rough, exponent, deviation = np.exp(x[:3])
+    return float(rough), float(exponent), float(deviation), float(x[3])
+
+
+def _condition(
+    scale: Scale,
+    data: GainData,
+    knots: FloatArray,
+    sizes: FloatArray,
+    strength: Strength,
+) -> OrificeLaw:
+    opening = np.maximum((data.w_v - scale.foot_v) / scale.range_v, 0.0)
+    points = scale.points(data.w_v, data.dp_pa, np.interp(opening, knots, sizes))
+    cov = kernel(points.rows(), points, *strength[:3])
+    tilt = np.exp(-strength[3] * points.log_dp) / scale.gain
+    cov[np.diag_indices_from(cov)] += (tilt * data.sd) ** 2 + (BLOCK_ERROR * points.size) ** 2
+    lower = cholesky(cov, lower=True)
+    alpha = cho_solve((lower, True), tilt * data.gain - opening)
+    return OrificeLaw(scale, strength, sizes, knots, points, alpha, lower)

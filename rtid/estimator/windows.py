@@ -11,6 +11,7 @@ as long as the overlaps of one block do not meet: eta_i + eta_i+1 <= b_i+1 - b_i
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rtid.model import FloatArray
 
@@ -37,7 +38,7 @@ def overlaps(border: FloatArray, share: float = OVERLAP) -> FloatArray:
     return share * np.minimum(np.append(width, width[-1]), np.insert(width, 0, width[0]))
 
 
-def blend(border: FloatArray, at: FloatArray) -> tuple[np.ndarray, FloatArray, FloatArray]:
+def blend(border: FloatArray, at: FloatArray) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
     """The two blocks that share each point, and how.
 
     border (n + 1,), at (m,) inside it.  Returns lower (m,), the first of the blocks lower and
@@ -46,7 +47,7 @@ def blend(border: FloatArray, at: FloatArray) -> tuple[np.ndarray, FloatArray, F
     """
     n, eta = len(border) - 1, overlaps(border)
     if n == 1:
-        return np.zeros(len(at), int), np.zeros(len(at)), np.zeros(len(at))
+        return np.zeros(len(at), np.intp), np.zeros(len(at)), np.zeros(len(at))
     middle = 0.5 * (border[1:] + border[:-1])
     lower = np.clip(np.searchsorted(middle, at) - 1, 0, n - 2)
     t = (at - border[lower + 1]) / eta[lower + 1]

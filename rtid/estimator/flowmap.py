@@ -1,0 +1,214 @@
+"""The published flow map Q(w, dp): continuous, with its uncertainty, slopes and inverse.
+
+Per edge, the Taylor polynomials of the (at most four) blocks around a point are blended by the
+squares of the lapped windows of eq. (12):
+
+    Q(w, dp) = sum over blocks of g_i(w) g_j(dp) phi_ij(w, dp)' theta_ij
+
+w = direction * u is the opening command.  At and below the safe band the flow is zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rtid.estimator.windows import blend, overlaps, rising, rising_slope
+from rtid.kernels.layout import TERMS
+from rtid.model import FloatArray, Grid
+
+# Status of a cell.
+VALID, LEARNING, EXTRAPOLATED, PRIOR, SHUT = "valid", "learning", "extrapolated", "prior", "shut"
+
+INVERSE_STEPS = 34  # bisections: from a quarter of a block to 1e-10 of it
+SCAN = 4  # points per block where a sign change is looked for
+
+Cells = tuple[NDArray[np.intp], NDArray[np.intp]]
+Corner = tuple[Cells, FloatArray, FloatArray, FloatArray]
+
+
+@dataclass(frozen=True)
+class EdgeMap:
+    """One edge's map: theta (nu, nd, 6) and cov (nu, nd, 6, 6) in m3/s, terms of `kernels.basis`.
+
+    status (nu, nd) holds the words above; reason says per cell (i, j) why it is not valid.
+    """
+
+    name: str
+    grid: Grid
+    safe_band_v: float
+    theta: FloatArray
+    cov: FloatArray
+    status: NDArray[np.str_]
+    reason: dict[tuple[int, int], str]
+
+    def flow(self, w_v: ArrayLike, dp_pa: ArrayLike) -> FloatArray:
+        """Q in m3/s at broadcast points; 0 at or below the safe band, NaN off the grid."""
+        return self._blended(w_v, dp_pa)[0]
+
+    def gradient(self, w_v: ArrayLike, dp_pa: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """dQ/dw in m3/s/V and dQ/ddp in m3/s/Pa of the same map."""
+        return self._blended(w_v, dp_pa)[1:]
+
+    def sd(self, w_v: ArrayLike, dp_pa: ArrayLike) -> FloatArray:
+        """Standard deviation of Q in m3/s; neighbours' errors are taken as wholly correlated."""
+        w, dp, open_, inside, shape = self._points(w_v, dp_pa)
+        total = np.zeros(len(w))
+        for cells, weight, *_ in self._corners(w, dp):
+            phi = self._terms(cells, w, dp)[0]
+            variance = np.einsum("ki,kij,kj->k", phi, self.cov[cells], phi)
+            total += weight * np.sqrt(np.maximum(variance, 0.0))
+        return self._finish(total * self._foot(w)[0], open_, inside, shape)
+
+    def inverse(self, q_m3s: ArrayLike, dp_pa: ArrayLike) -> FloatArray:
+        """The command w with Q(w, dp) = q, to 1e-9 V; NaN where there is none or more than one."""
+        q, dp = np.broadcast_arrays(np.asarray(q_m3s, float), np.asarray(dp_pa, float))
+        flat_q, flat_dp = q.ravel(), dp.ravel()
+        lattice = self._lattice()
+        table = self.flow(lattice[None, :], flat_dp[:, None]) - flat_q[:, None]
+        crossing = (table[:, :-1] < 0) != (table[:, 1:] < 0)
+        single = (crossing.sum(axis=1) == 1) & np.isfinite(table).all(axis=1)
+        at = crossing.argmax(axis=1)
+        low, high = lattice[at], lattice[at + 1]
+        falling = table[np.arange(len(at)), at] > 0
+        for _ in range(INVERSE_STEPS):
+            middle = 0.5 * (low + high)
+            above = (self.flow(middle, flat_dp) > flat_q) != falling
+            low, high = np.where(above, low, middle), np.where(above, middle, high)
+        found = np.where(single, 0.5 * (low + high), np.nan)
+        return found.reshape(q.shape)
+
+    def status_at(self, w_v: ArrayLike, dp_pa: ArrayLike) -> NDArray[np.str_]:
+        """Status of the cell that holds each point; "outside" off the grid."""
+        w, dp, open_, inside, shape = self._points(w_v, dp_pa)
+        i, j = (_cell(b, x) for b, x in ((self.grid.u_v, w), (self.grid.dp_pa, dp)))
+        status = np.where(inside, self.status[i, j], "outside")
+        return np.where(open_, status, SHUT).reshape(shape)
+
+    @property
+    def q_max_m3s(self) -> float:
+        """Largest flow at a valid cell's centre."""
+        valid = self.status == VALID
+        return float(np.abs(self.theta[valid][:, 0]).max()) if valid.any() else np.nan
+
+    def _lattice(self) -> FloatArray:
+        u = self.grid.u_v
+        steps = np.arange(SCAN) / SCAN
+        fine = np.append((u[:-1, None] + np.diff(u)[:, None] * steps).ravel(), u[-1])
+        start = max(self.safe_band_v, float(u[0]))
+        return np.append(start, fine[fine > start])
+
+    def _points(
+        self, w_v: ArrayLike, dp_pa: ArrayLike
+    ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_], NDArray[np.bool_], tuple[int, ...]]:
+        """Flat points moved into the grid; which are open, which lay inside; the shape."""
+        w, dp = np.broadcast_arrays(np.asarray(w_v, float), np.asarray(dp_pa, float))
+        shape, w, dp = w.shape, w.ravel(), dp.ravel()
+        u, p = self.grid.u_v, self.grid.dp_pa
+        inside = (w >= u[0]) & (w <= u[-1]) & (dp >= p[0]) & (dp <= p[-1])
+        open_ = ~(w <= self.safe_band_v)
+        w, dp = np.nan_to_num(w, nan=u[0]), np.nan_to_num(dp, nan=p[0])
+        return np.clip(w, u[0], u[-1]), np.clip(dp, p[0], p[-1]), open_, inside, shape
+
+    def _corners(self, w: FloatArray, dp: FloatArray) -> Iterator[Corner]:
+        """Per blended block: its cells (i, j), the weight, and the weight's slopes in w and dp."""
+        i, b, b_w = blend(self.grid.u_v, w)
+        j, c, c_p = blend(self.grid.dp_pa, dp)
+        for di, wi, si in ((0, 1 - b, -b_w), (1, b, b_w)):
+            for dj, wj, sj in ((0, 1 - c, -c_p), (1, c, c_p)):
+                nu, nd = self.grid.shape
+                cells = np.minimum(i + di, nu - 1), np.minimum(j + dj, nd - 1)
+                yield cells, wi * wj, si * wj, wi * sj
+
+    def _terms(
+        self, cells: Cells, w: FloatArray, dp: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """phi (k, 6) at the points in their cells, and its derivatives by w and dp."""
+        (i, j), u, p = cells, self.grid.u_v, self.grid.dp_pa
+        hu, hp = 2.0 / (u[i + 1] - u[i]), 2.0 / (p[j + 1] - p[j])
+        xi, eta = (w - u[i]) * hu - 1.0, (dp - p[j]) * hp - 1.0
+        one, zero = np.ones_like(xi), np.zeros_like(xi)
+        phi = np.stack([one, xi, eta, xi * xi, eta * eta, xi * eta], axis=1)
+        by_w = np.stack([zero, one, zero, 2 * xi, zero, eta], axis=1) * hu[:, None]
+        by_dp = np.stack([zero, zero, one, zero, 2 * eta, xi], axis=1) * hp[:, None]
+        return phi, by_w, by_dp
+
+    def _blended(
+        self, w_v: ArrayLike, dp_pa: ArrayLike
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Q and its two slopes: product rule over terms, windows and foot."""
+        w, dp, open_, inside, shape = self._points(w_v, dp_pa)
+        q, q_w, q_p = np.zeros((3, len(w)))
+        for cells, g, g_w, g_p in self._corners(w, dp):
+            theta = self.theta[cells]
+            value, by_w, by_p = ((t * theta).sum(axis=1) for t in self._terms(cells, w, dp))
+            q += g * value
+            q_w += g * by_w + g_w * value
+            q_p += g * by_p + g_p * value
+        f, f_w = self._foot(w)
+        parts = (f * q, f * q_w + f_w * q, f * q_p)
+        a, b, c = (self._finish(part, open_, inside, shape) for part in parts)
+        return a, b, c
+
+    def _foot(self, w: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Weight that lets the flow rise from zero at the safe band, and its derivative."""
+        if not np.isfinite(self.safe_band_v):
+            return np.ones(len(w)), np.zeros(len(w))
+        i = _cell(self.grid.u_v, np.array([self.safe_band_v]))[0]
+        eta = overlaps(self.grid.u_v)[i + 1] / 2
+        t = (w - self.safe_band_v) / eta - 1.0
+        return rising(t), rising_slope(t) / eta
+
+    @staticmethod
+    def _finish(
+        value: FloatArray,
+        open_: NDArray[np.bool_],
+        inside: NDArray[np.bool_],
+        shape: tuple[int, ...],
+    ) -> FloatArray:
+        return np.where(open_, np.where(inside, value, np.nan), 0.0).reshape(shape)
+
+
+def _cell(border: FloatArray, at: FloatArray) -> NDArray[np.intp]:
+    return np.clip(np.searchsorted(border, at, side="right") - 1, 0, len(border) - 2)
+
+
+@dataclass(frozen=True)
+class FlowMap:
+    """The maps of all edges, in the order of the model."""
+
+    edges: tuple[EdgeMap, ...]
+
+    def __getitem__(self, edge: int | str) -> EdgeMap:
+        """One edge by number or name; KeyError names the edges that exist."""
+        if isinstance(edge, int):
+            return self.edges[edge]
+        for found in self.edges:
+            if found.name == edge:
+                return found
+        raise KeyError(f"the map has no edge {edge!r}, only {[e.name for e in self.edges]}")
+
+    def flow(self, edge: int | str, w_v: ArrayLike, dp_pa: ArrayLike) -> FloatArray:
+        """Q of one edge in m3/s, see `EdgeMap.flow`."""
+        return self[edge].flow(w_v, dp_pa)
+
+    def sd(self, edge: int | str, w_v: ArrayLike, dp_pa: ArrayLike) -> FloatArray:
+        """Its standard deviation in m3/s."""
+        return self[edge].sd(w_v, dp_pa)
+
+    def gradient(
+        self, edge: int | str, w_v: ArrayLike, dp_pa: ArrayLike
+    ) -> tuple[FloatArray, FloatArray]:
+        """dQ/dw and dQ/ddp."""
+        return self[edge].gradient(w_v, dp_pa)
+
+    def inverse(self, edge: int | str, q_m3s: ArrayLike, dp_pa: ArrayLike) -> FloatArray:
+        """The command w in V for a wanted flow."""
+        return self[edge].inverse(q_m3s, dp_pa)
+
+    def theta_cells(self) -> FloatArray:
+        """Terms of all cells (cells, 6) in the order of `kernels.explain`."""
+        return np.concatenate([e.theta.reshape(-1, TERMS) for e in self.edges])

@@ -1,0 +1,155 @@
+"""From the joint estimate to the map that is published: every cell gets six terms and a status.
+
+A visited cell combines what it has learned itself with what the orifice law says from all other
+blocks, as two Gaussians: strongly excited terms stay its own, weakly excited ones come from the
+law.  A cell without data has the law alone.  In information form, with the law's (m, S), the cell's
+own (theta, C) and its mean flow phi' theta, which the law has already used and which counts once:
+
+    (S^-1 + C^-1 - phi phi' / (phi' C phi)) theta_new = S^-1 m + C^-1 theta - phi phi' theta / (...)
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtid.estimator.flowmap import EXTRAPOLATED, LEARNING, PRIOR, SHUT, VALID, EdgeMap, FlowMap
+from rtid.estimator.orifice import GainData, OrificeLaw, fit_law, root
+from rtid.estimator.solution import VALID as BLOCK_VALID
+from rtid.estimator.solution import Block, Solution
+from rtid.kernels.layout import TERMS
+from rtid.model import Edge, FloatArray, Grid
+
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(4)
+
+
+def publish(solution: Solution) -> FlowMap:
+    """The map of all edges."""
+    edges = solution.model.edges
+    of = [[b for b in solution.blocks if b.edge == i] for i in range(len(edges))]
+    return FlowMap(tuple(_publish_edge(e, b) for e, b in zip(edges, of, strict=True)))
+
+
+def _publish_edge(edge: Edge, blocks: list[Block]) -> EdgeMap:
+    """Law first, then each visited cell combined with it."""
+    shut = edge.grid.u_v[1:] <= edge.safe_band_v
+    blocks = [b for b in blocks if not shut[b.i]]
+    used = [b for b in blocks if _informative(edge, b)]
+    law = fit_law(edge, gain_data(edge.grid, used))
+    theta, cov = extrapolated(edge.grid, law)
+    status = np.full(edge.grid.shape, EXTRAPOLATED if used else PRIOR)
+    reason = {}
+    for b in blocks:
+        counted = any(b is other for other in used)
+        theta[b.i, b.j], cov[b.i, b.j] = combined(theta[b.i, b.j], cov[b.i, b.j], b, counted)
+        status[b.i, b.j] = VALID if b.status == BLOCK_VALID else LEARNING
+        if b.reason:
+            reason[b.i, b.j] = b.reason
+    cov[:, :, 0, 0] += misfit(theta, cov, np.isin(status, (VALID, LEARNING)))
+    theta[shut], cov[shut], status[shut] = 0.0, 0.0, SHUT
+    return EdgeMap(edge.name, edge.grid, edge.safe_band_v, theta, cov, status, reason)
+
+
+def _informative(edge: Edge, block: Block) -> bool:
+    """Its mean flow is known at all, at a pressure drop that is not zero."""
+    at_dp = mean_root(edge.grid, block)
+    return bool(block.mean_sd_m3s < edge.rated_q_m3s and at_dp**2 > 1e-3 * edge.rated_dp_pa)
+
+
+def gain_data(grid: Grid, blocks: list[Block]) -> GainData:
+    """Mean flow over mean root of dp of each block, at the mean point of its data."""
+    w = [_mean(grid.u_v, b.i, b.mean_phi[1]) for b in blocks]
+    dp = [_mean(grid.dp_pa, b.j, b.mean_phi[2]) for b in blocks]
+    s = np.array([mean_root(grid, b) for b in blocks])
+    q = np.array([b.mean_flow_m3s for b in blocks])
+    sd = np.array([b.mean_sd_m3s for b in blocks])
+    return GainData(np.array(w), np.array(dp), q / s, sd / np.abs(s))
+
+
+def _mean(border: FloatArray, i: int, local: float) -> float:
+    return float(0.5 * (border[i] + border[i + 1]) + 0.5 * local * (border[i + 1] - border[i]))
+
+
+def mean_root(grid: Grid, block: Block) -> float:
+    """Mean of s(dp) over the block's data, exact to second order."""
+    _, dp = _quadrature(grid, block.i)
+    return float(block.mean_phi @ projection() @ root(dp[block.j]))
+
+
+def extrapolated(grid: Grid, law: OrificeLaw) -> tuple[FloatArray, FloatArray]:
+    """The law's Taylor terms of every cell, theta (nu, nd, 6) and cov (nu, nd, 6, 6)."""
+    nu, nd = grid.shape
+    theta, cov = np.empty((nu, nd, TERMS)), np.empty((nu, nd, TERMS, TERMS))
+    project, terms = projection(), _terms()
+    for i in range(nu):
+        w, dp = _quadrature(grid, i)
+        s = root(dp)
+        mean, spread = law.gains(w, dp)
+        q = s * mean
+        theta[i] = q @ project.T
+        cov[i] = project @ (s[:, :, None] * spread * s[:, None, :]) @ project.T
+        rest = q - theta[i] @ terms.T  # what six terms cannot follow
+        cov[i, :, 0, 0] += np.mean(rest**2, axis=1)
+    return theta, cov
+
+
+def combined(
+    m: FloatArray, S: FloatArray, block: Block, counted: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Law (m, S) and block as two Gaussians; counted: the law contains the block's mean flow."""
+    scale = np.sqrt(np.diag(S))
+    law = np.linalg.inv(S / np.outer(scale, scale) + 1e-9 * np.eye(TERMS)) / np.outer(scale, scale)
+    own, phi = np.linalg.inv(block.cov), block.mean_phi
+    if counted:
+        own = own - np.outer(phi, phi) / block.mean_sd_m3s**2
+    total = (law + own) * np.outer(scale, scale)
+    cov = np.linalg.inv(0.5 * (total + total.T)) * np.outer(scale, scale)
+    return cov @ (law @ m + own @ block.theta), cov
+
+
+def misfit(theta: FloatArray, cov: FloatArray, visited: NDArray[np.bool_]) -> FloatArray:
+    """Variance (nu, nd) of each visited cell's own misfit, from the steps at its borders.
+
+    Six terms miss a cubic flow by opposite amounts at the two ends of a block, so that half of the
+    step to a neighbour beyond what noise explains is the misfit of either.
+    """
+    excess, count = np.zeros(visited.shape), np.zeros(visited.shape)
+    for axis, term in ((0, 1), (1, 2)):
+        end = np.zeros(TERMS)
+        end[[0, term, term + 2]] = 1.0
+        start = end * np.where(np.arange(TERMS) == term, -1.0, 1.0)
+        first, second = _pairs(axis)
+        step = theta[first] @ end - theta[second] @ start
+        noise = end @ cov[first] @ end + start @ cov[second] @ start
+        both = visited[first] & visited[second]
+        for side in (first, second):
+            excess[side] += np.where(both, step**2 - noise, 0.0) / 4
+            count[side] += both
+    return np.maximum(excess, 0.0) / np.maximum(count, 1.0)
+
+
+def _pairs(axis: int) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+    first, second = [slice(None)] * 2, [slice(None)] * 2
+    first[axis], second[axis] = slice(None, -1), slice(1, None)
+    return tuple(first), tuple(second)
+
+
+def _quadrature(grid: Grid, i: int) -> tuple[FloatArray, FloatArray]:
+    """Gauss points of all cells of column i: w, dp (nd, 16)."""
+    w = 0.5 * (grid.u_v[i] + grid.u_v[i + 1]) + 0.5 * (grid.u_v[i + 1] - grid.u_v[i]) * NODES
+    middle, half = 0.5 * (grid.dp_pa[1:] + grid.dp_pa[:-1]), 0.5 * np.diff(grid.dp_pa)
+    dp = middle[:, None] + half[:, None] * NODES
+    n = len(NODES)
+    return np.broadcast_to(np.repeat(w, n), (len(dp), n * n)), np.tile(dp, (1, n))
+
+
+def _terms() -> FloatArray:
+    """The six terms at the Gauss points (16, 6)."""
+    xi, eta = np.repeat(NODES, len(NODES)), np.tile(NODES, len(NODES))
+    return np.stack([np.ones_like(xi), xi, eta, xi * xi, eta * eta, xi * eta], axis=1)
+
+
+def projection() -> FloatArray:
+    """Least squares from values at the Gauss points to the six terms (6, 16)."""
+    weight = np.sqrt(np.outer(WEIGHTS, WEIGHTS).ravel())
+    return np.asarray(np.linalg.pinv(weight[:, None] * _terms()) * weight)
