@@ -17,14 +17,14 @@ def encode_message(
     message: str,
     t_us: NDArray[np.int64],
     values: Mapping[str, ArrayLike],
-    first_count: int = 0,
+    counter: ArrayLike = 0,
     channel: int = 0,
 ) -> Frames:
     """n frames of one message with alive counter and CRC.
 
     t_us: int64 (n,); values: per signal (n,) or a scalar, physical units of the DBC, saturating;
-    a signal that is missing or NaN is sent as not available.  The counter of the first frame is
-    first_count modulo its range.
+    a signal that is missing or NaN is sent as not available; counter: of every frame (n,), or of
+    the first, taken modulo its range.
     """
     source = catalog.message_source(message)
     layouts = catalog.layouts(message)
@@ -35,7 +35,8 @@ def encode_message(
         columns[:, layouts.names.index(name)] = value
     if source.counter is not None:
         k = layouts.names.index(source.counter)
-        columns[:, k] = (first_count + np.arange(n)) % (1 << int(layouts.rows["length"][k]))
+        counts = np.asarray(counter) + (np.arange(n) if np.ndim(counter) == 0 else 0)
+        columns[:, k] = counts % (1 << int(layouts.rows["length"][k]))
     if source.crc is not None:
         columns[:, layouts.names.index(source.crc)] = 0
     out = frames.empty(n)

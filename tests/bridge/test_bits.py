@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from firmware_bridge import bits, e2e
 from firmware_bridge.catalog import Catalog, CatalogError, load
+from firmware_bridge.encode import encode_message
 from tests.bridge.machine import CATALOG
 
 
@@ -201,3 +202,12 @@ def test_crc8_lets_few_corrupted_payloads_through() -> None:
     changed = (bad != data).any(axis=1)
     passed = changed & (e2e.crc8_bulk(bad, 8, 0, 4640) == bad[:, 0])
     assert passed.sum() / changed.sum() <= 0.0045
+
+
+def test_alive_counter_counts_on_or_is_given() -> None:
+    t_us = np.arange(20, dtype=np.int64)
+    rising = encode_message(CATALOG, "Motion", t_us, {"X": 0.1}, counter=14)
+    given_ = encode_message(CATALOG, "Motion", t_us, {"X": 0.1}, counter=14 + np.arange(20))
+    np.testing.assert_array_equal(rising.data, given_.data)
+    counts = CATALOG.layouts("Motion", ["AliveCounter"]).decode(rising.data)[:, 0]
+    np.testing.assert_array_equal(counts, (14 + np.arange(20)) % 16)
