@@ -23,11 +23,16 @@ from rtid.check.series import estimate_noise
 from rtid.errors import RtidError
 from rtid.estimator.estimator import Estimator, to_chunk
 from rtid.estimator.record import RecordFit, fit_record
+from rtid.live import Learner, listen, virtual_bus
 from rtid.model import FloatArray, Model, Signal
 from rtid.project import Project
 from rtid.project.table import is_table, open_table
 
 Progress = Callable[[str, float], None]
+
+
+def _silent(text: str, share: float) -> None:
+    """Progress that nobody watches."""
 
 
 class NoSamplesError(RtidError):
@@ -120,21 +125,45 @@ def _not_empty(trace: Trace, project: Project) -> Trace:
     )
 
 
-def replay(project: Project, path: Path, progress: Progress = lambda text, share: None) -> Replay:
-    """Everything that one trace tells.  `progress` is told what is done and the share, 0 to 1."""
+def replay(
+    project: Project, path: Path, progress: Progress = _silent, bus_speed: float | None = None
+) -> Replay:
+    """Everything that one trace tells.
+
+    progress is told what is being done and the share that is done, 0 to 1.  bus_speed: send the
+    frames through a virtual bus at so many times their pace (inf: at once) instead of taking them
+    from the file; the result is the same, bit for bit.
+    """
     progress("reading", 0.0)
     trace = read_trace(project, path)
     model = model_for(project, trace.samples)
     progress("learning as on board", 0.2)
     live = Estimator(model)
-    live.update(trace.samples)
-    progress("refining weights, lag and offsets", 0.4)
+    if bus_speed is None:
+        live.update(trace.samples)
+    else:
+        live = _through_bus(project, model, trace, bus_speed, progress)
+    progress("refining weights, lag and offsets", 0.5)
     span = project.sections.record.identification_s or (0.0, np.inf)
     fit, trace = _fit(project, model, trace, span)
     progress("done", 1.0)
     chunk = to_chunk(model, trace.samples, int(trace.samples.t_us[0]))
     validation = project.sections.record.validation_s
     return Replay(project, model, trace, live, fit, chunk, span, validation)
+
+
+def _through_bus(
+    project: Project, model: Model, trace: Trace, speed: float, progress: Progress
+) -> Estimator:
+    """The estimate from the same frames, sent over a virtual bus."""
+    if trace.frames is None:
+        raise RtidError(f"{trace.path}: a table has no frames for a bus", "give a CAN log", 2)
+    learner = Learner(model, catalog_of(project), project.assembly)
+    n = max(1, len(trace.frames))
+    with virtual_bus(trace.frames, speed) as (source, is_over):
+        for state in listen(source, learner, is_over):
+            progress("learning from the bus", 0.2 + 0.3 * state.frames / n)
+    return learner.estimator
 
 
 def model_for(project: Project, samples: Samples) -> Model:

@@ -14,7 +14,7 @@ from rtid.model import Edge, FloatArray, Model
 
 RecordArray = NDArray[np.void]
 
-RING_FLOOR = 1e-10  # a closed block is silent when its state has decayed to this share
+RING_FLOOR = 1e-9  # a closed block is silent when its state has decayed to this share
 FLOW_NOISE_FLOOR = 0.01  # least flow noise, share of the variance that the rated slope gives
 FIRST_BLOCKS, FIRST_PAIRS = 64, 4096
 MAX_CLOSED = 64
@@ -30,13 +30,17 @@ class State:
     blocks: RecordArray
     pairs: RecordArray
 
+    def __post_init__(self) -> None:
+        """Keep the memory of the arrays at hand as bytes, for the kernel."""
+        self._memory = tuple(array.view(np.uint8) for array in self.arrays)
+
     def advance(self, chunk: FloatArray) -> None:
         """Take samples (n, 2 + signals), rows [t_s, flags, values...]; tables grow as needed."""
-        taken = kernel.advance(*self.arrays, chunk)
+        taken = kernel.advance(*self._memory, chunk)
         while taken < len(chunk):
             self.make_room()
             chunk = chunk[taken:]
-            taken = kernel.advance(*self.arrays, chunk)
+            taken = kernel.advance(*self._memory, chunk)
 
     @property
     def arrays(self) -> tuple[RecordArray, RecordArray, RecordArray, RecordArray, RecordArray]:
@@ -53,6 +57,7 @@ class State:
         extra = np.zeros(len(self.blocks), layout.BLOCK)
         self.blocks = np.concatenate([self.blocks, extra])
         self.pairs = _rehash(self.engine[0], self.pairs)
+        self.__post_init__()
 
     def settled(self) -> State:
         """A copy in which all sums are complete; this state is not changed."""

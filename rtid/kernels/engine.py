@@ -19,23 +19,28 @@ from numpy.typing import NDArray
 from rtid.kernels.basis import relocate
 from rtid.kernels.holds import lagged_moments, second_order
 from rtid.kernels.information import (
+    RING_DET_LIMIT,
     close_block,
-    drop_open,
+    first_open,
     first_ring,
-    flush_local,
-    forget_ring,
+    forget,
     open_block,
     rebase,
-    ring_needs_rebase,
+    remove_open,
 )
 from rtid.kernels.layout import (
+    BLOCK,
     BLOCK_CHANGES,
     CARRY,
+    CELL,
+    CLOSED,
+    ENGINE,
     MAX_EDGES,
     MAX_OPEN,
     NOT_FINITE,
     OUT_OF_RANGE,
     OUTSIDE_GRID,
+    PAIR,
     RESTART_GAP,
     RESTART_MEMORY,
     SAMPLES,
@@ -61,15 +66,17 @@ def advance(
 ) -> int:
     """Take samples, rows of chunk (n, 2 + signals): [t_s, flags, values...], SI units.
 
-    engine (1,), cells, closed, blocks and pairs are the records of `layout`, changed in place.
-    Returns the number of samples taken: fewer than n when `blocks` or `pairs` must be enlarged
-    first (see `needs_room`).
+    The memory of the records of `layout` as bytes (numba recognises a plain array three times
+    faster than a structured one), changed in place.  Returns the number of samples taken: fewer
+    than n when `blocks` or `pairs` must be enlarged first (see `needs_room`).
     """
-    e = engine[0]
+    e = engine.view(ENGINE)[0]
+    cell, ringing = cells.view(CELL), closed.view(CLOSED)
+    block, pair = blocks.view(BLOCK), pairs.view(PAIR)
     for k in range(len(chunk)):
-        if needs_room(e, closed, blocks, pairs):
+        if needs_room(e, ringing, block, pair):
             return k
-        _take(e, cells, closed, blocks, pairs, chunk[k])
+        _take(e, cell, ringing, block, pair, chunk[k])
     return len(chunk)
 
 
@@ -143,9 +150,9 @@ def _start(e: Any, sample: FloatArray) -> None:
 def _stop(e: Any, closed: Any, blocks: Any, pairs: Any) -> None:
     """End all memory at a break of continuity; learned sums stay."""
     if e.running:
-        forget_ring(e, closed, blocks, pairs)
+        forget(e, closed, blocks, pairs)
         while e.n_open > 0:
-            drop_open(e, e.n_open - 1)
+            remove_open(e, e.n_open - 1)
     for i in range(e.n_edges):
         e.cell[i, 0] = SHUT
     e.running = 0
@@ -175,8 +182,7 @@ def _interval(
     else:
         remember(e, sample)
         _integral_step(e, row)
-    if ring_needs_rebase(e):
-        flush_local(e, closed, blocks, pairs)
+    if e.ring_det < RING_DET_LIMIT:
         rebase(e, closed, blocks, pairs)
 
 
@@ -218,36 +224,34 @@ def working_points(e: Any, sample: FloatArray, dt: float) -> bool:
 @njit(cache=True)
 def _change_blocks(e: Any, cells: Any, closed: Any, blocks: Any, pairs: Any) -> None:
     """Close the blocks that the working points left, open those that they entered."""
-    flushed, target = False, e.target
+    target = e.target
     for i in range(e.n_edges):
         same = target[i, 0] == e.cell[i, 0]
         if same and (target[i, 0] == SHUT or target[i, 1] == e.cell[i, 1]):
             continue
-        if not flushed:
-            _prepare_change(e, closed, blocks, pairs)
-            flushed = True
         e.counters[BLOCK_CHANGES] += 1
-        if e.place[i] >= 0:
-            k = e.place[i]
-            close_block(e, closed, k)
-            drop_open(e, k)
         e.cell[i, 0], e.cell[i, 1] = target[i, 0], target[i, 1]
+        k, was_open = e.place[i], e.place[i] >= 0
+        if was_open:
+            if e.n_closed == len(closed):
+                _begin_new_memory(e, closed, blocks, pairs)
+            close_block(e, closed, blocks, pairs, k)
         if target[i, 0] != SHUT:
-            open_block(e, closed, blocks, pairs, i, _slot(e, cells, blocks, i))
+            k = k if was_open else e.n_open
+            open_block(e, closed, blocks, pairs, k, i, _slot(e, cells, blocks, i))
+        elif was_open:
+            remove_open(e, k)
 
 
 @njit(cache=True)
-def _prepare_change(e: Any, closed: Any, blocks: Any, pairs: Any) -> None:
-    """Flush the local sums; where too many blocks ring at once, begin a new memory.
+def _begin_new_memory(e: Any, closed: Any, blocks: Any, pairs: Any) -> None:
+    """Too many blocks ring at once: forget them all.
 
-    A new memory costs one unknown start position per chamber, and bounds the work per change.
+    Costs one unknown start position per chamber, and bounds the work.
     """
-    if e.n_closed + MAX_OPEN > len(closed):
-        e.counters[RESTART_MEMORY] += 1
-        forget_ring(e, closed, blocks, pairs)
-        start_whitener(e)
-    else:
-        flush_local(e, closed, blocks, pairs)
+    e.counters[RESTART_MEMORY] += 1
+    forget(e, closed, blocks, pairs)
+    start_whitener(e)
 
 
 @njit(cache=True)
@@ -310,7 +314,7 @@ def _block_increments(
     i = e.open_edge[k]
     block = blocks[e.open_slot[k]]
     eta0, eta1 = mean_terms(e, i)
-    phi, first = e.phi, 1 + e.n_shared + TERMS * k
+    phi, first = e.phi, first_open(e, k)
     block.dwell_s += dt
     block.last_s = t
     if row:
@@ -366,7 +370,6 @@ def settle(engine: Any, closed: Any, blocks: Any, pairs: Any) -> None:
     """Bring all sums up to date without ending the memory, so that they can be read."""
     e = engine[0]
     if e.running:
-        flush_local(e, closed, blocks, pairs)
         rebase(e, closed, blocks, pairs)
 
 
@@ -375,7 +378,7 @@ def clear(engine: Any, cells: Any) -> None:
     """Set the state (not the configuration) to its beginning."""
     e = engine[0]
     e.running, e.n_open, e.n_closed, e.n_slots, e.n_pairs = 0, 0, 0, 0, 0
-    e.dt_s, e.ring_log = 0.0, 0.0
+    e.dt_s, e.ring_det = 0.0, 1.0
     for i in range(MAX_EDGES):
         e.place[i] = -1
         e.cell[i, 0], e.cell[i, 1] = SHUT, SHUT

@@ -4,7 +4,7 @@ The sizes are fixed, so that one compiled kernel serves every machine.  A *colum
 of the joint regression; its state is a short vector d (see `information`).  Local columns, those
 that move at every sample, are ordered
 
-    [ y | shared (theta_beta per chamber, effects) | 6 terms per open block | ring ]
+    [ y | shared (theta_beta per chamber, effects) | ring | 6 terms per open block ]
 
 `ring` are unit vectors that stand for all closed blocks, whose states decay together.
 """
@@ -36,9 +36,8 @@ COUNTERS = (
     "block_changes",
     "restart_memory",
 )
-SAMPLES, ROWS, RESTART_GAP, NOT_FINITE, OUT_OF_RANGE, OUTSIDE_GRID, BLOCK_CHANGES, RESTART_MEMORY = (
-    range(len(COUNTERS))
-)
+SAMPLES, ROWS, RESTART_GAP, NOT_FINITE = range(4)
+OUT_OF_RANGE, OUTSIDE_GRID, BLOCK_CHANGES, RESTART_MEMORY = range(4, 8)
 
 _F, _I = np.float64, np.int64
 
@@ -107,9 +106,9 @@ ENGINE = np.dtype(
         ("target", _I, (MAX_EDGES, 2)),  # the blocks that the working points are in
         ("phi", _F, (TERMS,)),
         ("gram", _F, (MAX_LOCAL, MAX_LOCAL)),
-        ("ring_w", _F, (MAX_STATE, MAX_STATE)),
         ("owed", _F, (MAX_STATE, TERMS)),
-        ("ring_log", _F),  # log det of the ring columns since the last rebase
+        ("basis", _F, (MAX_STATE, MAX_STATE)),
+        ("ring_det", _F),  # determinant of the ring columns (carry: of one chamber)
         ("n_closed", _I),
         ("n_slots", _I),
         ("n_pairs", _I),
@@ -148,7 +147,9 @@ CLOSED = np.dtype(
         ("slot", _I),
         ("size", _F),
         ("d", _F, (MAX_STATE, TERMS)),
-        ("w_start", _F, (MAX_STATE, MAX_STATE)),
+        ("through", _F, (MAX_STATE, TERMS)),  # ring x block while it was open
+        ("w_start", _F, (MAX_STATE, MAX_STATE)),  # ring x ring when it closed
+        ("shared_start", _F, (MAX_STATE, 1 + MAX_SHARED)),  # ring x shared when it closed
     ],
     align=True,
 )

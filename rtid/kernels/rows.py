@@ -18,7 +18,7 @@ from typing import Any
 
 from numba import njit
 
-from rtid.kernels.information import add_products, first_ring, local_width
+from rtid.kernels.information import add_products, first_open, first_ring, local_width
 from rtid.kernels.layout import ROWS
 
 
@@ -53,7 +53,7 @@ def integral_row_one(e: Any) -> None:
     v = e.v0_m3[0] + e.area_m2[0] * e.values[e.x_column]
     e.noise_gram[0] += (v * e.compliance[0]) ** 2 * e.p_var_pa2[0] / s
     e.cov[0, 0] *= keep
-    e.ring_log += math.log(keep)
+    e.ring_det *= keep
     e.counters[ROWS] += 1
     add_products(e, 1)
 
@@ -85,7 +85,7 @@ def integral_row_two(e: Any) -> None:
     cov[1, 1] = k10 * p01 + k11 * p11
     cov[0, 1] = 0.5 * (k00 * p01 + k01 * p11 + k10 * p00 + k11 * p01)
     cov[1, 0] = cov[0, 1]
-    e.ring_log += math.log(k00 * k11 - k01 * k10)
+    e.ring_det *= k00 * k11 - k01 * k10
     e.counters[ROWS] += 1
     add_products(e, 2)
 
@@ -94,7 +94,8 @@ def integral_row_two(e: Any) -> None:
 def carry_step(e: Any) -> None:
     """All filters over one interval: x+ = a x + b [start, end] per chamber and column."""
     a, b, d, inc, end = e.filter_a, e.filter_b, e.d, e.inc, e.end
-    ring, n = first_ring(e), local_width(e)
+    ring, first, used = first_ring(e), first_open(e, 0), first_open(e, e.n_open)
+    n = local_width(e)
     a00, a01, a10, a11 = a[0, 0], a[0, 1], a[1, 0], a[1, 1]
     b00, b01, b10, b11 = b[0, 0], b[0, 1], b[1, 0], b[1, 1]
     for c in range(e.n_chambers):
@@ -102,10 +103,11 @@ def carry_step(e: Any) -> None:
             x0, x1 = d[2 * c, j], d[2 * c + 1, j]
             d[2 * c, j] = a00 * x0 + a01 * x1
             d[2 * c + 1, j] = a10 * x0 + a11 * x1
-        for j in range(ring):
-            d[2 * c, j] += b00 * inc[c, j] + b01 * end[c, j]
-            d[2 * c + 1, j] += b10 * inc[c, j] + b11 * end[c, j]
-    e.ring_log -= 2.0 * e.zeta * e.wn_rad_s * e.dt_s
+        for j in range(used):
+            if j < ring or j >= first:
+                d[2 * c, j] += b00 * inc[c, j] + b01 * end[c, j]
+                d[2 * c + 1, j] += b10 * inc[c, j] + b11 * end[c, j]
+    e.ring_det *= a00 * a11 - a01 * a10
 
 
 @njit(cache=True)
