@@ -89,10 +89,10 @@ def column_rates(
         area = chamber.sign * chamber.area_m2
         p = values[:, model.column(chamber.pressure)]
         pdot = (p[end] - p[end - 1]) / dt * weights.compliance[c]
-        for side, at in enumerate((end - 1, end)):
-            rate = (x[end] - x[end - 1]) / dt if xdot_mps is None else xdot_mps[at]
+        for side, instants in enumerate((end - 1, end)):
+            rate = (x[end] - x[end - 1]) / dt if xdot_mps is None else xdot_mps[instants]
             out[:, c, side, 0] = area * rate
-            out[:, c, side, 1 + c] = -(chamber.v0_m3 + area * x[at]) * pdot
+            out[:, c, side, 1 + c] = -(chamber.v0_m3 + area * x[instants]) * pdot
     moments = _moments(track.opening, dt, weights.lag_s)
     for i, edge in enumerate(model.edges):
         dp = values[:, model.column(edge.source)] - values[:, model.column(edge.sink)]

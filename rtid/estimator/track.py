@@ -134,7 +134,8 @@ def _cell(edge: Edge, point: tuple[float, float], before: IntArray, hysteresis: 
                 out[axis] = before[axis]
                 continue
         if border[0] <= value <= border[-1]:
-            out[axis] = min(np.searchsorted(border, value, side="right") - 1, len(border) - 2)
+            at = int(np.searchsorted(border, value, side="right")) - 1
+            out[axis] = min(at, len(border) - 2)
     return out
 
 
