@@ -107,8 +107,8 @@ def _block(
     w, dp = u.mean() + 0.5 * np.diff(u) * xi, p.mean() + 0.5 * np.diff(p) * eta
     q = flow(w, dp) + noise_m3s * rng.standard_normal(rows)
     gram = phi.T @ phi + np.eye(6) * (noise_m3s / (10 * edge.rated_q_m3s)) ** 2
-    cov: FloatArray = np.linalg.inv(gram) * noise_m3s**2
-    theta: FloatArray = np.linalg.solve(gram, phi.T @ q)
+    cov = np.asarray(np.linalg.inv(gram) * noise_m3s**2, np.float64)
+    theta = np.asarray(np.linalg.solve(gram, phi.T @ q), np.float64)
     sure = rows >= 100
     status, reason = (VALID, "") if sure else (LEARNING, f"{rows} rows, 100 needed")
     return Block(

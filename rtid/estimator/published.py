@@ -10,6 +10,8 @@ own (theta, C) and its mean flow phi' theta, which the law has already used and 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -91,6 +93,12 @@ def extrapolated(grid: Grid, law: OrificeLaw) -> tuple[FloatArray, FloatArray]:
         rest = q - theta[i] @ terms.T  # what six terms cannot follow
         cov[i, :, 0, 0] += np.mean(rest**2, axis=1)
     return theta, cov
+
+
+def cell_terms(grid: Grid, flow: Callable[[FloatArray, FloatArray], FloatArray]) -> FloatArray:
+    """Taylor terms (nu * nd, 6) of a known flow in every cell, by least squares over the cell."""
+    points = [_quadrature(grid, i) for i in range(grid.shape[0])]
+    return np.concatenate([flow(w, dp) @ projection().T for w, dp in points])
 
 
 def combined(

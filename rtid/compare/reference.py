@@ -1,0 +1,85 @@
+"""Reference maps: data sheets and calibrations, to be used wherever a learned map is.
+
+    Q = K(|w|) sign(dp) sqrt |dp|,
+
+K between the table's points by linear interpolation; where a table gives Q at several pressure
+drops, K = Q / sqrt(dp) may depend on dp too.  Outside the table's commands the flow is not known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rtid.errors import RtidError
+from rtid.estimator.orifice import root
+from rtid.estimator.published import cell_terms
+from rtid.model import FloatArray, Model
+
+ANY_EDGE = "*"
+
+
+class MissingEdgeError(RtidError):
+    """The reference has no map for an edge of the machine."""
+
+
+@dataclass(frozen=True)
+class GainTable:
+    """K (n, m) in m3/s/sqrt(Pa) at w_v (n,) and dp_pa (m,), both rising; NaN: not in the table."""
+
+    w_v: FloatArray
+    dp_pa: FloatArray
+    gain: FloatArray
+
+    def at(self, w_v: FloatArray, dp_pa: FloatArray) -> FloatArray:
+        """K at points: linear between commands, linear and constant beyond along |dp|."""
+        columns = np.stack([self._along_dp(row, np.abs(dp_pa)) for row in self.gain])
+        at = np.clip(np.searchsorted(self.w_v, w_v) - 1, 0, max(len(self.w_v) - 2, 0))
+        low, high = columns[at, np.arange(len(at))], columns[at + 1, np.arange(len(at))]
+        share = (w_v - self.w_v[at]) / (self.w_v[at + 1] - self.w_v[at])
+        known = (w_v >= self.w_v[0]) & (w_v <= self.w_v[-1])
+        return np.where(known, low + share * (high - low), np.nan)
+
+    def _along_dp(self, row: FloatArray, dp_pa: FloatArray) -> FloatArray:
+        known = np.isfinite(row)
+        if not known.any():
+            return np.full(len(dp_pa), np.nan)
+        return np.interp(dp_pa, self.dp_pa[known], row[known])
+
+
+@dataclass(frozen=True)
+class ReferenceMap:
+    """Gain tables by edge name, or one for all edges under "*"."""
+
+    name: str
+    tables: dict[str, GainTable]
+
+    def table(self, edge: str) -> GainTable:
+        """The table of an edge.  Raises MissingEdgeError naming what there is."""
+        for key in (edge.casefold(), ANY_EDGE):
+            if key in self.tables:
+                return self.tables[key]
+        known = ", ".join(sorted(self.tables))
+        raise MissingEdgeError(
+            f"{self.name}: no map for edge {edge!r}, only for {known}",
+            "name its columns after the edges of the project, e.g. K_" + edge,
+        )
+
+    def flow(self, edge: str, w_v: ArrayLike, dp_pa: ArrayLike) -> FloatArray:
+        """Q in m3/s at broadcast points; NaN where the table has nothing."""
+        w, dp = np.broadcast_arrays(np.asarray(w_v, float), np.asarray(dp_pa, float))
+        gain = self.table(edge).at(w.ravel(), dp.ravel())
+        return (gain * root(dp.ravel())).reshape(w.shape)
+
+    def theta_cells(self, model: Model) -> FloatArray:
+        """Its Taylor terms for all cells of the model's grids (cells, 6), for `kernels.explain`."""
+        parts = []
+        for edge in model.edges:
+
+            def flow(w: FloatArray, dp: FloatArray, name: str = edge.name) -> FloatArray:
+                return self.flow(name, w, dp)
+
+            parts.append(cell_terms(edge.grid, flow))
+        return np.concatenate(parts)
