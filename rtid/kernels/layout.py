@@ -97,6 +97,8 @@ ENGINE = np.dtype(
         ("open_edge", _I, (MAX_OPEN,)),
         ("open_slot", _I, (MAX_OPEN,)),
         ("cov", _F, (MAX_CHAMBERS, MAX_CHAMBERS)),  # Kalman whitener: variance of the gap, m6
+        ("innovation", _F, (3,)),  # S: upper triangle
+        ("echo", _F, (MAX_CHAMBERS, 3)),  # pressure noise in the prediction of column -V dP
         ("d", _F, (MAX_STATE, MAX_LOCAL)),
         ("inc", _F, (MAX_CHAMBERS, MAX_LOCAL)),  # increments (integral) or start values (carry)
         ("end", _F, (MAX_CHAMBERS, MAX_LOCAL)),  # end values (carry)

@@ -25,6 +25,9 @@ from rtid.kernels.layout import ROWS
 @njit(cache=True)
 def start_whitener(e: Any) -> None:
     """The first position is known as well as it was measured: P = R."""
+    for c in range(e.n_chambers):
+        for k in range(3):
+            e.echo[c, k] = 0.0
     for a in range(e.n_chambers):
         for b in range(e.n_chambers):
             e.cov[a, b] = position_noise(e, a, b)
@@ -41,6 +44,39 @@ def position_noise(e: Any, a: int, b: int) -> float:
 
 
 @njit(cache=True)
+def _column_variance(e: Any, c: int) -> float:
+    """Variance of the noise n in column -V dP of chamber c, m6."""
+    w = (e.v0_m3[c] + e.area_m2[c] * e.values[e.x_column]) * e.compliance[c]
+    return float(w * w * e.p_var_pa2[c])
+
+
+@njit(cache=True)
+def _add_column_noise(
+    e: Any, c: int, k00: float, k01: float, k10: float, k11: float, det: float
+) -> None:
+    """Add what pressure noise adds on average to the square of column -V dP, beyond its signal.
+
+    Its row is L^-1 (n u_c - m), u_c the unit vector of its chamber, where the prediction m repeats
+    past noise: m <- k m + (I - k) u_c n, k = R S^-1, so its covariance E <- k E k' + ...  (The same n
+    also enters through dQ/ddp, but even in time where n - n_before is odd: they share nothing.)
+    """
+    v, echo = _column_variance(e, c), e.echo[c]
+    a = (1.0 - k00) if c == 0 else -k01
+    b = -k10 if c == 0 else (1.0 - k11)
+    s00, s01, s11 = echo[0], echo[1], echo[2]
+    x00 = s00 + (v if c == 0 else 0.0)
+    x11 = s11 + (v if c == 1 else 0.0)
+    # S^-1 = [[s11, -s01], [-s01, s00]] det, with the whitener's S kept in e.innovation
+    big = e.innovation
+    e.noise_gram[c] += det * (big[2] * x00 - 2.0 * big[1] * s01 + big[0] * x11)
+    echo[0] = k00 * k00 * s00 + 2.0 * k00 * k01 * s01 + k01 * k01 * s11 + a * a * v
+    echo[1] = (
+        k00 * k10 * s00 + (k00 * k11 + k01 * k10) * s01 + k01 * k11 * s11 + a * b * v
+    )
+    echo[2] = k10 * k10 * s00 + 2.0 * k10 * k11 * s01 + k11 * k11 * s11 + b * b * v
+
+
+@njit(cache=True)
 def integral_row_one(e: Any) -> None:
     """Row and decay for one chamber."""
     d, row, n = e.d, e.row, local_width(e)
@@ -50,8 +86,9 @@ def integral_row_one(e: Any) -> None:
     for j in range(n):
         row[0, j] = scale * d[0, j]
         d[0, j] *= keep
-    v = e.v0_m3[0] + e.area_m2[0] * e.values[e.x_column]
-    e.noise_gram[0] += (v * e.compliance[0]) ** 2 * e.p_var_pa2[0] / s
+    v = _column_variance(e, 0)
+    e.noise_gram[0] += (v + e.echo[0, 0]) / s
+    e.echo[0, 0] = keep * keep * e.echo[0, 0] + (1.0 - keep) ** 2 * v
     e.cov[0, 0] *= keep
     e.ring_det *= keep
     e.counters[ROWS] += 1
@@ -65,21 +102,20 @@ def integral_row_two(e: Any) -> None:
     r00, r01, r11 = position_noise(e, 0, 0), position_noise(e, 0, 1), position_noise(e, 1, 1)
     s00, s01, s11 = cov[0, 0] + r00, cov[0, 1] + r01, cov[1, 1] + r11
     i0 = 1.0 / math.sqrt(s00)
-    c = s01 * i0
-    i1 = 1.0 / math.sqrt(s11 - c * c)
+    half = s01 * i0
+    i1 = 1.0 / math.sqrt(s11 - half * half)
     det = 1.0 / (s00 * s11 - s01 * s01)
     k00, k01 = (r00 * s11 - r01 * s01) * det, (r01 * s00 - r00 * s01) * det
     k10, k11 = (r01 * s11 - r11 * s01) * det, (r11 * s00 - r01 * s01) * det
     for j in range(n):
         d0, d1 = d[0, j], d[1, j]
         row[0, j] = i0 * d0
-        row[1, j] = i1 * (d1 - c * i0 * d0)
+        row[1, j] = i1 * (d1 - half * i0 * d0)
         d[0, j] = k00 * d0 + k01 * d1
         d[1, j] = k10 * d0 + k11 * d1
-    v0 = e.v0_m3[0] + e.area_m2[0] * e.values[e.x_column]
-    v1 = e.v0_m3[1] + e.area_m2[1] * e.values[e.x_column]
-    e.noise_gram[0] += (v0 * e.compliance[0]) ** 2 * e.p_var_pa2[0] * s11 * det
-    e.noise_gram[1] += (v1 * e.compliance[1]) ** 2 * e.p_var_pa2[1] * s00 * det
+    e.innovation[0], e.innovation[1], e.innovation[2] = s00, s01, s11
+    for c in range(2):
+        _add_column_noise(e, c, k00, k01, k10, k11, det)
     p00, p01, p11 = cov[0, 0], cov[0, 1], cov[1, 1]
     cov[0, 0] = k00 * p00 + k01 * p01
     cov[1, 1] = k10 * p01 + k11 * p11
