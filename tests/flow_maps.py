@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
-from rtid.estimator.solution import LEARNING, VALID, Block, Solution
+from rtid.estimator.solution import LEARNING, VALID, Block, Solution, solve
+from rtid.estimator.state import build
 from rtid.model import (
     COMMAND,
     POSITION,
@@ -73,8 +75,12 @@ def solved(
     for e, edge in enumerate(model.edges):
         for i, j in sorted(_visited(edge.grid, rng, path)):
             blocks.append(_block(edge, e, i, j, flow, rng, rows, noise_m3s))
-    one = np.array([1.25e-9])
-    return Solution(model, one, np.array([[1e-24]]), tuple(blocks), 1.0, 1000)
+    return replace(empty(model), blocks=tuple(blocks))
+
+
+def empty(model: Model) -> Solution:
+    """What is known before the first sample."""
+    return solve(model, build(model))
 
 
 def _visited(grid: Grid, rng: np.random.Generator, path: int) -> set[tuple[int, int]]:

@@ -9,10 +9,9 @@ import pytest
 
 from rtid.estimator.flowmap import EXTRAPOLATED, LEARNING, PRIOR, SHUT, VALID, FlowMap
 from rtid.estimator.published import publish
-from rtid.estimator.solution import Solution
 from rtid.estimator.windows import OVERLAP, blend, overlaps, rising, rising_slope
 from rtid.model import FloatArray, Grid
-from tests.flow_maps import GRID, RATED_Q_M3S, Flow, compensated, machine, orifice, solved
+from tests.flow_maps import GRID, RATED_Q_M3S, Flow, compensated, empty, machine, orifice, solved
 
 
 def learned(seed: int = 1, flow: Flow = orifice, rows: int = 400) -> FlowMap:
@@ -110,9 +109,7 @@ def test_cells_say_where_they_come_from() -> None:
 
 
 def test_a_map_without_data_is_the_rated_valve_and_admits_that() -> None:
-    model = machine()
-    empty = Solution(model, np.array([1e-9]), np.eye(1), (), 1.0, 1)
-    edge = publish(empty)[0]
+    edge = publish(empty(machine()))[0]
     assert (edge.status == PRIOR).all()
     assert edge.flow(8.0, 3e6) == pytest.approx(RATED_Q_M3S, rel=0.02)
     assert edge.sd(8.0, 3e6) > RATED_Q_M3S
