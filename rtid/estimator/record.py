@@ -16,14 +16,13 @@ from rtid.estimator.profile import Profile, profile
 from rtid.estimator.solution import (
     VALID,
     Solution,
+    correct,
     factorize,
-    misfit,
     normal_equations,
     one_thread,
     solve,
 )
 from rtid.estimator.state import State, Weights, build, nominal_weights
-from rtid.kernels.layout import ROWS
 from rtid.model import FloatArray, Model
 
 LAG_PROBE = 0.1  # of the lag, plus 0.05 ms: distance of the finite differences
@@ -66,10 +65,11 @@ def fit_record(
     in seconds, which are then estimated within offset_tolerance_s (m,).
     """
     tolerance = np.zeros(0) if offset_tolerance_s is None else offset_tolerance_s
-    weights = refined(model, solve(model, run(model, chunk)), model.lag.nominal_s)
+    first = solve(model, run(model, chunk))
+    weights = refined(model, first, model.lag.nominal_s)
     lag_sd_s, offsets, offsets_sd = 0.0, np.zeros(len(tolerance)), np.zeros(len(tolerance))
     if model.lag.tolerance_s > 0 or len(tolerance):
-        found = _nuisance(model, assemble or (lambda _: chunk), weights, tolerance)
+        found = _nuisance(model, assemble or (lambda _: chunk), weights, first.leverage, tolerance)
         lag_sd_s, offsets, offsets_sd = float(found.sd[0]), found.value[1:], found.sd[1:]
         weights = replace(weights, lag_s=float(found.value[0]))
         chunk = assemble(offsets) if assemble else chunk
@@ -80,12 +80,16 @@ def fit_record(
 
 
 def _nuisance(
-    model: Model, assemble: Assemble, weights: Weights, tolerance_s: FloatArray
+    model: Model,
+    assemble: Assemble,
+    weights: Weights,
+    leverage: FloatArray,
+    tolerance_s: FloatArray,
 ) -> Profile:
     """Profile chi2 over [lag, message offsets]; their tolerances are prior knowledge."""
 
     def chi2(nu: FloatArray) -> float:
-        return excess(model, assemble(nu[1:]), replace(weights, lag_s=float(nu[0])))
+        return excess(model, assemble(nu[1:]), replace(weights, lag_s=float(nu[0])), leverage)
 
     lag = model.lag
     fixed = 1e-9  # a lag that is not to be estimated
@@ -125,13 +129,10 @@ def _first_cells(model: Model) -> list[int]:
     return [0, *np.cumsum(sizes)[:-1].tolist()]
 
 
-def excess(model: Model, chunk: FloatArray, weights: Weights) -> float:
-    """Misfit of the best linear fit minus its number of rows: comparable between nuisance values."""
+def excess(model: Model, chunk: FloatArray, weights: Weights, leverage: FloatArray) -> float:
+    """Cost of the best linear fit minus its number of rows: comparable between nuisance values."""
     state = run(model, chunk, weights).settled()
-    e, normal = state.engine[0], normal_equations(state)
+    normal = normal_equations(state)
     with one_thread():
-        theta = factorize(normal, int(e["n_shared"])).theta(normal.right)
-    # the cost whose minimum theta is: with the known noise in the columns taken out of the gram, or
-    # whatever moves theta_beta would seem to change the fit (it moved the lag by 4 of its sd)
-    cost = misfit(normal, theta) - float(normal.bias @ theta**2)
-    return cost - float(e["counters"][ROWS] * e["n_chambers"])
+        found = correct(normal, factorize(normal, int(state.engine[0]["n_shared"])), leverage)
+    return found.cost - normal.rows * len(model.chambers)

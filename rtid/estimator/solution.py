@@ -12,7 +12,7 @@ from scipy.linalg.lapack import dpotri
 from threadpoolctl import ThreadpoolController
 
 from rtid.estimator.state import State
-from rtid.kernels.layout import COUNTERS, TERMS
+from rtid.kernels.layout import COUNTERS, ROWS, TERMS
 from rtid.kernels.normal import assemble
 from rtid.model import FloatArray, Model
 
@@ -60,7 +60,8 @@ class Block:
 @dataclass(frozen=True)
 class Solution:
     """The joint estimate.  beta_pa and beta_sd_pa (chambers,); rho: residual variance in units of
-    the declared noise, 1 when the model explains the rows to the sensors' noise.
+    the declared noise, 1 when the model explains the rows to the sensors' noise; leverage
+    (chambers,): see `leverage_of`.
     """
 
     model: Model
@@ -69,6 +70,7 @@ class Solution:
     blocks: tuple[Block, ...]
     rho: float
     dof: int
+    leverage: FloatArray
     counters: dict[str, int] = field(default_factory=dict)
 
     @property
@@ -96,12 +98,17 @@ class Solution:
 
 @dataclass(frozen=True)
 class Normal:
-    """Normal equations in scaled units: gram and right without prior, bias = noise in the gram."""
+    """Normal equations in scaled units, without prior.
+
+    gram (n, n), right (n,), square = y'y; noise (chambers,): what pressure noise adds on average to
+    the diagonal of gram for -V dP; rows: pairs of rows.
+    """
 
     gram: FloatArray
     right: FloatArray
     square: float
-    bias: FloatArray
+    noise: FloatArray
+    rows: int
 
 
 def normal_equations(state: State) -> Normal:
@@ -110,36 +117,103 @@ def normal_equations(state: State) -> Normal:
     n = int(e["n_shared"] + TERMS * e["n_slots"])
     gram, right = np.zeros((n, n)), np.zeros(n)
     square = assemble(state.engine, state.blocks, state.pairs, gram, right)
-    bias = np.zeros(n)
-    n_chambers = int(e["n_chambers"])
-    if state.form_is_integral:
-        bias[:n_chambers] = e["noise_gram"][:n_chambers]
-    return Normal(gram, right, square, bias)
+    noise = e["noise_gram"][: int(e["n_chambers"])].copy()
+    return Normal(gram, right, square, noise, int(e["counters"][ROWS]))
+
+
+@dataclass(frozen=True)
+class Corrected:
+    """The estimate with the noise in -V dP taken out: errors in variables, least squares corrected.
+
+    theta (n,); basis (n, chambers): how theta follows the compliances; cov_change (chambers,
+    chambers): what the correction adds to their covariance; cost: the minimum of
+    |y - rows theta|^2 - theta' noise theta, comparable between nuisance parameters.
+    """
+
+    theta: FloatArray
+    basis: FloatArray
+    cov_change: FloatArray
+    cost: float
+
+
+def correct(normal: Normal, factor: Factor, leverage: FloatArray) -> Corrected:
+    """Take the noise out of the compliances' information, and let the flow terms follow.
+
+    leverage (chambers,): share of the noise that the flow terms absorb (see `leverage_of`).  Where
+    the motion holds no more information than the noise pretends, little is left, and the
+    variance says so.
+    """
+    n_c = len(normal.noise)
+    theta = factor.theta(normal.right)
+    columns = factor.columns(n_c)
+    information = np.linalg.inv(columns[:n_c])
+    noise = np.diag(normal.noise * (1 - leverage))
+    least = SHARED_PRIOR + 3 * np.sqrt(2 / max(1, normal.rows)) * normal.noise
+    left = _at_least(information - noise, least)
+    cov = np.linalg.inv(left)
+    basis = columns @ information
+    shift = cov @ information @ theta[:n_c] - theta[:n_c]
+    # noise times noise: its share of the rows' own variance adds to that of the product
+    own = normal.noise / max(1, normal.rows)
+    cov_change = cov + cov @ (noise * (1 + own)) @ cov - columns[:n_c]
+    told = theta[:n_c] + shift
+    cost = misfit(normal, theta) + shift @ information @ shift - told @ noise @ told
+    return Corrected(theta + basis @ shift, basis, cov_change, float(cost))
+
+
+def _at_least(information: FloatArray, least: FloatArray) -> FloatArray:
+    """Symmetric matrix with its eigenvalues, in units of `least`, raised to 1."""
+    scale = np.sqrt(least)
+    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    raised = (vectors * np.maximum(values, 1.0)) @ vectors.T
+    return np.asarray(raised * np.outer(scale, scale))
+
+
+def leverage_of(state: State, effective: FloatArray) -> FloatArray:
+    """Share (chambers,) of the noise in each column -V dP that the flow terms absorb.
+
+    Noise that the maps can follow never reaches theta_beta.  effective (n,): degrees of freedom
+    per unknown.  Terms of the chamber's own edges lie in the same direction of the pair of
+    whitened rows as the noise; those of the other chamber at the angle whose cosine is the
+    correlation of the two innovations.
+    """
+    e = state.engine[0]
+    n_c, n_slots = int(e["n_chambers"]), int(e["n_slots"])
+    feeds = e["sign"][state.blocks["edge"][:n_slots], :n_c] != 0
+    terms = effective[int(e["n_shared"]) :].reshape(n_slots, TERMS).sum(axis=1)
+    s00, s01, s11 = e["innovation"]
+    alike = s01**2 / (s00 * s11) if n_c == 2 and s00 * s11 > 0 else 0.0
+    cosines = np.where(np.eye(n_c, dtype=bool), 1.0, alike)
+    return np.clip(cosines @ (terms @ feeds) / max(1, int(e["counters"][ROWS])), 0.0, 0.9)
 
 
 def solve(model: Model, state: State) -> Solution:
-    """Joint estimate of everything seen so far; `state` is not changed.
-
-    Pressure noise in the column -V dP inflates its information; what it adds on average is known
-    from the declared noise and taken out, so that theta_beta is not biased towards zero.
-    """
+    """Joint estimate of everything seen so far; `state` is not changed."""
     settled = state.settled()
-    normal = normal_equations(settled)
-    e = settled.engine[0]
-    n_chambers = int(e["n_chambers"])
+    e, normal = settled.engine[0], normal_equations(settled)
+    n_c = int(e["n_chambers"])
     with one_thread():
         factor = factorize(normal, int(e["n_shared"]))
-        theta, cov = factor.theta(normal.right), factor.cov()
-    rows = int(e["counters"][1]) * n_chambers
-    active = int(np.sum(np.diag(normal.gram) * np.diag(cov) > 0.5))
-    dof = max(1, rows - active)
-    sse = misfit(normal, theta)
-    c0 = e["compliance"][:n_chambers]
-    compliance = theta[:n_chambers] * c0
-    compliance_cov = cov[:n_chambers, :n_chambers] * np.outer(c0, c0)
-    blocks = tuple(_block(model, settled, theta, cov, normal, s) for s in range(int(e["n_slots"])))
+        cov = factor.cov()
+        effective = np.einsum("ij,ij->i", cov, normal.gram)
+        leverage = leverage_of(settled, effective)
+        found = correct(normal, factor, leverage)
+        cov += found.basis @ found.cov_change @ found.basis.T
+    theta = found.theta
+    dof = max(1, normal.rows * n_c - round(float(effective.sum())))
+    c0 = e["compliance"][:n_c]
     counters = {name: int(count) for name, count in zip(COUNTERS, e["counters"], strict=True)}
-    return Solution(model, compliance, compliance_cov, blocks, float(sse / dof), dof, counters)
+    blocks = tuple(_block(model, settled, theta, cov, normal, s) for s in range(int(e["n_slots"])))
+    return Solution(
+        model=model,
+        compliance=theta[:n_c] * c0,
+        compliance_cov=cov[:n_c, :n_c] * np.outer(c0, c0),
+        blocks=blocks,
+        rho=misfit(normal, theta) / dof,
+        dof=dof,
+        leverage=leverage,
+        counters=counters,
+    )
 
 
 @cache
@@ -170,11 +244,16 @@ class Factor:
     lower: FloatArray
 
     def theta(self, right: FloatArray) -> FloatArray:
-        """Solution for one right-hand side (n,), with one step of refinement."""
-        right = right * self.scale
+        """Solution for right-hand sides (n,) or (n, m), with one step of refinement."""
+        scale = self.scale if right.ndim == 1 else self.scale[:, None]
+        right = right * scale
         theta = cho_solve((self.lower, True), right)
         theta += cho_solve((self.lower, True), right - self.matrix @ theta)
-        return np.asarray(theta * self.scale)
+        return np.asarray(theta * scale)
+
+    def columns(self, m: int) -> FloatArray:
+        """The first m columns (n, m) of the inverse."""
+        return self.theta(np.eye(len(self.scale), m))
 
     def cov(self) -> FloatArray:
         """Inverse of the normal matrix (n, n)."""
@@ -184,10 +263,10 @@ class Factor:
 
 
 def factorize(normal: Normal, n_shared: int) -> Factor:
-    """Factor of information - known bias + prior."""
+    """Factor of information + prior."""
     prior = np.full(len(normal.right), PRIOR_SD**-2)
     prior[:n_shared] = SHARED_PRIOR
-    matrix = normal.gram + np.diag(prior - normal.bias)
+    matrix = normal.gram + np.diag(prior)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
     matrix *= scale[:, None]
     matrix *= scale

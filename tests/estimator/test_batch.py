@@ -11,7 +11,6 @@ from rtid.estimator.solution import (
     PRIOR_SD,
     SHARED_PRIOR,
     VALID,
-    Normal,
     factorize,
     normal_equations,
     solve,
@@ -65,8 +64,7 @@ def parameter_error(case: Case) -> float:
     batch = batch_of(case)
     normal, state = accumulated(case)
     ns = int(state.engine[0]["n_shared"])
-    unbiased = Normal(normal.gram, normal.right, normal.square, 0 * normal.bias)
-    theta = factorize(unbiased, ns).theta(normal.right)
+    theta = factorize(normal, ns).theta(normal.right)  # least squares, without the correction
     own = np.ones(len(theta), bool)
     for b, block in enumerate(solve(case.model, state).blocks):
         own[ns + 6 * b : ns + 6 * b + 6] = block.status == VALID and block.condition <= 1e6
