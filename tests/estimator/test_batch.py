@@ -11,6 +11,7 @@ from rtid.estimator.solution import (
     PRIOR_SD,
     SHARED_PRIOR,
     VALID,
+    Normal,
     factorize,
     normal_equations,
     solve,
