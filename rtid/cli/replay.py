@@ -1,0 +1,52 @@
+"""`rtid replay`: learn from a captured trace, as on board, and say what was learned."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def replay(
+    trace: Annotated[Path, typer.Argument(help="CAN log (.blf .log .asc .trc .mf4) or table.")],
+    project: Annotated[Path, typer.Option("--project", "-p", help="Project file.")],
+    bus: Annotated[
+        bool, typer.Option("--bus", help="Through python-can's virtual bus instead of the file.")
+    ] = False,
+    speed: Annotated[float, typer.Option(help="Pace with --bus; 0: as fast as possible.")] = 0.0,
+    snapshot: Annotated[
+        Path | None, typer.Option(help="Write the estimator's memory (.npz) here.")
+    ] = None,
+    reference: Annotated[
+        Path | None, typer.Option("--map", help="Reference map (CSV) beside the learned one.")
+    ] = None,
+    pictures: Annotated[
+        Path | None, typer.Option(help="Folder for pictures: coverage, maps, model and residual.")
+    ] = None,
+    picture_format: Annotated[str, typer.Option(help="png or svg.")] = "png",
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Learn flow maps and bulk modulus from a captured trace.
+
+    Prints what the trace holds, what the gates refused, the bulk modulus with its interval and the
+    maps; the same frames give the same snapshot, bit for bit, from the file or from a bus.
+    """
+    from rtid.comparing import compare_trace, find_reference
+    from rtid.present import Story, progress_bar
+    from rtid.project import load
+    from rtid.replay import replay as run
+    from rtid.store import save
+
+    loaded = load(project)
+    with progress_bar(hidden=as_json) as progress:
+        result = run(loaded, trace, progress, bus_speed=(speed or float("inf")) if bus else None)
+    if snapshot is not None:
+        save(snapshot, result.live, loaded.digest)
+    story = Story(compare_trace(result, find_reference(loaded, reference)))
+    written = story.draw(pictures, picture_format) if pictures else []
+    if as_json:
+        print(json.dumps(story.as_json() | {"pictures": [str(p) for p in written]}))
+    else:
+        story.print(snapshot, written)
