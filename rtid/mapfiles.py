@@ -15,8 +15,10 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+import rtid
 from rtid.errors import RtidError
 from rtid.estimator.flowmap import VALID, EdgeMap, FlowMap
+from rtid.estimator.solution import Solution
 from rtid.model import FloatArray, Grid
 
 SCHEMA = "rtid-flowmap/1"
@@ -51,6 +53,20 @@ def read_map(path: Path) -> tuple[FlowMap, dict[str, Any]]:
         return FlowMap(tuple(_edge(part) for part in parts)), header["provenance"]
     except (KeyError, TypeError, ValueError, EOFError, BadZipFile) as error:
         raise MapFileError(f"{path}: not a flow map of {SCHEMA} ({error})") from error
+
+
+def provenance(solution: Solution, project: str, digest: str, source: str) -> dict[str, Any]:
+    """Where a map comes from, in JSON types: what was learned from, and how well it fits."""
+    return {
+        "program": f"rtid {rtid.__version__}",
+        "project": project,
+        "digest": digest,
+        "source": source,
+        "rows": solution.counters.get("rows", 0),
+        "rho": solution.rho,
+        "beta_pa": solution.beta_pa.tolist(),
+        "beta_sd_pa": solution.beta_sd_pa.tolist(),
+    }
 
 
 def table_rows(flowmap: FlowMap) -> Iterator[tuple[str, float, float, float, float, str]]:
