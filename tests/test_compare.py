@@ -106,6 +106,18 @@ def test_residual_of_a_wrong_edge_stays_in_its_blocks(machine: Learned) -> None:
     assert medians["pa"] > 5 * medians["pb"]
 
 
+def test_intervals_of_extrapolated_cells_are_honest(machine: Learned) -> None:
+    _, _, flowmap, _, run = machine
+    z = []
+    for d in deviations(flowmap, truth_table(run.plant)):
+        away = (d.status == "extrapolated") & np.isfinite(d.reference_m3s) & (d.dp_pa > 2e5)
+        z.append(((d.flow_m3s - d.reference_m3s) / d.sd_m3s)[away])
+    every = np.concatenate(z)
+    assert len(every) > 500
+    assert np.mean(np.abs(every) < 2) > 0.9
+    assert np.sqrt(np.mean(every**2)) < 1.5
+
+
 def test_deviations_from_the_truth_are_small_where_valid(machine: Learned) -> None:
     _, _, flowmap, _, run = machine
     for d in deviations(flowmap, truth_table(run.plant)):

@@ -2,9 +2,18 @@
 
 from rtid.compare.comparison import Candidate, Comparison, compare, learned, refitted
 from rtid.compare.reference import ReferenceMap
-from rtid.compare.tables import BlockRow, Deviation, block_rows, deviations
+from rtid.compare.tables import (
+    PAPER_DP_PA,
+    PAPER_U_V,
+    BlockRow,
+    Deviation,
+    block_rows,
+    deviations,
+)
 
 __all__ = [
+    "PAPER_DP_PA",
+    "PAPER_U_V",
     "BlockRow",
     "Candidate",
     "Comparison",

@@ -22,6 +22,7 @@ from rtid.estimator.solution import Block, Solution
 from rtid.kernels.layout import TERMS
 from rtid.model import Edge, FloatArray, Grid
 
+COLUMN_PRIOR = 0.05  # share of the rise of K over a column by which its shape may differ
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(4)
 
 
@@ -39,6 +40,7 @@ def _publish_edge(edge: Edge, blocks: list[Block]) -> EdgeMap:
     used = [b for b in blocks if _informative(edge, b)]
     law = fit_law(edge, gain_data(edge.grid, used))
     theta, cov = extrapolated(edge.grid, law)
+    refine_columns(edge.grid, law, used, theta, cov)
     status = np.full(edge.grid.shape, EXTRAPOLATED if used else PRIOR)
     reason = {}
     for b in blocks:
@@ -93,6 +95,32 @@ def extrapolated(grid: Grid, law: OrificeLaw) -> tuple[FloatArray, FloatArray]:
         rest = q - theta[i] @ terms.T  # what six terms cannot follow
         cov[i, :, 0, 0] += np.mean(rest**2, axis=1)
     return theta, cov
+
+
+def refine_columns(
+    grid: Grid, law: OrificeLaw, blocks: list[Block], theta: FloatArray, cov: FloatArray
+) -> None:
+    """Give unvisited cells what the visited ones of their column say about K(w) within it.
+
+    The law is smooth; where the dead band ends K(w) is not.  Per column K gets a correction
+    c0 + c1 xi + c2 xi^2 from its blocks' terms, with a share of K's rise as prior.  theta and cov
+    of the unvisited cells are changed in place.
+    """
+    for i in sorted({b.i for b in blocks}):
+        _, dp = _quadrature(grid, i)
+        shapes = projection() @ (root(dp)[:, :, None] * _terms()[:, [0, 1, 3]])
+        ends = law.gains(grid.u_v[i : i + 2, None], np.full((2, 1), law.scale.dp_pa))[0]
+        info = np.eye(3) / (COLUMN_PRIOR * abs(float(ends[1, 0] - ends[0, 0])) + 1e-30) ** 2
+        right = np.zeros(3)
+        visited = [b for b in blocks if b.i == i]
+        for b in visited:
+            weight = np.linalg.inv(b.cov + cov[i, b.j]) @ shapes[b.j]
+            info = info + shapes[b.j].T @ weight
+            right += weight.T @ (b.theta - theta[i, b.j])
+        spread = np.linalg.inv(info)
+        other = np.setdiff1d(np.arange(grid.shape[1]), [b.j for b in visited])
+        theta[i, other] += shapes[other] @ (spread @ right)
+        cov[i, other] += shapes[other] @ spread @ shapes[other].transpose(0, 2, 1)
 
 
 def cell_terms(grid: Grid, flow: Callable[[FloatArray, FloatArray], FloatArray]) -> FloatArray:
