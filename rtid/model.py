@@ -103,7 +103,7 @@ class Gates:
     max_gap_s: float = 0.05  # a longer step between samples restarts the integrals
     hysteresis: float = 0.05  # share of a block's width that the working point must leave it by
     min_rows: int = 20  # rows that a block needs before it can become valid
-    max_sd_share: float = 0.02  # of the rated flow: known worse than this is not valid
+    max_sd_share: float = 0.001  # of the edge's largest flow: known worse than this is not valid
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,14 +28,15 @@ class SnapshotError(RtidError):
 def save(path: Path, estimator: Estimator, digest: str) -> None:
     """Write a snapshot; the file appears whole or not at all."""
     header = {"schema": SCHEMA, "digest": digest, "origin_us": estimator.origin_us}
-    arrays = dict(zip(ARRAYS, estimator.state.arrays, strict=True))
+    arrays: dict[str, Any] = dict(zip(ARRAYS, estimator.state.arrays, strict=True))
     weights = estimator.weights
     if weights is not None:
         arrays |= {"slopes": weights.slopes, "compliance": weights.compliance}
         header["lag_s"] = weights.lag_s
     temporary = path.with_name(path.name + ".part")
     with temporary.open("wb") as file:
-        np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
+        arrays["header"] = np.array(json.dumps(header))
+        np.savez_compressed(file, **arrays)
         file.flush()
         os.fsync(file.fileno())
     os.replace(temporary, path)

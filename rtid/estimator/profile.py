@@ -1,4 +1,4 @@
-"""Nuisance parameters (spool lag, message offsets): minimise chi2 over them, outside the linear fit.
+"""Nuisance parameters (spool lag, message offsets): minimise chi2 outside the linear fit.
 
 chi2(nu) = misfit of the linear fit with nu held, plus the prior ((nu - nominal) / tolerance)^2.
 Newton steps on a quadratic through finite differences; chi2 is in units of the noise, so half its
@@ -20,11 +20,10 @@ LONGEST_STEP = 3.0  # probes
 
 @dataclass(frozen=True)
 class Profile:
-    """Minimum of chi2: value (n,), sd (n,), chi2 there, and the number of evaluations."""
+    """Minimum of chi2: value (n,), sd (n,), and the number of evaluations."""
 
     value: FloatArray
     sd: FloatArray
-    chi2: float
     evaluations: int
 
 
@@ -54,14 +53,13 @@ def profile(
     for _ in range(MAX_STEPS):
         gradient, hessian = _derivatives(cost, value, probe)
         trial = np.maximum(value + _newton(gradient, hessian, probe), least)
+        if np.all(np.abs(trial - value) <= probe):  # the parabola need not be extrapolated
+            value = trial
+            break
         if cost(trial) >= best:
             break
-        inside = bool(np.all(np.abs(trial - value) <= probe))
-        value, best = trial, cost(trial)
-        if inside:  # the parabola was not extrapolated
-            break
-        value = np.maximum(value, least + probe)
-    return Profile(value, np.sqrt(2 * np.diag(np.linalg.pinv(hessian))), best, len(known))
+        value, best = np.maximum(trial, least + probe), cost(trial)
+    return Profile(value, np.sqrt(2 * np.diag(np.linalg.pinv(hessian))), len(known))
 
 
 def _derivatives(

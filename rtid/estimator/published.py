@@ -100,27 +100,26 @@ def extrapolated(grid: Grid, law: OrificeLaw) -> tuple[FloatArray, FloatArray]:
 def refine_columns(
     grid: Grid, law: OrificeLaw, blocks: list[Block], theta: FloatArray, cov: FloatArray
 ) -> None:
-    """Give unvisited cells what the visited ones of their column say about K(w) within it.
+    """Give each cell what the other visited cells of its column say about K(w) within it.
 
     The law is smooth; where the dead band ends K(w) is not.  Per column K gets a correction
     c0 + c1 xi + c2 xi^2 from its blocks' terms, with a share of K's rise as prior.  theta and cov
-    of the unvisited cells are changed in place.
+    are changed in place.
     """
     for i in sorted({b.i for b in blocks}):
         _, dp = _quadrature(grid, i)
         shapes = projection() @ (root(dp)[:, :, None] * _terms()[:, [0, 1, 3]])
         ends = law.gains(grid.u_v[i : i + 2, None], np.full((2, 1), law.scale.dp_pa))[0]
-        info = np.eye(3) / (COLUMN_PRIOR * abs(float(ends[1, 0] - ends[0, 0])) + 1e-30) ** 2
-        right = np.zeros(3)
-        visited = [b for b in blocks if b.i == i]
-        for b in visited:
+        prior_sd = COLUMN_PRIOR * abs(float(ends[1, 0] - ends[0, 0])) + 1e-12 * law.scale.gain
+        info, right = np.zeros((len(dp), 3, 3)), np.zeros((len(dp), 3))
+        for b in (b for b in blocks if b.i == i):
             weight = np.linalg.inv(b.cov + cov[i, b.j]) @ shapes[b.j]
-            info = info + shapes[b.j].T @ weight
-            right += weight.T @ (b.theta - theta[i, b.j])
-        spread = np.linalg.inv(info)
-        other = np.setdiff1d(np.arange(grid.shape[1]), [b.j for b in visited])
-        theta[i, other] += shapes[other] @ (spread @ right)
-        cov[i, other] += shapes[other] @ spread @ shapes[other].transpose(0, 2, 1)
+            info[b.j] = shapes[b.j].T @ weight
+            right[b.j] = weight.T @ (b.theta - theta[i, b.j])
+        spread = np.linalg.inv(info.sum(axis=0) - info + np.eye(3) / prior_sd**2)
+        shift = spread @ (right.sum(axis=0) - right)[:, :, None]
+        theta[i] += (shapes @ shift)[:, :, 0]
+        cov[i] += shapes @ spread @ shapes.transpose(0, 2, 1)
 
 
 def cell_terms(grid: Grid, flow: Callable[[FloatArray, FloatArray], FloatArray]) -> FloatArray:

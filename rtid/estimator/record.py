@@ -14,12 +14,13 @@ import numpy as np
 
 from rtid.estimator.profile import Profile, profile
 from rtid.estimator.solution import (
-    VALID,
+    Sketch,
     Solution,
     correct,
     factorize,
     normal_equations,
     one_thread,
+    sketch,
     solve,
 )
 from rtid.estimator.state import State, Weights, build, nominal_weights
@@ -65,8 +66,9 @@ def fit_record(
     in seconds, which are then estimated within offset_tolerance_s (m,).
     """
     tolerance = np.zeros(0) if offset_tolerance_s is None else offset_tolerance_s
-    first = solve(model, run(model, chunk))
-    weights = refined(model, first, model.lag.nominal_s)
+    state = run(model, chunk)
+    first = sketch(model, state)
+    weights = refined(model, state, first, model.lag.nominal_s)
     lag_sd_s, offsets, offsets_sd = 0.0, np.zeros(len(tolerance)), np.zeros(len(tolerance))
     if model.lag.tolerance_s > 0 or len(tolerance):
         found = _nuisance(model, assemble or (lambda _: chunk), weights, first.leverage, tolerance)
@@ -74,7 +76,8 @@ def fit_record(
         weights = replace(weights, lag_s=float(found.value[0]))
         chunk = assemble(offsets) if assemble else chunk
         if len(tolerance):  # the first weights came from shifted signals
-            weights = refined(model, solve(model, run(model, chunk, weights)), weights.lag_s)
+            state = run(model, chunk, weights)
+            weights = refined(model, state, sketch(model, state), weights.lag_s)
     state = run(model, chunk, weights)
     return RecordFit(solve(model, state), state, weights, lag_sd_s, offsets, offsets_sd)
 
@@ -109,24 +112,18 @@ def run(model: Model, chunk: FloatArray, weights: Weights | None = None) -> Stat
     return state
 
 
-def refined(model: Model, solution: Solution, lag_s: float) -> Weights:
-    """Weights from a solution: the orifice slope Q / (2 dp) at the mean flow of each valid block."""
-    nominal = nominal_weights(model)
-    slopes, first = nominal.slopes.copy(), _first_cells(model)
-    for block in solution.blocks:
-        if block.status == VALID:
-            grid = model.edges[block.edge].grid
-            dp = abs(0.5 * (grid.dp_pa[block.j] + grid.dp_pa[block.j + 1]))
-            least = 0.5 * (grid.dp_pa[block.j + 1] - grid.dp_pa[block.j])
-            cell = first[block.edge] + block.i * grid.shape[1] + block.j
-            slopes[cell] = max(block.mean_flow_m3s, 0.0) / (2 * max(dp, least))
+def refined(model: Model, state: State, found: Sketch, lag_s: float) -> Weights:
+    """Weights from a first estimate: the orifice slope Q / (2 dp) at each block's mean flow."""
+    slopes = nominal_weights(model).slopes.copy()
+    for record, flow in zip(state.blocks, found.flow_m3s, strict=False):
+        if np.isfinite(flow):
+            edge = int(record["edge"])
+            borders = model.edges[edge].grid.dp_pa
+            j = int(record["cell"] - state.engine[0]["first_cell"][edge]) % (len(borders) - 1)
+            dp, least = abs(borders[j] + borders[j + 1]), borders[j + 1] - borders[j]
+            slopes[record["cell"]] = max(flow, 0.0) / max(dp, least)
     low, high = 1 / model.beta_bounds_pa[1], 1 / model.beta_bounds_pa[0]
-    return Weights(slopes, np.clip(solution.compliance, low, high), lag_s)
-
-
-def _first_cells(model: Model) -> list[int]:
-    sizes = [edge.grid.shape[0] * edge.grid.shape[1] for edge in model.edges]
-    return [0, *np.cumsum(sizes)[:-1].tolist()]
+    return Weights(slopes, np.clip(found.compliance, low, high), lag_s)
 
 
 def excess(model: Model, chunk: FloatArray, weights: Weights, leverage: FloatArray) -> float:

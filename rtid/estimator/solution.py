@@ -13,7 +13,7 @@ from threadpoolctl import ThreadpoolController
 
 from rtid.estimator.state import State
 from rtid.kernels.layout import COUNTERS, ROWS, TERMS
-from rtid.kernels.normal import assemble
+from rtid.kernels.normal import assemble, mirror
 from rtid.model import FloatArray, Model
 
 # One standard deviation of the prior on a flow term: ten times the rated flow, so that directions
@@ -59,9 +59,10 @@ class Block:
 
 @dataclass(frozen=True)
 class Solution:
-    """The joint estimate.  beta_pa and beta_sd_pa (chambers,); rho: residual variance in units of
-    the declared noise, 1 when the model explains the rows to the sensors' noise; leverage
-    (chambers,): see `leverage_of`.
+    """The joint estimate.
+
+    beta_pa and beta_sd_pa (chambers,); rho: residual variance in units of the declared noise, 1
+    when the model explains the rows to the sensors' noise; leverage (chambers,): `leverage_of`.
     """
 
     model: Model
@@ -187,6 +188,28 @@ def leverage_of(state: State, effective: FloatArray) -> FloatArray:
     return np.clip(cosines @ (terms @ feeds) / max(1, int(e["counters"][ROWS])), 0.0, 0.9)
 
 
+@dataclass(frozen=True)
+class Sketch:
+    """First estimate, no variances: compliance (chambers,), flow_m3s (slots,), NaN: few rows."""
+
+    compliance: FloatArray
+    flow_m3s: FloatArray
+    leverage: FloatArray
+
+
+def sketch(model: Model, state: State) -> Sketch:
+    """The estimate that weighs the next pass: no covariance, every term taken as learned."""
+    settled = state.settled()
+    e, normal = settled.engine[0], normal_equations(settled)
+    n_c, ns, n_slots = int(e["n_chambers"]), int(e["n_shared"]), int(e["n_slots"])
+    leverage = leverage_of(settled, np.ones(len(normal.right)))
+    with one_thread():
+        theta = correct(normal, factorize(normal, ns), leverage).theta
+    flow = _mean_flows(settled, theta)
+    flow[settled.blocks["rows"][:n_slots] < model.gates.min_rows] = np.nan
+    return Sketch(theta[:n_c] * e["compliance"][:n_c], flow, leverage)
+
+
 def solve(model: Model, state: State) -> Solution:
     """Joint estimate of everything seen so far; `state` is not changed."""
     settled = state.settled()
@@ -203,7 +226,10 @@ def solve(model: Model, state: State) -> Solution:
     dof = max(1, normal.rows * n_c - round(float(effective.sum())))
     c0 = e["compliance"][:n_c]
     counters = {name: int(count) for name, count in zip(COUNTERS, e["counters"], strict=True)}
-    blocks = tuple(_block(model, settled, theta, cov, normal, s) for s in range(int(e["n_slots"])))
+    largest = _largest_flows(model, settled, theta)
+    blocks = tuple(
+        _block(model, settled, theta, cov, normal, s, largest) for s in range(int(e["n_slots"]))
+    )
     return Solution(
         model=model,
         compliance=theta[:n_c] * c0,
@@ -258,8 +284,8 @@ class Factor:
     def cov(self) -> FloatArray:
         """Inverse of the normal matrix (n, n)."""
         inverse, _ = dpotri(self.lower, lower=1)
-        inverse = np.tril(inverse) + np.tril(inverse, -1).T
-        return np.asarray(inverse * np.outer(self.scale, self.scale))
+        mirror(inverse.T, self.scale)  # Fortran order: the transpose holds the upper triangle
+        return np.asarray(inverse)
 
 
 def factorize(normal: Normal, n_shared: int) -> Factor:
@@ -274,8 +300,38 @@ def factorize(normal: Normal, n_shared: int) -> Factor:
     return Factor(matrix, scale, lower)
 
 
+def _mean_flows(state: State, theta: FloatArray) -> FloatArray:
+    """Flow averaged over the data of each slot (slots,), m3/s."""
+    e = state.engine[0]
+    records = state.blocks[: int(e["n_slots"])]
+    mean_phi = records["phi_sum"] / np.maximum(records["dwell_s"], 1e-12)[:, None]
+    terms = theta[int(e["n_shared"]) :].reshape(-1, TERMS)
+    return np.asarray(e["scale_m3s"][records["edge"]] * (mean_phi * terms).sum(axis=1))
+
+
+def _largest_flows(model: Model, state: State, theta: FloatArray) -> FloatArray:
+    """Largest block-mean flow of each edge (edges,), m3/s; the rated flow where none is known."""
+    flows, records = (
+        np.abs(_mean_flows(state, theta)),
+        state.blocks[: int(state.engine[0]["n_slots"])],
+    )
+    enough = records["rows"] >= model.gates.min_rows
+    return np.array(
+        [
+            flows[enough & (records["edge"] == i)].max(initial=0.0) or edge.rated_q_m3s
+            for i, edge in enumerate(model.edges)
+        ]
+    )
+
+
 def _block(
-    model: Model, state: State, theta: FloatArray, cov: FloatArray, normal: Normal, slot: int
+    model: Model,
+    state: State,
+    theta: FloatArray,
+    cov: FloatArray,
+    normal: Normal,
+    slot: int,
+    largest_m3s: FloatArray,
 ) -> Block:
     record, e = state.blocks[slot], state.engine[0]
     edge = int(record["edge"])
@@ -285,7 +341,7 @@ def _block(
     i, j = divmod(int(record["cell"] - e["first_cell"][edge]), int(e["n_dp"][edge]))
     mean_phi = record["phi_sum"] / max(record["dwell_s"], 1e-12)
     condition = _condition(normal.gram[own, own])
-    sd_share = float(np.sqrt(max(0.0, mean_phi @ cov[own, own] @ mean_phi)))
+    sd_share = q / largest_m3s[edge] * float(np.sqrt(max(0.0, mean_phi @ cov[own, own] @ mean_phi)))
     status, reason = _status(model, int(record["rows"]), condition, sd_share)
     return Block(
         edge,
@@ -317,5 +373,6 @@ def _status(model: Model, rows: int, condition: float, sd_share: float) -> tuple
     if not condition <= gates.condition_limit:
         return LEARNING, f"condition number {condition:.1e} above {gates.condition_limit:.0e}"
     if sd_share > gates.max_sd_share:
-        return LEARNING, f"flow known to {100 * sd_share:.1f} % of rated, limit {100 * gates.max_sd_share:.1f} %"
+        known, limit = 100 * sd_share, 100 * gates.max_sd_share
+        return LEARNING, f"flow known to {known:.2g} % of the largest, limit {limit:.2g} %"
     return VALID, ""

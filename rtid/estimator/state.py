@@ -123,7 +123,9 @@ def _edge_slopes(edge: Edge) -> FloatArray:
     u, dp = edge.grid.u_v, edge.grid.dp_pa
     w, pressure = 0.5 * (u[1:] + u[:-1]), np.abs(0.5 * (dp[1:] + dp[:-1]))
     foot = edge.safe_band_v if np.isfinite(edge.safe_band_v) else u[0]
-    gain = edge.rated_q_m3s / np.sqrt(edge.rated_dp_pa) * np.clip((w - foot) / (u[-1] - foot), 0.02, 1)
+    gain = (
+        edge.rated_q_m3s / np.sqrt(edge.rated_dp_pa) * np.clip((w - foot) / (u[-1] - foot), 0.02, 1)
+    )
     floor = 0.5 * np.diff(dp)
     return np.outer(gain, 0.5 / np.sqrt(np.maximum(pressure, floor))).ravel()
 

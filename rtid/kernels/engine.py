@@ -2,7 +2,7 @@
 
 Per interval [t_k, t_k+1] and chamber c, eq. (14) integrated over it:
 
-    s_c A_c (x_k+1 - x_k) = - V_mid (P_k+1 - P_k) theta_beta_c + sum of sigma * int phi dt theta + ...
+    s_c A_c (x_k+1 - x_k) = - V_mid (P_k+1 - P_k) theta_beta_c + sum of sigma int phi dt theta + ...
 
 Replay calls `advance` with a whole trace, the daemon with one sample: same code, same bits.
 """
@@ -110,7 +110,7 @@ def _take(e: Any, cells: Any, closed: Any, blocks: Any, pairs: Any, sample: Floa
 
 @njit(cache=True)
 def step_s(e: Any, t_s: float) -> float:
-    """Time since the last sample in whole microseconds, as all stamps are: equal steps are equal."""
+    """Time since the last sample in whole microseconds: equal steps are equal to the bit."""
     return math.floor((t_s - e.t_s) * 1e6 + 0.5) * 1e-6
 
 
@@ -130,6 +130,7 @@ def acceptable(e: Any, sample: FloatArray) -> bool:
 
 @njit(cache=True)
 def remember(e: Any, sample: FloatArray) -> None:
+    """Keep the sample: it is the start of the next interval."""
     e.t_s = sample[0]
     for j in range(e.n_signals):
         e.values[j] = sample[2 + j]
@@ -160,7 +161,14 @@ def _stop(e: Any, closed: Any, blocks: Any, pairs: Any) -> None:
 
 @njit(cache=True)
 def _interval(
-    e: Any, cells: Any, closed: Any, blocks: Any, pairs: Any, sample: FloatArray, dt: float, row: bool
+    e: Any,
+    cells: Any,
+    closed: Any,
+    blocks: Any,
+    pairs: Any,
+    sample: FloatArray,
+    dt: float,
+    row: bool,
 ) -> None:
     """Integrate the columns over [t, t + dt]; make a row where the position was measured."""
     if dt != e.dt_s:
@@ -177,7 +185,9 @@ def _interval(
         carry_step(e)
         remember(e, sample)
         if e.t_s > e.next_row_s - 0.5 * dt:
-            e.next_row_s += e.row_period_s * max(1.0, math.ceil((e.t_s - e.next_row_s) / e.row_period_s))
+            e.next_row_s += e.row_period_s * max(
+                1.0, math.ceil((e.t_s - e.next_row_s) / e.row_period_s)
+            )
             carry_row(e)
     else:
         remember(e, sample)

@@ -66,7 +66,9 @@ def explain(
             innovation[k - 1] = np.nan
             cell[k - 1] = SHUT
             if joined:
-                joined = _one(e, cells, theta, compliance, chunk[k], dt, flow[k - 1], cell[k - 1], gap)
+                joined = _one(
+                    e, cells, theta, compliance, chunk[k], dt, flow[k - 1], cell[k - 1], gap
+                )
         if joined:
             remember(e, chunk[k])
             if (flags & ROW_FLAG) != 0:

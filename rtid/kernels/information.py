@@ -4,9 +4,9 @@ A whitened or filtered row is N_k d_k, where every column's state obeys
 
     d_{k+1} = M_k (d_k + increment)          (increment = 0 while its block is closed)
 
-so all closed blocks decay by the same product of M_k.  With `ring` = that product as local columns,
-d_closed(k) = ring(k) d_hat with constant d_hat, and what a closed block shares with any other column
-follows from the products of the ring with that column:
+so all closed blocks decay by the same product of M_k.  With `ring` = that product as local
+columns, d_closed(k) = ring(k) d_hat with constant d_hat, and what a closed block shares with any
+other column follows from the products of the ring with that column:
 
 * with an open block, from ring x open, kept with the open block when it closes (`through`);
 * with another closed block, from ring x ring since the later one closed.
@@ -231,9 +231,7 @@ def _clear(e: Any, first: int, count: int) -> None:
 
 
 @njit(cache=True)
-def open_block(
-    e: Any, closed: Any, blocks: Any, pairs: Any, k: int, edge: int, slot: int
-) -> None:
+def open_block(e: Any, closed: Any, blocks: Any, pairs: Any, k: int, edge: int, slot: int) -> None:
     """Make `slot` open block k: a place just closed, or n_open to append.
 
     If the block still rings, it goes on from the state it is in.
@@ -336,7 +334,7 @@ def rebase(e: Any, closed: Any, blocks: Any, pairs: Any) -> None:
 
 @njit(cache=True)
 def _advance_closed(e: Any, closed: Any, ring: int) -> None:
-    """Refer all closed states to now, d <- ring d, with nothing owed; keep those that still ring."""
+    """Refer closed states to now, d <- ring d, with nothing owed; keep those that still ring."""
     kept = 0
     for c in range(e.n_closed):
         item, largest = closed[c], 0.0

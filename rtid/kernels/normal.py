@@ -48,3 +48,14 @@ def _place(pair: Any, ns: int, gram: FloatArray) -> None:
         for j in range(TERMS):
             gram[low + i, high + j] = pair.gram[i, j]
             gram[high + j, low + i] = pair.gram[i, j]
+
+
+@njit(cache=True)
+def mirror(matrix: FloatArray, scale: FloatArray) -> None:
+    """matrix (n, n) <- scale_i scale_j upper_ij, both triangles, from its upper one; in place."""
+    n = len(matrix)
+    for i in range(n):
+        for j in range(i, n):
+            value = matrix[i, j] * scale[i] * scale[j]
+            matrix[i, j] = value
+            matrix[j, i] = value

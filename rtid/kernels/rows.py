@@ -7,8 +7,9 @@ dQ/ddp) is a random walk with covariance Q per step:
 
     P <- P + Q;  S = P + R;  row = L^-1 d, S = L L';  d <- R S^-1 d;  P <- P S^-1 R
 
-Carry form, eq. (10)-(11): every column passes H_f; a row is the filter's output at the row instants,
-divided by the Cholesky factor of the two chambers' position noise; d is the filter's state.
+Carry form, eq. (10)-(11): every column passes H_f; a row is the filter's output at the row
+instants, divided by the Cholesky factor of the two chambers' position noise; d is the state of the
+filter.
 """
 
 from __future__ import annotations
@@ -57,8 +58,8 @@ def _add_column_noise(
     """Add what pressure noise adds on average to the square of column -V dP, beyond its signal.
 
     Its row is L^-1 (n u_c - m), u_c the unit vector of its chamber, where the prediction m repeats
-    past noise: m <- k m + (I - k) u_c n, k = R S^-1, so its covariance E <- k E k' + ...  (The same n
-    also enters through dQ/ddp, but even in time where n - n_before is odd: they share nothing.)
+    past noise: m <- k m + (I - k) u_c n, k = R S^-1, so its covariance E <- k E k' + ...  The same
+    n also enters through dQ/ddp, but even in time where n - n_before is odd: they share nothing.
     """
     v, echo = _column_variance(e, c), e.echo[c]
     a = (1.0 - k00) if c == 0 else -k01
@@ -70,9 +71,7 @@ def _add_column_noise(
     big = e.innovation
     e.noise_gram[c] += det * (big[2] * x00 - 2.0 * big[1] * s01 + big[0] * x11)
     echo[0] = k00 * k00 * s00 + 2.0 * k00 * k01 * s01 + k01 * k01 * s11 + a * a * v
-    echo[1] = (
-        k00 * k10 * s00 + (k00 * k11 + k01 * k10) * s01 + k01 * k11 * s11 + a * b * v
-    )
+    echo[1] = k00 * k10 * s00 + (k00 * k11 + k01 * k10) * s01 + k01 * k11 * s11 + a * b * v
     echo[2] = k10 * k10 * s00 + 2.0 * k10 * k11 * s01 + k11 * k11 * s11 + b * b * v
 
 

@@ -230,7 +230,7 @@ class GatesSection(Section):
     max_gap_s: Annotated[float | None, TIME] = Field(default=None, gt=0)
     hysteresis: float = Field(default=0.05, ge=0, lt=0.5)
     min_rows: int = Field(default=20, ge=6)
-    max_sd_share: float = Field(default=0.02, gt=0, le=1)
+    max_sd_share: float = Field(default=0.001, gt=0, le=1)
 
 
 class LagSection(Section):
