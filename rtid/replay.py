@@ -76,7 +76,9 @@ class Replay:
 def catalog_of(project: Project) -> Catalog:
     """The bit layouts of the project's DBC.  RtidError if it names none."""
     if project.dbc is None:
-        raise RtidError(f"{project.path}: source.dbc is missing", "name the DBC of the CAN trace", 2)
+        raise RtidError(
+            f"{project.path}: source.dbc is missing", "name the DBC of the CAN trace", 2
+        )
     return load(project.dbc)
 
 

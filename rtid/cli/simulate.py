@@ -13,16 +13,13 @@ from firmware_bridge.playback import AS_FAST_AS_POSSIBLE, send
 from rtid.cli.exits import Exit
 from rtid.errors import RtidError
 from rtid.sim.bus import open_test_bus, run_frames
-from rtid.sim.declare import declared_model
-from rtid.sim.log import START_US, SUFFIXES, truth_of, write_log, write_table
+from rtid.sim.log import START_US, SUFFIXES
 from rtid.sim.motion import MOTIONS
 from rtid.sim.plant import Plant
-from rtid.sim.project_file import project_text
 from rtid.sim.random_plants import draw
+from rtid.sim.recording import TABLE_SUFFIX, write_run
 from rtid.sim.run import Run
 from rtid.sim.run import simulate as run_machine
-
-TABLE_SUFFIX = ".parquet"
 
 
 def simulate(
@@ -54,7 +51,7 @@ def simulate(
     machine = Plant() if plant is None else draw(plant, cross_port=cross_port)
     run = run_machine(machine, motion, seed, duration_s)
     result = {"samples": len(run.samples), "beta_pa": machine.beta_pa}
-    written = _write(trace, run, seed, motion) if trace else []
+    written = write_run(trace, run, seed, motion) if trace else []
     sent = _send(run, bus, channel, speed or AS_FAST_AS_POSSIBLE) if bus else 0
     if as_json:
         print(json.dumps(result | {"files": [str(p) for p in written], "frames_sent": sent}))
@@ -85,21 +82,6 @@ def _check_arguments(
 
 def _usage(message: str, remedy: str) -> RtidError:
     return RtidError(message, remedy, Exit.USAGE)
-
-
-def _write(trace: Path, run: Run, seed: int, motion: str) -> list[Path]:
-    """Write trace, truth and project beside each other; their paths."""
-    if trace.suffix == TABLE_SUFFIX:
-        write_table(trace, run)
-    else:
-        write_log(trace, run_frames(run, start_us=START_US))
-    truth, project = trace.with_suffix(".truth.json"), trace.with_suffix(".toml")
-    facts = {"seed": seed, "motion": motion} | truth_of(run.plant)
-    truth.write_text(json.dumps(facts, indent=1) + "\n", "utf-8")
-    model = declared_model(run.plant, sensors=run.sensors, seed=seed)
-    stroke_m = run.plant.constants.stroke_m
-    project.write_text(project_text(model, stroke_m, "simulated cylinder"), "utf-8")
-    return [trace, truth, project]
 
 
 def _send(run: Run, interface: str, channel: str, speed: float) -> int:

@@ -16,12 +16,14 @@ import pyarrow as pa
 import pyarrow.parquet
 
 from firmware_bridge.frames import Frames, to_messages
+from firmware_bridge.sources import blf, candump
 from rtid.sim.declare import UNITS
 from rtid.sim.plant import EDGES, Plant
 from rtid.sim.run import NAMES, Run
 
 START_US = 1_600_000_000_000_000
-SUFFIXES = (".blf", ".log", ".asc")
+BULK_WRITERS = {".blf": blf.write, ".log": candump.write}
+SUFFIXES = (*BULK_WRITERS, ".asc")
 MAP_U_V = np.arange(0.0, 10.01, 0.25)
 MAP_DP_PA = np.array([0.05, 0.1, 0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]) * 1e6
 
@@ -30,6 +32,9 @@ def write_log(path: Path, frames: Frames) -> None:
     """Write all frames; the suffix names the format.  Raises ValueError for an unknown one."""
     if path.suffix not in SUFFIXES:
         raise ValueError(f"{path}: unknown kind of log; use one of {', '.join(SUFFIXES)}")
+    if path.suffix in BULK_WRITERS:
+        BULK_WRITERS[path.suffix](path, frames)
+        return
     with can.Logger(path) as log:
         for message in to_messages(frames):
             log.on_message_received(message)

@@ -1,0 +1,126 @@
+"""`rtid demo`: watch a machine's maps being learned from its CAN frames, then see the result."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from rtid.comparing import TraceComparison
+    from rtid.demo import Demo
+
+MPA, LPM = 1e-6, 6e4
+Z95 = 1.96
+WIDTH = 110  # where the output is no terminal
+
+
+def demo(
+    folder: Annotated[Path, typer.Option(help="Trace, project file and pictures go here.")] = Path(
+        "rtid-demo"
+    ),
+    seed: Annotated[int, typer.Option(min=0, help="Another number, another machine.")] = 1,
+    duration_s: Annotated[float, typer.Option("--duration", min=20.0, help="Seconds.")] = 60.0,
+    speed: Annotated[float, typer.Option(help="Pace on the bus; 0: as fast as possible.")] = 0.0,
+    pictures: Annotated[
+        Path | None, typer.Option(help="Also draw coverage, maps and residual into this folder.")
+    ] = None,
+) -> None:
+    """Learn the flow maps of a simulated machine from its CAN frames.
+
+    A hydraulic cylinder on four cartridge valves moves; its controller speaks on a virtual CAN
+    bus; rtid listens, learns the four maps and the bulk modulus together, and never sees a flow.
+    """
+    from rich.console import Console
+
+    from rtid.demo import prepare
+
+    console = Console(highlight=False)
+    console = console if console.is_terminal else Console(highlight=False, width=WIDTH)
+    with console.status("simulating a machine nobody has measured ..."):
+        machine = prepare(folder, seed, duration_s)
+    _print_live(console, machine, speed or float("inf"))
+    found = _desk(machine)
+    _print_result(console, machine, found)
+    if pictures is not None:
+        from rtid.present import Story
+
+        for path in Story(found).draw(pictures, "png"):
+            console.print(f"wrote {path}")
+    _print_next(console, machine)
+
+
+def _print_live(console: Console, machine: Demo, speed: float) -> None:
+    """One line per look at the growing estimate."""
+    console.print(
+        "\n[bold]1  On board[/bold]  The machine's CAN frames arrive: valve command, pressures, "
+        "position.\n   No flow sensor, no data sheet; rtid starts with empty maps."
+    )
+    names = [chamber.name for chamber in machine.project.model.chambers]
+    heads = "  ".join(f"{f'bulk modulus {name}, MPa':>21}" for name in names)
+    console.print(f"\n   {'machine time':>12}  {'frames':>8}  {'blocks known':>12}  {heads}")
+    for look in machine.live(speed):
+        pairs = zip(look.solution.beta_pa, look.solution.beta_sd_pa, strict=True)
+        betas = "  ".join(f"{f'{b * MPA:.1f} +- {Z95 * sd * MPA:.1f}':>21}" for b, sd in pairs)
+        console.print(f"   {look.t_s:10.0f} s  {look.frames:8,}  {look.valid:12}  {betas}")
+
+
+def _desk(machine: Demo) -> TraceComparison:
+    from rtid.present import progress_bar
+
+    with progress_bar(hidden=False) as progress:
+        return machine.desk(progress)
+
+
+def _print_result(console: Console, machine: Demo, found: TraceComparison) -> None:
+    """What was learned, beside what the simulator kept to itself."""
+    fit, plant = found.replay.fit, machine.plant
+    solution = fit.solution
+    console.print(
+        "\n[bold]2  On the desk[/bold]  The same frames, replayed from the log, with refined "
+        "weights and the spool lag as an unknown."
+    )
+    console.print(f"\n   {'':24}{'learned (95 %)':>22}{'true':>12}")
+    for chamber, b, sd in zip(
+        found.replay.model.chambers, solution.beta_pa, solution.beta_sd_pa, strict=True
+    ):
+        learned = f"{b * MPA:.1f} +- {Z95 * sd * MPA:.1f} MPa"
+        true = f"{plant.beta_pa * MPA:.1f} MPa"
+        console.print(f"   {f'bulk modulus, chamber {chamber.name}':24}{learned:>22}{true:>12}")
+    lag = f"{fit.lag_s * 1e3:.3f} +- {Z95 * fit.lag_sd_s * 1e3:.3f} ms"
+    console.print(f"   {'lag of the spools':24}{lag:>22}{f'{plant.lag_s * 1e3:.3f} ms':>12}")
+    for error in machine.map_errors(found):
+        learned = f"{100 * error.mean:.3f} % mean error"
+        console.print(
+            f"   {f'flow map of valve {error.edge}':24}{learned:>22}"
+            f"   of its largest flow (worst {100 * error.largest:.2f} %)"
+        )
+    _print_answer(console, found)
+
+
+def _print_answer(console: Console, found: TraceComparison) -> None:
+    """Data sheet and learned map on the part of the trace that the fit has not seen."""
+    console.print("\n   What each map leaves unexplained of the flow, on motion it has not seen:")
+    for held in reversed(found.held):
+        part = held.parts["validation"]
+        cells = "   ".join(
+            f"chamber {chamber.name} {rms * LPM:6.3f} L/min = {100 * share:5.2f} %"
+            for chamber, rms, share in zip(
+                found.replay.model.chambers,
+                part.residual_rms_m3s,
+                part.residual_share,
+                strict=True,
+            )
+        )
+        console.print(f"   {held.name:12}{cells}")
+
+
+def _print_next(console: Console, machine: Demo) -> None:
+    trace, project = machine.trace, machine.project.path
+    console.print("\n[bold]3  Your turn[/bold]  The trace and its project file are yours to try:")
+    console.print(f"   rtid check {project} {trace}")
+    console.print(f"   rtid replay {trace} --project {project} --pictures {trace.parent}")
+    console.print(f"   rtid export {trace} {trace.parent / 'map.csv'} --project {project}\n")

@@ -1,0 +1,123 @@
+"""The whole story on a simulated machine: frames on a virtual bus in, flow maps out.
+
+Nobody tells the estimator the machine's maps, bulk modulus or lag; the simulator keeps them to
+itself until the end, where they are laid beside what was learned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from firmware_bridge.playback import AS_FAST_AS_POSSIBLE
+from firmware_bridge.sources import open_log
+from rtid.compare import ReferenceMap
+from rtid.compare.reference import GainTable
+from rtid.comparing import TraceComparison, compare_trace
+from rtid.estimator.flowmap import VALID
+from rtid.estimator.solution import Solution
+from rtid.live import Learner, listen, virtual_bus
+from rtid.model import Edge, FloatArray
+from rtid.project import Project, load
+from rtid.replay import catalog_of, replay
+from rtid.sim.plant import Plant
+from rtid.sim.random_plants import draw
+from rtid.sim.recording import write_run
+from rtid.sim.run import simulate
+
+MOTION = "rich"
+STEP_S = 6.0  # machine time between two looks at the estimate
+POINT_STEP = 10  # samples between two working points at which maps are compared
+
+
+@dataclass(frozen=True)
+class Look:
+    """The estimate after t_s of machine time."""
+
+    t_s: float
+    frames: int
+    solution: Solution
+
+    @property
+    def valid(self) -> int:
+        """Blocks known well enough to be used."""
+        return sum(block.status == VALID for block in self.solution.blocks)
+
+
+@dataclass(frozen=True)
+class MapError:
+    """Learned beside true flow of one edge, |difference| as shares of its largest flow.
+
+    valid: share of the working points with flow that lie in valid blocks; only these count.
+    """
+
+    edge: str
+    valid: float
+    mean: float
+    largest: float
+
+
+@dataclass(frozen=True)
+class Demo:
+    """A simulated machine, its trace and project file in a folder."""
+
+    plant: Plant
+    trace: Path
+    project: Project
+    seed: int
+
+    def live(self, speed: float = AS_FAST_AS_POSSIBLE) -> Iterator[Look]:
+        """Learn from the virtual bus; a look at the estimate every STEP_S of machine time."""
+        frames, model = open_log(self.trace), self.project.model
+        learner = Learner(model, catalog_of(self.project), self.project.assembly)
+        due_s = STEP_S
+        with virtual_bus(frames, speed) as (source, is_over):
+            for state in listen(source, learner, is_over):
+                t_s = float(state.estimator.state.engine[0]["t_s"])
+                if t_s >= due_s:
+                    due_s = (t_s // STEP_S + 1) * STEP_S
+                    yield Look(t_s, state.frames, state.estimator.solution())
+
+    def desk(self, progress: Callable[[str, float], None]) -> TraceComparison:
+        """Replay the same trace on the desk and hold learned map and data sheet against it."""
+        return compare_trace(replay(self.project, self.trace, progress), self.data_sheet())
+
+    def data_sheet(self) -> ReferenceMap:
+        """One map for all valves, as a manufacturer prints it: their mean, 4 % and 0.1 V off."""
+        u_v = np.linspace(0.0, 10.0, 101)
+        rng = np.random.default_rng([self.seed, 5])
+        shift_v, gain = 0.1 * rng.choice([-1, 1]), 1 + 0.04 * rng.choice([-1, 1])
+        flows = [
+            self.plant.flow(e, u_v - shift_v, np.full(len(u_v), 1e6)) for e in self.plant.edges
+        ]
+        table = GainTable(u_v, np.array([1e6]), gain * np.mean(flows, axis=0)[:, None] / 1e3)
+        return ReferenceMap("data sheet", {edge: table for edge in self.plant.edges})
+
+    def map_errors(self, found: TraceComparison) -> list[MapError]:
+        """Learned map beside the true one at the working points of the record, per edge."""
+        chunk = found.replay.chunk[::POINT_STEP]
+        return [self._map_error(edge, found, chunk) for edge in found.replay.model.edges]
+
+    def _map_error(self, edge: Edge, found: TraceComparison, chunk: FloatArray) -> MapError:
+        model, learned = found.replay.model, found.flowmap[edge.name]
+        w = edge.direction * chunk[:, 2 + model.column(edge.command)]
+        dp = chunk[:, 2 + model.column(edge.source)] - chunk[:, 2 + model.column(edge.sink)]
+        open_ = w > edge.safe_band_v
+        valid = np.zeros(len(w), bool)
+        valid[open_] = learned.status_at(w[open_], dp[open_]) == VALID
+        true = self.plant.flow(edge.name, w[valid], dp[valid])
+        error = np.abs(learned.flow(w[valid], dp[valid]) - true) / np.abs(true).max(initial=1e-12)
+        share = float(valid.sum() / max(1, open_.sum()))
+        return MapError(edge.name, share, float(error.mean()), float(error.max(initial=0.0)))
+
+
+def prepare(folder: Path, seed: int = 1, duration_s: float = 60.0) -> Demo:
+    """Draw a machine, let it move, and write its trace and project file into the folder."""
+    plant = draw(seed)
+    run = simulate(plant, MOTION, seed, duration_s)
+    folder.mkdir(parents=True, exist_ok=True)
+    trace, _, project = write_run(folder / "machine.blf", run, seed, MOTION)
+    return Demo(plant, trace, load(project), seed)

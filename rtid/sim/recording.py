@@ -1,0 +1,36 @@
+"""A simulated record as files beside each other: trace, truth, and the user's project file."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from rtid.sim.bus import run_frames
+from rtid.sim.declare import declared_model
+from rtid.sim.log import START_US, truth_of, write_log, write_table
+from rtid.sim.project_file import project_text
+from rtid.sim.run import Run
+
+TABLE_SUFFIX = ".parquet"
+IDENTIFICATION = 0.75  # share of the record to learn from; the rest is held out
+
+
+def write_run(trace: Path, run: Run, seed: int, motion: str) -> list[Path]:
+    """Write trace, truth (.truth.json) and project (.toml); their paths."""
+    if trace.suffix == TABLE_SUFFIX:
+        write_table(trace, run)
+    else:
+        write_log(trace, run_frames(run, start_us=START_US))
+    truth, project = trace.with_suffix(".truth.json"), trace.with_suffix(".toml")
+    facts = {"seed": seed, "motion": motion} | truth_of(run.plant)
+    truth.write_text(json.dumps(facts, indent=1) + "\n", "utf-8")
+    model = declared_model(run.plant, sensors=run.sensors, seed=seed)
+    text = project_text(model, run.plant.constants.stroke_m, "simulated cylinder")
+    project.write_text(text + _record(run), "utf-8")
+    return [trace, truth, project]
+
+
+def _record(run: Run) -> str:
+    end_s = len(run.samples) * 1e-3
+    split_s = IDENTIFICATION * end_s
+    return f"\n[record]\nidentification_s = [0, {split_s:g}]\nvalidation_s = [{split_s:g}, {end_s:g}]\n"
