@@ -40,8 +40,8 @@ def trace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     call("simulate", path, "--duration", 12, "--motion", "rich", "--seed", 1)
     project = path.with_suffix(".toml")
     text = project.read_text()
-    assert "[record]" not in text
-    project.write_text(text + "\n[record]\nidentification_s = [0, 8]\nvalidation_s = [8, 12]\n")
+    parts = "[record]\nidentification_s = [0, 8]\nvalidation_s = [8, 12]\n"
+    project.write_text(text.partition("[record]")[0] + parts)
     return path
 
 

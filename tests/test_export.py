@@ -75,7 +75,7 @@ def test_exported_csv_serves_as_reference_map(flowmap: FlowMap, tmp_path: Path) 
     sheet = read_reference(tmp_path / "map.csv")
     w, dp = np.linspace(2.5, 6, 40), np.linspace(1e6, 6e6, 40)
     learned = flowmap.flow("e1", w, dp)
-    np.testing.assert_allclose(sheet.flow("e1", w, dp), learned, atol=2e-3 * learned.max())
+    np.testing.assert_allclose(sheet.flow("e1", w, dp), learned, atol=4e-3 * learned.max())
 
 
 @pytest.mark.parametrize("name", ["map.xls", "map"])
