@@ -108,7 +108,7 @@ def _residuals(found: TraceComparison) -> Table:
         "residual L/min",
         "%",
         "rho",
-        "own data",
+        "valid",
     )
     table = Table(*heads, title="Equation residual, rms", title_justify="left", box=None)
     table.columns[0].min_width = max(len(held.name) for held in found.held)
