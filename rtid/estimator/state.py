@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rtid.estimator.limits import refuse_unfit
 from rtid.kernels import engine as kernel
 from rtid.kernels import layout
 from rtid.kernels.information import move_pairs
@@ -16,6 +17,7 @@ RecordArray = NDArray[np.void]
 
 RING_FLOOR = 1e-9  # a closed block is silent when its state has decayed to this share
 FLOW_NOISE_FLOOR = 0.01  # least flow noise, share of the variance that the rated slope gives
+INTERPOLATED = 2 / 3  # variance of white noise interpolated linearly, mean over the interval
 FIRST_BLOCKS, FIRST_PAIRS = 64, 4096
 MAX_CLOSED = 64
 
@@ -100,7 +102,11 @@ def nominal_weights(model: Model) -> Weights:
 
 
 def build(model: Model, weights: Weights | None = None) -> State:
-    """Empty state for a model; nominal weights when none are given."""
+    """Empty state for a model; nominal weights when none are given.
+
+    Raises ValueError for a model that the kernels cannot hold.
+    """
+    refuse_unfit(model)
     weights = weights or nominal_weights(model)
     cells = np.zeros(len(weights.slopes), layout.CELL)
     cells["slope"] = weights.slopes
@@ -143,6 +149,8 @@ def _configure(e: np.void, model: Model) -> None:
     for c, chamber in enumerate(model.chambers):
         e["p_column"][c] = model.column(chamber.pressure)
         e["p_var_pa2"][c] = _variance(model, chamber.pressure)
+        if model.pressure_period_s > 0:
+            e["p_var_pa2"][c] *= INTERPOLATED
         e["area_m2"][c], e["v0_m3"][c] = chamber.sign * chamber.area_m2, chamber.v0_m3
     first = 0
     for i, edge in enumerate(model.edges):

@@ -233,24 +233,38 @@ def working_points(e: Any, sample: FloatArray, dt: float) -> bool:
 
 @njit(cache=True)
 def _change_blocks(e: Any, cells: Any, closed: Any, blocks: Any, pairs: Any) -> None:
-    """Close the blocks that the working points left, open those that they entered."""
-    target = e.target
-    for i in range(e.n_edges):
-        same = target[i, 0] == e.cell[i, 0]
-        if same and (target[i, 0] == SHUT or target[i, 1] == e.cell[i, 1]):
-            continue
-        e.counters[BLOCK_CHANGES] += 1
-        e.cell[i, 0], e.cell[i, 1] = target[i, 0], target[i, 1]
-        k, was_open = e.place[i], e.place[i] >= 0
-        if was_open:
-            if e.n_closed == len(closed):
-                _begin_new_memory(e, closed, blocks, pairs)
-            close_block(e, closed, blocks, pairs, k)
-        if target[i, 0] != SHUT:
-            k = k if was_open else e.n_open
-            open_block(e, closed, blocks, pairs, k, i, _slot(e, cells, blocks, i))
-        elif was_open:
-            remove_open(e, k)
+    """Close the blocks that the working points left, open those that they entered.
+
+    Edges that shut come first, or a reversal of the command could exceed the places for open ones.
+    """
+    for opening in range(2):
+        for i in range(e.n_edges):
+            if (e.target[i, 0] != SHUT) == (opening == 1) and _moved(e, i):
+                _change(e, cells, closed, blocks, pairs, i)
+
+
+@njit(cache=True)
+def _moved(e: Any, i: int) -> bool:
+    """True when edge i is to be in another block than it was."""
+    if e.target[i, 0] != e.cell[i, 0]:
+        return True
+    return bool(e.target[i, 0] != SHUT and e.target[i, 1] != e.cell[i, 1])
+
+
+@njit(cache=True)
+def _change(e: Any, cells: Any, closed: Any, blocks: Any, pairs: Any, i: int) -> None:
+    e.counters[BLOCK_CHANGES] += 1
+    e.cell[i, 0], e.cell[i, 1] = e.target[i, 0], e.target[i, 1]
+    k, was_open = e.place[i], e.place[i] >= 0
+    if was_open:
+        if e.n_closed == len(closed):
+            _begin_new_memory(e, closed, blocks, pairs)
+        close_block(e, closed, blocks, pairs, k)
+    if e.target[i, 0] != SHUT:
+        k = k if was_open else e.n_open
+        open_block(e, closed, blocks, pairs, k, i, _slot(e, cells, blocks, i))
+    elif was_open:
+        remove_open(e, k)
 
 
 @njit(cache=True)
