@@ -121,6 +121,9 @@ class Model:
     gates: Gates = field(default_factory=Gates)
     form: str = "integral"  # or "carry"
     pressure_period_s: float = 0.0  # sampling period of the pressures; 0: every sample
+    # Variance of a pressure at the rows as a share of its sensor's: 1 where it is measured there,
+    # f^2 + (1 - f)^2 where it is interpolated at the fraction f between two samples.
+    pressure_share: float = 1.0
 
     def column(self, name: str) -> int:
         """Column of the signal `name` in `Samples.values`; KeyError if the model has none."""

@@ -205,7 +205,9 @@ def _fit(
     def chunk_of(offsets_s: FloatArray) -> FloatArray:
         return _chunk(model, shifted(offsets_s), span_s)
 
-    fit = fit_record(model, chunk, chunk_of, np.array(list(tolerance.values())))
+    commands = {s.message for s in project.assembly.signals if s.command}
+    lag_is_apart = not commands & set(tolerance)
+    fit = fit_record(model, chunk, chunk_of, np.array(list(tolerance.values())), lag_is_apart)
     return fit, replace(trace, samples=shifted(fit.offsets_s))
 
 

@@ -9,6 +9,7 @@ import json
 import os
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -48,7 +49,7 @@ def load(path: Path, model: Model, digest: str) -> Estimator:
         with np.load(path, allow_pickle=False) as file:
             header = json.loads(str(file["header"]))
             content = {name: file[name] for name in file.files if name != "header"}
-    except (ValueError, KeyError, OSError) as error:
+    except (ValueError, KeyError, OSError, EOFError, BadZipFile) as error:
         if isinstance(error, FileNotFoundError):
             raise
         raise SnapshotError(f"{path}: not a snapshot of rtid ({error})") from error

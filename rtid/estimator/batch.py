@@ -154,7 +154,7 @@ def position_noise(model: Model, x_m: float, weights: Weights) -> FloatArray:
     """Covariance (chambers, chambers) of the white noise of one pair of rows, m6."""
     a = np.array([c.sign * c.area_m2 for c in model.chambers])
     v = np.array([c.v0_m3 + c.sign * c.area_m2 * x_m for c in model.chambers])
-    p = np.array([variance(model, c.pressure) for c in model.chambers])
+    p = np.array([variance(model, c.pressure) * model.pressure_share for c in model.chambers])
     white = np.diag((v * weights.compliance[: len(a)]) ** 2 * p)
     return np.asarray(np.outer(a, a) * variance(model, model.position) + white)
 

@@ -36,19 +36,32 @@ def profile(
 ) -> Profile:
     """Minimise chi2 + prior from `nominal`; all arguments (n,).
 
-    probe: distance of the finite differences, of the order of what chi2 can resolve but above its
-    roughness; least: lower bound.
+    tolerance: 0 holds a parameter at its nominal value; probe: distance of the finite differences,
+    of the order of what chi2 can resolve but above its roughness; least: lower bound.
     """
+    free = tolerance > 0
     known: dict[bytes, float] = {}
 
-    def cost(nu: FloatArray) -> float:
-        nu = np.maximum(nu, least)
+    def cost(part: FloatArray) -> float:
+        nu = nominal.copy()
+        nu[free] = np.maximum(part, least[free])
         key = nu.tobytes()
         if key not in known:
-            known[key] = chi2(nu) + float(np.sum(((nu - nominal) / tolerance) ** 2))
+            prior = ((nu - nominal)[free] / tolerance[free]) ** 2
+            known[key] = chi2(nu) + float(np.sum(prior))
         return known[key]
 
-    value = np.maximum(nominal, least + probe)
+    part, sd = _minimise(cost, nominal[free], probe[free], least[free])
+    value, all_sd = nominal.copy(), np.zeros(len(nominal))
+    value[free], all_sd[free] = part, sd
+    return Profile(value, all_sd, len(known))
+
+
+def _minimise(
+    cost: Callable[[FloatArray], float], start: FloatArray, probe: FloatArray, least: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Newton's minimum and its standard deviation, half the Hessian being the information."""
+    value = np.maximum(start, least + probe)
     best = cost(value)
     for _ in range(MAX_STEPS):
         gradient, hessian = _derivatives(cost, value, probe)
@@ -59,7 +72,7 @@ def profile(
         if cost(trial) >= best:
             break
         value, best = np.maximum(trial, least + probe), cost(trial)
-    return Profile(value, np.sqrt(2 * np.diag(np.linalg.pinv(hessian))), len(known))
+    return value, np.sqrt(2 * np.diag(_inverse(hessian, probe)))
 
 
 def _derivatives(
@@ -77,10 +90,13 @@ def _derivatives(
     return (above - below) / (2 * h), hessian
 
 
-def _newton(gradient: FloatArray, hessian: FloatArray, h: FloatArray) -> FloatArray:
-    """Newton step, downhill even where the Hessian is not definite, at most LONGEST_STEP probes."""
-    scaled = hessian * np.outer(h, h)
-    values, vectors = np.linalg.eigh(scaled)
+def _inverse(hessian: FloatArray, h: FloatArray) -> FloatArray:
+    """Inverse of the Hessian, made definite where roughness of chi2 made it look otherwise."""
+    values, vectors = np.linalg.eigh(hessian * np.outer(h, h))
     values = np.maximum(np.abs(values), 1e-6 * np.abs(values).max() + 1e-12)
-    step = -(vectors / values) @ (vectors.T @ (gradient * h))
-    return np.asarray(np.clip(step, -LONGEST_STEP, LONGEST_STEP) * h)
+    return np.asarray((vectors / values) @ vectors.T * np.outer(h, h))
+
+
+def _newton(gradient: FloatArray, hessian: FloatArray, h: FloatArray) -> FloatArray:
+    """Newton step, at most LONGEST_STEP probes."""
+    return np.clip(-_inverse(hessian, h) @ gradient, -LONGEST_STEP * h, LONGEST_STEP * h)

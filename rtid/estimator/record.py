@@ -59,12 +59,16 @@ def fit_record(
     chunk: FloatArray,
     assemble: Assemble | None = None,
     offset_tolerance_s: FloatArray | None = None,
+    estimate_lag: bool = True,
 ) -> RecordFit:
     """Fit a whole record; chunk (n, 2 + signals) = [t_s, flags, values...] in SI units.
 
     assemble, where message offsets are unknown: gives the chunk for changes of the offsets (m,)
-    in seconds, which are then estimated within offset_tolerance_s (m,).
+    in seconds, which are then estimated within offset_tolerance_s (m,).  estimate_lag = False keeps
+    the declared lag: to first order it is the same as an offset of the command's message.
     """
+    if not estimate_lag:
+        model = replace(model, lag=replace(model.lag, tolerance_s=0.0))
     tolerance = np.zeros(0) if offset_tolerance_s is None else offset_tolerance_s
     state = run(model, chunk)
     first = sketch(model, state)
@@ -95,11 +99,10 @@ def _nuisance(
         return excess(model, assemble(nu[1:]), replace(weights, lag_s=float(nu[0])), leverage)
 
     lag = model.lag
-    fixed = 1e-9  # a lag that is not to be estimated
     return profile(
         chi2,
         nominal=np.array([lag.nominal_s, *np.zeros(len(tolerance_s))]),
-        tolerance=np.array([lag.tolerance_s or fixed, *tolerance_s]),
+        tolerance=np.array([lag.tolerance_s, *tolerance_s]),
         probe=np.array([LAG_PROBE * lag.nominal_s + 5e-5, *(OFFSET_PROBE * tolerance_s)]),
         least=np.array([0.0, *np.full(len(tolerance_s), -np.inf)]),
     )

@@ -17,7 +17,6 @@ RecordArray = NDArray[np.void]
 
 RING_FLOOR = 1e-9  # a closed block is silent when its state has decayed to this share
 FLOW_NOISE_FLOOR = 0.01  # least flow noise, share of the variance that the rated slope gives
-INTERPOLATED = 2 / 3  # variance of white noise interpolated linearly, mean over the interval
 FIRST_BLOCKS, FIRST_PAIRS = 64, 4096
 MAX_CLOSED = 64
 
@@ -148,9 +147,7 @@ def _configure(e: np.void, model: Model) -> None:
     e["x_var_m2"] = _variance(model, model.position)
     for c, chamber in enumerate(model.chambers):
         e["p_column"][c] = model.column(chamber.pressure)
-        e["p_var_pa2"][c] = _variance(model, chamber.pressure)
-        if model.pressure_period_s > 0:
-            e["p_var_pa2"][c] *= INTERPOLATED
+        e["p_var_pa2"][c] = _variance(model, chamber.pressure) * model.pressure_share
         e["area_m2"][c], e["v0_m3"][c] = chamber.sign * chamber.area_m2, chamber.v0_m3
     first = 0
     for i, edge in enumerate(model.edges):

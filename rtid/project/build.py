@@ -45,7 +45,7 @@ def build_model(sections: Sections, catalog: Catalog | None) -> Model:
             max_sd_share=gates.max_sd_share,
         ),
         form=sections.estimator.form,
-        pressure_period_s=_pressure_period_s(sections, signals, catalog),
+        pressure_period_s=_pressure_period_s(sections, catalog),
     )
 
 
@@ -198,13 +198,11 @@ def _mode(sections: Sections, catalog: Catalog | None) -> str:
     return sections.source.mode or (CYCLE if len(periods) <= 1 else MULTIRATE)
 
 
-def _pressure_period_s(
-    sections: Sections, signals: tuple[Signal, ...], catalog: Catalog | None
-) -> float:
-    """Period of the slowest measured pressure where samples come more often than pressures."""
+def _pressure_period_s(sections: Sections, catalog: Catalog | None) -> float:
+    """Period of the slowest chamber pressure where samples come more often than pressures."""
     if _mode(sections, catalog) == CYCLE:
         return 0.0
-    pressures = {signal.name for signal in signals if signal.kind == "pressure"}
+    pressures = {chamber.pressure for chamber in sections.chambers.values()}
     measured = [s for n, s in sections.signals.items() if n in pressures and s.constant is None]
     return max(
         (_message(s.message, sections, catalog).period_s for s in measured if s.message),

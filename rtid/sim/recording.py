@@ -33,4 +33,6 @@ def write_run(trace: Path, run: Run, seed: int, motion: str) -> list[Path]:
 def _record(run: Run) -> str:
     end_s = len(run.samples) * 1e-3
     split_s = IDENTIFICATION * end_s
-    return f"\n[record]\nidentification_s = [0, {split_s:g}]\nvalidation_s = [{split_s:g}, {end_s:g}]\n"
+    spans = {"identification_s": (0.0, split_s), "validation_s": (split_s, end_s)}
+    lines = [f"{key} = [{start:g}, {stop:g}]" for key, (start, stop) in spans.items()]
+    return "\n".join(["", "[record]", *lines, ""])
