@@ -24,7 +24,7 @@ LPM, MPA = 6e4, 1e-6  # display units: L/min per m3/s, MPa per Pa
 SCHEMA = 1
 WIDTH = 110  # where the output is no terminal
 Z95 = 1.96
-MAP_ROWS, MAP_COLUMNS = 8, 6  # of the printed table of one map
+MAP_ROWS, MAP_COLUMNS = 8, 5  # of the printed table of one map
 
 
 @contextmanager
@@ -134,18 +134,18 @@ class Story:
         ):
             console.print(
                 f"bulk modulus, chamber {chamber.name}: [bold]{beta * MPA:.1f} MPa[/bold] "
-                f"+- {Z95 * sd * MPA:.1f} (95 %)",
+                f"± {Z95 * sd * MPA:.1f} (95 %)",
                 highlight=False,
             )
         if fit.lag_sd_s > 0:
             console.print(
-                f"spool lag: {fit.lag_s * 1e3:.2f} ms +- {Z95 * fit.lag_sd_s * 1e3:.2f} "
+                f"spool lag: {fit.lag_s * 1e3:.2f} ms ± {Z95 * fit.lag_sd_s * 1e3:.2f} "
                 f"(declared {model.lag.nominal_s * 1e3:g} +- {model.lag.tolerance_s * 1e3:g})",
                 highlight=False,
             )
         for name, shift, sd in zip(self._offsets(), fit.offsets_s, fit.offsets_sd_s, strict=True):
             console.print(
-                f"message {name}: {shift * 1e3:+.2f} ms +- {Z95 * sd * 1e3:.2f} beyond its age",
+                f"message {name}: {shift * 1e3:+.2f} ms ± {Z95 * sd * 1e3:.2f} beyond its age",
                 highlight=False,
             )
 
@@ -184,16 +184,18 @@ class Story:
             return None
         u = _spread(edge.grid.u_v, i, MAP_ROWS)
         dp = _spread(edge.grid.dp_pa, j, MAP_COLUMNS)
-        table = Table(title=f"{edge.name}: flow in L/min +- 95 %", title_justify="left")
+        beside = "" if self.compared.reference is None else " | reference"
+        title = f"{edge.name}: flow in L/min ±95 %{beside}   (~ not known well enough yet)"
+        table = Table(title=title, title_justify="left")
         table.add_column("u \\ dp", justify="right")
         for p in dp:
             table.add_column(f"{p * MPA:.2f} MPa", justify="right")
-        beside = None
+        flows = None
         if self.compared.reference is not None:
             points = np.meshgrid(u, dp, indexing="ij")
-            beside = self.compared.reference.flow(edge.name, *points)
+            flows = self.compared.reference.flow(edge.name, *points)
         for a, w in enumerate(u):
-            row = None if beside is None else beside[a]
+            row = None if flows is None else flows[a]
             table.add_row(f"{w:.2f} V", *_map_cells(edge, np.full(len(dp), w), dp, row))
         return table
 
@@ -202,10 +204,10 @@ def _map_cells(edge: EdgeMap, w: Any, dp: Any, beside: Any) -> list[str]:
     flow, sd, status = edge.flow(w, dp), edge.sd(w, dp), edge.status_at(w, dp)
     cells = []
     for k in range(len(dp)):
-        text = f"{flow[k] * LPM:.2f} +- {Z95 * sd[k] * LPM:.2f}"
+        text = f"{flow[k] * LPM:.2f} ±{Z95 * sd[k] * LPM:.2f}"
         if beside is not None and np.isfinite(beside[k]):
             text += f" | {beside[k] * LPM:.2f}"
-        cells.append(text if status[k] == VALID else f"[dim]({text})[/dim]")
+        cells.append(text if status[k] == VALID else f"[dim]~{text}[/dim]")
     return cells
 
 

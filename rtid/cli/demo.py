@@ -64,7 +64,7 @@ def _print_live(console: Console, machine: Demo, speed: float) -> None:
     console.print(f"\n   {'machine time':>12}  {'frames':>8}  {'blocks known':>12}  {heads}")
     for look in machine.live(speed):
         pairs = zip(look.solution.beta_pa, look.solution.beta_sd_pa, strict=True)
-        betas = "  ".join(f"{f'{b * MPA:.1f} +- {Z95 * sd * MPA:.1f}':>21}" for b, sd in pairs)
+        betas = "  ".join(f"{f'{b * MPA:.1f} ± {Z95 * sd * MPA:.1f}':>21}" for b, sd in pairs)
         console.print(f"   {look.t_s:10.0f} s  {look.frames:8,}  {look.valid:12}  {betas}")
 
 
@@ -87,10 +87,10 @@ def _print_result(console: Console, machine: Demo, found: TraceComparison) -> No
     for chamber, b, sd in zip(
         found.replay.model.chambers, solution.beta_pa, solution.beta_sd_pa, strict=True
     ):
-        learned = f"{b * MPA:.1f} +- {Z95 * sd * MPA:.1f} MPa"
+        learned = f"{b * MPA:.1f} ± {Z95 * sd * MPA:.1f} MPa"
         true = f"{plant.beta_pa * MPA:.1f} MPa"
         console.print(f"   {f'bulk modulus, chamber {chamber.name}':24}{learned:>22}{true:>12}")
-    lag = f"{fit.lag_s * 1e3:.3f} +- {Z95 * fit.lag_sd_s * 1e3:.3f} ms"
+    lag = f"{fit.lag_s * 1e3:.3f} ± {Z95 * fit.lag_sd_s * 1e3:.3f} ms"
     console.print(f"   {'lag of the spools':24}{lag:>22}{f'{plant.lag_s * 1e3:.3f} ms':>12}")
     for error in machine.map_errors(found):
         learned = f"{100 * error.mean:.3f} % mean error"
