@@ -27,7 +27,7 @@ campaign: $(READY)
 	.venv/bin/python -m pytest -q -n 2 -p no:benchmark -m "campaign or soak"
 
 pictures: $(READY)
-	.venv/bin/rtid demo --pictures out/pictures
+	.venv/bin/python -m tools.readme_pictures tools/pictures
 
 $(READY): requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
