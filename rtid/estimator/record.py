@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rtid.estimator.misfit import count_misfit
 from rtid.estimator.profile import Profile, profile
 from rtid.estimator.solution import (
     Sketch,
@@ -83,7 +84,8 @@ def fit_record(
             state = run(model, chunk, weights)
             weights = refined(model, state, sketch(model, state), weights.lag_s)
     state = run(model, chunk, weights)
-    return RecordFit(solve(model, state), state, weights, lag_sd_s, offsets, offsets_sd)
+    solution = count_misfit(model, chunk, weights, solve(model, state))
+    return RecordFit(solution, state, weights, lag_sd_s, offsets, offsets_sd)
 
 
 def _nuisance(

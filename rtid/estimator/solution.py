@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 
 import numpy as np
@@ -63,6 +63,8 @@ class Solution:
 
     beta_pa and beta_sd_pa (chambers,); rho: residual variance in units of the declared noise, 1
     when the model explains the rows to the sensors' noise; leverage (chambers,): `leverage_of`.
+    In units of the unknowns, scale_pa (chambers,) for the compliances: basis (n, chambers), how all
+    unknowns follow the compliances; influence (chambers, n), their covariance with all unknowns.
     """
 
     model: Model
@@ -72,6 +74,9 @@ class Solution:
     rho: float
     dof: int
     leverage: FloatArray
+    basis: FloatArray
+    influence: FloatArray
+    scale_pa: FloatArray
     counters: dict[str, int] = field(default_factory=dict)
 
     @property
@@ -222,6 +227,7 @@ def solve(model: Model, state: State) -> Solution:
         leverage = leverage_of(settled, effective)
         found = correct(normal, factor, leverage)
         cov += found.basis @ found.cov_change @ found.basis.T
+    influence = cov[:n_c].copy()
     theta = found.theta
     dof = max(1, normal.rows * n_c - round(float(effective.sum())))
     c0 = e["compliance"][:n_c]
@@ -238,8 +244,27 @@ def solve(model: Model, state: State) -> Solution:
         rho=misfit(normal, theta) / dof,
         dof=dof,
         leverage=leverage,
+        basis=found.basis,
+        influence=influence,
+        scale_pa=c0.copy(),
         counters=counters,
     )
+
+
+def widen(solution: Solution, more: FloatArray) -> Solution:
+    """The solution with `more` (chambers, chambers) added to the covariance of the compliances.
+
+    In units of the nominal compliances; the flow terms follow the compliances as in the fit.
+    """
+    n_c = len(more)
+    c0 = solution.scale_pa
+    blocks = []
+    for slot, block in enumerate(solution.blocks):
+        at = n_c + TERMS * slot
+        follow = solution.basis[at : at + TERMS] * solution.model.edges[block.edge].rated_q_m3s
+        blocks.append(replace(block, cov=block.cov + follow @ more @ follow.T))
+    cov = solution.compliance_cov + more * np.outer(c0, c0)
+    return replace(solution, compliance_cov=cov, blocks=tuple(blocks))
 
 
 @cache

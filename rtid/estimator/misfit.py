@@ -1,0 +1,100 @@
+"""What the blocks' own misfit does to the compliances: a covariance by clusters of blocks.
+
+Six terms per block do not follow a map exactly; what is left is the same at every visit of a block,
+so it does not average out over time as noise does.  With w_k the whitened row of the compliance's
+influence (its covariance with all unknowns, times the columns) and r_k the innovation,
+
+    error of theta_beta = sum_k w_k r_k,
+
+summed per block these are independent from block to block, and their sum of squares estimates the
+variance, noise and misfit together (cluster-robust covariance; blocks of both chambers are crossed
+clusters: Cameron, Gelbach and Miller 2011).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtid.estimator.solution import Solution, widen
+from rtid.estimator.state import Weights, build
+from rtid.kernels.explain import explain
+from rtid.kernels.layout import TERMS
+from rtid.model import FloatArray, Model
+
+Cells = NDArray[np.int64]
+
+
+def count_misfit(model: Model, chunk: FloatArray, weights: Weights, solution: Solution) -> Solution:
+    """The solution with intervals that hold where its blocks' polynomials miss their maps."""
+    scores, cells = _scores(model, chunk, weights, solution)
+    own = solution.compliance_cov / np.outer(solution.scale_pa, solution.scale_pa)
+    variance = _crossed(scores, [_of_chamber(model, cells, c) for c in range(len(own))])
+    ratio = np.sqrt(np.maximum(1.0, variance / np.diag(own)))
+    return widen(solution, own * np.outer(ratio, ratio) - own)
+
+
+def _scores(
+    model: Model, chunk: FloatArray, weights: Weights, solution: Solution
+) -> tuple[FloatArray, Cells]:
+    """w_k r_k (rows, chambers) about their mean, and the grid cells (rows, edges)."""
+    theta, flows = _per_cell(model, solution)
+    residual, cells = _innovations(model, chunk, weights, theta, solution.compliance)
+    scores = np.empty((len(residual), len(solution.scale_pa)))
+    for c, influence in enumerate(flows):
+        moved = solution.influence[c, : len(solution.scale_pa)] * solution.scale_pa
+        shifted, _ = _innovations(
+            model, chunk, weights, theta + influence, solution.compliance + moved
+        )
+        scores[:, c] = ((residual - shifted) * residual).sum(axis=1)
+    known = np.isfinite(scores).all(axis=1)
+    scores, cells = scores[known], cells[known]
+    return scores - scores.mean(axis=0), cells
+
+
+def _per_cell(model: Model, solution: Solution) -> tuple[FloatArray, list[FloatArray]]:
+    """The fitted map (cells, 6) in m3/s, and the influence on each compliance as such maps."""
+    sizes = [edge.grid.shape[0] * edge.grid.shape[1] for edge in model.edges]
+    first, n_c = np.concatenate([[0], np.cumsum(sizes)]), len(solution.scale_pa)
+    theta = np.zeros((first[-1], TERMS))
+    flows = [np.zeros_like(theta) for _ in range(n_c)]
+    for slot, block in enumerate(solution.blocks):
+        edge = model.edges[block.edge]
+        cell = first[block.edge] + block.i * edge.grid.shape[1] + block.j
+        theta[cell] = block.theta
+        at = n_c + TERMS * slot
+        for c in range(n_c):
+            flows[c][cell] = solution.influence[c, at : at + TERMS] * edge.rated_q_m3s
+    return theta, flows
+
+
+def _innovations(
+    model: Model, chunk: FloatArray, weights: Weights, theta: FloatArray, compliance: FloatArray
+) -> tuple[FloatArray, Cells]:
+    n, n_c, state = len(chunk), len(model.chambers), build(model, weights)
+    flow, innovation = np.empty((n - 1, 2 * n_c)), np.empty((n - 1, n_c))
+    cells = np.empty((n - 1, len(model.edges)), np.int64)
+    explain(state.engine, state.cells, theta, compliance, chunk, flow, cells, innovation)
+    return innovation, cells
+
+
+def _of_chamber(model: Model, cells: Cells, chamber: int) -> Cells:
+    """One number per row: which blocks the edges of a chamber are in."""
+    pressure = model.chambers[chamber].pressure
+    own = [i for i, e in enumerate(model.edges) if pressure in (e.source, e.sink)]
+    return np.unique(cells[:, own], axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def _crossed(scores: FloatArray, clusters: list[Cells]) -> FloatArray:
+    """Variance (chambers,) of the sum of scores that are alike within either cluster."""
+    if len(clusters) == 1:
+        return _clustered(scores, clusters[0])
+    both = clusters[0] * (clusters[1].max() + 1) + clusters[1]
+    alone = [_clustered(scores, cluster) for cluster in clusters]
+    return alone[0] + alone[1] - _clustered(scores, np.unique(both, return_inverse=True)[1])
+
+
+def _clustered(scores: FloatArray, cluster: Cells) -> FloatArray:
+    n = int(cluster.max()) + 1
+    sums = np.stack([np.bincount(cluster, column, n) for column in scores.T], axis=1)
+    return np.asarray((sums**2).sum(axis=0) * n / max(1, n - 1))
