@@ -24,7 +24,8 @@ lint: $(READY)
 	.venv/bin/mypy
 
 campaign: $(READY)
-	.venv/bin/python -m pytest -q -n 2 -p no:benchmark -m "campaign or soak"
+	.venv/bin/python -m pytest -q -s -p no:benchmark -m campaign tests/campaign
+	.venv/bin/python -m tests.campaign.report
 
 pictures: $(READY)
 	.venv/bin/python -m tools.readme_pictures tools/pictures

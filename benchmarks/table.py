@@ -11,8 +11,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-BEGIN, END = "<!-- speed:begin -->", "<!-- speed:end -->"
-
 
 def human_time(seconds: float) -> str:
     """Three digits and the unit that suits: 31.4 ns, 5.30 us, 12.0 ms, 1.25 s."""
@@ -45,11 +43,11 @@ def markdown(measured: dict[str, Any]) -> str:
     return "\n".join([head, *_lines([r for r in measured["benchmarks"] if r["extra_info"]])])
 
 
-def insert(text: str, table: str) -> str:
-    """Text with everything between the two markers replaced by table."""
-    before, rest = text.split(BEGIN)
-    after = rest.split(END)[1]
-    return f"{before}{BEGIN}\n{table}\n{END}{after}"
+def replace_between(text: str, name: str, content: str) -> str:
+    """Text with everything between the markers <!-- name:begin --> and end replaced."""
+    begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
+    before, rest = text.split(begin)
+    return f"{before}{begin}\n{content}\n{end}{rest.split(end)[1]}"
 
 
 def main(arguments: list[str]) -> None:
@@ -57,7 +55,7 @@ def main(arguments: list[str]) -> None:
     source, target = arguments or ("out/bench.json", "README.md")
     table = markdown(json.loads(Path(source).read_text()))
     readme = Path(target)
-    readme.write_text(insert(readme.read_text(), table))
+    readme.write_text(replace_between(readme.read_text(), "speed", table))
     print(f"{target}: speed table written")
 
 
