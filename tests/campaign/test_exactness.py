@@ -1,0 +1,20 @@
+"""Recursive = batch over random machines."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.campaign.report import leave
+from tests.estimator.cases import plant_case
+from tests.estimator.test_batch import differences, parameter_error
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("form", ["integral", "carry"])
+def test_recursive_equals_batch(form: str) -> None:
+    cases = [plant_case(seed, form, seed % 3 == 2) for seed in range(20)]
+    parameters = max(parameter_error(case) for case in cases)
+    sums = max(differences(case)["gram"] for case in cases)
+    figure = f"sums {sums:.1e}, parameters {parameters:.1e}"
+    leave(f"recursive against batch, {form} form", figure, "1e-8", f"{len(cases)} plants")
+    assert max(sums, parameters) <= 1e-8
