@@ -27,7 +27,11 @@ Cells = NDArray[np.int64]
 
 def count_misfit(model: Model, chunk: FloatArray, weights: Weights, solution: Solution) -> Solution:
     """The solution with intervals that hold where its blocks' polynomials miss their maps."""
+    if len(chunk) < 2:
+        return solution
     scores, cells = _scores(model, chunk, weights, solution)
+    if not len(scores):
+        return solution
     own = solution.compliance_cov / np.outer(solution.scale_pa, solution.scale_pa)
     variance = _crossed(scores, [_of_chamber(model, cells, c) for c in range(len(own))])
     ratio = np.sqrt(np.maximum(1.0, variance / np.diag(own)))
@@ -49,7 +53,7 @@ def _scores(
         scores[:, c] = ((residual - shifted) * residual).sum(axis=1)
     known = np.isfinite(scores).all(axis=1)
     scores, cells = scores[known], cells[known]
-    return scores - scores.mean(axis=0), cells
+    return scores - scores.sum(axis=0) / max(1, len(scores)), cells
 
 
 def _per_cell(model: Model, solution: Solution) -> tuple[FloatArray, list[FloatArray]]:
