@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from rtid.estimator.limits import refuse_unfit
 from rtid.kernels import engine as kernel
 from rtid.kernels import layout
-from rtid.kernels.information import move_pairs
+from rtid.kernels.recent import move_pairs
 from rtid.model import Edge, FloatArray, Model
 
 RecordArray = NDArray[np.void]
 
 RING_FLOOR = 1e-9  # a closed block is silent when its state has decayed to this share
 FLOW_NOISE_FLOOR = 0.01  # least flow noise, share of the variance that the rated slope gives
-FIRST_BLOCKS, FIRST_PAIRS = 64, 4096
-MAX_CLOSED = 64
+FIRST_BLOCKS, FIRST_PAIRS = 64, 1024
+MAX_CLOSED = layout.MAX_RECENT
 
 
 @dataclass
@@ -54,18 +54,19 @@ class State:
         return bool(self.engine[0]["form"] == layout.INTEGRAL)
 
     def make_room(self) -> None:
-        """Double the tables of blocks and pairs; nothing else changes."""
-        extra = np.zeros(len(self.blocks), layout.BLOCK)
-        self.blocks = np.concatenate([self.blocks, extra])
-        self.pairs = _rehash(self.engine[0], self.pairs)
+        """Double the table that is full, of blocks or of pairs; nothing else changes."""
+        if self.engine[0]["n_slots"] + layout.MAX_EDGES > len(self.blocks):
+            extra = np.zeros(len(self.blocks), layout.BLOCK)
+            self.blocks = np.concatenate([self.blocks, extra])
+        else:
+            self.pairs = _rehash(self.engine, self.pairs)
         self.__post_init__()
 
     def settled(self) -> State:
         """A copy in which all sums are complete; this state is not changed."""
         copy = self.copy()
-        while kernel.needs_room(copy.engine[0], copy.closed, copy.blocks, copy.pairs):
+        while not kernel.settle(copy.engine, copy.closed, copy.blocks, copy.pairs):
             copy.make_room()
-        kernel.settle(copy.engine, copy.closed, copy.blocks, copy.pairs)
         return copy
 
     def copy(self) -> State:
@@ -73,10 +74,9 @@ class State:
         return State(*(array.copy() for array in self.arrays))
 
 
-def _rehash(e: np.void, pairs: RecordArray) -> RecordArray:
+def _rehash(engine: RecordArray, pairs: RecordArray) -> RecordArray:
     larger = np.zeros(2 * len(pairs), layout.PAIR)
-    e["n_pairs"] = 0
-    move_pairs(e, pairs, larger)
+    move_pairs(engine, pairs, larger)
     return larger
 
 

@@ -6,13 +6,14 @@ phi = [1, xi, eta, xi^2, eta^2, xi eta],  xi = (w - w_c) / half width, eta = (dp
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from rtid.kernels.jit import inlined
 
 FloatArray = NDArray[np.float64]
 
 
-@njit(cache=True)
+@inlined
 def locate(border: FloatArray, n: int, value: float) -> int:
     """Index of the interval of border[0..n] that holds value; -1 outside.  Bisection."""
     if not (value >= border[0] and value <= border[n]):
@@ -27,7 +28,7 @@ def locate(border: FloatArray, n: int, value: float) -> int:
     return low
 
 
-@njit(cache=True)
+@inlined
 def relocate(border: FloatArray, n: int, value: float, current: int, hysteresis: float) -> int:
     """As `locate`, but stay in `current` until value leaves it by hysteresis * its width."""
     if current >= 0:
@@ -37,7 +38,7 @@ def relocate(border: FloatArray, n: int, value: float, current: int, hysteresis:
     return locate(border, n, value)
 
 
-@njit(cache=True)
+@inlined
 def taylor(xi: float, eta: float, out: FloatArray) -> None:
     """The six terms at one point; out (6,) is changed in place."""
     out[0] = 1.0

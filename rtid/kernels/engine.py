@@ -13,7 +13,6 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from rtid.kernels.basis import relocate
@@ -21,13 +20,11 @@ from rtid.kernels.holds import lagged_moments, second_order
 from rtid.kernels.information import (
     RING_DET_LIMIT,
     close_block,
-    first_open,
-    first_ring,
     forget,
     open_block,
     rebase,
-    remove_open,
 )
+from rtid.kernels.jit import inlined, kernel, part
 from rtid.kernels.layout import (
     BLOCK,
     BLOCK_CHANGES,
@@ -35,6 +32,7 @@ from rtid.kernels.layout import (
     CELL,
     CLOSED,
     ENGINE,
+    FREE,
     MAX_EDGES,
     MAX_OPEN,
     NOT_FINITE,
@@ -46,6 +44,8 @@ from rtid.kernels.layout import (
     SAMPLES,
     TERMS,
 )
+from rtid.kernels.local import first_open, first_ring, remove_open
+from rtid.kernels.recent import hand_over, release
 from rtid.kernels.rows import (
     carry_row,
     carry_step,
@@ -60,7 +60,7 @@ ROW_FLAG, GAP_FLAG = 1, 2  # as in firmware_bridge.samples
 SHUT, OUTSIDE = -1, -2  # cell of an edge that passes nothing / whose working point is off the grid
 
 
-@njit(cache=True)
+@kernel
 def advance(
     engine: Any, cells: Any, closed: Any, blocks: Any, pairs: Any, chunk: FloatArray
 ) -> int:
@@ -74,22 +74,21 @@ def advance(
     cell, ringing = cells.view(CELL), closed.view(CLOSED)
     block, pair = blocks.view(BLOCK), pairs.view(PAIR)
     for k in range(len(chunk)):
-        if needs_room(e, ringing, block, pair):
+        if needs_room(e, block, pair):
             return k
         _take(e, cell, ringing, block, pair, chunk[k])
     return len(chunk)
 
 
-@njit(cache=True)
-def needs_room(e: Any, closed: Any, blocks: Any, pairs: Any) -> bool:
+@inlined
+def needs_room(e: Any, blocks: Any, pairs: Any) -> bool:
     """True when the next sample could overflow the tables: blocks, or pairs more than 60 % full."""
-    if e.n_slots + MAX_EDGES > len(blocks):
-        return True
-    ringing = e.n_closed + MAX_OPEN
-    return 10 * (e.n_pairs + ringing * ringing // 2) > 6 * len(pairs)
+    recent = e.n_open + e.n_closed + MAX_OPEN
+    full = 10 * (e.n_pairs + recent * recent // 2) > 6 * len(pairs)
+    return full or e.n_slots + MAX_EDGES > len(blocks)
 
 
-@njit(cache=True)
+@inlined
 def _take(e: Any, cells: Any, closed: Any, blocks: Any, pairs: Any, sample: FloatArray) -> None:
     """One sample: gate it, then integrate the interval that it closes."""
     e.counters[SAMPLES] += 1
@@ -108,13 +107,13 @@ def _take(e: Any, cells: Any, closed: Any, blocks: Any, pairs: Any, sample: Floa
     remember(e, sample)
 
 
-@njit(cache=True)
+@inlined
 def step_s(e: Any, t_s: float) -> float:
     """Time since the last sample in whole microseconds: equal steps are equal to the bit."""
     return math.floor((t_s - e.t_s) * 1e6 + 0.5) * 1e-6
 
 
-@njit(cache=True)
+@inlined
 def acceptable(e: Any, sample: FloatArray) -> bool:
     """Finite first (NaN passes no comparison), then the declared range of each signal."""
     for j in range(2 + e.n_signals):
@@ -128,7 +127,7 @@ def acceptable(e: Any, sample: FloatArray) -> bool:
     return True
 
 
-@njit(cache=True)
+@inlined
 def remember(e: Any, sample: FloatArray) -> None:
     """Keep the sample: it is the start of the next interval."""
     e.t_s = sample[0]
@@ -136,7 +135,7 @@ def remember(e: Any, sample: FloatArray) -> None:
         e.values[j] = sample[2 + j]
 
 
-@njit(cache=True)
+@inlined
 def _start(e: Any, sample: FloatArray) -> None:
     """Begin at a measured position: spools at rest, whitener at R, filters at zero."""
     remember(e, sample)
@@ -147,19 +146,20 @@ def _start(e: Any, sample: FloatArray) -> None:
     start_whitener(e)
 
 
-@njit(cache=True)
+@part
 def _stop(e: Any, closed: Any, blocks: Any, pairs: Any) -> None:
     """End all memory at a break of continuity; learned sums stay."""
     if e.running:
         forget(e, closed, blocks, pairs)
         while e.n_open > 0:
+            release(e, closed, blocks, pairs, e.open_recent[e.n_open - 1])
             remove_open(e, e.n_open - 1)
     for i in range(e.n_edges):
         e.cell[i, 0] = SHUT
     e.running = 0
 
 
-@njit(cache=True)
+@inlined
 def _interval(
     e: Any,
     cells: Any,
@@ -196,7 +196,7 @@ def _interval(
         rebase(e, closed, blocks, pairs)
 
 
-@njit(cache=True)
+@inlined
 def set_step(e: Any, dt: float) -> None:
     """Factors that depend on the length of the step alone."""
     e.dt_s = dt
@@ -205,7 +205,7 @@ def set_step(e: Any, dt: float) -> None:
         second_order(e.wn_rad_s, e.zeta, dt, e.filter_a, e.filter_b)
 
 
-@njit(cache=True)
+@inlined
 def working_points(e: Any, sample: FloatArray, dt: float) -> bool:
     """Per edge: moments of the lagged command, dp at both ends, and the block of its mean point.
 
@@ -231,7 +231,7 @@ def working_points(e: Any, sample: FloatArray, dt: float) -> bool:
     return inside
 
 
-@njit(cache=True)
+@part
 def _change_blocks(e: Any, cells: Any, closed: Any, blocks: Any, pairs: Any) -> None:
     """Close the blocks that the working points left, open those that they entered.
 
@@ -243,7 +243,7 @@ def _change_blocks(e: Any, cells: Any, closed: Any, blocks: Any, pairs: Any) -> 
                 _change(e, cells, closed, blocks, pairs, i)
 
 
-@njit(cache=True)
+@inlined
 def _moved(e: Any, i: int) -> bool:
     """True when edge i is to be in another block than it was."""
     if e.target[i, 0] != e.cell[i, 0]:
@@ -251,23 +251,23 @@ def _moved(e: Any, i: int) -> bool:
     return bool(e.target[i, 0] != SHUT and e.target[i, 1] != e.cell[i, 1])
 
 
-@njit(cache=True)
+@inlined
 def _change(e: Any, cells: Any, closed: Any, blocks: Any, pairs: Any, i: int) -> None:
     e.counters[BLOCK_CHANGES] += 1
     e.cell[i, 0], e.cell[i, 1] = e.target[i, 0], e.target[i, 1]
     k, was_open = e.place[i], e.place[i] >= 0
+    if e.target[i, 0] != SHUT and e.n_open + e.n_closed >= len(closed):
+        _begin_new_memory(e, closed, blocks, pairs)
     if was_open:
-        if e.n_closed == len(closed):
-            _begin_new_memory(e, closed, blocks, pairs)
-        close_block(e, closed, blocks, pairs, k)
+        close_block(e, closed, blocks, k)
     if e.target[i, 0] != SHUT:
         k = k if was_open else e.n_open
-        open_block(e, closed, blocks, pairs, k, i, _slot(e, cells, blocks, i))
+        open_block(e, closed, blocks, k, i, _slot(e, cells, blocks, i))
     elif was_open:
         remove_open(e, k)
 
 
-@njit(cache=True)
+@part
 def _begin_new_memory(e: Any, closed: Any, blocks: Any, pairs: Any) -> None:
     """Too many blocks ring at once: forget them all.
 
@@ -278,7 +278,7 @@ def _begin_new_memory(e: Any, closed: Any, blocks: Any, pairs: Any) -> None:
     start_whitener(e)
 
 
-@njit(cache=True)
+@inlined
 def _slot(e: Any, cells: Any, blocks: Any, edge: int) -> int:
     """Slot of the edge's current cell, given out at its first visit."""
     at = e.first_cell[edge] + e.cell[edge, 0] * e.n_dp[edge] + e.cell[edge, 1]
@@ -290,7 +290,7 @@ def _slot(e: Any, cells: Any, blocks: Any, edge: int) -> int:
     return int(cells[at].slot)
 
 
-@njit(cache=True)
+@inlined
 def _shared_increments(e: Any, sample: FloatArray, dt: float) -> None:
     """y: s A dx; theta_beta: -V dP (scaled by the nominal compliance), exact for linear x and P.
 
@@ -309,7 +309,7 @@ def _shared_increments(e: Any, sample: FloatArray, dt: float) -> None:
             e.d[c, 1 + c] += 0.5 * (v0 + v1) * dp
 
 
-@njit(cache=True)
+@inlined
 def mean_terms(e: Any, i: int) -> tuple[float, float]:
     """Means over the interval of the six terms of edge i's current block, into e.phi.
 
@@ -330,7 +330,7 @@ def mean_terms(e: Any, i: int) -> tuple[float, float]:
     return eta0, eta1
 
 
-@njit(cache=True)
+@inlined
 def _block_increments(
     e: Any, cells: Any, blocks: Any, k: int, t: float, dt: float, row: bool
 ) -> None:
@@ -355,7 +355,7 @@ def _block_increments(
     flow_noise(e, i, cells[block.cell].slope, dt)
 
 
-@njit(cache=True)
+@inlined
 def _carry_ends(e: Any, i: int, first: int, eta0: float, eta1: float) -> None:
     """Start and end values: the regressor runs from phi(u_k, dp_k) to phi(u_k, dp_k+1)."""
     for c in range(e.n_chambers):
@@ -369,7 +369,7 @@ def _carry_ends(e: Any, i: int, first: int, eta0: float, eta1: float) -> None:
             e.end[c, first + j] += change
 
 
-@njit(cache=True)
+@inlined
 def flow_noise(e: Any, i: int, slope: float, dt: float) -> None:
     """Random walk of the integral: pressure noise through dQ/ddp, (m3)^2 per step."""
     period = e.p_period_s if e.p_period_s > 0.0 else dt
@@ -379,7 +379,7 @@ def flow_noise(e: Any, i: int, slope: float, dt: float) -> None:
             e.cov[a, b] += e.sign[i, a] * e.sign[i, b] * q
 
 
-@njit(cache=True)
+@inlined
 def _integral_step(e: Any, row: bool) -> None:
     for c in range(e.n_chambers):
         e.cov[c, c] += e.q_floor[c] * e.dt_s
@@ -389,19 +389,29 @@ def _integral_step(e: Any, row: bool) -> None:
         integral_row_one(e)
 
 
-@njit(cache=True)
-def settle(engine: Any, closed: Any, blocks: Any, pairs: Any) -> None:
-    """Bring all sums up to date without ending the memory, so that they can be read."""
+@kernel
+def settle(engine: Any, closed: Any, blocks: Any, pairs: Any) -> bool:
+    """Bring the tables up to date without ending the memory, so that they can be read.
+
+    False, and nothing is done, when they must be enlarged first.
+    """
     e = engine[0]
+    if needs_room(e, blocks, pairs):
+        return False
     if e.running:
         rebase(e, closed, blocks, pairs)
+        for p in range(e.n_recent):
+            if closed[p].status != FREE:
+                hand_over(e, closed, blocks, pairs, p)
+    return True
 
 
-@njit(cache=True)
+@kernel
 def clear(engine: Any, cells: Any) -> None:
     """Set the state (not the configuration) to its beginning."""
     e = engine[0]
     e.running, e.n_open, e.n_closed, e.n_slots, e.n_pairs = 0, 0, 0, 0, 0
+    e.n_recent, e.n_young = 0, 0
     e.dt_s, e.ring_det = 0.0, 1.0
     for i in range(MAX_EDGES):
         e.place[i] = -1

@@ -10,7 +10,6 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from rtid.kernels.engine import (
@@ -26,6 +25,7 @@ from rtid.kernels.engine import (
     working_points,
 )
 from rtid.kernels.holds import second_order
+from rtid.kernels.jit import inlined, kernel
 from rtid.kernels.layout import TERMS
 from rtid.kernels.rows import position_noise, start_whitener
 
@@ -34,7 +34,7 @@ FloatArray = NDArray[np.float64]
 MEASURED, MODELLED = 0, 1
 
 
-@njit(cache=True)
+@kernel
 def explain(
     engine: Any,
     cells: Any,
@@ -80,7 +80,7 @@ def explain(
                 _begin(e, chunk[k])
 
 
-@njit(cache=True)
+@inlined
 def _begin(e: Any, sample: FloatArray) -> None:
     remember(e, sample)
     e.running = 1
@@ -90,7 +90,7 @@ def _begin(e: Any, sample: FloatArray) -> None:
     start_whitener(e)
 
 
-@njit(cache=True)
+@inlined
 def _one(
     e: Any,
     cells: Any,
@@ -131,7 +131,7 @@ def _one(
     return True
 
 
-@njit(cache=True)
+@inlined
 def _innovate(e: Any, gap: FloatArray, out: FloatArray) -> None:
     """Whitened innovation L^-1 gap, and the whitener's update (plain 2 x 2 algebra)."""
     n, cov = e.n_chambers, e.cov
@@ -154,7 +154,7 @@ def _innovate(e: Any, gap: FloatArray, out: FloatArray) -> None:
     cov[1, 0] = cov[0, 1]
 
 
-@njit(cache=True)
+@kernel
 def filter_rows(
     t_s: FloatArray, rate: FloatArray, wn: float, zeta: float, period_s: float, out: FloatArray
 ) -> int:

@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from rtid.kernels.jit import inlined, kernel
 
 FloatArray = NDArray[np.float64]
 
 
-@njit(cache=True)
+@kernel
 def second_order(wn: float, zeta: float, dt: float, a: FloatArray, b: FloatArray) -> None:
     """Discretise H_f for an input that is linear over dt: x+ = a x + b [u_start, u_end].
 
@@ -37,7 +38,7 @@ def second_order(wn: float, zeta: float, dt: float, a: FloatArray, b: FloatArray
     b[0, 0], b[1, 0] = g0 - m0, g1 - m1
 
 
-@njit(cache=True)
+@inlined
 def lagged_moments(
     held: float, start: float, lag: float, decay: float, dt: float
 ) -> tuple[float, float, float, float]:

@@ -9,14 +9,15 @@ columns, d_closed(k) = ring(k) d_hat with constant d_hat, and what a closed bloc
 other column follows from the products of the ring with that column:
 
 * with an open block, from ring x open, kept with the open block when it closes (`through`);
-* with another closed block, from ring x ring since the later one closed.
+* with another closed block, from W = ring x ring since the later one closed.
 
-Both are settled once per rebase of the ring, or when a block is entered again.  This is exact: it
-gives the normal equations of the dense rows, at a cost per sample and per change of block that does
-not depend on the number of blocks.
+Both are settled when the ring begins anew (`rebase`), or when a block is entered again.  Blocks
+that rang all the time since the last rebase are settled as one product of matrices, those that
+closed since (the young) one by one.  This is exact: the normal equations of the dense rows, at a
+cost per sample and per change of block that does not depend on the number of blocks.
 
-Local products stand in the upper triangle of e.gram.  All arguments named e, item, closed, blocks
-and pairs are records or record arrays of `layout` and are changed in place.
+All arguments named e, item, closed, blocks and pairs are records or record arrays of `layout` and
+are changed in place.
 """
 
 from __future__ import annotations
@@ -24,149 +25,124 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from rtid.kernels.layout import MAX_LOCAL, TERMS
+from rtid.kernels.jit import inlined, part
+from rtid.kernels.layout import OPEN, RINGING, TERMS, YOUNG
+from rtid.kernels.local import clear_open, first_open, first_ring, local_width
+from rtid.kernels.recent import add_tile, admit, release, spread
 
 FloatArray = NDArray[np.float64]
 
 # Rebase before the ring columns lose digits: at det ring = 1e-3 they lose about five of sixteen.
 RING_DET_LIMIT = 1e-3
-LANES = 4  # rows of the local products are padded to whole vectors
 
 
-@njit(cache=True)
-def first_ring(e: Any) -> int:
-    """Local index of the first ring column."""
-    return int(1 + e.n_shared)
+# --- products of one block ---
 
 
-@njit(cache=True)
-def first_open(e: Any, k: int) -> int:
-    """Local index of the first column of open block k."""
-    return int(1 + e.n_shared + e.n_state + TERMS * k)
+@inlined
+def _ring_ring(e: Any, s: int, r: int) -> float:
+    """W[s, r] since the ring began."""
+    ring = first_ring(e)
+    return e.gram[ring + max(s, r), ring + min(s, r)]
 
 
-@njit(cache=True)
-def local_width(e: Any) -> int:
-    """Number of local columns in use, padded; the padding is kept at zero."""
-    n = first_open(e, e.n_open)
-    return min(MAX_LOCAL, (n + LANES - 1) // LANES * LANES)
-
-
-@njit(cache=True)
-def add_products(e: Any, n_rows: int) -> None:
-    """gram += row' row over the n_rows local rows: the only work that every row costs."""
-    gram, row, n = e.gram, e.row, local_width(e)
-    if n_rows == 1:
-        for i in range(n):
-            a = row[0, i]
-            for j in range(i - i % LANES, n):
-                gram[i, j] += a * row[0, j]
-    else:
-        for i in range(n):
-            a, b = row[0, i], row[1, i]
-            for j in range(i - i % LANES, n):
-                gram[i, j] += a * row[0, j] + b * row[1, j]
-
-
-@njit(cache=True)
-def find_pair(e: Any, pairs: Any, low: int, high: int) -> int:
-    """Position of the pair's record (created at its first use); the table is never full."""
-    key = ((low + 1) << 32) | (high + 1)
-    mask = len(pairs) - 1
-    mixed = (low * 73856093) ^ (high * 19349663)
-    at = (mixed ^ (mixed >> 15)) & mask
-    while pairs[at].key != key:
-        if pairs[at].key == 0:
-            pairs[at].key = key
-            e.n_pairs += 1
-            break
-        at = (at + 1) & mask
-    return int(at)
-
-
-@njit(cache=True)
-def move_pairs(e: Any, pairs: Any, larger: Any) -> None:
-    """Enter all records of pairs into the empty table larger, which is changed in place."""
-    for p in range(len(pairs)):
-        if pairs[p].key != 0:
-            low, high = (pairs[p].key >> 32) - 1, (pairs[p].key & 0xFFFFFFFF) - 1
-            larger[find_pair(e, larger, low, high)].gram[:] = pairs[p].gram
-
-
-@njit(cache=True)
-def add_pair(
-    e: Any, pairs: Any, slot_a: int, slot_b: int, left: FloatArray, right: FloatArray
-) -> None:
-    """Add left' right, the products of the columns of slot_a (rows) and slot_b (columns).
-
-    left, right: (n_state, 6) or more rows, of which the first n_state count.
-    """
-    if slot_a < slot_b:
-        add_outer(pairs[find_pair(e, pairs, slot_a, slot_b)].gram, left, right, e.n_state)
-    else:
-        add_outer(pairs[find_pair(e, pairs, slot_b, slot_a)].gram, right, left, e.n_state)
-
-
-@njit(cache=True)
-def add_outer(target: FloatArray, left: FloatArray, right: FloatArray, n: int) -> None:
-    """target (6, 6) += left[:n]' right[:n], in place."""
-    for s in range(0, n - 1, 2):  # by twos: one pass over target for both chambers
+@inlined
+def _read_through(e: Any, k: int, sign: float, out: FloatArray) -> None:
+    """out (states, 6) = sign * ring x open block k."""
+    ring, first = first_ring(e), first_open(e, k)
+    for s in range(e.n_state):
         for i in range(TERMS):
-            a, b = left[s, i], left[s + 1, i]
-            for j in range(TERMS):
-                target[i, j] += a * right[s, j] + b * right[s + 1, j]
-    for s in range(n - n % 2, n):
-        for i in range(TERMS):
-            a = left[s, i]
-            for j in range(TERMS):
-                target[i, j] += a * right[s, j]
+            out[s, i] = sign * e.gram[first + i, ring + s]
 
 
-@njit(cache=True)
-def close_block(e: Any, closed: Any, blocks: Any, pairs: Any, k: int) -> None:
-    """Let open block k ring on: its state, referred to the ring's origin, joins the closed ones.
+@inlined
+def _add_own(e: Any, closed: Any, blocks: Any, k: int) -> None:
+    """Products of open block k with itself and the shared columns."""
+    p, first = e.open_recent[k], first_open(e, k)
+    item, block = closed[p], blocks[e.open_slot[k]]
+    for i in range(TERMS):
+        for j in range(1 + e.n_shared):
+            block.shared[i, j] += e.gram[first + i, j]
+        for j in range(TERMS):
+            item.gram[i, TERMS * p + j] += e.gram[first + max(i, j), first + min(i, j)]
 
-    Its own columns are flushed and cleared; `closed` must have room.
+
+@inlined
+def _add_open_pair(e: Any, closed: Any, k: int, other: int) -> None:
+    """Products of two open blocks."""
+    a, b = max(k, other), min(k, other)
+    item, at = closed[e.open_recent[a]], TERMS * e.open_recent[b]
+    first, second = first_open(e, a), first_open(e, b)
+    for i in range(TERMS):
+        for j in range(TERMS):
+            item.gram[i, at + j] += e.gram[first + i, second + j]
+
+
+@part
+def _weigh(e: Any, item: Any) -> None:
+    """What a closed block's columns share with the ring's origin, while open and since.
+
+    e.own = (W since it closed) d,  e.left = through + e.own.
     """
-    item, ring, first = closed[e.n_closed], first_ring(e), first_open(e, k)
-    item.slot, item.size = e.open_slot[k], 0.0
+    for s in range(e.n_state):
+        for i in range(TERMS):
+            e.own[s, i] = 0.0
+        for r in range(e.n_state):
+            w = _ring_ring(e, s, r) - item.w_start[s, r]
+            for i in range(TERMS):
+                e.own[s, i] += w * item.d[r, i]
+        for i in range(TERMS):
+            e.left[s, i] = item.through[s, i] + e.own[s, i]
+
+
+@part
+def _add_shared(e: Any, item: Any, block: Any) -> None:
+    """Products of a closed block with y and the shared columns since it closed."""
+    ring = first_ring(e)
+    for s in range(e.n_state):
+        for j in range(1 + e.n_shared):
+            value = e.gram[ring + s, j] - item.shared_start[s, j]
+            for i in range(TERMS):
+                block.shared[i, j] += item.d[s, i] * value
+
+
+# --- changes of block ---
+
+
+@part
+def close_block(e: Any, closed: Any, blocks: Any, k: int) -> None:
+    """Let open block k ring on, its state referred to the ring's origin; clear its columns."""
+    p, first, ring = e.open_recent[k], first_open(e, k), first_ring(e)
+    item = closed[p]
+    item.status, item.size = YOUNG, 0.0
     for s in range(e.n_state):
         for i in range(TERMS):
             item.d[s, i] = e.d[s, first + i]
-            item.through[s, i] = e.gram[ring + s, first + i]
             item.size = max(item.size, abs(item.d[s, i]))
         for r in range(e.n_state):
-            item.w_start[s, r] = e.gram[ring + min(s, r), ring + max(s, r)]
+            item.w_start[s, r] = _ring_ring(e, s, r)
         for j in range(1 + e.n_shared):
-            item.shared_start[s, j] = e.gram[j, ring + s]
-    _refer_to_origin(e, item, ring)
-    _flush_own(e, blocks, k)
+            item.shared_start[s, j] = e.gram[ring + s, j]
+    _read_through(e, k, 1.0, item.through)
+    _refer_to_origin(e, item.d)
+    _add_own(e, closed, blocks, k)
     for other in range(e.n_open):
         if other != k:
-            _flush_open_pair(e, pairs, k, other)
-            _owe_less(e, pairs, item, other)
-    _clear(e, first, TERMS)
-    if item.size > 0.0:
-        e.n_closed += 1
+            _add_open_pair(e, closed, k, other)
+            _read_through(e, other, -1.0, e.left)  # `other` will charge it from the beginning
+            add_tile(e, item, e.open_recent[other], item.d, e.left)
+    clear_open(e, k)
+    e.young[e.n_young] = p
+    e.n_young += 1
+    e.n_closed += 1
 
 
-@njit(cache=True)
-def _owe_less(e: Any, pairs: Any, item: Any, other: int) -> None:
-    """Take back what open block `other` will charge this block for the time before it closed."""
-    ring, first = first_ring(e), first_open(e, other)
-    for s in range(e.n_state):
-        for i in range(TERMS):
-            e.owed[s, i] = -e.gram[ring + s, first + i]
-    add_pair(e, pairs, item.slot, e.open_slot[other], item.d, e.owed)
-
-
-@njit(cache=True)
-def _refer_to_origin(e: Any, item: Any, ring: int) -> None:
-    """item.d <- ring^-1 item.d, Gauss elimination with row pivots on a copy of the ring."""
-    a, b, n = e.basis, item.d, e.n_state
+@part
+def _refer_to_origin(e: Any, b: FloatArray) -> None:
+    """b <- ring^-1 b, Gauss elimination with row pivots on a copy of the ring."""
+    a, n, ring = e.basis, e.n_state, first_ring(e)
     for i in range(n):
         for j in range(n):
             a[i, j] = e.d[i, ring + j]
@@ -191,138 +167,79 @@ def _refer_to_origin(e: Any, item: Any, ring: int) -> None:
             b[k, j] /= a[k, k]
 
 
-@njit(cache=True)
-def _flush_own(e: Any, blocks: Any, k: int) -> None:
-    """Products of open block k with itself and the shared columns."""
-    block, first = blocks[e.open_slot[k]], first_open(e, k)
-    for i in range(TERMS):
-        for j in range(TERMS):
-            block.gram[i, j] += e.gram[first + min(i, j), first + max(i, j)]
-        for j in range(1 + e.n_shared):
-            block.shared[i, j] += e.gram[j, first + i]
-
-
-@njit(cache=True)
-def _flush_open_pair(e: Any, pairs: Any, k: int, other: int) -> None:
-    """Products of two open blocks."""
-    a, b = min(k, other), max(k, other)
-    first, second = first_open(e, a), first_open(e, b)
-    slot_a, slot_b = e.open_slot[a], e.open_slot[b]
-    target = pairs[find_pair(e, pairs, min(slot_a, slot_b), max(slot_a, slot_b))].gram
-    for i in range(TERMS):
-        for j in range(TERMS):
-            value = e.gram[first + i, second + j]
-            if slot_a < slot_b:
-                target[i, j] += value
-            else:
-                target[j, i] += value
-
-
-@njit(cache=True)
-def _clear(e: Any, first: int, count: int) -> None:
-    """Zero local columns first .. first + count, states and products."""
-    n = local_width(e)
-    for j in range(first, first + count):
-        for s in range(e.n_state):
-            e.d[s, j] = 0.0
-        for i in range(n):
-            e.gram[i, j] = 0.0
-            e.gram[j, i] = 0.0
-
-
-@njit(cache=True)
-def open_block(e: Any, closed: Any, blocks: Any, pairs: Any, k: int, edge: int, slot: int) -> None:
+@part
+def open_block(e: Any, closed: Any, blocks: Any, k: int, edge: int, slot: int) -> None:
     """Make `slot` open block k: a place just closed, or n_open to append.
 
-    If the block still rings, it goes on from the state it is in.
+    If the block still rings, it goes on from the state it is in; else a position must be free.
     """
     if k == e.n_open:
         e.n_open += 1
-        _clear(e, first_open(e, k), TERMS)
+        clear_open(e, k)
     e.open_edge[k], e.open_slot[k], e.place[edge] = edge, slot, k
-    for c in range(e.n_closed):
-        if closed[c].slot == slot:
-            _resume(e, closed, blocks, pairs, c, k)
-            break
+    for p in range(e.n_recent):
+        if closed[p].slot == slot and closed[p].status >= YOUNG:
+            _settle_one(e, closed, blocks, k, p)
+            _resume(e, closed[p], k, p)
+            return
+    e.open_recent[k] = admit(e, closed, slot)
 
 
-@njit(cache=True)
-def _resume(e: Any, closed: Any, blocks: Any, pairs: Any, at: int, k: int) -> None:
-    """Settle what closed block `at` shares with all others, and continue it as open block k."""
-    item, ring = closed[at], first_ring(e)
-    _settle_closed(e, closed, blocks, pairs, at)
-    for c in range(at + 1, e.n_closed):
-        _owed(e, closed[c])
-        add_pair(e, pairs, item.slot, closed[c].slot, item.d, e.owed)
+@part
+def _settle_one(e: Any, closed: Any, blocks: Any, k: int, p: int) -> None:
+    """Settle what closed block p shares with all but open block k; a young one is so no more."""
+    item, later = closed[p], 0
+    if item.status == YOUNG:
+        while e.young[later] != p:
+            later += 1
+        _settle_young(e, closed, later)
+        e.n_young -= 1
+        for a in range(later, e.n_young):
+            e.young[a] = e.young[a + 1]
+    else:
+        _weigh(e, item)
+        spread(e, item, e.ringing, TERMS * e.n_recent)
+    for a in range(later, e.n_young):
+        _weigh(e, closed[e.young[a]])
+        add_tile(e, closed[e.young[a]], p, e.left, item.d)
     for other in range(e.n_open):
         if other != k:
-            first = first_open(e, other)
-            through = e.gram[ring:, first : first + TERMS]
-            add_pair(e, pairs, item.slot, e.open_slot[other], item.d, through)
-    first = first_open(e, k)
+            _read_through(e, other, 1.0, e.left)
+            add_tile(e, item, e.open_recent[other], item.d, e.left)
+    _add_shared(e, item, blocks[item.slot])
+
+
+@inlined
+def _resume(e: Any, item: Any, k: int, p: int) -> None:
+    """Continue closed block p as open block k."""
+    first, ring = first_open(e, k), first_ring(e)
     for s in range(e.n_state):
         for i in range(TERMS):
+            e.ringing[s, TERMS * p + i] = 0.0
             for r in range(e.n_state):
                 e.d[s, first + i] += e.d[s, ring + r] * item.d[r, i]
-    for c in range(at, e.n_closed - 1):
-        closed[c] = closed[c + 1]
+    item.status, e.open_recent[k] = OPEN, p
     e.n_closed -= 1
 
 
-@njit(cache=True)
-def _owed(e: Any, item: Any) -> None:
-    """e.owed: what a closed block's columns share with the ring's origin, while open and since.
-
-    through + (ring x ring since it closed) d.
-    """
-    ring = first_ring(e)
-    for s in range(e.n_state):
-        for j in range(TERMS):
-            e.owed[s, j] = item.through[s, j]
-        for r in range(e.n_state):
-            w = e.gram[ring + min(s, r), ring + max(s, r)] - item.w_start[s, r]
-            for j in range(TERMS):
-                e.owed[s, j] += w * item.d[r, j]
+# --- the ring begins anew ---
 
 
-@njit(cache=True)
-def _settle_closed(e: Any, closed: Any, blocks: Any, pairs: Any, at: int) -> None:
-    """Add the products of closed block `at` with the shared columns, itself, and earlier ones."""
-    item, ring = closed[at], first_ring(e)
-    block = blocks[item.slot]
-    for s in range(e.n_state):
-        for j in range(1 + e.n_shared):
-            shared = e.gram[j, ring + s] - item.shared_start[s, j]
-            for i in range(TERMS):
-                block.shared[i, j] += item.d[s, i] * shared
-        for r in range(e.n_state):
-            w = e.gram[ring + min(s, r), ring + max(s, r)] - item.w_start[s, r]
-            for i in range(TERMS):
-                for j in range(TERMS):
-                    block.gram[i, j] += item.d[s, i] * w * item.d[r, j]
-    _owed(e, item)
-    for c in range(at):
-        add_pair(e, pairs, closed[c].slot, item.slot, closed[c].d, e.owed)
-
-
-@njit(cache=True)
+@part
 def rebase(e: Any, closed: Any, blocks: Any, pairs: Any) -> None:
     """Settle all products, drop the blocks that fell silent, start the ring anew at I."""
     ring, n = first_ring(e), local_width(e)
     for k in range(e.n_open):
-        _flush_own(e, blocks, k)
-        for other in range(k + 1, e.n_open):
-            _flush_open_pair(e, pairs, k, other)
-        first = first_open(e, k)
-        through = e.gram[ring:, first : first + TERMS]
-        for c in range(e.n_closed):
-            add_pair(e, pairs, closed[c].slot, e.open_slot[k], closed[c].d, through)
+        _settle_open(e, closed, blocks, k)
     for i in range(1 + e.n_shared):
         for j in range(1 + e.n_shared):
-            e.shared[i, j] += e.gram[min(i, j), max(i, j)]
-    for c in range(e.n_closed):
-        _settle_closed(e, closed, blocks, pairs, c)
-    _advance_closed(e, closed, ring)
+            e.shared[i, j] += e.gram[max(i, j), min(i, j)]
+    _settle_ringing(e, closed, blocks)
+    for a in range(e.n_young):
+        _settle_young(e, closed, a)
+        _add_shared(e, closed[e.young[a]], blocks[closed[e.young[a]].slot])
+    e.n_young = 0
+    _advance_closed(e, closed, blocks, pairs)
     for i in range(n):
         for j in range(n):
             e.gram[i, j] = 0.0
@@ -332,55 +249,91 @@ def rebase(e: Any, closed: Any, blocks: Any, pairs: Any) -> None:
     e.ring_det = 1.0
 
 
-@njit(cache=True)
-def _advance_closed(e: Any, closed: Any, ring: int) -> None:
-    """Refer closed states to now, d <- ring d, with nothing owed; keep those that still ring."""
-    kept = 0
-    for c in range(e.n_closed):
-        item, largest = closed[c], 0.0
-        for s in range(e.n_state):
-            for i in range(TERMS):
-                e.owed[s, i] = item.d[s, i]
-        for s in range(e.n_state):
-            for i in range(TERMS):
-                item.d[s, i], item.through[s, i] = 0.0, 0.0
-                for r in range(e.n_state):
-                    item.d[s, i] += e.d[s, ring + r] * e.owed[r, i]
-                largest = max(largest, abs(item.d[s, i]))
-            item.w_start[s, :] = 0.0
-            item.shared_start[s, :] = 0.0
-        if largest > e.ring_floor * item.size:
-            closed[kept] = item
-            kept += 1
-    e.n_closed = kept
+@inlined
+def _settle_open(e: Any, closed: Any, blocks: Any, k: int) -> None:
+    """Products of open block k with itself, the open ones before it and all closed ones."""
+    _add_own(e, closed, blocks, k)
+    for other in range(k):
+        _add_open_pair(e, closed, k, other)
+    item = closed[e.open_recent[k]]
+    _read_through(e, k, 1.0, e.left)
+    spread(e, item, e.ringing, TERMS * e.n_recent)
+    for a in range(e.n_young):
+        add_tile(e, item, e.young[a], e.left, closed[e.young[a]].d)
 
 
-@njit(cache=True)
-def remove_open(e: Any, k: int) -> None:
-    """Take the closed and cleared block k out of the open ones; the last one takes its place."""
-    e.place[e.open_edge[k]] = -1
-    last = e.n_open - 1
-    if k < last:
-        to, source, gram = first_open(e, k), first_open(e, last), e.gram
-        for i in range(TERMS):
+@part
+def _settle_young(e: Any, closed: Any, a: int) -> None:
+    """Products of the a-th young block with itself and all that closed before it."""
+    p = e.young[a]
+    item = closed[p]
+    _weigh(e, item)
+    add_tile(e, item, p, e.own, item.d)
+    spread(e, item, e.ringing, TERMS * e.n_recent)
+    for b in range(a):
+        add_tile(e, item, e.young[b], e.left, closed[e.young[b]].d)
+
+
+@inlined
+def _settle_ringing(e: Any, closed: Any, blocks: Any) -> None:
+    """d_a' W d_b of those that rang all the time, and their products with the shared columns."""
+    for s in range(e.n_state):
+        target = e.weighted[s]
+        for j in range(TERMS * e.n_recent):
+            target[j] = 0.0
+        for r in range(e.n_state):
+            w, source = _ring_ring(e, s, r), e.ringing[r]
+            for j in range(TERMS * e.n_recent):
+                target[j] += w * source[j]
+    for p in range(e.n_recent):
+        item = closed[p]
+        if item.status == RINGING:
             for s in range(e.n_state):
-                e.d[s, to + i] = e.d[s, source + i]
-            for j in range(to):
-                gram[j, to + i] = gram[j, source + i]
-            for j in range(to + TERMS, source):
-                gram[to + i, j] = gram[j, source + i]
-            for j in range(TERMS):
-                gram[to + i, to + j] = gram[source + i, source + j]
-        e.open_edge[k], e.open_slot[k] = e.open_edge[last], e.open_slot[last]
-        e.place[e.open_edge[k]] = k
-    _clear(e, first_open(e, last), TERMS)
-    e.n_open = last
+                for i in range(TERMS):
+                    e.left[s, i] = item.d[s, i]
+            spread(e, item, e.weighted, TERMS * (p + 1))
+            _add_shared(e, item, blocks[item.slot])
 
 
-@njit(cache=True)
+@inlined
+def _advance_closed(e: Any, closed: Any, blocks: Any, pairs: Any) -> None:
+    """Refer closed states to now, d <- ring d, with nothing owed; release the silent ones."""
+    for p in range(e.n_recent - 1, -1, -1):
+        if closed[p].status >= YOUNG:
+            closed[p].status = RINGING
+            if not _advance_one(e, closed[p], p) > e.ring_floor * closed[p].size:
+                e.n_closed -= 1
+                release(e, closed, blocks, pairs, p)
+
+
+@part
+def _advance_one(e: Any, item: Any, p: int) -> float:
+    """As above for one block; returns the size of its state."""
+    largest, ring = 0.0, first_ring(e)
+    for s in range(e.n_state):
+        for i in range(TERMS):
+            value = 0.0
+            for r in range(e.n_state):
+                value += e.d[s, ring + r] * item.d[r, i]
+            e.ringing[s, TERMS * p + i] = value
+            largest = max(largest, abs(value))
+    for s in range(e.n_state):
+        for i in range(TERMS):
+            item.d[s, i], item.through[s, i] = e.ringing[s, TERMS * p + i], 0.0
+        for r in range(e.n_state):
+            item.w_start[s, r] = 0.0
+        for j in range(1 + e.n_shared):
+            item.shared_start[s, j] = 0.0
+    return largest
+
+
+@part
 def forget(e: Any, closed: Any, blocks: Any, pairs: Any) -> None:
     """End all memory: settle every product and set all states to zero (a gap, a restart)."""
     rebase(e, closed, blocks, pairs)
+    for p in range(e.n_recent - 1, -1, -1):
+        if closed[p].status == RINGING:
+            release(e, closed, blocks, pairs, p)
     e.n_closed = 0
     ring, n = first_ring(e), local_width(e)
     for s in range(e.n_state):

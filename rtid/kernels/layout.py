@@ -22,6 +22,7 @@ MAX_OPEN = 4
 TERMS = 6  # Taylor terms of one block, eq. (6)
 MAX_STATE = 4  # length of a column's state: chambers (integral form), 2 x chambers (carry form)
 MAX_LOCAL = 56  # 1 + MAX_SHARED + MAX_OPEN * TERMS + MAX_STATE, rounded up to whole vectors
+MAX_RECENT = 64  # blocks that are open or still ring
 
 INTEGRAL, CARRY = 0, 1  # the forms of the regression
 
@@ -96,6 +97,7 @@ ENGINE = np.dtype(
         ("n_open", _I),
         ("open_edge", _I, (MAX_OPEN,)),
         ("open_slot", _I, (MAX_OPEN,)),
+        ("open_recent", _I, (MAX_OPEN,)),  # its position among the recent blocks
         ("cov", _F, (MAX_CHAMBERS, MAX_CHAMBERS)),  # Kalman whitener: variance of the gap, m6
         ("innovation", _F, (3,)),  # S: upper triangle
         ("echo", _F, (MAX_CHAMBERS, 3)),  # pressure noise in the prediction of column -V dP
@@ -108,10 +110,16 @@ ENGINE = np.dtype(
         ("target", _I, (MAX_EDGES, 2)),  # the blocks that the working points are in
         ("phi", _F, (TERMS,)),
         ("gram", _F, (MAX_LOCAL, MAX_LOCAL)),
-        ("owed", _F, (MAX_STATE, TERMS)),
+        ("ringing", _F, (MAX_STATE, TERMS * MAX_RECENT)),  # d of those that rang at the last rebase
+        ("weighted", _F, (MAX_STATE, TERMS * MAX_RECENT)),
+        ("left", _F, (MAX_STATE, TERMS)),
+        ("own", _F, (MAX_STATE, TERMS)),
         ("basis", _F, (MAX_STATE, MAX_STATE)),
         ("ring_det", _F),  # determinant of the ring columns (carry: of one chamber)
         ("n_closed", _I),
+        ("n_recent", _I),  # positions in use among the recent blocks, free ones between included
+        ("n_young", _I),
+        ("young", _I, (MAX_RECENT,)),  # positions of the blocks closed since, in their order
         ("n_slots", _I),
         ("n_pairs", _I),
         ("shared", _F, (1 + MAX_SHARED, 1 + MAX_SHARED)),
@@ -140,18 +148,21 @@ BLOCK = np.dtype(
     align=True,
 )
 
-# One record per pair of blocks (low < high slot) that ever rang together; open addressing.
+# One record per pair of blocks (low < high slot) that were ever recent together; open addressing.
 PAIR = np.dtype([("key", _I), ("gram", _F, (TERMS, TERMS))], align=True)
 
-# One record per block that is closed but still rings, in the order of closing.
+# One record per recent block, see `recent`; young: closed since the last rebase.
+FREE, OPEN, YOUNG, RINGING = range(4)
 CLOSED = np.dtype(
     [
+        ("status", _I),
         ("slot", _I),
-        ("size", _F),
-        ("d", _F, (MAX_STATE, TERMS)),
+        ("size", _F),  # of its state when it closed
+        ("d", _F, (MAX_STATE, TERMS)),  # state, referred to the ring's origin
         ("through", _F, (MAX_STATE, TERMS)),  # ring x block while it was open
         ("w_start", _F, (MAX_STATE, MAX_STATE)),  # ring x ring when it closed
         ("shared_start", _F, (MAX_STATE, 1 + MAX_SHARED)),  # ring x shared when it closed
+        ("gram", _F, (TERMS, TERMS * MAX_RECENT)),
     ],
     align=True,
 )

@@ -8,15 +8,15 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from rtid.kernels.jit import inlined, kernel
 from rtid.kernels.layout import TERMS
 
 FloatArray = NDArray[np.float64]
 
 
-@njit(cache=True)
+@kernel
 def assemble(engine: Any, blocks: Any, pairs: Any, gram: FloatArray, right: FloatArray) -> float:
     """Fill gram (n, n) and right (n,), changed in place; returns y'y.  The sums must be settled."""
     e = engine[0]
@@ -40,7 +40,7 @@ def assemble(engine: Any, blocks: Any, pairs: Any, gram: FloatArray, right: Floa
     return float(e.shared[0, 0])
 
 
-@njit(cache=True)
+@inlined
 def _place(pair: Any, ns: int, gram: FloatArray) -> None:
     low = ns + TERMS * ((pair.key >> 32) - 1)
     high = ns + TERMS * ((pair.key & 0xFFFFFFFF) - 1)
@@ -50,7 +50,7 @@ def _place(pair: Any, ns: int, gram: FloatArray) -> None:
             gram[high + j, low + i] = pair.gram[i, j]
 
 
-@njit(cache=True)
+@kernel
 def mirror(matrix: FloatArray, scale: FloatArray) -> None:
     """matrix (n, n) <- scale_i scale_j upper_ij, both triangles, from its upper one; in place."""
     n = len(matrix)

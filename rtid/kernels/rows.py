@@ -17,13 +17,12 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from numba import njit
-
-from rtid.kernels.information import add_products, first_open, first_ring, local_width
+from rtid.kernels.jit import inlined, part
 from rtid.kernels.layout import ROWS
+from rtid.kernels.local import add_products, first_open, first_ring, local_width
 
 
-@njit(cache=True)
+@part
 def start_whitener(e: Any) -> None:
     """The first position is known as well as it was measured: P = R."""
     for c in range(e.n_chambers):
@@ -34,7 +33,7 @@ def start_whitener(e: Any) -> None:
             e.cov[a, b] = position_noise(e, a, b)
 
 
-@njit(cache=True)
+@inlined
 def position_noise(e: Any, a: int, b: int) -> float:
     """Covariance R of the rows' white noise, m6: one x for both chambers, one p for each."""
     r = e.area_m2[a] * e.area_m2[b] * e.x_var_m2
@@ -44,14 +43,14 @@ def position_noise(e: Any, a: int, b: int) -> float:
     return r
 
 
-@njit(cache=True)
+@inlined
 def _column_variance(e: Any, c: int) -> float:
     """Variance of the noise n in column -V dP of chamber c, m6."""
     w = (e.v0_m3[c] + e.area_m2[c] * e.values[e.x_column]) * e.compliance[c]
     return float(w * w * e.p_var_pa2[c])
 
 
-@njit(cache=True)
+@inlined
 def _add_column_noise(
     e: Any, c: int, k00: float, k01: float, k10: float, k11: float, det: float
 ) -> None:
@@ -75,7 +74,7 @@ def _add_column_noise(
     echo[2] = k10 * k10 * s00 + 2.0 * k10 * k11 * s01 + k11 * k11 * s11 + b * b * v
 
 
-@njit(cache=True)
+@inlined
 def integral_row_one(e: Any) -> None:
     """Row and decay for one chamber."""
     d, row, n = e.d, e.row, local_width(e)
@@ -94,7 +93,7 @@ def integral_row_one(e: Any) -> None:
     add_products(e, 1)
 
 
-@njit(cache=True)
+@inlined
 def integral_row_two(e: Any) -> None:
     """Rows and decay for two chambers that share the noise of x: whitened jointly."""
     d, row, cov, n = e.d, e.row, e.cov, local_width(e)
@@ -125,7 +124,7 @@ def integral_row_two(e: Any) -> None:
     add_products(e, 2)
 
 
-@njit(cache=True)
+@part
 def carry_step(e: Any) -> None:
     """All filters over one interval: x+ = a x + b [start, end] per chamber and column."""
     a, b, d, inc, end = e.filter_a, e.filter_b, e.d, e.inc, e.end
@@ -145,7 +144,7 @@ def carry_step(e: Any) -> None:
     e.ring_det *= a00 * a11 - a01 * a10
 
 
-@njit(cache=True)
+@part
 def carry_row(e: Any) -> None:
     """Rows at a row instant: outputs of the filters, weighted by the position noise."""
     d, row, n = e.d, e.row, local_width(e)
