@@ -7,24 +7,24 @@ the result equals the one from the log bit for bit.
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from uuid import uuid4
 
 import can
+import numpy as np
 
 from firmware_bridge.assemble import Assembler
 from firmware_bridge.catalog import Catalog
 from firmware_bridge.config import Assembly
-from firmware_bridge.frames import Frames, to_messages
+from firmware_bridge.frames import Frames, empty, to_messages
 from firmware_bridge.playback import SEND_TIMEOUT_S, send
 from firmware_bridge.sources.can_bus import CanBus
 from firmware_bridge.sources.live import LiveSource
 from rtid.estimator.estimator import Estimator
 from rtid.model import Model
 
-QUIET_S = 1.0  # the bus is over when its sender has ended and nothing came for so long
+QUIET_READS = 5  # the bus is over when its sender has ended and so many reads found nothing
 
 
 class Learner:
@@ -34,6 +34,13 @@ class Learner:
         self.assembler = Assembler(catalog, assembly)
         self.estimator = Estimator(model)
         self.frames = 0
+        self._compile()
+
+    def _compile(self) -> None:
+        """Have all kernels compiled before the first frame: it would wait for seconds."""
+        self.assembler.push(empty(0))
+        self.estimator.state.advance(np.empty((0, 2 + len(self.estimator.model.signals))))
+        self.estimator.solution()
 
     def push(self, frames: Frames) -> None:
         """Take frames in their order of arrival."""
@@ -50,11 +57,11 @@ def listen(
 ) -> Iterator[Learner]:
     """Learn from a source until it is over and quiet; yields the learner after each batch."""
     with source:
-        last = time.monotonic()
-        while not (is_over() and time.monotonic() - last > QUIET_S):
+        quiet_reads = 0
+        while quiet_reads < QUIET_READS or not is_over():
             frames = source.read()
+            quiet_reads = 0 if len(frames) else quiet_reads + 1
             if len(frames):
-                last = time.monotonic()
                 learner.push(frames)
                 yield learner
     learner.finish()
