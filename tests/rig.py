@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from rtid.compare import ReferenceMap
@@ -95,7 +96,7 @@ def _points(edge: Edge, found: Replay, chunk: FloatArray) -> tuple[FloatArray, F
     return mean[:-1], 0.5 * (dp[1:] + dp[:-1])
 
 
-def _cells(compared: TraceComparison, chunk: FloatArray) -> FloatArray:
+def _cells(compared: TraceComparison, chunk: FloatArray) -> NDArray[np.int64]:
     """Grid cell of every edge over each interval, as the estimator assigned it."""
     found = compared.replay
     n, c, state = len(chunk), len(found.model.chambers), build(found.model, found.fit.weights)

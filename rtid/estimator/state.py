@@ -15,7 +15,9 @@ from rtid.model import Edge, FloatArray, Model
 
 RecordArray = NDArray[np.void]
 
-RING_FLOOR = 1e-9  # a closed block is silent when its state has decayed to this share
+# A closed block is silent when its state has decayed to this share.  The carry form's rows know less
+# (condition), and fade so fast that digits cost nothing.
+RING_FLOOR = {layout.INTEGRAL: 1e-9, layout.CARRY: 1e-13}
 FLOW_NOISE_FLOOR = 0.01  # least flow noise, share of the variance that the rated slope gives
 FIRST_BLOCKS, FIRST_PAIRS = 64, 1024
 MAX_CLOSED = layout.MAX_RECENT
@@ -153,7 +155,7 @@ def _configure(e: np.void, model: Model) -> None:
     for i, edge in enumerate(model.edges):
         first = _configure_edge(e, model, i, edge, first)
     e["hysteresis"], e["max_gap_s"] = model.gates.hysteresis, model.gates.max_gap_s
-    e["ring_floor"] = RING_FLOOR
+    e["ring_floor"] = RING_FLOOR[int(e["form"])]
     e["wn_rad_s"], e["zeta"] = model.filter.wn_rad_s, model.filter.zeta
     e["row_period_s"] = 1.0 / model.filter.rows_per_s
     e["p_period_s"] = model.pressure_period_s

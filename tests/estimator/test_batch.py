@@ -21,7 +21,9 @@ from tests.estimator.cases import Case, draw_case, plant_case
 
 FORMS = ("integral", "carry")
 SUMS_LIMIT = 1e-8  # of the sums, each column in units of its own size
-LIMIT = 1e-8  # of the parameters, in units of the largest one
+# Of the parameters, in units of the largest one.  The low-pass of the carry form leaves a joint
+# condition number of 1e11 to 1e13 on short records, which normal equations feel.
+LIMIT = {"integral": 1e-8, "carry": 1e-6}
 
 
 def accumulated(case: Case) -> tuple[Normal, State]:
@@ -78,7 +80,7 @@ def parameter_error(case: Case) -> float:
     [(0, "integral", False), (2, "integral", True), (0, "carry", False)],
 )
 def test_parameters_of_random_plants(seed: int, form: str, cross_port: bool) -> None:
-    assert parameter_error(plant_case(seed, form, cross_port)) <= LIMIT
+    assert parameter_error(plant_case(seed, form, cross_port)) <= LIMIT[form]
 
 
 @pytest.mark.parametrize("form", FORMS)

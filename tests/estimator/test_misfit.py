@@ -37,13 +37,14 @@ def widening(n_u: int, n_dp: int) -> FloatArray:
 
 
 def test_blocks_that_fit_hardly_change_the_interval() -> None:
-    # the clustered estimate scatters: some 100 clusters know a variance to 15 %
-    assert (widening(10, 10) >= 1.0).all()
-    assert (widening(10, 10) < 1.5).all()
+    # in 12 s few clusters carry most of the weight: over seeds and grids the ratio was 1.0 to 1.85
+    ratio = widening(10, 10)
+    assert (ratio >= 1.0).all()
+    assert (ratio < 2.5).all()
 
 
 def test_blocks_that_miss_widen_it() -> None:
-    assert (widening(1, 2) > 3.0).all()
+    assert (widening(1, 2) > 8.0).all()  # 14 to 42 over seeds
 
 
 def test_flow_terms_follow_the_compliances() -> None:
