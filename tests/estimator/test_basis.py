@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rtid.kernels.basis import locate, relocate, taylor
@@ -20,6 +20,7 @@ def either(kernel: Any, compiled: bool) -> Any:
     return kernel if compiled else kernel.py_func
 
 
+@settings(deadline=None)  # the first call compiles
 @given(value=POINTS)
 @BOTH
 def test_locate_is_the_interval_that_holds_the_value(value: float, compiled: bool) -> None:
@@ -38,6 +39,7 @@ def test_nothing_holds_what_is_no_number(compiled: bool) -> None:
     assert either(relocate, compiled)(BORDER, 5, np.nan, 2, 0.1) == -1
 
 
+@settings(deadline=None)
 @given(value=POINTS, current=st.integers(0, 4), share=st.sampled_from([0.0, 0.05, 0.3]))
 @BOTH
 def test_hysteresis_holds_the_block(
