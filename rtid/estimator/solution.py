@@ -155,24 +155,31 @@ def correct(normal: Normal, factor: Factor, leverage: FloatArray) -> Corrected:
     information = np.linalg.inv(columns[:n_c])
     noise = np.diag(normal.noise * (1 - leverage))
     least = SHARED_PRIOR + 3 * np.sqrt(2 / max(1, normal.rows)) * normal.noise
-    left = _at_least(information - noise, least)
+    left, drawn = _at_least(information - noise, least)
     cov = np.linalg.inv(left)
     basis = columns @ information
     shift = cov @ information @ theta[:n_c] - theta[:n_c]
     # noise times noise: its share of the rows' own variance adds to that of the product
     own = normal.noise / max(1, normal.rows)
-    cov_change = cov + cov @ (noise * (1 + own)) @ cov - columns[:n_c]
+    cov_change = cov + cov @ (noise * (1 + own)) @ cov - columns[:n_c] + drawn
     told = theta[:n_c] + shift
     cost = misfit(normal, theta) + shift @ information @ shift - told @ noise @ told
     return Corrected(theta + basis @ shift, basis, cov_change, float(cost))
 
 
-def _at_least(information: FloatArray, least: FloatArray) -> FloatArray:
-    """Symmetric matrix with its eigenvalues, in units of `least`, raised to 1."""
+def _at_least(information: FloatArray, least: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Symmetric matrix with its eigenvalues, in units of `least`, raised to 1; and the error.
+
+    At 1, three standard deviations of what noise alone pretends, nothing may be known at all and the
+    estimate be drawn to zero; from 2 on the variance tells.  The second result is the square of the
+    error so made, for compliances of the nominal size.
+    """
     scale = np.sqrt(least)
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    missing = np.clip(2.0 - values, 0.0, 1.0)
     raised = (vectors * np.maximum(values, 1.0)) @ vectors.T
-    return np.asarray(raised * np.outer(scale, scale))
+    drawn = (vectors / scale[:, None]) * missing * (vectors.T @ scale)
+    return np.asarray(raised * np.outer(scale, scale)), np.asarray(drawn @ drawn.T)
 
 
 def leverage_of(state: State, effective: FloatArray) -> FloatArray:

@@ -15,8 +15,8 @@ from rtid.model import Edge, FloatArray, Model
 
 RecordArray = NDArray[np.void]
 
-# A closed block is silent when its state has decayed to this share.  The carry form's rows know less
-# (condition), and fade so fast that digits cost nothing.
+# A closed block is silent when its state has decayed to this share.  The rows of the carry form are
+# worse conditioned, and fade so fast that digits cost nothing.
 RING_FLOOR = {layout.INTEGRAL: 1e-9, layout.CARRY: 1e-13}
 FLOW_NOISE_FLOOR = 0.01  # least flow noise, share of the variance that the rated slope gives
 FIRST_BLOCKS, FIRST_PAIRS = 64, 1024

@@ -114,9 +114,6 @@ def test_standing_still_breaks_nothing(noise: float) -> None:
         sensible(declared_model(Plant()), standing_still(noise, seed))
 
 
-@pytest.mark.xfail(
-    reason="claims 1 / beta = 0 +- 0.3 of nominal where nothing is known", strict=True
-)
 def test_standing_still_tells_nothing_of_beta() -> None:
     model = declared_model(Plant())
     for seed in range(5):
