@@ -118,7 +118,10 @@ def run(model: Model, chunk: FloatArray, weights: Weights | None = None) -> Stat
 
 
 def refined(model: Model, state: State, found: Sketch, lag_s: float) -> Weights:
-    """Weights from a first estimate: the orifice slope Q / (2 dp) at each block's mean flow."""
+    """Weights from a first estimate: the orifice slope Q / (2 dp) at each block's mean flow.
+
+    A compliance outside its declared bounds tells that the motion did not show it.
+    """
     slopes = nominal_weights(model).slopes.copy()
     for record, flow in zip(state.blocks, found.flow_m3s, strict=False):
         if np.isfinite(flow):
@@ -128,7 +131,9 @@ def refined(model: Model, state: State, found: Sketch, lag_s: float) -> Weights:
             dp, least = abs(borders[j] + borders[j + 1]), borders[j + 1] - borders[j]
             slopes[record["cell"]] = max(flow, 0.0) / max(dp, least)
     low, high = 1 / model.beta_bounds_pa[1], 1 / model.beta_bounds_pa[0]
-    return Weights(slopes, np.clip(found.compliance, low, high), lag_s)
+    possible = (found.compliance >= low) & (found.compliance <= high)
+    compliance = np.where(possible, found.compliance, 1 / model.beta_nominal_pa)
+    return Weights(slopes, compliance, lag_s)
 
 
 def excess(model: Model, chunk: FloatArray, weights: Weights, leverage: FloatArray) -> float:

@@ -170,9 +170,9 @@ def correct(normal: Normal, factor: Factor, leverage: FloatArray) -> Corrected:
 def _at_least(information: FloatArray, least: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Symmetric matrix with its eigenvalues, in units of `least`, raised to 1; and the error.
 
-    At 1, three standard deviations of what noise alone pretends, nothing may be known at all and the
-    estimate be drawn to zero; from 2 on the variance tells.  The second result is the square of the
-    error so made, for compliances of the nominal size.
+    At 1, three standard deviations of what noise alone pretends, nothing may be known at all, and
+    the estimate is drawn to zero; from 2 on the variance tells.  The second result is the square
+    of the error so made, for compliances of the nominal size.
     """
     scale = np.sqrt(least)
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
