@@ -79,6 +79,22 @@ class Edge:
 
 
 @dataclass(frozen=True)
+class Term:
+    """A shared flow, linear in signals: theta * scale * (sum of weights * signal + constant).
+
+    weights: (signal, weight) pairs of quantities that run linearly between samples; signs:
+    (chamber, +1 or -1) pairs.  A laminar internal leakage has weights p_a: 1, p_b: -1, signs a: -1,
+    b: +1, and a scale in m3/s/Pa near the coefficient that is expected.
+    """
+
+    name: str
+    weights: tuple[tuple[str, float], ...]
+    signs: tuple[tuple[str, int], ...]
+    scale: float
+    constant: float = 0.0
+
+
+@dataclass(frozen=True)
 class Lag:
     """First-order lag of the spool behind the command: nominal value and tolerance, seconds."""
 
@@ -120,6 +136,7 @@ class Model:
     filter: Filter = field(default_factory=Filter)
     gates: Gates = field(default_factory=Gates)
     form: str = "integral"  # or "carry"
+    terms: tuple[Term, ...] = ()
     pressure_period_s: float = 0.0  # sampling period of the pressures; 0: every sample
     # Variance of a pressure at the rows as a share of its sensor's: 1 where it is measured there,
     # f^2 + (1 - f)^2 where it is interpolated at the fraction f between two samples.

@@ -29,6 +29,7 @@ class Candidate:
     """A map with its compressibility: theta (cells, 6) in m3/s, compliance (chambers,) in 1/Pa.
 
     status (cells,) holds the words of `rtid.estimator.flowmap`; weights gives lag and noise slopes.
+    terms (terms,): coefficients of the model's shared terms in units of their scales.
     """
 
     name: str
@@ -36,6 +37,7 @@ class Candidate:
     compliance: FloatArray
     status: NDArray[np.str_]
     weights: Weights
+    terms: FloatArray
 
 
 @dataclass(frozen=True)
@@ -81,7 +83,8 @@ def learned(fit: RecordFit, flowmap: FlowMap, name: str = "learned") -> Candidat
     """The published map with the compliance and lag of the fit."""
     status = np.concatenate([edge.status.ravel() for edge in flowmap.edges])
     compliance = fit.solution.compliance
-    return Candidate(name, flowmap.theta_cells(), compliance, status, fit.weights)
+    terms = fit.solution.terms_theta
+    return Candidate(name, flowmap.theta_cells(), compliance, status, fit.weights, terms)
 
 
 def refitted(
@@ -90,20 +93,23 @@ def refitted(
     """A reference map with each chamber's compliance fitted to the chunk, all else as it is."""
     theta = reference.theta_cells(model)
     empty, one = np.zeros_like(theta), np.ones(len(model.chambers))
-    by_map = _rows(model, _hold(model, theta, 0.0 * one, weights, chunk))
-    by_beta = _rows(model, _hold(model, empty, one, weights, chunk))
+    none = np.zeros(len(model.terms))
+    by_map = _rows(model, _hold(model, theta, 0.0 * one, weights, none, chunk))
+    by_beta = _rows(model, _hold(model, empty, one, weights, none, chunk))
     at = np.intersect1d(by_map[0], by_beta[0], return_indices=True)
     y = (by_map[1] - by_map[2])[at[1]]
     column = by_beta[2][at[2]]
     compliance = (column * y).sum(axis=0) / np.maximum((column**2).sum(axis=0), 1e-300)
     low, high = 1 / model.beta_bounds_pa[1], 1 / model.beta_bounds_pa[0]
     status = np.full(len(theta), REFERENCE)
-    return Candidate(reference.name, theta, np.clip(compliance, low, high), status, weights)
+    return Candidate(reference.name, theta, np.clip(compliance, low, high), status, weights, none)
 
 
 def compare(model: Model, candidate: Candidate, chunk: FloatArray) -> Comparison:
     """Hold the candidate against samples chunk (n, 2 + signals) = [t_s, flags, values...], SI."""
-    held = _hold(model, candidate.theta, candidate.compliance, candidate.weights, chunk)
+    held = _hold(
+        model, candidate.theta, candidate.compliance, candidate.weights, candidate.terms, chunk
+    )
     t_s, measured, modelled = _rows(model, held)
     interval = np.clip(np.searchsorted(held.t_s, t_s) - 1, 0, len(held.cell) - 1)
     rho = _mean_squares(held.innovation)
@@ -122,12 +128,18 @@ class _Held:
 
 
 def _hold(
-    model: Model, theta: FloatArray, compliance: FloatArray, weights: Weights, chunk: FloatArray
+    model: Model,
+    theta: FloatArray,
+    compliance: FloatArray,
+    weights: Weights,
+    terms: FloatArray,
+    chunk: FloatArray,
 ) -> _Held:
     n, c = max(len(chunk) - 1, 0), len(model.chambers)
     flow, innovation = np.full((n, 2 * c), np.nan), np.full((n, c), np.nan)
     cell = np.full((n, len(model.edges)), -1, np.int64)
     state = build(model, weights)
+    state.engine[0]["term_theta"][: len(terms)] = terms
     explain(state.engine, state.cells, theta, compliance, chunk, flow, cell, innovation)
     return _Held(np.ascontiguousarray(chunk[:, 0]), flow, cell, innovation)
 

@@ -62,7 +62,7 @@ def fit_batch(
     stacked = maker(model, t_s, values, rates, track, weights)
     y, rows = stacked[:, 0], stacked[:, 1:]
     ridge = np.full(rows.shape[1], prior[1])
-    ridge[: len(model.chambers)] = prior[0]
+    ridge[: len(model.chambers) + len(model.terms)] = prior[0]
     keep = np.diag(np.sqrt(ridge))[ridge > 0]
     theta = np.linalg.lstsq(
         np.vstack([rows, keep]), np.concatenate([y, np.zeros(len(keep))]), rcond=None
@@ -80,8 +80,8 @@ def column_rates(
 ) -> tuple[FloatArray, Blocks]:
     """(intervals, chambers, 2, 1 + n): start and end rate of y and of every column, m3/s."""
     blocks, end = _visited(track), track.end
-    n_shared = len(model.chambers)
-    out = np.zeros((len(end), n_shared, 2, 1 + n_shared + 6 * len(blocks)))
+    n_shared = len(model.chambers) + len(model.terms)
+    out = np.zeros((len(end), len(model.chambers), 2, 1 + n_shared + 6 * len(blocks)))
     place = {block: 1 + n_shared + 6 * b for b, block in enumerate(blocks)}
     dt = t_s[end] - t_s[end - 1]
     x = values[:, model.column(model.position)]
@@ -93,6 +93,16 @@ def column_rates(
             rate = (x[end] - x[end - 1]) / dt if xdot_mps is None else xdot_mps[instants]
             out[:, c, side, 0] = area * rate
             out[:, c, side, 1 + c] = -(chamber.v0_m3 + area * x[instants]) * pdot
+    for number, term in enumerate(model.terms):
+        flow = np.full(len(values), term.constant)
+        for name, weight in term.weights:
+            flow += weight * values[:, model.column(name)]
+        for c, chamber in enumerate(model.chambers):
+            sign = dict(term.signs).get(chamber.name, 0)
+            for side, instants in enumerate((end - 1, end)):
+                out[:, c, side, 1 + len(model.chambers) + number] = (
+                    sign * term.scale * flow[instants]
+                )
     moments = _moments(track.opening, dt, weights.lag_s)
     for i, edge in enumerate(model.edges):
         dp = values[:, model.column(edge.source)] - values[:, model.column(edge.sink)]

@@ -20,6 +20,7 @@ def _sizes(model: Model) -> Iterator[str]:
         ("chambers", len(model.chambers), layout.MAX_CHAMBERS),
         ("edges", len(model.edges), layout.MAX_EDGES),
         ("signals", len(model.signals), layout.MAX_SIGNALS),
+        ("shared terms", len(model.terms), layout.MAX_SHARED - len(model.chambers)),
         ("edges that are open at once", most_open(model), layout.MAX_OPEN),
     ):
         if count > most:

@@ -43,13 +43,13 @@ def _scores(
 ) -> tuple[FloatArray, Cells]:
     """w_k r_k (rows, chambers) about their mean, and the grid cells (rows, edges)."""
     theta, flows = _per_cell(model, solution)
-    residual, cells = _innovations(model, chunk, weights, theta, solution.compliance)
+    n_c, terms = len(solution.scale_pa), solution.terms_theta
+    residual, cells = _innovations(model, chunk, weights, theta, solution.compliance, terms)
     scores = np.empty((len(residual), len(solution.scale_pa)))
     for c, influence in enumerate(flows):
-        moved = solution.influence[c, : len(solution.scale_pa)] * solution.scale_pa
-        shifted, _ = _innovations(
-            model, chunk, weights, theta + influence, solution.compliance + moved
-        )
+        moved = solution.compliance + solution.influence[c, :n_c] * solution.scale_pa
+        shared = terms + solution.influence[c, n_c : n_c + len(terms)]
+        shifted, _ = _innovations(model, chunk, weights, theta + influence, moved, shared)
         scores[:, c] = ((residual - shifted) * residual).sum(axis=1)
     known = np.isfinite(scores).all(axis=1)
     scores, cells = scores[known], cells[known]
@@ -66,16 +66,22 @@ def _per_cell(model: Model, solution: Solution) -> tuple[FloatArray, list[FloatA
         edge = model.edges[block.edge]
         cell = first[block.edge] + block.i * edge.grid.shape[1] + block.j
         theta[cell] = block.theta
-        at = n_c + TERMS * slot
+        at = n_c + len(model.terms) + TERMS * slot
         for c in range(n_c):
             flows[c][cell] = solution.influence[c, at : at + TERMS] * edge.rated_q_m3s
     return theta, flows
 
 
 def _innovations(
-    model: Model, chunk: FloatArray, weights: Weights, theta: FloatArray, compliance: FloatArray
+    model: Model,
+    chunk: FloatArray,
+    weights: Weights,
+    theta: FloatArray,
+    compliance: FloatArray,
+    terms: FloatArray,
 ) -> tuple[FloatArray, Cells]:
     n, n_c, state = len(chunk), len(model.chambers), build(model, weights)
+    state.engine[0]["term_theta"][: len(terms)] = terms
     flow, innovation = np.empty((n - 1, 2 * n_c)), np.empty((n - 1, n_c))
     cells = np.empty((n - 1, len(model.edges)), np.int64)
     explain(state.engine, state.cells, theta, compliance, chunk, flow, cells, innovation)

@@ -65,6 +65,7 @@ class Solution:
     when the model explains the rows to the sensors' noise; leverage (chambers,): `leverage_of`.
     In units of the unknowns, scale_pa (chambers,) for the compliances: basis (n, chambers), how all
     unknowns follow the compliances; influence (chambers, n), their covariance with all unknowns.
+    terms (terms,) and terms_cov: coefficients of the model's shared terms.
     """
 
     model: Model
@@ -77,12 +78,19 @@ class Solution:
     basis: FloatArray
     influence: FloatArray
     scale_pa: FloatArray
+    terms: FloatArray
+    terms_cov: FloatArray
     counters: dict[str, int] = field(default_factory=dict)
 
     @property
     def beta_pa(self) -> FloatArray:
         """Effective bulk modulus per chamber."""
         return 1.0 / self.compliance
+
+    @property
+    def terms_theta(self) -> FloatArray:
+        """Coefficients of the shared terms in units of their scales (terms,)."""
+        return self.terms / np.array([term.scale for term in self.model.terms])
 
     @property
     def beta_sd_pa(self) -> FloatArray:
@@ -238,6 +246,7 @@ def solve(model: Model, state: State) -> Solution:
     theta = found.theta
     dof = max(1, normal.rows * n_c - round(float(effective.sum())))
     c0 = e["compliance"][:n_c]
+    scales = np.array([term.scale for term in model.terms])
     counters = {name: int(count) for name, count in zip(COUNTERS, e["counters"], strict=True)}
     largest = _largest_flows(model, settled, theta)
     blocks = tuple(
@@ -254,6 +263,9 @@ def solve(model: Model, state: State) -> Solution:
         basis=found.basis,
         influence=influence,
         scale_pa=c0.copy(),
+        terms=theta[n_c : int(e["n_shared"])] * scales,
+        terms_cov=cov[n_c : int(e["n_shared"]), n_c : int(e["n_shared"])]
+        * np.outer(scales, scales),
         counters=counters,
     )
 
@@ -267,7 +279,7 @@ def widen(solution: Solution, more: FloatArray) -> Solution:
     c0 = solution.scale_pa
     blocks = []
     for slot, block in enumerate(solution.blocks):
-        at = n_c + TERMS * slot
+        at = n_c + len(solution.terms) + TERMS * slot
         follow = solution.basis[at : at + TERMS] * solution.model.edges[block.edge].rated_q_m3s
         blocks.append(replace(block, cov=block.cov + follow @ more @ follow.T))
     cov = solution.compliance_cov + more * np.outer(c0, c0)

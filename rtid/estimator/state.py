@@ -141,7 +141,8 @@ def _configure(e: np.void, model: Model) -> None:
     e["form"] = layout.CARRY if model.form == "carry" else layout.INTEGRAL
     n_chambers = len(model.chambers)
     e["n_chambers"], e["n_edges"] = n_chambers, len(model.edges)
-    e["n_shared"], e["n_signals"] = n_chambers, len(model.signals)
+    e["n_shared"], e["n_signals"] = n_chambers + len(model.terms), len(model.signals)
+    _configure_terms(e, model)
     e["n_state"] = n_chambers * (2 if model.form == "carry" else 1)
     for j, signal in enumerate(model.signals):
         e["minimum"][j], e["maximum"][j] = signal.minimum, signal.maximum
@@ -177,6 +178,17 @@ def _configure_edge(e: np.void, model: Model, i: int, edge: Edge, first_cell: in
             noise = slope**2 * e["dp_var_pa2"][i] * period
             e["q_floor"][c] = max(e["q_floor"][c], FLOW_NOISE_FLOOR * noise)
     return first_cell + nu * nd
+
+
+def _configure_terms(e: np.void, model: Model) -> None:
+    e["n_terms"] = len(model.terms)
+    names = [chamber.name for chamber in model.chambers]
+    for k, term in enumerate(model.terms):
+        e["term_constant"][k] = term.scale * term.constant
+        for name, weight in term.weights:
+            e["term_weight"][k, model.column(name)] = term.scale * weight
+        for name, sign in term.signs:
+            e["term_sign"][k, names.index(name)] = sign
 
 
 def _variance(model: Model, name: str) -> float:

@@ -179,6 +179,8 @@ def _interval(
         return
     _change_blocks(e, cells, closed, blocks, pairs)
     _shared_increments(e, sample, dt)
+    if e.n_terms > 0:
+        _term_increments(e, sample, dt)
     for k in range(e.n_open):
         _block_increments(e, cells, blocks, k, sample[0], dt, row)
     if e.form == CARRY:
@@ -307,6 +309,29 @@ def _shared_increments(e: Any, sample: FloatArray, dt: float) -> None:
         else:
             e.d[c, 0] += dx
             e.d[c, 1 + c] += 0.5 * (v0 + v1) * dp
+
+
+@inlined
+def term_flow(e: Any, k: int, values: FloatArray, first: int) -> float:
+    """Flow of shared term k for theta = 1; the signals stand in values from `first` on."""
+    flow = e.term_constant[k]
+    for j in range(e.n_signals):
+        flow += e.term_weight[k, j] * values[first + j]
+    return float(flow)
+
+
+@part
+def _term_increments(e: Any, sample: FloatArray, dt: float) -> None:
+    """Integrals (carry form: end values) of the shared terms, linear between samples."""
+    for k in range(e.n_terms):
+        start, end = term_flow(e, k, e.values, 0), term_flow(e, k, sample, 2)
+        j = 1 + e.n_chambers + k
+        for c in range(e.n_chambers):
+            sign = e.term_sign[k, c]
+            if e.form == CARRY:
+                e.inc[c, j], e.end[c, j] = sign * start, sign * end
+            else:
+                e.d[c, j] += 0.5 * dt * sign * (start + end)
 
 
 @inlined

@@ -22,6 +22,7 @@ from rtid.kernels.engine import (
     remember,
     set_step,
     step_s,
+    term_flow,
     working_points,
 )
 from rtid.kernels.holds import second_order
@@ -47,7 +48,8 @@ def explain(
 ) -> None:
     """Rates over each interval and innovations at each row.  All outputs are changed in place.
 
-    engine (1,), cells: a freshly built state (the engine is used up); theta (cells, 6) m3/s,
+    engine (1,), cells: a freshly built state (the engine is used up; its term_theta holds the
+    coefficients of the shared terms); theta (cells, 6) m3/s,
     compliance (chambers,) 1/Pa, chunk (n, 2 + signals).  flow (n - 1, chambers, 2): measured
     s A v and modelled right-hand side of (14), mean over the interval, m3/s; NaN where the trace
     has a gap or the point is off the grid.  cell (n - 1, edges): grid cell, -1 shut.
@@ -113,6 +115,9 @@ def _one(
         v = e.v0_m3[c] + 0.5 * e.area_m2[c] * (x0 + x1)
         flow[MEASURED + 2 * c] = e.area_m2[c] * (x1 - x0) / dt
         flow[MODELLED + 2 * c] = -v * rate * compliance[c]
+        for k in range(e.n_terms):
+            mean = 0.5 * (term_flow(e, k, e.values, 0) + term_flow(e, k, sample, 2))
+            flow[MODELLED + 2 * c] += e.term_sign[k, c] * e.term_theta[k] * mean
         e.cov[c, c] += e.q_floor[c] * dt
     for i in range(e.n_edges):
         e.cell[i, 0], e.cell[i, 1] = e.target[i, 0], e.target[i, 1]

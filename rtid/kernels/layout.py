@@ -75,6 +75,11 @@ ENGINE = np.dtype(
         ("dp_border", _F, (MAX_EDGES, MAX_BORDERS)),
         ("minimum", _F, (MAX_SIGNALS,)),
         ("maximum", _F, (MAX_SIGNALS,)),
+        ("n_terms", _I),
+        ("term_weight", _F, (MAX_SHARED, MAX_SIGNALS)),  # flow per unit of signal, scale included
+        ("term_constant", _F, (MAX_SHARED,)),
+        ("term_sign", _F, (MAX_SHARED, MAX_CHAMBERS)),
+        ("term_theta", _F, (MAX_SHARED,)),  # read by `explain` alone
         ("hysteresis", _F),
         ("max_gap_s", _F),
         ("ring_floor", _F),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.campaign.report import leave
-from tests.estimator.cases import plant_case
+from tests.estimator.cases import draw_case, plant_case
 from tests.estimator.test_batch import differences, parameter_error
 
 
@@ -18,3 +18,17 @@ def test_recursive_equals_batch(form: str) -> None:
     figure = f"sums {sums:.1e}, parameters {parameters:.1e}"
     leave(f"recursive against batch, {form} form", figure, "1e-8", f"{len(cases)} plants")
     assert max(sums, parameters) <= 1e-8
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("form", ["integral", "carry"])
+def test_up_to_twenty_shared_columns(form: str) -> None:
+    cases = [draw_case(100 + terms, form, terms=terms) for terms in range(19)]
+    sums = max(differences(case)["gram"] for case in cases)
+    leave(
+        f"recursive against batch, 2 to 20 shared columns, {form} form",
+        f"sums {sums:.1e}",
+        "1e-8",
+        f"{len(cases)} random declarations",
+    )
+    assert sums <= 1e-8

@@ -19,6 +19,7 @@ from rtid.model import (
     Lag,
     Model,
     Signal,
+    Term,
 )
 from rtid.sim.declare import declared_model
 from rtid.sim.random_plants import draw
@@ -60,10 +61,12 @@ def draw_case(
     row_every: int = 1,
     faults: int = 0,
     reverse: bool = False,
+    terms: int = 0,
 ) -> Case:
     """A random case; faults: so many each of gaps, NaN, values out of range and off the grid."""
     rng = np.random.default_rng([seed, 77])
     model = draw_model(rng, form, chambers, blocks, -1 if reverse else 1)
+    model = replace(model, terms=tuple(draw_term(rng, model, k) for k in range(terms)))
     steps_us = np.rint(1e3 * (1 + jitter * rng.uniform(-1, 1, n)))
     t = 10.0 + 1e-6 * np.cumsum(steps_us)  # stamps are whole microseconds
     names = [s.name for s in model.signals]
@@ -110,6 +113,14 @@ def draw_model(
         gates=Gates(hysteresis=float(rng.choice([0.0, 0.05, 0.2]))),
         form=form,
     )
+
+
+def draw_term(rng: np.random.Generator, model: Model, k: int) -> Term:
+    """A shared flow that is linear in the pressures and the position."""
+    weights = tuple((name, float(rng.normal())) for name in NAMES[1:5])
+    position = ("x", float(1e7 * rng.normal()))
+    signs = tuple((c.name, int(rng.choice([-1, 0, 1]))) for c in model.chambers[1:])
+    return Term(f"term {k}", (*weights, position), (("a", 1), *signs), 1e-11, float(rng.normal()))
 
 
 def _draw_edge(

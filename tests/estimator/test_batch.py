@@ -126,3 +126,12 @@ def test_new_memory_when_too_many_blocks_ring(
     monkeypatch.setattr(state_module, "MAX_CLOSED", 7)
     found = check(draw_case(500 + seed, form, blocks=4, chatter_pa=1e5, faults=seed))
     assert found["memories"] > 3
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("terms", [1, 5, 18])
+def test_more_shared_columns(terms: int, form: str) -> None:
+    """Up to 20 shared columns: two compliances and 18 terms that are linear in the signals."""
+    case = draw_case(11 + terms, form, terms=terms)
+    assert len(batch_of(case).theta) - 6 * len(batch_of(case).blocks) == 2 + terms
+    check(case)
