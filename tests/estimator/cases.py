@@ -149,10 +149,12 @@ def draw_signals(rng: np.random.Generator, t: FloatArray) -> FloatArray:
     return np.stack([u, p_a, p_b, p_s, p_t, 0.25 + wave(0.2, 0.3, 2)], axis=1)
 
 
-def plant_case(seed: int, form: str, cross_port: bool = False) -> Case:
+def plant_case(
+    seed: int, form: str, cross_port: bool = False, duration_s: float | None = None
+) -> Case:
     """A short record of a random simulated machine with a coarse grid, full sensor noise."""
     plant = draw(seed, cross_port=cross_port)
-    duration_s = 3.0 if form == "integral" else 10.0
+    duration_s = duration_s or (3.0 if form == "integral" else 10.0)
     samples = simulate(plant, "rich", seed, duration_s).samples
     u = np.array([1.0, 2.0, 3.0, 4.5, 10.0])
     grids = dict.fromkeys(plant.edges, Grid(u, np.array([-1.0, 1.0, 2.5, 4.0, 6.0, 10.0]) * 1e6))
