@@ -39,7 +39,7 @@ def test_a_few_plants(motion: str) -> None:
 
 @pytest.mark.campaign
 @pytest.mark.parametrize(
-    ("motion", "duration_s", "plants"), [("rich", 15, 700), ("sweep", 20, 500)]
+    ("motion", "duration_s", "plants"), [("rich", 15, 1000), ("sweep", 20, 120)]
 )
 def test_intervals(motion: str, duration_s: float, plants: int) -> None:
     trials = [Trial(FIRST_SEED + k, motion, duration_s) for k in range(plants)]
