@@ -17,7 +17,7 @@ RecordArray = NDArray[np.void]
 
 # A closed block is silent when its state has decayed to this share.  The rows of the carry form are
 # worse conditioned, and fade so fast that digits cost nothing.
-RING_FLOOR = {layout.INTEGRAL: 1e-9, layout.CARRY: 1e-13}
+RING_FLOOR = {layout.INTEGRAL: 1e-11, layout.CARRY: 1e-13}
 FLOW_NOISE_FLOOR = 0.01  # least flow noise, share of the variance that the rated slope gives
 FIRST_BLOCKS, FIRST_PAIRS = 64, 1024
 MAX_CLOSED = layout.MAX_RECENT
