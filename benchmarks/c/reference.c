@@ -12,7 +12,7 @@
 #include "layout.h"
 
 enum { ROW_FLAG = 1, GAP_FLAG = 2, SHUT = -1, LANES = 4 };
-static const double RING_LOG_LIMIT = -4.0;
+static const double RING_DET_LIMIT = 1e-3;
 
 typedef struct {
     Engine *e;
@@ -23,17 +23,27 @@ typedef struct {
     int64_t max_closed, max_blocks, max_pairs;
 } Tables;
 
-typedef double Terms[TERMS][TERMS];
+typedef double State[MAX_STATE][TERMS];
+typedef double Row[TERMS * MAX_RECENT];
 
-static int first_ring(const Engine *e) { return (int)(1 + e->n_shared + TERMS * e->n_open); }
+static int first_open(const Engine *e, int64_t k) { return (int)(e->first + TERMS * k); }
 
-static int local_width(const Engine *e)
+static void set_open(Engine *e, int n)
 {
-    const int n = (first_ring(e) + (int)e->n_state + LANES - 1) / LANES * LANES;
-    return n < MAX_LOCAL ? n : MAX_LOCAL;
+    const int width = (first_open(e, n) + LANES - 1) / LANES * LANES;
+    e->n_open = n;
+    e->width = width < MAX_LOCAL ? width : MAX_LOCAL;
 }
 
-/* ---- pairs of blocks: open addressing ---- */
+/* an entry of the local products, which stand in the lower triangle */
+static double local(const Engine *e, int i, int j) { return i > j ? e->gram[i][j] : e->gram[j][i]; }
+
+static double ring_ring(const Engine *e, int s, int r)
+{
+    return local(e, (int)e->ring + s, (int)e->ring + r);
+}
+
+/* ---- recent blocks: a dense matrix, and the tables of blocks and pairs ---- */
 
 static Pair *find_pair(Tables *t, int64_t low, int64_t high)
 {
@@ -49,154 +59,141 @@ static Pair *find_pair(Tables *t, int64_t low, int64_t high)
     return &t->pairs[at];
 }
 
-static void add_pair(Tables *t, int64_t a, int64_t b, Terms product)
+static void hand_over(Tables *t, int p)
 {
-    Pair *pair = a < b ? find_pair(t, a, b) : find_pair(t, b, a);
+    Closed *item = &t->closed[p];
+    Block *own = &t->blocks[item->slot];
     for (int i = 0; i < TERMS; i++)
-        for (int j = 0; j < TERMS; j++) pair->gram[i][j] += a < b ? product[i][j] : product[j][i];
+        for (int j = 0; j < TERMS; j++) {
+            own->gram[i][j] += item->gram[i][TERMS * p + j];
+            item->gram[i][TERMS * p + j] = 0.0;
+        }
+    for (int q = 0; q < t->e->n_recent; q++) {
+        if (t->closed[q].status == FREE || q == p) continue;
+        const int a = item->slot < t->closed[q].slot ? p : q, b = p + q - a;
+        Closed *low = &t->closed[a], *high = &t->closed[b];
+        Pair *pair = find_pair(t, low->slot, high->slot);
+        for (int i = 0; i < TERMS; i++)
+            for (int j = 0; j < TERMS; j++) {
+                pair->gram[i][j] += low->gram[i][TERMS * b + j];
+                pair->gram[i][j] += high->gram[j][TERMS * a + i];
+                low->gram[i][TERMS * b + j] = high->gram[j][TERMS * a + i] = 0.0;
+            }
+    }
 }
 
-/* ---- local products to blocks, pairs and ring ---- */
-
-static void flush_open(Tables *t, int k)
+static void release(Tables *t, int p)
 {
     Engine *e = t->e;
+    hand_over(t, p);
+    t->closed[p].status = FREE;
+    for (int s = 0; s < e->n_state; s++) memset(&e->ringing[s][TERMS * p], 0, TERMS * sizeof(double));
+    while (e->n_recent > 0 && t->closed[e->n_recent - 1].status == FREE) e->n_recent--;
+}
+
+static int admit(Tables *t, int64_t slot)
+{
+    int p = 0;
+    while (p < t->e->n_recent && t->closed[p].status != FREE) p++;
+    if (p + 1 > t->e->n_recent) t->e->n_recent = p + 1;
+    t->closed[p].status = OPEN;
+    t->closed[p].slot = slot;
+    return p;
+}
+
+static void spread(const Engine *e, Closed *item, const State left, const Row *restrict right, int count)
+{
+    for (int i = 0; i < TERMS; i++) {
+        double *restrict target = item->gram[i];
+        const double a = left[0][i], b = left[1][i];
+        if (e->n_state == 2)
+            for (int j = 0; j < count; j++) target[j] += a * right[0][j] + b * right[1][j];
+        else
+            for (int j = 0; j < count; j++) target[j] += a * right[0][j];
+    }
+}
+
+static void add_tile(const Engine *e, Closed *item, int64_t p, const State left, const State right)
+{
+    for (int s = 0; s < e->n_state; s++)
+        for (int i = 0; i < TERMS; i++)
+            for (int j = 0; j < TERMS; j++) item->gram[i][TERMS * p + j] += left[s][i] * right[s][j];
+}
+
+/* ---- products of one block ---- */
+
+static void read_through(const Engine *e, int k, double sign, State out)
+{
+    const int ring = (int)e->ring, first = first_open(e, k);
+    for (int s = 0; s < e->n_state; s++)
+        for (int i = 0; i < TERMS; i++) out[s][i] = sign * e->gram[first + i][ring + s];
+}
+
+static void add_own(Tables *t, int k)
+{
+    Engine *e = t->e;
+    const int p = (int)e->open_recent[k], first = first_open(e, k);
+    Closed *item = &t->closed[p];
     Block *block = &t->blocks[e->open_slot[k]];
-    const int first = (int)(1 + e->n_shared + TERMS * k);
-    Terms product;
     for (int i = 0; i < TERMS; i++) {
         for (int j = 0; j < 1 + e->n_shared; j++) block->shared[i][j] += e->gram[first + i][j];
-        for (int j = 0; j < TERMS; j++) block->gram[i][j] += e->gram[first + i][first + j];
-    }
-    for (int other = k + 1; other < e->n_open; other++) {
-        const int second = (int)(1 + e->n_shared + TERMS * other);
-        for (int i = 0; i < TERMS; i++) memcpy(product[i], &e->gram[first + i][second], sizeof product[i]);
-        add_pair(t, e->open_slot[k], e->open_slot[other], product);
+        for (int j = 0; j < TERMS; j++) item->gram[i][TERMS * p + j] += local(e, first + i, first + j);
     }
 }
 
-static void flush_closed(Tables *t, const Closed *item)
+static void add_open_pair(Tables *t, int k, int other)
 {
     Engine *e = t->e;
-    Block *block = &t->blocks[item->slot];
-    const int ring = first_ring(e);
-    for (int s = 0; s < e->n_state; s++)
-        for (int i = 0; i < TERMS; i++)
-            for (int j = 0; j < 1 + e->n_shared; j++)
-                block->shared[i][j] += item->d[s][i] * e->gram[ring + s][j];
-    for (int k = 0; k < e->n_open; k++) {
-        const int first = (int)(1 + e->n_shared + TERMS * k);
-        Terms product = {{0.0}};
-        for (int s = 0; s < e->n_state; s++)
-            for (int i = 0; i < TERMS; i++)
-                for (int j = 0; j < TERMS; j++)
-                    product[i][j] += item->d[s][i] * e->gram[ring + s][first + j];
-        add_pair(t, item->slot, e->open_slot[k], product);
-    }
-}
-
-static void flush_local(Tables *t)
-{
-    Engine *e = t->e;
-    const int ring = first_ring(e), n = ring + (int)e->n_state;
-    for (int i = 0; i < 1 + e->n_shared; i++)
-        for (int j = 0; j < 1 + e->n_shared; j++) e->shared[i][j] += e->gram[i][j];
-    for (int i = 0; i < e->n_state; i++)
-        for (int j = 0; j < e->n_state; j++) e->ring_w[i][j] += e->gram[ring + i][ring + j];
-    for (int k = 0; k < e->n_open; k++) flush_open(t, k);
-    for (int c = 0; c < e->n_closed; c++) flush_closed(t, &t->closed[c]);
-    for (int i = 0; i < n; i++) memset(e->gram[i], 0, (size_t)n * sizeof(double));
-}
-
-/* ---- closed blocks, which ring together ---- */
-
-static void ring_product(const Engine *e, const Closed *a, const Closed *b,
-                         const double since[MAX_STATE][MAX_STATE], Terms out)
-{
-    double weighted[MAX_STATE][TERMS] = {{0.0}};
-    for (int s = 0; s < e->n_state; s++)
-        for (int r = 0; r < e->n_state; r++)
-            for (int j = 0; j < TERMS; j++)
-                weighted[s][j] += (e->ring_w[s][r] - since[s][r]) * b->d[r][j];
-    memset(out, 0, sizeof(Terms));
-    for (int s = 0; s < e->n_state; s++)
-        for (int i = 0; i < TERMS; i++)
-            for (int j = 0; j < TERMS; j++) out[i][j] += a->d[s][i] * weighted[s][j];
-}
-
-static void flush_ring(Tables *t, int at, int first)
-{
-    Engine *e = t->e;
-    const Closed *item = &t->closed[at];
-    Block *own = &t->blocks[item->slot];
-    Terms product;
-    ring_product(e, item, item, item->w_start, product);
+    const int a = k > other ? k : other, b = k + other - a;
+    Closed *item = &t->closed[e->open_recent[a]];
+    const int at = (int)(TERMS * e->open_recent[b]), first = first_open(e, a), second = first_open(e, b);
     for (int i = 0; i < TERMS; i++)
-        for (int j = 0; j < TERMS; j++) own->gram[i][j] += product[i][j];
-    for (int c = first; c < e->n_closed; c++) {
-        if (c == at) continue;
-        ring_product(e, item, &t->closed[c], t->closed[c > at ? c : at].w_start, product);
-        add_pair(t, item->slot, t->closed[c].slot, product);
+        for (int j = 0; j < TERMS; j++) item->gram[i][at + j] += e->gram[first + i][second + j];
+}
+
+static void weigh(const Engine *e, const Closed *item, State own, State left)
+{
+    memset(own, 0, sizeof(State));
+    for (int s = 0; s < e->n_state; s++) {
+        for (int r = 0; r < e->n_state; r++) {
+            const double w = ring_ring(e, s, r) - item->w_start[s][r];
+            for (int i = 0; i < TERMS; i++) own[s][i] += w * item->d[r][i];
+        }
+        for (int i = 0; i < TERMS; i++) left[s][i] = item->through[s][i] + own[s][i];
     }
 }
 
-static double largest(const Closed *item, int n_state)
+static void add_shared(Tables *t, const Closed *item)
 {
-    double size = 0.0;
-    for (int s = 0; s < n_state; s++)
-        for (int i = 0; i < TERMS; i++) size = fmax(size, fabs(item->d[s][i]));
-    return size;
-}
-
-static void advance_closed(const Engine *e, Closed *item)
-{
-    const int ring = first_ring(e);
-    double old[MAX_STATE][TERMS];
-    memcpy(old, item->d, sizeof old);
+    const Engine *e = t->e;
+    Block *block = &t->blocks[item->slot];
     for (int s = 0; s < e->n_state; s++)
-        for (int i = 0; i < TERMS; i++) {
-            item->d[s][i] = 0.0;
-            for (int r = 0; r < e->n_state; r++) item->d[s][i] += e->d[s][ring + r] * old[r][i];
+        for (int j = 0; j < 1 + e->n_shared; j++) {
+            const double value = e->gram[(int)e->ring + s][j] - item->shared_start[s][j];
+            for (int i = 0; i < TERMS; i++) block->shared[i][j] += item->d[s][i] * value;
         }
-    memset(item->w_start, 0, sizeof item->w_start);
 }
 
-static void rebase(Tables *t)
-{
-    Engine *e = t->e;
-    const int ring = first_ring(e);
-    int kept = 0;
-    for (int c = 0; c < e->n_closed; c++) flush_ring(t, c, c + 1);
-    for (int c = 0; c < e->n_closed; c++) {
-        advance_closed(e, &t->closed[c]);
-        if (largest(&t->closed[c], (int)e->n_state) > e->ring_floor * t->closed[c].size) {
-            if (kept != c) t->closed[kept] = t->closed[c];
-            kept++;
-        }
-    }
-    e->n_closed = kept;
-    e->ring_log = 0.0;
-    memset(e->ring_w, 0, sizeof e->ring_w);
-    for (int s = 0; s < e->n_state; s++)
-        for (int r = 0; r < e->n_state; r++) e->d[s][ring + r] = s == r;
-}
+/* ---- changes of block ---- */
 
-static void remove_closed(Tables *t, int at)
+static void clear_open(Engine *e, int k)
 {
-    memmove(&t->closed[at], &t->closed[at + 1], sizeof(Closed) * (size_t)(t->e->n_closed - 1 - at));
-    t->e->n_closed--;
+    const int first = first_open(e, k), n = (int)e->width;
+    for (int s = 0; s < e->n_state; s++) memset(&e->d[s][first], 0, TERMS * sizeof(double));
+    for (int i = 0; i < TERMS; i++) memset(e->gram[first + i], 0, (size_t)n * sizeof(double));
+    for (int i = 0; i < n; i++) memset(&e->gram[i][first], 0, TERMS * sizeof(double));
 }
 
 static void close_block(Tables *t, int k)
 {
     Engine *e = t->e;
-    const int ring = first_ring(e), first = (int)(1 + e->n_shared + TERMS * k);
-    Closed *item = &t->closed[e->n_closed];
-    memset(item, 0, sizeof *item);
-    item->slot = e->open_slot[k];
-    memcpy(item->w_start, e->ring_w, sizeof item->w_start);
+    const int ring = (int)e->ring, first = first_open(e, k), p = (int)e->open_recent[k];
+    Closed *item = &t->closed[p];
     const double *d0 = e->d[0], *d1 = e->d[1];
     const double det = e->n_state == 2 ? d0[ring] * d1[ring + 1] - d0[ring + 1] * d1[ring] : 1.0;
+    State left;
+    item->status = YOUNG;
+    item->size = 0.0;
     for (int i = 0; i < TERMS; i++) {
         const double x = d0[first + i], y = d1[first + i];
         if (e->n_state == 1) {
@@ -208,67 +205,217 @@ static void close_block(Tables *t, int k)
             item->size = fmax(item->size, fmax(fabs(x), fabs(y)));
         }
     }
-    if (item->size > 0.0) e->n_closed++;
+    for (int s = 0; s < e->n_state; s++) {
+        for (int r = 0; r < e->n_state; r++) item->w_start[s][r] = ring_ring(e, s, r);
+        memcpy(item->shared_start[s], e->gram[ring + s], (size_t)(1 + e->n_shared) * sizeof(double));
+    }
+    read_through(e, k, 1.0, item->through);
+    add_own(t, k);
+    for (int other = 0; other < e->n_open; other++) {
+        if (other == k) continue;
+        add_open_pair(t, k, other);
+        read_through(e, other, -1.0, left);
+        add_tile(e, item, e->open_recent[other], item->d, left);
+    }
+    clear_open(e, k);
+    e->young[e->n_young++] = p;
+    e->n_closed++;
 }
 
-/* ---- open blocks ---- */
-
-static void open_block(Tables *t, int edge, int64_t slot)
+static void settle_young(Tables *t, int a)
 {
     Engine *e = t->e;
-    const int ring = first_ring(e);
-    for (int s = 0; s < e->n_state; s++) {
-        for (int r = (int)e->n_state - 1; r >= 0; r--) e->d[s][ring + TERMS + r] = e->d[s][ring + r];
-        memset(&e->d[s][ring], 0, TERMS * sizeof(double));
-    }
-    e->open_edge[e->n_open] = edge;
-    e->open_slot[e->n_open] = slot;
-    e->place[edge] = e->n_open++;
-    for (int c = 0; c < e->n_closed; c++)
-        if (t->closed[c].slot == slot) {
-            flush_ring(t, c, 0);
-            for (int s = 0; s < e->n_state; s++)
-                for (int i = 0; i < TERMS; i++)
-                    for (int r = 0; r < e->n_state; r++)
-                        e->d[s][ring + i] += e->d[s][ring + TERMS + r] * t->closed[c].d[r][i];
-            remove_closed(t, c);
-            break;
-        }
+    const int p = (int)e->young[a];
+    Closed *item = &t->closed[p];
+    State own, left;
+    weigh(e, item, own, left);
+    add_tile(e, item, p, own, item->d);
+    spread(e, item, left, e->ringing, (int)(TERMS * e->n_recent));
+    for (int b = 0; b < a; b++) add_tile(e, item, e->young[b], left, t->closed[e->young[b]].d);
 }
 
-static void drop_open(Engine *e, int k)
+static void settle_one(Tables *t, int k, int p)
 {
-    const int ring = first_ring(e), first = (int)(1 + e->n_shared + TERMS * k), last = ring - TERMS;
-    const int n = (int)e->n_state;
-    for (int s = 0; s < n; s++) {
-        memmove(&e->d[s][first], &e->d[s][last], TERMS * sizeof(double));
-        for (int r = 0; r < n; r++) e->d[s][last + r] = e->d[s][ring + r];
-        for (int j = last + n; j < MAX_LOCAL && j < ring + n + LANES; j++) e->d[s][j] = 0.0;
+    Engine *e = t->e;
+    Closed *item = &t->closed[p];
+    State own, left;
+    int later = 0;
+    if (item->status == YOUNG) {
+        while (e->young[later] != p) later++;
+        settle_young(t, later);
+        e->n_young--;
+        for (int a = later; a < e->n_young; a++) e->young[a] = e->young[a + 1];
+    } else {
+        weigh(e, item, own, left);
+        spread(e, item, left, e->ringing, (int)(TERMS * e->n_recent));
     }
+    for (int a = later; a < e->n_young; a++) {
+        Closed *young = &t->closed[e->young[a]];
+        weigh(e, young, own, left);
+        add_tile(e, young, p, left, item->d);
+    }
+    for (int other = 0; other < e->n_open; other++) {
+        if (other == k) continue;
+        read_through(e, other, 1.0, left);
+        add_tile(e, item, e->open_recent[other], item->d, left);
+    }
+    add_shared(t, item);
+}
+
+static void resume(Tables *t, int k, int p)
+{
+    Engine *e = t->e;
+    Closed *item = &t->closed[p];
+    const int ring = (int)e->ring, first = first_open(e, k);
+    settle_one(t, k, p);
+    for (int s = 0; s < e->n_state; s++)
+        for (int i = 0; i < TERMS; i++) {
+            e->ringing[s][TERMS * p + i] = 0.0;
+            for (int r = 0; r < e->n_state; r++) e->d[s][first + i] += e->d[s][ring + r] * item->d[r][i];
+        }
+    item->status = OPEN;
+    e->open_recent[k] = p;
+    e->n_closed--;
+}
+
+static void open_block(Tables *t, int k, int edge, int64_t slot)
+{
+    Engine *e = t->e;
+    if (k == e->n_open) {
+        set_open(e, k + 1);
+        clear_open(e, k);
+    }
+    e->open_edge[k] = edge;
+    e->open_slot[k] = slot;
+    e->place[edge] = k;
+    for (int p = 0; p < e->n_recent; p++)
+        if (t->closed[p].slot == slot && t->closed[p].status >= YOUNG) {
+            resume(t, k, p);
+            return;
+        }
+    e->open_recent[k] = admit(t, slot);
+}
+
+static void remove_open(Engine *e, int k)
+{
+    const int last = (int)e->n_open - 1, to = first_open(e, k), source = first_open(e, last);
     e->place[e->open_edge[k]] = -1;
-    e->n_open--;
-    if (k < e->n_open) {
-        e->open_edge[k] = e->open_edge[e->n_open];
-        e->open_slot[k] = e->open_slot[e->n_open];
+    if (k < last) {
+        for (int s = 0; s < e->n_state; s++)
+            memmove(&e->d[s][to], &e->d[s][source], TERMS * sizeof(double));
+        for (int i = 0; i < TERMS; i++) {
+            memmove(e->gram[to + i], e->gram[source + i], (size_t)to * sizeof(double));
+            for (int j = to + TERMS; j < source; j++) e->gram[j][to + i] = e->gram[source + i][j];
+            memmove(&e->gram[to + i][to], &e->gram[source + i][source], TERMS * sizeof(double));
+        }
+        e->open_edge[k] = e->open_edge[last];
+        e->open_slot[k] = e->open_slot[last];
+        e->open_recent[k] = e->open_recent[last];
         e->place[e->open_edge[k]] = k;
     }
+    clear_open(e, last);
+    set_open(e, last);
 }
 
-static void forget_ring(Tables *t)
+/* ---- the ring begins anew ---- */
+
+static double advance_one(Engine *e, Closed *item, int p)
+{
+    const int ring = (int)e->ring;
+    double largest = 0.0;
+    for (int s = 0; s < e->n_state; s++)
+        for (int i = 0; i < TERMS; i++) {
+            double value = 0.0;
+            for (int r = 0; r < e->n_state; r++) value += e->d[s][ring + r] * item->d[r][i];
+            e->ringing[s][TERMS * p + i] = value;
+            largest = fmax(largest, fabs(value));
+        }
+    for (int s = 0; s < e->n_state; s++) memcpy(item->d[s], &e->ringing[s][TERMS * p], sizeof item->d[s]);
+    memset(item->through, 0, sizeof item->through);
+    memset(item->w_start, 0, sizeof item->w_start);
+    memset(item->shared_start, 0, sizeof item->shared_start);
+    return largest;
+}
+
+static void settle_ringing(Tables *t)
 {
     Engine *e = t->e;
-    flush_local(t);
+    const int n = (int)(TERMS * e->n_recent);
+    memset(e->weighted, 0, sizeof e->weighted);
+    for (int s = 0; s < e->n_state; s++)
+        for (int r = 0; r < e->n_state; r++)
+            for (int j = 0; j < n; j++) e->weighted[s][j] += ring_ring(e, s, r) * e->ringing[r][j];
+    for (int p = 0; p < e->n_recent; p++) {
+        Closed *item = &t->closed[p];
+        if (item->status != RINGING) continue;
+        spread(e, item, item->d, e->weighted, TERMS * (p + 1));
+        add_shared(t, item);
+    }
+}
+
+static void settle_open(Tables *t, int k)
+{
+    Engine *e = t->e;
+    Closed *item = &t->closed[e->open_recent[k]];
+    State left;
+    add_own(t, k);
+    for (int other = 0; other < k; other++) add_open_pair(t, k, other);
+    read_through(e, k, 1.0, left);
+    spread(e, item, left, e->ringing, (int)(TERMS * e->n_recent));
+    for (int a = 0; a < e->n_young; a++) add_tile(e, item, e->young[a], left, t->closed[e->young[a]].d);
+}
+
+static void rebase(Tables *t)
+{
+    Engine *e = t->e;
+    const int ring = (int)e->ring, n = (int)e->width;
+    for (int k = 0; k < e->n_open; k++) settle_open(t, k);
+    for (int i = 0; i < 1 + e->n_shared; i++)
+        for (int j = 0; j < 1 + e->n_shared; j++) e->shared[i][j] += local(e, i, j);
+    settle_ringing(t);
+    for (int a = 0; a < e->n_young; a++) {
+        settle_young(t, a);
+        add_shared(t, &t->closed[e->young[a]]);
+    }
+    e->n_young = 0;
+    for (int p = (int)e->n_recent - 1; p >= 0; p--) {
+        Closed *item = &t->closed[p];
+        if (item->status < YOUNG) continue;
+        item->status = RINGING;
+        if (!(advance_one(e, item, p) > e->ring_floor * item->size)) {
+            e->n_closed--;
+            release(t, p);
+        }
+    }
+    for (int i = 0; i < n; i++) memset(e->gram[i], 0, (size_t)n * sizeof(double));
+    for (int s = 0; s < e->n_state; s++)
+        for (int r = 0; r < e->n_state; r++) e->d[s][ring + r] = s == r;
+    e->ring_det = 1.0;
+}
+
+static void forget(Tables *t)
+{
+    Engine *e = t->e;
+    const int ring = (int)e->ring, opened = first_open(e, 0);
     rebase(t);
+    for (int p = (int)e->n_recent - 1; p >= 0; p--)
+        if (t->closed[p].status == RINGING) release(t, p);
     e->n_closed = 0;
-    for (int s = 0; s < e->n_state; s++) memset(e->d[s], 0, (size_t)first_ring(e) * sizeof(double));
+    for (int s = 0; s < e->n_state; s++) {
+        memset(e->d[s], 0, (size_t)ring * sizeof(double));
+        memset(&e->d[s][opened], 0, (size_t)((int)e->width - opened) * sizeof(double));
+    }
 }
 
 static void stop(Tables *t)
 {
     Engine *e = t->e;
     if (e->running) {
-        forget_ring(t);
-        while (e->n_open > 0) drop_open(e, (int)e->n_open - 1);
+        forget(t);
+        while (e->n_open > 0) {
+            release(t, (int)e->open_recent[e->n_open - 1]);
+            remove_open(e, (int)e->n_open - 1);
+        }
     }
     for (int i = 0; i < e->n_edges; i++) e->cell[i][0] = SHUT;
     e->running = 0;
@@ -340,18 +487,9 @@ static double position_noise(const Engine *e, int a, int b)
 
 static void start_whitener(Engine *e)
 {
+    memset(e->echo, 0, sizeof e->echo);
     for (int a = 0; a < e->n_chambers; a++)
         for (int b = 0; b < e->n_chambers; b++) e->cov[a][b] = position_noise(e, a, b);
-}
-
-static void prepare_change(Tables *t)
-{
-    if (t->e->n_closed + MAX_OPEN > t->max_closed) {
-        t->e->counters[RESTART_MEMORY]++;
-        forget_ring(t);
-        start_whitener(t->e);
-    } else
-        flush_local(t);
 }
 
 static int64_t slot_of(Tables *t, int edge)
@@ -367,23 +505,41 @@ static int64_t slot_of(Tables *t, int edge)
     return t->cells[at].slot;
 }
 
+static void change(Tables *t, const Point *p, int i)
+{
+    Engine *e = t->e;
+    const int was_open = e->place[i] >= 0;
+    int k = (int)e->place[i];
+    e->counters[BLOCK_CHANGES]++;
+    e->cell[i][0] = p->u, e->cell[i][1] = p->dp;
+    if (was_open) close_block(t, k);
+    if (p->u != SHUT) {
+        if (!was_open) k = (int)e->n_open;
+        open_block(t, k, i, slot_of(t, i));
+    } else if (was_open)
+        remove_open(e, k);
+}
+
+static int moved(const Engine *e, const Point *p, int i)
+{
+    return p->u != e->cell[i][0] || (p->u != SHUT && p->dp != e->cell[i][1]);
+}
+
+/* edges that shut come first, or a reversal could exceed the places for open blocks */
 static void change_blocks(Tables *t, const Point *points)
 {
     Engine *e = t->e;
-    int flushed = 0;
-    for (int i = 0; i < e->n_edges; i++) {
-        const Point *p = &points[i];
-        if (p->u == e->cell[i][0] && (p->u == SHUT || p->dp == e->cell[i][1])) continue;
-        if (!flushed++) prepare_change(t);
-        e->counters[BLOCK_CHANGES]++;
-        if (e->place[i] >= 0) {
-            const int k = (int)e->place[i];
-            close_block(t, k);
-            drop_open(e, k);
-        }
-        e->cell[i][0] = p->u, e->cell[i][1] = p->dp;
-        if (p->u != SHUT) open_block(t, i, slot_of(t, i));
+    int any = 0;
+    for (int i = 0; i < e->n_edges; i++) any |= moved(e, &points[i], i);
+    if (!any) return;
+    if (e->n_open + e->n_closed + MAX_OPEN > t->max_closed) {
+        e->counters[RESTART_MEMORY]++;
+        forget(t);
+        start_whitener(e);
     }
+    for (int opening = 0; opening < 2; opening++)
+        for (int i = 0; i < e->n_edges; i++)
+            if ((points[i].u != SHUT) == opening && moved(e, &points[i], i)) change(t, &points[i], i);
 }
 
 static void shared_increments(Engine *e, const double *now)
@@ -399,7 +555,7 @@ static void shared_increments(Engine *e, const double *now)
 static void block_increments(Tables *t, int k, double time_s, double dt, const Point *points, int row)
 {
     Engine *e = t->e;
-    const int i = (int)e->open_edge[k], first = (int)(1 + e->n_shared + TERMS * k);
+    const int i = (int)e->open_edge[k], first = first_open(e, k);
     const Point *w = &points[i];
     Block *block = &t->blocks[e->open_slot[k]];
     const double *u = &e->u_border[i][e->cell[i][0]], *p = &e->dp_border[i][e->cell[i][1]];
@@ -425,52 +581,74 @@ static void block_increments(Tables *t, int k, double time_s, double dt, const P
 
 /* ---- rows: Kalman whitener and products ---- */
 
+static double column_variance(const Engine *e, int c)
+{
+    const double w = (e->v0_m3[c] + e->area_m2[c] * e->values[e->x_column]) * e->compliance[c];
+    return w * w * e->p_var_pa2[c];
+}
+
 static void row_one(Engine *e)
 {
-    const int n = local_width(e);
-    const double r = position_noise(e, 0, 0), s = e->cov[0][0] + r;
-    const double scale = 1.0 / sqrt(s), keep = r / s;
+    const int n = (int)e->width;
+    const double s = e->cov[0][0] + position_noise(e, 0, 0);
+    const double scale = 1.0 / sqrt(s), keep = position_noise(e, 0, 0) / s, v = column_variance(e, 0);
     double *restrict d = e->d[0], row[MAX_LOCAL];
     for (int j = 0; j < n; j++) {
         row[j] = scale * d[j];
         d[j] *= keep;
     }
-    const double v = (e->v0_m3[0] + e->area_m2[0] * e->values[e->x_column]) * e->compliance[0];
-    e->noise_gram[0] += v * v * e->p_var_pa2[0] / s;
+    e->noise_gram[0] += (v + e->echo[0][0]) / s;
+    e->echo[0][0] = keep * keep * e->echo[0][0] + (1.0 - keep) * (1.0 - keep) * v;
     e->cov[0][0] *= keep;
-    e->ring_log += log(keep);
-    for (int i = 0; i < n; i++)
-        for (int j = 0; j < n; j++) e->gram[i][j] += row[i] * row[j];
+    e->ring_det *= keep;
+    for (int i = 0; i < n; i += LANES)
+        for (int j = 0; j <= i; j += LANES)
+            for (int q = i; q < i + LANES; q++)
+                for (int l = j; l < j + LANES; l++) e->gram[q][l] += row[q] * row[l];
+}
+
+/* what the noise in column -V dP of chamber c adds on average, k = R S^-1 */
+static void column_noise(Engine *e, int c, const double k[2][2], const double s[3], double det)
+{
+    double *m = e->echo[c];
+    const double v = column_variance(e, c), a = (c == 0) - k[0][c], b = (c == 1) - k[1][c];
+    const double m0 = m[0], m1 = m[1], m2 = m[2];
+    const double x0 = m0 + (c == 0 ? v : 0.0), x2 = m2 + (c == 1 ? v : 0.0);
+    e->noise_gram[c] += det * (s[2] * x0 - 2.0 * s[1] * m1 + s[0] * x2);
+    m[0] = k[0][0] * k[0][0] * m0 + 2.0 * k[0][0] * k[0][1] * m1 + k[0][1] * k[0][1] * m2 + a * a * v;
+    m[1] = k[0][0] * k[1][0] * m0 + (k[0][0] * k[1][1] + k[0][1] * k[1][0]) * m1 + k[0][1] * k[1][1] * m2
+           + a * b * v;
+    m[2] = k[1][0] * k[1][0] * m0 + 2.0 * k[1][0] * k[1][1] * m1 + k[1][1] * k[1][1] * m2 + b * b * v;
 }
 
 static void row_two(Engine *e)
 {
-    const int n = local_width(e);
+    const int n = (int)e->width;
     const double r00 = position_noise(e, 0, 0), r01 = position_noise(e, 0, 1), r11 = position_noise(e, 1, 1);
     const double p00 = e->cov[0][0], p01 = e->cov[0][1], p11 = e->cov[1][1];
-    const double s00 = p00 + r00, s01 = p01 + r01, s11 = p11 + r11;
-    const double i0 = 1.0 / sqrt(s00), c = s01 * i0, i1 = 1.0 / sqrt(s11 - c * c), ci0 = c * i0;
-    const double det = 1.0 / (s00 * s11 - s01 * s01);
-    const double k00 = (r00 * s11 - r01 * s01) * det, k01 = (r01 * s00 - r00 * s01) * det;
-    const double k10 = (r01 * s11 - r11 * s01) * det, k11 = (r11 * s00 - r01 * s01) * det;
+    const double s[3] = {p00 + r00, p01 + r01, p11 + r11};
+    const double i0 = 1.0 / sqrt(s[0]), c = s[1] * i0, i1 = 1.0 / sqrt(s[2] - c * c), ci0 = c * i0;
+    const double det = 1.0 / (s[0] * s[2] - s[1] * s[1]);
+    const double k[2][2] = {{(r00 * s[2] - r01 * s[1]) * det, (r01 * s[0] - r00 * s[1]) * det},
+                            {(r01 * s[2] - r11 * s[1]) * det, (r11 * s[0] - r01 * s[1]) * det}};
     double *restrict d0 = e->d[0], *restrict d1 = e->d[1], row0[MAX_LOCAL], row1[MAX_LOCAL];
     for (int j = 0; j < n; j++) {
         const double x = d0[j], y = d1[j];
         row0[j] = i0 * x;
         row1[j] = i1 * (y - ci0 * x);
-        d0[j] = k00 * x + k01 * y;
-        d1[j] = k10 * x + k11 * y;
+        d0[j] = k[0][0] * x + k[0][1] * y;
+        d1[j] = k[1][0] * x + k[1][1] * y;
     }
-    const double v0 = (e->v0_m3[0] + e->area_m2[0] * e->values[e->x_column]) * e->compliance[0];
-    const double v1 = (e->v0_m3[1] + e->area_m2[1] * e->values[e->x_column]) * e->compliance[1];
-    e->noise_gram[0] += v0 * v0 * e->p_var_pa2[0] * s11 * det;
-    e->noise_gram[1] += v1 * v1 * e->p_var_pa2[1] * s00 * det;
-    e->cov[0][0] = k00 * p00 + k01 * p01;
-    e->cov[1][1] = k10 * p01 + k11 * p11;
-    e->cov[0][1] = e->cov[1][0] = 0.5 * (k00 * p01 + k01 * p11 + k10 * p00 + k11 * p01);
-    e->ring_log += log(k00 * k11 - k01 * k10);
-    for (int i = 0; i < n; i++)
-        for (int j = 0; j < n; j++) e->gram[i][j] += row0[i] * row0[j] + row1[i] * row1[j];
+    for (int chamber = 0; chamber < 2; chamber++) column_noise(e, chamber, k, s, det);
+    e->cov[0][0] = k[0][0] * p00 + k[0][1] * p01;
+    e->cov[1][1] = k[1][0] * p01 + k[1][1] * p11;
+    e->cov[0][1] = e->cov[1][0] =
+        0.5 * (k[0][0] * p01 + k[0][1] * p11 + k[1][0] * p00 + k[1][1] * p01);
+    e->ring_det *= k[0][0] * k[1][1] - k[0][1] * k[1][0];
+    for (int i = 0; i < n; i += LANES)
+        for (int j = 0; j <= i; j += LANES)
+            for (int q = i; q < i + LANES; q++)
+                for (int l = j; l < j + LANES; l++) e->gram[q][l] += row0[q] * row0[l] + row1[q] * row1[l];
 }
 
 static void interval(Tables *t, double time_s, const double *now, double dt, int row)
@@ -494,11 +672,8 @@ static void interval(Tables *t, double time_s, const double *now, double dt, int
     if (row) {
         e->counters[ROWS]++;
         if (e->n_chambers == 2) row_two(e); else row_one(e);
-        if (e->ring_log < RING_LOG_LIMIT) {
-            flush_local(t);
-            rebase(t);
-        }
     }
+    if (e->ring_det < RING_DET_LIMIT) rebase(t);
 }
 
 /* ---- samples ---- */
@@ -531,7 +706,7 @@ static void take(Tables *t, const double *sample)
 {
     Engine *e = t->e;
     const int flags = (int)sample[1];
-    const double dt = sample[0] - e->t_s, *now = sample + 2;
+    const double dt = floor((sample[0] - e->t_s) * 1e6 + 0.5) * 1e-6, *now = sample + 2;
     e->counters[SAMPLES]++;
     if (!acceptable(e, sample)) {
         stop(t);
@@ -553,9 +728,9 @@ int64_t advance(Engine *e, Cell *cells, Closed *closed, int64_t max_closed, Bloc
 {
     Tables t = {e, cells, closed, blocks, pairs, max_closed, max_blocks, max_pairs};
     for (int64_t k = 0; k < n; k++) {
-        const int64_t ringing = e->n_closed + MAX_OPEN;
+        const int64_t recent = e->n_open + e->n_closed + MAX_OPEN;
         if (e->n_slots + MAX_EDGES > max_blocks ||
-            10 * (e->n_pairs + ringing * ringing / 2) > 6 * max_pairs)
+            10 * (e->n_pairs + recent * recent / 2) > 6 * max_pairs)
             return k;
         take(&t, chunk + k * (2 + e->n_signals));
     }

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from rtid.kernels.basis import relocate
 from rtid.kernels.holds import lagged_moments, second_order
+from rtid.kernels.increments import block_increments, shared_increments, term_increments
 from rtid.kernels.information import (
     RING_DET_LIMIT,
     close_block,
-    forget,
     open_block,
     rebase,
 )
@@ -42,9 +42,8 @@ from rtid.kernels.layout import (
     RESTART_GAP,
     RESTART_MEMORY,
     SAMPLES,
-    TERMS,
 )
-from rtid.kernels.local import first_open, first_ring, remove_open
+from rtid.kernels.local import remove_open, set_open
 from rtid.kernels.recent import hand_over, release
 from rtid.kernels.rows import (
     carry_row,
@@ -76,7 +75,9 @@ def advance(
     for k in range(len(chunk)):
         if needs_room(e, block, pair):
             return k
-        _take(e, cell, ringing, block, pair, chunk[k])
+        for j in range(2 + e.n_signals):  # a view of the row would be counted, atomically
+            e.sample[j] = chunk[k, j]
+        _take(e, cell, ringing, block, pair)
     return len(chunk)
 
 
@@ -89,22 +90,24 @@ def needs_room(e: Any, blocks: Any, pairs: Any) -> bool:
 
 
 @inlined
-def _take(e: Any, cells: Any, closed: Any, blocks: Any, pairs: Any, sample: FloatArray) -> None:
+def _take(e: Any, cells: Any, closed: Any, blocks: Any, pairs: Any) -> None:
     """One sample: gate it, then integrate the interval that it closes."""
     e.counters[SAMPLES] += 1
-    flags = int(sample[1])
-    if not acceptable(e, sample):
-        _stop(e, closed, blocks, pairs)
-        return
-    dt = step_s(e, sample[0])
-    if e.running and ((flags & GAP_FLAG) != 0 or dt > e.max_gap_s or dt <= 0.0):
+    sample, flags = e.sample, int(e.sample[1])
+    whole, dt = acceptable(e, sample), step_s(e, sample[0])
+    joined = whole and e.running
+    if joined and ((flags & GAP_FLAG) != 0 or dt > e.max_gap_s or dt <= 0.0):
         e.counters[RESTART_GAP] += 1
+        joined = False
+    inside = joined and _place(e, cells, closed, blocks, pairs, sample, dt)
+    if inside:
+        _integrate(e, cells, closed, blocks, pairs, sample, dt, (flags & ROW_FLAG) != 0)
+    elif e.running:
         _stop(e, closed, blocks, pairs)
-    if e.running:
-        _interval(e, cells, closed, blocks, pairs, sample, dt, (flags & ROW_FLAG) != 0)
-    elif (flags & ROW_FLAG) != 0:
-        _start(e, sample)
-    remember(e, sample)
+    if whole:
+        remember(e, sample)
+        if not joined and (flags & ROW_FLAG) != 0:
+            _start(e, sample)
 
 
 @inlined
@@ -113,7 +116,7 @@ def step_s(e: Any, t_s: float) -> float:
     return math.floor((t_s - e.t_s) * 1e6 + 0.5) * 1e-6
 
 
-@inlined
+@part
 def acceptable(e: Any, sample: FloatArray) -> bool:
     """Finite first (NaN passes no comparison), then the declared range of each signal."""
     for j in range(2 + e.n_signals):
@@ -146,21 +149,48 @@ def _start(e: Any, sample: FloatArray) -> None:
     start_whitener(e)
 
 
-@part
+@inlined
 def _stop(e: Any, closed: Any, blocks: Any, pairs: Any) -> None:
     """End all memory at a break of continuity; learned sums stay."""
-    if e.running:
-        forget(e, closed, blocks, pairs)
-        while e.n_open > 0:
-            release(e, closed, blocks, pairs, e.open_recent[e.n_open - 1])
-            remove_open(e, e.n_open - 1)
+    rebase(e, closed, blocks, pairs, np.inf)
+    while e.n_open > 0:
+        release(e, closed, blocks, pairs, e.open_recent[e.n_open - 1])
+        remove_open(e, e.n_open - 1)
     for i in range(e.n_edges):
         e.cell[i, 0] = SHUT
     e.running = 0
 
 
 @inlined
-def _interval(
+def _place(
+    e: Any, cells: Any, closed: Any, blocks: Any, pairs: Any, sample: FloatArray, dt: float
+) -> bool:
+    """Find the block of every edge over the interval; False where one is off its grid."""
+    if dt != e.dt_s:
+        set_step(e, dt)
+    inside, moved = working_points(e, sample, dt)
+    if not inside:
+        e.counters[OUTSIDE_GRID] += 1
+    elif moved:
+        if e.n_open + e.n_closed + MAX_OPEN > len(closed):
+            _begin_new_memory(e, closed, blocks, pairs)
+        _change_blocks(e, cells, closed, blocks)
+    return inside
+
+
+@inlined
+def _begin_new_memory(e: Any, closed: Any, blocks: Any, pairs: Any) -> None:
+    """Too many blocks ring at once: forget them all.
+
+    Costs one unknown start position per chamber, and bounds the work.
+    """
+    e.counters[RESTART_MEMORY] += 1
+    rebase(e, closed, blocks, pairs, np.inf)
+    start_whitener(e)
+
+
+@inlined
+def _integrate(
     e: Any,
     cells: Any,
     closed: Any,
@@ -171,18 +201,11 @@ def _interval(
     row: bool,
 ) -> None:
     """Integrate the columns over [t, t + dt]; make a row where the position was measured."""
-    if dt != e.dt_s:
-        set_step(e, dt)
-    if not working_points(e, sample, dt):
-        e.counters[OUTSIDE_GRID] += 1
-        _stop(e, closed, blocks, pairs)
-        return
-    _change_blocks(e, cells, closed, blocks, pairs)
-    _shared_increments(e, sample, dt)
+    shared_increments(e, sample, dt)
     if e.n_terms > 0:
-        _term_increments(e, sample, dt)
+        term_increments(e, sample, dt)
     for k in range(e.n_open):
-        _block_increments(e, cells, blocks, k, sample[0], dt, row)
+        block_increments(e, cells, blocks, k, sample[0], dt, row)
     if e.form == CARRY:
         carry_step(e)
         remember(e, sample)
@@ -195,7 +218,7 @@ def _interval(
         remember(e, sample)
         _integral_step(e, row)
     if e.ring_det < RING_DET_LIMIT:
-        rebase(e, closed, blocks, pairs)
+        rebase(e, closed, blocks, pairs, e.ring_floor)
 
 
 @inlined
@@ -207,34 +230,33 @@ def set_step(e: Any, dt: float) -> None:
         second_order(e.wn_rad_s, e.zeta, dt, e.filter_a, e.filter_b)
 
 
-@inlined
-def working_points(e: Any, sample: FloatArray, dt: float) -> bool:
+@part
+def working_points(e: Any, sample: FloatArray, dt: float) -> tuple[bool, bool]:
     """Per edge: moments of the lagged command, dp at both ends, and the block of its mean point.
 
-    False when an edge that is open lies outside its grid: its flow is unknown.
+    Returns (every edge that is open lies inside its grid, some edge changes its block).
     """
-    inside, moments, dp, target = True, e.moments, e.dp_pa, e.target
+    inside, moved, moments, dp, target = True, False, e.moments, e.dp_pa, e.target
     for i in range(e.n_edges):
         held = e.direction[i] * e.values[e.command[i]]
         end, m1, m2, mt = lagged_moments(held, e.w_v[i], e.lag_s, e.lag_decay, dt)
         e.w_v[i] = end
-        target[i, 0] = SHUT
-        if m1 <= e.safe_v[i]:
-            continue
-        dp[i, 0] = e.values[e.source[i]] - e.values[e.sink[i]]
-        dp[i, 1] = sample[2 + e.source[i]] - sample[2 + e.sink[i]]
-        moments[i, 0], moments[i, 1], moments[i, 2] = m1, m2, mt
-        mid = 0.5 * (dp[i, 0] + dp[i, 1])
-        target[i, 0] = relocate(e.u_border[i], e.n_u[i], m1, e.cell[i, 0], e.hysteresis)
-        before = e.cell[i, 1] if e.cell[i, 0] != SHUT else SHUT
-        target[i, 1] = relocate(e.dp_border[i], e.n_dp[i], mid, before, e.hysteresis)
-        if target[i, 0] < 0 or target[i, 1] < 0:
-            inside = False
-    return inside
+        u, p = SHUT, e.cell[i, 1]
+        if m1 > e.safe_v[i]:
+            dp[i, 0] = e.values[e.source[i]] - e.values[e.sink[i]]
+            dp[i, 1] = sample[2 + e.source[i]] - sample[2 + e.sink[i]]
+            moments[i, 0], moments[i, 1], moments[i, 2] = m1, m2, mt
+            mid, before = 0.5 * (dp[i, 0] + dp[i, 1]), p if e.cell[i, 0] != SHUT else SHUT
+            u = relocate(e.u_border[i], e.n_u[i], m1, e.cell[i, 0], e.hysteresis)
+            p = relocate(e.dp_border[i], e.n_dp[i], mid, before, e.hysteresis)
+            inside = inside and u >= 0 and p >= 0
+        moved = moved or u != e.cell[i, 0] or p != e.cell[i, 1]
+        target[i, 0], target[i, 1] = u, p
+    return inside, moved
 
 
 @part
-def _change_blocks(e: Any, cells: Any, closed: Any, blocks: Any, pairs: Any) -> None:
+def _change_blocks(e: Any, cells: Any, closed: Any, blocks: Any) -> None:
     """Close the blocks that the working points left, open those that they entered.
 
     Edges that shut come first, or a reversal of the command could exceed the places for open ones.
@@ -242,7 +264,7 @@ def _change_blocks(e: Any, cells: Any, closed: Any, blocks: Any, pairs: Any) -> 
     for opening in range(2):
         for i in range(e.n_edges):
             if (e.target[i, 0] != SHUT) == (opening == 1) and _moved(e, i):
-                _change(e, cells, closed, blocks, pairs, i)
+                _change(e, cells, closed, blocks, i)
 
 
 @inlined
@@ -254,12 +276,10 @@ def _moved(e: Any, i: int) -> bool:
 
 
 @inlined
-def _change(e: Any, cells: Any, closed: Any, blocks: Any, pairs: Any, i: int) -> None:
+def _change(e: Any, cells: Any, closed: Any, blocks: Any, i: int) -> None:
     e.counters[BLOCK_CHANGES] += 1
     e.cell[i, 0], e.cell[i, 1] = e.target[i, 0], e.target[i, 1]
     k, was_open = e.place[i], e.place[i] >= 0
-    if e.target[i, 0] != SHUT and e.n_open + e.n_closed >= len(closed):
-        _begin_new_memory(e, closed, blocks, pairs)
     if was_open:
         close_block(e, closed, blocks, k)
     if e.target[i, 0] != SHUT:
@@ -267,17 +287,6 @@ def _change(e: Any, cells: Any, closed: Any, blocks: Any, pairs: Any, i: int) ->
         open_block(e, closed, blocks, k, i, _slot(e, cells, blocks, i))
     elif was_open:
         remove_open(e, k)
-
-
-@part
-def _begin_new_memory(e: Any, closed: Any, blocks: Any, pairs: Any) -> None:
-    """Too many blocks ring at once: forget them all.
-
-    Costs one unknown start position per chamber, and bounds the work.
-    """
-    e.counters[RESTART_MEMORY] += 1
-    forget(e, closed, blocks, pairs)
-    start_whitener(e)
 
 
 @inlined
@@ -290,118 +299,6 @@ def _slot(e: Any, cells: Any, blocks: Any, edge: int) -> int:
         blocks[e.n_slots].edge = edge
         e.n_slots += 1
     return int(cells[at].slot)
-
-
-@inlined
-def _shared_increments(e: Any, sample: FloatArray, dt: float) -> None:
-    """y: s A dx; theta_beta: -V dP (scaled by the nominal compliance), exact for linear x and P.
-
-    Carry form: the rates at both ends of the interval instead of the integrals.
-    """
-    x0, x1 = e.values[e.x_column], sample[2 + e.x_column]
-    for c in range(e.n_chambers):
-        dx = e.area_m2[c] * (x1 - x0)
-        dp = -e.compliance[c] * (sample[2 + e.p_column[c]] - e.values[e.p_column[c]])
-        v0, v1 = e.v0_m3[c] + e.area_m2[c] * x0, e.v0_m3[c] + e.area_m2[c] * x1
-        if e.form == CARRY:
-            e.inc[c, 0], e.end[c, 0] = dx / dt, dx / dt
-            e.inc[c, 1 + c], e.end[c, 1 + c] = dp * v0 / dt, dp * v1 / dt
-        else:
-            e.d[c, 0] += dx
-            e.d[c, 1 + c] += 0.5 * (v0 + v1) * dp
-
-
-@inlined
-def term_flow(e: Any, k: int, values: FloatArray, first: int) -> float:
-    """Flow of shared term k for theta = 1; the signals stand in values from `first` on."""
-    flow = e.term_constant[k]
-    for j in range(e.n_signals):
-        flow += e.term_weight[k, j] * values[first + j]
-    return float(flow)
-
-
-@part
-def _term_increments(e: Any, sample: FloatArray, dt: float) -> None:
-    """Integrals (carry form: end values) of the shared terms, linear between samples."""
-    for k in range(e.n_terms):
-        start, end = term_flow(e, k, e.values, 0), term_flow(e, k, sample, 2)
-        j = 1 + e.n_chambers + k
-        for c in range(e.n_chambers):
-            sign = e.term_sign[k, c]
-            if e.form == CARRY:
-                e.inc[c, j], e.end[c, j] = sign * start, sign * end
-            else:
-                e.d[c, j] += 0.5 * dt * sign * (start + end)
-
-
-@inlined
-def mean_terms(e: Any, i: int) -> tuple[float, float]:
-    """Means over the interval of the six terms of edge i's current block, into e.phi.
-
-    Exact for the lagged command and linear dp.  Returns the local dp at both ends.
-    """
-    u, p, phi = e.u_border[i], e.dp_border[i], e.phi
-    iu, ip = e.cell[i, 0], e.cell[i, 1]
-    hu, hp = 2.0 / (u[iu + 1] - u[iu]), 2.0 / (p[ip + 1] - p[ip])
-    uc, pc = 0.5 * (u[iu + 1] + u[iu]), 0.5 * (p[ip + 1] + p[ip])
-    m1, m2, mt = e.moments[i, 0], e.moments[i, 1], e.moments[i, 2]
-    eta0, eta1 = (e.dp_pa[i, 0] - pc) * hp, (e.dp_pa[i, 1] - pc) * hp
-    phi[0] = 1.0
-    phi[1] = (m1 - uc) * hu
-    phi[2] = 0.5 * (eta0 + eta1)
-    phi[3] = (m2 - 2.0 * uc * m1 + uc * uc) * hu * hu
-    phi[4] = (eta0 * eta0 + eta0 * eta1 + eta1 * eta1) / 3.0
-    phi[5] = phi[1] * phi[2] + mt * hu * (eta1 - eta0)
-    return eta0, eta1
-
-
-@inlined
-def _block_increments(
-    e: Any, cells: Any, blocks: Any, k: int, t: float, dt: float, row: bool
-) -> None:
-    """Integrals (carry form: end values) of the six terms of open block k over the interval."""
-    i = e.open_edge[k]
-    block = blocks[e.open_slot[k]]
-    eta0, eta1 = mean_terms(e, i)
-    phi, first = e.phi, first_open(e, k)
-    block.dwell_s += dt
-    block.last_s = t
-    if row:
-        block.rows += 1
-    for j in range(TERMS):
-        block.phi_sum[j] += phi[j] * dt
-    if e.form == CARRY:
-        _carry_ends(e, i, first, eta0, eta1)
-    else:
-        for c in range(e.n_chambers):
-            scale = e.sign[i, c] * e.scale_m3s[i] * dt
-            for j in range(TERMS):
-                e.d[c, first + j] += scale * phi[j]
-    flow_noise(e, i, cells[block.cell].slope, dt)
-
-
-@inlined
-def _carry_ends(e: Any, i: int, first: int, eta0: float, eta1: float) -> None:
-    """Start and end values: the regressor runs from phi(u_k, dp_k) to phi(u_k, dp_k+1)."""
-    for c in range(e.n_chambers):
-        scale = e.sign[i, c] * e.scale_m3s[i]
-        for j in range(TERMS):
-            e.inc[c, first + j] = scale * e.phi[j]
-            e.end[c, first + j] = scale * e.phi[j]
-        half = 0.5 * scale * (eta1 - eta0)
-        for j, change in ((2, half), (4, half * (eta0 + eta1)), (5, half * e.phi[1])):
-            e.inc[c, first + j] -= change
-            e.end[c, first + j] += change
-
-
-@inlined
-def flow_noise(e: Any, i: int, slope: float, dt: float) -> None:
-    """Random walk of the integral: pressure noise through dQ/ddp, (m3)^2 per step."""
-    period = e.p_period_s if e.p_period_s > 0.0 else dt
-    q = slope * slope * e.dp_var_pa2[i] * period * dt
-    for a in range(e.n_chambers):
-        for b in range(e.n_chambers):
-            e.cov[a, b] += e.sign[i, a] * e.sign[i, b] * q
 
 
 @inlined
@@ -424,7 +321,7 @@ def settle(engine: Any, closed: Any, blocks: Any, pairs: Any) -> bool:
     if needs_room(e, blocks, pairs):
         return False
     if e.running:
-        rebase(e, closed, blocks, pairs)
+        rebase(e, closed, blocks, pairs, e.ring_floor)
         for p in range(e.n_recent):
             if closed[p].status != FREE:
                 hand_over(e, closed, blocks, pairs, p)
@@ -435,14 +332,15 @@ def settle(engine: Any, closed: Any, blocks: Any, pairs: Any) -> bool:
 def clear(engine: Any, cells: Any) -> None:
     """Set the state (not the configuration) to its beginning."""
     e = engine[0]
-    e.running, e.n_open, e.n_closed, e.n_slots, e.n_pairs = 0, 0, 0, 0, 0
-    e.n_recent, e.n_young = 0, 0
+    e.running, e.n_slots, e.n_pairs = 0, 0, 0
+    e.n_closed, e.n_recent, e.n_young = 0, 0, 0
+    e.ring, e.first = 1 + e.n_shared, 1 + e.n_shared + e.n_state
+    set_open(e, 0)
     e.dt_s, e.ring_det = 0.0, 1.0
     for i in range(MAX_EDGES):
         e.place[i] = -1
         e.cell[i, 0], e.cell[i, 1] = SHUT, SHUT
-    ring = first_ring(e)
     for s in range(e.n_state):
-        e.d[s, ring + s] = 1.0
+        e.d[s, e.ring + s] = 1.0
     for c in range(len(cells)):
         cells[c].slot = -1

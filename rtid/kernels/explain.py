@@ -17,15 +17,13 @@ from rtid.kernels.engine import (
     ROW_FLAG,
     SHUT,
     acceptable,
-    flow_noise,
-    mean_terms,
     remember,
     set_step,
     step_s,
-    term_flow,
     working_points,
 )
 from rtid.kernels.holds import second_order
+from rtid.kernels.increments import flow_noise, mean_terms, term_flow
 from rtid.kernels.jit import inlined, kernel
 from rtid.kernels.layout import TERMS
 from rtid.kernels.rows import position_noise, start_whitener
@@ -107,7 +105,7 @@ def _one(
     """One interval; False where a working point is off the grid."""
     if dt != e.dt_s:
         set_step(e, dt)
-    if not working_points(e, sample, dt):
+    if not working_points(e, sample, dt)[0]:
         return False
     x0, x1 = e.values[e.x_column], sample[2 + e.x_column]
     for c in range(e.n_chambers):

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from rtid.kernels.jit import inlined, part
 from rtid.kernels.layout import OPEN, RINGING, TERMS, YOUNG
-from rtid.kernels.local import clear_open, first_open, first_ring, local_width
+from rtid.kernels.local import clear_open, set_open
 from rtid.kernels.recent import add_tile, admit, release, spread
 
 FloatArray = NDArray[np.float64]
@@ -44,14 +44,14 @@ RING_DET_LIMIT = 1e-3
 @inlined
 def _ring_ring(e: Any, s: int, r: int) -> float:
     """W[s, r] since the ring began."""
-    ring = first_ring(e)
+    ring = e.ring
     return e.gram[ring + max(s, r), ring + min(s, r)]
 
 
 @inlined
 def _read_through(e: Any, k: int, sign: float, out: FloatArray) -> None:
     """out (states, 6) = sign * ring x open block k."""
-    ring, first = first_ring(e), first_open(e, k)
+    ring, first = e.ring, e.first + TERMS * k
     for s in range(e.n_state):
         for i in range(TERMS):
             out[s, i] = sign * e.gram[first + i, ring + s]
@@ -60,7 +60,7 @@ def _read_through(e: Any, k: int, sign: float, out: FloatArray) -> None:
 @inlined
 def _add_own(e: Any, closed: Any, blocks: Any, k: int) -> None:
     """Products of open block k with itself and the shared columns."""
-    p, first = e.open_recent[k], first_open(e, k)
+    p, first = e.open_recent[k], e.first + TERMS * k
     item, block = closed[p], blocks[e.open_slot[k]]
     for i in range(TERMS):
         for j in range(1 + e.n_shared):
@@ -74,7 +74,7 @@ def _add_open_pair(e: Any, closed: Any, k: int, other: int) -> None:
     """Products of two open blocks."""
     a, b = max(k, other), min(k, other)
     item, at = closed[e.open_recent[a]], TERMS * e.open_recent[b]
-    first, second = first_open(e, a), first_open(e, b)
+    first, second = e.first + TERMS * a, e.first + TERMS * b
     for i in range(TERMS):
         for j in range(TERMS):
             item.gram[i, at + j] += e.gram[first + i, second + j]
@@ -100,7 +100,7 @@ def _weigh(e: Any, item: Any) -> None:
 @part
 def _add_shared(e: Any, item: Any, block: Any) -> None:
     """Products of a closed block with y and the shared columns since it closed."""
-    ring = first_ring(e)
+    ring = e.ring
     for s in range(e.n_state):
         for j in range(1 + e.n_shared):
             value = e.gram[ring + s, j] - item.shared_start[s, j]
@@ -114,7 +114,7 @@ def _add_shared(e: Any, item: Any, block: Any) -> None:
 @part
 def close_block(e: Any, closed: Any, blocks: Any, k: int) -> None:
     """Let open block k ring on, its state referred to the ring's origin; clear its columns."""
-    p, first, ring = e.open_recent[k], first_open(e, k), first_ring(e)
+    p, first, ring = e.open_recent[k], e.first + TERMS * k, e.ring
     item = closed[p]
     item.status, item.size = YOUNG, 0.0
     for s in range(e.n_state):
@@ -142,7 +142,7 @@ def close_block(e: Any, closed: Any, blocks: Any, k: int) -> None:
 @part
 def _refer_to_origin(e: Any, b: FloatArray) -> None:
     """b <- ring^-1 b, Gauss elimination with row pivots on a copy of the ring."""
-    a, n, ring = e.basis, e.n_state, first_ring(e)
+    a, n, ring = e.basis, e.n_state, e.ring
     for i in range(n):
         for j in range(n):
             a[i, j] = e.d[i, ring + j]
@@ -174,7 +174,7 @@ def open_block(e: Any, closed: Any, blocks: Any, k: int, edge: int, slot: int) -
     If the block still rings, it goes on from the state it is in; else a position must be free.
     """
     if k == e.n_open:
-        e.n_open += 1
+        set_open(e, k + 1)
         clear_open(e, k)
     e.open_edge[k], e.open_slot[k], e.place[edge] = edge, slot, k
     for p in range(e.n_recent):
@@ -212,7 +212,7 @@ def _settle_one(e: Any, closed: Any, blocks: Any, k: int, p: int) -> None:
 @inlined
 def _resume(e: Any, item: Any, k: int, p: int) -> None:
     """Continue closed block p as open block k."""
-    first, ring = first_open(e, k), first_ring(e)
+    first, ring = e.first + TERMS * k, e.ring
     for s in range(e.n_state):
         for i in range(TERMS):
             e.ringing[s, TERMS * p + i] = 0.0
@@ -226,9 +226,12 @@ def _resume(e: Any, item: Any, k: int, p: int) -> None:
 
 
 @part
-def rebase(e: Any, closed: Any, blocks: Any, pairs: Any) -> None:
-    """Settle all products, drop the blocks that fell silent, start the ring anew at I."""
-    ring, n = first_ring(e), local_width(e)
+def rebase(e: Any, closed: Any, blocks: Any, pairs: Any, floor: float) -> None:
+    """Settle all products, drop the blocks that fell silent, start the ring anew at I.
+
+    floor: share of its size at closing below which a block is silent; with inf all memory ends,
+    and all states are zero.
+    """
     for k in range(e.n_open):
         _settle_open(e, closed, blocks, k)
     for i in range(1 + e.n_shared):
@@ -239,13 +242,14 @@ def rebase(e: Any, closed: Any, blocks: Any, pairs: Any) -> None:
         _settle_young(e, closed, a)
         _add_shared(e, closed[e.young[a]], blocks[closed[e.young[a]].slot])
     e.n_young = 0
-    _advance_closed(e, closed, blocks, pairs)
-    for i in range(n):
-        for j in range(n):
+    _advance_closed(e, closed, blocks, pairs, floor)
+    for i in range(e.width):
+        for j in range(e.width):
             e.gram[i, j] = 0.0
     for s in range(e.n_state):
-        for r in range(e.n_state):
-            e.d[s, ring + r] = 1.0 if s == r else 0.0
+        for j in range(e.width):
+            if floor == np.inf or e.ring <= j < e.first:
+                e.d[s, j] = 1.0 if j == e.ring + s else 0.0
     e.ring_det = 1.0
 
 
@@ -296,12 +300,12 @@ def _settle_ringing(e: Any, closed: Any, blocks: Any) -> None:
 
 
 @inlined
-def _advance_closed(e: Any, closed: Any, blocks: Any, pairs: Any) -> None:
+def _advance_closed(e: Any, closed: Any, blocks: Any, pairs: Any, floor: float) -> None:
     """Refer closed states to now, d <- ring d, with nothing owed; release the silent ones."""
     for p in range(e.n_recent - 1, -1, -1):
         if closed[p].status >= YOUNG:
             closed[p].status = RINGING
-            if not _advance_one(e, closed[p], p) > e.ring_floor * closed[p].size:
+            if not _advance_one(e, closed[p], p) > floor * closed[p].size:
                 e.n_closed -= 1
                 release(e, closed, blocks, pairs, p)
 
@@ -309,7 +313,7 @@ def _advance_closed(e: Any, closed: Any, blocks: Any, pairs: Any) -> None:
 @part
 def _advance_one(e: Any, item: Any, p: int) -> float:
     """As above for one block; returns the size of its state."""
-    largest, ring = 0.0, first_ring(e)
+    largest, ring = 0.0, e.ring
     for s in range(e.n_state):
         for i in range(TERMS):
             value = 0.0
@@ -325,18 +329,3 @@ def _advance_one(e: Any, item: Any, p: int) -> float:
         for j in range(1 + e.n_shared):
             item.shared_start[s, j] = 0.0
     return largest
-
-
-@part
-def forget(e: Any, closed: Any, blocks: Any, pairs: Any) -> None:
-    """End all memory: settle every product and set all states to zero (a gap, a restart)."""
-    rebase(e, closed, blocks, pairs)
-    for p in range(e.n_recent - 1, -1, -1):
-        if closed[p].status == RINGING:
-            release(e, closed, blocks, pairs, p)
-    e.n_closed = 0
-    ring, n = first_ring(e), local_width(e)
-    for s in range(e.n_state):
-        for j in range(n):
-            if j < ring or j >= ring + e.n_state:
-                e.d[s, j] = 0.0

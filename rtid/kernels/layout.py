@@ -44,6 +44,12 @@ _F, _I = np.float64, np.int64
 
 ENGINE = np.dtype(
     [
+        # --- local columns, see `local`; first, and whole cache lines each ---
+        ("d", _F, (MAX_STATE, MAX_LOCAL)),
+        ("inc", _F, (MAX_CHAMBERS, MAX_LOCAL)),  # increments (integral) or start values (carry)
+        ("end", _F, (MAX_CHAMBERS, MAX_LOCAL)),  # end values (carry)
+        ("row", _F, (MAX_CHAMBERS, MAX_LOCAL)),
+        ("gram", _F, (MAX_LOCAL, MAX_LOCAL)),
         # --- configuration, constant after `estimator.build` ---
         ("form", _I),
         ("n_chambers", _I),
@@ -95,10 +101,14 @@ ENGINE = np.dtype(
         ("lag_decay", _F),
         ("filter_a", _F, (2, 2)),
         ("filter_b", _F, (2, 2)),
+        ("sample", _F, (2 + MAX_SIGNALS,)),  # the one being taken, and the values of the last
         ("values", _F, (MAX_SIGNALS,)),
         ("w_v", _F, (MAX_EDGES,)),  # lagged opening command per edge
         ("cell", _I, (MAX_EDGES, 2)),  # current block of each edge
         ("place", _I, (MAX_EDGES,)),  # its position among the open blocks, -1 when shut
+        ("ring", _I),  # first local column of the ring, and of the open blocks
+        ("first", _I),
+        ("width", _I),  # number of local columns in use, rounded up to whole vectors
         ("n_open", _I),
         ("open_edge", _I, (MAX_OPEN,)),
         ("open_slot", _I, (MAX_OPEN,)),
@@ -106,15 +116,10 @@ ENGINE = np.dtype(
         ("cov", _F, (MAX_CHAMBERS, MAX_CHAMBERS)),  # Kalman whitener: variance of the gap, m6
         ("innovation", _F, (3,)),  # S: upper triangle
         ("echo", _F, (MAX_CHAMBERS, 3)),  # pressure noise in the prediction of column -V dP
-        ("d", _F, (MAX_STATE, MAX_LOCAL)),
-        ("inc", _F, (MAX_CHAMBERS, MAX_LOCAL)),  # increments (integral) or start values (carry)
-        ("end", _F, (MAX_CHAMBERS, MAX_LOCAL)),  # end values (carry)
-        ("row", _F, (MAX_CHAMBERS, MAX_LOCAL)),
         ("moments", _F, (MAX_EDGES, 3)),  # of the opening command over the interval
         ("dp_pa", _F, (MAX_EDGES, 2)),  # at its start and end
         ("target", _I, (MAX_EDGES, 2)),  # the blocks that the working points are in
         ("phi", _F, (TERMS,)),
-        ("gram", _F, (MAX_LOCAL, MAX_LOCAL)),
         ("ringing", _F, (MAX_STATE, TERMS * MAX_RECENT)),  # d of those that rang at the last rebase
         ("weighted", _F, (MAX_STATE, TERMS * MAX_RECENT)),
         ("left", _F, (MAX_STATE, TERMS)),

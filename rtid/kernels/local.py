@@ -15,27 +15,16 @@ LANES = 4  # rows of the products are padded to whole vectors; the padding is ke
 
 
 @inlined
-def first_ring(e: Any) -> int:
-    """Local index of the first ring column."""
-    return 1 + e.n_shared
-
-
-@inlined
-def first_open(e: Any, k: int) -> int:
-    """Local index of the first column of open block k."""
-    return 1 + e.n_shared + e.n_state + TERMS * k
-
-
-@inlined
-def local_width(e: Any) -> int:
-    """Number of local columns in use, padded."""
-    return min(MAX_LOCAL, (first_open(e, e.n_open) + LANES - 1) // LANES * LANES)
+def set_open(e: Any, n: int) -> None:
+    """Let n blocks be open; the width of the rows follows."""
+    e.n_open = n
+    e.width = min(MAX_LOCAL, (e.first + TERMS * n + LANES - 1) // LANES * LANES)
 
 
 @inlined
 def add_products(e: Any, n_rows: int) -> None:
     """gram += row' row over the n_rows local rows: the only work that every row costs."""
-    width = local_width(e)
+    width = e.width
     row_a, row_b = e.row[0], e.row[1]
     if n_rows == 1:
         for i in range(width):
@@ -52,7 +41,7 @@ def add_products(e: Any, n_rows: int) -> None:
 @part
 def clear_open(e: Any, k: int) -> None:
     """Zero the columns of open block k, states and products."""
-    first, n = first_open(e, k), local_width(e)
+    first, n = e.first + TERMS * k, e.width
     for j in range(first, first + TERMS):
         for s in range(e.n_state):
             e.d[s, j] = 0.0
@@ -67,7 +56,7 @@ def remove_open(e: Any, k: int) -> None:
     e.place[e.open_edge[k]] = -1
     last = e.n_open - 1
     if k < last:
-        to, source, gram = first_open(e, k), first_open(e, last), e.gram
+        to, source, gram = e.first + TERMS * k, e.first + TERMS * last, e.gram
         for i in range(TERMS):
             for s in range(e.n_state):
                 e.d[s, to + i] = e.d[s, source + i]
@@ -81,4 +70,4 @@ def remove_open(e: Any, k: int) -> None:
         e.open_recent[k] = e.open_recent[last]
         e.place[e.open_edge[k]] = k
     clear_open(e, last)
-    e.n_open = last
+    set_open(e, last)

@@ -98,10 +98,14 @@ def spread(e: Any, item: Any, right: FloatArray, count: int) -> None:
     """item.gram[:, :count] += left' right[:, :count]; e.left (states, 6), right (states, ...)."""
     for i in range(TERMS):
         target = item.gram[i]
-        for s in range(e.n_state):
-            a, source = e.left[s, i], right[s]
+        for s in range(0, e.n_state - 1, 2):  # by twos: one pass over target for both chambers
+            a, b, first, second = e.left[s, i], e.left[s + 1, i], right[s], right[s + 1]
             for j in range(count):
-                target[j] += a * source[j]
+                target[j] += a * first[j] + b * second[j]
+        if e.n_state == 1:
+            a, first = e.left[0, i], right[0]
+            for j in range(count):
+                target[j] += a * first[j]
 
 
 @inlined

@@ -18,8 +18,8 @@ import math
 from typing import Any
 
 from rtid.kernels.jit import inlined, part
-from rtid.kernels.layout import ROWS
-from rtid.kernels.local import add_products, first_open, first_ring, local_width
+from rtid.kernels.layout import ROWS, TERMS
+from rtid.kernels.local import add_products
 
 
 @part
@@ -74,10 +74,10 @@ def _add_column_noise(
     echo[2] = k10 * k10 * s00 + 2.0 * k10 * k11 * s01 + k11 * k11 * s11 + b * b * v
 
 
-@inlined
+@part
 def integral_row_one(e: Any) -> None:
     """Row and decay for one chamber."""
-    d, row, n = e.d, e.row, local_width(e)
+    d, row, n = e.d, e.row, e.width
     r = position_noise(e, 0, 0)
     s = e.cov[0, 0] + r
     scale, keep = 1.0 / math.sqrt(s), r / s
@@ -93,10 +93,10 @@ def integral_row_one(e: Any) -> None:
     add_products(e, 1)
 
 
-@inlined
+@part
 def integral_row_two(e: Any) -> None:
     """Rows and decay for two chambers that share the noise of x: whitened jointly."""
-    d, row, cov, n = e.d, e.row, e.cov, local_width(e)
+    d, row, cov, n = e.d, e.row, e.cov, e.width
     r00, r01, r11 = position_noise(e, 0, 0), position_noise(e, 0, 1), position_noise(e, 1, 1)
     s00, s01, s11 = cov[0, 0] + r00, cov[0, 1] + r01, cov[1, 1] + r11
     i0 = 1.0 / math.sqrt(s00)
@@ -128,8 +128,8 @@ def integral_row_two(e: Any) -> None:
 def carry_step(e: Any) -> None:
     """All filters over one interval: x+ = a x + b [start, end] per chamber and column."""
     a, b, d, inc, end = e.filter_a, e.filter_b, e.d, e.inc, e.end
-    ring, first, used = first_ring(e), first_open(e, 0), first_open(e, e.n_open)
-    n = local_width(e)
+    ring, first, used = e.ring, e.first, e.first + TERMS * e.n_open
+    n = e.width
     a00, a01, a10, a11 = a[0, 0], a[0, 1], a[1, 0], a[1, 1]
     b00, b01, b10, b11 = b[0, 0], b[0, 1], b[1, 0], b[1, 1]
     for c in range(e.n_chambers):
@@ -147,7 +147,7 @@ def carry_step(e: Any) -> None:
 @part
 def carry_row(e: Any) -> None:
     """Rows at a row instant: outputs of the filters, weighted by the position noise."""
-    d, row, n = e.d, e.row, local_width(e)
+    d, row, n = e.d, e.row, e.width
     i0 = 1.0 / math.sqrt(position_noise(e, 0, 0))
     for j in range(n):
         row[0, j] = i0 * d[0, j]
