@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from rtid.estimator.solution import Solution, widen
 from rtid.estimator.state import Weights, build
+from rtid.kernels.engine import ROW_FLAG
 from rtid.kernels.explain import explain
 from rtid.kernels.layout import TERMS
 from rtid.model import FloatArray, Model
@@ -27,7 +28,9 @@ Cells = NDArray[np.int64]
 
 def count_misfit(model: Model, chunk: FloatArray, weights: Weights, solution: Solution) -> Solution:
     """The solution with intervals that hold where its blocks' polynomials miss their maps."""
-    if len(chunk) < 2:
+    if len(chunk) < 2 or not (chunk[:, 1].astype(int) & ROW_FLAG).all():
+        # Where the position comes rarely, the engine may begin a new memory between two rows, which
+        # `explain` does not see: what is left of the blocks visited before would pass for misfit.
         return solution
     scores, cells = _scores(model, chunk, weights, solution)
     if not len(scores):

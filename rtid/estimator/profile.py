@@ -16,6 +16,7 @@ from rtid.model import FloatArray
 
 MAX_STEPS = 5
 LONGEST_STEP = 3.0  # probes
+MAX_HALVINGS = 3  # of a step that leads uphill
 
 
 @dataclass(frozen=True)
@@ -33,11 +34,13 @@ def profile(
     tolerance: FloatArray,
     probe: FloatArray,
     least: FloatArray,
+    stages: tuple[float, ...] = (1.0,),
 ) -> Profile:
     """Minimise chi2 + prior from `nominal`; all arguments (n,).
 
     tolerance: 0 holds a parameter at its nominal value; probe: distance of the finite differences,
-    of the order of what chi2 can resolve but above its roughness; least: lower bound.
+    of the order of what chi2 can resolve but above its roughness; least: lower bound; stages:
+    multiples of the probe, one search after the other, wide ones first to step over side valleys.
     """
     free = tolerance > 0
     known: dict[bytes, float] = {}
@@ -51,7 +54,9 @@ def profile(
             known[key] = chi2(nu) + float(np.sum(prior))
         return known[key]
 
-    part, sd = _minimise(cost, nominal[free], probe[free], least[free])
+    part = nominal[free]
+    for stage in stages:
+        part, sd = _minimise(cost, part, stage * probe[free], least[free])
     value, all_sd = nominal.copy(), np.zeros(len(nominal))
     value[free], all_sd[free] = part, sd
     return Profile(value, all_sd, len(known))
@@ -69,6 +74,10 @@ def _minimise(
         if np.all(np.abs(trial - value) <= probe):  # the parabola need not be extrapolated
             value = trial
             break
+        for _ in range(MAX_HALVINGS):
+            if cost(trial) < best:
+                break
+            trial = 0.5 * (trial + value)
         if cost(trial) >= best:
             break
         value, best = np.maximum(trial, least + probe), cost(trial)

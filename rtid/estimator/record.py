@@ -107,6 +107,7 @@ def _nuisance(
         tolerance=np.array([lag.tolerance_s, *tolerance_s]),
         probe=np.array([LAG_PROBE * lag.nominal_s + 5e-5, *(OFFSET_PROBE * tolerance_s)]),
         least=np.array([0.0, *np.full(len(tolerance_s), -np.inf)]),
+        stages=(3.0, 1.0) if len(tolerance_s) else (1.0,),
     )
 
 
