@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from time import perf_counter, sleep
 from typing import Any
 
@@ -16,12 +17,14 @@ from benchmarks.interleave import Job, report, side_by_side
 from benchmarks.machine import chunk, empty, model, one_chamber, record, warmed
 from benchmarks.reference import Reference
 from rtid.estimator.state import State
+from rtid.kernels.engine import advance
 from rtid.kernels.normal import assemble
 from rtid.model import Model
 
 FloatArray = NDArray[np.float64]
 
-C_BY_HAND, ARRAYS, PER_SAMPLE = "hand-written C", "rtid, over arrays", "rtid, called per sample"
+C_BY_HAND, ARRAYS = "hand-written C", "rtid, over arrays"
+PER_SAMPLE, KERNEL = "rtid, State.advance per sample", "rtid, kernel called per sample"
 ALL = len(record())
 FEW = 2000  # samples for the slow ones
 BLOCK = 3000  # samples of the calls one by one
@@ -57,21 +60,25 @@ def test_the_other_libraries_find_the_same_parameters() -> None:
 
 
 def joint_jobs(machine: Model) -> list[Job]:
-    """The joint update by C, by rtid over arrays and by rtid one sample at a time."""
+    """The joint update by C, by rtid over arrays and by rtid one sample at a time.
+
+    A call of the kernel on prepared memory is the least that Python can do.
+    """
     data, reference = chunk(record()), Reference()
-    by_c, by_arrays, by_calls = (warmed(machine, data) for _ in range(3))
+    by_c, by_arrays, by_calls, by_kernel = (warmed(machine, data) for _ in range(4))
     rows = [data[k : k + 1] for k in range(BLOCK)]
     return [
         Job(C_BY_HAND, lambda: reference.advance(by_c, data), ALL),
         Job(ARRAYS, lambda: by_arrays.advance(data), ALL),
         Job(PER_SAMPLE, lambda: one_by_one(by_calls.advance, rows), BLOCK),
+        Job(KERNEL, lambda: one_by_one(partial(advance, by_kernel.memory), rows), BLOCK),
     ]
 
 
-def one_by_one(advance: Callable[[FloatArray], None], rows: list[FloatArray]) -> None:
-    """Call advance once per sample."""
+def one_by_one(take: Callable[[FloatArray], object], rows: list[FloatArray]) -> None:
+    """Call take once per sample."""
     for row in rows:
-        advance(row)
+        take(row)
 
 
 def test_update_of_one_chamber(benchmark: Any) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,18 +32,32 @@ class State:
     closed: RecordArray
     blocks: RecordArray
     pairs: RecordArray
+    memory: NDArray[np.uint8] = field(init=False)
 
     def __post_init__(self) -> None:
-        """Keep the memory of the arrays at hand as bytes, for the kernel."""
-        self._memory = tuple(array.view(np.uint8) for array in self.arrays)
+        """Copy the arrays into one block of memory, which `kernel.advance` takes; keep views."""
+        arrays = self.arrays
+        self.memory = np.concatenate([array.view(np.uint8) for array in arrays])
+        ends = np.cumsum([array.nbytes for array in arrays]).tolist()
+        parts = zip(arrays, [0, *ends], ends, strict=False)
+        views = [self.memory[start:end].view(array.dtype) for array, start, end in parts]
+        self.engine, self.cells, self.closed, self.blocks, self.pairs = views
+        for name, table in zip(
+            ("n_cells", "max_closed", "max_blocks", "max_pairs"), views[1:], strict=True
+        ):
+            self.engine[0][name] = len(table)
+
+    def __reduce__(self) -> tuple[type[State], tuple[RecordArray, ...]]:
+        """Pickle and deepcopy the arrays alone: views would part from the memory."""
+        return State, self.arrays
 
     def advance(self, chunk: FloatArray) -> None:
         """Take samples (n, 2 + signals), rows [t_s, flags, values...]; tables grow as needed."""
-        taken = kernel.advance(*self._memory, chunk)
+        taken = kernel.advance(self.memory, chunk)
         while taken < len(chunk):
             self.make_room()
             chunk = chunk[taken:]
-            taken = kernel.advance(*self._memory, chunk)
+            taken = kernel.advance(self.memory, chunk)
 
     @property
     def arrays(self) -> tuple[RecordArray, RecordArray, RecordArray, RecordArray, RecordArray]:
@@ -73,7 +87,7 @@ class State:
 
     def copy(self) -> State:
         """An independent copy that continues bit for bit like this one."""
-        return State(*(array.copy() for array in self.arrays))
+        return State(*self.arrays)
 
 
 def _rehash(engine: RecordArray, pairs: RecordArray) -> RecordArray:

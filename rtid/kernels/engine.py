@@ -55,23 +55,27 @@ from rtid.kernels.rows import (
 
 FloatArray = NDArray[np.float64]
 
+ENGINE_BYTES, CELL_BYTES, CLOSED_BYTES = ENGINE.itemsize, CELL.itemsize, CLOSED.itemsize
+BLOCK_BYTES = BLOCK.itemsize
 ROW_FLAG, GAP_FLAG = 1, 2  # as in firmware_bridge.samples
 SHUT, OUTSIDE = -1, -2  # cell of an edge that passes nothing / whose working point is off the grid
 
 
 @kernel
-def advance(
-    engine: Any, cells: Any, closed: Any, blocks: Any, pairs: Any, chunk: FloatArray
-) -> int:
+def advance(memory: Any, chunk: FloatArray) -> int:
     """Take samples, rows of chunk (n, 2 + signals): [t_s, flags, values...], SI units.
 
-    The memory of the records of `layout` as bytes (numba recognises a plain array three times
-    faster than a structured one), changed in place.  Returns the number of samples taken: fewer
-    than n when `blocks` or `pairs` must be enlarged first (see `needs_room`).
+    memory: the records of `layout` one after the other as bytes, changed in place (one argument:
+    each costs a call from Python as much as the arithmetic of a block).  Returns the number of
+    samples taken: fewer than n when blocks or pairs must be enlarged first (see `needs_room`).
     """
-    e = engine.view(ENGINE)[0]
-    cell, ringing = cells.view(CELL), closed.view(CLOSED)
-    block, pair = blocks.view(BLOCK), pairs.view(PAIR)
+    e = memory[:ENGINE_BYTES].view(ENGINE)[0]
+    a = ENGINE_BYTES
+    b = a + CELL_BYTES * e.n_cells
+    c = b + CLOSED_BYTES * e.max_closed
+    d = c + BLOCK_BYTES * e.max_blocks
+    cell, ringing = memory[a:b].view(CELL), memory[b:c].view(CLOSED)
+    block, pair = memory[c:d].view(BLOCK), memory[d:].view(PAIR)
     for k in range(len(chunk)):
         if needs_room(e, block, pair):
             return k

@@ -93,6 +93,10 @@ ENGINE = np.dtype(
         ("zeta", _F),
         ("row_period_s", _F),
         ("lag_s", _F),
+        ("n_cells", _I),  # sizes of the tables that follow this record in memory
+        ("max_closed", _I),
+        ("max_blocks", _I),
+        ("max_pairs", _I),
         # --- state ---
         ("running", _I),
         ("t_s", _F),
