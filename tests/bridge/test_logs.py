@@ -136,7 +136,8 @@ def test_cut_text_log_never_gives_a_wrong_frame(tmp_path: Path, suffix: str) -> 
         part = open_log(cut)
         assert is_prefix(part, whole)
         assert len(part) >= len(whole) * size / len(raw) * 0.9 - 25
-        assert "truncated" in part.refused or raw[size - 1] == 10
+        whole_line = raw[size - 1] in b"\r\n"  # TRC ends its lines with both: nothing is cut
+        assert whole_line or "truncated" in part.refused
 
 
 @pytest.mark.parametrize("suffix", [".blf", ".log"])
