@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from firmware_bridge.samples import Samples
 from rtid.estimator.state import State, build
 from rtid.kernels import engine as kernel
-from rtid.model import Model
+from rtid.model import Grid, Model
 from rtid.sim.declare import declared_model, uniform_grid
 from rtid.sim.plant import Plant
 from rtid.sim.run import Run, simulate
@@ -52,6 +52,14 @@ def one_chamber(full: Model) -> Model:
     """Chamber A and its two edges alone: one shared parameter."""
     edges = tuple(e for e in full.edges if "p_a" in (e.source, e.sink))
     return replace(full, chambers=full.chambers[:1], edges=edges)
+
+
+def one_block(full: Model) -> Model:
+    """Chamber A, one edge that is always open, one block: 7 parameters, filter (10), all rows."""
+    grid = Grid(np.array([-20.0, 20.0]), np.array([-3e7, 3e7]))
+    edge = replace(full.edges[0], grid=grid, safe_band_v=-np.inf)
+    every_row = replace(full.filter, rows_per_s=1e3)
+    return replace(one_chamber(full), edges=(edge,), form="carry", filter=every_row)
 
 
 def chunk(samples: Samples) -> FloatArray:

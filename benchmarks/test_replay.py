@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from benchmarks.frames import assembler, frames
 from benchmarks.interleave import Job, interleave, report
-from benchmarks.machine import SECONDS, chunk, empty, model
+from benchmarks.machine import COARSE, SECONDS, chunk, empty, model
 from firmware_bridge.frames import from_messages, to_messages
 from firmware_bridge.sources.log_file import open_log
 from rtid.estimator.solution import solve
@@ -27,7 +27,7 @@ CYCLES = 6000
 
 @pytest.mark.parametrize("suffix", [".blf", ".log"])
 def test_replay(benchmark: Any, tmp_path: Path, suffix: str) -> None:
-    log, machine = tmp_path / f"trace{suffix}", model()
+    log, machine = tmp_path / f"trace{suffix}", model(COARSE)
     write_log(log, frames())
     read = open_log(log)
     data = chunk(assembler().push(read))
@@ -48,7 +48,8 @@ def test_replay(benchmark: Any, tmp_path: Path, suffix: str) -> None:
     for name, seconds in times.items():
         typical = float(np.median(seconds))
         rows.append({"name": name, "text": f"{SECONDS / typical:.0f} x real time"})
-    title = f"Replay of {SECONDS:.0f} s at 1 kHz ({len(read)} frames) from {suffix}, warm"
+    size = f"{len(read)} frames, 10 x 8 blocks per edge"
+    title = f"Replay of {SECONDS:.0f} s at 1 kHz ({size}) from {suffix}, warm"
     report(benchmark, title, "trace", rows)
 
 

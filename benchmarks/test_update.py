@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from benchmarks import rls
 from benchmarks.compiler import compile_c
 from benchmarks.interleave import Job, report, side_by_side
-from benchmarks.machine import chunk, empty, model, one_chamber, record, warmed
+from benchmarks.machine import chunk, empty, model, one_block, one_chamber, record, warmed
 from benchmarks.reference import Reference
 from rtid.estimator.state import State
 from rtid.kernels.engine import advance
@@ -82,17 +82,25 @@ def one_by_one(take: Callable[[FloatArray], object], rows: list[FloatArray]) -> 
 
 
 def test_update_of_one_chamber(benchmark: Any) -> None:
-    data, library = rls.samples(ALL), compile_c("rls")
-    few = data[:FEW]
-    jobs = [
-        *joint_jobs(one_chamber(model())),
-        Job("C, one block alone, classical RLS", lambda: rls.by_c(library, data), ALL),
-        Job("numpy, one block alone", lambda: rls.by_numpy(few), FEW),
-        Job("padasip, one block alone", lambda: rls.by_padasip(few), FEW),
-        Job("filterpy, one block alone", lambda: rls.by_filterpy(few), FEW),
-    ]
     title = "Update, one chamber, two edges, one shared parameter, 30 x 20 blocks per edge"
-    side_by_side(benchmark, title, "sample", jobs, C_BY_HAND)
+    side_by_side(benchmark, title, "sample", joint_jobs(one_chamber(model())), C_BY_HAND)
+
+
+def test_update_of_one_block(benchmark: Any) -> None:
+    """The others filter, evaluate the basis and update; rtid also gates and looks for the block."""
+    ours, theirs, library = chunk(record()), rls.samples(ALL), compile_c("rls")
+    few, rows = theirs[:FEW], [ours[k : k + 1] for k in range(BLOCK)]
+    state = warmed(one_block(model()), ours)
+    jobs = [
+        Job(ARRAYS, lambda: state.advance(ours), ALL),
+        Job(PER_SAMPLE, lambda: one_by_one(state.advance, rows), BLOCK),
+        Job("C by hand, covariance form", lambda: rls.by_c(library, theirs), ALL),
+        Job("numpy", lambda: rls.by_numpy(few), FEW),
+        Job("padasip", lambda: rls.by_padasip(few), FEW),
+        Job("filterpy", lambda: rls.by_filterpy(few), FEW),
+    ]
+    title = "The same job, one chamber, one block, 7 parameters: filter, basis, update"
+    side_by_side(benchmark, title, "sample", jobs, ARRAYS)
 
 
 def test_update_of_two_chambers(benchmark: Any) -> None:

@@ -101,21 +101,21 @@ def block_increments(
             scale = e.sign[i, c] * e.scale_m3s[i] * dt
             for j in range(TERMS):
                 e.d[c, first + j] += scale * phi[j]
-    flow_noise(e, i, cells[block.cell].slope, dt)
+        flow_noise(e, i, cells[block.cell].slope, dt)
 
 
 @inlined
 def _carry_ends(e: Any, i: int, first: int, eta0: float, eta1: float) -> None:
     """Start and end values: the regressor runs from phi(u_k, dp_k) to phi(u_k, dp_k+1)."""
+    phi, rise = e.phi, 0.5 * (eta1 - eta0)
     for c in range(e.n_chambers):
-        scale = e.sign[i, c] * e.scale_m3s[i]
+        scale, start, end = e.sign[i, c] * e.scale_m3s[i], e.inc[c], e.end[c]
         for j in range(TERMS):
-            e.inc[c, first + j] = scale * e.phi[j]
-            e.end[c, first + j] = scale * e.phi[j]
-        half = 0.5 * scale * (eta1 - eta0)
-        for j, change in ((2, half), (4, half * (eta0 + eta1)), (5, half * e.phi[1])):
-            e.inc[c, first + j] -= change
-            e.end[c, first + j] += change
+            start[first + j], end[first + j] = scale * phi[j], scale * phi[j]
+        d_eta, d_eta2, d_both = scale * rise, scale * rise * (eta0 + eta1), scale * rise * phi[1]
+        start[first + 2], end[first + 2] = start[first + 2] - d_eta, end[first + 2] + d_eta
+        start[first + 4], end[first + 4] = start[first + 4] - d_eta2, end[first + 4] + d_eta2
+        start[first + 5], end[first + 5] = start[first + 5] - d_both, end[first + 5] + d_both
 
 
 @inlined

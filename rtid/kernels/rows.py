@@ -128,19 +128,18 @@ def integral_row_two(e: Any) -> None:
 def carry_step(e: Any) -> None:
     """All filters over one interval: x+ = a x + b [start, end] per chamber and column."""
     a, b, d, inc, end = e.filter_a, e.filter_b, e.d, e.inc, e.end
-    ring, first, used = e.ring, e.first, e.first + TERMS * e.n_open
-    n = e.width
+    n, used = e.width, e.first + TERMS * e.n_open
     a00, a01, a10, a11 = a[0, 0], a[0, 1], a[1, 0], a[1, 1]
     b00, b01, b10, b11 = b[0, 0], b[0, 1], b[1, 0], b[1, 1]
     for c in range(e.n_chambers):
+        output, rate, first, last = d[2 * c], d[2 * c + 1], inc[c], end[c]
         for j in range(n):
-            x0, x1 = d[2 * c, j], d[2 * c + 1, j]
-            d[2 * c, j] = a00 * x0 + a01 * x1
-            d[2 * c + 1, j] = a10 * x0 + a11 * x1
-        for j in range(used):
-            if j < ring or j >= first:
-                d[2 * c, j] += b00 * inc[c, j] + b01 * end[c, j]
-                d[2 * c + 1, j] += b10 * inc[c, j] + b11 * end[c, j]
+            x0, x1 = output[j], rate[j]
+            output[j] = a00 * x0 + a01 * x1
+            rate[j] = a10 * x0 + a11 * x1
+        for j in range(used):  # first = last = 0 on the ring
+            output[j] += b00 * first[j] + b01 * last[j]
+            rate[j] += b10 * first[j] + b11 * last[j]
     e.ring_det *= a00 * a11 - a01 * a10
 
 
