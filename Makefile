@@ -24,8 +24,8 @@ lint: $(READY)
 	.venv/bin/mypy
 
 campaign: $(READY)
-	.venv/bin/python -m pytest -q -s -p no:benchmark -m campaign tests/campaign
-	.venv/bin/python -m tests.campaign.report
+	.venv/bin/python -m pytest -q -s -p no:benchmark -m campaign tests/campaign; \
+	  status=$$?; .venv/bin/python -m tests.campaign.report && exit $$status
 
 pictures: $(READY)
 	.venv/bin/python -m tools.readme_pictures tools/pictures
