@@ -9,7 +9,6 @@ import pytest
 
 from rtid.estimator.flowmap import EXTRAPOLATED, LEARNING, PRIOR, SHUT, VALID, FlowMap
 from rtid.estimator.published import publish
-from rtid.estimator.windows import OVERLAP, blend, overlaps, rising, rising_slope
 from rtid.model import FloatArray, Grid
 from tests.flow_maps import GRID, RATED_Q_M3S, Flow, compensated, empty, machine, orifice, solved
 
@@ -22,31 +21,6 @@ def centres(grid: Grid, chosen: FloatArray) -> tuple[FloatArray, FloatArray]:
     i, j = np.nonzero(chosen)
     u, p = grid.u_v, grid.dp_pa
     return 0.5 * (u[i] + u[i + 1]), 0.5 * (p[j] + p[j + 1])
-
-
-def test_squares_of_the_window_and_its_mirror_sum_to_one() -> None:
-    t = np.linspace(-1.5, 1.5, 301)
-    np.testing.assert_allclose(rising(t) + rising(-t), 1.0, atol=1e-15)
-    assert rising(np.array([-1.0]))[0] == 0.0
-    np.testing.assert_allclose(rising_slope(t), np.gradient(rising(t), t), atol=2e-3)
-
-
-def test_overlaps_of_one_block_never_meet() -> None:
-    border = np.array([0.0, 1.0, 1.1, 3.0, 3.05, 9.0])
-    for share in (OVERLAP, 0.5):
-        eta = overlaps(border, share)
-        assert (eta[:-1] + eta[1:] <= np.diff(border) + 1e-15).all()
-
-
-def test_each_point_belongs_to_the_block_that_holds_it() -> None:
-    border = np.array([0.0, 1.0, 1.1, 3.0, 9.0])
-    at = np.linspace(0, 9, 4001)
-    lower, weight, _ = blend(border, at)
-    held = np.searchsorted(border, at, side="right") - 1
-    mine = np.where(weight > 0.5, lower + 1, lower)
-    off_border = np.abs(at[:, None] - border).min(axis=1) > 1e-9
-    np.testing.assert_array_equal(mine[off_border], held[off_border])
-    assert ((weight >= 0) & (weight <= 1)).all()
 
 
 def test_flow_is_continuous_and_its_gradient_is_its_derivative() -> None:

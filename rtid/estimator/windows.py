@@ -1,7 +1,11 @@
 """Lapped windows, eq. (12): the smooth weights with which neighbouring blocks are blended.
 
-beta(t) rises from 0 at t <= -1 to 1 at t >= 1 with beta^2(t) + beta^2(-t) = 1.  The squares of the
-windows of all blocks sum to 1 at every point,
+The profile beta(t) rises from 0 at t <= -1 to 1 at t >= 1 with beta^2(t) + beta^2(-t) = 1,
+
+    beta(t) = sin(pi/2 sin^2(pi/4 (1 + t))),
+
+whose square is continuous with three derivatives.  The squares of the windows of all blocks sum to
+1 at every point,
 
     g_i(t) = beta^2((t - b_i) / eta_i) beta^2((b_i+1 - t) / eta_i+1),
 
@@ -19,17 +23,25 @@ from rtid.model import FloatArray
 OVERLAP = 0.25
 
 
+def profile(t: FloatArray) -> FloatArray:
+    """beta(t) for t of any shape: the sine of an angle that eases from 0 to pi / 2."""
+    return np.asarray(np.sin(_angle(t)))
+
+
 def rising(t: FloatArray) -> FloatArray:
-    """beta^2(t) for t of any shape: sin^2 of an angle that eases from 0 to pi / 2."""
-    angle = 0.25 * np.pi * (1.0 + np.sin(0.5 * np.pi * np.clip(t, -1.0, 1.0)))
-    return np.asarray(np.sin(angle) ** 2)
+    """beta^2(t)."""
+    return np.asarray(np.sin(_angle(t)) ** 2)
 
 
 def rising_slope(t: FloatArray) -> FloatArray:
     """Derivative of `rising`; zero outside [-1, 1] and continuous."""
-    inner = np.clip(t, -1.0, 1.0)
-    angle = 0.25 * np.pi * (1.0 + np.sin(0.5 * np.pi * inner))
-    return np.asarray(np.sin(2.0 * angle) * 0.125 * np.pi**2 * np.cos(0.5 * np.pi * inner))
+    slope = 0.125 * np.pi**2 * np.sin(0.5 * np.pi * (1.0 + np.clip(t, -1.0, 1.0)))
+    return np.asarray(np.sin(2.0 * _angle(t)) * slope)
+
+
+def _angle(t: FloatArray) -> FloatArray:
+    """pi/2 sin^2(pi/4 (1 + t)): its relative error stays small where it vanishes, at t = -1."""
+    return np.asarray(0.5 * np.pi * np.sin(0.25 * np.pi * (1.0 + np.clip(t, -1.0, 1.0))) ** 2)
 
 
 def overlaps(border: FloatArray, share: float = OVERLAP) -> FloatArray:
