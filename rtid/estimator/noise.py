@@ -1,0 +1,166 @@
+"""Sensor noise from the trace itself, where nobody has declared it.
+
+White noise of variance s^2 gives the m-th difference of a signal the variance s^2 C(2m, m); smooth
+motion loses a factor (2 pi f dt)^m.  So the differences' mean square falls with m to the noise's
+floor and stays there.  It is taken over the windows in which nothing else happened: those that lie
+within the chi-square scatter of their own floor.  A signal in steps of q has at least q^2/12.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import comb
+
+import numpy as np
+from scipy.stats import chi2
+
+from rtid.model import FloatArray
+
+ORDERS = range(2, 9)
+WINDOW = 32  # differences per window: shorter than the time between two steps of a command
+QUIET = 0.25  # the quantile of the windows that the floor starts from
+LIKELY = 0.999  # of the clean windows lie below the limit that counts as quiet
+ROUNDING = 1e-8  # share of the largest value below which steps are rounding errors
+FEW_LEVELS = 6
+HELD_SHARE = 0.3  # of equal neighbours, from which on repeats are looked at
+SINGLE_RUNS = 0.2  # share of values that come once, up to which a signal is held
+
+
+@dataclass(frozen=True)
+class NoiseEstimate:
+    """White noise of one signal, in its unit; samples: measurements that tell of it.
+
+    sd: 1 sigma in all, quantisation included; resolution: the quantisation step, 0 where there is
+    none; relative_sd: standard deviation of sd as a share of it, inf where nothing is known.
+    """
+
+    sd: float
+    resolution: float
+    relative_sd: float
+    samples: int
+
+    @property
+    def analogue_sd(self) -> float:
+        """The sensor's own noise, to be declared beside its resolution."""
+        return float(np.sqrt(max(0.0, self.sd**2 - self.resolution**2 / 12.0)))
+
+
+def estimate_noise(
+    t_s: FloatArray, values: FloatArray, held_command: bool = False
+) -> NoiseEstimate:
+    """Noise of a signal sampled at t_s (n,) with values (n,); NaN are left out.
+
+    held_command: the signal is a command, which is what was commanded: only its steps count.
+    """
+    values = np.asarray(values, np.float64)  # differences of unsigned counts would wrap
+    known = np.isfinite(t_s) & np.isfinite(values)
+    t, y = t_s[known], values[known]
+    step, levels = resolution_of(y), len(np.unique(y))
+    if held_command and levels < FEW_LEVELS:
+        step = 0.0  # the levels of a switched command
+    least = float(step / np.sqrt(12.0))
+    if held_command:
+        return NoiseEstimate(least, step, 0.0, len(y))
+    t, y = measurements(t, y)
+    floors = [f for m in ORDERS if (f := _floor(t, y, m)) is not None]
+    if not floors or levels < 2:
+        return NoiseEstimate(least, step, np.inf, 0)
+    sd, relative_sd, samples = _settled(floors)
+    if sd < least:
+        return NoiseEstimate(least, step, max(relative_sd, 1.0 - sd / least), samples)
+    return NoiseEstimate(sd, step, relative_sd, samples)
+
+
+def resolution_of(values: FloatArray) -> float:
+    """The step of which all differences are multiples, 0 where there is none: Euclid's algorithm.
+
+    With few levels they must be neighbours: what a signal jumps between is not its resolution.
+    """
+    levels = np.unique(values)
+    if len(levels) < 2:
+        return 0.0
+    rounding = ROUNDING * float(np.abs(levels).max())
+    rest = np.unique(np.diff(levels))
+    step, rest = float(rest[-1]), rest[rest > rounding]
+    while len(rest):
+        step = float(rest[0])
+        left = np.abs(rest - step * np.round(rest / step))
+        left = left[left > rounding]
+        rest = np.unique(np.append(left, step)) if len(left) else left
+    span = float(levels[-1] - levels[0])
+    apart = len(levels) < FEW_LEVELS and span > (len(levels) - 0.5) * step
+    return 0.0 if apart or step < 10 * rounding else _refined(levels, step)
+
+
+def _refined(levels: FloatArray, step: float) -> float:
+    """The step by least squares over all levels."""
+    count = np.round((levels - levels[0]) / step)
+    return float(count @ (levels - levels[0]) / (count @ count))
+
+
+def measurements(t_s: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """One sample per measurement: without the repeats by which a slower message fills its gaps.
+
+    Held values come at least twice nearly always; quantised ones often come once.
+    """
+    change = np.flatnonzero(np.diff(values) != 0.0) + 1
+    if len(change) < 3 or 1.0 - len(change) / len(values) < HELD_SHARE:
+        return t_s, values
+    runs = np.diff(change)
+    if np.mean(runs == 1) > SINGLE_RUNS:
+        return t_s, values
+    lengths, counts = np.unique(runs, return_counts=True)
+    hold = int(lengths[counts.argmax()])
+    times = np.maximum(1, np.round(runs / hold).astype(int))
+    first = np.repeat(change[:-1], times)
+    nth = np.arange(len(first)) - np.repeat(np.cumsum(times) - times, times)
+    return t_s[np.minimum(first + nth * hold, len(t_s) - 1)], values[first]
+
+
+@dataclass(frozen=True)
+class _Floor:
+    sd: float
+    relative_sd: float
+    samples: int
+
+
+def _floor(t_s: FloatArray, values: FloatArray, order: int) -> _Floor | None:
+    """Noise from the order-th differences in quiet windows; None where there are too few."""
+    squares = _windows(t_s, values, order)
+    if len(squares) < 4:
+        return None
+    # A correlated sum of squares scatters like one of fewer, independent ones.
+    correlation = comb(4 * order, 2 * order) / comb(2 * order, order) ** 2
+    dof = WINDOW / correlation
+    floor = float(np.quantile(squares, QUIET)) * dof / chi2.ppf(QUIET, dof)
+    quiet = squares
+    for _ in range(20):
+        quiet = squares[squares <= floor * chi2.ppf(LIKELY, dof) / dof]
+        before, floor = floor, float(quiet.mean()) if len(quiet) else 0.0
+        if abs(floor - before) <= 1e-9 * before:
+            break
+    n = len(quiet) * WINDOW
+    return _Floor(float(np.sqrt(floor)), float(np.sqrt(correlation / (2 * max(n, 1)))), n)
+
+
+def _windows(t_s: FloatArray, values: FloatArray, order: int) -> FloatArray:
+    """Mean square of the scaled differences per window (windows,); none reaches over a gap."""
+    if len(values) < order + WINDOW:
+        return np.zeros(0)
+    difference = np.diff(values, order) / np.sqrt(comb(2 * order, order))
+    spacing = np.diff(t_s)
+    uneven = np.abs(spacing - np.median(spacing)) > 0.5 * np.median(spacing)
+    across = np.convolve(uneven, np.ones(order), "valid") > 0
+    n = len(difference) // WINDOW * WINDOW
+    whole = ~across[:n].reshape(-1, WINDOW).any(axis=1)
+    return np.asarray(np.mean(difference[:n].reshape(-1, WINDOW) ** 2, axis=1)[whole])
+
+
+def _settled(floors: list[_Floor]) -> tuple[float, float, int]:
+    """The lowest order from which on the floor no longer falls, and what is left of the fall."""
+    lowest = min(floors, key=lambda f: f.sd)
+    for f in floors:
+        if f.sd <= lowest.sd * (1.0 + 2.0 * np.hypot(f.relative_sd, lowest.relative_sd)):
+            break
+    fall = 1.0 - lowest.sd / f.sd if f.sd > 0 else 0.0
+    return f.sd, float(np.hypot(f.relative_sd, fall)), f.samples
