@@ -5,13 +5,17 @@ Per chamber c the pressure equation (14) of IMECE2005-79420, all terms in m3/s, 
     s_c A_c v = - V_c(x) dP_c/dt * theta_beta_c + sum over open edges of sigma * Q_edge(u, dp)
 
 with V_c(x) = V0_c + s_c A_c x, theta_beta_c = 1 / beta_c, and sigma = +1 for an edge that feeds
-the chamber, -1 for one that drains it.  Everything here is SI and immutable; the project file
-(`rtid.project`) is turned into one `Model`, and nothing below this module knows a file.
+the chamber, -1 for one that drains it.
+
+A plant of the general form (1), xdot = phi(x)' theta + f(u, x), is the same with other names: a
+chamber without pressure whose `area_m2` is 1, shared terms for phi, an edge for f.  Everything here
+is SI and immutable; the project file (`rtid.project`) is turned into one `Model`, and nothing below
+this module knows a file.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +23,10 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 COMMAND, PRESSURE, POSITION, VELOCITY = "command", "pressure", "position", "velocity"
+MODE = "mode"  # kind of the signal that carries the number of the working mode
+TAYLOR, LAPPED, BLENDED = BASES = "taylor", "lapped", "blended"
+BOTH, COMMAND_ONLY, DROP_ONLY = "both", "command", "drop"
+NONE = ""  # in place of a signal's name: a quantity that is always zero
 
 
 @dataclass(frozen=True)
@@ -49,13 +57,18 @@ class Grid:
 
 @dataclass(frozen=True)
 class Chamber:
-    """One pressure equation: `pressure` names its signal, V(x) = v0_m3 + sign * area_m2 * x."""
+    """One pressure equation: `pressure` names its signal, V(x) = v0_m3 + sign * area_m2 * x.
+
+    Without a pressure (NONE) it is xdot = ..., times area_m2.  disturbance: intensity of unmodelled
+    flow, m3/s per sqrt(Hz), a white noise that the rows are weighed for.
+    """
 
     name: str
     pressure: str
     area_m2: float
     sign: int  # +1: the volume grows with x, -1: it shrinks
     v0_m3: float
+    disturbance: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -65,6 +78,12 @@ class Edge:
     `source` and `sink` name pressure signals.  The edge opens with w = direction * u of the signal
     `command`; for w <= safe_band_v it passes nothing (prior knowledge, can be -inf to switch off).
     The grid is in terms of w.  rated_* give the size of the flow for scaling and first weights.
+
+    basis: TAYLOR, eq. (6), LAPPED, local cosines under the windows of (12), or BLENDED, Taylor
+    terms under the squares of these windows.  terms: BOTH, or DROP_ONLY, eq. (15), one function of
+    dp per interval of w, or COMMAND_ONLY.  modes: working modes in which it may open, all when
+    empty; in the others its command is zero.  signs: (chamber, +1 or -1) pairs, where the ends'
+    names do not tell which chambers it feeds and drains.
     """
 
     name: str
@@ -76,15 +95,32 @@ class Edge:
     safe_band_v: float
     rated_q_m3s: float
     rated_dp_pa: float
+    basis: str = TAYLOR
+    terms: str = BOTH
+    modes: tuple[int, ...] = ()
+    signs: tuple[tuple[str, int], ...] = ()
+
+    def sign(self, chamber: Chamber) -> int:
+        """+1 where the edge feeds the chamber, -1 where it drains it, else 0."""
+        if self.signs:
+            return dict(self.signs).get(chamber.name, 0)
+        return (self.sink == chamber.pressure) - int(self.source == chamber.pressure)
+
+
+SHAPES = ("linear", "root", "hinge", "inverse")
 
 
 @dataclass(frozen=True)
 class Term:
-    """A shared flow, linear in signals: theta * scale * (sum of weights * signal + constant).
+    """A shared flow theta * scale * f(z) or, with `rate`, - theta * scale * V df(z)/dt.
 
-    weights: (signal, weight) pairs of quantities that run linearly between samples; signs:
-    (chamber, +1 or -1) pairs.  A laminar internal leakage has weights p_a: 1, p_b: -1, signs a: -1,
-    b: +1, and a scale in m3/s/Pa near the coefficient that is expected.
+    z = sum of weights * signal + constant, linear between samples; weights: (signal, weight) pairs;
+    signs: (chamber, +1 or -1) pairs.  f(z) by `shape`: z, sign(z) sqrt|z|, max(0, z) or -1 / z.
+    volume: the chamber whose V(x) multiplies a rate, NONE for 1.
+
+    A laminar internal leakage has weights p_a: 1, p_b: -1, signs a: -1, b: +1, and a scale in
+    m3/s/Pa near the coefficient that is expected; a relief valve is a hinge with the constant
+    -p_open; entrained air is the rate of -1 / p.
     """
 
     name: str
@@ -92,6 +128,9 @@ class Term:
     signs: tuple[tuple[str, int], ...]
     scale: float
     constant: float = 0.0
+    shape: str = "linear"
+    rate: bool = False
+    volume: str = NONE
 
 
 @dataclass(frozen=True)
@@ -117,6 +156,7 @@ class Gates:
 
     condition_limit: float = 1e8
     max_gap_s: float = 0.05  # a longer step between samples restarts the integrals
+    recovery_s: float = 0.0  # nothing is learned for so long after a gap or a refused sample
     hysteresis: float = 0.05  # share of a block's width that the working point must leave it by
     min_rows: int = 20  # rows that a block needs before it can become valid
     max_sd_share: float = 0.001  # of the edge's largest flow: known worse than this is not valid
@@ -135,12 +175,23 @@ class Model:
     lag: Lag = field(default_factory=Lag)
     filter: Filter = field(default_factory=Filter)
     gates: Gates = field(default_factory=Gates)
-    form: str = "integral"  # or "carry"
+    form: str = "integral"  # or "carry", "restart"
     terms: tuple[Term, ...] = ()
     pressure_period_s: float = 0.0  # sampling period of the pressures; 0: every sample
     # Variance of a pressure at the rows as a share of its sensor's: 1 where it is measured there,
     # f^2 + (1 - f)^2 where it is interpolated at the fraction f between two samples.
     pressure_share: float = 1.0
+    mode: str = NONE  # the signal that carries the number of the working mode
+
+    @property
+    def n_cells(self) -> int:
+        """Number of blocks of all grids."""
+        return sum(edge.grid.shape[0] * edge.grid.shape[1] for edge in self.edges)
+
+    @property
+    def with_taylor_maps(self) -> Model:
+        """The same machine with every map in Taylor terms, as maps are published."""
+        return replace(self, edges=tuple(replace(e, basis=TAYLOR) for e in self.edges))
 
     def column(self, name: str) -> int:
         """Column of the signal `name` in `Samples.values`; KeyError if the model has none."""

@@ -18,7 +18,8 @@ from rtid.estimator.estimator import Estimator
 from rtid.estimator.state import State, Weights
 from rtid.model import Model
 
-SCHEMA = 1
+SCHEMA = 2
+WEIGHTS = ("slopes", "compliance", "missed")
 ARRAYS = ("engine", "cells", "closed", "blocks", "pairs")
 
 
@@ -32,7 +33,7 @@ def save(path: Path, estimator: Estimator, digest: str) -> None:
     arrays: dict[str, Any] = dict(zip(ARRAYS, estimator.state.arrays, strict=True))
     weights = estimator.weights
     if weights is not None:
-        arrays |= {"slopes": weights.slopes, "compliance": weights.compliance}
+        arrays |= {name: getattr(weights, name) for name in WEIGHTS}
         header["lag_s"] = weights.lag_s
     temporary = path.with_name(path.name + ".part")
     with temporary.open("wb") as file:
@@ -56,7 +57,8 @@ def load(path: Path, model: Model, digest: str) -> Estimator:
     _check(path, header, digest)
     weights = None
     if "slopes" in content:
-        weights = Weights(content["slopes"], content["compliance"], float(header["lag_s"]))
+        slopes, compliance, missed = (content[name] for name in WEIGHTS)
+        weights = Weights(slopes, compliance, float(header["lag_s"]), missed)
     estimator = Estimator(model, weights)
     for name, array in zip(ARRAYS, estimator.state.arrays, strict=True):
         if content[name].dtype != array.dtype:

@@ -532,7 +532,7 @@ static void change_blocks(Tables *t, const Point *points)
     int any = 0;
     for (int i = 0; i < e->n_edges; i++) any |= moved(e, &points[i], i);
     if (!any) return;
-    if (e->n_open + e->n_closed + MAX_OPEN > t->max_closed) {
+    if (e->n_open + e->n_closed + e->max_open > t->max_closed) {
         e->counters[RESTART_MEMORY]++;
         forget(t);
         start_whitener(e);
@@ -728,8 +728,8 @@ int64_t advance(Engine *e, Cell *cells, Closed *closed, int64_t max_closed, Bloc
 {
     Tables t = {e, cells, closed, blocks, pairs, max_closed, max_blocks, max_pairs};
     for (int64_t k = 0; k < n; k++) {
-        const int64_t recent = e->n_open + e->n_closed + MAX_OPEN;
-        if (e->n_slots + MAX_EDGES > max_blocks ||
+        const int64_t recent = e->n_open + e->n_closed + e->max_open;
+        if (e->n_slots + e->max_open > max_blocks ||
             10 * (e->n_pairs + recent * recent / 2) > 6 * max_pairs)
             return k;
         take(&t, chunk + k * (2 + e->n_signals));

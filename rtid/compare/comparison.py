@@ -138,7 +138,7 @@ def _hold(
     n, c = max(len(chunk) - 1, 0), len(model.chambers)
     flow, innovation = np.full((n, 2 * c), np.nan), np.full((n, c), np.nan)
     cell = np.full((n, len(model.edges)), -1, np.int64)
-    state = build(model, weights)
+    state = build(model.with_taylor_maps, weights)
     state.engine[0]["term_theta"][: len(terms)] = terms
     explain(state.engine, state.cells, theta, compliance, chunk, flow, cell, innovation)
     return _Held(np.ascontiguousarray(chunk[:, 0]), flow, cell, innovation)

@@ -7,17 +7,19 @@ eq. (11) is met directly: the same filter on both sides.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import expm
 
-from rtid.estimator.state import FLOW_NOISE_FLOOR, Weights, nominal_weights
-from rtid.estimator.track import ROW, Track, follow
-from rtid.model import Edge, FloatArray, Model
+from rtid.estimator.state import MASKS, Weights, flow_noise_floor, nominal_weights, variance
+from rtid.estimator.track import ROW, IntArray, Track, follow, pressure_drop
+from rtid.model import BLENDED, TAYLOR, Edge, FloatArray, Model, Term
 
 Blocks = tuple[tuple[int, int, int], ...]
+GAUSS_POINTS = 0.5 + 0.5 / np.sqrt(3) * np.array([-1.0, 1.0])  # of an interval, in its lengths
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,7 @@ def fit_batch(
     flags = np.broadcast_to(np.asarray(flags, np.int64), len(t_s))
     track = follow(model, t_s, values, flags, weights)
     rates, blocks = column_rates(model, t_s, values, track, weights, xdot_mps)
-    maker = _carry_rows if model.form == "carry" else _integral_rows
+    maker = _integral_rows if model.form == "integral" else _carry_rows
     stacked = maker(model, t_s, values, rates, track, weights)
     y, rows = stacked[:, 0], stacked[:, 1:]
     ridge = np.full(rows.shape[1], prior[1])
@@ -79,7 +81,7 @@ def column_rates(
     xdot_mps: FloatArray | None = None,
 ) -> tuple[FloatArray, Blocks]:
     """(intervals, chambers, 2, 1 + n): start and end rate of y and of every column, m3/s."""
-    blocks, end = _visited(track), track.end
+    blocks, end = _visited(model, track), track.end
     n_shared = len(model.chambers) + len(model.terms)
     out = np.zeros((len(end), len(model.chambers), 2, 1 + n_shared + 6 * len(blocks)))
     place = {block: 1 + n_shared + 6 * b for b, block in enumerate(blocks)}
@@ -87,47 +89,123 @@ def column_rates(
     x = values[:, model.column(model.position)]
     for c, chamber in enumerate(model.chambers):
         area = chamber.sign * chamber.area_m2
-        p = values[:, model.column(chamber.pressure)]
+        p = values[:, model.column(chamber.pressure)] if chamber.pressure else np.zeros(len(t_s))
         pdot = (p[end] - p[end - 1]) / dt * weights.compliance[c]
         for side, instants in enumerate((end - 1, end)):
             rate = (x[end] - x[end - 1]) / dt if xdot_mps is None else xdot_mps[instants]
             out[:, c, side, 0] = area * rate
             out[:, c, side, 1 + c] = -(chamber.v0_m3 + area * x[instants]) * pdot
     for number, term in enumerate(model.terms):
-        flow = np.full(len(values), term.constant)
-        for name, weight in term.weights:
-            flow += weight * values[:, model.column(name)]
+        flow = _term_rates(model, term, values, end, dt)
         for c, chamber in enumerate(model.chambers):
             sign = dict(term.signs).get(chamber.name, 0)
-            for side, instants in enumerate((end - 1, end)):
-                out[:, c, side, 1 + len(model.chambers) + number] = (
-                    sign * term.scale * flow[instants]
-                )
+            out[:, c, :, 1 + len(model.chambers) + number] = sign * flow
     moments = _moments(track.opening, dt, weights.lag_s)
     for i, edge in enumerate(model.edges):
-        dp = values[:, model.column(edge.source)] - values[:, model.column(edge.sink)]
+        dp = pressure_drop(model, edge, values)
         for k in np.flatnonzero(track.cells[:, i, 0] >= 0):
-            a, b = (int(j) for j in track.cells[k, i])
-            phi = _terms(edge, a, b, moments[k, i], dp[end[k] - 1 : end[k] + 1])
-            at = place[(i, a, b)]
-            for c, sigma in enumerate(_signs(model, edge)):
-                out[k, c, :, at : at + 6] = sigma * edge.rated_q_m3s * phi
+            ends = dp[end[k] - 1 : end[k] + 1]
+            for a, b in _windows(edge, track.cells[k, i]):
+                if edge.basis != TAYLOR:
+                    w = _at_gauss_points(track.opening[k, i], dt[k], weights.lag_s)
+                    phi = _windowed_terms(edge, a, b, w, ends)
+                else:
+                    phi = _terms(edge, a, b, moments[k, i], ends)
+                at = place[(i, a, b)]
+                for c, chamber in enumerate(model.chambers):
+                    flow = edge.sign(chamber) * edge.rated_q_m3s * phi * MASKS[edge.terms]
+                    out[k, c, :, at : at + 6] = flow
     return out, blocks
 
 
-def _visited(track: Track) -> Blocks:
+_SHAPES: dict[str, Callable[[FloatArray], FloatArray]] = {
+    "linear": lambda z: z,
+    "root": lambda z: np.sign(z) * np.sqrt(np.abs(z)),
+    "hinge": lambda z: np.maximum(z, 0.0),
+    "inverse": lambda z: -1.0 / z,
+}
+
+
+def _term_rates(
+    model: Model, term: Term, values: FloatArray, end: IntArray, dt: FloatArray
+) -> FloatArray:
+    """(intervals, 2): flow of a shared term for theta = 1 at the start and end of each interval."""
+    z = np.full(len(values), term.constant)
+    for name, weight in term.weights:
+        z += weight * values[:, model.column(name)]
+    f = _SHAPES[term.shape](z)
+    if not term.rate:
+        return np.asarray(term.scale * np.stack([f[end - 1], f[end]], axis=1))
+    volume = np.ones(len(values))
+    for chamber in model.chambers:
+        if chamber.name == term.volume:
+            x = values[:, model.column(model.position)]
+            volume = chamber.v0_m3 + chamber.sign * chamber.area_m2 * x
+    rate = -term.scale * (f[end] - f[end - 1]) / dt
+    return np.stack([volume[end - 1] * rate, volume[end] * rate], axis=1)
+
+
+def _windows(edge: Edge, cell: IntArray) -> tuple[tuple[int, int], ...]:
+    """The blocks that share a working point: one, or up to two by two where windows overlap."""
+    a, b = int(cell[0]), int(cell[1])
+    if edge.basis == TAYLOR:
+        return ((a, b),)
+    nu, nd = edge.grid.shape
+    return tuple((i, j) for i in range(a, min(a + 2, nu)) for j in range(b, min(b + 2, nd)))
+
+
+def _visited(model: Model, track: Track) -> Blocks:
     """Blocks in the order of their first visit, as the engine gives out its slots."""
     seen: dict[tuple[int, int, int], None] = {}
     for interval in track.cells:
-        for i, (a, b) in enumerate(interval):
-            if a >= 0:
-                seen.setdefault((i, int(a), int(b)))
+        for i, edge in enumerate(model.edges):
+            if interval[i, 0] >= 0:
+                for a, b in _windows(edge, interval[i]):
+                    seen.setdefault((i, a, b))
     return tuple(seen)
 
 
-def _signs(model: Model, edge: Edge) -> list[int]:
-    """+1 for a chamber that the edge feeds, -1 for one that it drains."""
-    return [(edge.sink == c.pressure) - int(edge.source == c.pressure) for c in model.chambers]
+def _at_gauss_points(opening: FloatArray, dt: float, lag_s: float) -> FloatArray:
+    """Lagged command at the two Gauss points of one interval (2,)."""
+    held, start = opening
+    t = GAUSS_POINTS * dt
+    return np.asarray(held + (start - held) * (np.exp(-t / lag_s) if lag_s > 0 else 0 * t))
+
+
+def _windowed_terms(edge: Edge, i: int, j: int, w: FloatArray, dp: FloatArray) -> FloatArray:
+    """(2, 6): windowed terms at both ends of an interval, on the line through two Gauss points."""
+    drop = dp[0] + GAUSS_POINTS * (dp[1] - dp[0])
+    axis = _blended if edge.basis == BLENDED else _local_cosines
+    a, b = axis(edge.grid.u_v, i, w), axis(edge.grid.dp_pa, j, drop)
+    phi = np.stack([a[k] * b[m] for k, m in ((0, 0), (1, 0), (0, 1), (2, 0), (0, 2), (1, 1))])
+    slope = (phi[:, 1] - phi[:, 0]) / (GAUSS_POINTS[1] - GAUSS_POINTS[0])
+    return np.stack([phi.mean(axis=1) - 0.5 * slope, phi.mean(axis=1) + 0.5 * slope])
+
+
+def _window(border: FloatArray, i: int, at: FloatArray) -> FloatArray:
+    """Window (12) of block i (points,): none falls at the grid's ends."""
+    n, width = len(border) - 1, np.diff(border)
+    window = np.ones(len(at))
+    if i > 0:
+        t = (at - border[i]) / (0.5 * min(width[i - 1], width[i]))
+        window = np.sin(np.pi / 4 * (1 + np.clip(t, -1, 1)))
+    if i < n - 1:
+        t = (border[i + 1] - at) / (0.5 * min(width[i], width[i + 1]))
+        window = window * np.sin(np.pi / 4 * (1 + np.clip(t, -1, 1)))
+    return window
+
+
+def _local_cosines(border: FloatArray, i: int, at: FloatArray) -> FloatArray:
+    """(3, points): the window times cos(pi (k + 1/2) s); the last block's cosines are even."""
+    s = (at - border[i]) / (border[i + 1] - border[i])
+    shift = 0.5 if i < len(border) - 2 else 0.0
+    return np.stack([_window(border, i, at) * np.cos(np.pi * (k + shift) * s) for k in range(3)])
+
+
+def _blended(border: FloatArray, i: int, at: FloatArray) -> FloatArray:
+    """(3, points): the window's square times 1, xi and xi^2."""
+    xi = (2 * at - border[i] - border[i + 1]) / (border[i + 1] - border[i])
+    return _window(border, i, at) ** 2 * np.stack([np.ones(len(at)), xi, xi**2])
 
 
 def _moments(opening: FloatArray, dt: FloatArray, lag_s: float) -> FloatArray:
@@ -169,35 +247,19 @@ def position_noise(model: Model, x_m: float, weights: Weights) -> FloatArray:
     return np.asarray(np.outer(a, a) * variance(model, model.position) + white)
 
 
-def variance(model: Model, name: str) -> float:
-    """Declared sensor noise and quantisation of a signal, SI squared."""
-    signal = model.signals[model.column(name)]
-    return signal.noise**2 + signal.resolution**2 / 12
-
-
-def _least_flow_noise(model: Model) -> FloatArray:
-    """(chambers, chambers), m6/s: a share of what the rated slope of the noisiest edge gives."""
-    least = np.zeros(len(model.chambers))
-    for edge in model.edges:
-        slope = 0.5 * edge.rated_q_m3s / edge.rated_dp_pa
-        noise = variance(model, edge.source) + variance(model, edge.sink)
-        size = FLOW_NOISE_FLOOR * slope**2 * noise * (model.pressure_period_s or 1e-3)
-        least = np.maximum(least, np.abs(_signs(model, edge)) * size)
-    return np.diag(least)
-
-
-def flow_noise(model: Model, cells: FloatArray, dt: float, weights: Weights) -> FloatArray:
+def flow_noise(model: Model, cells: IntArray, dt: float, weights: Weights) -> FloatArray:
     """Covariance added by one interval: pressure noise through the slope of the open maps.
 
     cells (edges, 2): the interval's block per edge, -1 when shut.
     """
-    q, first = _least_flow_noise(model) * dt, 0
+    q, first = np.diag(flow_noise_floor(model)) * dt, 0
     for (a, b), edge in zip(cells, model.edges, strict=True):
         if a >= 0:
-            slope = weights.slopes[first + a * edge.grid.shape[1] + b]
-            s = np.array(_signs(model, edge))
+            at = first + a * edge.grid.shape[1] + b
+            s = np.array([edge.sign(chamber) for chamber in model.chambers])
             noise = variance(model, edge.source) + variance(model, edge.sink)
-            q = q + np.outer(s, s) * slope**2 * noise * (model.pressure_period_s or dt) * dt
+            noise *= weights.slopes[at] ** 2 * (model.pressure_period_s or dt)
+            q = q + np.outer(s, s) * (noise + weights.missed[at]) * dt
         first += edge.grid.shape[0] * edge.grid.shape[1]
     return q
 
@@ -219,7 +281,7 @@ def _integral_rows(
             cov, gap = position_noise(model, x[end - 1], weights), np.zeros_like(gap)
         dt = t_s[end] - t_s[end - 1]
         gap = gap + rates[k].mean(axis=1) * dt
-        cov = cov + flow_noise(model, track.cells[k], dt, weights)
+        cov = cov + flow_noise(model, track.home[k], dt, weights)
         if track.row[k]:
             s = cov + position_noise(model, x[end], weights)
             rows.append(np.linalg.solve(np.linalg.cholesky(s), gap))

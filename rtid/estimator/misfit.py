@@ -61,18 +61,19 @@ def _scores(
 
 def _per_cell(model: Model, solution: Solution) -> tuple[FloatArray, list[FloatArray]]:
     """The fitted map (cells, 6) in m3/s, and the influence on each compliance as such maps."""
-    sizes = [edge.grid.shape[0] * edge.grid.shape[1] for edge in model.edges]
-    first, n_c = np.concatenate([[0], np.cumsum(sizes)]), len(solution.scale_pa)
-    theta = np.zeros((first[-1], TERMS))
-    flows = [np.zeros_like(theta) for _ in range(n_c)]
-    for slot, block in enumerate(solution.blocks):
-        edge = model.edges[block.edge]
-        cell = first[block.edge] + block.i * edge.grid.shape[1] + block.j
-        theta[cell] = block.theta
-        at = n_c + len(model.terms) + TERMS * slot
-        for c in range(n_c):
-            flows[c][cell] = solution.influence[c, at : at + TERMS] * edge.rated_q_m3s
-    return theta, flows
+    first = len(solution.scale_pa) + len(model.terms)
+    maps = []
+    for unknowns in (solution.unknowns, *solution.influence):
+        theta = np.zeros((model.n_cells, TERMS))
+        theta[solution.cells] = unknowns[first:].reshape(-1, TERMS)
+        maps.append(theta * np.repeat(*_rated(model))[:, None])
+    return maps[0], maps[1:]
+
+
+def _rated(model: Model) -> tuple[FloatArray, list[int]]:
+    """Rated flow and number of cells of each edge."""
+    rated = np.array([edge.rated_q_m3s for edge in model.edges])
+    return rated, [edge.grid.shape[0] * edge.grid.shape[1] for edge in model.edges]
 
 
 def _innovations(

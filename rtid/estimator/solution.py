@@ -7,11 +7,13 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dpotri
 from threadpoolctl import ThreadpoolController
 
-from rtid.estimator.state import State
+from rtid.estimator.lapped import overlaps, to_taylor
+from rtid.estimator.state import MASKS, State
 from rtid.kernels.layout import COUNTERS, ROWS, TERMS
 from rtid.kernels.normal import assemble, mirror
 from rtid.model import FloatArray, Model
@@ -63,8 +65,9 @@ class Solution:
 
     beta_pa and beta_sd_pa (chambers,); rho: residual variance in units of the declared noise, 1
     when the model explains the rows to the sensors' noise; leverage (chambers,): `leverage_of`.
-    In units of the unknowns, scale_pa (chambers,) for the compliances: basis (n, chambers), how all
-    unknowns follow the compliances; influence (chambers, n), their covariance with all unknowns.
+    In units of the unknowns, scale_pa (chambers,) for the compliances: unknowns (n,), terms of the
+    grid cells `cells` (slots,) in the basis of their maps; influence (chambers, n), covariance of
+    the compliances with them; basis (n, chambers), how the former move what is published.
     terms (terms,) and terms_cov: coefficients of the model's shared terms.
     """
 
@@ -77,6 +80,8 @@ class Solution:
     leverage: FloatArray
     basis: FloatArray
     influence: FloatArray
+    unknowns: FloatArray
+    cells: NDArray[np.int64]
     scale_pa: FloatArray
     terms: FloatArray
     terms_cov: FloatArray
@@ -224,7 +229,10 @@ def sketch(model: Model, state: State) -> Sketch:
     n_c, ns, n_slots = int(e["n_chambers"]), int(e["n_shared"]), int(e["n_slots"])
     leverage = leverage_of(settled, np.ones(len(normal.right)))
     with one_thread():
-        theta = correct(normal, factorize(normal, ns), leverage).theta
+        factor = factorize(normal, ns)
+        theta = correct(normal, factor, leverage).theta
+        if overlaps(model):
+            theta = to_taylor(model, settled, factor.cov(), PRIOR_SD)[0] @ theta
     flow = _mean_flows(settled, theta)
     flow[settled.blocks["rows"][:n_slots] < model.gates.min_rows] = np.nan
     return Sketch(theta[:n_c] * e["compliance"][:n_c], flow, leverage)
@@ -243,7 +251,10 @@ def solve(model: Model, state: State) -> Solution:
         found = correct(normal, factor, leverage)
         cov += found.basis @ found.cov_change @ found.basis.T
     influence = cov[:n_c].copy()
-    theta = found.theta
+    theta, basis, left = found.theta, found.basis, misfit(normal, found.theta)
+    if overlaps(model):
+        change, cov = to_taylor(model, settled, cov, PRIOR_SD)
+        theta, basis = change @ theta, change @ basis
     dof = max(1, normal.rows * n_c - round(float(effective.sum())))
     c0 = e["compliance"][:n_c]
     scales = np.array([term.scale for term in model.terms])
@@ -257,11 +268,13 @@ def solve(model: Model, state: State) -> Solution:
         compliance=theta[:n_c] * c0,
         compliance_cov=cov[:n_c, :n_c] * np.outer(c0, c0),
         blocks=blocks,
-        rho=misfit(normal, theta) / dof,
+        rho=left / dof,
         dof=dof,
         leverage=leverage,
-        basis=found.basis,
+        basis=basis,
         influence=influence,
+        unknowns=found.theta,
+        cells=settled.blocks["cell"][: int(e["n_slots"])].copy(),
         scale_pa=c0.copy(),
         terms=theta[n_c : int(e["n_shared"])] * scales,
         terms_cov=cov[n_c : int(e["n_shared"]), n_c : int(e["n_shared"])]
@@ -384,7 +397,8 @@ def _block(
     q = model.edges[edge].rated_q_m3s
     i, j = divmod(int(record["cell"] - e["first_cell"][edge]), int(e["n_dp"][edge]))
     mean_phi = record["phi_sum"] / max(record["dwell_s"], 1e-12)
-    condition = _condition(normal.gram[own, own])
+    used = at + np.flatnonzero(MASKS[model.edges[edge].terms])
+    condition = _condition(normal.gram[np.ix_(used, used)])
     sd_share = q / largest_m3s[edge] * float(np.sqrt(max(0.0, mean_phi @ cov[own, own] @ mean_phi)))
     status, reason = _status(model, int(record["rows"]), condition, sd_share)
     return Block(

@@ -7,17 +7,20 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from rtid.estimator.limits import refuse_unfit
+from rtid.estimator.limits import most_open, refuse_unfit
 from rtid.kernels import engine as kernel
 from rtid.kernels import layout
 from rtid.kernels.recent import move_pairs
-from rtid.model import Edge, FloatArray, Model
+from rtid.model import BASES, BOTH, COMMAND_ONLY, DROP_ONLY, SHAPES, Edge, FloatArray, Model
 
 RecordArray = NDArray[np.void]
 
 # A closed block is silent when its state has decayed to this share.  The rows of the carry form are
 # worse conditioned, and fade so fast that digits cost nothing.
-RING_FLOOR = {layout.INTEGRAL: 1e-11, layout.CARRY: 1e-13}
+RING_FLOOR = {layout.INTEGRAL: 1e-11, layout.CARRY: 1e-13, layout.RESTART: 1e-13}
+FORMS = {"integral": layout.INTEGRAL, "carry": layout.CARRY, "restart": layout.RESTART}
+# Where no pressure noise bounds it, the whitener forgets within this time.
+MEMORY_S = 2.0
 FLOW_NOISE_FLOOR = 0.01  # least flow noise, share of the variance that the rated slope gives
 FIRST_BLOCKS, FIRST_PAIRS = 64, 1024
 MAX_CLOSED = layout.MAX_RECENT
@@ -71,7 +74,7 @@ class State:
 
     def make_room(self) -> None:
         """Double the table that is full, of blocks or of pairs; nothing else changes."""
-        if self.engine[0]["n_slots"] + layout.MAX_EDGES > len(self.blocks):
+        if self.engine[0]["n_slots"] + layout.MAX_OPEN > len(self.blocks):
             extra = np.zeros(len(self.blocks), layout.BLOCK)
             self.blocks = np.concatenate([self.blocks, extra])
         else:
@@ -101,12 +104,19 @@ class Weights:
     """What weighs the rows, frozen per revision so that recursive = batch has a meaning.
 
     slopes (cells,): dQ/ddp in m3/s/Pa per grid cell, in the order of the edges; compliance
-    (chambers,): 1 / beta in 1/Pa; lag_s: first-order lag of the spools.
+    (chambers,): 1 / beta in 1/Pa; lag_s: first-order lag of the spools; missed (cells,): variance
+    rate of the flow that a block's terms miss, m6/s, none when not given.
     """
 
     slopes: FloatArray
     compliance: FloatArray
     lag_s: float
+    missed: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        """Give every cell its value."""
+        if not len(self.missed):
+            object.__setattr__(self, "missed", np.zeros(len(self.slopes)))
 
 
 def nominal_weights(model: Model) -> Weights:
@@ -124,7 +134,7 @@ def build(model: Model, weights: Weights | None = None) -> State:
     refuse_unfit(model)
     weights = weights or nominal_weights(model)
     cells = np.zeros(len(weights.slopes), layout.CELL)
-    cells["slope"] = weights.slopes
+    cells["slope"], cells["missed"] = weights.slopes, weights.missed
     engine = np.zeros(1, layout.ENGINE)
     _configure(engine[0], model)
     engine[0]["compliance"][: len(model.chambers)] = weights.compliance
@@ -152,24 +162,27 @@ def _edge_slopes(edge: Edge) -> FloatArray:
 
 
 def _configure(e: np.void, model: Model) -> None:
-    e["form"] = layout.CARRY if model.form == "carry" else layout.INTEGRAL
+    e["form"] = FORMS[model.form]
     n_chambers = len(model.chambers)
     e["n_chambers"], e["n_edges"] = n_chambers, len(model.edges)
     e["n_shared"], e["n_signals"] = n_chambers + len(model.terms), len(model.signals)
     _configure_terms(e, model)
-    e["n_state"] = n_chambers * (2 if model.form == "carry" else 1)
+    e["n_state"] = n_chambers * (1 if model.form == "integral" else 2)
     for j, signal in enumerate(model.signals):
         e["minimum"][j], e["maximum"][j] = signal.minimum, signal.maximum
     e["x_column"] = model.column(model.position)
-    e["x_var_m2"] = _variance(model, model.position)
+    e["x_var_m2"] = variance(model, model.position)
     for c, chamber in enumerate(model.chambers):
-        e["p_column"][c] = model.column(chamber.pressure)
-        e["p_var_pa2"][c] = _variance(model, chamber.pressure) * model.pressure_share
+        e["p_column"][c] = _column(model, chamber.pressure)
+        e["p_var_pa2"][c] = variance(model, chamber.pressure) * model.pressure_share
         e["area_m2"][c], e["v0_m3"][c] = chamber.sign * chamber.area_m2, chamber.v0_m3
     first = 0
     for i, edge in enumerate(model.edges):
         first = _configure_edge(e, model, i, edge, first)
+    e["q_floor"][:n_chambers] = flow_noise_floor(model)
+    e["mode_column"], e["max_open"] = _column(model, model.mode), most_open(model)
     e["hysteresis"], e["max_gap_s"] = model.gates.hysteresis, model.gates.max_gap_s
+    e["recovery_s"] = model.gates.recovery_s
     e["ring_floor"] = RING_FLOOR[int(e["form"])]
     e["wn_rad_s"], e["zeta"] = model.filter.wn_rad_s, model.filter.zeta
     e["row_period_s"] = 1.0 / model.filter.rows_per_s
@@ -177,34 +190,72 @@ def _configure(e: np.void, model: Model) -> None:
 
 
 def _configure_edge(e: np.void, model: Model, i: int, edge: Edge, first_cell: int) -> int:
-    e["source"][i], e["sink"][i] = model.column(edge.source), model.column(edge.sink)
+    e["source"][i], e["sink"][i] = _column(model, edge.source), _column(model, edge.sink)
     e["command"][i], e["direction"][i] = model.column(edge.command), edge.direction
+    e["modes"][i] = sum(1 << m for m in edge.modes) if edge.modes else -1
+    e["map_basis"][i] = BASES.index(edge.basis)
+    e["mask"][i] = MASKS[edge.terms]
+    e["masked"][i] = edge.terms != BOTH
     e["safe_v"][i], e["scale_m3s"][i] = edge.safe_band_v, edge.rated_q_m3s
-    e["dp_var_pa2"][i] = _variance(model, edge.source) + _variance(model, edge.sink)
+    e["dp_var_pa2"][i] = variance(model, edge.source) + variance(model, edge.sink)
     nu, nd = edge.grid.shape
     e["n_u"][i], e["n_dp"][i], e["first_cell"][i] = nu, nd, first_cell
     e["u_border"][i, : nu + 1], e["dp_border"][i, : nd + 1] = edge.grid.u_v, edge.grid.dp_pa
-    slope = 0.5 * edge.rated_q_m3s / edge.rated_dp_pa
     for c, chamber in enumerate(model.chambers):
-        e["sign"][i, c] = (edge.sink == chamber.pressure) - int(edge.source == chamber.pressure)
-        if e["sign"][i, c] != 0:
-            period = model.pressure_period_s or 1e-3
-            noise = slope**2 * e["dp_var_pa2"][i] * period
-            e["q_floor"][c] = max(e["q_floor"][c], FLOW_NOISE_FLOOR * noise)
+        e["sign"][i, c] = edge.sign(chamber)
     return first_cell + nu * nd
+
+
+def flow_noise_floor(model: Model) -> FloatArray:
+    """Least intensity of the flow noise (chambers,), m6/s.
+
+    A share of what the rated slope of the noisiest edge gives, and what is declared as disturbance;
+    where neither is there, what lets the whitener forget within MEMORY_S.
+    """
+    least, period = np.zeros(len(model.chambers)), model.pressure_period_s or 1e-3
+    for c, chamber in enumerate(model.chambers):
+        for edge in model.edges:
+            if edge.sign(chamber) != 0:
+                slope = 0.5 * edge.rated_q_m3s / edge.rated_dp_pa
+                noise = variance(model, edge.source) + variance(model, edge.sink)
+                least[c] = max(least[c], FLOW_NOISE_FLOOR * slope**2 * noise * period)
+        least[c] += chamber.disturbance**2
+        if least[c] == 0.0:
+            row_noise = chamber.area_m2**2 * variance(model, model.position)
+            least[c] = row_noise * period / MEMORY_S**2
+    return least
 
 
 def _configure_terms(e: np.void, model: Model) -> None:
     e["n_terms"] = len(model.terms)
     names = [chamber.name for chamber in model.chambers]
     for k, term in enumerate(model.terms):
-        e["term_constant"][k] = term.scale * term.constant
+        e["term_shape"][k], e["term_scale"][k] = SHAPES.index(term.shape), term.scale
+        e["term_volume"][k] = layout.FLOW
+        if term.rate:
+            e["term_volume"][k] = names.index(term.volume) if term.volume else layout.RATE
+        e["term_constant"][k] = term.constant
         for name, weight in term.weights:
-            e["term_weight"][k, model.column(name)] = term.scale * weight
+            e["term_weight"][k, model.column(name)] = weight
         for name, sign in term.signs:
             e["term_sign"][k, names.index(name)] = sign
 
 
-def _variance(model: Model, name: str) -> float:
+def _column(model: Model, name: str) -> int:
+    return model.column(name) if name else layout.NOTHING
+
+
+def variance(model: Model, name: str) -> float:
+    """Declared sensor noise and quantisation of a signal, SI squared; 0 for NONE."""
+    if not name:
+        return 0.0
     signal = model.signals[model.column(name)]
     return signal.noise**2 + signal.resolution**2 / 12.0
+
+
+# Which of the terms [1, xi, eta, xi^2, eta^2, xi eta] a map has.
+MASKS = {
+    BOTH: np.ones(layout.TERMS),
+    COMMAND_ONLY: np.array([1.0, 1.0, 0.0, 1.0, 0.0, 0.0]),
+    DROP_ONLY: np.array([1.0, 0.0, 1.0, 0.0, 1.0, 0.0]),
+}

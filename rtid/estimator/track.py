@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rtid.estimator.state import Weights, build
 from rtid.kernels.layout import RESTART_MEMORY
-from rtid.model import Edge, FloatArray, Model
+from rtid.model import TAYLOR, Edge, FloatArray, Model
 
 IntArray = NDArray[np.int64]
 ROW, GAP = 1, 2  # flags of a sample, as in firmware_bridge.samples
@@ -25,7 +25,8 @@ class Track:
 
     end (m,); fresh (m,): memory begins at the interval's start; started_s (m,): since when the
     record has run without a break; row (m,): the position was measured at its end;
-    cells (m, edges, 2): block (i, j), -1 when shut;
+    cells (m, edges, 2): block (i, j), -1 when shut; where windows overlap, the first of the blocks
+    that share the point; home (m, edges, 2): the block that holds it;
     opening (m, edges, 2): command held over the interval, lagged command at its start, volts.
     """
 
@@ -34,6 +35,7 @@ class Track:
     started_s: FloatArray
     row: NDArray[np.bool_]
     cells: IntArray
+    home: IntArray
     opening: FloatArray
 
 
@@ -47,27 +49,33 @@ def follow(
     new_memory = _memory_restarts(model, t_s, values, flags, weights)
     usable = _usable(model, t_s, values)
     found: list[tuple[int, bool, float, bool]] = []
-    cells, openings = [], []
-    running, fresh, started = False, False, 0.0
+    cells, homes, openings = [], [], []
+    running, fresh, started, ready = False, False, 0.0, -np.inf
     cell, w = _all_shut(model), np.zeros(len(model.edges))
     for k in range(len(t_s)):
         broken = k == 0 or not usable[k] or bool(flags[k] & GAP)
         broken = broken or not 0.0 < t_s[k] - t_s[k - 1] <= model.gates.max_gap_s
         inside = True
+        if not usable[k] or (running and broken):
+            ready = (t_s[k] if usable[k] else _last_usable(t_s, usable, k)) + model.gates.recovery_s
         if running and not broken:
             held = _held(model, values[k - 1])
             mean, last = _lagged(held, w, weights.lag_s, t_s[k] - t_s[k - 1])
-            cell, inside = _cells(model, values[k - 1 : k + 1], mean, cell)
+            before = cell
+            cell, home, inside = _cells(model, values[k - 1 : k + 1], mean, cell)
             if inside:
+                fresh = fresh or (model.form == "restart" and bool((cell != before).any()))
                 found.append((k, fresh or bool(new_memory[k]), started, bool(flags[k] & ROW)))
                 cells.append(cell)
+                homes.append(home)
                 openings.append(np.stack([held, w], axis=1))
                 w, fresh = last, False
         was_running = running
         running = running and not broken and inside
         if not running:
             cell = _all_shut(model)
-            if usable[k] and flags[k] & ROW and not (was_running and not broken):
+            may_start = usable[k] and flags[k] & ROW and t_s[k] >= ready
+            if may_start and not (was_running and not broken):
                 running, fresh, started, w = True, True, t_s[k], _held(model, values[k])
     ends, begins, since, rows = zip(*found, strict=True) if found else ((), (), (), ())
     return Track(
@@ -76,6 +84,7 @@ def follow(
         np.array(since, float),
         np.array(rows, bool),
         np.array(cells, np.int64).reshape(-1, len(model.edges), 2),
+        np.array(homes, np.int64).reshape(-1, len(model.edges), 2),
         np.array(openings, float).reshape(-1, len(model.edges), 2),
     )
 
@@ -87,8 +96,28 @@ def _usable(model: Model, t_s: FloatArray, values: FloatArray) -> NDArray[np.boo
     return whole & (values >= low).all(axis=1) & (values <= high).all(axis=1)
 
 
+def _last_usable(t_s: FloatArray, usable: NDArray[np.bool_], k: int) -> float:
+    before = np.flatnonzero(usable[:k])
+    return float(t_s[before[-1]]) if len(before) else 0.0
+
+
 def _held(model: Model, sample: FloatArray) -> FloatArray:
-    return np.array([edge.direction * sample[model.column(edge.command)] for edge in model.edges])
+    """Command of each edge (edges,); zero in a mode that keeps it shut."""
+    mode = int(sample[model.column(model.mode)]) if model.mode else 0
+    return np.array(
+        [
+            0.0
+            if edge.modes and mode not in edge.modes
+            else edge.direction * sample[model.column(edge.command)]
+            for edge in model.edges
+        ]
+    )
+
+
+def pressure_drop(model: Model, edge: Edge, values: FloatArray) -> FloatArray:
+    """dp over the edge (...,) from values (..., signals); an end that is NONE is at zero."""
+    ends = [values[..., model.column(name)] if name else 0.0 for name in (edge.source, edge.sink)]
+    return np.zeros(values.shape[:-1]) + ends[0] - ends[1]
 
 
 def _lagged(
@@ -108,17 +137,31 @@ def _all_shut(model: Model) -> IntArray:
 
 def _cells(
     model: Model, samples: FloatArray, mean_w: FloatArray, before: IntArray
-) -> tuple[IntArray, bool]:
-    """Block per edge of the interval between two samples; False when one is off its grid."""
-    cell, inside = _all_shut(model), True
+) -> tuple[IntArray, IntArray, bool]:
+    """Blocks and homes per edge of the interval between two samples; False: one is off its grid."""
+    cell, home, inside = _all_shut(model), _all_shut(model), True
     for i, edge in enumerate(model.edges):
         if mean_w[i] <= edge.safe_band_v:
             continue
-        dp = samples[:, model.column(edge.source)] - samples[:, model.column(edge.sink)]
-        point = (mean_w[i], 0.5 * (dp[0] + dp[1]))
-        cell[i] = _cell(edge, point, before[i], model.gates.hysteresis)
-        inside = inside and bool(cell[i].min() >= 0)
-    return cell, inside
+        point = (mean_w[i], float(pressure_drop(model, edge, samples).mean()))
+        if edge.basis != TAYLOR:
+            home[i] = _cell(edge, point, _all_shut(model)[i], 0.0)
+            cell[i] = _first_window(edge, point, home[i])
+        else:
+            cell[i] = home[i] = _cell(edge, point, before[i], model.gates.hysteresis)
+        inside = inside and bool(home[i].min() >= 0)
+    return cell, home, inside
+
+
+def _first_window(edge: Edge, point: tuple[float, float], home: IntArray) -> IntArray:
+    """Along each axis: the first of the two windows that overlap at the point."""
+    out = home.copy()
+    for axis, border in enumerate((edge.grid.u_v, edge.grid.dp_pa)):
+        i, n = home[axis], len(border) - 1
+        if i >= 0:
+            first = i - 1 if point[axis] < 0.5 * (border[i] + border[i + 1]) else i
+            out[axis] = max(0, min(first, n - 2))
+    return out
 
 
 def _cell(edge: Edge, point: tuple[float, float], before: IntArray, hysteresis: float) -> IntArray:

@@ -1,14 +1,27 @@
 """Blocks of the u-dp plane, eq. (5)-(7): six Taylor terms in local coordinates scaled to [-1, 1].
 
 phi = [1, xi, eta, xi^2, eta^2, xi eta],  xi = (w - w_c) / half width, eta = (dp - dp_c) / ...
+
+And the lapped basis: local cosines under the overlapping windows of (12), six per block,
+
+    g_i(w) g_j(dp) cos(pi (k + 1/2) s) cos(pi (l + 1/2) r),   k + l <= 2,   s, r in [0, 1],
+
+with g_i(t) = beta((t - b_i) / eta_i) beta((b_i+1 - t) / eta_i+1), beta(t) = sin(pi/4 (1 + t)).
+With this profile and the largest overlap the first cosines of equal blocks sum to a constant.
+
+And the blended basis: Taylor terms under the squares of the same windows, which sum to one, so that
+any quadratic flow is met exactly and the map has no jumps; not orthogonal.
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
-from rtid.kernels.jit import inlined
+from rtid.kernels.jit import inlined, kernel, part
+from rtid.kernels.layout import BLENDED
 
 FloatArray = NDArray[np.float64]
 
@@ -47,3 +60,84 @@ def taylor(xi: float, eta: float, out: FloatArray) -> None:
     out[3] = xi * xi
     out[4] = eta * eta
     out[5] = xi * eta
+
+
+OVERLAP = 0.5  # half the overlap at a border, in widths of the narrower neighbour: the most
+
+
+@inlined
+def locate_pair(border: FloatArray, n: int, value: float) -> tuple[int, int]:
+    """(First of the two lapped blocks that share value, the block that holds it); -1 outside."""
+    home = locate(border, n, value)
+    if home < 0:
+        return -1, -1
+    left = value < 0.5 * (border[home] + border[home + 1])
+    return max(0, min(home - 1 if left else home, n - 2)), home
+
+
+@inlined
+def _rise(t: float) -> float:
+    """beta(t) of (12): beta^2(t) + beta^2(-t) = 1."""
+    if t <= -1.0:
+        return 0.0
+    return 1.0 if t >= 1.0 else math.sin(0.25 * math.pi * (1.0 + t))
+
+
+@part
+def lapped_axis(
+    border: FloatArray, n: int, i: int, value: float, basis: int, out: FloatArray
+) -> None:
+    """Window i times its three functions at one value; out (3,) is changed in place.
+
+    The outer borders have no neighbour: no window falls there, and the last block's cosines are
+    even about its end instead of odd.
+    """
+    width = border[i + 1] - border[i]
+    g, shift = 1.0, 0.5
+    if i > 0:
+        eta = OVERLAP * min(width, border[i] - border[i - 1])
+        g = _rise((value - border[i]) / eta)
+    if i < n - 1:
+        eta = OVERLAP * min(width, border[i + 2] - border[i + 1])
+        g *= _rise((border[i + 1] - value) / eta)
+    else:
+        shift = 0.0
+    s = (value - border[i]) / width
+    if basis == BLENDED:
+        xi = 2.0 * s - 1.0
+        out[0], out[1], out[2] = g * g, g * g * xi, g * g * xi * xi
+        return
+    for k in range(3):
+        out[k] = g * math.cos(math.pi * (k + shift) * s)
+
+
+@inlined
+def lapped(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
+    """Products of the two axes' functions up to total order two, in the order of `taylor`."""
+    out[0] = a[0] * b[0]
+    out[1] = a[1] * b[0]
+    out[2] = a[0] * b[1]
+    out[3] = a[2] * b[0]
+    out[4] = a[0] * b[2]
+    out[5] = a[1] * b[1]
+
+
+@kernel
+def lapped_at(
+    basis: int,
+    u: FloatArray,
+    dp: FloatArray,
+    i: int,
+    j: int,
+    points: FloatArray,
+    out: FloatArray,
+) -> None:
+    """The six lapped terms of block (i, j) at points (n, 2) = [w, dp]; out (n, 6) is changed.
+
+    u (nu + 1,), dp (nd + 1,): the borders of the grid.
+    """
+    a, b = np.empty(3), np.empty(3)
+    for k in range(len(points)):
+        lapped_axis(u, len(u) - 1, i, points[k, 0], basis, a)
+        lapped_axis(dp, len(dp) - 1, j, points[k, 1], basis, b)
+        lapped(a, b, out[k])

@@ -15,9 +15,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rtid.kernels.basis import relocate
-from rtid.kernels.holds import lagged_moments, second_order
-from rtid.kernels.increments import block_increments, shared_increments, term_increments
+from rtid.kernels.basis import locate_pair, relocate
+from rtid.kernels.gate import admitted
+from rtid.kernels.holds import GAUSS, lagged_moments, second_order
+from rtid.kernels.increments import (
+    block_increments,
+    lapped_increments,
+    shared_increments,
+    term_increments,
+)
 from rtid.kernels.information import (
     RING_DET_LIMIT,
     close_block,
@@ -28,20 +34,22 @@ from rtid.kernels.jit import inlined, kernel, part
 from rtid.kernels.layout import (
     BLOCK,
     BLOCK_CHANGES,
-    CARRY,
     CELL,
     CLOSED,
     ENGINE,
     FREE,
+    INTEGRAL,
     MAX_EDGES,
-    MAX_OPEN,
     NOT_FINITE,
     OUT_OF_RANGE,
     OUTSIDE_GRID,
     PAIR,
+    RECOVERING,
+    RESTART,
     RESTART_GAP,
     RESTART_MEMORY,
     SAMPLES,
+    TAYLOR,
 )
 from rtid.kernels.local import remove_open, set_open
 from rtid.kernels.recent import hand_over, release
@@ -88,9 +96,9 @@ def advance(memory: Any, chunk: FloatArray) -> int:
 @inlined
 def needs_room(e: Any, blocks: Any, pairs: Any) -> bool:
     """True when the next sample could overflow the tables: blocks, or pairs more than 60 % full."""
-    recent = e.n_open + e.n_closed + MAX_OPEN
+    recent = e.n_open + e.n_closed + e.max_open
     full = 10 * (e.n_pairs + recent * recent // 2) > 6 * len(pairs)
-    return full or e.n_slots + MAX_EDGES > len(blocks)
+    return full or e.n_slots + e.max_open > len(blocks)
 
 
 @inlined
@@ -100,9 +108,12 @@ def _take(e: Any, cells: Any, closed: Any, blocks: Any, pairs: Any) -> None:
     sample, flags = e.sample, int(e.sample[1])
     whole, dt = acceptable(e, sample), step_s(e, sample[0])
     joined = whole and e.running
-    if joined and ((flags & GAP_FLAG) != 0 or dt > e.max_gap_s or dt <= 0.0):
+    broken = (flags & GAP_FLAG) != 0 or dt > e.max_gap_s or dt <= 0.0 or e.break_due != 0
+    if joined and broken:
         e.counters[RESTART_GAP] += 1
         joined = False
+    if not whole or (e.running and not joined):
+        e.ready_s = e.t_s + e.recovery_s if not whole else sample[0] + e.recovery_s
     inside = joined and _place(e, cells, closed, blocks, pairs, sample, dt)
     if inside:
         _integrate(e, cells, closed, blocks, pairs, sample, dt, (flags & ROW_FLAG) != 0)
@@ -111,7 +122,10 @@ def _take(e: Any, cells: Any, closed: Any, blocks: Any, pairs: Any) -> None:
     if whole:
         remember(e, sample)
         if not joined and (flags & ROW_FLAG) != 0:
-            _start(e, sample)
+            if sample[0] < e.ready_s:
+                e.counters[RECOVERING] += 1
+            else:
+                _start(e, sample)
 
 
 @inlined
@@ -146,11 +160,19 @@ def remember(e: Any, sample: FloatArray) -> None:
 def _start(e: Any, sample: FloatArray) -> None:
     """Begin at a measured position: spools at rest, whitener at R, filters at zero."""
     remember(e, sample)
-    e.running = 1
+    e.running, e.break_due = 1, 0
     e.next_row_s = sample[0] + e.row_period_s
     for i in range(e.n_edges):
-        e.w_v[i] = e.direction[i] * e.values[e.command[i]]
+        e.w_v[i] = commanded(e, i)
     start_whitener(e)
+
+
+@inlined
+def commanded(e: Any, i: int) -> float:
+    """Opening command of edge i at the last sample: zero in a mode that keeps it shut."""
+    if (e.modes[i] >> int(e.values[e.mode_column])) & 1 == 0:
+        return 0.0
+    return float(e.direction[i] * e.values[e.command[i]])
 
 
 @inlined
@@ -176,7 +198,9 @@ def _place(
     if not inside:
         e.counters[OUTSIDE_GRID] += 1
     elif moved:
-        if e.n_open + e.n_closed + MAX_OPEN > len(closed):
+        if e.form == RESTART:
+            rebase(e, closed, blocks, pairs, np.inf)
+        elif e.n_open + e.n_closed + e.max_open > len(closed):
             _begin_new_memory(e, closed, blocks, pairs)
         _change_blocks(e, cells, closed, blocks)
     return inside
@@ -209,8 +233,11 @@ def _integrate(
     if e.n_terms > 0:
         term_increments(e, sample, dt)
     for k in range(e.n_open):
-        block_increments(e, cells, blocks, k, sample[0], dt, row)
-    if e.form == CARRY:
+        if e.map_basis[e.open_edge[k]] != TAYLOR:
+            lapped_increments(e, cells, blocks, k, sample[0], dt, row)
+        else:
+            block_increments(e, cells, blocks, k, sample[0], dt, row)
+    if e.form != INTEGRAL:
         carry_step(e)
         remember(e, sample)
         if e.t_s > e.next_row_s - 0.5 * dt:
@@ -220,7 +247,7 @@ def _integrate(
             carry_row(e)
     else:
         remember(e, sample)
-        _integral_step(e, row)
+        _integral_step(e, blocks, row)
     if e.ring_det < RING_DET_LIMIT:
         rebase(e, closed, blocks, pairs, e.ring_floor)
 
@@ -230,7 +257,10 @@ def set_step(e: Any, dt: float) -> None:
     """Factors that depend on the length of the step alone."""
     e.dt_s = dt
     e.lag_decay = math.exp(-dt / e.lag_s) if e.lag_s > 0.0 else 0.0
-    if e.form == CARRY:
+    for g in range(2):
+        at = 0.5 + (GAUSS if g == 1 else -GAUSS)
+        e.gauss_decay[g] = math.exp(-at * dt / e.lag_s) if e.lag_s > 0.0 else 0.0
+    if e.form != INTEGRAL:
         second_order(e.wn_rad_s, e.zeta, dt, e.filter_a, e.filter_b)
 
 
@@ -242,17 +272,22 @@ def working_points(e: Any, sample: FloatArray, dt: float) -> tuple[bool, bool]:
     """
     inside, moved, moments, dp, target = True, False, e.moments, e.dp_pa, e.target
     for i in range(e.n_edges):
-        held = e.direction[i] * e.values[e.command[i]]
+        held = commanded(e, i)
         end, m1, m2, mt = lagged_moments(held, e.w_v[i], e.lag_s, e.lag_decay, dt)
-        e.w_v[i] = end
+        e.held_v[i], e.start_v[i], e.w_v[i] = held, e.w_v[i], end
         u, p = SHUT, e.cell[i, 1]
         if m1 > e.safe_v[i]:
             dp[i, 0] = e.values[e.source[i]] - e.values[e.sink[i]]
             dp[i, 1] = sample[2 + e.source[i]] - sample[2 + e.sink[i]]
             moments[i, 0], moments[i, 1], moments[i, 2] = m1, m2, mt
             mid, before = 0.5 * (dp[i, 0] + dp[i, 1]), p if e.cell[i, 0] != SHUT else SHUT
-            u = relocate(e.u_border[i], e.n_u[i], m1, e.cell[i, 0], e.hysteresis)
-            p = relocate(e.dp_border[i], e.n_dp[i], mid, before, e.hysteresis)
+            if e.map_basis[i] != TAYLOR:
+                u, e.home[i, 0] = locate_pair(e.u_border[i], e.n_u[i], m1)
+                p, e.home[i, 1] = locate_pair(e.dp_border[i], e.n_dp[i], mid)
+            else:
+                u = relocate(e.u_border[i], e.n_u[i], m1, e.cell[i, 0], e.hysteresis)
+                p = relocate(e.dp_border[i], e.n_dp[i], mid, before, e.hysteresis)
+                e.home[i, 0], e.home[i, 1] = u, p
             inside = inside and u >= 0 and p >= 0
         moved = moved or u != e.cell[i, 0] or p != e.cell[i, 1]
         target[i, 0], target[i, 1] = u, p
@@ -268,7 +303,10 @@ def _change_blocks(e: Any, cells: Any, closed: Any, blocks: Any) -> None:
     for opening in range(2):
         for i in range(e.n_edges):
             if (e.target[i, 0] != SHUT) == (opening == 1) and _moved(e, i):
-                _change(e, cells, closed, blocks, i)
+                if e.map_basis[i] != TAYLOR:
+                    _change_lapped(e, cells, closed, blocks, i)
+                else:
+                    _change(e, cells, closed, blocks, i)
 
 
 @inlined
@@ -287,16 +325,43 @@ def _change(e: Any, cells: Any, closed: Any, blocks: Any, i: int) -> None:
     if was_open:
         close_block(e, closed, blocks, k)
     if e.target[i, 0] != SHUT:
-        k = k if was_open else e.n_open
-        open_block(e, closed, blocks, k, i, _slot(e, cells, blocks, i))
+        k, u, p = k if was_open else e.n_open, e.cell[i, 0], e.cell[i, 1]
+        open_block(e, closed, blocks, k, i, _slot(e, cells, blocks, i, u, p), u, p)
     elif was_open:
         remove_open(e, k)
 
 
+@part
+def _change_lapped(e: Any, cells: Any, closed: Any, blocks: Any, i: int) -> None:
+    """The same for the windows that share a point: up to two by two from the cell on."""
+    e.counters[BLOCK_CHANGES] += 1
+    u, p = e.target[i, 0], e.target[i, 1]
+    e.cell[i, 0], e.cell[i, 1] = u, p
+    for k in range(e.n_open - 1, -1, -1):
+        a, b = e.open_cell[k, 0] - u, e.open_cell[k, 1] - p
+        if e.open_edge[k] == i and (u == SHUT or a < 0 or a > 1 or b < 0 or b > 1):
+            close_block(e, closed, blocks, k)
+            remove_open(e, k)
+    if u == SHUT:
+        return
+    for a in range(u, min(u + 2, e.n_u[i])):
+        for b in range(p, min(p + 2, e.n_dp[i])):
+            if not _is_open(e, i, a, b):
+                open_block(e, closed, blocks, e.n_open, i, _slot(e, cells, blocks, i, a, b), a, b)
+
+
 @inlined
-def _slot(e: Any, cells: Any, blocks: Any, edge: int) -> int:
-    """Slot of the edge's current cell, given out at its first visit."""
-    at = e.first_cell[edge] + e.cell[edge, 0] * e.n_dp[edge] + e.cell[edge, 1]
+def _is_open(e: Any, i: int, u: int, p: int) -> bool:
+    for k in range(e.n_open):
+        if e.open_edge[k] == i and e.open_cell[k, 0] == u and e.open_cell[k, 1] == p:
+            return True
+    return False
+
+
+@part
+def _slot(e: Any, cells: Any, blocks: Any, edge: int, u: int, p: int) -> int:
+    """Slot of a cell of the edge, given out at its first visit."""
+    at = e.first_cell[edge] + u * e.n_dp[edge] + p
     if cells[at].slot < 0:
         cells[at].slot = e.n_slots
         blocks[e.n_slots].cell = at
@@ -306,13 +371,15 @@ def _slot(e: Any, cells: Any, blocks: Any, edge: int) -> int:
 
 
 @inlined
-def _integral_step(e: Any, row: bool) -> None:
+def _integral_step(e: Any, blocks: Any, row: bool) -> None:
+    """Noise of the interval, then a row, unless its innovation is refused."""
     for c in range(e.n_chambers):
         e.cov[c, c] += e.q_floor[c] * e.dt_s
-    if row and e.n_chambers == 2:
-        integral_row_two(e)
-    elif row:
-        integral_row_one(e)
+    if row and (e.gate_sd <= 0.0 or admitted(e, blocks)):
+        if e.n_chambers == 2:
+            integral_row_two(e)
+        else:
+            integral_row_one(e)
 
 
 @kernel
@@ -336,11 +403,11 @@ def settle(engine: Any, closed: Any, blocks: Any, pairs: Any) -> bool:
 def clear(engine: Any, cells: Any) -> None:
     """Set the state (not the configuration) to its beginning."""
     e = engine[0]
-    e.running, e.n_slots, e.n_pairs = 0, 0, 0
+    e.running, e.break_due, e.n_slots, e.n_pairs = 0, 0, 0, 0
     e.n_closed, e.n_recent, e.n_young = 0, 0, 0
     e.ring, e.first = 1 + e.n_shared, 1 + e.n_shared + e.n_state
     set_open(e, 0)
-    e.dt_s, e.ring_det = 0.0, 1.0
+    e.dt_s, e.ring_det, e.ready_s = 0.0, 1.0, -np.inf
     for i in range(MAX_EDGES):
         e.place[i] = -1
         e.cell[i, 0], e.cell[i, 1] = SHUT, SHUT

@@ -17,15 +17,16 @@ from rtid.kernels.engine import (
     ROW_FLAG,
     SHUT,
     acceptable,
+    commanded,
     remember,
     set_step,
     step_s,
     working_points,
 )
 from rtid.kernels.holds import second_order
-from rtid.kernels.increments import flow_noise, mean_terms, term_flow
-from rtid.kernels.jit import inlined, kernel
-from rtid.kernels.layout import TERMS
+from rtid.kernels.increments import flow_noise, mean_lapped, mean_terms, term_rates
+from rtid.kernels.jit import inlined, kernel, part
+from rtid.kernels.layout import TAYLOR, TERMS
 from rtid.kernels.rows import position_noise, start_whitener
 
 FloatArray = NDArray[np.float64]
@@ -47,7 +48,7 @@ def explain(
     """Rates over each interval and innovations at each row.  All outputs are changed in place.
 
     engine (1,), cells: a freshly built state (the engine is used up; its term_theta holds the
-    coefficients of the shared terms); theta (cells, 6) m3/s,
+    coefficients of the shared terms); theta (cells, 6) m3/s in the basis of the state,
     compliance (chambers,) 1/Pa, chunk (n, 2 + signals).  flow (n - 1, chambers, 2): measured
     s A v and modelled right-hand side of (14), mean over the interval, m3/s; NaN where the trace
     has a gap or the point is off the grid.  cell (n - 1, edges): grid cell, -1 shut.
@@ -85,7 +86,7 @@ def _begin(e: Any, sample: FloatArray) -> None:
     remember(e, sample)
     e.running = 1
     for i in range(e.n_edges):
-        e.w_v[i] = e.direction[i] * e.values[e.command[i]]
+        e.w_v[i] = commanded(e, i)
         e.cell[i, 0] = SHUT
     start_whitener(e)
 
@@ -114,24 +115,43 @@ def _one(
         flow[MEASURED + 2 * c] = e.area_m2[c] * (x1 - x0) / dt
         flow[MODELLED + 2 * c] = -v * rate * compliance[c]
         for k in range(e.n_terms):
-            mean = 0.5 * (term_flow(e, k, e.values, 0) + term_flow(e, k, sample, 2))
-            flow[MODELLED + 2 * c] += e.term_sign[k, c] * e.term_theta[k] * mean
+            start, end = term_rates(e, k, sample, dt)
+            flow[MODELLED + 2 * c] += e.term_sign[k, c] * e.term_theta[k] * 0.5 * (start + end)
         e.cov[c, c] += e.q_floor[c] * dt
     for i in range(e.n_edges):
         e.cell[i, 0], e.cell[i, 1] = e.target[i, 0], e.target[i, 1]
         if e.cell[i, 0] != SHUT:
-            at = e.first_cell[i] + e.cell[i, 0] * e.n_dp[i] + e.cell[i, 1]
+            at = e.first_cell[i] + e.home[i, 0] * e.n_dp[i] + e.home[i, 1]
             cell[i] = at
-            mean_terms(e, i)
-            q = 0.0
-            for j in range(TERMS):
-                q += e.phi[j] * theta[at, j]
+            q = _mapped(e, theta, i, at) if e.map_basis[i] == TAYLOR else _windowed(e, theta, i)
             for c in range(e.n_chambers):
                 flow[MODELLED + 2 * c] += e.sign[i, c] * q
-            flow_noise(e, i, cells[at].slope, dt)
+            flow_noise(e, i, cells[at].slope, cells[at].missed, dt)
     for c in range(e.n_chambers):
         gap[c] += (flow[MEASURED + 2 * c] - flow[MODELLED + 2 * c]) * dt
     return True
+
+
+@inlined
+def _mapped(e: Any, theta: FloatArray, i: int, at: int) -> float:
+    """Mean flow of edge i over the interval, Taylor terms of its cell `at`."""
+    mean_terms(e, i, e.home[i, 0], e.home[i, 1])
+    q = 0.0
+    for j in range(TERMS):
+        q += e.phi[j] * theta[at, j]
+    return q
+
+
+@part
+def _windowed(e: Any, theta: FloatArray, i: int) -> float:
+    """The same for up to two by two windows that overlap."""
+    u, p, q = e.target[i, 0], e.target[i, 1], 0.0
+    for a in range(u, min(u + 2, e.n_u[i])):
+        for b in range(p, min(p + 2, e.n_dp[i])):
+            mean_lapped(e, i, a, b)
+            for j in range(TERMS):
+                q += e.phi[j] * theta[e.first_cell[i] + a * e.n_dp[i] + b, j]
+    return q
 
 
 @inlined

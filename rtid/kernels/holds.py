@@ -38,6 +38,10 @@ def second_order(wn: float, zeta: float, dt: float, a: FloatArray, b: FloatArray
     b[0, 0], b[1, 0] = g0 - m0, g1 - m1
 
 
+# Two Gauss points of an interval, in steps from its middle: exact to the third power of time.
+GAUSS = 0.5 / math.sqrt(3.0)
+
+
 @inlined
 def lagged_moments(
     held: float, start: float, lag: float, decay: float, dt: float

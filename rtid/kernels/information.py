@@ -168,8 +168,10 @@ def _refer_to_origin(e: Any, b: FloatArray) -> None:
 
 
 @part
-def open_block(e: Any, closed: Any, blocks: Any, k: int, edge: int, slot: int) -> None:
-    """Make `slot` open block k: a place just closed, or n_open to append.
+def open_block(
+    e: Any, closed: Any, blocks: Any, k: int, edge: int, slot: int, iu: int, ip: int
+) -> None:
+    """Make `slot`, block (iu, ip) of its edge, open block k: a place just closed, or n_open.
 
     If the block still rings, it goes on from the state it is in; else a position must be free.
     """
@@ -177,6 +179,7 @@ def open_block(e: Any, closed: Any, blocks: Any, k: int, edge: int, slot: int) -
         set_open(e, k + 1)
         clear_open(e, k)
     e.open_edge[k], e.open_slot[k], e.place[edge] = edge, slot, k
+    e.open_cell[k, 0], e.open_cell[k, 1] = iu, ip
     for p in range(e.n_recent):
         if closed[p].slot == slot and closed[p].status >= YOUNG:
             _settle_one(e, closed, blocks, k, p)

@@ -6,7 +6,8 @@ that move at every sample, are ordered
 
     [ y | shared (theta_beta per chamber, effects) | ring | 6 terms per open block ]
 
-`ring` are unit vectors that stand for all closed blocks, whose states decay together.
+An edge has one open block in the Taylor basis, up to four where windows overlap.  `ring` are unit
+vectors that stand for all closed blocks, whose states decay together.
 """
 
 from __future__ import annotations
@@ -18,13 +19,17 @@ MAX_EDGES = 8
 MAX_BORDERS = 129
 MAX_SIGNALS = 24
 MAX_SHARED = 24
-MAX_OPEN = 4
+MAX_OPEN = 16  # two edges per chamber, four windows of the lapped basis each
 TERMS = 6  # Taylor terms of one block, eq. (6)
 MAX_STATE = 4  # length of a column's state: chambers (integral form), 2 x chambers (carry form)
-MAX_LOCAL = 56  # 1 + MAX_SHARED + MAX_OPEN * TERMS + MAX_STATE, rounded up to whole vectors
+# 1 + MAX_SHARED + MAX_OPEN * TERMS + MAX_STATE, and so much more that rows share no cache set.
+MAX_LOCAL = 132
 MAX_RECENT = 64  # blocks that are open or still ring
 
-INTEGRAL, CARRY = 0, 1  # the forms of the regression
+NOTHING = MAX_SIGNALS  # the column of a signal that is not there: always zero
+
+INTEGRAL, CARRY, RESTART = 0, 1, 2  # the forms of the regression
+TAYLOR, LAPPED, BLENDED = 0, 1, 2  # the bases of a map
 
 # counters[...]: how often a sample was refused or an estimate restarted, by reason
 COUNTERS = (
@@ -36,9 +41,13 @@ COUNTERS = (
     "outside_grid",
     "block_changes",
     "restart_memory",
+    "recovering",
+    "outlier",
+    "reopened",
 )
 SAMPLES, ROWS, RESTART_GAP, NOT_FINITE = range(4)
 OUT_OF_RANGE, OUTSIDE_GRID, BLOCK_CHANGES, RESTART_MEMORY = range(4, 8)
+RECOVERING, OUTLIER, REOPENED = range(8, 11)
 
 _F, _I = np.float64, np.int64
 
@@ -69,6 +78,11 @@ ENGINE = np.dtype(
         ("source", _I, (MAX_EDGES,)),
         ("sink", _I, (MAX_EDGES,)),
         ("command", _I, (MAX_EDGES,)),
+        ("mode_column", _I),
+        ("modes", _I, (MAX_EDGES,)),  # bit m: the edge may open in mode m
+        ("map_basis", _I, (MAX_EDGES,)),
+        ("masked", _I, (MAX_EDGES,)),
+        ("mask", _F, (MAX_EDGES, TERMS)),  # 1 for the terms that the map has, eq. (15)
         ("direction", _F, (MAX_EDGES,)),
         ("safe_v", _F, (MAX_EDGES,)),
         ("sign", _F, (MAX_EDGES, MAX_CHAMBERS)),
@@ -82,12 +96,21 @@ ENGINE = np.dtype(
         ("minimum", _F, (MAX_SIGNALS,)),
         ("maximum", _F, (MAX_SIGNALS,)),
         ("n_terms", _I),
-        ("term_weight", _F, (MAX_SHARED, MAX_SIGNALS)),  # flow per unit of signal, scale included
+        ("term_shape", _I, (MAX_SHARED,)),
+        ("term_volume", _I, (MAX_SHARED,)),  # rate: -1 none, -2 of its argument alone, else chamber
+        ("term_scale", _F, (MAX_SHARED,)),
+        ("term_weight", _F, (MAX_SHARED, MAX_SIGNALS)),
         ("term_constant", _F, (MAX_SHARED,)),
         ("term_sign", _F, (MAX_SHARED, MAX_CHAMBERS)),
         ("term_theta", _F, (MAX_SHARED,)),  # read by `explain` alone
         ("hysteresis", _F),
         ("max_gap_s", _F),
+        ("recovery_s", _F),
+        ("max_open", _I),  # blocks that can be open at once
+        ("gate_sd", _F),  # innovations beyond are refused, in standard deviations; 0: none is
+        ("gate_rows", _I),  # so many refused in a row: the plant has changed
+        ("held_compliance", _F, (MAX_CHAMBERS,)),  # of the map held, in units of `compliance`
+        ("held_terms", _F, (MAX_SHARED,)),
         ("ring_floor", _F),
         ("wn_rad_s", _F),
         ("zeta", _F),
@@ -103,19 +126,29 @@ ENGINE = np.dtype(
         ("next_row_s", _F),
         ("dt_s", _F),  # step for which the filter and lag factors below hold
         ("lag_decay", _F),
+        ("gauss_decay", _F, (2,)),  # of the lag, at the two Gauss points of the step
+        ("ready_s", _F),  # nothing starts before
+        ("gap", _F, (MAX_CHAMBERS,)),  # y less the map held: the whitener's state of the innovation
+        ("blind", _I),  # the map held does not know the open block
+        ("refused", _I),  # innovations refused in a row
+        ("break_due", _I),  # the next sample begins anew
         ("filter_a", _F, (2, 2)),
         ("filter_b", _F, (2, 2)),
-        ("sample", _F, (2 + MAX_SIGNALS,)),  # the one being taken, and the values of the last
-        ("values", _F, (MAX_SIGNALS,)),
+        ("sample", _F, (3 + MAX_SIGNALS,)),  # the one being taken, and the values of the last
+        ("values", _F, (1 + MAX_SIGNALS,)),
         ("w_v", _F, (MAX_EDGES,)),  # lagged opening command per edge
-        ("cell", _I, (MAX_EDGES, 2)),  # current block of each edge
-        ("place", _I, (MAX_EDGES,)),  # its position among the open blocks, -1 when shut
+        ("cell", _I, (MAX_EDGES, 2)),  # current block of each edge; lapped: the first of its four
+        ("home", _I, (MAX_EDGES, 2)),  # the block that holds the working point
+        ("place", _I, (MAX_EDGES,)),  # its position among the open blocks, -1 when shut (Taylor)
+        ("held_v", _F, (MAX_EDGES,)),  # opening command over the interval, and w_v at its start
+        ("start_v", _F, (MAX_EDGES,)),
         ("ring", _I),  # first local column of the ring, and of the open blocks
         ("first", _I),
         ("width", _I),  # number of local columns in use, rounded up to whole vectors
         ("n_open", _I),
         ("open_edge", _I, (MAX_OPEN,)),
         ("open_slot", _I, (MAX_OPEN,)),
+        ("open_cell", _I, (MAX_OPEN, 2)),
         ("open_recent", _I, (MAX_OPEN,)),  # its position among the recent blocks
         ("cov", _F, (MAX_CHAMBERS, MAX_CHAMBERS)),  # Kalman whitener: variance of the gap, m6
         ("innovation", _F, (3,)),  # S: upper triangle
@@ -124,6 +157,8 @@ ENGINE = np.dtype(
         ("dp_pa", _F, (MAX_EDGES, 2)),  # at its start and end
         ("target", _I, (MAX_EDGES, 2)),  # the blocks that the working points are in
         ("phi", _F, (TERMS,)),
+        ("phi_at", _F, (2, TERMS)),  # lapped: at the two Gauss points
+        ("axis", _F, (2, 3)),
         ("ringing", _F, (MAX_STATE, TERMS * MAX_RECENT)),  # d of those that rang at the last rebase
         ("weighted", _F, (MAX_STATE, TERMS * MAX_RECENT)),
         ("left", _F, (MAX_STATE, TERMS)),
@@ -143,9 +178,17 @@ ENGINE = np.dtype(
     align=True,
 )
 
-# One record per cell of a grid: the slot of its block (-1 before the first visit) and the nominal
-# dQ/ddp, which weighs the pressure noise.
-CELL = np.dtype([("slot", _I), ("slope", _F)], align=True)
+# One record per cell of a grid: the slot of its block (-1 before the first visit), the nominal
+# dQ/ddp, which weighs the pressure noise, the variance rate of the flow that the block's terms miss
+# (m6/s), and the terms of the map held (in units of the edge's scale), if it knows the block.
+CELL = np.dtype(
+    [("slot", _I), ("slope", _F), ("missed", _F), ("known", _I), ("held", _F, (TERMS,))],
+    align=True,
+)
+
+# Shapes of a shared term's argument z, see `rtid.model.Term`.
+LINEAR, ROOT, HINGE, INVERSE = range(4)
+FLOW, RATE = -1, -2  # term_volume where no chamber's volume multiplies
 
 # One record per visited block.
 BLOCK = np.dtype(
@@ -155,7 +198,9 @@ BLOCK = np.dtype(
         ("rows", _I),
         ("dwell_s", _F),
         ("last_s", _F),
-        ("phi_sum", _F, (TERMS,)),  # integral of the basis over the time spent in the block
+        ("phi_sum", _F, (TERMS,)),  # integral of the Taylor terms over the time spent in the block
+        ("surprise", _F),  # sum of squared innovations of the map held, per chamber and row
+        ("judged", _F),  # number of those innovations
         ("gram", _F, (TERMS, TERMS)),
         ("shared", _F, (TERMS, 1 + MAX_SHARED)),  # products with y and the shared columns
     ],

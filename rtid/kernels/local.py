@@ -68,6 +68,7 @@ def remove_open(e: Any, k: int) -> None:
                 gram[to + i, to + j] = gram[source + i, source + j]
         e.open_edge[k], e.open_slot[k] = e.open_edge[last], e.open_slot[last]
         e.open_recent[k] = e.open_recent[last]
+        e.open_cell[k, 0], e.open_cell[k, 1] = e.open_cell[last, 0], e.open_cell[last, 1]
         e.place[e.open_edge[k]] = k
     clear_open(e, last)
     set_open(e, last)

@@ -8,8 +8,11 @@ import numpy as np
 
 from rtid.model import (
     COMMAND,
+    MODE,
     POSITION,
     PRESSURE,
+    SHAPES,
+    TAYLOR,
     Chamber,
     Edge,
     Filter,
@@ -62,15 +65,28 @@ def draw_case(
     faults: int = 0,
     reverse: bool = False,
     terms: int = 0,
+    basis: str = TAYLOR,
+    modes: bool = False,
+    recovery_s: float = 0.0,
 ) -> Case:
     """A random case; faults: so many each of gaps, NaN, values out of range and off the grid."""
     rng = np.random.default_rng([seed, 77])
     model = draw_model(rng, form, chambers, blocks, -1 if reverse else 1)
-    model = replace(model, terms=tuple(draw_term(rng, model, k) for k in range(terms)))
+    model = replace(
+        model,
+        terms=tuple(draw_term(rng, model, k) for k in range(terms)),
+        edges=tuple(replace(edge, basis=basis) for edge in model.edges),
+        gates=replace(model.gates, recovery_s=recovery_s),
+    )
+    model = with_modes(model) if modes else model
     steps_us = np.rint(1e3 * (1 + jitter * rng.uniform(-1, 1, n)))
     t = 10.0 + 1e-6 * np.cumsum(steps_us)  # stamps are whole microseconds
     names = [s.name for s in model.signals]
-    values = draw_signals(rng, t)[:, [NAMES.index(name) for name in names]]
+    drawn = draw_signals(rng, t)
+    values = drawn[:, [NAMES.index(name) for name in names if name != "mode"]]
+    if modes:
+        mode = np.repeat(rng.integers(0, 3, n // 100 + 1), 100)[:n]
+        values = np.column_stack([values, mode])
     noisy = [j for j, name in enumerate(names) if name.startswith("p_")]
     values[:, noisy] += chatter_pa * rng.standard_normal((n, len(noisy)))
     flags = np.zeros(n)
@@ -115,12 +131,31 @@ def draw_model(
     )
 
 
+def with_modes(model: Model) -> Model:
+    """Three modes: all edges, a regenerative one with the cross-port edge, one without it."""
+    allowed = {"ab": (0, 1), "pb": (0, 2), "bt": (0, 2)}
+    return replace(
+        model,
+        signals=(*model.signals, Signal("mode", MODE, minimum=0.0, maximum=2.0)),
+        edges=tuple(replace(edge, modes=allowed.get(edge.name, ())) for edge in model.edges),
+        mode="mode",
+    )
+
+
 def draw_term(rng: np.random.Generator, model: Model, k: int) -> Term:
-    """A shared flow that is linear in the pressures and the position."""
+    """A shared flow of the pressures and the position; every shape and kind of rate in turn."""
     weights = tuple((name, float(rng.normal())) for name in NAMES[1:5])
     position = ("x", float(1e7 * rng.normal()))
     signs = tuple((c.name, int(rng.choice([-1, 0, 1]))) for c in model.chambers[1:])
-    return Term(f"term {k}", (*weights, position), (("a", 1), *signs), 1e-11, float(rng.normal()))
+    signs = (("a", 1), *signs)
+    if k % 6 == 4:  # extra volume: the rate of a pressure
+        return Term(f"term {k}", (("p_a", 1.0),), signs, 1e-13, rate=True)
+    if k % 6 == 5:  # entrained air: -V d(-1 / p)/dt
+        positive = (("p_s", 1.0),)
+        return Term(f"term {k}", positive, signs, 1e5, 1e5, "inverse", rate=True, volume="a")
+    shape = SHAPES[k % 6 % 3]
+    scale = 1e-8 if shape == "root" else 1e-11
+    return Term(f"term {k}", (*weights, position), signs, scale, float(rng.normal()), shape)
 
 
 def _draw_edge(

@@ -11,7 +11,7 @@ from rtid.estimator.limits import most_open
 from rtid.estimator.record import fit_record
 from rtid.estimator.solution import solve
 from rtid.estimator.state import build
-from rtid.model import Filter, Grid, Model, Signal
+from rtid.model import LAPPED, Filter, Grid, Model, Signal
 from rtid.sim.declare import declared_model, uniform_grid
 from rtid.sim.plant import Plant
 from rtid.sim.run import Sensors, simulate
@@ -26,12 +26,14 @@ def five_edges(safe_band_v: float) -> Model:
     return declared_model(plant, grid=WIDE, safe_band_v=safe_band_v)
 
 
-def test_too_many_edges_open_at_once_are_refused() -> None:
-    assert most_open(five_edges(1.0)) == 3
-    build(five_edges(1.0))
-    assert most_open(five_edges(-np.inf)) == 5
-    with pytest.raises(ValueError, match="5 edges that are open at once, at most 4"):
-        build(five_edges(-np.inf))
+def test_too_many_blocks_open_at_once_are_refused() -> None:
+    for safe_band_v, edges in ((1.0, 3), (-np.inf, 5)):
+        assert most_open(five_edges(safe_band_v)) == edges
+        build(five_edges(safe_band_v))
+    model = five_edges(-np.inf)
+    lapped = replace(model, edges=tuple(replace(e, basis=LAPPED) for e in model.edges))
+    with pytest.raises(ValueError, match="20 blocks that are open at once, at most 16"):
+        build(lapped)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,75 @@
+"""The innovation gate: a row must be what the map held says, within the noise.
+
+The gap between y and the map held passes the same whitener as the columns; whitened, it has unit
+variance for a perfect map.  A refused row is as if the position had not been measured, so that one
+outlier costs one row.  When rows are refused for long, the plant or a sensor's zero has changed:
+all memory ends, and the gate is open until another map is held.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from rtid.kernels.jit import inlined, part
+from rtid.kernels.layout import OUTLIER, REOPENED, TAYLOR
+from rtid.kernels.rows import position_noise
+
+
+@part
+def admitted(e: Any, blocks: Any) -> bool:
+    """Judge the coming row, follow the gap through it; False when it is refused."""
+    if e.blind != 0:  # what the unknown block added to the gap must not be judged later
+        e.blind = 0
+        for c in range(e.n_chambers):
+            e.gap[c] = 0.0
+        return True
+    first, second = _innovations(e)
+    if max(abs(first), abs(second)) > e.gate_sd:
+        e.counters[OUTLIER] += 1
+        e.refused += 1
+        if e.refused >= e.gate_rows:
+            e.counters[REOPENED] += 1
+            e.gate_sd, e.refused, e.break_due = 0.0, 0, 1
+        return False
+    e.refused = 0
+    _judge(e, blocks, first * first + second * second)
+    _follow(e)
+    return True
+
+
+@inlined
+def _innovations(e: Any) -> tuple[float, float]:
+    """L^-1 gap with L L' = S; the second is 0 for one chamber."""
+    s00 = e.cov[0, 0] + position_noise(e, 0, 0)
+    first = e.gap[0] / math.sqrt(s00)
+    if e.n_chambers == 1:
+        return first, 0.0
+    s01, s11 = e.cov[0, 1] + position_noise(e, 0, 1), e.cov[1, 1] + position_noise(e, 1, 1)
+    return first, (e.gap[1] - s01 / s00 * e.gap[0]) / math.sqrt(s11 - s01 * s01 / s00)
+
+
+@inlined
+def _judge(e: Any, blocks: Any, square: float) -> None:
+    """Note the surprise with the blocks that hold the working points."""
+    for k in range(e.n_open):
+        i = e.open_edge[k]
+        home = e.open_cell[k, 0] == e.home[i, 0] and e.open_cell[k, 1] == e.home[i, 1]
+        if e.map_basis[i] == TAYLOR or home:
+            blocks[e.open_slot[k]].surprise += square
+            blocks[e.open_slot[k]].judged += e.n_chambers
+
+
+@inlined
+def _follow(e: Any) -> None:
+    """gap <- R S^-1 gap, as the columns do at a row."""
+    r00 = position_noise(e, 0, 0)
+    s00 = e.cov[0, 0] + r00
+    if e.n_chambers == 1:
+        e.gap[0] *= r00 / s00
+        return
+    r01, r11 = position_noise(e, 0, 1), position_noise(e, 1, 1)
+    s01, s11 = e.cov[0, 1] + r01, e.cov[1, 1] + r11
+    det = s00 * s11 - s01 * s01
+    g0, g1 = (s11 * e.gap[0] - s01 * e.gap[1]) / det, (s00 * e.gap[1] - s01 * e.gap[0]) / det
+    e.gap[0], e.gap[1] = r00 * g0 + r01 * g1, r01 * g0 + r11 * g1
