@@ -13,6 +13,7 @@ import can
 from firmware_bridge import frames as fr
 from firmware_bridge.frames import EXTENDED, Frames
 from firmware_bridge.sources.live import POLL_S, LiveSource, SourceError
+from firmware_bridge.stamps import Continuous
 
 RECEIVE_BUFFER_BYTES = 4 << 20  # the default loses thousands of frames in a stall of 2 s
 
@@ -21,6 +22,7 @@ class CanBus(LiveSource[can.Message]):
     """Frames of one bus, listening only.
 
     `can_ids` (as in `Frames.can_id`) are filtered by the driver where it can; None takes all.
+    Time stamps are python-can's, but a clock that is set back does not stop them (see `stamps`).
     Raises SourceError if the bus cannot be opened.
     """
 
@@ -29,23 +31,30 @@ class CanBus(LiveSource[can.Message]):
         interface: str,
         channel: str | int | None = None,
         can_ids: Iterable[int] | None = None,
+        reopen_s: float = 0.0,
         **options: Any,
     ) -> None:
-        super().__init__()
+        super().__init__(reopen_s=reopen_s)
+        self._name = f"{interface} channel {channel!r}"
         filters = None if can_ids is None else [_filter(can_id) for can_id in can_ids]
+        self._options = {
+            "interface": interface, "channel": channel, "can_filters": filters, **options
+        }  # fmt: skip
+        self._clock = Continuous()
+        self._open()
+
+    def _open(self) -> None:
         try:
-            self._bus = can.Bus(
-                interface=interface, channel=channel, can_filters=filters, **options
-            )
+            self._bus = can.Bus(**self._options)
         except Exception as error:  # each interface raises its own kind
-            raise SourceError(f"cannot open {interface} channel {channel!r}: {error}") from error
+            raise SourceError(f"cannot open {self._name}: {error}") from error
         _enlarge_buffer(self._bus)
 
     def _receive(self) -> can.Message | None:
         return self._bus.recv(POLL_S)
 
     def _convert(self, items: list[can.Message]) -> Frames:
-        return fr.from_messages(items)
+        return self._clock.push(fr.from_messages(items))
 
     def _close(self) -> None:
         self._bus.shutdown()

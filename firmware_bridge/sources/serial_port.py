@@ -1,9 +1,12 @@
 """Frames over a serial line: COBS with CRC-16.
 
-On the wire: COBS(body + CRC), then 0x00.  The body is little-endian: can_id (4 bytes, bit 31 for
+On the wire: 0x00, COBS(body + CRC), 0x00.  The body is little-endian: can_id (4 bytes, bit 31 for
 a 29 bit identifier), t_us (8 bytes, clock of the controller), payload (0 to 8 bytes).  The CRC is
-CRC-16 CCITT over the body (binascii.crc_hqx, start value 0xFFFF), high byte first.
-0x00 occurs nowhere else, so after any damage the reader is in step again at the next 0x00.
+CRC-16 CCITT over the body (binascii.crc_hqx, start value 0xFFFF), inverted, high byte first: not
+inverted, a CRC that ends in 0x00 would not notice the loss of that byte (1 frame in 256).
+0x00 occurs nowhere else, so after any damage the reader is in step again at the next 0x00; with one
+before and one behind each frame no single bad byte can join two frames.  Of damaged frames the CRC
+lets 2^-16 through, the rest is refused also for an identifier or a time that cannot be.
 """
 
 from __future__ import annotations
@@ -19,11 +22,15 @@ from numpy.typing import NDArray
 from firmware_bridge import frames as fr
 from firmware_bridge.frames import Frames
 from firmware_bridge.jit import Integer, inlined, kernel
-from firmware_bridge.sources.live import POLL_S, LiveSource, SourceError
+from firmware_bridge.sources.live import now_us
+from firmware_bridge.sources.port import PortSource
+from firmware_bridge.stamps import Continuous, StampModel
 
+BAUDRATE = 2_000_000
 BODY = struct.Struct("<IQ")
 MAX_BLOCK = BODY.size + 8 + 2  # body, payload, CRC: below 254, so COBS needs one byte more
 MAX_PENDING = 4096  # bytes kept while no 0x00 comes
+TIME_BITS = 53  # 285 years
 CRC_START = 0xFFFF
 
 _CRC = np.array([binascii.crc_hqx(bytes([k]), 0) for k in range(256)], np.uint16)
@@ -35,7 +42,8 @@ def encode(frames: Frames) -> bytes:
     for k in range(len(frames)):
         body = BODY.pack(int(frames.can_id[k]), int(frames.t_us[k]))
         body += frames.data[k, : frames.length[k]].tobytes()
-        out += cobs.encode(body + binascii.crc_hqx(body, CRC_START).to_bytes(2, "big")) + b"\0"
+        crc = binascii.crc_hqx(body, CRC_START) ^ 0xFFFF
+        out += b"\0" + cobs.encode(body + crc.to_bytes(2, "big")) + b"\0"
     return bytes(out)
 
 
@@ -65,7 +73,23 @@ def _intact(block: NDArray[np.uint8], n: Integer) -> bool:
     crc = np.int64(CRC_START)
     for k in range(n - 2):
         crc = ((crc << 8) & 0xFFFF) ^ np.int64(_CRC[(crc >> 8) ^ np.int64(block[k])])
-    return bool(crc == np.int64(block[n - 2]) * 256 + np.int64(block[n - 1]))
+    return bool(crc ^ 0xFFFF == np.int64(block[n - 2]) * 256 + np.int64(block[n - 1]))
+
+
+@inlined
+def _number(block: NDArray[np.uint8], first: Integer, count: Integer) -> Integer:
+    """Little-endian number of `count` bytes."""
+    number = np.int64(0)
+    for k in range(count):
+        number |= np.int64(block[first + k]) << (8 * k)
+    return number
+
+
+@inlined
+def _possible(can_id: Integer, t_us: Integer) -> bool:
+    """Whether there is such an identifier and such a time."""
+    first, bits = (fr.EXTENDED, 29) if can_id >= fr.EXTENDED else (0, 11)
+    return bool(can_id - first < 1 << bits and 0 <= t_us < 1 << TIME_BITS)
 
 
 @kernel
@@ -75,6 +99,7 @@ def parse(
     can_id: NDArray[np.uint32],
     length: NDArray[np.uint8],
     data: NDArray[np.uint8],
+    ends: NDArray[np.int64],
     block: NDArray[np.uint8],
 ) -> tuple[Integer, Integer, Integer]:
     """Frames found, bytes used and bad blocks in text; the arrays are changed in place."""
@@ -89,12 +114,11 @@ def parse(
         if size < 14 or size > MAX_BLOCK or not _intact(block, size):
             bad += 1
             continue
-        number, stamp = np.uint32(0), np.int64(0)
-        for k in range(4):
-            number |= np.uint32(block[k]) << np.uint32(8 * k)
-        for k in range(8):
-            stamp |= np.int64(block[4 + k]) << (8 * k)
-        t_us[n], can_id[n], length[n] = stamp, number, size - 14
+        number, stamp = _number(block, 0, 4), _number(block, 4, 8)
+        if not _possible(number, stamp):
+            bad += 1
+            continue
+        t_us[n], can_id[n], length[n], ends[n] = stamp, number, size - 14, start
         data[n] = 0
         data[n, : size - 14] = block[12 : size - 2]
         n += 1
@@ -110,36 +134,52 @@ class Decoder:
 
     def push(self, piece: bytes) -> Frames:
         """The frames that became complete; `refused` counts "bad_serial_frame"."""
-        text = self._pending + piece
-        out = fr.empty(text.count(0))
+        return self.decode(piece)[0]
+
+    def decode(self, piece: bytes) -> tuple[Frames, NDArray[np.int64]]:
+        """As `push`; and behind which byte of the piece each frame was complete, int64 (n,)."""
+        kept, text = len(self._pending), self._pending + piece
+        out, ends = fr.empty(text.count(0)), np.empty(text.count(0), np.int64)
         n, used, bad = parse(
-            np.frombuffer(text, np.uint8), out.t_us, out.can_id, out.length, out.data, self._block
-        )
-        self._pending = text[used:]
-        if len(self._pending) > MAX_PENDING:
-            self._pending, bad = b"\x01", bad + 1  # what follows up to 0x00 cannot be a frame
+            np.frombuffer(text, np.uint8),
+            out.t_us, out.can_id, out.length, out.data, ends, self._block,
+        )  # fmt: skip
+        # What is longer cannot become a frame: its beginning is refused at the next 0x00.
+        self._pending = text[used : used + MAX_PENDING]
         found = out[:n]
         fr.add_counts(found.refused, {"bad_serial_frame": bad})
-        return found
+        return found, ends[:n] - kept
 
 
-class SerialPort(LiveSource[bytes]):
-    """Frames from a serial port (or a pty); raises SourceError if it cannot be opened."""
+class SerialPort(PortSource):
+    """Frames from a serial port, stamped by the controller.
 
-    def __init__(self, port: str, baudrate: int = 2_000_000) -> None:
-        super().__init__()
+    The controller's stamps stay as they are (see `stamps.Continuous`); with host_time they are
+    mapped to the clock of this machine (`stamps.StampModel`), as several controllers need it.
+    """
+
+    def __init__(
+        self,
+        port: str,
+        baudrate: int = BAUDRATE,
+        *,
+        host_time: bool = False,
+        reopen_s: float = 0.0,
+    ) -> None:
         self._decoder = Decoder()
-        try:
-            self._line = serial.Serial(port, baudrate, timeout=POLL_S)
-        except (serial.SerialException, ValueError) as error:
-            raise SourceError(f"cannot open serial port {port}: {error}") from error
+        self._own, self._model = Continuous(), StampModel() if host_time else None
+        super().__init__(port, baudrate, reopen_s)
 
-    def _receive(self) -> bytes | None:
-        piece: bytes = self._line.read(max(1, self._line.in_waiting))
-        return piece or None
+    def _greet(self, line: serial.Serial) -> None:
+        """The controller speaks unasked."""
 
-    def _convert(self, items: list[bytes]) -> Frames:
-        return self._decoder.push(b"".join(items))
+    def _decode(self, stream: bytes) -> tuple[Frames, NDArray[np.int64]]:
+        return self._decoder.decode(stream)
 
-    def _close(self) -> None:
-        self._line.close()
+    def _timed(self, frames: Frames, arrived_us: NDArray[np.int64]) -> Frames:
+        if self._model is None:
+            return self._own.push(frames)
+        return self._model.push(frames, arrived_us)
+
+    def _seam(self) -> tuple[int, bytes]:
+        return now_us(), b"\0"  # ends what was cut
