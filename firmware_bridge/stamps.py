@@ -8,11 +8,11 @@ recursive regression with forgetting over these points gives the offset c and th
     d = (cov + w r d_prior) / (var + w r),  w = max(1/n, 1/40)
 
 A window that as a whole came late (a stalled reader) is left out, ten of them in a row are a new
-truth.  The published line follows the estimated one by at most 200 ppm, so that times grow
-strictly.  A stamp that goes back, or that arrives before it was sent, is an outlier; the third in
-a row is a step of the clock: the line is opened anew, and frames are held off for 0.2 s until the
-new offset is known, so that every step is exactly one gap.  No clock is asked here: the same
-stamps and arrivals give the same times in pieces of any size.
+truth.  The published line follows the estimated one by at most 200 ppm (0.1 % in the first 10 s),
+so that times grow strictly.  A stamp that goes back, or that arrives before it was sent, is an
+outlier; the third in a row is a step of the clock: the line is opened anew, and frames are held off
+for 0.2 s until the new offset is known, so that every step is exactly one gap.  No clock is asked
+here: the same stamps and arrivals give the same times in pieces of any size.
 """
 
 from __future__ import annotations
@@ -28,15 +28,14 @@ WINDOW_US = 1_000_000
 MEMORY = 1 / 40  # least weight of a new window
 PRIOR_US2 = 0.25e12  # (0.1 ms of noise / 200 ppm of drift)^2: how much the prior drift weighs
 DRIFT_LIMIT = 1e-3
-SLEW = 200e-6  # published line towards estimated line, per microsecond
+SLEW, FIRST_SLEW = 200e-6, 1e-3  # published line towards estimated line, per microsecond
+FIRST_WINDOWS = 10  # so long the offset of a new line is still being found
 JUMP_US = 10_000.0  # a difference that is not worth slewing
 LATE_US = 1_000.0  # a window this much later than foreseen is left out, at least
 LATE_WINDOWS = 10
 STEP_US = 50_000  # back by more, or early by more: not jitter
 CONFIRM = 3
 HOLD_US = 200_000
-BACK_US = 1_000_000  # without arrivals: frames out of order are not that late
-GAP_US = 1_000_000  # what is put between the frames before and after such a step
 
 REASONS = ("stamp_outlier", "clock_step_hold", "clock_step")
 OUTLIER, HELD, STEPS = 0, 1, 2
@@ -137,7 +136,8 @@ def _show(line: Record, x: float) -> float:
     ahead = line.shown_z + line.drift * dx
     error = _estimate(line, x) - ahead
     if abs(error) < JUMP_US:
-        error = min(max(error, -SLEW * dx), SLEW * dx)
+        most = dx * (SLEW if line.n > FIRST_WINDOWS else FIRST_SLEW)
+        error = min(max(error, -most), most)
     line.shown_x, line.shown_z = x, ahead + error
     return line.shown_z
 
@@ -229,37 +229,3 @@ class StampModel:
         fr.add_counts(kept.refused, frames.refused)
         fr.add_counts(kept.refused, dict(zip(REASONS, counts.tolist(), strict=True)))
         return kept
-
-
-@kernel
-def carry_on(t_us: NDArray[np.int64], state: NDArray[np.int64]) -> Integer:
-    """Shift t_us so that it never goes back by a step; the steps.  Both changed in place.
-
-    state: [latest time, shift, whether it has begun].
-    """
-    steps = 0
-    for k in range(len(t_us)):
-        t = t_us[k] + state[1]
-        if state[2] and t < state[0] - BACK_US:
-            steps += 1
-            state[1] += state[0] + GAP_US - t
-            t = state[0] + GAP_US
-        state[0], state[2] = (max(t, state[0]) if state[2] else t), 1
-        t_us[k] = t
-    return steps
-
-
-class Continuous:
-    """Stamps without arrivals: a clock set back costs one gap of 1 s, not the time until then.
-
-    Anything else is left as it is, to the bit: a clock set forward is a gap by itself.  `refused`
-    of what `push` returns counts "clock_step".
-    """
-
-    def __init__(self) -> None:
-        self._state = np.zeros(3, np.int64)
-
-    def push(self, frames: Frames) -> Frames:
-        """The same frames, their stamps changed in place."""
-        fr.add_counts(frames.refused, {"clock_step": int(carry_on(frames.t_us, self._state))})
-        return frames

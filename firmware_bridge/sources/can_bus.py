@@ -13,7 +13,7 @@ import can
 from firmware_bridge import frames as fr
 from firmware_bridge.frames import EXTENDED, Frames
 from firmware_bridge.sources.live import POLL_S, LiveSource, SourceError
-from firmware_bridge.stamps import Continuous
+from firmware_bridge.steps import Continuous
 
 RECEIVE_BUFFER_BYTES = 4 << 20  # the default loses thousands of frames in a stall of 2 s
 
@@ -22,7 +22,7 @@ class CanBus(LiveSource[can.Message]):
     """Frames of one bus, listening only.
 
     `can_ids` (as in `Frames.can_id`) are filtered by the driver where it can; None takes all.
-    Time stamps are python-can's, but a clock that is set back does not stop them (see `stamps`).
+    Time stamps are python-can's, but a clock that is set back does not stop them (see `steps`).
     Raises SourceError if the bus cannot be opened.
     """
 

@@ -24,7 +24,8 @@ from firmware_bridge.frames import Frames
 from firmware_bridge.jit import Integer, inlined, kernel
 from firmware_bridge.sources.live import now_us
 from firmware_bridge.sources.port import PortSource
-from firmware_bridge.stamps import Continuous, StampModel
+from firmware_bridge.stamps import StampModel
+from firmware_bridge.steps import Continuous
 
 BAUDRATE = 2_000_000
 BODY = struct.Struct("<IQ")
@@ -154,7 +155,7 @@ class Decoder:
 class SerialPort(PortSource):
     """Frames from a serial port, stamped by the controller.
 
-    The controller's stamps stay as they are (see `stamps.Continuous`); with host_time they are
+    The controller's stamps stay as they are (see `steps.Continuous`); with host_time they are
     mapped to the clock of this machine (`stamps.StampModel`), as several controllers need it.
     """
 
