@@ -122,20 +122,22 @@ def _containers(raw: bytes) -> list[Piece]:
 
 
 def _segments(
-    contents: list[Content], counts: NDArray[np.int64]
+    contents: list[Content], is_cut: bool, counts: NDArray[np.int64]
 ) -> tuple[NDArray[np.uint8], list[int]]:
     """All content in one piece, and the borders that no object may cross; counts them.
 
-    Between two containers lies nothing but padding, or a container whose head is damaged.
+    Between two containers lies nothing but padding, or a container whose head is damaged; behind
+    the last one of a cut file, what is left of the next one.
     """
     borders, size = [0], 0
-    for content in contents:
+    for k, content in enumerate(contents, 1):
         size += len(content.data)
-        if content.rest:
+        if content.rest and not (is_cut and k == len(contents)):
             counts[OTHER if content.rest.startswith(SIGNATURE) else BAD_CONTAINER] += 1
         if content.rest or not content.is_whole:
             borders.append(size)
-    borders.append(size)
+    if size > borders[-1]:
+        borders.append(size)
     return np.frombuffer(b"".join([content.data for content in contents]), np.uint8), borders
 
 
@@ -150,7 +152,8 @@ def read(path: Path) -> Frames:
         contents = list(pool.map(_inflate, pieces))
     lost = [not (c.is_whole or p.is_cut) for p, c in zip(pieces, contents, strict=True)]
     counts[BAD_CONTAINER] += sum(lost)
-    text, borders = _segments(contents, counts)
+    is_cut = _is_cut(raw, pieces)
+    text, borders = _segments(contents, is_cut, counts)
     out = fr.empty(len(text) // MIN_OBJECT + 1)
     n, start_us = 0, _start_us(raw)
     for begin, end in itertools.pairwise(borders):
@@ -160,7 +163,9 @@ def read(path: Path) -> Frames:
             text, begin, end, start_us, out.t_us, out.channel, out.can_id, out.length, out.data,
             n, counts,
         )  # fmt: skip
-    counts[TRUNCATED] |= _is_cut(raw, pieces)
+    if lost and lost[-1]:
+        counts[BAD], counts[TRUNCATED] = counts[BAD] + counts[TRUNCATED], 0
+    counts[TRUNCATED] = counts[TRUNCATED] > 0 or is_cut
     found = out[:n]
     fr.add_counts(found.refused, dict(zip(REASONS, counts.tolist(), strict=True)))
     return found

@@ -22,6 +22,7 @@ from firmware_bridge.sources.text import BAD, ERROR, FD, NOTHING, OK, REMOTE, Ro
 LIKE = "'1.5,0x120,0,0,0,2,ABE=' (a table of samples is no log of frames)"
 COMMA, EQUALS, MINUS, SMALL_E, SMALL_X = 44, 61, 45, 101, 120
 HEADER = tx.code("timestamp")
+HEADER_BYTES = len("timestamp,arbitration_id,extended,remote,error,dlc,data\n")
 
 _BASE64 = np.full(256, 255, np.int64)
 for _k, _c in enumerate(b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/"):
@@ -80,8 +81,10 @@ def _line(  # noqa: PLR0911  each return names what is wrong with the line
     text: NDArray[np.uint8], pos: Integer, end: Integer, rows: Rows, k: Integer
 ) -> tuple[Integer, Integer]:
     """Parse text[pos:end] into row k (changed in place); OK or why not, and where to go on."""
-    if tx.skip(text, pos, end) == end or tx.word(text, pos, end) == HEADER:
+    if tx.skip(text, pos, end) == end:
         return NOTHING, end
+    if tx.word(text, pos, end) == HEADER:
+        return NOTHING, pos + HEADER_BYTES
     last = _field(text, pos, end)
     rows.t_us[k], first = _time(text, pos, last), last + 1
     last = _field(text, first, end)

@@ -4,7 +4,8 @@ A line is a frame only if it is one to its last character: lengths must agree, d
 in their full number, nothing may follow.  A flipped digit that yields another digit is therefore
 all that can pass; the end-to-end CRC of the payload is the guard against that.  Every line that is
 no data frame is counted under its reason.  A last line without a newline has been cut and is left
-out.  A damaged newline joins two lines: the first is lost, the second is still found.
+out.  A damaged newline joins two lines: the first is lost, the second is still found.  The order
+of the lines guards the stamps: one that lies outside its neighbours by 0.1 s is refused.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ BAD, REMOTE, FD, ERROR, OTHER, TRUNCATED = 0, 1, 2, 3, 4, 5
 OK, NOTHING = -1, -2  # a frame; a blank, header or comment line
 NEWLINE, CR, TAB, SPACE, DOT = 10, 13, 9, 32, 46
 EXTENDED = 0x8000_0000
+STRAY_US = 100_000  # logs of several channels may be out of order by less
 FRAMES_PER_LINE = 2  # a damaged newline joins two lines
 
 HEX = np.full(256, 255, np.int64)
@@ -136,4 +138,23 @@ def read(
     found, n_bad = scan(text, parse, *options)
     if len(found) == 0 and n_bad:
         raise LogError(f"{path}: no line looks like {like}; give the file its right suffix")
-    return found
+    return _without_stray_stamps(found)
+
+
+def _without_stray_stamps(frames: Frames) -> Frames:
+    """The frames but those whose stamp alone lies outside its neighbours, which are in order.
+
+    One digit makes such a stamp; taken for true it would make all that follows come too late.
+    """
+    t_us = frames.t_us
+    if len(t_us) < 2:
+        return frames
+    before = np.concatenate([np.minimum(t_us[:1], t_us[1:2]), t_us[:-1]])
+    after = np.concatenate([t_us[1:], np.maximum(t_us[-1:], t_us[-2:-1])])
+    outside = (t_us > after + STRAY_US) | (t_us < before - STRAY_US)
+    stray = outside & (before <= after)
+    if not stray.any():
+        return frames
+    kept = frames[~stray]
+    fr.add_counts(kept.refused, frames.refused | {"stray_stamp": int(stray.sum())})
+    return kept

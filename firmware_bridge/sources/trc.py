@@ -35,6 +35,7 @@ COLUMNS = {
     "2.0": b"NOTIdlD",
     "2.1": b"NOTBIdRLD",
 }
+KNOWN = re.compile(rb"[NOTBIdR]*[lL]D")
 DAY_ZERO = datetime.datetime(1899, 12, 30, tzinfo=datetime.UTC)
 
 NUMBER, OFFSET, TYPE, BUS, IDENTIFIER, DIRECTION, BYTES = b"NOTBIdD"
@@ -97,8 +98,8 @@ def _line(  # noqa: PLR0911  each return names what is wrong with the line
 ) -> tuple[Integer, Integer]:  # fmt: skip
     """Parse text[pos:end] into row k (changed in place); OK or why not, and where to go on."""
     first = tx.skip(text, pos, end)
-    if first == end or text[first] == SEMICOLON:
-        return NOTHING, end
+    if first == end or (text[first] == SEMICOLON and not 48 <= text[min(first + 1, end - 1)] <= 57):
+        return NOTHING, end  # a ; before a digit was a digit once
     rows.channel[k], size, last = 0, 0, first
     for column in columns:
         first, last = tx.token(text, last, end)
@@ -174,10 +175,13 @@ def _columns(head: str, text: NDArray[np.uint8]) -> NDArray[np.uint8]:
     stated = re.search(r"^;\$COLUMNS=([\w,]+)", head, re.MULTILINE)
     version = re.search(r"^;\$FILEVERSION=(\d\.\d)", head, re.MULTILINE)
     first = COLUMNS.get(version[1] if version else "1.0", COLUMNS["1.0"])
-    if stated:
-        first = stated[1].replace(",", "").encode()
+    letters = stated[1].replace(",", "").encode() if stated else b""
+    if KNOWN.fullmatch(letters) and all(letters.count(one) == 1 for one in b"OID"):
+        first = letters
     choices = [np.frombuffer(one, np.uint8) for one in (first, *COLUMNS.values())]
     sample = text[: HEAD_BYTES + SAMPLE_BYTES]
+    if len(tx.scan(sample, parse, choices[0])[0]):
+        return choices[0]
     return max(choices, key=lambda columns: len(tx.scan(sample, parse, columns)[0]))
 
 
