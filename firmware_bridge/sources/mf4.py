@@ -1,55 +1,84 @@
-"""MF4 bus logs (ASAM MDF 4), through asammdf, which is an extra: pip install rtid[mf4]."""
+"""MF4 bus logs (ASAM MDF 4), through asammdf, which is an extra: pip install rtid[mf4].
+
+The index of a file may stand before its data (loggers) or behind (converters, asammdf, python-can).
+Of a log that is cut, all is read in the first case ("not_finalised": nothing says where such a log
+should end), nothing can be in the second: that is an error which says "truncated".  Compressed
+blocks carry a checksum: a damaged one is skipped and counted.  Uncompressed data, the heads of
+blocks and the index carry none: damage there may yield wrong frames.  Stamps are rounded to 1 us.
+"""
 
 from __future__ import annotations
 
+import importlib.util
+import io
+import struct
+import subprocess
+import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from firmware_bridge import frames as fr
 from firmware_bridge.frames import Frames
+from firmware_bridge.sources import mf4_child
 from firmware_bridge.sources.errors import LogError
+
+FIRST_GROUP, GROUP_DATA = 88, 40  # where the links to the first data group and to its data stand
+LIMIT_S, BYTES_PER_S = 10.0, 2e6  # a reader that is slower than this has lost its way
 
 
 def read(path: Path) -> Frames:
     """All classic data frames of a bus-logging MF4, sorted by time; LogError if it holds none."""
-    try:
-        from asammdf import MDF  # noqa: PLC0415  680 ms and 100 MB: only who reads MF4 pays
-    except ImportError:
-        raise LogError(f"{path}: reading MF4 needs asammdf; pip install 'rtid[mf4]'") from None
-    try:
-        with MDF(path) as mdf:
-            start_us = round(mdf.start_time.timestamp() * 1e6)
-            parts = [_group(mdf, k, start_us) for k in range(len(mdf.groups))]
-    except Exception as error:  # asammdf raises whatever a damaged block causes
-        raise LogError(f"{path}: not a readable MF4 bus log: {error}") from error
-    found = fr.by_time(fr.concatenate([part for part in parts if part is not None]))
-    if len(found) == 0:
-        raise LogError(f"{path}: holds no CAN data frames; is it a bus log?")
+    if importlib.util.find_spec("asammdf") is None:
+        raise LogError(f"{path}: reading MF4 needs asammdf; pip install 'rtid[mf4]'")
+    finalised = _check_index(path)
+    columns, refused = _extract(path)
+    if len(columns.get("t_us", ())) == 0:
+        lost = "all its blocks are damaged" if refused.get("bad_container") else "is it a bus log?"
+        raise LogError(f"{path}: holds no CAN data frames; {lost}")
+    found = fr.by_time(Frames(**columns))
+    fr.add_counts(found.refused, refused | {"not_finalised": int(not finalised)})
     return found
 
 
-def _group(mdf: Any, k: int, start_us: int) -> Frames | None:
-    """Frames of one channel group; None if it holds no data frames."""
-    names = {channel.name for channel in mdf.groups[k].channels}
-    if "CAN_DataFrame" not in names:
-        return None
-    signal = mdf.get("CAN_DataFrame", group=k)
-    if not len(signal.timestamps):
-        return None
-    samples = signal.samples
-    length = np.asarray(samples["CAN_DataFrame.DataLength"], np.int64)
-    keep = length <= fr.MAX_LENGTH
-    out = fr.empty(int(keep.sum()))
-    out.t_us[:] = start_us + np.rint(signal.timestamps[keep] * 1e6).astype(np.int64)
-    out.channel[:] = samples["CAN_DataFrame.BusChannel"][keep]
-    extended = samples["CAN_DataFrame.IDE"][keep].astype(np.uint32) * np.uint32(fr.EXTENDED)
-    identifier = samples["CAN_DataFrame.ID"][keep].astype(np.uint32) & np.uint32(0x1FFF_FFFF)
-    out.can_id[:] = identifier | extended
-    out.length[:] = length[keep]
-    data = np.asarray(samples["CAN_DataFrame.DataBytes"])[keep][:, : fr.MAX_LENGTH]
-    inside = np.arange(data.shape[1]) < out.length[:, None]
-    out.data[:, : data.shape[1]] = np.where(inside, data, 0)
-    fr.add_counts(out.refused, {"fd_frame": int((~keep).sum())})
-    return out
+def _check_index(path: Path) -> bool:
+    """Whether the log was closed by its writer; LogError if its index or data lie behind its end.
+
+    asammdf would say so less plainly.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        place, head = 0, file.read(FIRST_GROUP + 8)
+        if not head.startswith((b"MDF ", b"UnFinMF ")):
+            raise LogError(f"{path}: not an MF4 file; check the file or its suffix")
+        for offset in (FIRST_GROUP, GROUP_DATA):
+            file.seek(place + offset)
+            link = file.read(8)
+            place = struct.unpack("<Q", link)[0] if len(link) == 8 else size
+            if place >= size:
+                raise LogError(
+                    f"{path}: truncated: it ends at byte {size}, before its index or first frame; "
+                    "copy the log again"
+                )
+    return head.startswith(b"MDF ")
+
+
+def _extract(path: Path) -> tuple[mf4_child.Columns, dict[str, int]]:
+    """`mf4_child.extract` in a process of its own; LogError if it fails, crashes or hangs."""
+    limit_s = LIMIT_S + path.stat().st_size / BYTES_PER_S
+    try:
+        done = subprocess.run(
+            [sys.executable, "-P", mf4_child.__file__, str(path)],
+            capture_output=True, check=False, timeout=limit_s,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        raise LogError(f"{path}: not read in {limit_s:.0f} s; its index is damaged") from None
+    if done.returncode == mf4_child.FAILED:
+        why = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
+        raise LogError(f"{path}: not a readable MF4 bus log: {why}")
+    if done.returncode:
+        raise LogError(f"{path}: asammdf crashed ({done.returncode}); the log's index is damaged")
+    with np.load(io.BytesIO(done.stdout)) as arrays:
+        columns = dict(arrays)
+    reasons, counts = columns.pop("reasons").tolist(), columns.pop("counts").tolist()
+    return columns, dict(zip(reasons, map(int, counts), strict=True))

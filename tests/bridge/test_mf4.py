@@ -1,0 +1,199 @@
+from __future__ import annotations
+
+import re
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator
+from itertools import islice, pairwise
+from multiprocessing import get_context
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+
+from firmware_bridge import frames as fr
+from firmware_bridge.frames import Frames
+from firmware_bridge.sources import LogError, mf4, mf4_child, open_log
+from tests.bridge.machine import cycles, equal
+
+N = 200
+HANG_S = 10.0
+HEAD = 48  # bytes of the head of a compressed block
+
+
+def test_missing_asammdf_is_a_plain_message(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "asammdf", None)
+    path = tmp_path / "t.mf4"
+    path.write_bytes(b"MDF     4.10    ")
+    with pytest.raises(LogError, match=r"rtid\[mf4\]"):
+        open_log(path)
+
+
+@pytest.fixture
+def asammdf() -> None:
+    pytest.importorskip("asammdf", reason="needs the extra mf4")
+
+
+def write(path: Path, frames: Frames) -> Path:
+    with can.MF4Writer(path, compression_level=0) as log:
+        for message in fr.to_messages(frames):
+            log.on_message_received(message)
+    return path
+
+
+def compress(path: Path) -> Path:
+    """The same log in compressed blocks of 16 KiB, each with a checksum."""
+    from asammdf import MDF
+
+    with MDF(path) as log:
+        log.configure(write_fragment_size=16 << 10)
+        log.save(path.with_stem("packed"), compression=2)
+    return path.with_stem("packed")
+
+
+def rows(frames: Frames) -> Counter[tuple[int, int, int, bytes]]:
+    data = [row.tobytes() for row in frames.data]
+    columns = (frames.t_us.tolist(), frames.can_id.tolist(), frames.length.tolist())
+    return Counter(zip(*columns, data, strict=True))
+
+
+def open_here(path: Path) -> Frames | str:
+    """`open_log` without a process for each file: for a worker, which may crash itself."""
+    mf4._extract = extract_here
+    try:
+        return open_log(path)
+    except LogError as error:
+        return str(error)
+
+
+def extract_here(path: Path) -> tuple[mf4_child.Columns, dict[str, int]]:
+    try:
+        return mf4_child.extract(str(path))
+    except Exception as error:
+        raise LogError(f"{path}: {error}") from error
+
+
+def each(path: Path, contents: Iterator[bytes]) -> Iterator[Frames | str]:
+    """Read files one after the other in one worker; an error if it crashes or hangs."""
+    with get_context("spawn").Pool(1) as pool:  # its end kills a worker that hangs
+        for content in contents:
+            path.write_bytes(content)
+            yield pool.apply_async(open_here, (path,)).get(HANG_S)
+
+
+def flips(raw: bytes, inside: Callable[[int], bool], seed: int) -> Iterator[bytes]:
+    rng = np.random.default_rng(seed)
+    places = [k for k in rng.integers(64, len(raw), 20 * N).tolist() if inside(k)][:N]
+    for place in places:
+        broken = bytearray(raw)
+        broken[place] ^= 1 << int(rng.integers(8))
+        yield bytes(broken)
+
+
+@pytest.mark.usefixtures("asammdf")
+def test_what_python_can_writes_is_read(tmp_path: Path) -> None:
+    frames = cycles(200)
+    frames.can_id[::7] |= fr.EXTENDED
+    found = open_log(write(tmp_path / "t.mf4", frames))
+    assert np.ptp(found.t_us - frames.t_us) <= 1  # the format has seconds as floats
+    found.t_us[:] = frames.t_us
+    assert equal(found, frames)
+    assert found.refused == {}
+
+
+@pytest.mark.usefixtures("asammdf")
+def test_real_capture(shared: Path) -> None:
+    frames = open_log(shared / "data/can_j1939/vehicle.mf4")
+    assert len(frames) == 150_411
+    assert len(np.unique(frames.can_id)) == 67
+    assert np.ptp(frames.t_us) * 1e-6 == pytest.approx(401.6, abs=0.1)
+    assert frames.refused == {"not_finalised": 1}
+
+
+@pytest.mark.usefixtures("asammdf")
+def test_cut_real_capture_keeps_what_stands_before(shared: Path, tmp_path: Path) -> None:
+    """The logger writes the index first; records of 19 to 20 bytes follow from `first` on."""
+    path = shared / "data/can_j1939/vehicle.mf4"
+    raw, first = path.read_bytes()[:400_000], 106_800
+    path = tmp_path / "t.mf4"
+    path.write_bytes(raw)
+    whole = open_log(path)
+    good, size = rows(whole), (len(raw) - first) / len(whole)
+    cuts = np.random.default_rng(15).integers(first + 20_000, len(raw), N).tolist()
+    shares = []
+    for cut, part in zip(cuts, each(path, (raw[:k] for k in cuts)), strict=True):
+        assert isinstance(part, Frames)
+        assert not rows(part) - good
+        assert part.refused == {"not_finalised": 1}
+        shares.append(len(part) / ((cut - first) / size))
+    print(f".mf4, index first: {N} cuts, kept >= {100 * min(shares):.1f} %, 0 wrong")
+    assert min(shares) >= 0.995
+    path.write_bytes(raw[: first - 5000])
+    with pytest.raises(LogError, match="truncated"):
+        open_log(path)
+
+
+@pytest.mark.usefixtures("asammdf")
+def test_cut_log_without_its_index_is_refused_as_truncated(tmp_path: Path) -> None:
+    raw = write(tmp_path / "t.mf4", cycles(500)).read_bytes()
+    cut = tmp_path / "cut.mf4"
+    for size in np.random.default_rng(15).integers(64, len(raw) - 30_000, N).tolist():
+        cut.write_bytes(raw[:size])
+        with pytest.raises(LogError, match="truncated"):
+            open_log(cut)
+
+
+@pytest.mark.usefixtures("asammdf")
+def test_a_flipped_bit_costs_one_block(tmp_path: Path) -> None:
+    """What is in compressed blocks has a checksum; their heads and the index have none."""
+    packed = compress(write(tmp_path / "t.mf4", cycles(1500)))
+    raw, whole = packed.read_bytes(), open_log(packed)
+    heads = [k.start() for k in re.finditer(b"##DZ", raw)]
+    inner = {k for a, b in pairwise(heads) for k in range(a + HEAD, b)}
+    good, lost = rows(whole), []
+    for found in each(tmp_path / "flip.mf4", flips(raw, inner.__contains__, 16)):
+        assert isinstance(found, Frames)
+        assert not rows(found) - good
+        lost.append(len(whole) - len(found))
+        assert lost[-1] == 0 or found.refused["bad_container"] == 1
+    print(f".mf4: {N} flips in blocks, worst loss {max(lost)} frames of one block, 0 wrong")
+    assert max(lost) <= (16 << 10) // 70 + 2 * mf4_child.SMALLEST_RUN
+
+
+@pytest.mark.usefixtures("asammdf")
+def test_a_flipped_bit_in_the_index_does_no_harm_to_the_program(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """asammdf was seen to hang and to abort the process on such files; the log is refused then."""
+    monkeypatch.setattr(mf4, "LIMIT_S", 3.0)
+    raw = write(tmp_path / "t.mf4", cycles(300)).read_bytes()
+    index, seen, path = raw.rfind(b"##DT"), Counter[str](), tmp_path / "flip.mf4"
+    index = raw.find(b"##", index + 4)
+    for content in islice(flips(raw, lambda k: k >= index, 17), 24):
+        path.write_bytes(content)
+        try:
+            open_log(path)
+            seen["read"] += 1
+        except LogError as error:
+            seen["refused"] += 1
+            assert str(path) in str(error)
+    print(f".mf4: {seen.total()} flips in the index: {dict(seen)}")
+
+
+@pytest.mark.usefixtures("asammdf")
+def test_a_crash_of_asammdf_is_an_error_of_the_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write(tmp_path / "t.mf4", cycles(10))
+    child = tmp_path / "child.py"
+    monkeypatch.setattr(mf4_child, "__file__", str(child))
+    child.write_text("import os; os.abort()")
+    with pytest.raises(LogError, match="crashed"):
+        open_log(path)
+    monkeypatch.setattr(mf4, "LIMIT_S", 0.5)
+    child.write_text("import time; time.sleep(60)")
+    with pytest.raises(LogError, match="not read in"):
+        open_log(path)
