@@ -1,0 +1,270 @@
+#include "rtid_frames.h"
+
+#include <string.h>
+
+typedef struct {
+    uint32_t can_id;
+    uint32_t late_us;
+    uint16_t data_id;
+    uint8_t first, count; /* rows of SIGNALS */
+    uint8_t length;
+    uint8_t crc_byte;
+    uint8_t counter_shift, counter_bits;
+} message_row;
+
+typedef struct {
+    uint8_t shift, bits, is_signed;
+    int64_t low, high; /* counts outside mean: not available */
+    double scale, offset;
+} signal_row;
+
+static const message_row MESSAGES[] = {RTID_MESSAGE_ROWS};
+static const signal_row SIGNALS[] = {RTID_SIGNAL_ROWS};
+
+static uint64_t mask_of(uint8_t bits) { return (UINT64_C(1) << bits) - 1; }
+
+static uint64_t word_of(const uint8_t *data)
+{
+    uint64_t word = 0;
+    for (int k = 7; k >= 0; k--)
+        word = word << 8 | data[k];
+    return word;
+}
+
+/* CRC-8 SAE J1850 over the data id and all bytes but the CRC (AUTOSAR E2E Profile 1). */
+static uint8_t crc8_step(uint8_t crc, uint8_t byte)
+{
+    crc ^= byte;
+    for (int bit = 0; bit < 8; bit++)
+        crc = (uint8_t)(crc & 0x80 ? crc << 1 ^ 0x1D : crc << 1);
+    return crc;
+}
+
+static uint8_t crc8(const message_row *row, const uint8_t *data)
+{
+    uint8_t crc = crc8_step(0, (uint8_t)(row->data_id & 0xFF));
+    crc = crc8_step(crc, (uint8_t)(row->data_id >> 8));
+    for (uint8_t k = 0; k < row->length; k++)
+        if (k != row->crc_byte)
+            crc = crc8_step(crc, data[k]);
+    return crc;
+}
+
+/* Nearest whole number, halves to even; |x| < 2^52. */
+static int64_t nearest(double x)
+{
+    int64_t n = (int64_t)x;
+    double rest = x - (double)n;
+    if (rest > 0.5 || (rest == 0.5 && n % 2 != 0))
+        n++;
+    if (rest < -0.5 || (rest == -0.5 && n % 2 != 0))
+        n--;
+    return n;
+}
+
+static uint64_t to_bits(const signal_row *row, double value)
+{
+    double x = (value - row->offset) / row->scale;
+    int64_t count;
+    if (x != x) /* NaN: the lowest count if signed, else all ones */
+        return row->is_signed ? UINT64_C(1) << (row->bits - 1) : mask_of(row->bits);
+    if (x <= (double)row->low)
+        count = row->low;
+    else if (x >= (double)row->high)
+        count = row->high;
+    else
+        count = nearest(x);
+    return (uint64_t)count & mask_of(row->bits);
+}
+
+void rtid_pack(int message, int64_t t_us, uint8_t counter, const double *values,
+               rtid_frame *frame)
+{
+    const message_row *row = &MESSAGES[message];
+    uint64_t word = (counter & mask_of(row->counter_bits)) << row->counter_shift;
+    for (uint8_t k = 0; k < row->count; k++) {
+        const signal_row *signal = &SIGNALS[row->first + k];
+        word |= to_bits(signal, values[k]) << signal->shift;
+    }
+    frame->t_us = t_us;
+    frame->can_id = row->can_id;
+    frame->length = row->length;
+    for (int k = 0; k < 8; k++)
+        frame->data[k] = (uint8_t)(word >> (8 * k));
+    frame->data[row->crc_byte] = crc8(row, frame->data);
+}
+
+static int find(uint32_t can_id)
+{
+    for (int m = 0; m < RTID_N_MESSAGES; m++)
+        if (MESSAGES[m].can_id == can_id)
+            return m;
+    return -1;
+}
+
+/* A counter cannot see a loss of a multiple of its range: it is judged together with the time. */
+static int check_sequence(rtid_receiver *receiver, int m, int64_t t_us, uint8_t counter)
+{
+    const int64_t dt = t_us - receiver->last[m].t_us, late = (int64_t)MESSAGES[m].late_us;
+    const int mask = (int)mask_of(MESSAGES[m].counter_bits);
+    const int step = (counter - receiver->last[m].counter) & mask;
+    if (!receiver->last[m].seen)
+        return RTID_OK;
+    if (dt <= late && step == 0)
+        return RTID_COUNTER_REPEAT;
+    if (dt <= late && 2 * step > mask + 1)
+        return RTID_OUT_OF_ORDER;
+    if (dt > 0 && step != 1)
+        receiver->counts[RTID_COUNTER_JUMP]++;
+    return dt <= 0 ? RTID_OUT_OF_ORDER : RTID_OK;
+}
+
+static int read_value(const signal_row *row, uint64_t word, double *value)
+{
+    static const uint64_t nan_bits = UINT64_C(0x7FF8000000000000);
+    int64_t count = (int64_t)(word >> row->shift & mask_of(row->bits));
+    if (row->is_signed && count >> (row->bits - 1))
+        count -= INT64_C(1) << row->bits;
+    if (count < row->low || count > row->high) {
+        memcpy(value, &nan_bits, sizeof *value);
+        return RTID_NOT_AVAILABLE;
+    }
+    *value = (double)count * row->scale + row->offset;
+    return RTID_OK;
+}
+
+static int judge(rtid_receiver *receiver, const rtid_frame *frame, int m, double *values)
+{
+    const message_row *row = &MESSAGES[m];
+    const uint64_t word = word_of(frame->data);
+    const uint8_t counter = (uint8_t)(word >> row->counter_shift & mask_of(row->counter_bits));
+    int verdict;
+    if (frame->length != row->length)
+        return RTID_WRONG_LENGTH;
+    if (crc8(row, frame->data) != frame->data[row->crc_byte])
+        return RTID_CRC;
+    verdict = check_sequence(receiver, m, frame->t_us, counter);
+    if (verdict != RTID_OK)
+        return verdict;
+    receiver->last[m].t_us = frame->t_us;
+    receiver->last[m].counter = counter;
+    receiver->last[m].seen = 1;
+    for (uint8_t k = 0; k < row->count; k++)
+        if (read_value(&SIGNALS[row->first + k], word, &values[k]) != RTID_OK)
+            verdict = RTID_NOT_AVAILABLE;
+    return verdict;
+}
+
+int rtid_check(rtid_receiver *receiver, const rtid_frame *frame, int *message, double *values)
+{
+    const int m = find(frame->can_id);
+    const int verdict = m < 0 ? RTID_UNKNOWN_ID : judge(receiver, frame, m, values);
+    if (verdict != RTID_OK)
+        receiver->counts[verdict]++;
+    *message = m;
+    return verdict;
+}
+
+/* CRC-16 CCITT, start 0xFFFF, inverted at the end: a plain one that ends in 0x00 could lose it. */
+static uint16_t crc16(const uint8_t *data, size_t n)
+{
+    uint16_t crc = 0xFFFF;
+    for (size_t k = 0; k < n; k++) {
+        crc = (uint16_t)(crc ^ (uint16_t)(data[k] << 8));
+        for (int bit = 0; bit < 8; bit++)
+            crc = (uint16_t)(crc & 0x8000 ? crc << 1 ^ 0x1021 : crc << 1);
+    }
+    return (uint16_t)~crc;
+}
+
+size_t rtid_wire_encode(const rtid_frame *frame, uint8_t *out)
+{
+    uint8_t block[RTID_BLOCK_MAX];
+    const size_t length = frame->length > 8 ? 8 : frame->length;
+    size_t n = 12 + length, code = 1, k;
+    uint16_t crc;
+    for (k = 0; k < 4; k++)
+        block[k] = (uint8_t)(frame->can_id >> (8 * k));
+    for (k = 0; k < 8; k++)
+        block[4 + k] = (uint8_t)((uint64_t)frame->t_us >> (8 * k));
+    memcpy(block + 12, frame->data, length);
+    crc = crc16(block, n);
+    block[n++] = (uint8_t)(crc >> 8);
+    block[n++] = (uint8_t)(crc & 0xFF);
+
+    out[0] = 0;
+    out[code] = 1;
+    for (k = 0; k < n; k++) { /* COBS: out[code] counts the way to the next zero */
+        if (block[k] == 0) {
+            code += out[code];
+            out[code] = 1;
+        } else {
+            out[code + out[code]] = block[k];
+            out[code]++;
+        }
+    }
+    code += out[code];
+    out[code] = 0;
+    return code + 1;
+}
+
+/* Undo COBS into block[RTID_BLOCK_MAX]; the number of bytes, 0 if malformed. */
+static size_t uncobs(const uint8_t *code, size_t end, uint8_t *block)
+{
+    size_t n = 0, pos = 0;
+    while (pos < end) {
+        const size_t run = code[pos];
+        if (pos + run > end)
+            return 0;
+        memcpy(block + n, code + pos + 1, run - 1);
+        n += run - 1;
+        pos += run;
+        if (pos < end)
+            block[n++] = 0;
+    }
+    return n;
+}
+
+static int unpack(const uint8_t *block, size_t n, rtid_frame *frame)
+{
+    const size_t length = n - 14;
+    uint64_t t_us = 0;
+    uint32_t can_id = 0;
+    if (n < 14 || n > RTID_BLOCK_MAX)
+        return 0;
+    if (crc16(block, n - 2) != (uint16_t)(block[n - 2] << 8 | block[n - 1]))
+        return 0;
+    for (int k = 3; k >= 0; k--)
+        can_id = can_id << 8 | block[k];
+    for (int k = 11; k >= 4; k--)
+        t_us = t_us << 8 | block[k];
+    if (t_us >> 53 || (can_id & ~RTID_EXTENDED) >> (can_id & RTID_EXTENDED ? 29 : 11))
+        return 0;
+    frame->t_us = (int64_t)t_us;
+    frame->can_id = can_id;
+    frame->length = (uint8_t)length;
+    memset(frame->data, 0, sizeof frame->data);
+    memcpy(frame->data, block + 12, length);
+    return 1;
+}
+
+int rtid_wire_push(rtid_decoder *decoder, uint8_t byte, rtid_frame *frame)
+{
+    uint8_t block[RTID_CODE_MAX];
+    const size_t n = decoder->n;
+    int good;
+    if (byte != 0) {
+        if (n < RTID_CODE_MAX)
+            decoder->code[n] = byte;
+        if (n <= RTID_CODE_MAX)
+            decoder->n++;
+        return 0;
+    }
+    decoder->n = 0;
+    if (n == 0)
+        return 0;
+    good = n <= RTID_CODE_MAX && unpack(block, uncobs(decoder->code, n, block), frame);
+    if (!good)
+        decoder->bad++;
+    return good;
+}
