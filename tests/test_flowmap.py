@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
+from hypothesis import given, reject, settings
+from hypothesis import strategies as st
 
-from rtid.estimator.flowmap import EXTRAPOLATED, LEARNING, PRIOR, SHUT, VALID, FlowMap
-from rtid.estimator.published import publish
+from rtid.estimator.flowmap import EXTRAPOLATED, LEARNING, PRIOR, SHUT, VALID, EdgeMap, FlowMap
+from rtid.estimator.published import cell_terms, publish
 from rtid.model import FloatArray, Grid
 from tests.flow_maps import GRID, RATED_Q_M3S, Flow, compensated, empty, machine, orifice, solved
 
@@ -21,20 +24,6 @@ def centres(grid: Grid, chosen: FloatArray) -> tuple[FloatArray, FloatArray]:
     i, j = np.nonzero(chosen)
     u, p = grid.u_v, grid.dp_pa
     return 0.5 * (u[i] + u[i + 1]), 0.5 * (p[j] + p[j + 1])
-
-
-def test_flow_is_continuous_and_its_gradient_is_its_derivative() -> None:
-    edge = learned()[0]
-    rng = np.random.default_rng(0)
-    w, dp = rng.uniform(1.05, 7.9, 3000), rng.uniform(-0.4e6, 6.9e6, 3000)
-    by_w, by_dp = edge.gradient(w, dp)
-    h_v, h_pa = 1e-6, 1.0
-    np.testing.assert_allclose(
-        (edge.flow(w + h_v, dp) - edge.flow(w - h_v, dp)) / (2 * h_v), by_w, atol=2e-8
-    )
-    np.testing.assert_allclose(
-        (edge.flow(w, dp + h_pa) - edge.flow(w, dp - h_pa)) / (2 * h_pa), by_dp, atol=2e-14
-    )
 
 
 def test_raw_polynomials_would_have_jumped() -> None:
@@ -57,10 +46,115 @@ def test_nothing_flows_up_to_the_safe_band_and_nothing_is_known_off_the_grid() -
     assert edge.status_at([0.5, 9.0, 3.0], [3e6, 3e6, 9e6]).tolist() == [SHUT, "outside", "outside"]
 
 
-def test_inverse_gives_back_the_command() -> None:
+def random_map(seed: int, safe: bool = True) -> EdgeMap:
+    """Unequal blocks with wild polynomials."""
+    rng = np.random.default_rng(seed)
+    u = np.append(0.0, np.cumsum(10.0 ** rng.uniform(-1, 0.5, rng.integers(1, 7))))
+    p = np.append(0.0, np.cumsum(10.0 ** rng.uniform(5, 6.5, rng.integers(1, 7)))) - 2e5
+    theta = rng.standard_normal((len(u) - 1, len(p) - 1, 6)) * 1e-4
+    start = float(rng.uniform(u[0], u[1])) if safe else -np.inf
+    return edge_map(Grid(u, p), theta, start)
+
+
+def edge_map(grid: Grid, theta: FloatArray, safe_band_v: float) -> EdgeMap:
+    cov = np.zeros((*grid.shape, 6, 6))
+    return EdgeMap("e", grid, safe_band_v, theta, cov, np.full(grid.shape, VALID), {})
+
+
+def monotone_map(seed: int) -> EdgeMap | None:
+    """Terms of a rising flow, disturbed; None where the disturbance bends it down somewhere."""
+    rng = np.random.default_rng(seed)
+    edge = random_map(seed)
+    curve, exponent = rng.uniform(0, 0.3), rng.uniform(0.3, 1.0)
+
+    def flow(w: FloatArray, dp: FloatArray) -> FloatArray:
+        return 1e-4 * (w + curve * w * w) * np.sign(dp) * np.abs(dp / 1e6) ** exponent
+
+    theta = cell_terms(edge.grid, flow).reshape(edge.theta.shape)
+    theta[:, :, 0] += 1e-6 * rng.standard_normal(theta.shape[:2])
+    edge = edge_map(edge.grid, theta, edge.safe_band_v)
+    near = edge.safe_band_v + np.diff(edge.grid.u_v).min() * np.geomspace(1e-6, 0.1, 20)
+    w, dp = np.meshgrid(np.append(_fine(edge.grid.u_v), near), _fine(edge.grid.dp_pa))
+    checked = (w > edge.safe_band_v) & (dp > 2e5)
+    rising = edge.gradient(w, dp)[0][checked] > 0
+    return edge if rising.any() and rising.all() else None
+
+
+def _fine(border: FloatArray) -> FloatArray:
+    return np.unique(np.concatenate([np.linspace(*pair, 41) for pair in pairwise(border)]))
+
+
+@given(st.integers(0, 2**32 - 1), st.booleans())
+@settings(max_examples=60, deadline=None)
+def test_nothing_jumps_at_the_borders(seed: int, safe: bool) -> None:
+    """Q and both slopes on either side of every border and of the safe band: equal to rounding."""
+    edge = random_map(seed, safe)
+    u, p = edge.grid.u_v, edge.grid.dp_pa
+    rng = np.random.default_rng(seed)
+    h_v, h_pa = 1e-12 * np.diff(u).min(), 1e-12 * np.diff(p).min()
+    scale = (1e-4, 1e-4 / np.diff(u).min(), 1e-4 / np.diff(p).min())
+    w, dp = rng.uniform(u[0], u[-1], 50), rng.uniform(p[0], p[-1], 50)
+    starts = [edge.safe_band_v] if safe else []
+    pairs = [((at - h_v, dp), (at + h_v, dp)) for at in [*u[1:-1], *starts]]
+    pairs += [((w, at - h_pa), (w, at + h_pa)) for at in p[1:-1]]
+    for sides in pairs:
+        below, above = ((edge.flow(*at), *edge.gradient(*at)) for at in sides)
+        for x, y, size in zip(below, above, scale, strict=True):
+            np.testing.assert_allclose(x, y, rtol=0, atol=2e-9 * size)
+
+
+@given(st.integers(0, 2**32 - 1), st.booleans())
+@settings(max_examples=60, deadline=None)
+def test_gradient_equals_finite_differences(seed: int, safe: bool) -> None:
+    """To 1e-6 of the largest slope."""
+    edge = random_map(seed, safe)
+    rng = np.random.default_rng(seed + 1)
+    u, p = edge.grid.u_v, edge.grid.dp_pa
+    h_v, h_pa = 1e-5 * np.diff(u).min(), 1e-5 * np.diff(p).min()
+    w = rng.uniform(u[0] + h_v, u[-1] - h_v, 300)
+    dp = rng.uniform(p[0] + h_pa, p[-1] - h_pa, 300)
+    by_w, by_dp = edge.gradient(w, dp)
+    found_w = (edge.flow(w + h_v, dp) - edge.flow(w - h_v, dp)) / (2 * h_v)
+    found_dp = (edge.flow(w, dp + h_pa) - edge.flow(w, dp - h_pa)) / (2 * h_pa)
+    np.testing.assert_allclose(found_w, by_w, rtol=0, atol=1e-6 * 1e-3 / np.diff(u).min())
+    np.testing.assert_allclose(found_dp, by_dp, rtol=0, atol=1e-6 * 1e-3 / np.diff(p).min())
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=100, deadline=None)
+def test_inverse_gives_back_the_command(seed: int) -> None:
+    """To 1e-9 of the command's range, from the foot at the safe band to the end of the grid."""
+    edge = monotone_map(seed) or reject()
+    u, p, rng = edge.grid.u_v, edge.grid.dp_pa, np.random.default_rng(seed)
+    foot = edge.safe_band_v + (u[1] - edge.safe_band_v) * 10.0 ** -rng.uniform(0, 4, 30)
+    inner = rng.uniform(edge.safe_band_v, u[-1], 60)
+    w = np.concatenate([foot, inner, u[1:], [edge.safe_band_v]])
+    dp = rng.uniform(2e5, p[-1], len(w))
+    tolerance = 1e-9 * (u[-1] - u[0])
+    np.testing.assert_allclose(edge.inverse(edge.flow(w, dp), dp), w, rtol=0, atol=tolerance)
+    beyond = edge.flow(u[-1], dp) * 1.0001
+    assert np.isnan(edge.inverse(beyond, dp)).all()
+    assert np.isnan(edge.inverse(-beyond, dp)).all()
+
+
+def test_inverse_of_a_map_that_falls() -> None:
+    """At negative pressure drops the flow falls with the command."""
+    grid = Grid(np.linspace(0, 8, 9), np.linspace(-2e6, 2e6, 5))
+    terms = cell_terms(grid, lambda w, dp: 1e-4 * w * dp / 1e6).reshape(8, 4, 6)
+    edge = edge_map(grid, terms, 0.5)
+    w, dp = np.meshgrid(np.linspace(0.6, 8, 40), [-1.9e6, -0.7e6, 0.3e6])
+    np.testing.assert_allclose(edge.inverse(edge.flow(w, dp), dp), w, atol=8e-9)
+    assert np.isnan(edge.inverse(0.0, 0.0))
+    assert edge.inverse(0.0, 1e6) == pytest.approx(0.5, abs=1e-9)
+
+
+def test_inverse_of_many_points_is_that_of_each() -> None:
     edge = learned()[0]
-    w, dp = np.linspace(2.6, 6.5, 50), np.linspace(1e6, 6e6, 50)
-    np.testing.assert_allclose(edge.inverse(edge.flow(w, dp), dp), w, atol=1e-9)
+    rng = np.random.default_rng(0)
+    w, dp = rng.uniform(2.6, 7.9, (3, 3000)), rng.uniform(1e6, 6e6, (3, 3000))
+    found = edge.inverse(edge.flow(w, dp), dp)
+    np.testing.assert_allclose(found, w, atol=7e-9)
+    assert found[1, 7] == edge.inverse(edge.flow(w[1, 7], dp[1, 7]), dp[1, 7])
 
 
 def test_inverse_refuses_what_the_map_cannot_give() -> None:

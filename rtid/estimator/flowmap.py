@@ -16,15 +16,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rtid.estimator.windows import blend, overlaps, rising, rising_slope
+from rtid.estimator.inverse import invert
+from rtid.estimator.windows import blend, foot
 from rtid.kernels.layout import TERMS
 from rtid.model import FloatArray, Grid
 
 # Status of a cell.
 VALID, LEARNING, EXTRAPOLATED, PRIOR, SHUT = "valid", "learning", "extrapolated", "prior", "shut"
-
-INVERSE_STEPS = 34  # bisections: from a quarter of a block to 1e-10 of it
-SCAN = 4  # points per block where a sign change is looked for
 
 Cells = tuple[NDArray[np.intp], NDArray[np.intp]]
 Corner = tuple[Cells, FloatArray, FloatArray, FloatArray]
@@ -57,28 +55,21 @@ class EdgeMap:
         """Standard deviation of Q in m3/s; neighbours' errors are taken as wholly correlated."""
         w, dp, open_, inside, shape = self._points(w_v, dp_pa)
         total = np.zeros(len(w))
-        for cells, weight, *_ in self._corners(w, dp):
-            phi = self._terms(cells, w, dp)[0]
+        for cells, weight, *_ in self.corners(w, dp):
+            phi = self.terms(cells, w, dp)[0]
             variance = np.einsum("ki,kij,kj->k", phi, self.cov[cells], phi)
             total += weight * np.sqrt(np.maximum(variance, 0.0))
-        return self._finish(total * self._foot(w)[0], open_, inside, shape)
+        return self._finish(
+            total * foot(self.grid.u_v, self.safe_band_v, w)[0], open_, inside, shape
+        )
 
     def inverse(self, q_m3s: ArrayLike, dp_pa: ArrayLike) -> FloatArray:
-        """The command w with Q(w, dp) = q, to 1e-9 V; NaN where there is none or more than one."""
+        """The command w with Q(w, dp) = q, to rounding; NaN where there is none or more than one.
+
+        For q = 0 it is the safe band, the largest command that surely passes nothing.
+        """
         q, dp = np.broadcast_arrays(np.asarray(q_m3s, float), np.asarray(dp_pa, float))
-        flat_q, flat_dp = q.ravel(), dp.ravel()
-        lattice = self._lattice()
-        table = self.flow(lattice[None, :], flat_dp[:, None]) - flat_q[:, None]
-        crossing = (table[:, :-1] < 0) != (table[:, 1:] < 0)
-        single = (crossing.sum(axis=1) == 1) & np.isfinite(table).all(axis=1)
-        at = crossing.argmax(axis=1)
-        low, high = lattice[at], lattice[at + 1]
-        falling = table[np.arange(len(at)), at] > 0
-        for _ in range(INVERSE_STEPS):
-            middle = 0.5 * (low + high)
-            above = (self.flow(middle, flat_dp) > flat_q) != falling
-            low, high = np.where(above, low, middle), np.where(above, middle, high)
-        found = np.where(single, 0.5 * (low + high), np.nan)
+        found = invert(self.grid, self.safe_band_v, self.theta, q.ravel(), dp.ravel())
         return found.reshape(q.shape)
 
     def status_at(self, w_v: ArrayLike, dp_pa: ArrayLike) -> NDArray[np.str_]:
@@ -94,13 +85,6 @@ class EdgeMap:
         valid = self.status == VALID
         return float(np.abs(self.theta[valid][:, 0]).max()) if valid.any() else np.nan
 
-    def _lattice(self) -> FloatArray:
-        u = self.grid.u_v
-        steps = np.arange(SCAN) / SCAN
-        fine = np.append((u[:-1, None] + np.diff(u)[:, None] * steps).ravel(), u[-1])
-        start = max(self.safe_band_v, float(u[0]))
-        return np.append(start, fine[fine > start])
-
     def _points(
         self, w_v: ArrayLike, dp_pa: ArrayLike
     ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_], NDArray[np.bool_], tuple[int, ...]]:
@@ -113,7 +97,7 @@ class EdgeMap:
         w, dp = np.nan_to_num(w, nan=u[0]), np.nan_to_num(dp, nan=p[0])
         return np.clip(w, u[0], u[-1]), np.clip(dp, p[0], p[-1]), open_, inside, shape
 
-    def _corners(self, w: FloatArray, dp: FloatArray) -> Iterator[Corner]:
+    def corners(self, w: FloatArray, dp: FloatArray) -> Iterator[Corner]:
         """Per blended block: its cells (i, j), the weight, and the weight's slopes in w and dp."""
         i, b, b_w = blend(self.grid.u_v, w)
         j, c, c_p = blend(self.grid.dp_pa, dp)
@@ -123,7 +107,7 @@ class EdgeMap:
                 cells = np.minimum(i + di, nu - 1), np.minimum(j + dj, nd - 1)
                 yield cells, wi * wj, si * wj, wi * sj
 
-    def _terms(
+    def terms(
         self, cells: Cells, w: FloatArray, dp: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """phi (k, 6) at the points in their cells, and its derivatives by w and dp."""
@@ -142,25 +126,16 @@ class EdgeMap:
         """Q and its two slopes: product rule over terms, windows and foot."""
         w, dp, open_, inside, shape = self._points(w_v, dp_pa)
         q, q_w, q_p = np.zeros((3, len(w)))
-        for cells, g, g_w, g_p in self._corners(w, dp):
+        for cells, g, g_w, g_p in self.corners(w, dp):
             theta = self.theta[cells]
-            value, by_w, by_p = ((t * theta).sum(axis=1) for t in self._terms(cells, w, dp))
+            value, by_w, by_p = ((t * theta).sum(axis=1) for t in self.terms(cells, w, dp))
             q += g * value
             q_w += g * by_w + g_w * value
             q_p += g * by_p + g_p * value
-        f, f_w = self._foot(w)
+        f, f_w = foot(self.grid.u_v, self.safe_band_v, w)
         parts = (f * q, f * q_w + f_w * q, f * q_p)
         a, b, c = (self._finish(part, open_, inside, shape) for part in parts)
         return a, b, c
-
-    def _foot(self, w: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Weight that lets the flow rise from zero at the safe band, and its derivative."""
-        if not np.isfinite(self.safe_band_v):
-            return np.ones(len(w)), np.zeros(len(w))
-        i = _cell(self.grid.u_v, np.array([self.safe_band_v]))[0]
-        eta = overlaps(self.grid.u_v)[i + 1] / 2
-        t = (w - self.safe_band_v) / eta - 1.0
-        return rising(t), rising_slope(t) / eta
 
     @staticmethod
     def _finish(

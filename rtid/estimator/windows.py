@@ -64,3 +64,16 @@ def blend(border: FloatArray, at: FloatArray) -> tuple[NDArray[np.intp], FloatAr
     lower = np.clip(np.searchsorted(middle, at) - 1, 0, n - 2)
     t = (at - border[lower + 1]) / eta[lower + 1]
     return lower, rising(t), rising_slope(t) / eta[lower + 1]
+
+
+def foot(border: FloatArray, start: float, at: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Weight (m,) that lets a map rise from zero at `start`, and its derivative.
+
+    It is 1 from one half overlap of the border above `start` on, everywhere where start is -inf.
+    """
+    if not np.isfinite(start):
+        return np.ones(len(at)), np.zeros(len(at))
+    i = int(np.clip(np.searchsorted(border, start, side="right") - 1, 0, len(border) - 2))
+    eta = overlaps(border)[i + 1] / 2
+    t = (at - start) / eta - 1.0
+    return rising(t), rising_slope(t) / eta
