@@ -70,6 +70,38 @@ def test_receive_error_reaches_the_reader(monkeypatch: pytest.MonkeyPatch) -> No
     source.stop()  # twice is harmless
 
 
+class Failing(CanBus):
+    """A bus whose driver fails for a while, as after bus-off."""
+
+    def __init__(self, fault_s: float) -> None:
+        self.fault_s, self.end_s = fault_s, 0.0
+        super().__init__("virtual", "failing", reopen_s=60.0)
+
+    def _receive(self) -> can.Message | None:
+        if not self.end_s:
+            self.end_s = time.monotonic() + self.fault_s
+        if time.monotonic() < self.end_s:
+            raise can.CanOperationError("bus-off")
+        return super()._receive()
+
+    def _open(self) -> None:
+        if time.monotonic() < self.end_s:
+            raise SourceError("interface down")
+        super()._open()
+
+
+def test_bus_that_fails_is_opened_again() -> None:
+    """Fault 11: recovery within 2.5 s of the end of the fault."""
+    with Failing(fault_s=1.5) as source:
+        got = source.read(0.0)
+        while "reopened" not in got.refused:
+            got = source.read(0.1)
+            assert not source.end_s or time.monotonic() < source.end_s + 2.5
+        with can.Bus(interface="virtual", channel="failing") as sender:
+            sender.send(can.Message(arbitration_id=7), timeout=1.0)
+            assert len(collect(source, 1)) == 1
+
+
 def test_full_queue_drops_the_oldest_and_says_so() -> None:
     source = CanBus("virtual", "full")
     source._queue_items = 10

@@ -7,11 +7,15 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from firmware_bridge.assemble import Assembler
-from firmware_bridge.sources import blf, candump, open_log
+from firmware_bridge.frames import Frames, concatenate
+from firmware_bridge.sources import blf, candump, open_log, slcan_lines
 from firmware_bridge.sources.serial_port import Decoder, encode
+from firmware_bridge.stamps import StampModel
+from firmware_bridge.steps import Continuous
 from tests.bridge.machine import CATALOG, assembly, cycles
 from tests.bridge.test_assemble import damaged
 
@@ -31,6 +35,20 @@ sys.stdout.write(digest(pathlib.Path(sys.argv[1])))
 """
 
 
+NOISY_SLCAN = (
+    b"t1212BEEF\rT000001231\xffA\rt1212BEEt1221AA\r\x07r1238\rd1239112233\r" + b"t1211AA0010\r" * 5
+)
+
+
+def stepped() -> Frames:
+    """Frames whose clock is set back, then forward, mapped with and without arrivals."""
+    frames = cycles(500)
+    arrived_us = np.maximum.accumulate(frames.t_us + 300)
+    frames.t_us[400:] -= 3_600_000_000
+    frames.t_us[900:] += 3_600_000_000
+    return concatenate([StampModel().push(frames, arrived_us), Continuous().push(frames)])
+
+
 def digest(folder: Path) -> str:
     """All results of the bridge's kernels on a small damaged log, as one text."""
     lines = []
@@ -46,6 +64,8 @@ def digest(folder: Path) -> str:
     for found in (open_log(folder / "t.blf"), open_log(folder / "t.log"),
                   Decoder().push(b"\1\2\0" + encode(frames))):  # fmt: skip
         lines += [found.t_us.tobytes().hex(), found.data.tobytes().hex(), str(found.refused)]
+    for clocked in (stepped(), slcan_lines.Decoder().push(NOISY_SLCAN)):
+        lines += [clocked.t_us.tobytes().hex(), clocked.data.tobytes().hex(), str(clocked.refused)]
     return "\n".join(lines)
 
 
