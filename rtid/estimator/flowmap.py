@@ -32,7 +32,8 @@ Corner = tuple[Cells, FloatArray, FloatArray, FloatArray]
 class EdgeMap:
     """One edge's map: theta (nu, nd, 6) and cov (nu, nd, 6, 6) in m3/s, terms of `kernels.basis`.
 
-    status (nu, nd) holds the words above; reason says per cell (i, j) why it is not valid.
+    status (nu, nd) holds the words above; reason says per cell (i, j) why it is not valid, or that
+    its data contradict a flow that rises with the command.
     """
 
     name: str

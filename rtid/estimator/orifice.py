@@ -1,11 +1,14 @@
 """What the visited blocks say about the rest of the map: the orifice law as a Gaussian process.
 
-    Q(w, dp) = s(dp) |dp|^delta [K(w) + K(w) h(log |dp|) + e(w, dp)],     s(dp) = sign(dp) sqrt |dp|
+    Q(w, dp) = s(dp) |dp|^delta [K(w) + K(w) h(log |dp|) + a K(w) l(dp) + e(w, dp)],
+
+    s(dp) = sign(dp) sqrt |dp|,     l(dp) = 1 - (1 + (dp_laminar / dp)^2)^(-1/4)
 
 K(w), the flow gain, is an integrated Wiener process that starts at zero at the edge of the safe
 band: smooth where there are data, and less and less certain away from them.  delta is 0 unless the
 data clearly want another exponent than 1/2 (a load-compensated valve, a laminar gap).  h, another
-integrated Wiener process, is how the whole valve deviates from the law; e is what is left, in
+integrated Wiener process, is how the whole valve deviates from the law.  Towards dp = 0 every edge
+turns laminar, at dp_laminar or elsewhere: a has the standard deviation 1.  e is what is left, in
 proportion to K, with a correlation that fades over the command and over log |dp|.  How rough K is
 and how large h and e are follow from the scatter of Q / s(dp) among the blocks themselves (largest
 marginal likelihood), so a valve that does not obey the law says so by wide intervals.
@@ -25,6 +28,7 @@ from rtid.model import Edge, FloatArray
 REACH_LOG_DP = 1.0  # e fades by 1/e over this change of log |dp| ...
 REACH_W = 0.2  # ... and over this share of the command's range
 SLOPE_SD = 2.0  # of K' before any data, in units of the rated gain per range
+LAMINAR_DP_PA = 5e4  # about where metering edges turn laminar
 LEAST_SIZE = 0.02  # of the rated gain: e does not vanish in the dead band
 BLOCK_ERROR = 3e-4  # share of K by which a block's polynomial misses its data at the least
 # Log rough, log exponent, log deviation, delta: starts (law obeyed, or not) and bounds.
@@ -48,19 +52,23 @@ class GainData:
 
 @dataclass(frozen=True)
 class Points:
-    """Arguments of the kernel, arrays of one shape, dimensionless: opening, log |dp|, size of e."""
+    """Arguments of the kernel, arrays of one shape, dimensionless; size: that of e."""
 
     opening: FloatArray
     log_dp: FloatArray
     size: FloatArray
+    laminar: FloatArray
 
     def rows(self) -> Points:
         """The same points with a new last axis."""
-        return Points(self.opening[..., None], self.log_dp[..., None], self.size[..., None])
+        return Points(*(a[..., None] for a in self._arrays()))
 
     def columns(self) -> Points:
         """The same points with a new last axis but one."""
-        return Points(*(a[..., None, :] for a in (self.opening, self.log_dp, self.size)))
+        return Points(*(a[..., None, :] for a in self._arrays()))
+
+    def _arrays(self) -> tuple[FloatArray, ...]:
+        return self.opening, self.log_dp, self.size, self.laminar
 
 
 @dataclass(frozen=True)
@@ -77,7 +85,8 @@ class Scale:
         """Kernel arguments of physical points; size in units of the rated gain."""
         opening = np.maximum((w_v - self.foot_v) / self.range_v, 0.0)
         log_dp = np.log((np.abs(dp_pa) + self.least_dp_pa) / self.dp_pa)
-        return Points(opening, log_dp, size)
+        ratio = LAMINAR_DP_PA / (np.abs(dp_pa) + self.least_dp_pa)
+        return Points(opening, log_dp, size, 1.0 - (1.0 + ratio**2) ** -0.25)
 
 
 @dataclass(frozen=True)
@@ -122,7 +131,7 @@ def kernel(a: Points, b: Points, rough: float, exponent: float, deviation: float
         a.log_dp * b.log_dp > 0.0, wiener(np.minimum(*both), np.maximum(*both)), 0.0
     )
     far = (high - low) / REACH_W + np.abs(a.log_dp - b.log_dp) / REACH_LOG_DP
-    deviations = exponent**2 * shared + deviation**2 * np.exp(-far)
+    deviations = exponent**2 * shared + deviation**2 * np.exp(-far) + a.laminar * b.laminar
     return np.asarray(smooth + a.size * b.size * deviations)
 
 

@@ -2,7 +2,8 @@
 
 A visited cell combines what it has learned itself with what the orifice law says from all other
 blocks, as two Gaussians: strongly excited terms stay its own, weakly excited ones come from the
-law.  A cell without data has the law alone.  In information form, with the law's (m, S), the cell's
+law.  A cell without data has the law alone, or a prior map with it (`prior`); what is known must not
+fall with the command (`monotone`).  In information form, with the law's (m, S), the cell's
 own (theta, C) and its mean flow phi' theta, which the law has already used and which counts once:
 
     (S^-1 + C^-1 - phi phi' / (phi' C phi)) theta_new = S^-1 m + C^-1 theta - phi phi' theta / (...)
@@ -15,43 +16,66 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from rtid.estimator.cells import mean_square, projection, quadrature, terms
 from rtid.estimator.flowmap import EXTRAPOLATED, LEARNING, PRIOR, SHUT, VALID, EdgeMap, FlowMap
+from rtid.estimator.monotone import monotone
 from rtid.estimator.orifice import GainData, OrificeLaw, fit_law, root
+from rtid.estimator.prior import SHARE as PRIOR_SHARE
+from rtid.estimator.prior import add_prior
 from rtid.estimator.solution import VALID as BLOCK_VALID
 from rtid.estimator.solution import Block, Solution
 from rtid.kernels.layout import TERMS
 from rtid.model import Edge, FloatArray, Grid
 
 COLUMN_PRIOR = 0.05  # share of the rise of K over a column by which its shape may differ
-NODES, WEIGHTS = np.polynomial.legendre.leggauss(4)
 
 
-def publish(solution: Solution) -> FlowMap:
-    """The map of all edges."""
+def publish(
+    solution: Solution, prior: FlowMap | None = None, prior_sd: float = PRIOR_SHARE
+) -> FlowMap:
+    """The map of all edges.
+
+    prior: a map known before (see `prior.reference_map` for a data sheet), by the edges' names; its
+    flows are believed to the share prior_sd, where this map does not know better.
+    """
     edges = solution.model.edges
     of = [[b for b in solution.blocks if b.edge == i] for i in range(len(edges))]
-    return FlowMap(tuple(_publish_edge(e, b) for e, b in zip(edges, of, strict=True)))
+    before = {} if prior is None else {e.name: e for e in prior.edges}
+    return FlowMap(
+        tuple(
+            _publish_edge(e, b, before.get(e.name), prior_sd)
+            for e, b in zip(edges, of, strict=True)
+        )
+    )
 
 
-def _publish_edge(edge: Edge, blocks: list[Block]) -> EdgeMap:
-    """Law first, then each visited cell combined with it."""
+def _publish_edge(
+    edge: Edge, blocks: list[Block], prior: EdgeMap | None, prior_sd: float
+) -> EdgeMap:
+    """Law first, then the prior, then each visited cell combined with them."""
     shut = edge.grid.u_v[1:] <= edge.safe_band_v
     blocks = [b for b in blocks if not shut[b.i]]
     used = [b for b in blocks if _informative(edge, b)]
     law = fit_law(edge, gain_data(edge.grid, used))
     theta, cov = extrapolated(edge.grid, law)
     refine_columns(edge.grid, law, used, theta, cov)
-    status = np.full(edge.grid.shape, EXTRAPOLATED if used else PRIOR)
+    status = np.full(edge.grid.shape, EXTRAPOLATED if used else PRIOR, dtype="<U12")
+    for b in blocks:
+        status[b.i, b.j] = VALID if b.status == BLOCK_VALID else LEARNING
+    if prior is not None:
+        add_prior(edge, prior, prior_sd, theta, cov, status)
     reason = {}
     for b in blocks:
         counted = any(b is other for other in used)
         theta[b.i, b.j], cov[b.i, b.j] = combined(theta[b.i, b.j], cov[b.i, b.j], b, counted)
-        status[b.i, b.j] = VALID if b.status == BLOCK_VALID else LEARNING
         if b.reason:
             reason[b.i, b.j] = b.reason
-    cov[:, :, 0, 0] += misfit(theta, cov, np.isin(status, (VALID, LEARNING)))
+    missed = misfit(theta, cov, np.isin(status, (VALID, LEARNING)))
+    spread = cov + missed[:, :, None, None] * np.linalg.inv(TERMS * mean_square())
+    cov[:, :, 0, 0] += missed
     theta[shut], cov[shut], status[shut] = 0.0, 0.0, SHUT
-    return EdgeMap(edge.name, edge.grid, edge.safe_band_v, theta, cov, status, reason)
+    free = EdgeMap(edge.name, edge.grid, edge.safe_band_v, theta, cov, status, reason)
+    return monotone(free, spread)
 
 
 def _informative(edge: Edge, block: Block) -> bool:
@@ -76,7 +100,7 @@ def _mean(border: FloatArray, i: int, local: float) -> float:
 
 def mean_root(grid: Grid, block: Block) -> float:
     """Mean of s(dp) over the block's data, exact to second order."""
-    _, dp = _quadrature(grid, block.i)
+    _, dp = quadrature(grid, block.i)
     return float(block.mean_phi @ projection() @ root(dp[block.j]))
 
 
@@ -84,15 +108,15 @@ def extrapolated(grid: Grid, law: OrificeLaw) -> tuple[FloatArray, FloatArray]:
     """The law's Taylor terms of every cell, theta (nu, nd, 6) and cov (nu, nd, 6, 6)."""
     nu, nd = grid.shape
     theta, cov = np.empty((nu, nd, TERMS)), np.empty((nu, nd, TERMS, TERMS))
-    project, terms = projection(), _terms()
+    project, phi = projection(), terms()
     for i in range(nu):
-        w, dp = _quadrature(grid, i)
+        w, dp = quadrature(grid, i)
         s = root(dp)
         mean, spread = law.gains(w, dp)
         q = s * mean
         theta[i] = q @ project.T
         cov[i] = project @ (s[:, :, None] * spread * s[:, None, :]) @ project.T
-        rest = q - theta[i] @ terms.T  # what six terms cannot follow
+        rest = q - theta[i] @ phi.T  # what six terms cannot follow
         cov[i, :, 0, 0] += np.mean(rest**2, axis=1)
     return theta, cov
 
@@ -107,8 +131,8 @@ def refine_columns(
     are changed in place.
     """
     for i in sorted({b.i for b in blocks}):
-        _, dp = _quadrature(grid, i)
-        shapes = projection() @ (root(dp)[:, :, None] * _terms()[:, [0, 1, 3]])
+        _, dp = quadrature(grid, i)
+        shapes = projection() @ (root(dp)[:, :, None] * terms()[:, [0, 1, 3]])
         ends = law.gains(grid.u_v[i : i + 2, None], np.full((2, 1), law.scale.dp_pa))[0]
         prior_sd = COLUMN_PRIOR * abs(float(ends[1, 0] - ends[0, 0])) + 1e-12 * law.scale.gain
         info, right = np.zeros((len(dp), 3, 3)), np.zeros((len(dp), 3))
@@ -124,7 +148,7 @@ def refine_columns(
 
 def cell_terms(grid: Grid, flow: Callable[[FloatArray, FloatArray], FloatArray]) -> FloatArray:
     """Taylor terms (nu * nd, 6) of a known flow in every cell, by least squares over the cell."""
-    points = [_quadrature(grid, i) for i in range(grid.shape[0])]
+    points = [quadrature(grid, i) for i in range(grid.shape[0])]
     return np.concatenate([flow(w, dp) @ projection().T for w, dp in points])
 
 
@@ -167,24 +191,3 @@ def _pairs(axis: int) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
     first, second = [slice(None)] * 2, [slice(None)] * 2
     first[axis], second[axis] = slice(None, -1), slice(1, None)
     return tuple(first), tuple(second)
-
-
-def _quadrature(grid: Grid, i: int) -> tuple[FloatArray, FloatArray]:
-    """Gauss points of all cells of column i: w, dp (nd, 16)."""
-    w = 0.5 * (grid.u_v[i] + grid.u_v[i + 1]) + 0.5 * (grid.u_v[i + 1] - grid.u_v[i]) * NODES
-    middle, half = 0.5 * (grid.dp_pa[1:] + grid.dp_pa[:-1]), 0.5 * np.diff(grid.dp_pa)
-    dp = middle[:, None] + half[:, None] * NODES
-    n = len(NODES)
-    return np.broadcast_to(np.repeat(w, n), (len(dp), n * n)), np.tile(dp, (1, n))
-
-
-def _terms() -> FloatArray:
-    """The six terms at the Gauss points (16, 6)."""
-    xi, eta = np.repeat(NODES, len(NODES)), np.tile(NODES, len(NODES))
-    return np.stack([np.ones_like(xi), xi, eta, xi * xi, eta * eta, xi * eta], axis=1)
-
-
-def projection() -> FloatArray:
-    """Least squares from values at the Gauss points to the six terms (6, 16)."""
-    weight = np.sqrt(np.outer(WEIGHTS, WEIGHTS).ravel())
-    return np.asarray(np.linalg.pinv(weight[:, None] * _terms()) * weight)
