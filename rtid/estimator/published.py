@@ -2,9 +2,10 @@
 
 A visited cell combines what it has learned itself with what the orifice law says from all other
 blocks, as two Gaussians: strongly excited terms stay its own, weakly excited ones come from the
-law.  A cell without data has the law alone, or a prior map with it (`prior`); what is known must not
-fall with the command (`monotone`).  In information form, with the law's (m, S), the cell's
-own (theta, C) and its mean flow phi' theta, which the law has already used and which counts once:
+law.  A cell without data has the law alone, or a prior map with it (`prior`); and where the map is
+known it must not fall with the command (`monotone`).  In information form, with the law's (m, S),
+the cell's own (theta, C) and its mean flow phi' theta, which the law has already used and which
+counts once:
 
     (S^-1 + C^-1 - phi phi' / (phi' C phi)) theta_new = S^-1 m + C^-1 theta - phi phi' theta / (...)
 """
