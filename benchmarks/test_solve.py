@@ -6,7 +6,9 @@ from typing import Any
 
 from benchmarks.interleave import Job, side_by_side
 from benchmarks.machine import chunk, model, one_chamber, record, warmed
-from rtid.estimator.solution import factorize, normal_equations, one_thread, solve
+from rtid.estimator.factor import factorize, one_thread
+from rtid.estimator.solution import solve
+from rtid.estimator.sums import normal_equations
 from rtid.model import Model
 
 
@@ -16,7 +18,7 @@ def jobs_of(machine: Model) -> list[Job]:
     n_shared, n_blocks = int(state.engine[0]["n_shared"]), int(state.engine[0]["n_slots"])
 
     def estimate() -> None:
-        normal = normal_equations(state.settled())
+        normal = normal_equations(state)
         with one_thread():
             factor = factorize(normal, n_shared)
             factor.theta(normal.right)

@@ -17,8 +17,8 @@ from benchmarks.interleave import Job, report, side_by_side
 from benchmarks.machine import chunk, empty, model, one_block, one_chamber, record, warmed
 from benchmarks.reference import Reference
 from rtid.estimator.state import State
+from rtid.estimator.sums import Sums
 from rtid.kernels.engine import advance
-from rtid.kernels.normal import assemble
 from rtid.model import Model
 
 FloatArray = NDArray[np.float64]
@@ -32,12 +32,9 @@ BLOCK = 3000  # samples of the calls one by one
 
 def normal_equations(state: State) -> tuple[FloatArray, FloatArray]:
     """Gram matrix scaled to a unit diagonal, and right-hand side in the same scale."""
-    done = state.settled()
-    n = int(done.engine[0]["n_shared"] + 6 * done.engine[0]["n_slots"])
-    gram, right = np.zeros((n, n)), np.zeros(n)
-    square = assemble(done.engine, done.blocks, done.pairs, gram, right)
-    scale = np.sqrt(np.where(np.diag(gram) > 0, np.diag(gram), 1.0))
-    return gram / np.outer(scale, scale), right / scale / np.sqrt(square)
+    normal = Sums.of(state).normal()
+    scale = np.sqrt(np.where(np.diag(normal.gram) > 0, np.diag(normal.gram), 1.0))
+    return normal.gram / np.outer(scale, scale), normal.right / scale / np.sqrt(normal.square)
 
 
 @pytest.mark.parametrize("chambers", [1, 2])

@@ -160,6 +160,26 @@ class Gates:
     hysteresis: float = 0.05  # share of a block's width that the working point must leave it by
     min_rows: int = 20  # rows that a block needs before it can become valid
     max_sd_share: float = 0.001  # of the edge's largest flow: known worse than this is not valid
+    max_surprise: float = 3.0  # mean squared innovation of the map held: above it is invalid
+    stale_s: float = np.inf  # a block that was not visited for longer is stale
+
+
+@dataclass(frozen=True)
+class Upkeep:
+    """What happens beside the update, every `every_s` seconds of sample time; 0: never.
+
+    forget_s, shared_forget_s: time constants after which blocks and shared unknowns have given up
+    what news replaced.  innovation_sd: rows further from the map held are refused, after
+    `innovation_rows` in a row the gate opens; 0: no gate.  folds: interleaved parts of the record,
+    changed at every upkeep, whose sums are kept apart for cross-validation.
+    """
+
+    every_s: float = 0.0
+    forget_s: float = np.inf
+    shared_forget_s: float = np.inf
+    innovation_sd: float = 0.0
+    innovation_rows: int = 100
+    folds: int = 1
 
 
 @dataclass(frozen=True)
@@ -175,6 +195,7 @@ class Model:
     lag: Lag = field(default_factory=Lag)
     filter: Filter = field(default_factory=Filter)
     gates: Gates = field(default_factory=Gates)
+    upkeep: Upkeep = field(default_factory=Upkeep)
     form: str = "integral"  # or "carry", "restart"
     terms: tuple[Term, ...] = ()
     pressure_period_s: float = 0.0  # sampling period of the pressures; 0: every sample

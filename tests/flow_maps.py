@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from rtid.estimator.solution import LEARNING, VALID, Block, Solution, solve
+from rtid.estimator.blocks import LEARNING, VALID, Block
+from rtid.estimator.solution import Solution, solve
 from rtid.estimator.state import build
 from rtid.model import (
     COMMAND,

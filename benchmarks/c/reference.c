@@ -671,6 +671,7 @@ static void interval(Tables *t, double time_s, const double *now, double dt, int
     for (int c = 0; c < e->n_chambers; c++) e->cov[c][c] += e->q_floor[c] * dt;
     if (row) {
         e->counters[ROWS]++;
+        e->rows += 1.0;
         if (e->n_chambers == 2) row_two(e); else row_one(e);
     }
     if (e->ring_det < RING_DET_LIMIT) rebase(t);

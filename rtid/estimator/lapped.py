@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from rtid.estimator.state import MASKS, State
+from rtid.estimator.state import MASKS
+from rtid.estimator.sums import Sums
 from rtid.kernels.basis import lapped_at, taylor
 from rtid.kernels.layout import TERMS
 from rtid.model import BASES, BLENDED, LAPPED, TAYLOR, Edge, FloatArray, Model
@@ -29,14 +30,14 @@ def overlaps(model: Model) -> bool:
 
 
 def to_taylor(
-    model: Model, state: State, cov: FloatArray, prior_sd: float
+    model: Model, sums: Sums, cov: FloatArray, prior_sd: float
 ) -> tuple[FloatArray, FloatArray]:
     """Matrix T (n, n) from the unknowns to those with Taylor terms, and their covariance (n, n).
 
     cov (n, n): of the unknowns in their scaled units; prior_sd: of a term without data.
     """
-    n_shared = int(state.engine[0]["n_shared"])
-    change, slots = np.eye(len(cov)), _slots(model, state)
+    n_shared = sums.n_shared
+    change, slots = np.eye(len(cov)), _places(model, sums)
     tiles = []
     for (edge, i, j), slot in slots.items():
         if model.edges[edge].basis == TAYLOR:
@@ -64,13 +65,14 @@ def to_taylor(
     return change, changed
 
 
-def _slots(model: Model, state: State) -> dict[tuple[int, int, int], int]:
-    """Slot of each visited (edge, i, j)."""
-    e, found = state.engine[0], {}
-    for slot in range(int(e["n_slots"])):
-        edge = int(state.blocks[slot]["edge"])
-        cell = int(state.blocks[slot]["cell"] - e["first_cell"][edge])
-        found[(edge, *divmod(cell, int(e["n_dp"][edge])))] = slot
+def _places(model: Model, sums: Sums) -> dict[tuple[int, int, int], int]:
+    """Place of each visited (edge, i, j) among the blocks."""
+    found, first = {}, 0
+    for edge, declared in enumerate(model.edges):
+        nu, nd = declared.grid.shape
+        for place in np.flatnonzero(sums.blocks["edge"] == edge):
+            found[(edge, *divmod(int(sums.cells[place]) - first, nd))] = int(place)
+        first += nu * nd
     return found
 
 

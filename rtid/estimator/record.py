@@ -12,20 +12,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rtid.estimator.correction import correct
+from rtid.estimator.factor import factorize, one_thread
 from rtid.estimator.misfit import count_misfit
 from rtid.estimator.profile import Profile, profile
-from rtid.estimator.solution import (
-    Sketch,
-    Solution,
-    correct,
-    factorize,
-    normal_equations,
-    one_thread,
-    sketch,
-    solve,
-)
+from rtid.estimator.solution import Sketch, Solution, sketch, solve
 from rtid.estimator.state import State, Weights, build, nominal_weights
-from rtid.model import FloatArray, Model
+from rtid.estimator.sums import Sums
+from rtid.model import Edge, FloatArray, Model
 
 LAG_PROBE = 0.1  # of the lag, plus 0.05 ms: distance of the finite differences
 OFFSET_PROBE = 0.1  # of an offset's tolerance
@@ -73,7 +67,7 @@ def fit_record(
     tolerance = np.zeros(0) if offset_tolerance_s is None else offset_tolerance_s
     state = run(model, chunk)
     first = sketch(model, state)
-    weights = refined(model, state, first, model.lag.nominal_s)
+    weights = refined(model, first, model.lag.nominal_s)
     lag_sd_s, offsets, offsets_sd = 0.0, np.zeros(len(tolerance)), np.zeros(len(tolerance))
     if model.lag.tolerance_s > 0 or len(tolerance):
         found = _nuisance(model, assemble or (lambda _: chunk), weights, first.leverage, tolerance)
@@ -82,9 +76,9 @@ def fit_record(
         chunk = assemble(offsets) if assemble else chunk
         if len(tolerance):  # the first weights came from shifted signals
             state = run(model, chunk, weights)
-            weights = refined(model, state, sketch(model, state), weights.lag_s)
+            weights = refined(model, sketch(model, state), weights.lag_s)
     state = run(model, chunk, weights)
-    solution = count_misfit(model, chunk, weights, solve(model, state))
+    solution = count_misfit(model, chunk, weights, solve(model, state, counters=state.counters))
     return RecordFit(solution, state, weights, lag_sd_s, offsets, offsets_sd)
 
 
@@ -118,29 +112,32 @@ def run(model: Model, chunk: FloatArray, weights: Weights | None = None) -> Stat
     return state
 
 
-def refined(model: Model, state: State, found: Sketch, lag_s: float) -> Weights:
+def refined(model: Model, found: Sketch, lag_s: float) -> Weights:
     """Weights from a first estimate: the orifice slope Q / (2 dp) at each block's mean flow.
 
     A compliance outside its declared bounds tells that the motion did not show it.
     """
     slopes = nominal_weights(model).slopes.copy()
-    for record, flow in zip(state.blocks, found.flow_m3s, strict=False):
-        if np.isfinite(flow):
-            edge = int(record["edge"])
-            borders = model.edges[edge].grid.dp_pa
-            j = int(record["cell"] - state.engine[0]["first_cell"][edge]) % (len(borders) - 1)
-            dp, least = abs(borders[j] + borders[j + 1]), borders[j + 1] - borders[j]
-            slopes[record["cell"]] = max(flow, 0.0) / max(dp, least)
+    span = np.concatenate([_span(edge) for edge in model.edges])
+    known = np.isfinite(found.flow_m3s)
+    cells = found.cells[known]
+    slopes[cells] = np.maximum(found.flow_m3s[known], 0.0) / span[cells]
     low, high = 1 / model.beta_bounds_pa[1], 1 / model.beta_bounds_pa[0]
     possible = (found.compliance >= low) & (found.compliance <= high)
     compliance = np.where(possible, found.compliance, 1 / model.beta_nominal_pa)
     return Weights(slopes, compliance, lag_s)
 
 
+def _span(edge: Edge) -> FloatArray:
+    """2 |dp| at each cell's centre, at least the cell's own height: (cells,)."""
+    dp = edge.grid.dp_pa
+    return np.tile(np.maximum(np.abs(dp[1:] + dp[:-1]), np.diff(dp)), edge.grid.shape[0])
+
+
 def excess(model: Model, chunk: FloatArray, weights: Weights, leverage: FloatArray) -> float:
     """Cost of the best linear fit minus its number of rows: comparable between nuisance values."""
-    state = run(model, chunk, weights).settled()
-    normal = normal_equations(state)
+    sums = Sums.of(run(model, chunk, weights))
+    normal = sums.normal()
     with one_thread():
-        found = correct(normal, factorize(normal, int(state.engine[0]["n_shared"])), leverage)
+        found = correct(normal, factorize(normal, sums.n_shared), leverage)
     return found.cost - normal.rows * len(model.chambers)

@@ -68,6 +68,11 @@ class State:
         return self.engine, self.cells, self.closed, self.blocks, self.pairs
 
     @property
+    def counters(self) -> dict[str, int]:
+        """Samples, rows, and how often a sample was refused or a memory restarted, by reason."""
+        return dict(zip(layout.COUNTERS, self.engine[0]["counters"].tolist(), strict=True))
+
+    @property
     def form_is_integral(self) -> bool:
         """True for the integral form, False for the carry form."""
         return bool(self.engine[0]["form"] == layout.INTEGRAL)
@@ -81,12 +86,32 @@ class State:
             self.pairs = _rehash(self.engine, self.pairs)
         self.__post_init__()
 
+    def settle(self) -> None:
+        """Bring all sums up to date, in place."""
+        while not kernel.settle(self.engine, self.closed, self.blocks, self.pairs):
+            self.make_room()
+
     def settled(self) -> State:
         """A copy in which all sums are complete; this state is not changed."""
         copy = self.copy()
-        while not kernel.settle(copy.engine, copy.closed, copy.blocks, copy.pairs):
-            copy.make_room()
+        copy.settle()
         return copy
+
+    def hold(self, cells: RecordArray, compliance: FloatArray, terms: FloatArray) -> None:
+        """Judge rows from now on by this map, in the state's units and bases.
+
+        cells: records of `layout.CELL` with the fields known and held; compliance (chambers,) in
+        units of the weights', terms (terms,) of their scales.
+        """
+        e = self.engine[0]
+        for name in ("known", "held"):
+            self.cells[name] = cells[name]
+        e["held_compliance"][: len(compliance)] = compliance
+        e["held_terms"][: len(terms)] = terms
+
+    def clear_sums(self) -> None:
+        """Empty the sums of a settled state; it goes on with its memory of recent columns."""
+        kernel.clear_sums(self.engine, self.blocks, self.pairs)
 
     def copy(self) -> State:
         """An independent copy that continues bit for bit like this one."""

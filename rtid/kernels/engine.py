@@ -50,6 +50,7 @@ from rtid.kernels.layout import (
     RESTART_MEMORY,
     SAMPLES,
     TAYLOR,
+    TERMS,
 )
 from rtid.kernels.local import remove_open, set_open
 from rtid.kernels.recent import hand_over, release
@@ -307,6 +308,8 @@ def _change_blocks(e: Any, cells: Any, closed: Any, blocks: Any) -> None:
                     _change_lapped(e, cells, closed, blocks, i)
                 else:
                     _change(e, cells, closed, blocks, i)
+    for c in range(e.n_chambers):
+        e.gap[c] = 0.0
 
 
 @inlined
@@ -397,6 +400,31 @@ def settle(engine: Any, closed: Any, blocks: Any, pairs: Any) -> bool:
             if closed[p].status != FREE:
                 hand_over(e, closed, blocks, pairs, p)
     return True
+
+
+@kernel
+def clear_sums(engine: Any, blocks: Any, pairs: Any) -> None:
+    """Empty all sums of settled tables; slots, pairs and the memory of recent columns stay."""
+    e = engine[0]
+    e.rows = 0.0
+    for i in range(1 + e.n_shared):
+        for j in range(1 + e.n_shared):
+            e.shared[i, j] = 0.0
+    for c in range(e.n_chambers):
+        e.noise_gram[c] = 0.0
+    for s in range(e.n_slots):
+        block = blocks[s]
+        block.rows, block.dwell_s, block.surprise, block.judged = 0, 0.0, 0.0, 0.0
+        for i in range(TERMS):
+            block.phi_sum[i] = 0.0
+            for j in range(TERMS):
+                block.gram[i, j] = 0.0
+            for j in range(1 + e.n_shared):
+                block.shared[i, j] = 0.0
+    for p in range(len(pairs)):
+        for i in range(TERMS):
+            for j in range(TERMS):
+                pairs[p].gram[i, j] = 0.0
 
 
 @kernel

@@ -2,7 +2,8 @@
 
 The gap between y and the map held passes the same whitener as the columns; whitened, it has unit
 variance for a perfect map.  A refused row is as if the position had not been measured, so that one
-outlier costs one row.  When rows are refused for long, the plant or a sensor's zero has changed:
+outlier costs one row.  At a change of block the gap begins at zero, so that each block answers for
+itself.  When rows are refused for long, the plant or a sensor's zero has changed:
 all memory ends, and the gate is open until another map is held.
 """
 
@@ -25,6 +26,8 @@ def admitted(e: Any, blocks: Any) -> bool:
             e.gap[c] = 0.0
         return True
     first, second = _innovations(e)
+    limit = e.gate_sd * e.gate_sd
+    _judge(e, blocks, min(first * first, limit) + min(second * second, limit))
     if max(abs(first), abs(second)) > e.gate_sd:
         e.counters[OUTLIER] += 1
         e.refused += 1
@@ -33,7 +36,6 @@ def admitted(e: Any, blocks: Any) -> bool:
             e.gate_sd, e.refused, e.break_due = 0.0, 0, 1
         return False
     e.refused = 0
-    _judge(e, blocks, first * first + second * second)
     _follow(e)
     return True
 

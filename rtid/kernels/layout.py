@@ -173,6 +173,7 @@ ENGINE = np.dtype(
         ("n_pairs", _I),
         ("shared", _F, (1 + MAX_SHARED, 1 + MAX_SHARED)),
         ("noise_gram", _F, (MAX_CHAMBERS,)),
+        ("rows", _F),  # pairs of rows in the sums
         ("counters", _I, (len(COUNTERS),)),
     ],
     align=True,

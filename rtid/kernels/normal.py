@@ -1,6 +1,6 @@
 """Dense normal equations of the joint regression, read out of the sparse sums.
 
-Unknowns in the order [shared (n_shared) | 6 terms of slot 0 | 6 terms of slot 1 | ...].
+Unknowns in the order [shared (n_shared) | 6 terms of block 0 | 6 terms of block 1 | ...].
 """
 
 from __future__ import annotations
@@ -17,15 +17,21 @@ FloatArray = NDArray[np.float64]
 
 
 @kernel
-def assemble(engine: Any, blocks: Any, pairs: Any, gram: FloatArray, right: FloatArray) -> float:
-    """Fill gram (n, n) and right (n,), changed in place; returns y'y.  The sums must be settled."""
-    e = engine[0]
-    ns = e.n_shared
+def assemble(
+    shared: FloatArray,
+    blocks: Any,
+    pairs: Any,
+    tiles: FloatArray,
+    gram: FloatArray,
+    right: FloatArray,
+) -> None:
+    """Fill gram (n, n) and right (n,), changed in place; arguments as in `estimator.sums.Sums`."""
+    ns = len(shared) - 1
     for i in range(ns):
-        right[i] = e.shared[1 + i, 0]
+        right[i] = shared[1 + i, 0]
         for j in range(ns):
-            gram[i, j] = e.shared[1 + i, 1 + j]
-    for s in range(e.n_slots):
+            gram[i, j] = shared[1 + i, 1 + j]
+    for s in range(len(blocks)):
         at = ns + TERMS * s
         for i in range(TERMS):
             right[at + i] = blocks[s].shared[i, 0]
@@ -35,19 +41,15 @@ def assemble(engine: Any, blocks: Any, pairs: Any, gram: FloatArray, right: Floa
             for j in range(TERMS):
                 gram[at + i, at + j] = blocks[s].gram[i, j]
     for p in range(len(pairs)):
-        if pairs[p].key != 0:
-            _place(pairs[p], ns, gram)
-    return float(e.shared[0, 0])
+        _place(tiles[p], ns + TERMS * pairs[p, 0], ns + TERMS * pairs[p, 1], gram)
 
 
 @inlined
-def _place(pair: Any, ns: int, gram: FloatArray) -> None:
-    low = ns + TERMS * ((pair.key >> 32) - 1)
-    high = ns + TERMS * ((pair.key & 0xFFFFFFFF) - 1)
+def _place(tile: FloatArray, low: int, high: int, gram: FloatArray) -> None:
     for i in range(TERMS):
         for j in range(TERMS):
-            gram[low + i, high + j] = pair.gram[i, j]
-            gram[high + j, low + i] = pair.gram[i, j]
+            gram[low + i, high + j] = tile[i, j]
+            gram[high + j, low + i] = tile[i, j]
 
 
 @kernel

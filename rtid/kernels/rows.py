@@ -91,6 +91,7 @@ def integral_row_one(e: Any) -> None:
     e.cov[0, 0] *= keep
     e.ring_det *= keep
     e.counters[ROWS] += 1
+    e.rows += 1.0
     add_products(e, 1)
 
 
@@ -122,6 +123,7 @@ def integral_row_two(e: Any) -> None:
     cov[1, 0] = cov[0, 1]
     e.ring_det *= k00 * k11 - k01 * k10
     e.counters[ROWS] += 1
+    e.rows += 1.0
     add_products(e, 2)
 
 
@@ -157,4 +159,5 @@ def carry_row(e: Any) -> None:
         for j in range(n):
             row[1, j] = i1 * (d[2, j] - c * i0 * d[0, j])
     e.counters[ROWS] += 1
+    e.rows += 1.0
     add_products(e, e.n_chambers)

@@ -15,8 +15,8 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from rtid.estimator.batch import Blocks, column_rates, flow_noise, position_noise
+from rtid.estimator.factor import PRIOR_SD, SHARED_PRIOR
 from rtid.estimator.record import fit_record
-from rtid.estimator.solution import PRIOR_SD, SHARED_PRIOR
 from rtid.estimator.state import Weights, nominal_weights, variance
 from rtid.estimator.track import Track, follow
 from rtid.kernels.holds import second_order

@@ -6,8 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rtid.estimator.solution import VALID, Normal, factorize, normal_equations, solve
+from rtid.estimator.blocks import VALID
+from rtid.estimator.factor import factorize
+from rtid.estimator.solution import solve
 from rtid.estimator.state import build
+from rtid.estimator.sums import Normal, normal_equations
 from rtid.model import FloatArray
 from tests.estimator.cases import plant_case
 
@@ -36,7 +39,7 @@ def endure(samples: int, form: str = "integral") -> Endurance:
     period = case.chunk
     once = build(case.model)
     once.advance(period)
-    one = normal_equations(once.settled())
+    one = normal_equations(once)
     n, span = len(period), period[-1, 0] + 1.0
     many = np.tile(period, (PERIODS_PER_CALL, 1))
     many[:, 0] += np.repeat(np.arange(PERIODS_PER_CALL), n) * span
@@ -46,7 +49,7 @@ def endure(samples: int, form: str = "integral") -> Endurance:
         chunk[:, 0] += count // n % 1000 * span  # stamps stay of a size whose steps are exact
         state.advance(chunk)
         count += len(many)
-    all_ = normal_equations(state.settled())
+    all_ = normal_equations(state)
     share = n / count
     scaled = replace(all_, gram=all_.gram * share, right=all_.right * share)
     expected, found = _theta(one), _theta(scaled)

@@ -7,16 +7,11 @@ import pytest
 
 from rtid.estimator import state as state_module
 from rtid.estimator.batch import BatchFit, fit_batch
-from rtid.estimator.solution import (
-    PRIOR_SD,
-    SHARED_PRIOR,
-    VALID,
-    Normal,
-    factorize,
-    normal_equations,
-    solve,
-)
+from rtid.estimator.blocks import VALID
+from rtid.estimator.factor import PRIOR_SD, SHARED_PRIOR, factorize
+from rtid.estimator.solution import solve
 from rtid.estimator.state import State, build
+from rtid.estimator.sums import Normal, normal_equations
 from tests.estimator.cases import Case, draw_case, plant_case
 
 FORMS = ("integral", "carry")
@@ -29,7 +24,7 @@ LIMIT = {"integral": 1e-8, "carry": 1e-6}
 def accumulated(case: Case) -> tuple[Normal, State]:
     state = build(case.model)
     state.advance(case.chunk)
-    return normal_equations(state.settled()), state
+    return normal_equations(state), state
 
 
 def batch_of(case: Case) -> BatchFit:
