@@ -171,7 +171,8 @@ class Upkeep:
     forget_s, shared_forget_s: time constants after which blocks and shared unknowns have given up
     what news replaced.  innovation_sd: rows further from the map held are refused, after
     `innovation_rows` in a row the gate opens; 0: no gate.  folds: interleaved parts of the record,
-    changed at every upkeep, whose sums are kept apart for cross-validation.
+    changed at every upkeep, whose sums are kept apart for cross-validation.  history_s: raw samples
+    of so many seconds are kept, at `history_rows_per_s`, for refits and the diagnosis; 0: none.
     """
 
     every_s: float = 0.0
@@ -180,6 +181,8 @@ class Upkeep:
     innovation_sd: float = 0.0
     innovation_rows: int = 100
     folds: int = 1
+    history_s: float = 0.0
+    history_rows_per_s: float = 1000.0
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,9 @@ from firmware_bridge.frames import Frames
 from firmware_bridge.samples import Samples
 from firmware_bridge.sources import open_log
 from firmware_bridge.sources.table import to_samples
-from rtid.check.series import estimate_noise
 from rtid.errors import RtidError
 from rtid.estimator.estimator import Estimator, to_chunk
+from rtid.estimator.noise import estimate_noise
 from rtid.estimator.record import RecordFit, fit_record
 from rtid.live import Learner, listen, virtual_bus
 from rtid.model import FloatArray, Model, Signal
@@ -179,13 +179,13 @@ def model_for(project: Project, samples: Samples) -> Model:
 
 def _white_noise(samples: Samples, signal: Signal) -> float:
     """Noise of one signal beside its quantisation, which the model counts separately."""
-    total = estimate_noise(samples.column(signal.name))
-    if not np.isfinite(total):
+    found = estimate_noise(1e-6 * samples.t_us, samples.column(signal.name))
+    if not np.isfinite(found.relative_sd):
         raise NoSamplesError(
             f"{len(samples)} samples are too few to estimate the noise of {signal.name}",
             f"give signals.{signal.name}.noise in the project file",
         )
-    return float(np.sqrt(max(0.0, total**2 - signal.resolution**2 / 12)))
+    return float(np.sqrt(max(0.0, found.sd**2 - signal.resolution**2 / 12)))
 
 
 def _fit(

@@ -15,10 +15,13 @@ import numpy as np
 
 from rtid.errors import RtidError
 from rtid.estimator.estimator import Estimator
+from rtid.estimator.history import History
 from rtid.estimator.state import State, Weights
+from rtid.estimator.sums import Sums
 from rtid.model import Model
 
-SCHEMA = 2
+SCHEMA = 3
+FOLD = ("shared", "blocks", "pairs", "tiles", "noise", "rows", "compliance", "innovation")
 WEIGHTS = ("slopes", "compliance", "missed")
 ARRAYS = ("engine", "cells", "closed", "blocks", "pairs")
 
@@ -29,12 +32,21 @@ class SnapshotError(RtidError):
 
 def save(path: Path, estimator: Estimator, digest: str) -> None:
     """Write a snapshot; the file appears whole or not at all."""
-    header = {"schema": SCHEMA, "digest": digest, "origin_us": estimator.origin_us}
+    header = {
+        "schema": SCHEMA,
+        "digest": digest,
+        "origin_us": estimator.origin_us,
+        "turns": estimator.turns,
+    }
     arrays: dict[str, Any] = dict(zip(ARRAYS, estimator.state.arrays, strict=True))
     weights = estimator.weights
     if weights is not None:
         arrays |= {name: getattr(weights, name) for name in WEIGHTS}
         header["lag_s"] = weights.lag_s
+    for k, fold in enumerate(estimator.folds):
+        arrays |= {f"fold{k}_{name}": getattr(fold, name) for name in FOLD}
+    if estimator.history is not None:
+        arrays |= {f"history_{k}": a for k, a in estimator.history.to_arrays().items()}
     temporary = path.with_name(path.name + ".part")
     with temporary.open("wb") as file:
         arrays["header"] = np.array(json.dumps(header))
@@ -64,8 +76,18 @@ def load(path: Path, model: Model, digest: str) -> Estimator:
         if content[name].dtype != array.dtype:
             raise SnapshotError(f"{path}: {name} has another layout", "learn again with `replay`")
     estimator.state = State(*(content[name] for name in ARRAYS))
-    estimator.origin_us = header["origin_us"]
+    estimator.origin_us, estimator.turns = header["origin_us"], header["turns"]
+    estimator.folds = [_fold(content, k) for k in range(model.upkeep.folds)]
+    if estimator.history is not None:
+        stored = {k: a for k, a in content.items() if k.startswith("history_")}
+        kept = {name.removeprefix("history_"): array for name, array in stored.items()}
+        estimator.history = History.from_arrays(kept)
     return estimator
+
+
+def _fold(content: dict[str, Any], k: int) -> Sums:
+    parts = {name: content[f"fold{k}_{name}"] for name in FOLD}
+    return Sums(**parts | {"rows": float(parts["rows"])})
 
 
 def _check(path: Path, header: dict[str, object], digest: str) -> None:

@@ -55,6 +55,7 @@ UNITS = (
     Unit("us", "us", "time", 1e-6),
     Unit("Hz", "hz", "frequency", 1.0),
     Unit("m3/s", "m3s", "flow", 1.0),
+    Unit("mode", "mode", "mode", 1.0),  # the number of a working mode
     Unit("L/min", "lpm", "flow", 1e-3 / 60),
 )
 _BY_NAME = {unit.name: unit for unit in UNITS}

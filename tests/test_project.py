@@ -11,6 +11,7 @@ import pytest
 import tomlkit
 
 import rtid.project
+from rtid.estimator.state import build
 from rtid.project import Problem, Project, ProjectError, load
 from rtid.units import UNITS, find_unit
 
@@ -86,6 +87,59 @@ def test_digest_follows_the_model_and_nothing_else(raw: dict[str, Any], tmp_path
     assert loaded(raw, tmp_path).digest == before
     raw["chambers"]["a"]["dead_volume_l"] = 0.61
     assert loaded(raw, tmp_path).digest != before
+
+
+def with_modes(raw: dict[str, Any]) -> dict[str, Any]:
+    """The example with a mode in the status message, and regeneration by the cross-port valve."""
+    raw["signals"]["mode"] = {
+        "message": "Motion",
+        "signal": "Mode",
+        "column": "mode",
+        "unit": "mode",
+        "numbers": {"extend": 1, "retract": 2, "regenerate": 3},
+    }
+    raw["edges"]["ab"] = {"source": "p_b", "sink": "p_a", "direction": 1}
+    raw["modes"]["regenerate"] = ["pa", "ab"]
+    return raw
+
+
+def test_modes_tell_which_edges_may_open(raw: dict[str, Any], tmp_path: Path) -> None:
+    model = loaded(with_modes(raw), tmp_path).model
+    assert model.mode == "mode"
+    opens = {edge.name: edge.modes for edge in model.edges}
+    assert opens == {"pa": (1, 3), "at": (2,), "pb": (2,), "bt": (1,), "ab": (3,)}
+    assert model.signals[model.column("mode")].kind == "mode"
+    build(model)
+
+
+def test_without_a_mode_signal_edges_are_free(raw: dict[str, Any], tmp_path: Path) -> None:
+    assert all(edge.modes == () for edge in loaded(raw, tmp_path).model.edges)
+
+
+def test_modes_need_their_numbers_and_every_edge(raw: dict[str, Any], tmp_path: Path) -> None:
+    with_modes(raw)
+    del raw["signals"]["mode"]["numbers"]["retract"]
+    del raw["modes"]["regenerate"]
+    problems = refused(raw, tmp_path)
+    assert "extend = 1, retract = 2" in problems["signals.mode.numbers"].remedy
+    assert "[modes]" in problems["edges.ab"].remedy
+
+
+def test_upkeep_basis_and_form_reach_the_model(raw: dict[str, Any], tmp_path: Path) -> None:
+    raw["upkeep"] = {"every_s": 10, "forget_min": 10, "innovation_sd": 8, "folds": 5}
+    assert "upkeep.forget_min" in refused(raw, tmp_path)
+    raw["upkeep"] = {"every_s": 10, "forget_s": 600, "innovation_sd": 8, "folds": 5}
+    raw["edge_defaults"]["basis"] = "blended"
+    raw["edges"]["at"]["terms"] = "drop"
+    raw["edges"]["at"]["basis"] = "taylor"
+    raw["estimator"]["form"] = "restart"
+    raw["gates"]["recovery_ms"] = 200
+    model = loaded(raw, tmp_path).model
+    assert (model.upkeep.forget_s, model.upkeep.folds, model.form) == (600.0, 5, "restart")
+    assert model.upkeep.shared_forget_s == np.inf
+    assert [e.basis for e in model.edges] == ["blended", "taylor", "blended", "blended"]
+    assert model.edges[1].terms == "drop"
+    assert model.gates.recovery_s == pytest.approx(0.2)
 
 
 def set_at(raw: dict[str, Any], path: str, value: Any) -> None:

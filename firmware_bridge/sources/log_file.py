@@ -13,6 +13,7 @@ from pathlib import Path
 from firmware_bridge.frames import Frames
 from firmware_bridge.sources import asc, blf, can_csv, candump, mf4, trc
 from firmware_bridge.sources.errors import LogError
+from firmware_bridge.steps import Continuous
 
 READERS: dict[str, Callable[[Path], Frames]] = {
     ".blf": blf.read,
@@ -37,8 +38,8 @@ def open_log(path: str | Path) -> Frames:
     """All data frames of a log, in file order; `refused` says what was left out and why.
 
     "truncated" in `refused`: the file ends within a line, container or block, or before its end
-    mark.  Raises LogError if the file is absent, empty, a folder, or not of the kind that its
-    suffix says.
+    mark; "clock_step": the recorder's clock was set back, which became a gap.  Raises LogError if
+    the file is absent, empty, a folder, or not of the kind that its suffix says.
     """
     path = Path(path)
     if path.is_dir():
@@ -53,7 +54,7 @@ def open_log(path: str | Path) -> Frames:
         raise LogError(f"{path}: unknown suffix {suffix!r}; known are {', '.join(READERS)}{hint}")
     if looks and looks != suffix:
         raise LogError(f"{path}: not a {suffix} log{hint}")
-    return READERS[suffix](path)
+    return Continuous().push(READERS[suffix](path))
 
 
 def _looks_like(path: Path) -> str:

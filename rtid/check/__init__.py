@@ -1,7 +1,6 @@
 """Judge a project file against a trace, and a raw capture by itself."""
 
 from rtid.check.judge import Finding, Report, judge
-from rtid.check.series import estimate_noise
 from rtid.check.timing import IdTiming, Timing, bus, timing
 
-__all__ = ["Finding", "IdTiming", "Report", "Timing", "bus", "estimate_noise", "judge", "timing"]
+__all__ = ["Finding", "IdTiming", "Report", "Timing", "bus", "judge", "timing"]

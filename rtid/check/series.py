@@ -1,12 +1,4 @@
-"""One measured signal judged alone: range, resolution, noise, spans in which it is frozen.
-
-Noise is what remains of a smooth signal after divided differences of order d,
-
-    e_k = sum_i w_i x_(k+i) / sqrt(sum_i w_i^2),   w_i = 1 / prod_(j != i) (t_(k+i) - t_(k+j)),
-
-so that white noise keeps its size at any jitter of t: sigma = rms(e, outliers left out).  The
-order with the smallest sigma counts, because a low order still holds motion.
-"""
+"""One measured signal judged alone: range, resolution, noise, spans in which it is frozen."""
 
 from __future__ import annotations
 
@@ -15,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-MAX_ORDER = 6
+from rtid.estimator.noise import estimate_noise
+
 FROZEN_S = 0.2
 FROZEN_SAMPLES = 20
 
@@ -59,7 +52,7 @@ def describe(series: Series) -> SignalReport:
         minimum=float(x.min()),
         maximum=float(x.max()),
         step=smallest_step(x),
-        noise=estimate_noise(x, t_us),
+        noise=estimate_noise(1e-6 * t_us, x).sd,
         frozen_s=span_s,
         frozen_from_s=start_s,
     )
@@ -70,43 +63,6 @@ def smallest_step(x: NDArray[np.float64]) -> float:
     change = np.diff(np.unique(x))
     change = change[change > 1e-9 * np.abs(x).max()]
     return float(change.min()) if len(change) else 0.0
-
-
-def estimate_noise(x: NDArray[np.float64], t_us: NDArray[np.int64] | None = None) -> float:
-    """Standard deviation of white noise on a smooth signal; NaN from fewer than 20 values.
-
-    Without t_us the values are taken as equally spaced.
-    """
-    if len(x) < 20:
-        return float("nan")
-    t = np.arange(len(x), dtype=np.float64)
-    if t_us is not None:
-        t = (t_us - t_us[0]) / max(float(np.median(np.diff(t_us))), 1.0)
-    return min(_robust_rms(_normed_difference(t, x, d)) for d in range(1, MAX_ORDER + 1))
-
-
-def _normed_difference(
-    t: NDArray[np.float64], x: NDArray[np.float64], order: int
-) -> NDArray[np.float64]:
-    """Divided difference of d + 1 neighbours, scaled to gain 1 on white noise."""
-    n = len(x) - order
-    total, gain = np.zeros(n), np.zeros(n)
-    for i in range(order + 1):
-        product = np.ones(n)
-        for j in range(order + 1):
-            if j != i:
-                product *= t[i : i + n] - t[j : j + n]
-        weight = np.divide(1.0, product, out=np.zeros(n), where=product != 0)
-        total += weight * x[i : i + n]
-        gain += weight**2
-    return np.divide(total, np.sqrt(gain), out=np.zeros(n), where=gain > 0)
-
-
-def _robust_rms(x: NDArray[np.float64]) -> float:
-    """Root mean square without what lies beyond four robust standard deviations."""
-    limit = 4 * 1.4826 * float(np.median(np.abs(x)))
-    kept = x[np.abs(x) <= limit]
-    return float(np.sqrt(np.mean(kept**2)))
 
 
 def longest_frozen(t_us: NDArray[np.int64], x: NDArray[np.float64]) -> tuple[float, float]:

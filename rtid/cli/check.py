@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rtid.cli.exits import Exit
+from rtid.cli.exits import Exit, refuse_truncated
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -61,6 +61,7 @@ def check(
         print(json.dumps({"schema": SCHEMA, "ok": report.ok} | _plain(report)))
     else:
         _print_report(report, loaded)
+    refuse_truncated(trace, read.refused)
     if not report.ok:
         raise typer.Exit(Exit.NEGATIVE)
 
@@ -77,8 +78,9 @@ def _check_bus(log: Path, dbc: Path | None, as_json: bool) -> None:
         ids = [_plain(one) | {"name": names.get((one.can_id, one.extended))} for one in found]
         counts = {"frames": len(frames), "ids": len(found), "refused": frames.refused}
         print(json.dumps({"schema": SCHEMA} | counts | {"timing": ids}))
-        return
-    _print_bus(found, names, len(frames), frames.refused)
+    else:
+        _print_bus(found, names, len(frames), frames.refused)
+    refuse_truncated(log, frames.refused)
 
 
 def _names(catalog: Catalog) -> dict[tuple[int, bool], str]:

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rtid.cli.exits import refuse_truncated
+
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
@@ -50,6 +52,7 @@ def compare(
         print(json.dumps(plain(found) | {"pictures": [str(path) for path in written]}))
     else:
         _print(found, written)
+    refuse_truncated(trace, found.replay.trace.counters)
 
 
 def _draw(found: TraceComparison, folder: Path, suffix: str) -> list[Path]:

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Mapping
 from enum import IntEnum
+from pathlib import Path
+
+import typer
 
 
 class Exit(IntEnum):
@@ -14,3 +19,13 @@ class Exit(IntEnum):
     INPUT = 3  # input that cannot be used: no wanted frame, an empty file, a wrong DBC
     NEGATIVE = 4  # the command worked and its result is negative: `check` found problems
     INTERRUPTED = 130  # Ctrl-C
+
+
+def refuse_truncated(trace: Path, counters: Mapping[str, int]) -> None:
+    """End with INPUT, after the result, where a trace stops before its end: scripts must see it."""
+    if counters.get("truncated"):
+        print(
+            f"{trace}: truncated: the log stops before its end; what stood before was used",
+            file=sys.stderr,
+        )
+        raise typer.Exit(Exit.INPUT)

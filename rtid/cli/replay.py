@@ -8,9 +8,13 @@ from typing import Annotated
 
 import typer
 
+from rtid.cli.exits import refuse_truncated
+
 
 def replay(
-    trace: Annotated[Path, typer.Argument(help="CAN log (.blf .log .asc .trc .mf4) or table.")],
+    trace: Annotated[
+        Path, typer.Argument(help="CAN log (.blf .log .asc .trc .csv .mf4) or table.")
+    ],
     project: Annotated[Path, typer.Option("--project", "-p", help="Project file.")],
     bus: Annotated[
         bool, typer.Option("--bus", help="Through python-can's virtual bus instead of the file.")
@@ -50,3 +54,4 @@ def replay(
         print(json.dumps(story.as_json() | {"pictures": [str(p) for p in written]}))
     else:
         story.print(snapshot, written)
+    refuse_truncated(trace, result.trace.counters)

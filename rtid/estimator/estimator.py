@@ -7,11 +7,14 @@ held from now on judges the rows to come.
 
 from __future__ import annotations
 
+from copy import deepcopy
+
 import numpy as np
 
 from firmware_bridge.samples import Samples
 from rtid.estimator.blocks import VALID
 from rtid.estimator.forgetting import faded, halved_surprise
+from rtid.estimator.history import History
 from rtid.estimator.solution import Solution, solve
 from rtid.estimator.state import State, Weights, build
 from rtid.estimator.sums import IntArray, Sums
@@ -50,7 +53,11 @@ class Estimator:
         self.state: State = build(self.model, self.weights)
         self.origin_us: int | None = None
         self.folds = [Sums.of(self.state)] * self.model.upkeep.folds
-        self.turns = 0
+        self.turns, upkeep = 0, self.model.upkeep
+        self.history: History | None = None
+        if upkeep.history_s > 0:
+            rate, signals = upkeep.history_rows_per_s, len(self.model.signals)
+            self.history = History(signals, upkeep.history_s, rate)
 
     def update(self, samples: Samples) -> None:
         """Take a run of samples in their order."""
@@ -62,6 +69,8 @@ class Estimator:
 
     def advance(self, chunk: FloatArray) -> None:
         """Take samples in the kernel's view, with upkeep where it is due."""
+        if self.history is not None:
+            self.history.append(chunk)
         every_s = self.model.upkeep.every_s
         if every_s <= 0:
             self.state.advance(chunk)
@@ -138,4 +147,5 @@ class Estimator:
         twin.model, twin.weights = self.model, self.weights
         twin.state, twin.origin_us = self.state.copy(), self.origin_us
         twin.folds, twin.turns = list(self.folds), self.turns
+        twin.history = deepcopy(self.history)
         return twin

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from math import comb
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from rtid.model import FloatArray
@@ -23,6 +24,7 @@ LIKELY = 0.999  # of the clean windows lie below the limit that counts as quiet
 ROUNDING = 1e-8  # share of the largest value below which steps are rounding errors
 FEW_LEVELS = 6
 HELD_SHARE = 0.3  # of equal neighbours, from which on repeats are looked at
+EVEN = 0.01  # scatter of the sampling intervals up to which plain differences do
 SINGLE_RUNS = 0.2  # share of values that come once, up to which a signal is held
 
 
@@ -46,13 +48,14 @@ class NoiseEstimate:
 
 
 def estimate_noise(
-    t_s: FloatArray, values: FloatArray, held_command: bool = False
+    t_s: NDArray[np.floating], values: NDArray[np.floating], held_command: bool = False
 ) -> NoiseEstimate:
     """Noise of a signal sampled at t_s (n,) with values (n,); NaN are left out.
 
     held_command: the signal is a command, which is what was commanded: only its steps count.
     """
     values = np.asarray(values, np.float64)  # differences of unsigned counts would wrap
+    t_s = np.asarray(t_s, np.float64)
     known = np.isfinite(t_s) & np.isfinite(values)
     t, y = t_s[known], values[known]
     step, levels = resolution_of(y), len(np.unique(y))
@@ -147,13 +150,33 @@ def _windows(t_s: FloatArray, values: FloatArray, order: int) -> FloatArray:
     """Mean square of the scaled differences per window (windows,); none reaches over a gap."""
     if len(values) < order + WINDOW:
         return np.zeros(0)
-    difference = np.diff(values, order) / np.sqrt(comb(2 * order, order))
     spacing = np.diff(t_s)
+    even = np.ptp(spacing) < EVEN * np.median(spacing)
+    difference = (
+        np.diff(values, order) / np.sqrt(comb(2 * order, order))
+        if even
+        else _divided(t_s, values, order)
+    )
     uneven = np.abs(spacing - np.median(spacing)) > 0.5 * np.median(spacing)
     across = np.convolve(uneven, np.ones(order), "valid") > 0
     n = len(difference) // WINDOW * WINDOW
     whole = ~across[:n].reshape(-1, WINDOW).any(axis=1)
     return np.asarray(np.mean(difference[:n].reshape(-1, WINDOW) ** 2, axis=1)[whole])
+
+
+def _divided(t_s: FloatArray, values: FloatArray, order: int) -> FloatArray:
+    """Divided differences at uneven instants, scaled to gain 1 on white noise."""
+    n, t = len(values) - order, t_s / np.median(np.diff(t_s))
+    total, gain = np.zeros(n), np.zeros(n)
+    for i in range(order + 1):
+        product = np.ones(n)
+        for j in range(order + 1):
+            if j != i:
+                product *= t[i : i + n] - t[j : j + n]
+        weight = np.divide(1.0, product, out=np.zeros(n), where=product != 0)
+        total += weight * values[i : i + n]
+        gain += weight**2
+    return np.divide(total, np.sqrt(gain), out=np.zeros(n), where=gain > 0)
 
 
 def _settled(floors: list[_Floor]) -> tuple[float, float, int]:

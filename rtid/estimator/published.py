@@ -17,14 +17,15 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from rtid.estimator.blocks import VALID as BLOCK_VALID
+from rtid.estimator.blocks import Block
 from rtid.estimator.cells import mean_square, projection, quadrature, terms
 from rtid.estimator.flowmap import EXTRAPOLATED, LEARNING, PRIOR, SHUT, VALID, EdgeMap, FlowMap
 from rtid.estimator.monotone import monotone
 from rtid.estimator.orifice import GainData, OrificeLaw, fit_law, root
 from rtid.estimator.prior import SHARE as PRIOR_SHARE
 from rtid.estimator.prior import add_prior
-from rtid.estimator.solution import VALID as BLOCK_VALID
-from rtid.estimator.solution import Block, Solution
+from rtid.estimator.solution import Solution
 from rtid.kernels.layout import TERMS
 from rtid.model import Edge, FloatArray, Grid
 

@@ -10,10 +10,23 @@ import numpy as np
 
 from firmware_bridge.catalog import Catalog
 from firmware_bridge.config import CYCLE, MULTIRATE, Assembly, MessageSource, SignalSource
-from rtid.model import Chamber, Edge, Filter, Gates, Grid, Lag, Model, Signal
+from rtid.model import (
+    BOTH,
+    NONE,
+    TAYLOR,
+    Chamber,
+    Edge,
+    Filter,
+    Gates,
+    Grid,
+    Lag,
+    Model,
+    Signal,
+    Upkeep,
+)
 from rtid.project.project import Sections
 from rtid.project.references import KINDS
-from rtid.project.schema import EdgeSection, SignalSection
+from rtid.project.schema import MOST_MODE, EdgeSection, SignalSection
 from rtid.units import Unit, find_unit
 
 MIN_GAP_S = 0.05
@@ -43,7 +56,12 @@ def build_model(sections: Sections, catalog: Catalog | None) -> Model:
             hysteresis=gates.hysteresis,
             min_rows=gates.min_rows,
             max_sd_share=gates.max_sd_share,
+            max_surprise=gates.max_surprise,
+            recovery_s=gates.recovery_s,
+            stale_s=gates.stale_s or math.inf,
         ),
+        upkeep=_upkeep(sections),
+        mode=next((signal.name for signal in signals if signal.kind == "mode"), NONE),
         form=sections.estimator.form,
         pressure_period_s=_pressure_period_s(sections, catalog),
     )
@@ -108,8 +126,9 @@ def _signal(name: str, signal: SignalSection, catalog: Catalog | None) -> Signal
     scale = 1.0 if signal.scale is None else signal.scale
     step, limits = _dbc(signal, catalog)
     ends = sorted(scale * limit + signal.offset for limit in limits)
-    low, high = _to_si(signal.range or (ends[0], ends[1]), signal, unit)
     kind = _kind(signal, unit)
+    known = (0.0, float(MOST_MODE)) if kind == "mode" else (ends[0], ends[1])
+    low, high = _to_si(signal.range or known, signal, unit)
     slope = _slope(signal, unit)
     resolution = abs(scale) * step if signal.resolution is None else signal.resolution
     return Signal(
@@ -153,7 +172,7 @@ def _source(
         raw = tuple((angle - signal.offset) / scale for angle in signal.table.angle)
         table = (raw, signal.table.position_m)
         table = table if scale > 0 else (raw[::-1], signal.table.position_m[::-1])
-    command = _kind(signal, unit) == "command"
+    kind = _kind(signal, unit)
     return SignalSource(
         name=name,
         message="" if column else signal.message or "",
@@ -162,8 +181,8 @@ def _source(
         offset=unit.factor * signal.offset,
         table=table,
         constant=None if signal.constant is None else unit.factor * signal.constant,
-        hold=signal.hold or ("zero" if command else "linear"),
-        command=command,
+        hold=signal.hold or ("zero" if kind in ("command", "mode") else "linear"),
+        command=kind == "command",
     )
 
 
@@ -218,6 +237,27 @@ def _max_gap_s(sections: Sections, catalog: Catalog | None) -> float:
     return max([MIN_GAP_S, *(2.5 * period for period in periods)])
 
 
+def _upkeep(sections: Sections) -> Upkeep:
+    given = sections.upkeep
+    return Upkeep(
+        every_s=given.every_s,
+        forget_s=given.forget_s or math.inf,
+        shared_forget_s=given.shared_forget_s or math.inf,
+        innovation_sd=given.innovation_sd,
+        innovation_rows=given.innovation_rows,
+        folds=given.folds,
+        history_s=given.history_s,
+    )
+
+
+def _open_in(edge: str, sections: Sections) -> tuple[int, ...]:
+    """Numbers of the modes in which an edge may open; empty where no signal tells the mode."""
+    numbers = next((s.numbers for s in sections.signals.values() if s.numbers), {})
+    if not numbers:
+        return ()
+    return tuple(sorted(numbers[m] for m, edges in sections.modes.items() if edge in edges))
+
+
 def _position(sections: Sections, signals: tuple[Signal, ...]) -> str:
     named = sections.geometry.position
     return named or next(signal.name for signal in signals if signal.kind == "position")
@@ -245,4 +285,7 @@ def _edge(name: str, edge: EdgeSection, sections: Sections, signals: tuple[Signa
         safe_band_v=given.get("safe_band_v", -math.inf),
         rated_q_m3s=given["rated_flow_m3s"],
         rated_dp_pa=given["rated_dp_pa"],
+        basis=given.get("basis", TAYLOR),
+        terms=given.get("terms", BOTH),
+        modes=_open_in(name, sections),
     )

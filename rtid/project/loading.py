@@ -25,6 +25,7 @@ SINGLE: dict[str, type[schema.Section]] = {
     "beta": schema.BetaSection,
     "filter": schema.FilterSection,
     "gates": schema.GatesSection,
+    "upkeep": schema.UpkeepSection,
     "dynamics": schema.DynamicsSection,
     "estimator": schema.EstimatorSection,
     "record": schema.RecordSection,

@@ -23,6 +23,7 @@ from rtid.project.schema import (
     RecordSection,
     SignalSection,
     SourceSection,
+    UpkeepSection,
 )
 
 
@@ -42,6 +43,7 @@ class Sections:
     beta: BetaSection = field(default_factory=BetaSection)
     filter: FilterSection = field(default_factory=FilterSection)
     gates: GatesSection = field(default_factory=GatesSection)
+    upkeep: UpkeepSection = field(default_factory=UpkeepSection)
     dynamics: DynamicsSection = field(default_factory=DynamicsSection)
     estimator: EstimatorSection = field(default_factory=EstimatorSection)
     record: RecordSection = field(default_factory=RecordSection)

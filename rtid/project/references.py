@@ -18,12 +18,14 @@ KINDS = {
     "length": "position",
     "angle": "position",
     "velocity": "velocity",
+    "mode": "mode",
 } | dict.fromkeys(COMMAND_DIMENSIONS, "command")
 KIND_DIMENSIONS = {
     "command": COMMAND_DIMENSIONS,
     "pressure": ("pressure",),
     "position": ("length", "angle"),
     "velocity": ("velocity",),
+    "mode": ("mode",),
 }
 # Which signal kind each reference needs: (section, key) -> kind.
 REFERENCES = {
@@ -90,6 +92,7 @@ def check(raw: Raw, catalog: Catalog | None, folder: Path) -> Iterator[Problem]:
     for name, edge in tables(raw, "edges").items():
         yield from _edge(f"edges.{name}", edge, raw, kinds, catalog, folder)
     yield from _modes(raw)
+    yield from _mode_signals(raw, kinds)
     yield from _messages(raw, catalog)
 
 
@@ -239,6 +242,23 @@ def _modes(raw: Raw) -> Iterator[Problem]:
             if name not in edges:
                 near = nearest(str(name), edges)
                 yield Problem(f"modes.{mode}[{k}]", f"there is no edge {name!r}", near)
+
+
+def _mode_signals(raw: Raw, kinds: dict[str, str | None]) -> Iterator[Problem]:
+    """A mode signal names the number of every mode, and every edge is in one."""
+    signals = [name for name, kind in kinds.items() if kind == "mode"]
+    for name in signals[1:]:
+        yield Problem(f"signals.{name}", "a second signal of the mode", f"keep {signals[0]}")
+    if not signals:
+        return
+    path, modes = f"signals.{signals[0]}.numbers", table(raw, "modes")
+    numbers = tables(raw, "signals")[signals[0]].get("numbers")
+    if not isinstance(numbers, dict) or set(numbers) != set(modes):
+        example = ", ".join(f"{mode} = {k}" for k, mode in enumerate(modes or ["extend"], 1))
+        yield Problem(path, "must give the number of each of [modes]", f"numbers = {{{example}}}")
+    listed = {name for names in modes.values() if isinstance(names, list) for name in names}
+    for edge in sorted(set(tables(raw, "edges")) - listed):
+        yield Problem(f"edges.{edge}", "is open in no mode", "name it in one of [modes]")
 
 
 def _messages(raw: Raw, catalog: Catalog | None) -> Iterator[Problem]:

@@ -16,6 +16,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from pydantic_core import PydanticCustomError
 
 MAX_BORDERS = 10_000
+MOST_MODE = 62
 
 
 @dataclass(frozen=True)
@@ -152,7 +153,7 @@ class SignalSection(Section):
     signal: str | None = None
     column: str | None = None
     unit: str | None = None
-    kind: Literal["command", "pressure", "position", "velocity"] | None = None
+    kind: Literal["command", "pressure", "position", "velocity", "mode"] | None = None
     hold: Literal["zero", "linear"] | None = None
     scale: float | None = None
     offset: float = 0.0
@@ -161,6 +162,7 @@ class SignalSection(Section):
     range: Interval | None = None
     constant: float | None = None
     table: AngleTable | None = None
+    numbers: dict[str, Annotated[int, Field(ge=0, le=MOST_MODE)]] | None = None
 
 
 class GeometrySection(Section):
@@ -197,6 +199,8 @@ class EdgeDefaults(Section):
     safe_band_v: Annotated[float | None, COMMAND] = Field(default=None, ge=0)
     rated_flow_m3s: Annotated[float | None, FLOW] = Field(default=None, gt=0)
     rated_dp_pa: Annotated[float | None, PRESSURE] = Field(default=None, gt=0)
+    basis: Literal["taylor", "lapped", "blended"] | None = None
+    terms: Literal["both", "command", "drop"] | None = None
 
 
 class EdgeSection(EdgeDefaults):
@@ -231,6 +235,21 @@ class GatesSection(Section):
     hysteresis: float = Field(default=0.05, ge=0, lt=0.5)
     min_rows: int = Field(default=20, ge=6)
     max_sd_share: float = Field(default=0.001, gt=0, le=1)
+    max_surprise: float = Field(default=3.0, gt=1)
+    recovery_s: Annotated[float, TIME] = Field(default=0.0, ge=0)
+    stale_s: Annotated[float | None, TIME] = Field(default=None, gt=0)
+
+
+class UpkeepSection(Section):
+    """[upkeep]: what happens beside the update at fixed sample times; off unless every_s > 0."""
+
+    every_s: Annotated[float, TIME] = Field(default=0.0, ge=0)
+    forget_s: Annotated[float | None, TIME] = Field(default=None, gt=0)
+    shared_forget_s: Annotated[float | None, TIME] = Field(default=None, gt=0)
+    innovation_sd: float = Field(default=0.0, ge=0)
+    innovation_rows: int = Field(default=100, ge=2)
+    folds: int = Field(default=1, ge=1, le=20)
+    history_s: Annotated[float, TIME] = Field(default=120.0, ge=0)
 
 
 class LagSection(Section):
@@ -249,7 +268,7 @@ class DynamicsSection(Section):
 class EstimatorSection(Section):
     """[estimator]: which exact form of the regression."""
 
-    form: Literal["integral", "carry"] = "integral"
+    form: Literal["integral", "carry", "restart"] = "integral"
 
 
 class RecordSection(Section):
