@@ -404,9 +404,9 @@ def settle(engine: Any, closed: Any, blocks: Any, pairs: Any) -> bool:
 
 @kernel
 def clear_sums(engine: Any, blocks: Any, pairs: Any) -> None:
-    """Empty all sums of settled tables; slots, pairs and the memory of recent columns stay."""
+    """Empty all sums of settled tables; slots and the memory of recent columns stay."""
     e = engine[0]
-    e.rows = 0.0
+    e.rows, e.n_pairs = 0.0, 0
     for i in range(1 + e.n_shared):
         for j in range(1 + e.n_shared):
             e.shared[i, j] = 0.0
@@ -422,9 +422,11 @@ def clear_sums(engine: Any, blocks: Any, pairs: Any) -> None:
             for j in range(1 + e.n_shared):
                 block.shared[i, j] = 0.0
     for p in range(len(pairs)):
-        for i in range(TERMS):
-            for j in range(TERMS):
-                pairs[p].gram[i, j] = 0.0
+        if pairs[p].key != 0:
+            pairs[p].key = 0
+            for i in range(TERMS):
+                for j in range(TERMS):
+                    pairs[p].gram[i, j] = 0.0
 
 
 @kernel
