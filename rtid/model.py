@@ -205,6 +205,9 @@ class Model:
     # Variance of a pressure at the rows as a share of its sensor's: 1 where it is measured there,
     # f^2 + (1 - f)^2 where it is interpolated at the fraction f between two samples.
     pressure_share: float = 1.0
+    # Blocks that may ring at once before memory begins anew: fewer need less memory on fine grids,
+    # where a block is coupled to all that were visited within its memory, and cost information.
+    recent_blocks: int = 64
     mode: str = NONE  # the signal that carries the number of the working mode
 
     @property

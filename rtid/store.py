@@ -37,6 +37,7 @@ def save(path: Path, estimator: Estimator, digest: str) -> None:
         "digest": digest,
         "origin_us": estimator.origin_us,
         "turns": estimator.turns,
+        "due_s": estimator.due_s,
     }
     arrays: dict[str, Any] = dict(zip(ARRAYS, estimator.state.arrays, strict=True))
     weights = estimator.weights
@@ -77,6 +78,7 @@ def load(path: Path, model: Model, digest: str) -> Estimator:
             raise SnapshotError(f"{path}: {name} has another layout", "learn again with `replay`")
     estimator.state = State(*(content[name] for name in ARRAYS))
     estimator.origin_us, estimator.turns = header["origin_us"], header["turns"]
+    estimator.due_s = float(header["due_s"])
     estimator.folds = [_fold(content, k) for k in range(model.upkeep.folds)]
     if estimator.history is not None:
         stored = {k: a for k, a in content.items() if k.startswith("history_")}

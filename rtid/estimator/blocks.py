@@ -105,7 +105,7 @@ def read_blocks(
             condition,
             status,
             reason,
-            _progress(model.gates, int(record["rows"]), sd_share),
+            _progress(model.gates, int(record["rows"]), condition, sd_share),
         )
 
 
@@ -141,7 +141,11 @@ def _status(
     return VALID, ""
 
 
-def _progress(gates: Gates, rows: int, sd_share: float) -> float:
-    """Share of the way to a valid block: variance falls as rows come in."""
+def _progress(gates: Gates, rows: int, condition: float, sd_share: float) -> float:
+    """Share of the way to a valid block: variance falls as rows come in.
+
+    It can fall when the data move to where the block is known less.
+    """
     known = (gates.max_sd_share / max(sd_share, 1e-12)) ** 2
-    return min(1.0, rows / gates.min_rows, known)
+    told = gates.condition_limit / max(condition, 1.0)
+    return float(min(1.0, rows / gates.min_rows, known, told))

@@ -13,13 +13,16 @@ import numpy as np
 
 from firmware_bridge.samples import Samples
 from rtid.estimator.blocks import VALID
-from rtid.estimator.forgetting import faded, halved_surprise
+from rtid.estimator.factor import one_thread
+from rtid.estimator.forgetting import faded, halved_surprise, without_surprise
 from rtid.estimator.history import History
 from rtid.estimator.solution import Solution, solve
 from rtid.estimator.state import State, Weights, build
 from rtid.estimator.sums import IntArray, Sums
 from rtid.kernels.layout import TERMS
 from rtid.model import FloatArray, Model
+
+KNOWN = 0.05  # relative sd of the compliances up to which a map may judge rows
 
 
 def to_chunk(model: Model, samples: Samples, origin_us: int) -> FloatArray:
@@ -53,7 +56,7 @@ class Estimator:
         self.state: State = build(self.model, self.weights)
         self.origin_us: int | None = None
         self.folds = [Sums.of(self.state)] * self.model.upkeep.folds
-        self.turns, upkeep = 0, self.model.upkeep
+        self.turns, self.due_s, upkeep = 0, -np.inf, self.model.upkeep
         self.history: History | None = None
         if upkeep.history_s > 0:
             rate, signals = upkeep.history_rows_per_s, len(self.model.signals)
@@ -72,34 +75,36 @@ class Estimator:
         if self.history is not None:
             self.history.append(chunk)
         every_s = self.model.upkeep.every_s
-        if every_s <= 0:
-            self.state.advance(chunk)
-            return
-        turns = np.floor(chunk[:, 0] / every_s)
-        while len(chunk):
-            due = turns > self.turns
+        while every_s > 0 and len(chunk):
+            t_s = chunk[:, 0]
+            due = (t_s >= self.due_s) | (t_s < self.due_s - every_s)
             count = int(np.argmax(due)) if due.any() else len(chunk)
             self.state.advance(chunk[:count])
-            chunk, turns = chunk[count:], turns[count:]
+            chunk = chunk[count:]
             if len(chunk):
-                self._keep_house(int(turns[0]))
+                self._keep_house(float(chunk[0, 0]))
+        self.state.advance(chunk)
 
-    def _keep_house(self, turn: int) -> None:
-        """End one turn; what no sample fell into is skipped."""
+    def _keep_house(self, now_s: float) -> None:
+        """End one turn; a clock that jumps ends it too, and the next one begins at the new time."""
         upkeep, fold = self.model.upkeep, self.turns % self.model.upkeep.folds
+        self.due_s = now_s + upkeep.every_s if np.isfinite(now_s) else self.due_s
+        self.turns += 1
         news = Sums.drained(self.state)
-        passed_s = (turn - self.turns) * upkeep.every_s
-        self.turns = turn
-        if np.isfinite(min(upkeep.forget_s, upkeep.shared_forget_s)):
-            self._fade(news, passed_s)
-        self.folds[fold] = self.folds[fold] + news
+        with one_thread():
+            changed = self._changed(news)
+            self._fade(news, changed)
+        self.folds[fold] = self.folds[fold] + without_surprise(news, changed)
         if upkeep.innovation_sd > 0:
             self._hold()
 
-    def _fade(self, news: Sums, passed_s: float) -> None:
-        upkeep, changed = self.model.upkeep, self._changed(news)
-        share = -np.expm1(-passed_s / upkeep.forget_s)
-        shared = -np.expm1(-passed_s / upkeep.shared_forget_s)
+    def _fade(self, news: Sums, changed: IntArray) -> None:
+        """Let the past give up what the news replace, and what they contradict."""
+        upkeep = self.model.upkeep
+        share = -float(np.expm1(-upkeep.every_s / upkeep.forget_s))
+        shared = -float(np.expm1(-upkeep.every_s / upkeep.shared_forget_s))
+        if not (share or shared or upkeep.innovation_sd):
+            return
         self.folds = [
             faded(halved_surprise(past), news, share, shared, changed) for past in self.folds
         ]
@@ -111,25 +116,28 @@ class Estimator:
         return news.cells[enough & (blocks["surprise"] > gates.max_surprise * blocks["judged"])]
 
     def _hold(self) -> None:
-        """Let the valid part of the present map judge the rows to come."""
-        solution, cells = self.solution(), self.state.cells.copy()
-        status = np.array([block.status for block in solution.blocks])
-        terms = solution.unknowns[len(solution.unknowns) - TERMS * len(status) :]
-        cells["held"][solution.cells] = terms.reshape(-1, TERMS)
-        cells["known"][solution.cells] = status == VALID
-        shared = len(solution.scale_pa)
-        known = solution.unknowns[: shared + len(solution.terms)]
-        compliance, coefficients = np.split(known, [shared])
-        self.state.hold(cells, compliance, coefficients)
-        self.state.engine[0]["gate_sd"] = self.model.upkeep.innovation_sd
-        self.state.engine[0]["gate_rows"] = self.model.upkeep.innovation_rows
+        """Let the valid part of the present map judge the rows to come, once beta is known."""
+        solution, engine = self.solution(), self.state.engine[0]
+        pressures = np.array([bool(c.pressure) for c in self.model.chambers])
+        uncertain = np.sqrt(np.diag(solution.compliance_cov)) > KNOWN * solution.compliance
+        if (uncertain & pressures).any():
+            engine["gate_sd"] = 0.0
+            return
+        n_c, m = len(solution.scale_pa), len(solution.terms)
+        valid = np.array([block.status == VALID for block in solution.blocks], bool)
+        theta = solution.unknowns[n_c + m :].reshape(-1, TERMS)
+        compliance, terms = solution.unknowns[:n_c], solution.unknowns[n_c : n_c + m]
+        cells, cov = solution.cells[valid], solution.cell_cov[valid]
+        self.state.hold(cells, theta[valid], cov, compliance, terms)
+        engine["gate_sd"] = self.model.upkeep.innovation_sd
+        engine["gate_rows"] = self.model.upkeep.innovation_rows
 
     @property
     def sums(self) -> Sums:
         """Everything that counts by now: all folds, and what was learned since the last upkeep."""
         total = Sums.of(self.state)
         for fold in self.folds:
-            total = fold + total if len(fold.blocks) else total
+            total = fold + total
         return total
 
     @property
@@ -146,6 +154,6 @@ class Estimator:
         twin = Estimator.__new__(Estimator)
         twin.model, twin.weights = self.model, self.weights
         twin.state, twin.origin_us = self.state.copy(), self.origin_us
-        twin.folds, twin.turns = list(self.folds), self.turns
+        twin.folds, twin.turns, twin.due_s = list(self.folds), self.turns, self.due_s
         twin.history = deepcopy(self.history)
         return twin

@@ -22,6 +22,7 @@ from rtid.estimator.sums import IntArray, Normal, Sums
 from rtid.kernels.layout import TERMS
 from rtid.model import FloatArray
 
+ALL = 1.0 - 1e-6  # the most that is lost at once: a positive diagonal stays positive
 CHANGED = 0.99  # share that a block loses when its map is seen to hold no longer
 PRIOR = 1e-9  # share of a term's own information, so that what is not excited can be solved for
 TINY = 1e-12  # of the largest information of a group: directions below are left alone
@@ -78,11 +79,11 @@ def _lose(
     kept = values > TINY * values[-1]
     whitening = vectors[:, kept] / np.sqrt(values[kept])  # W' g W = I
     if np.isnan(gained).any():
-        turn, loss = whitening, np.full(whitening.shape[1], most)
+        turn, loss = whitening, np.full(whitening.shape[1], min(most, ALL))
     else:
         n = gained[np.ix_(used, used)] / np.outer(scale, scale)
         news, rotation = eigh(whitening.T @ n @ whitening)
-        turn, loss = whitening @ rotation, np.clip(news, 0.0, most)
+        turn, loss = whitening @ rotation, np.clip(news, 0.0, min(most, ALL))
     v = turn / scale[:, None]
     columns, toward = gram[:, own] @ v, right[own] @ v
     gram -= (columns * loss) @ columns.T
@@ -96,3 +97,12 @@ def halved_surprise(past: Sums) -> Sums:
     for name in ("surprise", "judged"):
         blocks[name] *= 0.5
     return replace(past, blocks=blocks)
+
+
+def without_surprise(news: Sums, changed: IntArray) -> Sums:
+    """The news as knowledge: what surprised was the map given up, not what they say now."""
+    blocks = news.blocks.copy()
+    here = np.isin(news.cells, changed)
+    for name in ("surprise", "judged"):
+        blocks[name][here] = 0.0
+    return replace(news, blocks=blocks)

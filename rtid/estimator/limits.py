@@ -12,7 +12,7 @@ MOST_MODE = 62  # a set of modes is kept as bits of one integer
 
 def refuse_unfit(model: Model) -> None:
     """Raise ValueError that names everything in the declaration which the kernels cannot hold."""
-    faults = [*_sizes(model), *_numbers(model)]
+    faults = [*_sizes(model), *_numbers(model), *_edges(model), *_terms(model), *_upkeep(model)]
     if faults:
         raise ValueError("; ".join(faults))
 
@@ -42,10 +42,19 @@ def _numbers(model: Model) -> Iterator[str]:
         signal = model.signals[model.column(name)]
         if not signal.noise**2 + signal.resolution**2 > 0:
             yield f"signal {name}: noise and resolution are zero; declare the sensor's noise"
+    least = 2 * most_open(model)
+    if not least <= model.recent_blocks <= layout.MAX_RECENT:
+        yield (
+            f"recent_blocks {model.recent_blocks}: must lie between {least}, twice the blocks that "
+            f"can be open at once, and {layout.MAX_RECENT}"
+        )
     if model.mode:
         mode = model.signals[model.column(model.mode)]
         if not (mode.minimum >= 0 and mode.maximum <= MOST_MODE):
             yield f"mode signal {model.mode}: its range must lie within 0 and {MOST_MODE}"
+
+
+def _edges(model: Model) -> Iterator[str]:
     for edge in model.edges:
         if edge.modes and not model.mode:
             yield f"edge {edge.name}: it has modes, but the model has no mode signal"
@@ -58,6 +67,27 @@ def _numbers(model: Model) -> Iterator[str]:
             )
 
 
+def _terms(model: Model) -> Iterator[str]:
+    """-1 / z has to stay finite over all that the gates let through."""
+    for term in (term for term in model.terms if term.shape == "inverse"):
+        least = term.constant
+        for name, weight in term.weights:
+            signal = model.signals[model.column(name)]
+            least += min(weight * signal.minimum, weight * signal.maximum)
+        if not least > 0:
+            yield f"term {term.name}: z can be zero; declare ranges that keep it positive"
+
+
+def _upkeep(model: Model) -> Iterator[str]:
+    upkeep = model.upkeep
+    if upkeep.innovation_sd > 0 and model.form != "integral":
+        yield f"upkeep: the {model.form} form has no innovation gate, only the integral form"
+    if upkeep.innovation_sd > 0 and upkeep.every_s <= 0:
+        yield "upkeep: the innovation gate needs every_s > 0, when a map is held"
+    if upkeep.folds < 1 or upkeep.innovation_rows < 1 or upkeep.every_s < 0:
+        yield "upkeep: folds and innovation_rows must be at least 1, every_s not negative"
+
+
 def _crossed(edge: Edge) -> bool:
     nu, nd = edge.grid.shape
     return (edge.terms == DROP_ONLY and nu > 1) or (edge.terms == COMMAND_ONLY and nd > 1)
@@ -67,11 +97,15 @@ def most_open(model: Model) -> int:
     """Largest number of blocks that can be open at once.
 
     One per open edge, up to four where windows overlap.  Edges of one command that open in opposite
-    directions exclude each other, unless their safe band reaches below zero.
+    directions exclude each other, unless their safe band reaches below zero, or modes shut them one
+    by one: with a lag one closes while the other opens.
     """
     total = 0
     for command in {edge.command for edge in model.edges}:
         mine = [edge for edge in model.edges if edge.command == command]
+        if any(edge.modes for edge in mine):
+            total += sum(_windows(edge) for edge in mine)
+            continue
         always = sum(_windows(e) for e in mine if e.safe_band_v < 0)
         ways = [
             sum(_windows(e) for e in mine if e.safe_band_v >= 0 and e.direction == way)

@@ -13,6 +13,8 @@ clusters: Cameron, Gelbach and Miller 2011).
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,9 +30,7 @@ Cells = NDArray[np.int64]
 
 def count_misfit(model: Model, chunk: FloatArray, weights: Weights, solution: Solution) -> Solution:
     """The solution with intervals that hold where its blocks' polynomials miss their maps."""
-    if len(chunk) < 2 or not (chunk[:, 1].astype(int) & ROW_FLAG).all():
-        # Where the position comes rarely, the engine may begin a new memory between two rows, which
-        # `explain` does not see: what is left of the blocks visited before would pass for misfit.
+    if not can_be_explained(chunk):
         return solution
     scores, cells = _scores(model, chunk, weights, solution)
     if not len(scores):
@@ -41,18 +41,47 @@ def count_misfit(model: Model, chunk: FloatArray, weights: Weights, solution: So
     return widen(solution, own * np.outer(ratio, ratio) - own)
 
 
+def can_be_explained(chunk: FloatArray) -> bool:
+    """True where every sample is a row.
+
+    Where the position comes rarely, the engine may begin a new memory between two rows, which
+    `explain` does not see: what is left of the blocks visited before would pass for misfit.
+    """
+    return len(chunk) >= 2 and bool((chunk[:, 1].astype(int) & ROW_FLAG).all())
+
+
+@dataclass(frozen=True)
+class Residual:
+    """A fit held against its record, per interval (n - 1).
+
+    flow (n - 1, 2 x chambers): measured and modelled, m3/s; innovation (n - 1, chambers): whitened,
+    NaN where no row; cells (n - 1, edges): grid cell, -1 shut.
+    """
+
+    flow: FloatArray
+    innovation: FloatArray
+    cells: Cells
+
+
+def residual_of(model: Model, chunk: FloatArray, weights: Weights, solution: Solution) -> Residual:
+    """What a fit leaves of its record."""
+    theta = _per_cell(model, solution)[0]
+    return _residual(model, chunk, weights, theta, solution.compliance, solution.terms_theta)
+
+
 def _scores(
     model: Model, chunk: FloatArray, weights: Weights, solution: Solution
 ) -> tuple[FloatArray, Cells]:
     """w_k r_k (rows, chambers) about their mean, and the grid cells (rows, edges)."""
     theta, flows = _per_cell(model, solution)
     n_c, terms = len(solution.scale_pa), solution.terms_theta
-    residual, cells = _innovations(model, chunk, weights, theta, solution.compliance, terms)
+    found = _residual(model, chunk, weights, theta, solution.compliance, terms)
+    residual, cells = found.innovation, found.cells
     scores = np.empty((len(residual), len(solution.scale_pa)))
     for c, influence in enumerate(flows):
         moved = solution.compliance + solution.influence[c, :n_c] * solution.scale_pa
         shared = terms + solution.influence[c, n_c : n_c + len(terms)]
-        shifted, _ = _innovations(model, chunk, weights, theta + influence, moved, shared)
+        shifted = _residual(model, chunk, weights, theta + influence, moved, shared).innovation
         scores[:, c] = ((residual - shifted) * residual).sum(axis=1)
     known = np.isfinite(scores).all(axis=1)
     scores, cells = scores[known], cells[known]
@@ -76,26 +105,25 @@ def _rated(model: Model) -> tuple[FloatArray, list[int]]:
     return rated, [edge.grid.shape[0] * edge.grid.shape[1] for edge in model.edges]
 
 
-def _innovations(
+def _residual(
     model: Model,
     chunk: FloatArray,
     weights: Weights,
     theta: FloatArray,
     compliance: FloatArray,
     terms: FloatArray,
-) -> tuple[FloatArray, Cells]:
+) -> Residual:
     n, n_c, state = len(chunk), len(model.chambers), build(model, weights)
     state.engine[0]["term_theta"][: len(terms)] = terms
     flow, innovation = np.empty((n - 1, 2 * n_c)), np.empty((n - 1, n_c))
     cells = np.empty((n - 1, len(model.edges)), np.int64)
     explain(state.engine, state.cells, theta, compliance, chunk, flow, cells, innovation)
-    return innovation, cells
+    return Residual(flow, innovation, cells)
 
 
 def _of_chamber(model: Model, cells: Cells, chamber: int) -> Cells:
     """One number per row: which blocks the edges of a chamber are in."""
-    pressure = model.chambers[chamber].pressure
-    own = [i for i, e in enumerate(model.edges) if pressure in (e.source, e.sink)]
+    own = [i for i, e in enumerate(model.edges) if e.sign(model.chambers[chamber]) != 0]
     return np.unique(cells[:, own], axis=0, return_inverse=True)[1].reshape(-1)
 
 
@@ -105,7 +133,9 @@ def _crossed(scores: FloatArray, clusters: list[Cells]) -> FloatArray:
         return _clustered(scores, clusters[0])
     both = clusters[0] * (clusters[1].max() + 1) + clusters[1]
     alone = [_clustered(scores, cluster) for cluster in clusters]
-    return alone[0] + alone[1] - _clustered(scores, np.unique(both, return_inverse=True)[1])
+    crossed = alone[0] + alone[1] - _clustered(scores, np.unique(both, return_inverse=True)[1])
+    # The difference of estimates can turn negative; the sum is at least as alike as in either.
+    return np.maximum(crossed, np.maximum(alone[0], alone[1]))
 
 
 def _clustered(scores: FloatArray, cluster: Cells) -> FloatArray:

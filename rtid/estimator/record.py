@@ -1,7 +1,8 @@
 """The record path: everything that a captured trace can tell, in a few passes of the live kernel.
 
 1. one pass with nominal weights, as on board;
-2. a pass with weights from the first result (slopes dQ/ddp of the learned maps, learned beta);
+2. a pass with weights from the first result (slopes dQ/ddp of the learned maps, learned beta),
+   which also tells the blocks whose terms miss the flow: they lose their say;
 3. the declared lag as a nuisance parameter (`profile`), and a last pass with the value found.
 """
 
@@ -14,7 +15,8 @@ import numpy as np
 
 from rtid.estimator.correction import correct
 from rtid.estimator.factor import factorize, one_thread
-from rtid.estimator.misfit import count_misfit
+from rtid.estimator.misfit import can_be_explained, count_misfit
+from rtid.estimator.missed import weighed
 from rtid.estimator.profile import Profile, profile
 from rtid.estimator.solution import Sketch, Solution, sketch, solve
 from rtid.estimator.state import State, Weights, build, nominal_weights
@@ -65,9 +67,8 @@ def fit_record(
     if not estimate_lag:
         model = replace(model, lag=replace(model.lag, tolerance_s=0.0))
     tolerance = np.zeros(0) if offset_tolerance_s is None else offset_tolerance_s
-    state = run(model, chunk)
-    first = sketch(model, state)
-    weights = refined(model, first, model.lag.nominal_s)
+    first = sketch(model, run(model, chunk))
+    weights = _excused(model, chunk, refined(model, first, model.lag.nominal_s))
     lag_sd_s, offsets, offsets_sd = 0.0, np.zeros(len(tolerance)), np.zeros(len(tolerance))
     if model.lag.tolerance_s > 0 or len(tolerance):
         found = _nuisance(model, assemble or (lambda _: chunk), weights, first.leverage, tolerance)
@@ -75,11 +76,19 @@ def fit_record(
         weights = replace(weights, lag_s=float(found.value[0]))
         chunk = assemble(offsets) if assemble else chunk
         if len(tolerance):  # the first weights came from shifted signals
-            state = run(model, chunk, weights)
-            weights = refined(model, sketch(model, state), weights.lag_s)
+            weights = refined(model, sketch(model, run(model, chunk, weights)), weights.lag_s)
+    weights = _excused(model, chunk, weights)
     state = run(model, chunk, weights)
-    solution = count_misfit(model, chunk, weights, solve(model, state, counters=state.counters))
+    solution = solve(model, state, counters=state.counters)
+    solution = count_misfit(model, chunk, weights, solution)
     return RecordFit(solution, state, weights, lag_sd_s, offsets, offsets_sd)
+
+
+def _excused(model: Model, chunk: FloatArray, weights: Weights) -> Weights:
+    """The weights with those blocks excused whose terms miss the flow (`missed`)."""
+    if not can_be_explained(chunk):
+        return weights
+    return weighed(model, chunk, weights, solve(model, run(model, chunk, weights)))
 
 
 def _nuisance(

@@ -24,8 +24,9 @@ class Solution:
     beta_pa and beta_sd_pa (chambers,); rho: residual variance in units of the declared noise, 1
     when the model explains the rows to the sensors' noise; leverage (chambers,): `leverage_of`.
     In units of the unknowns, scale_pa (chambers,) for the compliances: unknowns (n,), terms of the
-    grid cells `cells` (slots,) in the basis of their maps; influence (chambers, n), covariance of
-    the compliances with them; basis (n, chambers), how the former move what is published.
+    grid cells `cells` (slots,) in the basis of their maps, their covariance cell_cov (slots, 6, 6);
+    influence (chambers, n), covariance of the compliances with the unknowns; basis (n, chambers),
+    how the former move what is published.
     terms (terms,) and terms_cov: coefficients of the model's shared terms.
     """
 
@@ -40,6 +41,7 @@ class Solution:
     influence: FloatArray
     unknowns: FloatArray
     cells: NDArray[np.int64]
+    cell_cov: FloatArray
     scale_pa: FloatArray
     terms: FloatArray
     terms_cov: FloatArray
@@ -120,7 +122,8 @@ def solve(
         leverage = leverage_of(model, sums, effective)
         found = correct(normal, factor, leverage)
         cov += found.basis @ found.cov_change @ found.basis.T
-    influence = cov[:n_c].copy()
+    influence, m = cov[:n_c].copy(), len(sums.blocks)
+    tiles = cov[ns:, ns:].reshape(m, TERMS, m, TERMS)[np.arange(m), :, np.arange(m)]
     theta, basis = found.theta, found.basis
     if overlaps(model):
         change, cov = to_taylor(model, sums, cov, PRIOR_SD)
@@ -139,6 +142,7 @@ def solve(
         influence=influence,
         unknowns=found.theta,
         cells=sums.cells,
+        cell_cov=tiles.copy(),
         scale_pa=sums.compliance,
         terms=theta[n_c:ns] * scales,
         terms_cov=cov[n_c:ns, n_c:ns] * np.outer(scales, scales),

@@ -72,11 +72,6 @@ class State:
         """Samples, rows, and how often a sample was refused or a memory restarted, by reason."""
         return dict(zip(layout.COUNTERS, self.engine[0]["counters"].tolist(), strict=True))
 
-    @property
-    def form_is_integral(self) -> bool:
-        """True for the integral form, False for the carry form."""
-        return bool(self.engine[0]["form"] == layout.INTEGRAL)
-
     def make_room(self) -> None:
         """Double the table that is full, of blocks or of pairs; nothing else changes."""
         if self.engine[0]["n_slots"] + layout.MAX_OPEN > len(self.blocks):
@@ -97,15 +92,23 @@ class State:
         copy.settle()
         return copy
 
-    def hold(self, cells: RecordArray, compliance: FloatArray, terms: FloatArray) -> None:
+    def hold(
+        self,
+        cells: NDArray[np.int64],
+        theta: FloatArray,
+        cov: FloatArray,
+        compliance: FloatArray,
+        terms: FloatArray,
+    ) -> None:
         """Judge rows from now on by this map, in the state's units and bases.
 
-        cells: records of `layout.CELL` with the fields known and held; compliance (chambers,) in
-        units of the weights', terms (terms,) of their scales.
+        cells (m,): grid cells that are known, theta (m, 6), cov (m, 6, 6); compliance (chambers,)
+        in units of the weights', terms (terms,) of their scales.
         """
         e = self.engine[0]
-        for name in ("known", "held"):
-            self.cells[name] = cells[name]
+        self.cells["known"] = 0
+        self.cells["known"][cells], self.cells["held"][cells] = 1, theta
+        self.blocks["held_cov"][self.cells["slot"][cells]] = cov
         e["held_compliance"][: len(compliance)] = compliance
         e["held_terms"][: len(terms)] = terms
 
@@ -147,7 +150,7 @@ class Weights:
 def nominal_weights(model: Model) -> Weights:
     """Weights from the declared values alone: what a start without data has."""
     compliance = np.full(len(model.chambers), 1.0 / model.beta_nominal_pa)
-    slopes = np.concatenate([_edge_slopes(edge) for edge in model.edges])
+    slopes = np.concatenate([np.zeros(0), *(_edge_slopes(edge) for edge in model.edges)])
     return Weights(slopes, compliance, model.lag.nominal_s)
 
 
@@ -168,7 +171,7 @@ def build(model: Model, weights: Weights | None = None) -> State:
     return State(
         engine,
         cells,
-        np.zeros(MAX_CLOSED, layout.CLOSED),
+        np.zeros(min(MAX_CLOSED, model.recent_blocks), layout.CLOSED),
         np.zeros(FIRST_BLOCKS, layout.BLOCK),
         np.zeros(FIRST_PAIRS, layout.PAIR),
     )

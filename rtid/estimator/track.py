@@ -57,7 +57,8 @@ def follow(
         broken = broken or not 0.0 < t_s[k] - t_s[k - 1] <= model.gates.max_gap_s
         inside = True
         if not usable[k] or (running and broken):
-            ready = (t_s[k] if usable[k] else _last_usable(t_s, usable, k)) + model.gates.recovery_s
+            stamped = t_s[k] if np.isfinite(t_s[k]) else _last_usable(t_s, usable, k)
+            ready = stamped + model.gates.recovery_s
         if running and not broken:
             held = _held(model, values[k - 1])
             mean, last = _lagged(held, w, weights.lag_s, t_s[k] - t_s[k - 1])
@@ -92,7 +93,7 @@ def follow(
 def _usable(model: Model, t_s: FloatArray, values: FloatArray) -> NDArray[np.bool_]:
     low = np.array([s.minimum for s in model.signals])
     high = np.array([s.maximum for s in model.signals])
-    whole = np.isfinite(t_s) & np.isfinite(values).all(axis=1)
+    whole = np.isfinite(t_s) & (np.abs(values) < 1e30).all(axis=1)
     return whole & (values >= low).all(axis=1) & (values <= high).all(axis=1)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtid.kernels.basis import locate_pair, relocate
-from rtid.kernels.gate import admitted
+from rtid.kernels.gate import admitted, forgive
 from rtid.kernels.holds import GAUSS, lagged_moments, second_order
 from rtid.kernels.increments import (
     block_increments,
@@ -67,6 +67,7 @@ FloatArray = NDArray[np.float64]
 ENGINE_BYTES, CELL_BYTES, CLOSED_BYTES = ENGINE.itemsize, CELL.itemsize, CLOSED.itemsize
 BLOCK_BYTES = BLOCK.itemsize
 ROW_FLAG, GAP_FLAG = 1, 2  # as in firmware_bridge.samples
+INSANE = 1e30  # no quantity in SI units is that large, and its square is still a number
 SHUT, OUTSIDE = -1, -2  # cell of an edge that passes nothing / whose working point is off the grid
 
 
@@ -114,7 +115,7 @@ def _take(e: Any, cells: Any, closed: Any, blocks: Any, pairs: Any) -> None:
         e.counters[RESTART_GAP] += 1
         joined = False
     if not whole or (e.running and not joined):
-        e.ready_s = e.t_s + e.recovery_s if not whole else sample[0] + e.recovery_s
+        e.ready_s = e.recovery_s + (sample[0] if math.isfinite(sample[0]) else e.t_s)
     inside = joined and _place(e, cells, closed, blocks, pairs, sample, dt)
     if inside:
         _integrate(e, cells, closed, blocks, pairs, sample, dt, (flags & ROW_FLAG) != 0)
@@ -137,9 +138,9 @@ def step_s(e: Any, t_s: float) -> float:
 
 @part
 def acceptable(e: Any, sample: FloatArray) -> bool:
-    """Finite first (NaN passes no comparison), then the declared range of each signal."""
+    """Finite and sane first (NaN passes no comparison), then the declared range of each signal."""
     for j in range(2 + e.n_signals):
-        if not math.isfinite(sample[j]):
+        if not abs(sample[j]) < INSANE:
             e.counters[NOT_FINITE] += 1
             return False
     for j in range(e.n_signals):
@@ -161,7 +162,7 @@ def remember(e: Any, sample: FloatArray) -> None:
 def _start(e: Any, sample: FloatArray) -> None:
     """Begin at a measured position: spools at rest, whitener at R, filters at zero."""
     remember(e, sample)
-    e.running, e.break_due = 1, 0
+    e.running, e.break_due, e.blind, e.refused = 1, 0, 0, 0
     e.next_row_s = sample[0] + e.row_period_s
     for i in range(e.n_edges):
         e.w_v[i] = commanded(e, i)
@@ -308,8 +309,8 @@ def _change_blocks(e: Any, cells: Any, closed: Any, blocks: Any) -> None:
                     _change_lapped(e, cells, closed, blocks, i)
                 else:
                     _change(e, cells, closed, blocks, i)
-    for c in range(e.n_chambers):
-        e.gap[c] = 0.0
+    if e.refused == 0:
+        forgive(e)
 
 
 @inlined
@@ -431,7 +432,7 @@ def clear_sums(engine: Any, blocks: Any, pairs: Any) -> None:
 
 @kernel
 def clear(engine: Any, cells: Any) -> None:
-    """Set the state (not the configuration) to its beginning."""
+    """Set the state of a zeroed record (not the configuration) to its beginning."""
     e = engine[0]
     e.running, e.break_due, e.n_slots, e.n_pairs = 0, 0, 0, 0
     e.n_closed, e.n_recent, e.n_young = 0, 0, 0

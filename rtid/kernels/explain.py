@@ -57,9 +57,10 @@ def explain(
     e = engine[0]
     gap = np.zeros(2)
     for k in range(len(chunk)):
-        dt = step_s(e, chunk[k, 0])
-        flags = int(chunk[k, 1])
-        whole = acceptable(e, chunk[k])
+        for j in range(2 + e.n_signals):
+            e.sample[j] = chunk[k, j]
+        sample, flags, dt = e.sample, int(e.sample[1]), step_s(e, e.sample[0])
+        whole = acceptable(e, sample)
         joined = whole and e.running and dt > 0.0 and dt <= e.max_gap_s
         joined = joined and (flags & GAP_FLAG) == 0
         if k > 0:
@@ -68,17 +69,17 @@ def explain(
             cell[k - 1] = SHUT
             if joined:
                 joined = _one(
-                    e, cells, theta, compliance, chunk[k], dt, flow[k - 1], cell[k - 1], gap
+                    e, cells, theta, compliance, sample, dt, flow[k - 1], cell[k - 1], gap
                 )
         if joined:
-            remember(e, chunk[k])
+            remember(e, sample)
             if (flags & ROW_FLAG) != 0:
                 _innovate(e, gap, innovation[k - 1])
         else:
             e.running = 0
             gap[:] = 0.0
             if whole and (flags & ROW_FLAG) != 0:
-                _begin(e, chunk[k])
+                _begin(e, sample)
 
 
 @inlined

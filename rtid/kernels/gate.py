@@ -1,9 +1,10 @@
 """The innovation gate: a row must be what the map held says, within the noise.
 
-The gap between y and the map held passes the same whitener as the columns; whitened, it has unit
-variance for a perfect map.  A refused row is as if the position had not been measured, so that one
-outlier costs one row.  At a change of block the gap begins at zero, so that each block answers for
-itself.  When rows are refused for long, the plant or a sensor's zero has changed:
+The gap between y and the map held passes the same whitener as the columns; whitened, with the map's
+own error beside the noise, it has unit variance at most.  A refused row is as if the position had
+not been measured, so that one outlier costs one row.  At a change of block the gap begins at zero,
+so that each block answers for itself, but not while rows are being refused: what is wrong then has
+to show that it lasts.  When rows are refused for long, the plant or a sensor's zero has changed:
 all memory ends, and the gate is open until another map is held.
 """
 
@@ -22,8 +23,7 @@ def admitted(e: Any, blocks: Any) -> bool:
     """Judge the coming row, follow the gap through it; False when it is refused."""
     if e.blind != 0:  # what the unknown block added to the gap must not be judged later
         e.blind = 0
-        for c in range(e.n_chambers):
-            e.gap[c] = 0.0
+        forgive(e)
         return True
     first, second = _innovations(e)
     limit = e.gate_sd * e.gate_sd
@@ -41,13 +41,21 @@ def admitted(e: Any, blocks: Any) -> bool:
 
 
 @inlined
+def forgive(e: Any) -> None:
+    """Begin the gap at zero."""
+    for c in range(e.n_chambers):
+        e.gap[c], e.gap_sd[c] = 0.0, 0.0
+
+
+@inlined
 def _innovations(e: Any) -> tuple[float, float]:
-    """L^-1 gap with L L' = S; the second is 0 for one chamber."""
-    s00 = e.cov[0, 0] + position_noise(e, 0, 0)
+    """L^-1 gap with L L' = S plus the map's own variance; the second is 0 for one chamber."""
+    s00 = e.cov[0, 0] + position_noise(e, 0, 0) + e.gap_sd[0] * e.gap_sd[0]
     first = e.gap[0] / math.sqrt(s00)
     if e.n_chambers == 1:
         return first, 0.0
     s01, s11 = e.cov[0, 1] + position_noise(e, 0, 1), e.cov[1, 1] + position_noise(e, 1, 1)
+    s11 += e.gap_sd[1] * e.gap_sd[1]
     return first, (e.gap[1] - s01 / s00 * e.gap[0]) / math.sqrt(s11 - s01 * s01 / s00)
 
 
@@ -67,11 +75,13 @@ def _follow(e: Any) -> None:
     """gap <- R S^-1 gap, as the columns do at a row."""
     r00 = position_noise(e, 0, 0)
     s00 = e.cov[0, 0] + r00
+    e.gap_sd[0] *= r00 / s00
     if e.n_chambers == 1:
         e.gap[0] *= r00 / s00
         return
     r01, r11 = position_noise(e, 0, 1), position_noise(e, 1, 1)
     s01, s11 = e.cov[0, 1] + r01, e.cov[1, 1] + r11
+    e.gap_sd[1] *= r11 / s11
     det = s00 * s11 - s01 * s01
     g0, g1 = (s11 * e.gap[0] - s01 * e.gap[1]) / det, (s00 * e.gap[1] - s01 * e.gap[0]) / det
     e.gap[0], e.gap[1] = r00 * g0 + r01 * g1, r01 * g0 + r11 * g1

@@ -26,6 +26,8 @@ from rtid.kernels.layout import (
 
 FloatArray = NDArray[np.float64]
 
+HELD_MISFIT = 2e-3  # of an edge's scale: what six terms may miss of a flow, for the gate
+
 
 @inlined
 def shared_increments(e: Any, sample: FloatArray, dt: float) -> None:
@@ -133,7 +135,7 @@ def block_increments(
         _integrals(e, i, e.first + TERMS * k, dt)
         flow_noise(e, i, cells[block.cell].slope, cells[block.cell].missed, dt)
         if e.gate_sd > 0.0:
-            _subtract_held(e, cells[block.cell], i, dt)
+            _subtract_held(e, cells[block.cell], block, i, dt)
 
 
 @part
@@ -154,7 +156,7 @@ def lapped_increments(
         if at_home:
             flow_noise(e, i, cells[block.cell].slope, cells[block.cell].missed, dt)
         if e.gate_sd > 0.0:
-            _subtract_held(e, cells[block.cell], i, dt)
+            _subtract_held(e, cells[block.cell], block, i, dt)
 
 
 @inlined
@@ -192,15 +194,22 @@ def _integrals(e: Any, i: int, first: int, dt: float) -> None:
 
 
 @part
-def _subtract_held(e: Any, cell: Any, i: int, dt: float) -> None:
-    """Take the flow of the map held from the gap; where it knows nothing, judge nothing."""
+def _subtract_held(e: Any, cell: Any, block: Any, i: int, dt: float) -> None:
+    """Take the flow of the map held from the gap; where it knows nothing, judge nothing.
+
+    Its own error stays the same during a visit: the deviations of the intervals add up.
+    """
     if cell.known == 0:
         e.blind = 1
-    q = 0.0
+    q, variance = 0.0, HELD_MISFIT * HELD_MISFIT
     for j in range(TERMS):
         q += e.phi[j] * cell.held[j]
+        for k in range(TERMS):
+            variance += e.phi[j] * block.held_cov[j, k] * e.phi[k]
+    flow = e.scale_m3s[i] * dt
     for c in range(e.n_chambers):
-        e.gap[c] -= e.sign[i, c] * e.scale_m3s[i] * dt * q
+        e.gap[c] -= e.sign[i, c] * flow * q
+        e.gap_sd[c] += abs(e.sign[i, c]) * flow * math.sqrt(max(0.0, variance))
 
 
 @inlined

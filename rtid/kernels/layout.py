@@ -19,11 +19,11 @@ MAX_EDGES = 8
 MAX_BORDERS = 129
 MAX_SIGNALS = 24
 MAX_SHARED = 24
-MAX_OPEN = 16  # two edges per chamber, four windows of the lapped basis each
+MAX_OPEN = 20  # five edges, four windows of the lapped basis each
 TERMS = 6  # Taylor terms of one block, eq. (6)
 MAX_STATE = 4  # length of a column's state: chambers (integral form), 2 x chambers (carry form)
 # 1 + MAX_SHARED + MAX_OPEN * TERMS + MAX_STATE, and so much more that rows share no cache set.
-MAX_LOCAL = 132
+MAX_LOCAL = 152
 MAX_RECENT = 64  # blocks that are open or still ring
 
 NOTHING = MAX_SIGNALS  # the column of a signal that is not there: always zero
@@ -129,6 +129,7 @@ ENGINE = np.dtype(
         ("gauss_decay", _F, (2,)),  # of the lag, at the two Gauss points of the step
         ("ready_s", _F),  # nothing starts before
         ("gap", _F, (MAX_CHAMBERS,)),  # y less the map held: the whitener's state of the innovation
+        ("gap_sd", _F, (MAX_CHAMBERS,)),  # standard deviation of the gap from the map held's own
         ("blind", _I),  # the map held does not know the open block
         ("refused", _I),  # innovations refused in a row
         ("break_due", _I),  # the next sample begins anew
@@ -202,6 +203,7 @@ BLOCK = np.dtype(
         ("phi_sum", _F, (TERMS,)),  # integral of the Taylor terms over the time spent in the block
         ("surprise", _F),  # sum of squared innovations of the map held, per chamber and row
         ("judged", _F),  # number of those innovations
+        ("held_cov", _F, (TERMS, TERMS)),  # covariance of the terms of the map held
         ("gram", _F, (TERMS, TERMS)),
         ("shared", _F, (TERMS, 1 + MAX_SHARED)),  # products with y and the shared columns
     ],

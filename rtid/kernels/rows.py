@@ -26,7 +26,7 @@ from rtid.kernels.local import add_products
 def start_whitener(e: Any) -> None:
     """The first position is known as well as it was measured: P = R."""
     for c in range(e.n_chambers):
-        e.gap[c] = 0.0
+        e.gap[c], e.gap_sd[c] = 0.0, 0.0
         for k in range(3):
             e.echo[c, k] = 0.0
     for a in range(e.n_chambers):

@@ -63,6 +63,7 @@ def build_model(sections: Sections, catalog: Catalog | None) -> Model:
         upkeep=_upkeep(sections),
         mode=next((signal.name for signal in signals if signal.kind == "mode"), NONE),
         form=sections.estimator.form,
+        recent_blocks=sections.estimator.recent_blocks,
         pressure_period_s=_pressure_period_s(sections, catalog),
     )
 

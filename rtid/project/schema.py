@@ -269,6 +269,7 @@ class EstimatorSection(Section):
     """[estimator]: which exact form of the regression."""
 
     form: Literal["integral", "carry", "restart"] = "integral"
+    recent_blocks: int = Field(default=64, ge=2, le=64)
 
 
 class RecordSection(Section):

@@ -57,7 +57,6 @@ def test_the_same_standstill_in_other_libraries(way: str) -> None:
 
 
 @pytest.mark.campaign
-@pytest.mark.xfail(reason="see the figures in tests.estimator.test_hard_cases", strict=False)
 @pytest.mark.parametrize("motion", ["rich", "sweep"])
 def test_corner_of_the_dead_band(motion: str) -> None:
     found = fits(range(FIRST_SEED, FIRST_SEED + 40), motion)

@@ -46,7 +46,7 @@ def pieces(
         yield at_s + PIECE_S, chunk
 
 
-def test_points(plant: Plant, model: Model, duration_s: float = 60.0) -> list[FloatArray]:
+def points_of(plant: Plant, model: Model, duration_s: float = 60.0) -> list[FloatArray]:
     """Per edge: opening, pressure drop and true flow (n, 3) along a record of its own."""
     run = simulate(plant, rich, 9999, duration_s)
     value = {name: run.truth.signals[:, k] for k, name in enumerate(run.samples.names)}

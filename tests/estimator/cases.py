@@ -108,7 +108,11 @@ def draw_model(
     """A declaration with grids of unequal spacing."""
     sizes = rng.uniform(0.7, 1.3, 4)
     ends = ENDS if chambers == 2 else ENDS[:2]
-    pressures = [Signal(name, PRESSURE, "Pa", 5e3 * sizes[0], 150.0) for name in NAMES[1:5]]
+    noise = 5e3 * sizes[0]
+    limits = {"p_s": (0.0, np.inf)}  # entrained air needs a pressure that is never zero
+    pressures = [
+        Signal(name, PRESSURE, "Pa", noise, 150.0, *limits.get(name, ())) for name in NAMES[1:5]
+    ]
     both = (
         Chamber("a", "p_a", 2e-3 * sizes[1], way, 6e-4),
         Chamber("b", "p_b", 1e-3 * sizes[2], -way, 9e-4),

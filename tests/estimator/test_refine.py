@@ -1,0 +1,49 @@
+"""Grid refinement: a coarse grid at the corner of the dead band becomes as fine as it must be."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rtid.estimator.estimator import to_chunk
+from rtid.estimator.record import fit_record
+from rtid.estimator.refine import refine
+from rtid.model import FloatArray, Grid, Model
+from rtid.sim.declare import declared_model, default_grid
+from rtid.sim.plant import Plant
+from rtid.sim.random_plants import draw
+from rtid.sim.run import simulate
+
+
+def machine(seed: int, coarse: bool) -> tuple[Plant, Model, FloatArray]:
+    """A random plant on the default grid, or with one block up to 4 V."""
+    plant = draw(seed)
+    grid = default_grid(1.25 * plant.p_supply_pa)
+    if coarse:
+        borders = np.concatenate([grid.u_v[:1], grid.u_v[grid.u_v >= 4.0]])
+        grid = Grid(borders, grid.dp_pa)
+    model = declared_model(plant, seed=seed, grid=grid)
+    return plant, model, to_chunk(model, simulate(plant, "rich", seed, 30.0).samples, 0)
+
+
+@pytest.mark.parametrize("seed", [4, 7])
+def test_a_coarse_grid_is_refined_where_the_dead_band_ends(seed: int) -> None:
+    plant, model, chunk = machine(seed, coarse=True)
+    before = fit_record(model, chunk)
+    finer, fit = refine(model, chunk)
+    error = np.abs(fit.solution.beta_pa / plant.beta_pa - 1)
+    print(f"rho {before.solution.rho:.2f} -> {fit.solution.rho:.3f}, beta off by {error.max():.2%}")
+    added = [
+        np.setdiff1d(new.grid.u_v, old.grid.u_v)
+        for old, new in zip(model.edges, finer.edges, strict=True)
+    ]
+    assert all(len(a) >= 1 and (a < 4.5).all() for a in added)
+    assert fit.solution.rho < 1.1
+    assert not fit.weights.missed.any() or fit.weights.missed.sum() < before.weights.missed.sum()
+    assert error.max() < 0.005
+
+
+def test_a_grid_that_is_fine_enough_stays() -> None:
+    _, model, chunk = machine(5, coarse=False)
+    finer, _ = refine(model, chunk)
+    assert finer.n_cells <= 1.1 * model.n_cells
