@@ -130,6 +130,7 @@ class Estimator:
         cells, cov = solution.cells[valid], solution.cell_cov[valid]
         self.state.hold(cells, theta[valid], cov, compliance, terms)
         engine["gate_sd"] = self.model.upkeep.innovation_sd
+        engine["admits_all"] = 0
         engine["gate_rows"] = self.model.upkeep.innovation_rows
 
     @property

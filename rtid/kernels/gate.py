@@ -5,7 +5,7 @@ own error beside the noise, it has unit variance at most.  A refused row is as i
 not been measured, so that one outlier costs one row.  At a change of block the gap begins at zero,
 so that each block answers for itself, but not while rows are being refused: what is wrong then has
 to show that it lasts.  When rows are refused for long, the plant or a sensor's zero has changed:
-all memory ends, and the gate is open until another map is held.
+all memory ends, and the gate admits everything until another map is held, but goes on to judge.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ def admitted(e: Any, blocks: Any) -> bool:
     first, second = _innovations(e)
     limit = e.gate_sd * e.gate_sd
     _judge(e, blocks, min(first * first, limit) + min(second * second, limit))
-    if max(abs(first), abs(second)) > e.gate_sd:
+    if max(abs(first), abs(second)) > e.gate_sd and e.admits_all == 0:
         e.counters[OUTLIER] += 1
         e.refused += 1
         if e.refused >= e.gate_rows:
             e.counters[REOPENED] += 1
-            e.gate_sd, e.refused, e.break_due = 0.0, 0, 1
+            e.admits_all, e.refused, e.break_due = 1, 0, 1
         return False
     e.refused = 0
     _follow(e)

@@ -131,6 +131,7 @@ ENGINE = np.dtype(
         ("gap", _F, (MAX_CHAMBERS,)),  # y less the map held: the whitener's state of the innovation
         ("gap_sd", _F, (MAX_CHAMBERS,)),  # standard deviation of the gap from the map held's own
         ("blind", _I),  # the map held does not know the open block
+        ("admits_all", _I),  # the gate only judges, until another map is held
         ("refused", _I),  # innovations refused in a row
         ("break_due", _I),  # the next sample begins anew
         ("filter_a", _F, (2, 2)),
