@@ -61,7 +61,7 @@ def ratios(seed: int, n: int = 3000) -> dict[str, tuple[float, float]]:
     model = replace(declared_model(plant, seed=seed, grid=GRID), lag=Lag(plant.lag_s, 0.0))
     samples = run.samples
     chunk = np.column_stack([samples.t_us * 1e-6, samples.flags, samples.values])
-    # Generalised least squares believes the model; excusing blocks that miss the flow costs variance.
+    # least squares believes the model: to excuse blocks that miss the flow costs variance
     found = replace(fit_record(model, chunk).weights, missed=np.zeros(0))
     problem = pose(model, plant, run, n)
     best = least_covariance(problem)
