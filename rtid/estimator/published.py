@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from rtid.estimator.blocks import VALID as BLOCK_VALID
 from rtid.estimator.blocks import Block
 from rtid.estimator.cells import mean_square, projection, quadrature, terms
+from rtid.estimator.factor import PRIOR_SD
 from rtid.estimator.flowmap import EXTRAPOLATED, LEARNING, PRIOR, SHUT, VALID, EdgeMap, FlowMap
 from rtid.estimator.monotone import monotone
 from rtid.estimator.orifice import GainData, OrificeLaw, fit_law, root
@@ -46,9 +47,26 @@ def publish(
     return FlowMap(
         tuple(
             _publish_edge(e, b, before.get(e.name), prior_sd)
+            if e.source or e.sink
+            else _without_pressures(e, b)
             for e, b in zip(edges, of, strict=True)
         )
     )
+
+
+def _without_pressures(edge: Edge, blocks: list[Block]) -> EdgeMap:
+    """No orifice: each cell says what it has learned, and nothing of its neighbours."""
+    shape = edge.grid.shape
+    theta = np.zeros((*shape, TERMS))
+    cov = np.broadcast_to(
+        (PRIOR_SD * edge.rated_q_m3s) ** 2 * np.eye(TERMS), (*shape, TERMS, TERMS)
+    )
+    cov, status = cov.copy(), np.full(shape, PRIOR, dtype="<U12")
+    for b in blocks:
+        theta[b.i, b.j], cov[b.i, b.j] = b.theta, b.cov
+        status[b.i, b.j] = VALID if b.status == BLOCK_VALID else LEARNING
+    reason = {(b.i, b.j): b.reason for b in blocks if b.reason}
+    return EdgeMap(edge.name, edge.grid, edge.safe_band_v, theta, cov, status, reason)
 
 
 def _publish_edge(
