@@ -21,14 +21,15 @@ from rtid.kernels.rows import position_noise
 @part
 def admitted(e: Any, blocks: Any) -> bool:
     """Judge the coming row, follow the gap through it; False when it is refused."""
-    if e.blind != 0:  # what the unknown block added to the gap must not be judged later
-        e.blind = 0
+    blind, e.blind = e.blind != 0, 0
+    if blind and e.refused == 0:  # what the unknown block adds to the gap must not be judged later
         forgive(e)
         return True
     first, second = _innovations(e)
-    limit = e.gate_sd * e.gate_sd
-    _judge(e, blocks, min(first * first, limit) + min(second * second, limit))
-    if max(abs(first), abs(second)) > e.gate_sd and e.admits_all == 0:
+    if not blind:
+        limit = e.gate_sd * e.gate_sd
+        _judge(e, blocks, min(first * first, limit) + min(second * second, limit))
+    if (blind or max(abs(first), abs(second)) > e.gate_sd) and e.admits_all == 0:
         e.counters[OUTLIER] += 1
         e.refused += 1
         if e.refused >= e.gate_rows:

@@ -26,7 +26,7 @@ from rtid.kernels.layout import (
 
 FloatArray = NDArray[np.float64]
 
-HELD_MISFIT = 2e-3  # of an edge's scale: what six terms may miss of a flow, for the gate
+HELD_MISFIT = 5e-4  # of an edge's scale: what six terms miss of a flow at the borders of a block
 
 
 @inlined

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from firmware_bridge.samples import GAP as GAP_FLAG
+from firmware_bridge.samples import ROW as ROW_FLAG
 from rtid.estimator.blocks import VALID, Block
 from rtid.estimator.estimator import Estimator, to_chunk
 from rtid.model import (
@@ -155,7 +157,7 @@ def test_single_outliers_are_refused_and_cost_little(column: int, size: float) -
     cost = (more_rows - rows) / len(at)
     drift = np.abs(errors(est)).max()
     print(f"{len(at)} outliers: {cost:.2f} rows each, drift {drift:.1e}, rows refused clean {rows}")
-    assert 0.85 <= cost <= 3.0
+    assert 0.9 <= cost <= 3.0
     assert drift < 1e-3
     assert est.counters["samples"] == plain.counters["samples"]
 
@@ -173,18 +175,35 @@ def test_an_outlier_just_before_a_change_of_block_costs_little() -> None:
     assert max(c[1] for c in costs) == 0
 
 
-def test_a_sensor_whose_zero_jumps_does_not_spoil_the_map() -> None:
+def after_a_jump(announced: bool) -> tuple[Estimator, float]:
+    """An estimator that saw its position's zero jump by 5 mm, and its error 9.5 s later."""
     jumped = exact_record(90_000)[: LEARNED + 20_000].copy()
     jumped[LEARNED + 10_000 :, X] += 5e-3
+    if announced:
+        jumped[LEARNED + 10_000, 1] = ROW_FLAG + GAP_FLAG
     est = gated()
     est.advance(jumped[LEARNED:-500])
-    drift = np.abs(errors(est)).max()
-    print(f"5 mm: drift {drift:.1e}, {est.counters['reopened']} re-opened")
+    drift = float(np.abs(errors(est)).max())
     before = est.counters["rows"]
     est.advance(jumped[-500:])
-    assert est.counters["reopened"] >= 1
     assert est.counters["rows"] - before > 450
-    assert drift < 2e-3
+    return est, drift
+
+
+def test_a_sensor_whose_zero_jumps_is_as_if_the_jump_had_been_announced() -> None:
+    est, drift = after_a_jump(announced=False)
+    _, told = after_a_jump(announced=True)
+    print(f"5 mm: drift {drift:.1e}, announced {told:.1e}, {est.counters['reopened']} re-opened")
+    assert est.counters["reopened"] >= 1
+    assert drift < 1.05 * told
+
+
+@pytest.mark.xfail(
+    strict=True,
+    reason="1.3e-3, and 1.3e-3 where the jump is announced: 5 mm make V(x) wrong by 1.6 %",
+)
+def test_a_sensor_whose_zero_jumps_does_not_spoil_the_map() -> None:
+    assert after_a_jump(announced=False)[1] < 1e-3
 
 
 @pytest.mark.parametrize("plant", ["exact", "simulated"])
@@ -213,10 +232,8 @@ def stepped(upkeep: Upkeep) -> Estimator:
 
 
 def again_wrong(blocks: list[Block]) -> list[float]:
-    """Errors of mean flows after a step of 5 %, shares of the largest flow."""
-    true = [1.05 * true_mean(b) for b in blocks]
-    largest = max(abs(q) for q in true)
-    return [abs(b.mean_flow_m3s - q) / largest for b, q in zip(blocks, true, strict=True)]
+    """Errors of mean flows after a step of 5 %, each as a share of its own flow."""
+    return [abs(b.mean_flow_m3s / (1.05 * true_mean(b)) - 1) for b in blocks]
 
 
 def test_a_step_of_the_gain_is_learned_again_where_it_is_visited() -> None:
