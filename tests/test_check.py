@@ -137,7 +137,7 @@ def test_wrong_noise_is_a_warning_with_the_right_figure(folder: Path) -> None:
     report = judged(folder, quiet)
     (found,) = [f for f in report.findings if f.subject == "p_a"]
     figure = re.search(r"noise is (\S+) Pa", found.text)
-    assert report.ok and figure and float(figure[1]) == pytest.approx(5e3, rel=0.05)
+    assert report.ok and figure and float(figure[1]) == pytest.approx(5e3, rel=0.015)
 
 
 def test_grid_that_misses_the_motion_is_named(folder: Path) -> None:

@@ -180,10 +180,14 @@ def _divided(t_s: FloatArray, values: FloatArray, order: int) -> FloatArray:
 
 
 def _settled(floors: list[_Floor]) -> tuple[float, float, int]:
-    """The lowest order from which on the floor no longer falls, and what is left of the fall."""
+    """The lowest order from which on the floor no longer falls, and what is left of the fall.
+
+    The orders see the same noise: their difference scatters by the difference of the variances.
+    """
     lowest = min(floors, key=lambda f: f.sd)
     for f in floors:
-        if f.sd <= lowest.sd * (1.0 + 2.0 * np.hypot(f.relative_sd, lowest.relative_sd)):
+        apart = np.sqrt(max(0.0, lowest.relative_sd**2 - f.relative_sd**2))
+        if f.sd <= lowest.sd * (1.0 + 2.0 * apart):
             break
     fall = 1.0 - lowest.sd / f.sd if f.sd > 0 else 0.0
     return f.sd, float(np.hypot(f.relative_sd, fall)), f.samples
