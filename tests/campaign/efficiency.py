@@ -61,14 +61,15 @@ def ratios(seed: int, n: int = 3000) -> dict[str, tuple[float, float]]:
     model = replace(declared_model(plant, seed=seed, grid=GRID), lag=Lag(plant.lag_s, 0.0))
     samples = run.samples
     chunk = np.column_stack([samples.t_us * 1e-6, samples.flags, samples.values])
-    # least squares believes the model: to excuse blocks that miss the flow costs variance
-    found = replace(fit_record(model, chunk).weights, missed=np.zeros(0))
+    found = fit_record(model, chunk).weights
+    believed = replace(found, missed=np.zeros(0))
     problem = pose(model, plant, run, n)
     best = least_covariance(problem)
     known = np.einsum("vi,ij,vj->v", problem.values, best, problem.values) < KNOWN**2
     out = {}
     forms: dict[str, Callable[[FloatArray], FloatArray]] = {
         "record": lambda z: whitened(problem, found, z),
+        "believed": lambda z: whitened(problem, believed, z),
         "live": lambda z: whitened(problem, nominal_weights(model), z),
         "windows": lambda z: windowed(problem, z),
         "carry": lambda z: filtered(problem, z),

@@ -10,17 +10,36 @@ from tests.campaign.report import leave
 
 NAMES = {
     "record": ("record path (refined weights)", "1.3", 1.3),
+    "believed": ("record path, no block excused for missing the flow", "1.3", 1.3),
     "live": ("live path (nominal weights)", "2", 2.0),
     "windows": ("plain integral rows, windows of 1.5 s", "", np.inf),
     "carry": ("carry form, 50 rows/s", "", np.inf),
 }
 
 
-def test_one_plant() -> None:
-    found = ratios(0, 1500)
-    for form, (_, _, limit) in NAMES.items():
-        assert min(found[form]) > 0.999, "nothing beats generalised least squares"
-        assert max(found[form]) <= limit
+@pytest.fixture(scope="module")
+def one_plant() -> dict[str, tuple[float, float]]:
+    return ratios(0, 1500)
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        pytest.param(
+            "record",
+            marks=pytest.mark.xfail(
+                strict=True,
+                reason="1.44 on this plant: its coarse grid misses the flow in 6 of 64 blocks, and "
+                "to excuse them costs variance that generalised least squares, which believes "
+                "the model, does not pay; median over plants by campaign",
+            ),
+        ),
+        *(form for form in NAMES if form != "record"),
+    ],
+)
+def test_one_plant(one_plant: dict[str, tuple[float, float]], form: str) -> None:
+    assert min(one_plant[form]) > 0.999, "nothing beats generalised least squares"
+    assert max(one_plant[form]) <= NAMES[form][2]
 
 
 @pytest.mark.campaign

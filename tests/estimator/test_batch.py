@@ -36,8 +36,9 @@ def differences(case: Case) -> dict[str, float]:
     """Largest differences of the sums, each column in units of its own size, and what happened."""
     batch = batch_of(case)
     normal, state = accumulated(case)
-    # a block that no row saw has rounding alone: no smaller unit than 1e-6 of the largest column
-    size = np.sqrt(np.maximum(np.diag(batch.gram), 1e-12 * np.diag(batch.gram).max()))
+    diagonal = np.diag(batch.gram)
+    # each column in its own size; one that no row saw is rounding, measured in 1e-6 of the largest
+    size = np.sqrt(np.where(diagonal > 0, diagonal, 1e-12 * diagonal.max()))
     counters = state.engine[0]["counters"]
     return {
         "gram": float(np.abs((normal.gram - batch.gram) / np.outer(size, size)).max()),

@@ -30,7 +30,7 @@ def difference(a: Sums, b: Sums) -> float:
     """Largest difference of the products, each column in units of its own size."""
     one, other = by_cell(a), by_cell(b)
     diagonal = np.diag(one.gram)
-    size = np.sqrt(np.maximum(diagonal, 1e-12 * diagonal.max()))
+    size = np.sqrt(np.where(diagonal > 0, diagonal, 1e-12 * diagonal.max()))
     return max(
         float(np.abs((one.gram - other.gram) / np.outer(size, size)).max()),
         float(np.abs((one.right - other.right) / size).max() / np.sqrt(one.square)),
