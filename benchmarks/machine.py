@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from firmware_bridge.samples import Samples
 from rtid.estimator.state import State, build
-from rtid.kernels import engine as kernel
+from rtid.kernels import tables
 from rtid.model import Grid, Model
 from rtid.sim.declare import declared_model, uniform_grid
 from rtid.sim.plant import Plant
@@ -73,7 +73,7 @@ def empty(of: Model, shared: int | None = None) -> State:
     state = build(of)
     if shared is not None:
         state.engine[0]["n_shared"] = shared
-        kernel.clear(state.engine, state.cells)
+        tables.clear(state.engine, state.cells)
     return state
 
 

@@ -26,6 +26,7 @@ COMMAND, PRESSURE, POSITION, VELOCITY = "command", "pressure", "position", "velo
 MODE = "mode"  # kind of the signal that carries the number of the working mode
 TAYLOR, LAPPED, BLENDED = BASES = "taylor", "lapped", "blended"
 BOTH, COMMAND_ONLY, DROP_ONLY = "both", "command", "drop"
+MOST_MODE = 62  # a set of modes is kept as bits of one integer
 NONE = ""  # in place of a signal's name: a quantity that is always zero
 
 
@@ -214,6 +215,12 @@ class Model:
     def n_cells(self) -> int:
         """Number of blocks of all grids."""
         return sum(edge.grid.shape[0] * edge.grid.shape[1] for edge in self.edges)
+
+    @property
+    def first_cells(self) -> tuple[int, ...]:
+        """Number of each edge's first block among the blocks of all grids."""
+        sizes = [edge.grid.shape[0] * edge.grid.shape[1] for edge in self.edges]
+        return tuple(sum(sizes[:i]) for i in range(len(sizes)))
 
     @property
     def with_taylor_maps(self) -> Model:

@@ -81,7 +81,7 @@ def read_blocks(
     theta (n,) and cov (n, n) in Taylor terms, gram (n, n): information of the rows.
     """
     largest, means = largest_flows(model, sums, theta), mean_phi(sums.blocks)
-    first = first_cells(model)
+    first = model.first_cells
     for place, record in enumerate(sums.blocks):
         at = sums.n_shared + TERMS * place
         own, edge = slice(at, at + TERMS), int(record["edge"])
@@ -107,12 +107,6 @@ def read_blocks(
             reason,
             _progress(model.gates, int(record["rows"]), condition, sd_share),
         )
-
-
-def first_cells(model: Model) -> list[int]:
-    """Number of the first grid cell of each edge."""
-    sizes = [edge.grid.shape[0] * edge.grid.shape[1] for edge in model.edges]
-    return [sum(sizes[:i]) for i in range(len(sizes))]
 
 
 def _condition(gram: FloatArray) -> float:

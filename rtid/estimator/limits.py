@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from rtid.kernels import layout
-from rtid.model import COMMAND_ONLY, DROP_ONLY, TAYLOR, Edge, Model
-
-MOST_MODE = 62  # a set of modes is kept as bits of one integer
+from rtid.model import COMMAND_ONLY, DROP_ONLY, MOST_MODE, TAYLOR, Edge, Model
 
 
 def refuse_unfit(model: Model) -> None:

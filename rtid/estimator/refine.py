@@ -64,15 +64,14 @@ def excesses(model: Model, left: Residual) -> list[Excess]:
     """Where the innovations of a fit exceed the noise, per edge."""
     square = (left.innovation**2).mean(axis=1) - 1.0
     known = np.isfinite(square)
-    found, first = [], 0
-    for i, edge in enumerate(model.edges):
+    found = []
+    for i, (edge, first) in enumerate(zip(model.edges, model.first_cells, strict=True)):
         size = edge.grid.shape[0] * edge.grid.shape[1]
         own = left.cells[known, i] - first
         here = (own >= 0) & (own < size)
         rows = np.bincount(own[here], minlength=size).astype(np.float64)
         total = np.bincount(own[here], square[known][here], size).astype(np.float64)
         found.append(Excess(rows.reshape(edge.grid.shape), total.reshape(edge.grid.shape)))
-        first += size
     return found
 
 

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from rtid.estimator.blocks import Block, mean_flows, read_blocks
 from rtid.estimator.correction import correct, leverage_of
 from rtid.estimator.factor import PRIOR_SD, factorize, misfit, one_thread
-from rtid.estimator.lapped import overlaps, to_taylor
 from rtid.estimator.state import State
 from rtid.estimator.sums import Sums, sums_of
+from rtid.estimator.windowed import overlaps, to_taylor
 from rtid.kernels.layout import TERMS
 from rtid.model import FloatArray, Model
 

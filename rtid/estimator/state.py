@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rtid.estimator.limits import most_open, refuse_unfit
 from rtid.kernels import engine as kernel
-from rtid.kernels import layout
+from rtid.kernels import layout, tables
 from rtid.kernels.recent import move_pairs
 from rtid.model import BASES, BOTH, COMMAND_ONLY, DROP_ONLY, SHAPES, Edge, FloatArray, Model
 
@@ -83,7 +83,7 @@ class State:
 
     def settle(self) -> None:
         """Bring all sums up to date, in place."""
-        while not kernel.settle(self.engine, self.closed, self.blocks, self.pairs):
+        while not tables.settle(self.engine, self.closed, self.blocks, self.pairs):
             self.make_room()
 
     def settled(self) -> State:
@@ -114,7 +114,7 @@ class State:
 
     def clear_sums(self) -> None:
         """Empty the sums of a settled state; it goes on with its memory of recent columns."""
-        kernel.clear_sums(self.engine, self.blocks, self.pairs)
+        tables.clear_sums(self.engine, self.blocks, self.pairs)
 
     def copy(self) -> State:
         """An independent copy that continues bit for bit like this one."""
@@ -167,7 +167,7 @@ def build(model: Model, weights: Weights | None = None) -> State:
     _configure(engine[0], model)
     engine[0]["compliance"][: len(model.chambers)] = weights.compliance
     engine[0]["lag_s"] = weights.lag_s
-    kernel.clear(engine, cells)
+    tables.clear(engine, cells)
     return State(
         engine,
         cells,

@@ -67,7 +67,7 @@ OVERLAP = 0.5  # half the overlap at a border, in widths of the narrower neighbo
 
 @inlined
 def locate_pair(border: FloatArray, n: int, value: float) -> tuple[int, int]:
-    """(First of the two lapped blocks that share value, the block that holds it); -1 outside."""
+    """(First of the two blocks whose windows share value, the block that holds it); -1 outside."""
     home = locate(border, n, value)
     if home < 0:
         return -1, -1
@@ -84,7 +84,7 @@ def _rise(t: float) -> float:
 
 
 @part
-def lapped_axis(
+def window_axis(
     border: FloatArray, n: int, i: int, value: float, basis: int, out: FloatArray
 ) -> None:
     """Window i times its three functions at one value; out (3,) is changed in place.
@@ -112,7 +112,7 @@ def lapped_axis(
 
 
 @inlined
-def lapped(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
+def window_terms(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
     """Products of the two axes' functions up to total order two, in the order of `taylor`."""
     out[0] = a[0] * b[0]
     out[1] = a[1] * b[0]
@@ -123,7 +123,7 @@ def lapped(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
 
 
 @kernel
-def lapped_at(
+def window_terms_at(
     basis: int,
     u: FloatArray,
     dp: FloatArray,
@@ -132,12 +132,12 @@ def lapped_at(
     points: FloatArray,
     out: FloatArray,
 ) -> None:
-    """The six lapped terms of block (i, j) at points (n, 2) = [w, dp]; out (n, 6) is changed.
+    """The six windowed terms of block (i, j) at points (n, 2) = [w, dp]; out (n, 6) is changed.
 
     u (nu + 1,), dp (nd + 1,): the borders of the grid.
     """
     a, b = np.empty(3), np.empty(3)
     for k in range(len(points)):
-        lapped_axis(u, len(u) - 1, i, points[k, 0], basis, a)
-        lapped_axis(dp, len(dp) - 1, j, points[k, 1], basis, b)
-        lapped(a, b, out[k])
+        window_axis(u, len(u) - 1, i, points[k, 0], basis, a)
+        window_axis(dp, len(dp) - 1, j, points[k, 1], basis, b)
+        window_terms(a, b, out[k])

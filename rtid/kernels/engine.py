@@ -20,9 +20,9 @@ from rtid.kernels.gate import admitted, forgive
 from rtid.kernels.holds import GAUSS, lagged_moments, second_order
 from rtid.kernels.increments import (
     block_increments,
-    lapped_increments,
     shared_increments,
     term_increments,
+    windowed_increments,
 )
 from rtid.kernels.information import (
     RING_DET_LIMIT,
@@ -37,9 +37,7 @@ from rtid.kernels.layout import (
     CELL,
     CLOSED,
     ENGINE,
-    FREE,
     INTEGRAL,
-    MAX_EDGES,
     NOT_FINITE,
     OUT_OF_RANGE,
     OUTSIDE_GRID,
@@ -50,10 +48,9 @@ from rtid.kernels.layout import (
     RESTART_MEMORY,
     SAMPLES,
     TAYLOR,
-    TERMS,
 )
-from rtid.kernels.local import remove_open, set_open
-from rtid.kernels.recent import hand_over, release
+from rtid.kernels.local import remove_open
+from rtid.kernels.recent import release
 from rtid.kernels.rows import (
     carry_row,
     carry_step,
@@ -236,7 +233,7 @@ def _integrate(
         term_increments(e, sample, dt)
     for k in range(e.n_open):
         if e.map_basis[e.open_edge[k]] != TAYLOR:
-            lapped_increments(e, cells, blocks, k, sample[0], dt, row)
+            windowed_increments(e, cells, blocks, k, sample[0], dt, row)
         else:
             block_increments(e, cells, blocks, k, sample[0], dt, row)
     if e.form != INTEGRAL:
@@ -306,7 +303,7 @@ def _change_blocks(e: Any, cells: Any, closed: Any, blocks: Any) -> None:
         for i in range(e.n_edges):
             if (e.target[i, 0] != SHUT) == (opening == 1) and _moved(e, i):
                 if e.map_basis[i] != TAYLOR:
-                    _change_lapped(e, cells, closed, blocks, i)
+                    _change_windows(e, cells, closed, blocks, i)
                 else:
                     _change(e, cells, closed, blocks, i)
     if e.refused == 0:
@@ -336,7 +333,7 @@ def _change(e: Any, cells: Any, closed: Any, blocks: Any, i: int) -> None:
 
 
 @part
-def _change_lapped(e: Any, cells: Any, closed: Any, blocks: Any, i: int) -> None:
+def _change_windows(e: Any, cells: Any, closed: Any, blocks: Any, i: int) -> None:
     """The same for the windows that share a point: up to two by two from the cell on."""
     e.counters[BLOCK_CHANGES] += 1
     u, p = e.target[i, 0], e.target[i, 1]
@@ -384,65 +381,3 @@ def _integral_step(e: Any, blocks: Any, row: bool) -> None:
             integral_row_two(e)
         else:
             integral_row_one(e)
-
-
-@kernel
-def settle(engine: Any, closed: Any, blocks: Any, pairs: Any) -> bool:
-    """Bring the tables up to date without ending the memory, so that they can be read.
-
-    False, and nothing is done, when they must be enlarged first.
-    """
-    e = engine[0]
-    if needs_room(e, blocks, pairs):
-        return False
-    if e.running:
-        rebase(e, closed, blocks, pairs, e.ring_floor)
-        for p in range(e.n_recent):
-            if closed[p].status != FREE:
-                hand_over(e, closed, blocks, pairs, p)
-    return True
-
-
-@kernel
-def clear_sums(engine: Any, blocks: Any, pairs: Any) -> None:
-    """Empty all sums of settled tables; slots and the memory of recent columns stay."""
-    e = engine[0]
-    e.rows, e.n_pairs = 0.0, 0
-    for i in range(1 + e.n_shared):
-        for j in range(1 + e.n_shared):
-            e.shared[i, j] = 0.0
-    for c in range(e.n_chambers):
-        e.noise_gram[c] = 0.0
-    for s in range(e.n_slots):
-        block = blocks[s]
-        block.rows, block.dwell_s, block.surprise, block.judged = 0, 0.0, 0.0, 0.0
-        for i in range(TERMS):
-            block.phi_sum[i] = 0.0
-            for j in range(TERMS):
-                block.gram[i, j] = 0.0
-            for j in range(1 + e.n_shared):
-                block.shared[i, j] = 0.0
-    for p in range(len(pairs)):
-        if pairs[p].key != 0:
-            pairs[p].key = 0
-            for i in range(TERMS):
-                for j in range(TERMS):
-                    pairs[p].gram[i, j] = 0.0
-
-
-@kernel
-def clear(engine: Any, cells: Any) -> None:
-    """Set the state of a zeroed record (not the configuration) to its beginning."""
-    e = engine[0]
-    e.running, e.break_due, e.n_slots, e.n_pairs = 0, 0, 0, 0
-    e.n_closed, e.n_recent, e.n_young = 0, 0, 0
-    e.ring, e.first = 1 + e.n_shared, 1 + e.n_shared + e.n_state
-    set_open(e, 0)
-    e.dt_s, e.ring_det, e.ready_s = 0.0, 1.0, -np.inf
-    for i in range(MAX_EDGES):
-        e.place[i] = -1
-        e.cell[i, 0], e.cell[i, 1] = SHUT, SHUT
-    for s in range(e.n_state):
-        e.d[s, e.ring + s] = 1.0
-    for c in range(len(cells)):
-        cells[c].slot = -1

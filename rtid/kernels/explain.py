@@ -24,10 +24,10 @@ from rtid.kernels.engine import (
     working_points,
 )
 from rtid.kernels.holds import second_order
-from rtid.kernels.increments import flow_noise, mean_lapped, mean_terms, term_rates
+from rtid.kernels.increments import flow_noise, mean_terms, mean_windowed, term_rates
 from rtid.kernels.jit import inlined, kernel, part
 from rtid.kernels.layout import TAYLOR, TERMS
-from rtid.kernels.rows import position_noise, start_whitener
+from rtid.kernels.rows import fade, innovations, start_whitener
 
 FloatArray = NDArray[np.float64]
 
@@ -55,7 +55,7 @@ def explain(
     innovation (n - 1, chambers): whitened, unit variance for a perfect model; NaN where no row.
     """
     e = engine[0]
-    gap = np.zeros(2)
+    gap, work = np.zeros(2), np.zeros((2, 2))
     for k in range(len(chunk)):
         for j in range(2 + e.n_signals):
             e.sample[j] = chunk[k, j]
@@ -74,7 +74,7 @@ def explain(
         if joined:
             remember(e, sample)
             if (flags & ROW_FLAG) != 0:
-                _innovate(e, gap, innovation[k - 1])
+                _innovate(e, gap, work, innovation[k - 1])
         else:
             e.running = 0
             gap[:] = 0.0
@@ -149,33 +149,30 @@ def _windowed(e: Any, theta: FloatArray, i: int) -> float:
     u, p, q = e.target[i, 0], e.target[i, 1], 0.0
     for a in range(u, min(u + 2, e.n_u[i])):
         for b in range(p, min(p + 2, e.n_dp[i])):
-            mean_lapped(e, i, a, b)
+            mean_windowed(e, i, a, b)
             for j in range(TERMS):
                 q += e.phi[j] * theta[e.first_cell[i] + a * e.n_dp[i] + b, j]
     return q
 
 
 @inlined
-def _innovate(e: Any, gap: FloatArray, out: FloatArray) -> None:
-    """Whitened innovation L^-1 gap, and the whitener's update (plain 2 x 2 algebra)."""
-    n, cov = e.n_chambers, e.cov
-    r00, s00 = position_noise(e, 0, 0), cov[0, 0] + position_noise(e, 0, 0)
-    out[0] = gap[0] / math.sqrt(s00)
-    if n == 1:
-        gap[0] *= r00 / s00
-        cov[0, 0] *= r00 / s00
-        return
-    r01, r11 = position_noise(e, 0, 1), position_noise(e, 1, 1)
-    s01, s11 = cov[0, 1] + r01, cov[1, 1] + r11
-    det = s00 * s11 - s01 * s01
-    out[1] = (gap[1] - s01 / s00 * gap[0]) / math.sqrt(det / s00)
-    k00, k01 = (r00 * s11 - r01 * s01) / det, (r01 * s00 - r00 * s01) / det
-    k10, k11 = (r01 * s11 - r11 * s01) / det, (r11 * s00 - r01 * s01) / det
-    gap[0], gap[1] = k00 * gap[0] + k01 * gap[1], k10 * gap[0] + k11 * gap[1]
-    p00, p01, p11 = cov[0, 0], cov[0, 1], cov[1, 1]
-    cov[0, 0], cov[1, 1] = k00 * p00 + k01 * p01, k10 * p01 + k11 * p11
-    cov[0, 1] = 0.5 * (k00 * p01 + k01 * p11 + k10 * p00 + k11 * p01)
-    cov[1, 0] = cov[0, 1]
+def _innovate(e: Any, gap: FloatArray, work: FloatArray, out: FloatArray) -> None:
+    """Whitened innovation L^-1 gap, and the whitener's update P <- R S^-1 P, column by column.
+
+    work (chambers, chambers) is scratch.
+    """
+    first, second = innovations(e, gap, 0.0, 0.0)
+    out[0] = first
+    if e.n_chambers == 2:
+        out[1] = second
+    fade(e, gap)
+    for c in range(e.n_chambers):
+        for k in range(e.n_chambers):
+            work[c, k] = e.cov[k, c]
+        fade(e, work[c])
+    for c in range(e.n_chambers):
+        for k in range(e.n_chambers):
+            e.cov[k, c] = 0.5 * (work[c, k] + work[k, c])
 
 
 @kernel

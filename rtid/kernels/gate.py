@@ -10,12 +10,11 @@ all memory ends, and the gate admits everything until another map is held, but g
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 from rtid.kernels.jit import inlined, part
 from rtid.kernels.layout import OUTLIER, REOPENED, TAYLOR
-from rtid.kernels.rows import position_noise
+from rtid.kernels.rows import fade, innovations, position_noise
 
 
 @part
@@ -25,7 +24,7 @@ def admitted(e: Any, blocks: Any) -> bool:
     if blind and e.refused == 0:  # what the unknown block adds to the gap must not be judged later
         forgive(e)
         return True
-    first, second = _innovations(e)
+    first, second = innovations(e, e.gap, e.gap_sd[0] ** 2, e.gap_sd[1] ** 2)
     if not blind:
         limit = e.gate_sd * e.gate_sd
         _judge(e, blocks, min(first * first, limit) + min(second * second, limit))
@@ -49,18 +48,6 @@ def forgive(e: Any) -> None:
 
 
 @inlined
-def _innovations(e: Any) -> tuple[float, float]:
-    """L^-1 gap with L L' = S plus the map's own variance; the second is 0 for one chamber."""
-    s00 = e.cov[0, 0] + position_noise(e, 0, 0) + e.gap_sd[0] * e.gap_sd[0]
-    first = e.gap[0] / math.sqrt(s00)
-    if e.n_chambers == 1:
-        return first, 0.0
-    s01, s11 = e.cov[0, 1] + position_noise(e, 0, 1), e.cov[1, 1] + position_noise(e, 1, 1)
-    s11 += e.gap_sd[1] * e.gap_sd[1]
-    return first, (e.gap[1] - s01 / s00 * e.gap[0]) / math.sqrt(s11 - s01 * s01 / s00)
-
-
-@inlined
 def _judge(e: Any, blocks: Any, square: float) -> None:
     """Note the surprise with the blocks that hold the working points."""
     for k in range(e.n_open):
@@ -73,16 +60,8 @@ def _judge(e: Any, blocks: Any, square: float) -> None:
 
 @inlined
 def _follow(e: Any) -> None:
-    """gap <- R S^-1 gap, as the columns do at a row."""
-    r00 = position_noise(e, 0, 0)
-    s00 = e.cov[0, 0] + r00
-    e.gap_sd[0] *= r00 / s00
-    if e.n_chambers == 1:
-        e.gap[0] *= r00 / s00
-        return
-    r01, r11 = position_noise(e, 0, 1), position_noise(e, 1, 1)
-    s01, s11 = e.cov[0, 1] + r01, e.cov[1, 1] + r11
-    e.gap_sd[1] *= r11 / s11
-    det = s00 * s11 - s01 * s01
-    g0, g1 = (s11 * e.gap[0] - s01 * e.gap[1]) / det, (s00 * e.gap[1] - s01 * e.gap[0]) / det
-    e.gap[0], e.gap[1] = r00 * g0 + r01 * g1, r01 * g0 + r11 * g1
+    """Let the gap fade as the columns do at a row, and the share that is the map's own error."""
+    for c in range(e.n_chambers):
+        r = position_noise(e, c, c)
+        e.gap_sd[c] *= r / (e.cov[c, c] + r)
+    fade(e, e.gap)

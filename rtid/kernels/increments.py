@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rtid.kernels.basis import lapped, lapped_axis
+from rtid.kernels.basis import window_axis, window_terms
 from rtid.kernels.holds import GAUSS
 from rtid.kernels.jit import inlined, part
 from rtid.kernels.layout import (
@@ -139,18 +139,18 @@ def block_increments(
 
 
 @part
-def lapped_increments(
+def windowed_increments(
     e: Any, cells: Any, blocks: Any, k: int, t: float, dt: float, row: bool
 ) -> None:
-    """The same for a block of the lapped basis; the visit counts for the block that is home."""
+    """The same for a block under a window; the visit counts for the block that is home."""
     i, iu, ip = e.open_edge[k], e.open_cell[k, 0], e.open_cell[k, 1]
     block, at_home = blocks[e.open_slot[k]], iu == e.home[i, 0] and ip == e.home[i, 1]
     if at_home:
         mean_terms(e, i, iu, ip)
         _visit(e, block, t, dt, row)
-    mean_lapped(e, i, iu, ip)
+    mean_windowed(e, i, iu, ip)
     if e.form != INTEGRAL:
-        _lapped_ends(e, i, e.first + TERMS * k)
+        _windowed_ends(e, i, e.first + TERMS * k)
     else:
         _integrals(e, i, e.first + TERMS * k, dt)
         if at_home:
@@ -160,15 +160,15 @@ def lapped_increments(
 
 
 @inlined
-def mean_lapped(e: Any, i: int, iu: int, ip: int) -> None:
-    """Means of the lapped terms over the interval, by two Gauss points, which stay in e.phi_at."""
+def mean_windowed(e: Any, i: int, iu: int, ip: int) -> None:
+    """Means of the windowed terms over the interval, by two Gauss points, kept in e.phi_at."""
     for g in range(2):
         at = 0.5 + (GAUSS if g == 1 else -GAUSS)
         w = e.held_v[i] + (e.start_v[i] - e.held_v[i]) * e.gauss_decay[g]
         dp = e.dp_pa[i, 0] + at * (e.dp_pa[i, 1] - e.dp_pa[i, 0])
-        lapped_axis(e.u_border[i], e.n_u[i], iu, w, e.map_basis[i], e.axis[0])
-        lapped_axis(e.dp_border[i], e.n_dp[i], ip, dp, e.map_basis[i], e.axis[1])
-        lapped(e.axis[0], e.axis[1], e.phi_at[g])
+        window_axis(e.u_border[i], e.n_u[i], iu, w, e.map_basis[i], e.axis[0])
+        window_axis(e.dp_border[i], e.n_dp[i], ip, dp, e.map_basis[i], e.axis[1])
+        window_terms(e.axis[0], e.axis[1], e.phi_at[g])
     for j in range(TERMS):
         e.phi[j] = 0.5 * (e.phi_at[0, j] + e.phi_at[1, j])
         if e.masked[i] != 0:
@@ -228,7 +228,7 @@ def _carry_ends(e: Any, i: int, first: int, eta0: float, eta1: float) -> None:
 
 
 @inlined
-def _lapped_ends(e: Any, i: int, first: int) -> None:
+def _windowed_ends(e: Any, i: int, first: int) -> None:
     """Start and end values of the straight line through the two Gauss points."""
     for c in range(e.n_chambers):
         scale = e.sign[i, c] * e.scale_m3s[i]

@@ -45,6 +45,32 @@ def position_noise(e: Any, a: int, b: int) -> float:
 
 
 @inlined
+def innovations(e: Any, gap: Any, more_a: float, more_b: float) -> tuple[float, float]:
+    """L^-1 gap (chambers,) of a column, L L' = S + diag(more); the second is 0 for one chamber."""
+    s00 = e.cov[0, 0] + position_noise(e, 0, 0) + more_a
+    first = gap[0] / math.sqrt(s00)
+    if e.n_chambers == 1:
+        return first, 0.0
+    s01, s11 = e.cov[0, 1] + position_noise(e, 0, 1), e.cov[1, 1] + position_noise(e, 1, 1) + more_b
+    return first, (gap[1] - s01 / s00 * gap[0]) / math.sqrt(s11 - s01 * s01 / s00)
+
+
+@inlined
+def fade(e: Any, gap: Any) -> None:
+    """gap <- R S^-1 gap (chambers,) of one column at a row, in place."""
+    r00 = position_noise(e, 0, 0)
+    s00 = e.cov[0, 0] + r00
+    if e.n_chambers == 1:
+        gap[0] *= r00 / s00
+        return
+    r01, r11 = position_noise(e, 0, 1), position_noise(e, 1, 1)
+    s01, s11 = e.cov[0, 1] + r01, e.cov[1, 1] + r11
+    det = s00 * s11 - s01 * s01
+    g0, g1 = (s11 * gap[0] - s01 * gap[1]) / det, (s00 * gap[1] - s01 * gap[0]) / det
+    gap[0], gap[1] = r00 * g0 + r01 * g1, r01 * g0 + r11 * g1
+
+
+@inlined
 def _column_variance(e: Any, c: int) -> float:
     """Variance of the noise n in column -V dP of chamber c, m6."""
     w = (e.v0_m3[c] + e.area_m2[c] * e.values[e.x_column]) * e.compliance[c]

@@ -12,6 +12,7 @@ from firmware_bridge.catalog import Catalog
 from firmware_bridge.config import CYCLE, MULTIRATE, Assembly, MessageSource, SignalSource
 from rtid.model import (
     BOTH,
+    MOST_MODE,
     NONE,
     TAYLOR,
     Chamber,
@@ -26,7 +27,7 @@ from rtid.model import (
 )
 from rtid.project.project import Sections
 from rtid.project.references import KINDS
-from rtid.project.schema import MOST_MODE, EdgeSection, SignalSection
+from rtid.project.schema import EdgeSection, SignalSection
 from rtid.units import Unit, find_unit
 
 MIN_GAP_S = 0.05

@@ -15,8 +15,9 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 from pydantic_core import PydanticCustomError
 
+from rtid.model import MOST_MODE
+
 MAX_BORDERS = 10_000
-MOST_MODE = 62
 
 
 @dataclass(frozen=True)
