@@ -121,10 +121,7 @@ def parse(
         pos, first = starts[i], True
         while pos < stops[i]:
             result, after = _line(text, pos, stops[i], rows, n)
-            if result == OK:
-                n += 1
-            elif result >= 0 and (first or result != BAD):
-                counts[result] += 1
+            n += tx.counted(result, first, counts)
             pos, first = after if first else stops[i], False
     return n
 

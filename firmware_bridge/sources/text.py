@@ -113,6 +113,17 @@ def code(letters: str) -> int:
     return int.from_bytes(letters.lower().encode()[:4], "big")
 
 
+@inlined
+def counted(result: Integer, is_first: bool, counts: NDArray[np.int64]) -> Integer:
+    """1 for a frame; else 0, and the reason is counted in place.
+
+    What is bad in the rest of a joined line was counted with its beginning.
+    """
+    if result >= 0 and (is_first or result != BAD):
+        counts[result] += 1
+    return 1 if result == OK else 0
+
+
 def scan(text: NDArray[np.uint8], parse: Callable[..., Any], *options: Any) -> tuple[Frames, int]:
     """All frames of a text log, and how many lines are malformed.
 
