@@ -1,0 +1,360 @@
+"""Free run: the pressures that the model itself predicts, from a measured start.
+
+Per chamber the pressure equation (14), solved for the pressure instead of the flow,
+
+    V_c(x) theta_beta_c dP_c/dt = sum of sigma Q(w, dp) + shared terms - s_c A_c dx/dt,
+
+with the model's own P_c in dp and in the terms; the lagged command, the position and all other
+signals are inputs (u held, sensors linear between samples).  Shared terms that are rates of a
+pressure make the left side a 2 x 2 matrix.  Q is the published map: cells blended by the squares
+of the windows of (12), C1 everywhere; beyond the grid along dp it goes on along its tangent.
+
+Integration: Dormand-Prince 5(4) with steps controlled to TOLERANCE_PA inside every interval, so
+that a stiff chamber (small dp, wide open valve) takes more steps and not a wrong one.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtid.kernels.basis import locate
+from rtid.kernels.engine import GAP_FLAG, acceptable, commanded, remember, set_step, step_s
+from rtid.kernels.holds import lagged_moments
+from rtid.kernels.increments import shaped
+from rtid.kernels.jit import kernel, part
+from rtid.kernels.layout import (
+    FLOW,
+    HINGE,
+    INVERSE,
+    MAX_EDGES,
+    MAX_SIGNALS,
+    NOTHING,
+    RATE,
+    ROOT,
+)
+
+FloatArray = NDArray[np.float64]
+
+# How the pressure of a sample came about.  BEYOND: a pressure drop was off its grid on the way.
+# GAP to STUCK end a run, which begins anew at that sample; no pressure is predicted there.
+START, INSIDE, BEYOND, GAP, OFF_GRID, STUCK = range(6)
+STATUSES = ("start", "inside", "beyond", "gap", "off_grid", "stuck")
+
+TOLERANCE_PA = 0.01  # error of one step
+MOST_STEPS = 500  # in one interval; more: the model is no machine
+INSANE_PA = 1e9
+SAFETY, SHRINK, GROW = 0.9, 0.2, 4.0
+
+# Dormand and Prince 1980: stages (7, 6), nodes (7,), and the error's weights (7,); row 6 steps on.
+A = np.array(
+    [
+        [0, 0, 0, 0, 0, 0],
+        [1 / 5, 0, 0, 0, 0, 0],
+        [3 / 40, 9 / 40, 0, 0, 0, 0],
+        [44 / 45, -56 / 15, 32 / 9, 0, 0, 0],
+        [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0, 0],
+        [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0],
+        [35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84],
+    ]
+)
+NODE = np.array([0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1, 1])
+ERROR = np.array([71 / 57600, 0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40])
+STAGES = 7
+
+
+@kernel
+def free_run(
+    engine: Any,
+    theta: FloatArray,
+    compliance: FloatArray,
+    overlap: float,
+    chunk: FloatArray,
+    position: FloatArray,
+    period_s: float,
+    pressure: FloatArray,
+    status: Any,
+) -> None:
+    """Predicted pressures at all samples; pressure and status are changed in place.
+
+    engine (1,): freshly built, used up; its term_theta holds the coefficients of the shared terms.
+    theta (cells, 6) m3/s, Taylor terms; compliance (chambers,) 1/Pa; overlap: half the overlap of
+    the windows in widths of the narrower neighbour.  chunk (n, 2 + signals), position (n,) smooth.
+    period_s: the run begins anew from the measurement so often; inf: only after a stop.
+    pressure (n, chambers) Pa, NaN where a run was stopped; status (n,): the codes above.
+    """
+    e = engine[0]
+    p, now = np.zeros(2), np.zeros(MAX_SIGNALS + 1)
+    foot, slopes = np.ones(MAX_EDGES), np.zeros((STAGES, 2))
+    for i in range(e.n_edges):
+        foot[i] = _foot_width(e, i, overlap)
+    due, h = 0.0, 1.0
+    for k in range(len(chunk)):
+        for j in range(2 + e.n_signals):
+            e.sample[j] = chunk[k, j]
+        sample, dt = e.sample, step_s(e, e.sample[0])
+        whole = acceptable(e, sample)
+        joined = whole and e.running and dt > 0.0 and dt <= e.max_gap_s
+        joined = joined and (int(sample[1]) & GAP_FLAG) == 0
+        code = GAP
+        if joined:
+            if dt != e.dt_s:
+                set_step(e, dt)
+            code = OFF_GRID
+            if _spools(e, dt):
+                x0, x1 = position[k - 1], position[k]
+                code, h = _interval(
+                    e, theta, compliance, overlap, foot, x0, x1, dt, p, now, slopes, h
+                )
+        pressure[k], status[k] = np.nan, code
+        e.running = 0
+        if whole:
+            remember(e, sample)
+            e.running = 1
+        if whole and not joined:
+            for i in range(e.n_edges):
+                e.w_v[i] = commanded(e, i)
+        restart = whole and (code > BEYOND or sample[0] > due - 0.5 * dt)
+        if restart:
+            for c in range(e.n_chambers):
+                p[c] = e.values[e.p_column[c]]
+            due = sample[0] + period_s
+            if code <= BEYOND or k == 0:
+                status[k] = START
+        if status[k] <= BEYOND:
+            for c in range(e.n_chambers):
+                pressure[k, c] = p[c]
+
+
+@part
+def _spools(e: Any, dt: float) -> bool:
+    """Move the spools over the interval; False where an open one is off its grid."""
+    inside = True
+    for i in range(e.n_edges):
+        held, n = commanded(e, i), e.n_u[i]
+        end, mean, _, _ = lagged_moments(held, e.w_v[i], e.lag_s, e.lag_decay, dt)
+        e.held_v[i], e.start_v[i], e.w_v[i] = held, e.w_v[i], end
+        if mean > e.safe_v[i]:
+            inside = inside and mean >= e.u_border[i, 0] and mean <= e.u_border[i, n]
+    return inside
+
+
+@part
+def _interval(
+    e: Any,
+    theta: FloatArray,
+    compliance: FloatArray,
+    overlap: float,
+    foot: FloatArray,
+    x0: float,
+    x1: float,
+    dt: float,
+    p: FloatArray,
+    now: FloatArray,
+    slopes: FloatArray,
+    h: float,
+) -> tuple[int, float]:
+    """Integrate p (chambers,), in place, over one interval; its status and the next first step.
+
+    Time runs from 0 to 1 in units of the interval; h: first step to try.
+    """
+    s, h, code, trial = 0.0, min(1.0, h), INSIDE, np.zeros(2)
+    for _ in range(MOST_STEPS):
+        h = min(h, 1.0 - s)
+        error = 0.0
+        beyond = False
+        for stage in range(STAGES):
+            for c in range(e.n_chambers):
+                trial[c] = p[c]
+                for j in range(stage):
+                    trial[c] += h * A[stage, j] * slopes[j, c]
+            at = s + NODE[stage] * h
+            off = _rates(
+                e, theta, compliance, overlap, foot, x0, x1, dt, at, trial, now, slopes[stage]
+            )
+            beyond = beyond or off
+        for c in range(e.n_chambers):
+            left = 0.0
+            for j in range(STAGES):
+                left += ERROR[j] * slopes[j, c]
+            error = max(error, abs(h * left))
+        if not error < INSANE_PA:
+            h *= SHRINK
+            continue
+        factor = SAFETY * (TOLERANCE_PA / max(error, 1e-30)) ** 0.2
+        if error <= TOLERANCE_PA:
+            s += h
+            if beyond:
+                code = BEYOND
+            for c in range(e.n_chambers):
+                p[c] = trial[c]  # the last stage is the new state
+                if not abs(p[c]) < INSANE_PA:
+                    return STUCK, 1.0
+        if s >= 1.0 - 1e-12:
+            return code, h * max(1.0, min(GROW, factor))
+        h *= max(SHRINK, min(GROW, factor))
+    return STUCK, 1.0
+
+
+@part
+def _rates(
+    e: Any,
+    theta: FloatArray,
+    compliance: FloatArray,
+    overlap: float,
+    foot: FloatArray,
+    x0: float,
+    x1: float,
+    dt: float,
+    s: float,
+    p: FloatArray,
+    now: FloatArray,
+    out: FloatArray,
+) -> bool:
+    """out (chambers,) = dt dP/dt at the time s in [0, 1]; True where a dp is beyond its grid.
+
+    now (signals + 1,): scratch for the signals at that time.
+    """
+    for j in range(e.n_signals):
+        now[j] = e.values[j] + s * (e.sample[2 + j] - e.values[j])
+    now[NOTHING] = 0.0
+    for c in range(e.n_chambers):
+        now[e.p_column[c]] = p[c]
+    f0, f1, beyond = 0.0, 0.0, False
+    for i in range(e.n_edges):
+        w = e.held_v[i]
+        if e.start_v[i] != w and e.lag_s > 0.0:
+            w += (e.start_v[i] - w) * math.exp(-s * dt / e.lag_s)
+        if w > e.safe_v[i]:
+            dp = now[e.source[i]] - now[e.sink[i]]
+            q, off = map_flow(e, theta, i, overlap, w, dp)
+            q *= _rise((w - e.safe_v[i]) / foot[i] - 1.0) if foot[i] > 0.0 else 1.0
+            f0, f1 = f0 + e.sign[i, 0] * q, f1 + e.sign[i, 1] * q
+            beyond = beyond or off
+    x = x0 + s * (x1 - x0)
+    f0 -= e.area_m2[0] * (x1 - x0) / dt
+    m00, m01 = (e.v0_m3[0] + e.area_m2[0] * x) * compliance[0], 0.0
+    m10, m11 = 0.0, 1.0
+    if e.n_chambers == 2:
+        f1 -= e.area_m2[1] * (x1 - x0) / dt
+        m11 = (e.v0_m3[1] + e.area_m2[1] * x) * compliance[1]
+    for k in range(e.n_terms):
+        flow, d0, d1 = _term(e, k, now, x, dt)
+        f0, f1 = f0 + e.term_sign[k, 0] * flow, f1 + e.term_sign[k, 1] * flow
+        m00, m01 = m00 + e.term_sign[k, 0] * d0, m01 + e.term_sign[k, 0] * d1
+        m10, m11 = m10 + e.term_sign[k, 1] * d0, m11 + e.term_sign[k, 1] * d1
+    if e.n_chambers == 1:
+        out[0] = dt * f0 / m00
+        return beyond
+    det = m00 * m11 - m01 * m10
+    out[0], out[1] = dt * (m11 * f0 - m01 * f1) / det, dt * (m00 * f1 - m10 * f0) / det
+    return beyond
+
+
+@part
+def _term(e: Any, k: int, now: FloatArray, x: float, dt: float) -> tuple[float, float, float]:
+    """Flow of shared term k without the pressures' own rates, and what stands before these."""
+    theta, volume = e.term_theta[k] * e.term_scale[k], e.term_volume[k]
+    if volume == FLOW:
+        return theta * shaped(e, k, now, 0), 0.0, 0.0
+    if volume != RATE:
+        theta *= e.v0_m3[volume] + e.area_m2[volume] * x
+    z, rate, shape = e.term_constant[k], 0.0, e.term_shape[k]
+    own0, own1 = 0.0, 0.0
+    for j in range(e.n_signals):
+        weight = e.term_weight[k, j]
+        z += weight * now[j]
+        if j == e.p_column[0]:
+            own0 += weight
+        elif e.n_chambers == 2 and j == e.p_column[1]:
+            own1 += weight
+        else:
+            rate += weight * (e.sample[2 + j] - e.values[j]) / dt
+    slope = 1.0
+    if shape == ROOT:
+        slope = 0.5 / math.sqrt(max(abs(z), 1.0))
+    elif shape == HINGE:
+        slope = 1.0 if z > 0.0 else 0.0
+    elif shape == INVERSE:
+        slope = 1.0 / (z * z)
+    return -theta * slope * rate, theta * slope * own0, theta * slope * own1
+
+
+@part
+def map_flow(
+    e: Any, theta: FloatArray, i: int, overlap: float, w: float, dp: float
+) -> tuple[float, bool]:
+    """Q of edge i in m3/s at one point, without the foot; True where dp is beyond the grid."""
+    nu, nd = e.n_u[i], e.n_dp[i]
+    w = min(max(w, e.u_border[i, 0]), e.u_border[i, nu])
+    inside = min(max(dp, e.dp_border[i, 0]), e.dp_border[i, nd])
+    a, share_a = _blend(e.u_border[i], nu, overlap, w)
+    b, share_b = _blend(e.dp_border[i], nd, overlap, inside)
+    q, slope = 0.0, 0.0
+    for di in range(2):
+        g = share_a if di == 1 else 1.0 - share_a
+        if g == 0.0:
+            continue
+        for dj in range(2):
+            weight = g * (share_b if dj == 1 else 1.0 - share_b)
+            if weight != 0.0:
+                value, by_dp = _cell_flow(e, theta, i, a + di, b + dj, w, inside)
+                q += weight * value
+                slope += weight * by_dp
+    return q + max(0.0, slope) * (dp - inside), dp != inside
+
+
+@part
+def _cell_flow(
+    e: Any, theta: FloatArray, i: int, iu: int, ip: int, w: float, dp: float
+) -> tuple[float, float]:
+    """The six Taylor terms of one cell at a point, and their slope in dp."""
+    u0, p0 = e.u_border[i, iu], e.dp_border[i, ip]
+    hp = 2.0 / (e.dp_border[i, ip + 1] - p0)
+    xi = 2.0 * (w - u0) / (e.u_border[i, iu + 1] - u0) - 1.0
+    eta = (dp - p0) * hp - 1.0
+    t = theta[e.first_cell[i] + iu * e.n_dp[i] + ip]
+    q = t[0] + xi * (t[1] + xi * t[3] + eta * t[5]) + eta * (t[2] + eta * t[4])
+    return q, hp * (t[2] + 2.0 * eta * t[4] + xi * t[5])
+
+
+@part
+def _blend(border: FloatArray, n: int, overlap: float, at: float) -> tuple[int, float]:
+    """First of the two cells that share a point, and the share of the second (`windows.blend`)."""
+    if n == 1:
+        return 0, 0.0
+    home = locate(border, n, at)
+    left = at < 0.5 * (border[home] + border[home + 1])
+    first = max(0, min(home - 1 if left else home, n - 2))
+    eta = overlap * min(border[first + 1] - border[first], border[first + 2] - border[first + 1])
+    return first, _rise((at - border[first + 1]) / eta)
+
+
+@part
+def _rise(t: float) -> float:
+    """beta^2(t) of the published windows, from 0 at t = -1 to 1 at t = 1."""
+    if t <= -1.0:
+        return 0.0
+    if t >= 1.0:
+        return 1.0
+    angle = math.sin(0.25 * math.pi * (1.0 + t))
+    return math.sin(0.5 * math.pi * angle * angle) ** 2
+
+
+@part
+def _foot_width(e: Any, i: int, overlap: float) -> float:
+    """Half the width over which a map rises from zero above its safe band; 0: it has none."""
+    safe, n = e.safe_v[i], e.n_u[i]
+    if not math.isfinite(safe):
+        return 0.0
+    k = 0
+    while k < n - 1 and e.u_border[i, k + 1] <= safe:
+        k += 1
+    border = e.u_border[i]
+    width = border[k + 1] - border[k]
+    if k + 2 <= n:
+        width = min(width, border[k + 2] - border[k + 1])
+    return 0.5 * overlap * width
