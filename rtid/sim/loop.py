@@ -1,16 +1,26 @@
 """The closed loop as one kernel: sensors at 1 kHz, position controller, held command, RK4 between.
 
-State y = (P_A, P_B, x, v).  Supply, tank and load force run linearly between samples; the lag of
-the valves is exact for a held command: w(t_k + t) = u_k + (w(t_k) - u_k) exp(-t / tau).
+State y = (P_A, P_B, x, v), longer with extra physics (see `extra_flows`).  Supply, tank and load
+force run linearly between samples; the lag of the valves is exact for a held command:
+w(t_k + t) = u_k + (w(t_k) - u_k) exp(-t / tau).
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 
+from rtid.sim.extra_flows import (
+    PORT_A,
+    PORT_B,
+    SUPPLY,
+    extra_flows,
+    extra_rates,
+    extra_valve_flows,
+)
 from rtid.sim.plant import (
     AB,
     AT,
@@ -23,8 +33,51 @@ from rtid.sim.plant import (
     flow_gain,
     metered_flow,
 )
+from rtid.sim.spool import PLAYS, acting, play, spool_table, sticking_pilot, travel
 
-X_REF, V_REF, DITHER, P_SUPPLY, P_TANK, LOAD = range(6)  # columns of the drive
+# columns of the drive; the last two are of extra physics: factor of all gains, bursts
+X_REF, V_REF, DITHER, P_SUPPLY, P_TANK, LOAD, FACTOR, BURST = range(8)
+
+
+class Machine(NamedTuple):
+    """What the kernel knows of a plain plant: valves (5, 7), directions (5,)."""
+
+    c: Constants
+    k: Controller
+    valves: FloatArray
+    directions: FloatArray
+    lag_s: float
+
+
+class Record(NamedTuple):
+    """What the kernel fills, at the samples, just after the command has changed.
+
+    signals (n, 5): true u, P_A, P_B, x, v; x_measured_m (n,); opening_v (n, 5); flow_m3s (n, 5);
+    nodes_pa (n, 3): supply and both chambers as the valves see them; extra_m3s (n, 2): flows into
+    the chambers past the valves.
+    """
+
+    signals: FloatArray
+    x_measured_m: FloatArray
+    opening_v: FloatArray
+    flow_m3s: FloatArray
+    nodes_pa: FloatArray
+    extra_m3s: FloatArray
+
+
+class Spools(NamedTuple):
+    """The valves: openings and rates (5,), commands (2, 5) before and after a change, propagators.
+
+    table (5, 4) over half a substep; plays (PLAYS,); pilot (3,); pilot_v (n,): given so far.
+    """
+
+    w: FloatArray
+    rate: FloatArray
+    commands: FloatArray
+    table: FloatArray
+    plays: FloatArray
+    pilot: FloatArray
+    pilot_v: FloatArray
 
 
 @njit(cache=True)
@@ -56,7 +109,7 @@ def flows(
 
 @njit(cache=True)
 def rates(c: Constants, q: FloatArray, y: FloatArray, load_n: float, dy: FloatArray) -> None:
-    """Fill dy (4,) in place with the time derivative of the state for the flows q."""
+    """Fill dy (4,) in place with the time derivative of the plain machine for the flows q."""
     x, v = y[2], y[3]
     volume_a = c.v0_a_m3 + c.area_a_m2 * x
     volume_b = c.v0_b_m3 + c.area_b_m2 * (c.stroke_m - x)
@@ -72,6 +125,7 @@ def rates(c: Constants, q: FloatArray, y: FloatArray, load_n: float, dy: FloatAr
 @njit(cache=True)
 def runge_kutta(
     c: Constants,
+    e: Any,
     gains: FloatArray,
     inputs: FloatArray,
     h_s: float,
@@ -79,65 +133,145 @@ def runge_kutta(
     slopes: FloatArray,
     trial: FloatArray,
     q: FloatArray,
+    net: FloatArray,
 ) -> None:
-    """One step of the classical fourth-order rule; y (4,) is changed in place.
+    """One step of the classical fourth-order rule; y (s,) is changed in place.
 
-    gains (3, 5) and inputs (3, 3) = (supply, tank, load) hold at the start, middle and end of the
-    step; slopes (4, 4), trial (4,) and q (5,) are work space.
+    gains (3, 5) and inputs (3, 5) hold at the start, middle and end of the step; slopes (4, s),
+    trial (s,), q (5,) and net (2,) are work space.
     """
     for stage in range(4):
         at = (stage + 1) // 2
         reach = h_s if stage == 3 else 0.5 * h_s
-        for i in range(4):
+        for i in range(len(y)):
             trial[i] = y[i] + reach * slopes[stage - 1, i] if stage > 0 else y[i]
-        flows(c, gains[at], trial, inputs[at, 0], inputs[at, 1], q)
+        if e is None:
+            flows(c, gains[at], trial, inputs[at, 0], inputs[at, 1], q)
+        else:
+            extra_valve_flows(c, e, gains[at], inputs[at], trial, q)
         rates(c, q, trial, inputs[at, 2], slopes[stage])
-    for i in range(4):
+        if e is not None:
+            extra_rates(c, e, inputs[at], trial, q, net, slopes[stage])
+    for i in range(len(y)):
         bend = slopes[1, i] + slopes[2, i]
         y[i] += h_s / 6.0 * (slopes[0, i] + 2.0 * bend + slopes[3, i])
 
 
 @njit(cache=True)
 def advance(
-    c: Constants,
-    valves: FloatArray,
-    commands: FloatArray,
+    m: Machine,
+    e: Any,
+    start_gains: FloatArray,
     drive: FloatArray,
     decay: float,
+    change_s: float,
     h_s: float,
-    substeps: int,
-    w: FloatArray,
+    spools: Spools,
     y: FloatArray,
+    substeps: int,
 ) -> None:
-    """Integrate over one sample; w (5,) and y (4,) are changed in place.
+    """Integrate over one sample; y and the spools are changed in place.
 
-    commands (5,) are held, drive (2, 6) are its rows at both ends, decay = exp(-h / (2 lag)).
+    start_gains (5,) hold at its start, drive (2, 8) are its rows at both ends, decay =
+    exp(-h / (2 lag)); commands[0] act until change_s after the sample, then commands[1].
     """
-    gains, inputs = np.empty((3, 5)), np.empty((3, 3))
-    slopes, trial, q = np.empty((4, 4)), np.empty(4), np.empty(5)
-    for e in range(5):
-        gains[2, e] = flow_gain(valves[e], w[e])
+    gains, inputs = np.empty((3, 5)), np.empty((3, 5))
+    slopes, trial, q, net = np.empty((4, len(y))), np.empty(len(y)), np.empty(5), np.empty(2)
+    valves, w, after = m.valves, spools.w, spools.commands[1]
+    gains[2] = start_gains
     for step in range(substeps):
         gains[0] = gains[2]
-        for half in range(1, 3):
-            for e in range(5):
-                w[e] = commands[e] + (w[e] - commands[e]) * decay
-                gains[half, e] = flow_gain(valves[e], w[e])
         for half in range(3):
             share = (step + 0.5 * half) / substeps
-            for j in range(3):
+            for j in range(inputs.shape[1]):
                 start = drive[0, P_SUPPLY + j]
                 inputs[half, j] = start + share * (drive[1, P_SUPPLY + j] - start)
-        runge_kutta(c, gains, inputs, h_s, y, slopes, trial, q)
+        for half in range(1, 3):
+            if e is None:
+                for edge in range(5):
+                    w[edge] = after[edge] + (w[edge] - after[edge]) * decay
+            else:
+                until_s = change_s - (step + 0.5 * (half - 1)) * h_s
+                before, table = spools.commands[0], spools.table
+                travel(e, m.lag_s, before, after, until_s, 0.5 * h_s, table, w, spools.rate)
+            for edge in range(5):
+                gains[half, edge] = flow_gain(valves[edge], w[edge])
+            if e is not None:
+                gains[half] *= inputs[half, FACTOR - P_SUPPLY]
+        runge_kutta(m.c, e, gains, inputs, h_s, y, slopes, trial, q, net)
+
+
+@njit(cache=True)
+def steer(m: Machine, e: Any, i: int, dt_s: float, u_v: float, spools: Spools) -> float:
+    """Set the commands of the five edges; returns until when the former ones act, s."""
+    change_s = 0.0
+    if e is None:
+        for edge in range(5):
+            spools.commands[1, edge] = m.directions[edge] * u_v
+    else:
+        if e.play_v > 0.0:
+            u_v = play(u_v, e.play_v, spools.plays)
+        if e.stick_v > 0.0:
+            u_v = sticking_pilot(u_v, e.stick_v, spools.pilot)
+        spools.pilot_v[i] = u_v
+        late = math.floor(e.delay_s / dt_s)
+        change_s = e.delay_s - late * dt_s
+        for edge in range(5):
+            spools.commands[0, edge] = m.directions[edge] * acting(spools.pilot_v, i, late + 1)
+            spools.commands[1, edge] = m.directions[edge] * acting(spools.pilot_v, i, late)
+    return change_s
+
+
+@njit(cache=True)
+def seen_position(e: Any, x: FloatArray, i: int, dt_s: float) -> float:
+    """Position that the sensor shows at sample i, before noise, m."""
+    late = 0.0
+    if e is not None:
+        late = e.position_delay_s / dt_s
+    if late == 0.0 or late >= i:
+        return x[i] if late == 0.0 else x[0]
+    row = math.floor(i - late)
+    return x[row] + (i - late - row) * (x[min(row + 1, i)] - x[row])
+
+
+@njit(cache=True)
+def note_flows(
+    c: Constants,
+    e: Any,
+    gains: FloatArray,
+    drive: FloatArray,
+    y: FloatArray,
+    i: int,
+    record: Record,
+) -> None:
+    """Write the flows and the pressures at the valves at sample i for the gains (5,)."""
+    nodes = record.nodes_pa[i]
+    if e is None:
+        nodes[0], nodes[1], nodes[2] = drive[P_SUPPLY], y[0], y[1]
+        flows(c, gains, y, drive[P_SUPPLY], drive[P_TANK], record.flow_m3s[i])
+    else:
+        inputs = drive[P_SUPPLY:]
+        extra_valve_flows(c, e, gains, inputs, y, record.flow_m3s[i])
+        extra_flows(c, e, inputs, y, record.extra_m3s[i])
+        nodes[0], nodes[1], nodes[2] = y[SUPPLY], y[PORT_A], y[PORT_B]
+
+
+@njit(cache=True)
+def new_spools(e: Any, lag_s: float, half_s: float, n: int) -> Spools:
+    """Spools at rest in their middle."""
+    table = np.zeros((5, 4))
+    if e is not None:
+        spool_table(e, lag_s, half_s, table)
+    commands = np.zeros((2, 5))
+    pilot = np.array([0.0, 0.0, 1.0])
+    given = np.zeros(0 if e is None else n)
+    return Spools(np.zeros(5), np.zeros(5), commands, table, np.zeros(PLAYS), pilot, given)
 
 
 @njit(cache=True)
 def run_loop(
-    c: Constants,
-    k: Controller,
-    valves: FloatArray,
-    directions: FloatArray,
-    lag_s: float,
+    m: Machine,
+    e: Any,
     drive: FloatArray,
     x_noise_m: FloatArray,
     x_step_m: float,
@@ -145,30 +279,33 @@ def run_loop(
     dt_s: float,
     substeps: int,
     y: FloatArray,
-    signals: FloatArray,
-    x_measured_m: FloatArray,
-    opening_v: FloatArray,
-    flow_m3s: FloatArray,
+    record: Record,
 ) -> None:
-    """Simulate n samples from the state y (4,); drive (n + 1, 6), x_noise_m (n,).
+    """Simulate n samples from the state y; drive (n + 1, 8), x_noise_m (n,).
 
-    Filled in place: signals (n, 5) with the true u, P_A, P_B, x, v;
-    x_measured_m (n,); opening_v (n, 5) and flow_m3s (n, 5) as they are at the sample, just after
-    the command has changed.  y ends at the state after the last sample.
+    e: a record of `extra.RECORD`, or None for the plain machine, which is compiled without it.
+
+    The record is filled in place; y ends at the state after the last sample.
     """
-    h_s = dt_s / substeps
-    decay = math.exp(-0.5 * h_s / lag_s) if lag_s > 0.0 else 0.0
-    w, commands, gains = np.zeros(5), np.empty(5), np.empty(5)
-    for i in range(len(signals)):
-        x_measured_m[i] = quantise(y[2] + x_noise_m[i], x_step_m)
-        u = quantise(command(k, drive[i], x_measured_m[i]), u_step_v)
-        for e in range(5):
-            commands[e] = directions[e] * u
-            if lag_s <= 0.0:
-                w[e] = commands[e]
-            gains[e] = flow_gain(valves[e], w[e])
-        signals[i, 0] = u
-        signals[i, 1:] = y
-        opening_v[i] = w
-        flows(c, gains, y, drive[i, P_SUPPLY], drive[i, P_TANK], flow_m3s[i])
-        advance(c, valves, commands, drive[i : i + 2], decay, h_s, substeps, w, y)
+    h_s, x = dt_s / substeps, record.signals[:, 3]
+    decay = math.exp(-0.5 * h_s / m.lag_s) if m.lag_s > 0.0 else 0.0
+    gains = np.empty(5)
+    spools = new_spools(e, m.lag_s, 0.5 * h_s, len(x))
+    at_once = m.lag_s <= 0.0
+    if e is not None:
+        at_once = m.lag_s + e.spool_lag_s + e.spool_radps <= 0.0
+    for i in range(len(x)):
+        record.signals[i, 1:] = y[:4]
+        x_measured_m = quantise(seen_position(e, x, i, dt_s) + x_noise_m[i], x_step_m)
+        u = quantise(command(m.k, drive[i], x_measured_m), u_step_v)
+        record.x_measured_m[i], record.signals[i, 0] = x_measured_m, u
+        change_s = steer(m, e, i, dt_s, u, spools)
+        if at_once:
+            spools.w[:] = spools.commands[0 if change_s > 0.0 else 1]
+        record.opening_v[i] = spools.w
+        for edge in range(5):
+            gains[edge] = flow_gain(m.valves[edge], spools.w[edge])
+        if e is not None:
+            gains *= drive[i, FACTOR]
+        note_flows(m.c, e, gains, drive[i], y, i, record)
+        advance(m, e, gains, drive[i : i + 2], decay, change_s, h_s, spools, y, substeps)

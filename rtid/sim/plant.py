@@ -21,6 +21,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from rtid.sim.extra import NONE, Extra, Planted
+
 FloatArray = NDArray[np.float64]
 
 EDGES = ("pa", "at", "pb", "bt", "ab")  # supply->A, A->tank, supply->B, B->tank, A->B
@@ -134,6 +136,8 @@ class Plant:
     lag_s: float = 1.3e-3
     p_supply_pa: float = 7e6
     p_tank_pa: float = 1e5
+    extra: Extra = NONE  # physics besides the equations above, see `rtid.sim.hidden`
+    hidden: tuple[Planted, ...] = ()
 
     @property
     def beta_pa(self) -> float:

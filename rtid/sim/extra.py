@@ -1,0 +1,83 @@
+"""Physics that a simulated machine may have besides its declared equations: the numbers alone.
+
+Everything is zero for the plain machine.  A pair belongs to the chambers (A, B), a five to the
+edges in the order of `plant.EDGES`.  `rtid.sim.hidden` sets the numbers; the equations are in
+`rtid.sim.extra_flows`, `spool`, `schedule` and `sensing`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+Pair = tuple[float, float]
+Five = tuple[float, float, float, float, float]
+NO_PAIR: Pair = (0.0, 0.0)
+NO_FIVE: Five = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+class Extra(NamedTuple):
+    """Coefficients of all extra physics, SI."""
+
+    # flows out of, into and between the chambers
+    internal_laminar: float = 0.0  # m3/s/Pa
+    internal_turbulent: float = 0.0  # m3/s/sqrt(Pa)
+    external_laminar: Pair = NO_PAIR
+    external_turbulent: Pair = NO_PAIR
+    groove: float = 0.0  # m3/s/Pa at its middle
+    groove_one_way: float = 0.0  # the same, open while extending only
+    relief: Pair = NO_PAIR  # m3/s/Pa
+    relief_open_pa: Pair = NO_PAIR
+    makeup: Pair = NO_PAIR  # m3/s/Pa
+    makeup_open_pa: Pair = NO_PAIR
+    burst_m3s: float = 0.0  # into chamber A
+    # metering edges
+    seat: Five = NO_FIVE  # m3/s/sqrt(Pa)
+    compensated: Five = NO_FIVE  # 0: orifice, 1: flow does not depend on dp
+    gain_drift: float = 0.0  # relative change of all gains over the record
+    gain_swing: float = 0.0  # relative amplitude
+    # storage
+    air_share: float = 0.0  # of the volume at atmospheric pressure
+    released: Pair = NO_PAIR  # share of the volume that boils out of the oil below `release_pa`
+    release_pa: Pair = NO_PAIR
+    dead_volume_m3: Pair = NO_PAIR
+    hose_m3ppa: Pair = NO_PAIR
+    line_m: Pair = NO_PAIR  # length of the hose between valve and chamber
+    sensor_at_valve: float = 0.0  # 1: the pressure sensors sit at the valves' end of the hose
+    # supply
+    sag_pasm3: float = 0.0  # droop of the pump: pressure per flow
+    sag_measured: float = 0.0  # 1: the supply sensor sees it
+    branch_kgpm4: float = 0.0  # inertance of the supply branch of the edge pa
+    # from the command to the spools
+    delay_s: float = 0.0
+    play_v: float = 0.0  # full width
+    stick_v: float = 0.0  # command that sets a stuck pilot free
+    spool_radps: float = 0.0  # natural frequency; 0: first order
+    spool_damping: float = 0.0
+    spool_lag_s: float = 0.0  # a lag besides the spool's own
+    # sensors
+    pressure_lag_s: Pair = NO_PAIR
+    pressure_bias_pa: Pair = NO_PAIR
+    position_delay_s: float = 0.0
+    velocity_scale: float = 0.0  # relative
+
+
+NONE = Extra()
+RECORD = np.dtype([(k, float, np.shape(v)) for k, v in NONE._asdict().items()], align=True)
+
+
+def as_record(e: Extra) -> np.record | None:
+    """The numbers as the kernels take them, by reference; None if all are zero."""
+    table = np.zeros(1, RECORD).view(np.recarray)
+    table[0] = tuple(e)
+    record: np.record = table[0]
+    return None if e == NONE else record
+
+
+class Planted(NamedTuple):
+    """One effect hidden in a plant: its name in `hidden.HIDDEN`, its place, its size there."""
+
+    name: str
+    where: str
+    strength: float
