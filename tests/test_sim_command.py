@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import can
@@ -96,6 +97,33 @@ def test_truth(tmp_path: Path) -> None:
     assert {Path(f).name for f in said["files"]} == {"run.blf", "run.truth.json", "run.toml"}
 
 
+def test_hidden_effects_are_told_in_the_truth_alone(tmp_path: Path) -> None:
+    trace = tmp_path / "run.parquet"
+    wishes = ["--hide", "internal_leakage_laminar", "--hide", "relief_valve:b=strong"]
+    wishes += ["--hide", "input_delay=0.004"]
+    output = call(trace, "--duration", 1, "--motion", "rich_record", *wishes)
+    assert "hidden: relief_valve at b, 2.7e-11 m3/s/Pa" in output
+    truth = json.loads((tmp_path / "run.truth.json").read_text())
+    told = [(h["name"], h["where"], h["strength"], h["unit"]) for h in truth["hidden"]]
+    assert told == [
+        ("internal_leakage_laminar", "", 2e-12, "m3/s/Pa"),
+        ("relief_valve", "b", 2.7e-11, "m3/s/Pa"),
+        ("input_delay", "", 0.004, "s"),
+    ]
+    assert truth["extra"]["delay_s"] == 0.004
+    assert truth["hidden"][1]["catalogue"] == "relief_valve"
+    written = project.load(tmp_path / "run.toml")
+    assert "relief" not in (tmp_path / "run.toml").read_text()
+    assert_same_machine(written.model, declared_model(Plant(), seed=0))
+
+
+def test_a_record_declares_its_parts(tmp_path: Path) -> None:
+    call(tmp_path / "run.parquet", "--motion", "sweep_record", "--duration", 11)
+    record = tomllib.loads((tmp_path / "run.toml").read_text())["record"]
+    assert record["identification_s"] == pytest.approx([0, 8])
+    assert record["validation_s"] == pytest.approx([8.3, 11])
+
+
 def test_live_on_a_bus() -> None:
     with can.Bus("sim-live", interface="virtual") as receiver:
         output = call("--bus", "virtual", "--channel", "sim-live", "--duration", 0.05, "--speed", 0)
@@ -112,6 +140,9 @@ def test_live_on_a_bus() -> None:
         (["no/such/run.blf"], "no such folder"),
         (["run.blf", "--motion", "dance"], "--motion dance"),
         (["run.blf", "--cross-port"], "--cross-port"),
+        (["run.blf", "--hide", "leak"], "leak: no such effect"),
+        (["run.blf", "--hide", "supply_sag=huge"], "supply_sag=huge"),
+        (["run.blf", "--hide", "relief_valve:c"], "cannot sit at 'c'"),
         (["--bus", "pcan", "--channel", "PCAN_USBBUS1", "--duration", "0.1"], "must not speak"),
     ],
 )

@@ -7,7 +7,7 @@ from rtid.sim import extra_flows, loop, sensing, spool
 from rtid.sim.extra import NONE, RECORD, Extra, as_record
 from rtid.sim.hidden import HIDDEN, LEVELS, HiddenError, hide
 from rtid.sim.plant import Constants, FloatArray, Plant
-from rtid.sim.random_plants import draw
+from rtid.sim.random_plants import draw, draw_hidden
 from rtid.sim.run import EXACT, Run, simulate
 
 P_A, P_B = 1, 2
@@ -231,6 +231,16 @@ def test_an_effect_is_hidden_once_in_a_place() -> None:
     twice = hide(hidden("relief_valve", where="a"), "relief_valve", 1e-12, "b")
     with pytest.raises(HiddenError, match="twice"):
         hide(twice, "relief_valve", 1e-12, "a")
+
+
+def test_random_machines_hide_a_varied_strength_in_a_varied_place() -> None:
+    found = [draw_hidden(seed, "relief_valve", "strong").hidden[0] for seed in range(12)]
+    assert {h.where for h in found} == {"a", "b"}
+    shares = [h.strength / 27e-12 for h in found]
+    assert 0.7 <= min(shares) < 0.9 and 1.1 < max(shares) <= 1.3
+    bare = draw_hidden(3, "input_delay", "weak")
+    assert (bare.constants, bare.valves) == (draw(3).constants, draw(3).valves)
+    assert bare == draw_hidden(3, "input_delay", "weak")
 
 
 def test_kernels_agree_with_their_python_source(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,6 +13,7 @@ from firmware_bridge.playback import AS_FAST_AS_POSSIBLE, send
 from rtid.cli.exits import Exit
 from rtid.errors import RtidError
 from rtid.sim.bus import open_test_bus, run_frames
+from rtid.sim.hidden import hide_wish, known
 from rtid.sim.log import START_US, SUFFIXES
 from rtid.sim.motion import MOTIONS
 from rtid.sim.plant import Plant
@@ -32,8 +33,17 @@ def simulate(
     cross_port: Annotated[
         bool, typer.Option("--cross-port", help="A fifth valve A<->B (random machines).")
     ] = False,
+    hide: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Physics to hide: EFFECT[:WHERE][=STRENGTH], STRENGTH weak, middle, strong or a "
+            "number in SI units; repeatable.  An unknown EFFECT lists all."
+        ),
+    ] = None,
     motion: Annotated[str, typer.Option(help=" | ".join(MOTIONS))] = "sweep",
-    duration_s: Annotated[float, typer.Option("--duration", min=0.01, help="Seconds.")] = 80.0,
+    duration_s: Annotated[
+        float | None, typer.Option("--duration", min=0.01, help="Seconds; 80, a record 110.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of noise and motion.")] = 0,
     bus: Annotated[
         str | None, typer.Option(help="Send live: udp_multicast, virtual, or socketcan with vcan.")
@@ -49,14 +59,20 @@ def simulate(
     """
     _check_arguments(trace, bus, motion, plant, cross_port)
     machine = Plant() if plant is None else draw(plant, cross_port=cross_port)
+    for wish in hide or ():
+        machine = hide_wish(machine, wish)
     run = run_machine(machine, motion, seed, duration_s)
-    result = {"samples": len(run.samples), "beta_pa": machine.beta_pa}
+    hidden = [planted._asdict() for planted in machine.hidden]
+    result = {"samples": len(run.samples), "beta_pa": machine.beta_pa, "hidden": hidden}
     written = write_run(trace, run, seed, motion) if trace else []
     sent = _send(run, bus, channel, speed or AS_FAST_AS_POSSIBLE) if bus else 0
     if as_json:
         print(json.dumps(result | {"files": [str(p) for p in written], "frames_sent": sent}))
         return
     print(f"{len(run.samples)} samples, bulk modulus {machine.beta_pa / 1e6:.0f} MPa")
+    for name, where, strength in machine.hidden:
+        place = f" at {where}" if where else ""
+        print(f"hidden: {name}{place}, {strength:g} {known(name).unit}")
     for path in written:
         print(f"wrote {path}")
     if sent:

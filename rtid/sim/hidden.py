@@ -68,7 +68,7 @@ def hide(plant: Plant, name: str, strength: float, where: str = "") -> Plant:
     effect = known(name)
     where = where or effect.places[0]
     if where not in effect.places:
-        places = ", ".join(effect.places) or "the whole machine"
+        places = ", ".join(place for place in effect.places if place) or "the whole machine alone"
         raise HiddenError(f"{name}: cannot sit at {where!r}", f"it can sit at {places}")
     if not 0.0 <= strength < float("inf"):
         raise HiddenError(f"{name}: strength {strength:g}", "give a positive number")
@@ -78,6 +78,13 @@ def hide(plant: Plant, name: str, strength: float, where: str = "") -> Plant:
         return plant
     changed = effect.apply(plant, float(strength), where)
     return replace(changed, hidden=(*plant.hidden, Planted(name, where, float(strength))))
+
+
+def hide_wish(plant: Plant, wish: str) -> Plant:
+    """The plant with a wish of the form EFFECT[:WHERE][=STRENGTH] fulfilled, middle by default."""
+    place, _, strength = wish.partition("=")
+    name, _, where = place.partition(":")
+    return hide(plant, name, known(name).strength(strength or "middle"), where)
 
 
 def known(name: str) -> Hidden:

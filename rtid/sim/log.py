@@ -18,6 +18,8 @@ import pyarrow.parquet
 from firmware_bridge.frames import Frames, to_messages
 from firmware_bridge.sources import blf, candump
 from rtid.sim.declare import UNITS
+from rtid.sim.extra import Planted
+from rtid.sim.hidden import HIDDEN
 from rtid.sim.plant import EDGES, Plant
 from rtid.sim.run import NAMES, Run
 
@@ -53,9 +55,10 @@ def write_table(path: Path, run: Run) -> None:
 
 
 def truth_of(plant: Plant) -> dict[str, Any]:
-    """What an estimate is scored against: bulk modulus, lag, and the true map of each edge.
+    """What an estimate is scored against: bulk modulus, lag, the true map of each edge, effects.
 
-    maps: q_m3s[edge] is a list over u_v of lists over dp_pa.
+    maps: q_m3s[edge] is a list over u_v of lists over dp_pa; hidden: one entry per effect; extra:
+    the numbers of `rtid.sim.extra` that are not zero.
     """
     q_m3s = {
         edge: plant.flow(edge, MAP_U_V[:, None], MAP_DP_PA[None, :]).tolist()
@@ -67,5 +70,13 @@ def truth_of(plant: Plant) -> dict[str, Any]:
         "p_supply_pa": plant.p_supply_pa,
         "constants": plant.constants._asdict(),
         "valves": {edge: asdict(valve) for edge, valve in zip(EDGES, plant.valves, strict=True)},
+        "hidden": [_told(planted) for planted in plant.hidden],
+        "extra": {name: value for name, value in plant.extra._asdict().items() if np.any(value)},
         "maps": {"u_v": MAP_U_V.tolist(), "dp_pa": MAP_DP_PA.tolist(), "q_m3s": q_m3s},
     }
+
+
+def _told(planted: Planted) -> dict[str, Any]:
+    effect = HIDDEN[planted.name]
+    told = {"form": effect.form, "unit": effect.unit, "catalogue": effect.catalogue}
+    return planted._asdict() | told

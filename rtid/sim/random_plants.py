@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from rtid.sim.hidden import hide, known
 from rtid.sim.plant import AB, AT, BT, EDGES, PA, PB, Constants, Controller, Plant, Valve
 
 SPREAD = 0.3  # of every constant
@@ -43,6 +44,18 @@ def draw(seed: int, *, cross_port: bool = False) -> Plant:
         directions=(1, -1, -1, 1, -1 if cross_port else 0),
         lag_s=nominal.lag_s + rng.uniform(-0.2e-3, 0.2e-3),
     )
+
+
+def draw_hidden(seed: int, name: str, level: str = "middle", *, cross_port: bool = False) -> Plant:
+    """The machine with this number and an effect in it, at random +-30 % and in a random place.
+
+    level: weak, middle or strong.  Raises HiddenError for an unknown name or level.
+    """
+    rng = np.random.default_rng([seed, 7])
+    effect = known(name)
+    strength = _vary(rng, effect.strength(level))
+    where = effect.places[int(rng.integers(len(effect.places)))]
+    return hide(draw(seed, cross_port=cross_port), name, strength, where)
 
 
 def _vary(rng: np.random.Generator, value: float, spread: float = SPREAD) -> float:

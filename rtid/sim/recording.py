@@ -8,11 +8,11 @@ from pathlib import Path
 from rtid.sim.bus import run_frames
 from rtid.sim.declare import declared_model
 from rtid.sim.log import START_US, truth_of, write_log, write_table
+from rtid.sim.motion import parts_s
 from rtid.sim.project_file import project_text
 from rtid.sim.run import Run
 
 TABLE_SUFFIX = ".parquet"
-IDENTIFICATION = 0.75  # share of the record to learn from; the rest is held out
 
 
 def write_run(trace: Path, run: Run, seed: int, motion: str) -> list[Path]:
@@ -26,13 +26,11 @@ def write_run(trace: Path, run: Run, seed: int, motion: str) -> list[Path]:
     truth.write_text(json.dumps(facts, indent=1) + "\n", "utf-8")
     model = declared_model(run.plant, sensors=run.sensors, seed=seed)
     text = project_text(model, run.plant.constants.stroke_m, "simulated cylinder")
-    project.write_text(text + _record(run), "utf-8")
+    project.write_text(text + _record(run, motion), "utf-8")
     return [trace, truth, project]
 
 
-def _record(run: Run) -> str:
-    end_s = len(run.samples) * 1e-3
-    split_s = IDENTIFICATION * end_s
-    spans = {"identification_s": (0.0, split_s), "validation_s": (split_s, end_s)}
+def _record(run: Run, motion: str) -> str:
+    spans = parts_s(motion, len(run.samples) * 1e-3)
     lines = [f"{key} = [{start:g}, {stop:g}]" for key, (start, stop) in spans.items()]
     return "\n".join(["", "[record]", *lines, ""])

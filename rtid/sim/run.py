@@ -14,7 +14,7 @@ from rtid.errors import RtidError
 from rtid.sim import extra_flows as state
 from rtid.sim.extra import NONE, as_record
 from rtid.sim.loop import P_SUPPLY, P_TANK, X_REF, Machine, Record, run_loop
-from rtid.sim.motion import DT_S, MOTIONS, Motion
+from rtid.sim.motion import DT_S, MOTIONS, Motion, usual_duration_s
 from rtid.sim.plant import EDGES, FloatArray, Plant
 from rtid.sim.schedule import schedule
 from rtid.sim.sensing import EXACT, NAMES, P_A, P_B, P_S, P_T, Sensors, U, V, X, see
@@ -77,18 +77,21 @@ def simulate(
     plant: Plant,
     motion: str | Motion = "sweep",
     seed: int = 0,
-    duration_s: float = 80.0,
+    duration_s: float | None = None,
     sensors: Sensors | None = None,
     substeps: int = 10,
 ) -> Run:
     """Run the closed loop for duration_s at 1 kHz; the same arguments give identical samples.
 
-    motion: a name in `motion.MOTIONS` or a function of that kind.  Raises SimulationError if the
+    motion: a name in `motion.MOTIONS` or a function of that kind; duration_s: 80 s, and 110 s for
+    a record with its validation part, unless told.  Raises SimulationError if the
     machine leaves its stroke, cavitates, or a pressure exceeds its sensor's range.
     """
     sensors = sensors or Sensors()
     motion_rng, noise_rng, burst_rng = (np.random.default_rng([seed, i]) for i in (2, 3, 6))
     build = MOTIONS[motion] if isinstance(motion, str) else motion
+    if duration_s is None:
+        duration_s = usual_duration_s(motion if isinstance(motion, str) else "")
     drive = build(plant, motion_rng, duration_s)
     clocked = schedule(plant.extra, len(drive), DT_S, burst_rng)
     noise = noise_rng.standard_normal((len(drive) - 1, 7)) * sensors.noise()
