@@ -19,6 +19,8 @@ LAYER = {
     "rtid.model": ESTIMATOR,
     "rtid.estimator": ESTIMATOR,
     "rtid.compare": ESTIMATOR,
+    "rtid.effects": ESTIMATOR,
+    "rtid.units": ESTIMATOR,
     "rtid.cli": COMMAND,
     "rtid.__main__": COMMAND,
 }  # every other part of rtid is a shell: files, clocks and threads are allowed

@@ -24,6 +24,7 @@ COMMANDS = {
     "simulate": "Record a simulated machine as a trace, with its project file.",
     "replay": "Learn from a recorded trace: gates, blocks, bulk modulus, flow maps.",
     "compare": "Compare the learned maps with a data sheet.",
+    "effects": "List the physical effects that may be missing in the model, or explain one.",
     "export": "Write the learned maps as CSV, JSON or npz.",
 }
 

@@ -1,0 +1,27 @@
+"""Physical effects that may be missing in the model: the catalogue, and effects of the user's own.
+
+`catalogue()` and `effect(name)` give the pages, `Expression` reads a formula safely, `define` and
+`from_expression` make a `UserEffect` from a function or a formula.
+"""
+
+from rtid.effects.expression import Expression
+from rtid.effects.page import Effect, EffectError, Parameter, Symbol, catalogue, effect
+from rtid.effects.parsing import ExpressionError
+from rtid.effects.user import UserEffect, define, from_expression
+from rtid.effects.view import View, names_of_model
+
+__all__ = [
+    "Effect",
+    "EffectError",
+    "Expression",
+    "ExpressionError",
+    "Parameter",
+    "Symbol",
+    "UserEffect",
+    "View",
+    "catalogue",
+    "define",
+    "effect",
+    "from_expression",
+    "names_of_model",
+]

@@ -1,0 +1,118 @@
+"""What an effect may look at: the signals of a record in SI, with volumes and areas.
+
+Names that an expression may use: every signal by its name in the project file, `t` (s), `x` (m),
+`v` (m/s), and per chamber c `V_c` (m3) and `A_c` (m2); `stroke` (m) where it is known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from rtid.effects.dimension import PURE, UNITS, Dimension
+from rtid.effects.page import EffectError
+from rtid.effects.tree import FloatArray
+from rtid.model import COMMAND, POSITION, PRESSURE, VELOCITY, Model
+from rtid.units import nearest
+
+_KIND_UNIT = {COMMAND: "V", PRESSURE: "Pa", POSITION: "m"}
+
+
+def _power(unit: str, power: int) -> Dimension:
+    return tuple(power * p for p in UNITS[unit])
+
+
+def names_of_model(model: Model) -> dict[str, Dimension]:
+    """Every name that an expression may use, with its dimension."""
+    speed = tuple(a - b for a, b in zip(UNITS["m"], UNITS["s"], strict=True))
+    names = {"t": UNITS["s"], "x": UNITS["m"], "v": speed, "stroke": UNITS["m"]}
+    names |= {f"V_{c.name}": _power("m", 3) for c in model.chambers}
+    names |= {f"A_{c.name}": _power("m", 2) for c in model.chambers}
+    for signal in model.signals:
+        unit = _KIND_UNIT.get(signal.kind)
+        names[signal.name] = UNITS[unit] if unit else PURE
+        if signal.kind == VELOCITY:
+            names[signal.name] = speed
+    return names
+
+
+@dataclass(frozen=True)
+class View:
+    """One record, SI: values (n, signals) in the order of `model.signals` at the times t_s (n,).
+
+    A command at sample k acts from t_s[k] to t_s[k + 1]; all others are taken at t_s[k].
+    """
+
+    model: Model
+    t_s: FloatArray
+    values: FloatArray
+    constants: Mapping[str, float] = field(default_factory=dict)  # e.g. stroke
+
+    def signal(self, name: str) -> FloatArray:
+        """One signal by its name, (n,); EffectError if the model has none."""
+        names = [s.name for s in self.model.signals]
+        if name not in names:
+            raise EffectError(f"there is no signal {name!r}", nearest(name, names))
+        return self.values[:, names.index(name)]
+
+    def _of_kind(self, kind: str) -> dict[str, FloatArray]:
+        return {s.name: self.signal(s.name) for s in self.model.signals if s.kind == kind}
+
+    @cached_property
+    def dt_s(self) -> FloatArray:
+        """Time to the next sample, (n,); the last one repeats."""
+        steps = np.diff(self.t_s)
+        return np.append(steps, steps[-1:]) if len(steps) else np.zeros(len(self.t_s))
+
+    @cached_property
+    def u(self) -> FloatArray:
+        """The first command, (n,)."""
+        commands = self._of_kind(COMMAND)
+        if not commands:
+            raise EffectError("the model has no command", "name a signal with view.signal(name)")
+        return next(iter(commands.values()))
+
+    @cached_property
+    def p(self) -> dict[str, FloatArray]:
+        """Pressures by the names of their signals, Pa."""
+        return self._of_kind(PRESSURE)
+
+    @property
+    def x(self) -> FloatArray:
+        """Position, m."""
+        return self.signal(self.model.position)
+
+    @cached_property
+    def v(self) -> FloatArray:
+        """Velocity, m/s: as it is measured, else central differences of the position."""
+        measured = self._of_kind(VELOCITY)
+        if measured:
+            return next(iter(measured.values()))
+        return np.gradient(self.x, self.t_s) if len(self.t_s) > 1 else np.zeros(len(self.t_s))
+
+    @cached_property
+    def volume_m3(self) -> dict[str, FloatArray]:
+        """V(x) by the chamber's name."""
+        return {c.name: c.v0_m3 + c.sign * c.area_m2 * self.x for c in self.model.chambers}
+
+    @property
+    def area_m2(self) -> dict[str, float]:
+        """Piston areas by the chamber's name."""
+        return {c.name: c.area_m2 for c in self.model.chambers}
+
+    def value(self, name: str) -> FloatArray:
+        """Array of any name that an expression may use, (n,)."""
+        if name in (signal.name for signal in self.model.signals):
+            return self.signal(name)
+        own = {"t": lambda: self.t_s, "x": lambda: self.x, "v": lambda: self.v}
+        if name in own:
+            return own[name]()
+        if name[:2] == "V_" and name[2:] in self.volume_m3:
+            return self.volume_m3[name[2:]]
+        known = dict(self.constants) | {f"A_{c}": area for c, area in self.area_m2.items()}
+        if name not in known:
+            raise EffectError(f"the record knows no {name!r}", nearest(name, list(known)))
+        return np.full(len(self.t_s), known[name])

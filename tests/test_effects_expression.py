@@ -1,0 +1,249 @@
+"""Expressions are worth what Python says, and nothing but arithmetic gets through."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rtid.effects import Expression, ExpressionError
+from rtid.effects.parsing import MOST_CHARACTERS, MOST_DEPTH
+from rtid.effects.tree import FUNCTIONS, NAME, NEG, NUMBER, Node, written
+
+NAMES = ("x", "p_a", "p_b", "c")
+
+
+def python_function(name: str) -> Any:
+    """The same function on plain floats, written independently."""
+    own = {
+        "ssqrt": lambda z: math.copysign(math.sqrt(abs(z)), z),
+        "sign": lambda z: (z > 0) - (z < 0),
+        "pos": lambda z: z if z > 0 else 0.0,
+        "abs": abs,
+        "min": min,
+        "max": max,
+    }
+    return own.get(name) or getattr(math, name)
+
+
+def numbers() -> st.SearchStrategy[Node]:
+    plain = st.integers(0, 9).map(float) | st.sampled_from([0.5, 1e-3, 2.75, 1e6])
+    return plain.map(lambda v: Node(NUMBER, value=v))
+
+
+def grown(inner: st.SearchStrategy[Node]) -> st.SearchStrategy[Node]:
+    calls = [
+        st.tuples(st.just(name), st.tuples(*[inner] * count))
+        for name, (count, _) in FUNCTIONS.items()
+    ]
+    binary = st.tuples(st.sampled_from(["+", "-", "*", "/"]), st.tuples(inner, inner))
+    power = st.tuples(st.just("**"), st.tuples(inner, numbers().filter(lambda n: n.value <= 8)))
+    negated = st.tuples(st.just(NEG), st.tuples(inner))
+    return st.one_of(binary, power, negated, *calls).map(lambda made: Node(made[0], made[1]))
+
+
+TREES = st.recursive(
+    numbers() | st.sampled_from(NAMES).map(lambda name: Node(NAME, name=name)), grown, max_leaves=12
+)
+VALUES = st.fixed_dictionaries({name: st.floats(-1e3, 1e3) for name in NAMES})
+
+
+@given(TREES, VALUES)
+@settings(deadline=None, max_examples=400)
+def test_value_is_that_of_python(tree: Node, values: dict[str, float]) -> None:
+    text = written(tree)
+    if len(text) > MOST_CHARACTERS:
+        return
+    scope = {name: python_function(name) for name in FUNCTIONS} | values
+    found = Expression.parse(text, NAMES)(**values)
+    try:
+        wanted = eval(text, {"__builtins__": {}}, scope)
+    except (ValueError, ZeroDivisionError, OverflowError):
+        return  # Python raises where IEEE gives NaN or infinity: see the table below
+    if isinstance(wanted, complex):
+        assert np.isnan(found)
+    else:
+        np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-300)
+
+
+@given(TREES)
+@settings(deadline=None, max_examples=200)
+def test_what_is_written_reads_back_as_the_same(tree: Node) -> None:
+    text = written(tree)
+    if len(text) <= MOST_CHARACTERS:
+        assert Expression.parse(text, NAMES).root == tree
+
+
+SMOOTH = ("exp(x / 900)", "sin(x) * cos(p_a)", "tanh(x / 7) / (3 + x**2)", "sqrt(4 + x**2)")
+CORNERS = ("abs(x - 1)", "pos(x - p_a) * c", "min(x, p_a, 3 * c)", "max(x * c, p_b)", "ssqrt(x)")
+OTHERS = ("log(x**2 + 1)**3", "-x**-2", "hypot(x, p_a) - c", "(x**2 + 1)**(x / 50)", "c / x", "p_a")
+
+
+@pytest.mark.parametrize("text", [*SMOOTH, *CORNERS, *OTHERS])
+@given(values=VALUES)
+@settings(deadline=None, max_examples=60)
+def test_derivative_is_the_slope(text: str, values: dict[str, float]) -> None:
+    """Against central differences, away from corners and poles."""
+    values = values | {"x": 0.25 + abs(values["x"]) / 20}
+    expression = Expression.parse(text, NAMES)
+    step = 1e-5
+
+    def at(x: float) -> float:
+        return float(expression(**(values | {"x": x})))
+
+    left, middle, right = at(values["x"] - step), at(values["x"]), at(values["x"] + step)
+    slope = (right - left) / (2 * step)
+    scale = abs(middle) / values["x"] + abs(slope) + 1e-9
+    if abs(right - 2 * middle + left) / step > 1e-3 * scale:
+        return  # a corner
+    found = float(expression.derivative("x")(**values))
+    assert found == pytest.approx(slope, rel=1e-4, abs=1e-5 * scale + 1e-9 * abs(middle) / step)
+
+
+def test_derivative_to_a_name_that_is_not_there_is_zero() -> None:
+    expression = Expression.parse("p_a - p_b")
+    assert str(expression.derivative("x")) == "0"
+    assert str(expression.derivative("p_b")) == "-1"
+    assert str(Expression.parse("c * x**3").derivative("x")) == "c * (3 * x**2)"
+    assert str(Expression.parse("abs(x)").derivative("x")) == "sign(x)"
+
+
+def test_arrays_broadcast_and_other_names_are_ignored() -> None:
+    expression = Expression.parse("pos(x - x0) * (p_a - p_b)", ["x", "x0", "p_a", "p_b", "u"])
+    assert expression.names == ("x", "x0", "p_a", "p_b")
+    flow = expression(x=np.array([0.0, 0.2, 0.4]), x0=0.1, p_a=3e6, p_b=1e6, u=7)
+    np.testing.assert_allclose(flow, [0.0, 2e5, 6e5])
+    assert flow.dtype == np.float64
+
+
+@pytest.mark.parametrize(
+    ("text", "x", "value"),
+    [
+        ("1 / x", 0.0, np.inf),
+        ("-1 / x", 0.0, -np.inf),
+        ("x / x", 0.0, np.nan),
+        ("sqrt(x)", -1.0, np.nan),
+        ("ssqrt(x)", -4.0, -2.0),
+        ("log(x)", 0.0, -np.inf),
+        ("exp(x)", 1e4, np.inf),
+        ("x**0.5", -1.0, np.nan),
+        ("max(0, x)", np.nan, np.nan),
+        ("pos(x)", np.nan, np.nan),
+        ("sign(x)", np.nan, np.nan),
+        ("tanh(x)", -np.inf, -1.0),
+    ],
+)
+@pytest.mark.filterwarnings("error")
+def test_values_that_are_not_finite_follow_ieee_and_stay_quiet(
+    text: str, x: float, value: float
+) -> None:
+    found = Expression.parse(text)(x=np.array([x, 1.0]))
+    np.testing.assert_equal(found[0], value)
+    assert np.isfinite(found[1])
+
+
+HOSTILE = [
+    "__import__('os').system('true')",
+    "().__class__.__bases__[0].__subclasses__()",
+    "x.__class__",
+    "x[0]",
+    "(lambda: x)()",
+    "[x for x in (1, 2)]",
+    "{x: 1}",
+    "f'{x}'",
+    "'text' * 3",
+    "b'text'",
+    "x if x else p_a",
+    "x and p_a",
+    "x < p_a",
+    "not x",
+    "~x",
+    "x // 2",
+    "x % 2",
+    "x @ x",
+    "x << 9",
+    "(y := 3)",
+    "x, p_a",
+    "await x",
+    "yield x",
+    "eval('x')",
+    "open('x')",
+    "sqrt(x, x)",
+    "min(x)",
+    "hypot(x)",
+    "sqrt(*x)",
+    "sqrt(x=x)",
+    "sqrt",
+    "True",
+    "None",
+    "...",
+    "1j",
+    "x; p_a",
+    "x = 1",
+    "import os",
+    "x # p_a",
+    "x\x00",
+    "x + ﬀ",
+    "p_ａ",
+    "x**9",
+    "x**-9",
+    "9" * 400,
+    "1e999",
+    "(" * 300 + "x" + ")" * 300,
+    "-" * 900 + "x",
+    "x" + "+x" * 300,
+    "x" * 5000,
+    "x +",
+    "",
+    "   ",
+    "exec",
+    "__builtins__",
+    "nan",
+    "inf",
+]
+
+
+@pytest.mark.parametrize("text", HOSTILE, ids=range(len(HOSTILE)))
+def test_everything_but_arithmetic_is_refused_with_its_place(text: str) -> None:
+    with pytest.raises(ExpressionError) as caught:
+        Expression.parse(text, NAMES)
+    error = caught.value
+    assert error.remedy and error.exit_code == 2
+    lines = str(error).splitlines()
+    assert lines[-1].strip() == "^" and len(lines[-1]) == error.column + 3
+    assert "column" in error.in_one_line
+
+
+@given(st.text(max_size=60) | st.text("xp_ab()+-*/.,0123456789e sqrtminos", max_size=40))
+@settings(deadline=None, max_examples=400)
+@pytest.mark.filterwarnings("error")
+def test_any_text_is_read_or_refused(text: str) -> None:
+    with contextlib.suppress(ExpressionError):
+        Expression.parse(text, NAMES)(x=1.0, p_a=2.0, p_b=3.0, c=4.0)
+
+
+def test_the_error_points_at_the_place_and_names_the_near_one() -> None:
+    with pytest.raises(ExpressionError) as caught:
+        Expression.parse("pos(x) * (p_a - pb)", NAMES)
+    assert str(caught.value) == (
+        "'pb' is no known name\n  pos(x) * (p_a - pb)\n                  ^"
+    )
+    assert caught.value.remedy == "did you mean 'p_b'?"
+    with pytest.raises(ExpressionError) as caught:
+        Expression.parse("sqr(x)", NAMES)
+    assert caught.value.remedy == "did you mean 'sqrt'?"
+
+
+def test_a_missing_value_is_named() -> None:
+    with pytest.raises(ExpressionError, match="'p_a' has no value"):
+        Expression.parse("x * p_a")(x=1.0)
+
+
+def test_depth_is_limited_but_long_sums_within_it_work() -> None:
+    text = "+".join(["x"] * (MOST_DEPTH - 2))
+    assert Expression.parse(text)(x=1.0) == MOST_DEPTH - 2
