@@ -11,7 +11,7 @@ import pytest
 from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
 
-from rtid.compare import Comparison
+from rtid.compare import Comparison, Intervals
 from rtid.estimator.flowmap import VALID, FlowMap
 from rtid.estimator.published import publish
 from rtid.model import Model
@@ -37,9 +37,10 @@ def part(rows: int = 4000, spike: float = 0.0) -> Comparison:
     modelled = measured.copy()
     if rows:
         modelled[rows // 3] -= spike
-    return Comparison(
-        "learned", t_s, measured, modelled, np.full((rows, 2), -1), {"valid": 1.0}, np.ones(1)
-    )
+    cell = np.full((rows, 2), -1)
+    inner = Intervals(np.arange(rows + 1) / 50.0, cell, np.zeros((rows, 1)), np.zeros((rows, 4)))
+    shares, rho, signals = {"valid": 1.0}, np.ones(1), np.zeros((rows, 4))
+    return Comparison("learned", t_s, measured, modelled, cell, shares, rho, signals, inner)
 
 
 def chunk(n: int = 500) -> np.ndarray:

@@ -1,7 +1,15 @@
-"""See where a map agrees with the measurement and where it does not; arrays in, arrays out."""
+"""See where a model agrees with the measurement and where it does not; arrays in, arrays out."""
 
-from rtid.compare.comparison import Candidate, Comparison, compare, learned, refitted
+from rtid.compare.comparison import Candidate, Comparison, Intervals, compare, learned, refitted
+from rtid.compare.correlation import Correlation, correlations
+from rtid.compare.cusum import Cusum, cusums, recursive_residuals
+from rtid.compare.dependence import Dependence, against_signals, by_direction, over_time
+from rtid.compare.examination import Examination, examine
+from rtid.compare.extra import ExtraFlowError, with_extra_flow
+from rtid.compare.motion import smooth_position
+from rtid.compare.places import NoSuchBlockError, Visit, blocks_in_span, spans_of_block
 from rtid.compare.reference import ReferenceMap
+from rtid.compare.simulation import FREE_RUN, HORIZONS_S, NoFreeRunError, Simulation, simulate
 from rtid.compare.tables import (
     PAPER_DP_PA,
     PAPER_U_V,
@@ -12,16 +20,40 @@ from rtid.compare.tables import (
 )
 
 __all__ = [
+    "FREE_RUN",
+    "HORIZONS_S",
     "PAPER_DP_PA",
     "PAPER_U_V",
     "BlockRow",
     "Candidate",
     "Comparison",
+    "Correlation",
+    "Cusum",
+    "Dependence",
     "Deviation",
+    "Examination",
+    "ExtraFlowError",
+    "Intervals",
+    "NoFreeRunError",
+    "NoSuchBlockError",
     "ReferenceMap",
+    "Simulation",
+    "Visit",
+    "against_signals",
     "block_rows",
+    "blocks_in_span",
+    "by_direction",
     "compare",
+    "correlations",
+    "cusums",
     "deviations",
+    "examine",
     "learned",
+    "over_time",
+    "recursive_residuals",
     "refitted",
+    "simulate",
+    "smooth_position",
+    "spans_of_block",
+    "with_extra_flow",
 ]

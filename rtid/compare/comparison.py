@@ -2,22 +2,26 @@
 
 Per chamber, the measured side s A v of eq. (14) and the modelled one, both through H_f of eq. (10)
 and decimated to the rows of the project's filter; their difference is the equation residual.  Any
-map can be held against any trace: the learned one, a calibrated one, a data sheet.
+map can be held against any trace: the learned one, a calibrated one, a data sheet; extra flows of
+effects go to the modelled side.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rtid.compare.extra import with_extra_flow
 from rtid.compare.reference import ReferenceMap
 from rtid.estimator.flowmap import EXTRAPOLATED, LEARNING, PRIOR, SHUT, VALID, FlowMap
 from rtid.estimator.record import RecordFit
+from rtid.estimator.solution import Solution
 from rtid.estimator.state import Weights, build
 from rtid.kernels.explain import explain, filter_rows
-from rtid.model import FloatArray, Model
+from rtid.kernels.layout import TERMS
+from rtid.model import TAYLOR, FloatArray, Model
 
 REFERENCE, OUTSIDE = "reference", "outside"
 # The status of an interval is that of its least certain open edge: the last of this list.
@@ -30,6 +34,9 @@ class Candidate:
 
     status (cells,) holds the words of `rtid.estimator.flowmap`; weights gives lag and noise slopes.
     terms (terms,): coefficients of the model's shared terms in units of their scales.
+    fitted (cells, 6): the fit's own terms, before the orifice law and the blending of the published
+    map, NaN where it has none: what whitened innovations are taken from, where it is there;
+    unknowns: how many of them the fit has determined, in effect.
     """
 
     name: str
@@ -38,14 +45,33 @@ class Candidate:
     status: NDArray[np.str_]
     weights: Weights
     terms: FloatArray
+    fitted: FloatArray | None = None
+    unknowns: float = 0.0
+
+
+@dataclass(frozen=True)
+class Intervals:
+    """The samples of a comparison before any filter.
+
+    t_s (n,); cell (n - 1, edges): grid cell of each edge over the interval, -1 shut; innovation
+    (n - 1, c): whitened, at the interval's end, NaN where no row: the first chamber's own, the
+    second's given the first; of the fit's own terms, where the candidate has them.
+    values (n - 1, m): the model's signals at the interval's start.
+    """
+
+    t_s: FloatArray
+    cell: NDArray[np.int64]
+    innovation: FloatArray
+    values: FloatArray
 
 
 @dataclass(frozen=True)
 class Comparison:
     """One part of a trace beside what a candidate says about it, c chambers.
 
-    t_s (rows,), measured_m3s and modelled_m3s (rows, c): through H_f.  cell (rows, edges): grid
-    cell of each edge at the row, -1 shut.  shares: time by status of the least certain open edge.
+    t_s (rows,), measured_m3s and modelled_m3s (rows, c), signals (rows, m) of the model: all
+    through H_f.  cell (rows, edges): grid cell of each edge at the row, -1 shut.  shares: time by
+    status of the least certain open edge.
     rho (c,): variance of the whitened innovations, 1 for a model that is right to the noise; a
     published map lies a little above the fit itself, whose weak terms it replaces by the law's.
     """
@@ -57,6 +83,8 @@ class Comparison:
     cell: NDArray[np.int64]
     shares: dict[str, float]
     rho: FloatArray
+    signals: FloatArray
+    intervals: Intervals
 
     @property
     def residual_m3s(self) -> FloatArray:
@@ -83,38 +111,74 @@ def learned(fit: RecordFit, flowmap: FlowMap, name: str = "learned") -> Candidat
     """The published map with the compliance and lag of the fit."""
     status = np.concatenate([edge.status.ravel() for edge in flowmap.edges])
     compliance = fit.solution.compliance
-    terms = fit.solution.terms_theta
-    return Candidate(name, flowmap.theta_cells(), compliance, status, fit.weights, terms)
+    terms, theta = fit.solution.terms_theta, flowmap.theta_cells()
+    unknowns = fit.state.engine[0]["rows"] * len(compliance) - fit.solution.dof
+    own = _fitted(fit.solution)
+    return Candidate(name, theta, compliance, status, fit.weights, terms, own, float(unknowns))
+
+
+def _fitted(solution: Solution) -> FloatArray | None:
+    """The fit's own terms (cells, 6), NaN where never visited; None where windows overlap."""
+    model = solution.model
+    if any(edge.basis != TAYLOR for edge in model.edges):
+        return None
+    theta, first = np.full((model.n_cells, TERMS), np.nan), model.first_cells
+    for b in solution.blocks:
+        theta[first[b.edge] + b.i * model.edges[b.edge].grid.shape[1] + b.j] = b.theta
+    return theta
 
 
 def refitted(
     model: Model, reference: ReferenceMap, weights: Weights, chunk: FloatArray
 ) -> Candidate:
     """A reference map with each chamber's compliance fitted to the chunk, all else as it is."""
-    theta = reference.theta_cells(model)
-    empty, one = np.zeros_like(theta), np.ones(len(model.chambers))
-    none = np.zeros(len(model.terms))
-    by_map = _rows(model, _hold(model, theta, 0.0 * one, weights, none, chunk))
-    by_beta = _rows(model, _hold(model, empty, one, weights, none, chunk))
-    at = np.intersect1d(by_map[0], by_beta[0], return_indices=True)
-    y = (by_map[1] - by_map[2])[at[1]]
-    column = by_beta[2][at[2]]
+    theta, none = reference.theta_cells(model), np.zeros(len(model.terms))
+    one = np.ones(len(model.chambers))
+    unknown = np.full(len(theta), REFERENCE)
+    parts = Candidate(reference.name, theta, 0.0 * one, unknown, weights, none)
+    by_map = _rows(model, _hold(model, parts, chunk))
+    parts = replace(parts, theta=np.zeros_like(theta), compliance=one)
+    by_beta = _rows(model, _hold(model, parts, chunk))
+    at = np.intersect1d(by_map.t_s, by_beta.t_s, return_indices=True)
+    y = (by_map.measured - by_map.modelled)[at[1]]
+    column = by_beta.modelled[at[2]]
     compliance = (column * y).sum(axis=0) / np.maximum((column**2).sum(axis=0), 1e-300)
     low, high = 1 / model.beta_bounds_pa[1], 1 / model.beta_bounds_pa[0]
-    status = np.full(len(theta), REFERENCE)
-    return Candidate(reference.name, theta, np.clip(compliance, low, high), status, weights, none)
+    found = np.clip(compliance, low, high)
+    return Candidate(reference.name, theta, found, unknown, weights, none)
 
 
-def compare(model: Model, candidate: Candidate, chunk: FloatArray) -> Comparison:
-    """Hold the candidate against samples chunk (n, 2 + signals) = [t_s, flags, values...], SI."""
-    held = _hold(
-        model, candidate.theta, candidate.compliance, candidate.weights, candidate.terms, chunk
+def compare(
+    model: Model,
+    candidate: Candidate,
+    chunk: FloatArray,
+    extra_flow: FloatArray | None = None,
+    seen: bool = False,
+) -> Comparison:
+    """Hold the candidate against samples chunk (n, 2 + signals) = [t_s, flags, values...], SI.
+
+    extra_flow (n - 1, chambers) m3/s is added to the modelled side.  seen: the candidate was fitted
+    to these samples, so that its own terms hold in every block, else in the valid ones alone.
+    """
+    held = _hold(model, candidate, chunk, extra_flow)
+    innovation = held.innovation
+    if candidate.fitted is not None:
+        known = np.isfinite(candidate.fitted[:, 0]) & (seen | (candidate.status == VALID))
+        own = np.where(known[:, None], candidate.fitted, candidate.theta)
+        innovation = _hold(model, replace(candidate, theta=own), chunk, extra_flow).innovation
+    rows = _rows(model, held, chunk)
+    interval = np.clip(np.searchsorted(held.t_s, rows.t_s) - 1, 0, len(held.cell) - 1)
+    return Comparison(
+        candidate.name,
+        rows.t_s,
+        rows.measured,
+        rows.modelled,
+        held.cell[interval],
+        _shares(held, candidate.status),
+        _mean_squares(held.innovation),
+        rows.signals,
+        Intervals(held.t_s, held.cell, innovation, chunk[:-1, 2 : 2 + len(model.signals)]),
     )
-    t_s, measured, modelled = _rows(model, held)
-    interval = np.clip(np.searchsorted(held.t_s, t_s) - 1, 0, len(held.cell) - 1)
-    rho = _mean_squares(held.innovation)
-    shares = _shares(held, candidate.status)
-    return Comparison(candidate.name, t_s, measured, modelled, held.cell[interval], shares, rho)
 
 
 @dataclass(frozen=True)
@@ -128,32 +192,43 @@ class _Held:
 
 
 def _hold(
-    model: Model,
-    theta: FloatArray,
-    compliance: FloatArray,
-    weights: Weights,
-    terms: FloatArray,
-    chunk: FloatArray,
+    model: Model, candidate: Candidate, chunk: FloatArray, extra_flow: FloatArray | None = None
 ) -> _Held:
+    model, terms, chunk = with_extra_flow(model, candidate.terms, chunk, extra_flow)
     n, c = max(len(chunk) - 1, 0), len(model.chambers)
     flow, innovation = np.full((n, 2 * c), np.nan), np.full((n, c), np.nan)
     cell = np.full((n, len(model.edges)), -1, np.int64)
-    state = build(model.with_taylor_maps, weights)
+    state = build(model.with_taylor_maps, candidate.weights)
     state.engine[0]["term_theta"][: len(terms)] = terms
+    theta, compliance = candidate.theta, candidate.compliance
     explain(state.engine, state.cells, theta, compliance, chunk, flow, cell, innovation)
     return _Held(np.ascontiguousarray(chunk[:, 0]), flow, cell, innovation)
 
 
-def _rows(model: Model, held: _Held) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Row instants, measured and modelled flow through the project's filter."""
-    f = model.filter
+@dataclass(frozen=True)
+class _Rows:
+    """Rows of H_f: instants (rows,), flows (rows, c) and signals (rows, m)."""
+
+    t_s: FloatArray
+    measured: FloatArray
+    modelled: FloatArray
+    signals: FloatArray
+
+
+def _rows(model: Model, held: _Held, chunk: FloatArray | None = None) -> _Rows:
+    """Row instants, measured and modelled flow through the project's filter, and the signals."""
+    f, c = model.filter, len(model.chambers)
+    rate = held.flow
+    if chunk is not None:
+        values = chunk[:, 2 : 2 + len(model.signals)]
+        rate = np.hstack([rate, 0.5 * (values[1:] + values[:-1])])
     if len(held.t_s) < 2:
-        empty = np.empty((0, len(model.chambers)))
-        return np.empty(0), empty, empty
+        return _Rows(np.empty(0), *(np.empty((0, m)) for m in (c, c, len(model.signals))))
     span_s = held.t_s[-1] - held.t_s[0]
-    out = np.empty((int(span_s * f.rows_per_s) + 2, 1 + held.flow.shape[1]))
-    rows = filter_rows(held.t_s, held.flow, f.wn_rad_s, f.zeta, 1.0 / f.rows_per_s, out)
-    return out[:rows, 0], out[:rows, 1::2], out[:rows, 2::2]
+    out = np.empty((int(span_s * f.rows_per_s) + 2, 1 + rate.shape[1]))
+    rows = filter_rows(held.t_s, rate, f.wn_rad_s, f.zeta, 1.0 / f.rows_per_s, out)
+    out = out[:rows]
+    return _Rows(out[:, 0], out[:, 1 : 2 * c : 2], out[:, 2 : 2 * c + 1 : 2], out[:, 2 * c + 1 :])
 
 
 def _mean_squares(innovation: FloatArray) -> FloatArray:

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rtid.compare.comparison import Comparison
+from rtid.estimator.blocks import EMPTY
 from rtid.estimator.flowmap import VALID, FlowMap
 from rtid.estimator.solution import Solution
-from rtid.model import FloatArray
+from rtid.model import FloatArray, Model
 
 PAPER_U_V = (4.0, 5.0, 6.0, 7.0)  # Table 1 of IMECE2005-79420
 PAPER_DP_PA = (4.5e6, 5.0e6, 5.5e6)
@@ -26,9 +27,16 @@ class AnyMap(Protocol):
 
 @dataclass(frozen=True)
 class BlockRow:
-    """One visited block; residual_rms_m3s: of its chambers' rows while it was open, NaN: none."""
+    """One block that was visited by the fit or in this part; i along u, j along dp.
+
+    rows, dwell_s, condition, flow_m3s and sd_m3s are the fit's, NaN where it has none.
+    residual_rms_m3s: of its chambers' rows while it was open, NaN: none; residual_share: of the sum
+    of squares of these chambers' residual over the whole part.  reason: why it is not identified.
+    """
 
     edge: str
+    i: int
+    j: int
     u_v: tuple[float, float]
     dp_pa: tuple[float, float]
     rows: int
@@ -37,42 +45,69 @@ class BlockRow:
     flow_m3s: float
     sd_m3s: float
     residual_rms_m3s: float
+    residual_share: float
     status: str
     reason: str
 
 
-def block_rows(solution: Solution, comparison: Comparison) -> list[BlockRow]:
-    """All visited blocks with the residual that they leave in a comparison."""
-    model, first = solution.model, 0
-    starts = []
-    for edge in model.edges:
-        starts.append(first)
-        first += edge.grid.shape[0] * edge.grid.shape[1]
-    table = []
-    for b in solution.blocks:
-        edge = model.edges[b.edge]
-        u, p, nd = edge.grid.u_v, edge.grid.dp_pa, edge.grid.shape[1]
-        at = comparison.cell[:, b.edge] == starts[b.edge] + b.i * nd + b.j
-        ends = (edge.source, edge.sink)
-        touched = [c for c, chamber in enumerate(model.chambers) if chamber.pressure in ends]
-        residual = comparison.residual_m3s[np.ix_(at, touched)]
-        rms = float(np.sqrt(np.mean(residual**2))) if residual.size else np.nan
-        span = (float(u[b.i]), float(u[b.i + 1])), (float(p[b.j]), float(p[b.j + 1]))
-        table.append(
-            BlockRow(
-                edge.name,
-                *span,
-                rows=b.rows,
-                dwell_s=b.dwell_s,
-                condition=b.condition,
-                flow_m3s=b.mean_flow_m3s,
-                sd_m3s=b.mean_sd_m3s,
-                residual_rms_m3s=rms,
-                status=b.status,
-                reason=b.reason,
+NEVER = "never visited in the data of the fit"
+
+
+def block_rows(
+    solution: Solution, comparison: Comparison, flowmap: FlowMap | None = None
+) -> list[BlockRow]:
+    """All blocks that the fit or the comparison visited, with the residual that they leave.
+
+    flowmap: gives the status of blocks that the fit has not visited.
+    """
+    model, table = solution.model, []
+    for k, edge in enumerate(model.edges):
+        nd = edge.grid.shape[1]
+        squares, count, total = _residual_by_cell(model, comparison, k)
+        visited = {(b.i, b.j) for b in solution.blocks if b.edge == k}
+        here = {divmod(int(cell), nd) for cell in np.flatnonzero(count)}
+        for i, j in sorted(visited | here):
+            b, at = solution.block(k, i, j), i * nd + j
+            u, p = edge.grid.u_v[i : i + 2].tolist(), edge.grid.dp_pa[j : j + 2].tolist()
+            unknown = EMPTY if flowmap is None else str(flowmap.edges[k].status[i, j])
+            table.append(
+                BlockRow(
+                    edge.name,
+                    i,
+                    j,
+                    (u[0], u[1]),
+                    (p[0], p[1]),
+                    rows=b.rows if b else 0,
+                    dwell_s=b.dwell_s if b else 0.0,
+                    condition=b.condition if b else np.nan,
+                    flow_m3s=b.mean_flow_m3s if b else np.nan,
+                    sd_m3s=b.mean_sd_m3s if b else np.nan,
+                    residual_rms_m3s=float(np.sqrt(squares[at] / count[at]))
+                    if count[at]
+                    else np.nan,
+                    residual_share=float(squares[at] / total) if total > 0 else 0.0,
+                    status=b.status if b else unknown,
+                    reason=b.reason if b else NEVER,
+                )
             )
-        )
     return table
+
+
+def _residual_by_cell(
+    model: Model, comparison: Comparison, k: int
+) -> tuple[FloatArray, FloatArray, float]:
+    """Per cell of edge k: sum of squares of its chambers' residual, and their number; the total."""
+    edge = model.edges[k]
+    touched = [c for c, chamber in enumerate(model.chambers) if edge.sign(chamber) != 0]
+    square = (comparison.residual_m3s[:, touched] ** 2).sum(axis=1)
+    cell, size = (
+        comparison.cell[:, k] - model.first_cells[k],
+        edge.grid.shape[0] * edge.grid.shape[1],
+    )
+    here = comparison.cell[:, k] >= 0
+    squares = np.bincount(cell[here], square[here], size)
+    count = len(touched) * np.bincount(cell[here], minlength=size)
+    return np.asarray(squares, float), np.asarray(count, float), float(square.sum())
 
 
 @dataclass(frozen=True)

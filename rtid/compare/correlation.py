@@ -1,0 +1,161 @@
+"""What the whitened innovations are still correlated with: themselves, and each input.
+
+    r_ee(k) = corr(e_t, e_t-k)            r_eu(k) = corr(e_t, u_t-k)
+
+A model that explains everything leaves white e.  The 95 % bands are Bartlett's (1935): for two
+series that have nothing to do with each other
+
+    var r_eu(k) = 1 / N_k  sum over j of rho_ee(j) rho_uu(j),
+
+so an input's own correlation counts as far as e is correlated too; N_k pairs of rows.  A fit with
+p unknowns has made its own residual a little anti-correlated within its blocks, by p / N at most
+times the share of the rows k apart that are in one block: the autocorrelation's lower band is so
+much further away.
+
+Positive lags: the input comes first, the model misses some of its effect.  Negative lags: e comes
+first, that is feedback, a controller that sees the sensors' noise, and no fault of the model.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.fft import irfft, next_fast_len, rfft
+
+from rtid.compare.comparison import Comparison
+from rtid.model import COMMAND, PRESSURE, FloatArray, Model
+
+MAX_LAG_S = 0.2
+MOST_LAGS = 400
+MEMORY = 4  # of the bands' sum over j, in largest lags
+Z95 = 1.959964
+VARIES = 3.0  # an input's standard deviation in those of its noise, below which it is constant
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """Of one chamber's innovations with a signal (itself: `itself`), lags_s and value (l,).
+
+    low, high (l,): 95 % of the lags of an unrelated signal lie within.
+    """
+
+    chamber: str
+    signal: str
+    lags_s: FloatArray
+    value: FloatArray
+    low: FloatArray
+    high: FloatArray
+
+    @property
+    def itself(self) -> bool:
+        """Whether it is the autocorrelation; its lags are all positive."""
+        return self.signal == ""
+
+    @property
+    def outside(self) -> float:
+        """Share of the lags of 0 and later outside the band; 0.05 is what chance gives."""
+        return self._outside(self.lags_s >= 0)
+
+    @property
+    def feedback(self) -> float:
+        """Share of the negative lags outside the band."""
+        return self._outside(self.lags_s < 0)
+
+    def _outside(self, at: np.ndarray) -> float:
+        off = (self.value < self.low) | (self.value > self.high)
+        return float(np.mean(off[at])) if at.any() else 0.0
+
+
+def correlations(
+    model: Model, part: Comparison, unknowns: float = 0.0, max_lag_s: float = MAX_LAG_S
+) -> list[Correlation]:
+    """Autocorrelation of every chamber's innovations and their correlation with every input.
+
+    Inputs are the commands and the pressures that are no chamber's, as far as they vary.  unknowns:
+    of the fit, where it was made from this part.
+    """
+    e = part.intervals.innovation
+    at = np.flatnonzero(np.isfinite(e).all(axis=1))
+    if len(at) < 16:
+        return []
+    t_s = part.intervals.t_s[1:][at]
+    step_s = float(np.median(np.diff(t_s)))
+    lags = int(min(MOST_LAGS, len(at) // 4, max(1, round(max_lag_s / step_s))))
+    row = np.round((t_s - t_s[0]) / step_s).astype(int)
+    n, found = int(row[-1]) + 1, []
+    known = np.zeros(n)
+    known[row] = 1.0
+    dip = unknowns / len(at) * _together(part.intervals.cell[at], lags)
+    for c, chamber in enumerate(model.chambers):
+        error = _centred(row, e[at, c], n)
+        own = _Series(error, known, (MEMORY + 1) * lags)
+        found.append(_auto(chamber.name, own, dip, step_s))
+        for name, values in _inputs(model, part, at):
+            other = _Series(_centred(row, values, n), known, (MEMORY + 1) * lags)
+            found.append(_cross(chamber.name, name, own, other, lags, step_s))
+    return found
+
+
+def _inputs(model: Model, part: Comparison, at: np.ndarray) -> list[tuple[str, FloatArray]]:
+    """Inputs over the intervals that end in the rows `at`."""
+    states = {chamber.pressure for chamber in model.chambers}
+    found = []
+    for k, signal in enumerate(model.signals):
+        if signal.kind in (COMMAND, PRESSURE) and signal.name not in states:
+            values = part.intervals.values[at, k]
+            noise = np.hypot(signal.noise, signal.resolution)
+            if values.std() > max(VARIES * noise, 1e-9 * np.abs(values).max()):
+                found.append((signal.name, values))
+    return found
+
+
+def _centred(row: np.ndarray, values: FloatArray, n: int) -> FloatArray:
+    series = np.zeros(n)
+    series[row] = values - values.mean()
+    return series
+
+
+class _Series:
+    """A centred series with gaps (zeros), its spectrum and its autocorrelation up to `most`."""
+
+    def __init__(self, values: FloatArray, known: FloatArray, most: int) -> None:
+        self.n = len(values)
+        self.size = next_fast_len(self.n + most + 1, real=True)
+        self.spectrum, self.mask = rfft(values, self.size), rfft(known, self.size)
+        self.power = float(values @ values)
+        pairs = np.maximum(np.round(irfft(np.abs(self.mask) ** 2, self.size)), 1.0)
+        raw = irfft(np.abs(self.spectrum) ** 2, self.size)
+        scale = known.sum() / max(self.power, 1e-300)
+        self.pairs = pairs
+        self.rho = (raw / pairs * scale)[: min(most, self.n - 1) + 1]
+
+
+def _together(cell: np.ndarray, lags: int) -> FloatArray:
+    """Share of the rows k = 1..lags apart between which no edge has changed its block (lags,)."""
+    changes = np.concatenate([[0], np.cumsum((np.diff(cell, axis=0) != 0).any(axis=1))])
+    some = np.unique(np.round(np.geomspace(1, lags, 16)).astype(int))
+    share = [float(np.mean(changes[k:] == changes[:-k])) for k in some]
+    return np.interp(np.arange(1, lags + 1), some, share)
+
+
+def _auto(chamber: str, own: _Series, dip: FloatArray, step_s: float) -> Correlation:
+    k = np.arange(1, len(dip) + 1)
+    lags_s = np.asarray(k * step_s)
+    band = Z95 / np.sqrt(own.pairs[k])
+    return Correlation(chamber, "", lags_s, own.rho[k], -band - dip, band)
+
+
+def _cross(
+    chamber: str, name: str, own: _Series, other: _Series, lags: int, step_s: float
+) -> Correlation:
+    k = np.arange(-lags, lags + 1)
+    lags_s = np.asarray(k * step_s)
+    # sum over t of e_t u_t-k: the inverse transform of E conj(U), at lag k
+    raw = irfft(own.spectrum * np.conj(other.spectrum), own.size)[k]
+    value = raw / np.sqrt(max(own.power * other.power, 1e-300))
+    most = min(len(own.rho), len(other.rho))
+    taper = 1.0 - np.arange(1, most) / most
+    related = 1.0 + 2.0 * float((taper * own.rho[1:most] * other.rho[1:most]).sum())
+    band = Z95 * np.sqrt(max(related, 1.0 / own.n) / own.pairs[np.abs(k)])
+    return Correlation(chamber, name, lags_s, value, -band, band)
