@@ -8,7 +8,7 @@ from rtid.effects.expression import Expression
 from rtid.effects.page import Effect, EffectError, Parameter, Symbol, catalogue, effect
 from rtid.effects.parsing import ExpressionError
 from rtid.effects.user import UserEffect, define, from_expression
-from rtid.effects.view import View, names_of_model
+from rtid.effects.view import View, names_of, names_of_model
 
 __all__ = [
     "Effect",
@@ -23,5 +23,6 @@ __all__ = [
     "define",
     "effect",
     "from_expression",
+    "names_of",
     "names_of_model",
 ]

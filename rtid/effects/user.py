@@ -18,12 +18,17 @@ from typing import Any
 
 import numpy as np
 
-from rtid.effects.dimension import FLOW, dimension, dimension_of_unit, unit_of_dimension
+from rtid.effects.dimension import (
+    FLOW,
+    Dimension,
+    dimension,
+    dimension_of_unit,
+    unit_of_dimension,
+)
 from rtid.effects.expression import Expression
 from rtid.effects.page import EffectError
 from rtid.effects.tree import FloatArray
 from rtid.effects.view import View
-from rtid.units import nearest
 
 MOST_SHAPES = 64  # combinations of all banks: each is a column of its own
 Flow = Callable[..., FloatArray]  # (view, **shape) -> (n,)
@@ -142,30 +147,41 @@ def define(
 
 
 def from_expression(
-    name: str, text: str, unit: str, *, view_names: Mapping[str, Any], **keys: Any
+    name: str,
+    text: str,
+    unit: str,
+    *,
+    names: Mapping[str, Dimension | None],
+    constants: Mapping[str, float] | None = None,
+    **keys: Any,
 ) -> UserEffect:
-    """A UserEffect from an expression over the names of a view and the shape parameters.
+    """A UserEffect from an expression over the names of a view, constants and shape parameters.
 
-    view_names: dimension of every name (see `view.names_of_model`).  Raises ExpressionError with
-    the place in the text, EffectError where the unit does not fit or a shape is not used.
+    names: those of a view with their dimension, see `names_of_model`; keys: as of `make`.  Raises
+    ExpressionError with the place in the text, EffectError where the unit does not fit or a shape
+    is not used.
     """
-    shapes = keys.get("shapes") or {}
-    known = {**view_names, **dict.fromkeys(shapes)}
+    shapes, constants = keys.get("shapes") or {}, dict(constants or {})
+    known = {**names, **dict.fromkeys(constants), **dict.fromkeys(shapes)}
     expression = Expression.parse(text, known)
     for shape in shapes:
         if shape not in expression.names:
-            remedy = f"use it in flow, or {nearest(shape, list(expression.names))}"
-            raise EffectError(f"effect {name!r}: flow does not use {shape!r}", remedy)
+            raise EffectError(f"effect {name!r}: flow does not use {shape!r}", "use it, or drop it")
     _check_unit(name, expression, unit, known)
+    own = {n: value for n, value in constants.items() if n not in names}
 
     def function(view: View, **shape: float) -> FloatArray:
-        needed = (n for n in expression.names if n not in shape)
-        return expression.value({**{n: view.value(n) for n in needed}, **shape})
+        given = own | shape
+        return expression.value(
+            {n: given[n] if n in given else view.value(n) for n in expression.names}
+        )
 
     return make(name, unit, function, source=text, **keys)
 
 
-def _check_unit(name: str, expression: Expression, unit: str, known: Mapping[str, Any]) -> None:
+def _check_unit(
+    name: str, expression: Expression, unit: str, known: Mapping[str, Dimension | None]
+) -> None:
     """Refuse a coefficient whose unit does not turn the expression into a flow."""
     found, given = dimension(expression, known, literal_is_pure=False), dimension_of_unit(unit)
     if found is None:

@@ -1,42 +1,46 @@
 """What an effect may look at: the signals of a record in SI, with volumes and areas.
 
 Names that an expression may use: every signal by its name in the project file, `t` (s), `x` (m),
-`v` (m/s), and per chamber c `V_c` (m3) and `A_c` (m2); `stroke` (m) where it is known.
+`v` (m/s), and per chamber c `V_c` (m3) and `A_c` (m2).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from rtid.effects.dimension import PURE, UNITS, Dimension
+from rtid.effects.dimension import Dimension, dimension_of_unit
 from rtid.effects.page import EffectError
 from rtid.effects.tree import FloatArray
-from rtid.model import COMMAND, POSITION, PRESSURE, VELOCITY, Model
+from rtid.model import COMMAND, MODE, POSITION, PRESSURE, VELOCITY, Model
 from rtid.units import nearest
 
-_KIND_UNIT = {COMMAND: "V", PRESSURE: "Pa", POSITION: "m"}
+_UNIT_OF_KIND = {COMMAND: "V", PRESSURE: "Pa", POSITION: "m", VELOCITY: "m/s", MODE: "1"}
 
 
-def _power(unit: str, power: int) -> Dimension:
-    return tuple(power * p for p in UNITS[unit])
+def names_of(
+    kinds: Mapping[str, str | None], chambers: Iterable[str]
+) -> dict[str, Dimension | None]:
+    """Every name that an expression may use, with its dimension (None: any).
+
+    kinds: kind of each signal (`rtid.model.COMMAND`, ...) by its name.
+    """
+    units = {"t": "s", "x": "m", "v": "m/s"}
+    for chamber in chambers:
+        units |= {f"V_{chamber}": "m3", f"A_{chamber}": "m2"}
+    known: dict[str, Dimension | None] = {n: dimension_of_unit(u) for n, u in units.items()}
+    for name, kind in kinds.items():
+        unit = _UNIT_OF_KIND.get(kind or "")
+        known[name] = dimension_of_unit(unit) if unit else None
+    return known
 
 
-def names_of_model(model: Model) -> dict[str, Dimension]:
-    """Every name that an expression may use, with its dimension."""
-    speed = tuple(a - b for a, b in zip(UNITS["m"], UNITS["s"], strict=True))
-    names = {"t": UNITS["s"], "x": UNITS["m"], "v": speed, "stroke": UNITS["m"]}
-    names |= {f"V_{c.name}": _power("m", 3) for c in model.chambers}
-    names |= {f"A_{c.name}": _power("m", 2) for c in model.chambers}
-    for signal in model.signals:
-        unit = _KIND_UNIT.get(signal.kind)
-        names[signal.name] = UNITS[unit] if unit else PURE
-        if signal.kind == VELOCITY:
-            names[signal.name] = speed
-    return names
+def names_of_model(model: Model) -> dict[str, Dimension | None]:
+    """As `names_of`, for the signals and chambers of a model."""
+    return names_of({s.name: s.kind for s in model.signals}, [c.name for c in model.chambers])
 
 
 @dataclass(frozen=True)
@@ -49,7 +53,6 @@ class View:
     model: Model
     t_s: FloatArray
     values: FloatArray
-    constants: Mapping[str, float] = field(default_factory=dict)  # e.g. stroke
 
     def signal(self, name: str) -> FloatArray:
         """One signal by its name, (n,); EffectError if the model has none."""
@@ -112,7 +115,7 @@ class View:
             return own[name]()
         if name[:2] == "V_" and name[2:] in self.volume_m3:
             return self.volume_m3[name[2:]]
-        known = dict(self.constants) | {f"A_{c}": area for c, area in self.area_m2.items()}
-        if name not in known:
-            raise EffectError(f"the record knows no {name!r}", nearest(name, list(known)))
-        return np.full(len(self.t_s), known[name])
+        areas = {f"A_{chamber}": area for chamber, area in self.area_m2.items()}
+        if name not in areas:
+            raise EffectError(f"the record knows no {name!r}", nearest(name, [*own, *areas]))
+        return np.full(len(self.t_s), areas[name])

@@ -8,8 +8,9 @@ from typing import Any
 
 from firmware_bridge import catalog as catalogs
 from firmware_bridge.catalog import Catalog
+from rtid.effects import UserEffect
 from rtid.model import Model
-from rtid.project import build, references, schema
+from rtid.project import build, effects, references, schema
 from rtid.project.errors import Problem, ProjectError
 from rtid.project.project import Project, Sections
 from rtid.project.sections import Raw, read_section
@@ -35,6 +36,7 @@ NAMED: dict[str, type[schema.Section]] = {
     "signals": schema.SignalSection,
     "chambers": schema.ChamberSection,
     "edges": schema.EdgeSection,
+    "effects": schema.EffectSection,
 }
 REQUIRED = ("project", "source", "signals", "geometry", "chambers", "edges")
 
@@ -47,10 +49,12 @@ def load(path: str | Path) -> Project:
     dbc, catalog = _open_dbc(raw, path.parent, problems)
     problems += references.check(raw, catalog, path.parent)
     problems += _across(parts)
+    own, more = effects.build(parts, raw, catalog, path.parent)
+    problems += more
     if problems:
         first = {problem.path: problem for problem in reversed(problems)}  # one per place
         raise ProjectError(path, [p for p in problems if first[p.path] is p])
-    return _assemble(path, Sections(**parts), dbc, catalog)
+    return _assemble(path, Sections(**parts), dbc, catalog, own)
 
 
 def _parse(path: Path) -> Raw:
@@ -101,7 +105,10 @@ def _read_named(
     found: dict[str, Any] = {}
     problems: list[Problem] = []
     for key, table in raw.items():
-        found[key], more = read_section(kind, table, f"{name}.{key}")
+        place = f"{name}.{key}"
+        found[key], more = (
+            effects.read(table, place) if name == "effects" else read_section(kind, table, place)
+        )
         problems += more
     return found, problems
 
@@ -148,7 +155,13 @@ def _across(parts: dict[str, Any]) -> list[Problem]:
     return problems
 
 
-def _assemble(path: Path, sections: Sections, dbc: Path | None, catalog: Catalog | None) -> Project:
+def _assemble(
+    path: Path,
+    sections: Sections,
+    dbc: Path | None,
+    catalog: Catalog | None,
+    own: tuple[UserEffect, ...],
+) -> Project:
     model = build.build_model(sections, catalog)
     signals = sections.signals
     has_columns = all(s.column or s.constant is not None for s in signals.values())
@@ -172,6 +185,7 @@ def _assemble(path: Path, sections: Sections, dbc: Path | None, catalog: Catalog
             if m.name in sections.messages and sections.messages[m.name].offset_s is None
         },
         digest=build.digest(model),
+        effects=own,
     )
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from firmware_bridge.config import Assembly
+from rtid.effects import UserEffect
 from rtid.model import Model
 from rtid.project.schema import (
     BetaSection,
@@ -14,6 +15,7 @@ from rtid.project.schema import (
     DynamicsSection,
     EdgeDefaults,
     EdgeSection,
+    EffectSection,
     EstimatorSection,
     FilterSection,
     GatesSection,
@@ -47,6 +49,7 @@ class Sections:
     dynamics: DynamicsSection = field(default_factory=DynamicsSection)
     estimator: EstimatorSection = field(default_factory=EstimatorSection)
     record: RecordSection = field(default_factory=RecordSection)
+    effects: dict[str, EffectSection] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,8 @@ class Project:
 
     `assembly` serves a CAN trace, or a table if the project has no DBC; `table_assembly` serves a
     table, None unless every signal names a `column` or is constant.  `noise_unknown` and
-    `offset_tolerance_s` list what the file leaves to be estimated.
+    `offset_tolerance_s` list what the file leaves to be estimated.  `effects` are the user's own,
+    of the file and of its Python module: candidates of the diagnosis, not part of the model.
     """
 
     path: Path
@@ -68,6 +72,7 @@ class Project:
     noise_unknown: tuple[str, ...]
     offset_tolerance_s: dict[str, float]
     digest: str
+    effects: tuple[UserEffect, ...] = ()
 
     def model_with(self, noise: Mapping[str, float]) -> Model:
         """The model with the noise of some signals (1 sigma, SI) replaced, e.g. by an estimate."""

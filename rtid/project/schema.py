@@ -97,6 +97,7 @@ Estimable = Annotated[float | None, BeforeValidator(_estimate)]
 Interval = Annotated[tuple[float, float], BeforeValidator(_pair), AfterValidator(_ordered)]
 Borders = Annotated[tuple[float, ...], BeforeValidator(_borders)]
 Numbers = Annotated[tuple[float, ...], BeforeValidator(_tuple), Field(min_length=2)]
+Bank = Annotated[tuple[float, ...], BeforeValidator(_tuple), Field(min_length=1)]
 Sign = Literal[1, -1]
 
 LENGTH, AREA, VOLUME = Dimension("length"), Dimension("area"), Dimension("volume")
@@ -111,9 +112,10 @@ class Section(BaseModel):
 
 
 class ProjectSection(Section):
-    """[project]: what the machine is called."""
+    """[project]: what the machine is called, and a file of Python code with effects of its own."""
 
     name: str = Field(min_length=1, description='name = "boom cylinder"')
+    effects_module: str | None = None  # a Python file with effects; it is run at every load
 
 
 class SourceSection(Section):
@@ -271,6 +273,21 @@ class EstimatorSection(Section):
 
     form: Literal["integral", "carry", "restart"] = "integral"
     recent_blocks: int = Field(default=64, ge=2, le=64)
+
+
+class EffectSection(Section):
+    """[effects.NAME]: a flow that somebody suspects, as a formula per unit of its coefficient.
+
+    Every other key of the table with a list of numbers is a shape parameter with its bank.
+    """
+
+    flow: str = Field(description='flow = "p_a - p_b", m3/s per unit of the coefficient')
+    unit: str = Field(description='unit = "m3/s/Pa", of the coefficient')
+    chambers: dict[str, Sign] = Field(min_length=1, description="chambers = {a = -1, b = 1}")
+    sign: Literal[1, 0, -1] = 1
+    largest: float | None = Field(default=None, gt=0)
+    title: str = ""
+    shapes: dict[str, Bank] = Field(default_factory=dict)
 
 
 class RecordSection(Section):
