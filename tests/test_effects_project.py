@@ -38,7 +38,7 @@ def loaded(folder: Path, more: str, python: str = "") -> Project:
     text = EXAMPLE.read_text()
     if python:
         (folder / "mine.py").write_text(python)
-        text = text.replace("[project]", '[project]\neffects_module = "mine.py"')
+        text = text.replace("[project]", '[project]\neffects_module = "mine.py"', 1)
     path = folder / "project.toml"
     path.write_text(text + more)
     return load(path)
@@ -169,7 +169,7 @@ def test_errors_of_the_python_file_name_its_line(tmp_path: Path, python: str, pr
 
 
 def test_a_missing_python_file_and_a_double_name_are_refused(tmp_path: Path) -> None:
-    text = EXAMPLE.read_text().replace("[project]", '[project]\neffects_module = "none.py"')
+    text = EXAMPLE.read_text().replace("[project]", '[project]\neffects_module = "none.py"', 1)
     (tmp_path / "project.toml").write_text(text)
     with pytest.raises(ProjectError, match=r"none\.py is no file"):
         load(tmp_path / "project.toml")
