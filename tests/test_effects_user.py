@@ -99,6 +99,14 @@ def test_a_measured_velocity_is_taken() -> None:
         _ = seen.u
 
 
+def test_volumes_hold_the_command_and_take_the_rest_as_linear() -> None:
+    """Half a sample of wrong hold would look like a delay."""
+    seen, found = view(), formula("u * (p_a - p_b)", "m3/s/Pa/V")
+    u, drop = seen.u, seen.p["p_a"] - seen.p["p_b"]
+    wanted = u[:-1] * 0.5 * (drop[1:] + drop[:-1]) * 1e-3
+    np.testing.assert_allclose(found.volume(seen), wanted, rtol=1e-9)
+
+
 def test_geometry_time_and_constants_have_names() -> None:
     chambers = {"a": 1}
     found = from_expression(

@@ -143,7 +143,7 @@ NOTATION = {
 PRACTICAL = {
     "m3/s/Pa": ("L/min/MPa", 6e10),
     "m3/s/sqrt(Pa)": ("L/min/sqrt(MPa)", 6e7),
-    "Pa s/m3": ("MPa/(L/min)", 1e-6 / 6e4),
+    "m3/s": ("L/min", 6e4),
     "m3/Pa": ("cm3/MPa", 1e12),
     "m3": ("L", 1e3),
     "Pa": ("MPa", 1e-6),

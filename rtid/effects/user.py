@@ -76,6 +76,15 @@ class UserEffect:
             raise EffectError(f"{reason}, {at}", "guard roots, logarithms and quotients")
         return found
 
+    def volume(self, view: View, shape: Mapping[str, float] | None = None) -> FloatArray:
+        """Volume per unit of the coefficient over each interval, m3, (n - 1,).
+
+        The command is held over the interval, all else is linear between its samples.
+        """
+        at_start = self.flow(view, shape)[:-1]
+        at_end = self.flow(view.before_the_next_command, shape)
+        return 0.5 * (at_start + at_end) * np.diff(view.t_s)
+
 
 def make(
     name: str,

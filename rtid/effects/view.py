@@ -65,6 +65,15 @@ class View:
         return {s.name: self.signal(s.name) for s in self.model.signals if s.kind == kind}
 
     @cached_property
+    def before_the_next_command(self) -> View:
+        """The same record at t_s[1:], with the command that acted until then."""
+        held = self.values[1:].copy()
+        for k, signal in enumerate(self.model.signals):
+            if signal.kind in (COMMAND, MODE):
+                held[:, k] = self.values[:-1, k]
+        return View(self.model, self.t_s[1:], held)
+
+    @cached_property
     def dt_s(self) -> FloatArray:
         """Time to the next sample, (n,); the last one repeats."""
         steps = np.diff(self.t_s)
