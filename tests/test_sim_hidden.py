@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
+from rtid.sim import extra as numbers
 from rtid.sim import extra_flows, loop, sensing, spool
-from rtid.sim.extra import NONE, RECORD, Extra, as_record
-from rtid.sim.hidden import HIDDEN, LEVELS, HiddenError, hide
-from rtid.sim.plant import Constants, FloatArray, Plant
+from rtid.sim.extra import NONE, Extra, Parts, parts_of
+from rtid.sim.hidden import HIDDEN, LEVELS, MECHANICAL, OUTSIDE, HiddenError, hide
+from rtid.sim.plant import EDGES, FloatArray, Plant
 from rtid.sim.random_plants import draw, draw_hidden
 from rtid.sim.run import EXACT, Run, simulate
 
@@ -121,6 +122,12 @@ def test_a_seat_leaks_when_shut_and_vanishes_when_open() -> None:
     [
         ("internal_leakage_laminar", ""),
         ("external_leakage_laminar", "b"),
+        ("internal_leakage_turbulent", ""),
+        ("external_leakage_turbulent", "a"),
+        ("position_dependent_leakage", ""),
+        ("groove_one_way", ""),
+        ("flow_bursts", ""),
+        ("makeup_valve", "a"),
         ("relief_valve", "a"),
         ("relief_valve", "b"),
         ("valve_seat_leakage", "pa"),
@@ -142,24 +149,59 @@ def test_dead_volume_stores_oil() -> None:
     assert balance(run)[0] > 1.5e-3
 
 
+def parts(plant: Plant) -> Parts:
+    found = parts_of(plant.extra)
+    assert found is not None
+    return found
+
+
+def softness(plant: Plant, p_pa: FloatArray, chamber: int = 0) -> FloatArray:
+    """1 / beta_c - 1 / beta at the pressures, 1/Pa."""
+    c, e = plant.constants, parts(plant)
+    r = (e.a, e.b)[chamber]
+    found = [extra_flows.compressibility(c, e, r, p) - 1 / c.beta_pa for p in p_pa]
+    return np.array(found)
+
+
+def volumes(run: Run) -> FloatArray:
+    """Volumes of A and B, m3, float64 (2, n)."""
+    c, x = run.plant.constants, run.truth.signals[:, 5]
+    volume_b = c.v0_b_m3 + c.area_b_m2 * (c.stroke_m - x)
+    return np.array([c.v0_a_m3 + c.area_a_m2 * x, volume_b])
+
+
+def softer(run: Run) -> FloatArray:
+    """What both chambers store per pascal besides V / beta, m3/Pa, float64 (2, n)."""
+    p = run.truth.signals[:, 1:3].T
+    return volumes(run) * np.array([softness(run.plant, p[i], i) for i in range(2)])
+
+
 def test_air_softens_the_oil_at_low_pressure() -> None:
     """1 / beta of the mixture is that of oil plus the stated share of isothermal air at 1.5 MPa."""
-    c = Constants()
-    e = as_record(hidden("entrained_air").extra)
-    at = [extra_flows.compressibility(c, e, 0, p) - 1 / c.beta_pa for p in (0.5e6, 1.5e6, 6e6)]
+    at = softness(hidden("entrained_air"), np.array([0.5e6, 1.5e6, 6e6]))
     assert at[1] == pytest.approx(0.03 * 101325 / 1.5e6**2, rel=0.03)
     assert at[0] > 7 * at[1] and at[2] < at[1] / 12
     run = rich(hidden("entrained_air", "strong"))
-    e = as_record(run.plant.extra)
-    p, x = run.truth.signals[:, 1:3], run.truth.signals[:, 5]
-    volumes = (c.v0_a_m3 + c.area_a_m2 * x, c.v0_b_m3 + c.area_b_m2 * (c.stroke_m - x))
-    more = np.array(
-        [
-            [v * (extra_flows.compressibility(c, e, i, at) - 1 / c.beta_pa) for v, at in rows]
-            for i, rows in enumerate(zip(volumes[j], p[:, j], strict=True) for j in range(2))
-        ]
-    )
-    assert balance(run, more).max() < 5e-4
+    assert balance(run, softer(run)).max() < 3e-4
+    assert balance(run).max() > 1.5e-3
+
+
+def test_gas_boils_out_below_its_pressure_alone() -> None:
+    plant = hidden("cavitation", "strong", "b")
+    limit = plant.extra.release_pa[1]
+    at = softness(plant, np.array([0.5 * limit, 0.99 * limit, 1.01 * limit]), 1)
+    assert at[0] == pytest.approx(13e-3 / limit) and 0 < at[1] < 0.03 * at[0]
+    assert at[2] == 0
+    assert not softness(plant, np.array([0.5 * limit]), 0).any()
+    run = rich(plant)
+    assert balance(run, softer(run)).max() < 5e-4
+
+
+def test_a_hose_wall_stores_oil_and_stiffens() -> None:
+    run = rich(hidden("hose_compliance", "strong", "a"))
+    wall = 1.5e-12 / (1 + (run.truth.signals[:, P_A] - 3e6) / 6e6)
+    assert balance(run, np.array([wall, 0 * wall])).max() < 5e-4
+    assert balance(run)[0] > 1.5e-3
 
 
 def test_relief_valve_opens_at_its_pressure_with_its_slope() -> None:
@@ -184,12 +226,72 @@ def test_a_line_swings_at_its_own_frequency() -> None:
     assert slope == pytest.approx(7e7, rel=0.1)
 
 
+def test_make_up_valve_fills_below_its_pressure() -> None:
+    run = rich(hidden("makeup_valve", "strong", "b"), 20.0)
+    opening = run.plant.extra.makeup_open_pa[1]
+    p, into = run.truth.signals[:, P_B], run.truth.extra_m3s[:, 1]
+    below = p < opening - 0.3e6
+    assert below.mean() > 0.02
+    assert into[below] == pytest.approx(27e-12 * (opening - p[below]), rel=0.08)
+    assert into.min() >= 0 and into[p > opening + 0.5e6].max() < 0.05 * into.max()
+
+
+@pytest.mark.parametrize(
+    ("name", "column", "sign"),
+    [("internal_leakage_turbulent", 0, -1), ("external_leakage_turbulent", 0, -1)],
+)
+def test_turbulent_leaks_follow_the_root_of_their_drop(name: str, column: int, sign: int) -> None:
+    run = rich(hidden(name, "strong"))
+    s = run.truth.signals
+    drop = s[:, P_A] - (s[:, P_B] if name.startswith("internal") else s[:, 4])
+    far = np.abs(drop) > 0.5e6
+    found = run.truth.extra_m3s[far, column] / (np.sign(drop) * np.sqrt(np.abs(drop)))[far]
+    assert found == pytest.approx(sign * HIDDEN[name].strengths[2], rel=0.03)
+
+
+def test_a_groove_leaks_in_its_place_and_a_lip_in_its_direction() -> None:
+    for name in ("position_dependent_leakage", "groove_one_way"):
+        run = rich(hidden(name, "strong"), 20.0)
+        s, q = run.truth.signals, run.truth.extra_m3s[:, 1]
+        drop, x, v = s[:, P_A] - s[:, P_B], s[:, 5], s[:, 6]
+        k, away = q / drop, np.abs(x - 0.27) > 0.07
+        top = (np.abs(x - 0.27) < 2e-3) & (v > 0.03)
+        assert k[top] == pytest.approx(HIDDEN[name].strengths[2], rel=0.12)
+        assert np.abs(k[away]).max() < 0.01 * k.max()
+        back = (np.abs(x - 0.27) < 2e-3) & (v < -0.03)
+        assert (k[back].max() < 0.01 * k.max()) == (name == "groove_one_way")
+
+
+def test_bursts_come_by_chance_and_from_the_seed() -> None:
+    plant = hidden("flow_bursts", "strong")
+    q = simulate(plant, "rich", 3, 30.0, EXACT).truth.extra_m3s
+    again, other = (simulate(plant, "rich", i, 30.0, EXACT).truth.extra_m3s for i in (3, 4))
+    assert np.array_equal(q, again) and not np.array_equal(q, other)
+    assert not q[:, 1].any() and 0.05 < (q[:, 0] != 0).mean() < 0.3
+    assert 18e-6 < np.abs(q).max() < 4 * 18e-6 and q.min() < 0 < q.max()
+
+
 def test_supply_sags_with_the_flow_and_the_column_does_not_show_it() -> None:
     run = simulate(hidden("supply_sag", "strong"), "sweep", 1, 10.0, EXACT)
     p_s, drawn = run.truth.signals[:, 3], run.truth.flow("pa") + run.truth.flow("pb")
     assert p_s.min() < 6.5e6
     assert (7e6 - p_s).mean() == pytest.approx(3.3e9 * drawn.mean(), rel=0.1)
     assert (run.samples.column("p_supply") == 7e6).all()
+    seen = simulate(hidden("supply_sag_measured", "strong"), "sweep", 1, 10.0, EXACT)
+    assert np.array_equal(seen.truth.signals, run.truth.signals)
+    assert np.array_equal(seen.samples.column("p_supply"), p_s)
+
+
+def test_a_supply_branch_swings_at_9_hz() -> None:
+    """The other edge's flow does not see it: its own law holds with the supply's pressure."""
+    run = rich(hidden("supply_branch_resonance", "strong"), 20.0)
+    s, w = run.truth.signals, run.truth.opening_v
+    open_a, open_b = w[:, 0] > 2.5, w[:, 2] > 2.5
+    law = run.plant.flow("pb", w[open_b, 2], (s[:, 3] - s[:, 2])[open_b])
+    assert run.truth.flow("pb")[open_b] == pytest.approx(law, rel=1e-9)
+    law = run.plant.flow("pa", w[open_a, 0], (s[:, 3] - s[:, 1])[open_a])
+    ratio = run.truth.flow("pa")[open_a] / law
+    assert ratio.std() > 0.005
 
 
 def test_gain_drift_warms_up_by_its_strength() -> None:
@@ -203,6 +305,42 @@ def test_gain_drift_warms_up_by_its_strength() -> None:
     assert factor == pytest.approx(1 + 0.09 * np.expm1(-2 * t) / np.expm1(-2), rel=1e-4)
     linear = np.polyfit(t, factor, 1)[0]
     assert linear == pytest.approx(0.09, rel=0.1)
+
+
+def test_the_gain_swings_with_7_s() -> None:
+    run = rich(hidden("gain_oscillation", "strong"), 15.0)
+    w, s = run.truth.opening_v[:, 0], run.truth.signals
+    open_ = w > 3.0
+    plain = run.plant.flow("pa", w[open_], (s[:, 3] - s[:, 1])[open_])
+    t = 1e-3 * np.arange(len(s))[open_]
+    expected = 1 + 0.09 * np.sin(2 * np.pi * t / 7.0)
+    assert run.truth.flow("pa")[open_] / plain == pytest.approx(expected, rel=1e-4)
+
+
+def test_a_compensated_edge_is_flat_in_the_drop() -> None:
+    run = rich(hidden("load_compensated_valve", "strong", "at"), 20.0)
+    s, w = run.truth.signals, run.truth.opening_v[:, 1]
+    drop = s[:, P_A] - s[:, 4]
+    open_ = (w > 2.5) & (drop > 1e6)
+    at_2_mpa = run.plant.flow("at", w[open_], 2e6)
+    share = run.truth.flow("at")[open_] / at_2_mpa
+    assert share == pytest.approx(0.9 + 0.1 * np.sqrt(drop[open_] / 2e6), rel=1e-3)
+    b = run.plant.flow("bt", run.truth.opening_v[:, 3], s[:, P_B] - s[:, 4])
+    assert np.allclose(run.truth.flow("bt"), b, rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize("name", MECHANICAL[:3])
+def test_mechanical_changes_keep_the_pressure_equations(name: str) -> None:
+    run = rich(hidden(name, "strong"))
+    assert run.plant.extra == NONE and run.plant.hidden[0].name == name
+    assert balance(run).max() < 3e-4
+
+
+def test_groups() -> None:
+    assert len(OUTSIDE) >= 4
+    silent = {name for name, effect in HIDDEN.items() if not effect.catalogue}
+    assert silent == {*OUTSIDE, *MECHANICAL}
+    assert HIDDEN["line_dynamics_seen_at_valve"].catalogue == "line_dynamics"
 
 
 def test_two_effects_at_once() -> None:
@@ -259,8 +397,11 @@ def test_kernels_agree_with_their_python_source(monkeypatch: pytest.MonkeyPatch)
     assert np.allclose(plain.truth.extra_m3s, compiled.truth.extra_m3s, rtol=1e-9, atol=1e-18)
 
 
-def test_the_record_holds_every_number() -> None:
-    assert RECORD.names == Extra._fields
-    assert as_record(NONE) is None
-    e = as_record(Extra(relief=(1.0, 2.0), delay_s=3.0))
-    assert e is not None and list(e["relief"]) == [1.0, 2.0] and e["delay_s"] == 3.0
+def test_the_kernels_get_every_number() -> None:
+    assert numbers.EDGES == EDGES
+    names = [*numbers.WHOLE, *numbers.CHAMBER, *numbers.EDGE]
+    assert sorted(names) == sorted(Extra._fields)
+    assert parts_of(NONE) is None
+    e = parts_of(Extra(relief=(1.0, 2.0), delay_s=3.0, seat=(0.0, 0.0, 4.0, 0.0, 0.0)))
+    assert e is not None
+    assert (e.a.relief, e.b.relief, e.whole.delay_s, e.whole.seat_pb) == (1.0, 2.0, 3.0, 4.0)

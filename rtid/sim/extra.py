@@ -7,7 +7,7 @@ edges in the order of `plant.EDGES`.  `rtid.sim.hidden` sets the numbers; the eq
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -64,15 +64,39 @@ class Extra(NamedTuple):
 
 
 NONE = Extra()
-RECORD = np.dtype([(k, float, np.shape(v)) for k, v in NONE._asdict().items()], align=True)
+EDGES = ("pa", "at", "pb", "bt", "ab")  # as `plant.EDGES`, which knows this file
+WHOLE = [name for name, value in NONE._asdict().items() if value == 0.0]
+CHAMBER = [name for name, value in NONE._asdict().items() if value == NO_PAIR]
+EDGE = [name for name, value in NONE._asdict().items() if value == NO_FIVE]
 
 
-def as_record(e: Extra) -> np.record | None:
-    """The numbers as the kernels take them, by reference; None if all are zero."""
-    table = np.zeros(1, RECORD).view(np.recarray)
-    table[0] = tuple(e)
+class Parts(NamedTuple):
+    """The numbers as the kernels take them: records of floats, by reference.
+
+    whole: the machine's own and, as seat_pa, seat_at ..., those of its edges; a, b: the chambers'.
+    """
+
+    whole: Any
+    a: Any
+    b: Any
+
+
+def parts_of(e: Extra) -> Parts | None:
+    """The numbers for the kernels; None if all are zero."""
+    if e == NONE:
+        return None
+    whole = {name: getattr(e, name) for name in WHOLE}
+    for name in EDGE:
+        whole |= {f"{name}_{edge}": getattr(e, name)[i] for i, edge in enumerate(EDGES)}
+    a, b = ({name: getattr(e, name)[i] for name in CHAMBER} for i in range(2))
+    return Parts(_record(whole), _record(a), _record(b))
+
+
+def _record(numbers: dict[str, float]) -> np.record:
+    table = np.zeros(1, [(name, float) for name in numbers]).view(np.recarray)
+    table[0] = tuple(numbers.values())
     record: np.record = table[0]
-    return None if e == NONE else record
+    return record
 
 
 class Planted(NamedTuple):

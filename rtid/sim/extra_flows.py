@@ -46,129 +46,140 @@ PUMP_M3S, SUPPLY_LAG_S, ACCUMULATOR = 6e-4, 0.4, 1.8  # exponent of C(P)
 BRANCH_RADPS, BRANCH_DAMPING = 2 * math.pi * 9.0, 0.1
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def gap_flow(k: float, p1_pa: float, p2_pa: float) -> float:
     """Laminar leak from p1 to p2, m3/s; k (m3/s/Pa) at a mean pressure of 3 MPa."""
     q: float = k * (p1_pa - p2_pa) * (1 + (0.5 * (p1_pa + p2_pa) - GAP_MEAN_PA) / GAP_WIDENS_PA)
     return q
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def orifice_flow(k: float, dp_pa: float) -> float:
-    """Leak through a sharp edge, m3/s; k in m3/s/sqrt(Pa)."""
+    """Leak through a sharp edge, m3/s; k in m3/s/sqrt(Pa); none costs no root."""
+    if k == 0.0:
+        return 0.0
     return k * dp_pa / math.sqrt(abs(dp_pa) + TRANSITION_PA)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def knee(d_pa: float) -> float:
     """0 far below zero, d far above, smooth between; Pa."""
     return 0.5 * (d_pa + math.sqrt(d_pa * d_pa + KNEE_PA * KNEE_PA))
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def groove_opening(x_m: float, stroke_m: float) -> float:
     """0..1: a bump of the leak in the worn part of the stroke."""
     s = (x_m - 0.5 * stroke_m - GROOVE_SHIFT_M) / GROOVE_M
     return math.exp(-0.5 * s * s)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def crossing_flow(c: Constants, e: Any, y: FloatArray) -> float:
     """All leaks from A to B past the piston, m3/s."""
     p_a, p_b = y[P_A], y[P_B]
-    one_way = 0.5 * (1.0 + math.tanh(y[V] / GROOVE_SPEED_MPS)) * e.groove_one_way
-    k = e.internal_laminar + groove_opening(y[X], c.stroke_m) * (e.groove + one_way)
-    return gap_flow(k, p_a, p_b) + orifice_flow(e.internal_turbulent, p_a - p_b)
+    k = e.whole.internal_laminar
+    if e.whole.groove + e.whole.groove_one_way > 0.0:
+        one_way = 0.5 * (1.0 + math.tanh(y[V] / GROOVE_SPEED_MPS)) * e.whole.groove_one_way
+        k += groove_opening(y[X], c.stroke_m) * (e.whole.groove + one_way)
+    return gap_flow(k, p_a, p_b) + orifice_flow(e.whole.internal_turbulent, p_a - p_b)
 
 
-@njit(cache=True)
-def outward_flow(e: Any, chamber: int, p_pa: float, p_tank_pa: float) -> float:
+@njit(cache=True, error_model="numpy")
+def outward_flow(r: Any, p_pa: float, p_tank_pa: float) -> float:
     """All flows from one chamber to tank, m3/s; negative where more is made up."""
-    leak = gap_flow(e.external_laminar[chamber], p_pa, p_tank_pa)
-    leak += orifice_flow(e.external_turbulent[chamber], p_pa - p_tank_pa)
-    if e.relief[chamber] > 0.0:
-        leak += e.relief[chamber] * knee(p_pa - e.relief_open_pa[chamber])
-    if e.makeup[chamber] > 0.0:
-        leak -= e.makeup[chamber] * knee(e.makeup_open_pa[chamber] - p_pa)
+    leak = gap_flow(r.external_laminar, p_pa, p_tank_pa)
+    leak += orifice_flow(r.external_turbulent, p_pa - p_tank_pa)
+    if r.relief > 0.0:
+        leak += r.relief * knee(p_pa - r.relief_open_pa)
+    if r.makeup > 0.0:
+        leak -= r.makeup * knee(r.makeup_open_pa - p_pa)
     return leak
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def extra_flows(c: Constants, e: Any, inputs: FloatArray, y: FloatArray, net: FloatArray) -> None:
     """Fill net (2,) in place: what flows into A and B past valves and hoses, m3/s."""
     crossing, p_tank_pa = crossing_flow(c, e, y), inputs[TANK_IN]
-    net[0] = e.burst_m3s * inputs[BURST_IN] - crossing - outward_flow(e, 0, y[P_A], p_tank_pa)
-    net[1] = crossing - outward_flow(e, 1, y[P_B], p_tank_pa)
+    net[0] = e.whole.burst_m3s * inputs[BURST_IN] - crossing - outward_flow(e.a, y[P_A], p_tank_pa)
+    net[1] = crossing - outward_flow(e.b, y[P_B], p_tank_pa)
 
 
-@njit(cache=True)
-def edge_flow(c: Constants, e: Any, edge: int, gain: float, dp_pa: float) -> float:
+@njit(cache=True, error_model="numpy")
+def edge_flow(c: Constants, seat: float, compensated: float, gain: float, dp_pa: float) -> float:
     """Flow of a metering edge with its seat leak and its pressure compensator, m3/s.
 
     The seat's gap adds to the opening like two sides of a right angle: K = hypot(K(w), K_seat).
     """
     q: float = metered_flow(gain, dp_pa, c.dp_laminar_pa)
-    share = e.compensated[edge]
-    if share > 0.0:
+    if compensated > 0.0:
         flat = math.sqrt(COMPENSATED_PA) * math.tanh(dp_pa / COMPENSATED_CORNER_PA)
-        q = (1.0 - share) * q + share * gain * flat
-    seat = e.seat[edge]
+        q = (1.0 - compensated) * q + compensated * gain * flat
     if seat > 0.0:
         q += metered_flow(math.hypot(gain, seat) - gain, dp_pa, SEAT_LAMINAR_PA)
     return q
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def tie_nodes(e: Any, p_supply_pa: float, y: FloatArray) -> None:
     """Give the pressures at the valves, where nothing lies between, their neighbours' value."""
-    if e.sag_pasm3 == 0.0:
+    if e.whole.sag_pasm3 == 0.0:
         y[SUPPLY] = p_supply_pa
-    if e.branch_kgpm4 == 0.0:
+    if e.whole.branch_kgpm4 == 0.0:
         y[BRANCH] = y[SUPPLY]
-    for chamber in range(2):
-        if e.line_m[chamber] == 0.0:
-            y[PORT_A + chamber] = y[P_A + chamber]
+    if e.a.line_m == 0.0:
+        y[PORT_A] = y[P_A]
+    if e.b.line_m == 0.0:
+        y[PORT_B] = y[P_B]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def extra_valve_flows(
     c: Constants, e: Any, gains: FloatArray, inputs: FloatArray, y: FloatArray, q: FloatArray
 ) -> None:
     """Fill q (5,) in place with the flow of each edge; y's pressures at the valves are tied."""
     tie_nodes(e, inputs[SUPPLY_IN], y)
-    p_tank_pa = inputs[TANK_IN]
+    w, p_tank_pa = e.whole, inputs[TANK_IN]
     port_a, port_b, p_s = y[PORT_A], y[PORT_B], y[SUPPLY]
-    q[PA] = edge_flow(c, e, PA, gains[PA], y[BRANCH] - port_a)
-    q[AT] = edge_flow(c, e, AT, gains[AT], port_a - p_tank_pa)
-    q[PB] = edge_flow(c, e, PB, gains[PB], p_s - port_b)
-    q[BT] = edge_flow(c, e, BT, gains[BT], port_b - p_tank_pa)
-    q[AB] = edge_flow(c, e, AB, gains[AB], port_a - port_b)
+    q[PA] = edge_flow(c, w.seat_pa, w.compensated_pa, gains[PA], y[BRANCH] - port_a)
+    q[AT] = edge_flow(c, w.seat_at, w.compensated_at, gains[AT], port_a - p_tank_pa)
+    q[PB] = edge_flow(c, w.seat_pb, w.compensated_pb, gains[PB], p_s - port_b)
+    q[BT] = edge_flow(c, w.seat_bt, w.compensated_bt, gains[BT], port_b - p_tank_pa)
+    q[AB] = edge_flow(c, w.seat_ab, w.compensated_ab, gains[AB], port_a - port_b)
 
 
-@njit(cache=True)
-def compressibility(c: Constants, e: Any, chamber: int, p_pa: float) -> float:
+@njit(cache=True, error_model="numpy")
+def compressibility(c: Constants, e: Any, r: Any, p_pa: float) -> float:
     """1 / beta_c of oil with free and released gas at the absolute pressure, 1/Pa."""
     oil = 1.0 / c.beta_pa
-    if e.air_share > 0.0:
-        gas = e.air_share * (ATMOSPHERE_PA / p_pa) ** (1.0 / POLYTROPIC)
-        liquid = (1.0 - e.air_share) * math.exp(-(p_pa - ATMOSPHERE_PA) * oil)
+    if e.whole.air_share > 0.0:
+        gas = e.whole.air_share * (ATMOSPHERE_PA / p_pa) ** (1.0 / POLYTROPIC)
+        liquid = (1.0 - e.whole.air_share) * math.exp(-(p_pa - ATMOSPHERE_PA) * oil)
         oil = (gas / (POLYTROPIC * p_pa) + liquid * oil) / (gas + liquid)
-    if e.released[chamber] > 0.0 and p_pa < e.release_pa[chamber]:
-        below = 1.0 - p_pa / e.release_pa[chamber]
-        oil += 2.0 * e.released[chamber] * below / e.release_pa[chamber]
+    if r.released > 0.0 and p_pa < r.release_pa:
+        below = 1.0 - p_pa / r.release_pa
+        oil += 2.0 * r.released * below / r.release_pa
     return oil
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def chamber_rates(
-    c: Constants, e: Any, chamber: int, valves: float, net: float, y: FloatArray, dy: FloatArray
+    c: Constants,
+    e: Any,
+    r: Any,
+    chamber: int,
+    valves: float,
+    net: float,
+    y: FloatArray,
+    dy: FloatArray,
 ) -> None:
     """Fill in place the rates of one chamber, its hose, its dead volume and its soft hose wall.
 
-    valves: net flow through the metering edges of this chamber; net: the extra flows, m3/s.
+    r: the chamber's numbers; valves: net flow through its metering edges; net: its extra flows,
+    m3/s.
     """
     p = y[P_A + chamber]
-    line_m3 = e.line_m[chamber] * HOSE_AREA_M2
+    line_m3 = r.line_m * HOSE_AREA_M2
     volume = c.v0_a_m3 + c.area_a_m2 * y[X] + 0.5 * line_m3
     area = c.area_a_m2
     if chamber == 1:
@@ -177,39 +188,41 @@ def chamber_rates(
     into = valves
     if line_m3 > 0.0:
         into = y[LINE_A + chamber]
-        port, length = y[PORT_A + chamber], e.line_m[chamber]
-        soft = 0.5 * line_m3 * compressibility(c, e, chamber, port)
+        port, length = y[PORT_A + chamber], r.line_m
+        soft = 0.5 * line_m3 * compressibility(c, e, r, port)
         dy[PORT_A + chamber] = (valves - into) / soft
         loss = (RESISTANCE_PASPM4 + TURBULENT_PAS2PM7 * abs(into)) * length * into
         dy[LINE_A + chamber] = (port - p - loss) / (INERTANCE_KGPM5 * length)
-    if e.dead_volume_m3[chamber] > 0.0:
+    if r.dead_volume_m3 > 0.0:
         dy[DEAD_A + chamber] = (p - y[DEAD_A + chamber]) / DEAD_LAG_S
-        into -= e.dead_volume_m3[chamber] / c.beta_pa * dy[DEAD_A + chamber]
-    if e.hose_m3ppa[chamber] > 0.0:
+        into -= r.dead_volume_m3 / c.beta_pa * dy[DEAD_A + chamber]
+    if r.hose_m3ppa > 0.0:
         dy[HOSE_A + chamber] = (p - y[HOSE_A + chamber]) / HOSE_LAG_S
         softness = 1.0 / (1.0 + (y[HOSE_A + chamber] - GAP_MEAN_PA) / HOSE_STIFF_PA)
-        into -= e.hose_m3ppa[chamber] * softness * dy[HOSE_A + chamber]
-    room = volume * compressibility(c, e, chamber, p)
+        into -= r.hose_m3ppa * softness * dy[HOSE_A + chamber]
+    room = volume * compressibility(c, e, r, p)
     dy[P_A + chamber] = (into + net - area * y[V]) / room
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def supply_rates(e: Any, q: FloatArray, p_set_pa: float, y: FloatArray, dy: FloatArray) -> None:
     """Fill in place the rates of the supply: pump, accumulator, and the branch to the edge pa."""
     to_pa: float = q[PA]
-    if e.branch_kgpm4 > 0.0:
-        capacity = 1.0 / (BRANCH_RADPS**2 * e.branch_kgpm4)
-        resistance = 2.0 * BRANCH_DAMPING * BRANCH_RADPS * e.branch_kgpm4
+    if e.whole.branch_kgpm4 > 0.0:
+        capacity = 1.0 / (BRANCH_RADPS**2 * e.whole.branch_kgpm4)
+        resistance = 2.0 * BRANCH_DAMPING * BRANCH_RADPS * e.whole.branch_kgpm4
         dy[BRANCH] = (y[BRANCH_FLOW] - q[PA]) / capacity
-        dy[BRANCH_FLOW] = (y[SUPPLY] - y[BRANCH] - resistance * y[BRANCH_FLOW]) / e.branch_kgpm4
+        dy[BRANCH_FLOW] = (
+            y[SUPPLY] - y[BRANCH] - resistance * y[BRANCH_FLOW]
+        ) / e.whole.branch_kgpm4
         to_pa = y[BRANCH_FLOW]
-    if e.sag_pasm3 > 0.0:
-        droop = (p_set_pa - y[SUPPLY]) / (e.sag_pasm3 * PUMP_M3S)
-        capacity = SUPPLY_LAG_S / e.sag_pasm3 * (p_set_pa / y[SUPPLY]) ** ACCUMULATOR
+    if e.whole.sag_pasm3 > 0.0:
+        droop = (p_set_pa - y[SUPPLY]) / (e.whole.sag_pasm3 * PUMP_M3S)
+        capacity = SUPPLY_LAG_S / e.whole.sag_pasm3 * (p_set_pa / y[SUPPLY]) ** ACCUMULATOR
         dy[SUPPLY] = (PUMP_M3S * math.tanh(droop) - to_pa - q[PB]) / capacity
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def extra_rates(
     c: Constants,
     e: Any,
@@ -222,6 +235,6 @@ def extra_rates(
     """Replace the pressure rates of dy (STATES,) for the flows q (5,); fill net (2,); in place."""
     extra_flows(c, e, inputs, y, net)
     dy[PORT_A:] = 0.0
-    chamber_rates(c, e, 0, q[PA] - q[AT] - q[AB], net[0], y, dy)
-    chamber_rates(c, e, 1, q[PB] - q[BT] + q[AB], net[1], y, dy)
+    chamber_rates(c, e, e.a, 0, q[PA] - q[AT] - q[AB], net[0], y, dy)
+    chamber_rates(c, e, e.b, 1, q[PB] - q[BT] + q[AB], net[1], y, dy)
     supply_rates(e, q, inputs[SUPPLY_IN], y, dy)

@@ -33,7 +33,7 @@ from rtid.sim.plant import (
     flow_gain,
     metered_flow,
 )
-from rtid.sim.spool import PLAYS, acting, play, spool_table, sticking_pilot, travel
+from rtid.sim.spool import PLAYS, acting, move_spools, play, spool_table, sticking_pilot, travel
 
 # columns of the drive; the last two are of extra physics: factor of all gains, bursts
 X_REF, V_REF, DITHER, P_SUPPLY, P_TANK, LOAD, FACTOR, BURST = range(8)
@@ -80,13 +80,13 @@ class Spools(NamedTuple):
     pilot_v: FloatArray
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def quantise(value: float, step: float) -> float:
     """The nearest multiple of `step`; the value itself for step 0."""
     return value if step == 0.0 else step * math.floor(value / step + 0.5)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def command(k: Controller, drive: FloatArray, x_m: float) -> float:
     """The controller's signed command from one row of the drive and the measured position."""
     demand: float = drive[V_REF] + k.kp_1ps * (drive[X_REF] - x_m)
@@ -95,7 +95,7 @@ def command(k: Controller, drive: FloatArray, x_m: float) -> float:
     return min(max(u, -k.limit_v), k.limit_v)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def flows(
     c: Constants, gains: FloatArray, y: FloatArray, p_s: float, p_t: float, q: FloatArray
 ) -> None:
@@ -107,7 +107,7 @@ def flows(
     q[AB] = metered_flow(gains[AB], y[0] - y[1], c.dp_laminar_pa)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def rates(c: Constants, q: FloatArray, y: FloatArray, load_n: float, dy: FloatArray) -> None:
     """Fill dy (4,) in place with the time derivative of the plain machine for the flows q."""
     x, v = y[2], y[3]
@@ -122,7 +122,7 @@ def rates(c: Constants, q: FloatArray, y: FloatArray, load_n: float, dy: FloatAr
     dy[3] = force / c.mass_kg
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def runge_kutta(
     c: Constants,
     e: Any,
@@ -145,19 +145,20 @@ def runge_kutta(
         reach = h_s if stage == 3 else 0.5 * h_s
         for i in range(len(y)):
             trial[i] = y[i] + reach * slopes[stage - 1, i] if stage > 0 else y[i]
+        now, dy = inputs[at], slopes[stage]
         if e is None:
-            flows(c, gains[at], trial, inputs[at, 0], inputs[at, 1], q)
+            flows(c, gains[at], trial, now[0], now[1], q)
+            rates(c, q, trial, now[2], dy)
         else:
-            extra_valve_flows(c, e, gains[at], inputs[at], trial, q)
-        rates(c, q, trial, inputs[at, 2], slopes[stage])
-        if e is not None:
-            extra_rates(c, e, inputs[at], trial, q, net, slopes[stage])
+            extra_valve_flows(c, e, gains[at], now, trial, q)
+            rates(c, q, trial, now[2], dy)
+            extra_rates(c, e, now, trial, q, net, dy)
     for i in range(len(y)):
         bend = slopes[1, i] + slopes[2, i]
         y[i] += h_s / 6.0 * (slopes[0, i] + 2.0 * bend + slopes[3, i])
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def advance(
     m: Machine,
     e: Any,
@@ -177,7 +178,8 @@ def advance(
     """
     gains, inputs = np.empty((3, 5)), np.empty((3, 5))
     slopes, trial, q, net = np.empty((4, len(y))), np.empty(len(y)), np.empty(5), np.empty(2)
-    valves, w, after = m.valves, spools.w, spools.commands[1]
+    valves, w, rate, table = m.valves, spools.w, spools.rate, spools.table
+    before, after = spools.commands[0], spools.commands[1]
     gains[2] = start_gains
     for step in range(substeps):
         gains[0] = gains[2]
@@ -192,8 +194,10 @@ def advance(
                     w[edge] = after[edge] + (w[edge] - after[edge]) * decay
             else:
                 until_s = change_s - (step + 0.5 * (half - 1)) * h_s
-                before, table = spools.commands[0], spools.table
-                travel(e, m.lag_s, before, after, until_s, 0.5 * h_s, table, w, spools.rate)
+                if until_s <= 0.0:
+                    move_spools(after, table, w, rate)
+                else:
+                    travel(e, m.lag_s, before, after, until_s, 0.5 * h_s, table, w, rate)
             for edge in range(5):
                 gains[half, edge] = flow_gain(valves[edge], w[edge])
             if e is not None:
@@ -201,7 +205,7 @@ def advance(
         runge_kutta(m.c, e, gains, inputs, h_s, y, slopes, trial, q, net)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def steer(m: Machine, e: Any, i: int, dt_s: float, u_v: float, spools: Spools) -> float:
     """Set the commands of the five edges; returns until when the former ones act, s."""
     change_s = 0.0
@@ -209,32 +213,32 @@ def steer(m: Machine, e: Any, i: int, dt_s: float, u_v: float, spools: Spools) -
         for edge in range(5):
             spools.commands[1, edge] = m.directions[edge] * u_v
     else:
-        if e.play_v > 0.0:
-            u_v = play(u_v, e.play_v, spools.plays)
-        if e.stick_v > 0.0:
-            u_v = sticking_pilot(u_v, e.stick_v, spools.pilot)
+        if e.whole.play_v > 0.0:
+            u_v = play(u_v, e.whole.play_v, spools.plays)
+        if e.whole.stick_v > 0.0:
+            u_v = sticking_pilot(u_v, e.whole.stick_v, spools.pilot)
         spools.pilot_v[i] = u_v
-        late = math.floor(e.delay_s / dt_s)
-        change_s = e.delay_s - late * dt_s
+        late = math.floor(e.whole.delay_s / dt_s)
+        change_s = e.whole.delay_s - late * dt_s
         for edge in range(5):
             spools.commands[0, edge] = m.directions[edge] * acting(spools.pilot_v, i, late + 1)
             spools.commands[1, edge] = m.directions[edge] * acting(spools.pilot_v, i, late)
     return change_s
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def seen_position(e: Any, x: FloatArray, i: int, dt_s: float) -> float:
     """Position that the sensor shows at sample i, before noise, m."""
     late = 0.0
     if e is not None:
-        late = e.position_delay_s / dt_s
+        late = e.whole.position_delay_s / dt_s
     if late == 0.0 or late >= i:
         return x[i] if late == 0.0 else x[0]
     row = math.floor(i - late)
     return x[row] + (i - late - row) * (x[min(row + 1, i)] - x[row])
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def note_flows(
     c: Constants,
     e: Any,
@@ -256,7 +260,7 @@ def note_flows(
         nodes[0], nodes[1], nodes[2] = y[SUPPLY], y[PORT_A], y[PORT_B]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def new_spools(e: Any, lag_s: float, half_s: float, n: int) -> Spools:
     """Spools at rest in their middle."""
     table = np.zeros((5, 4))
@@ -268,7 +272,7 @@ def new_spools(e: Any, lag_s: float, half_s: float, n: int) -> Spools:
     return Spools(np.zeros(5), np.zeros(5), commands, table, np.zeros(PLAYS), pilot, given)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def run_loop(
     m: Machine,
     e: Any,
@@ -283,7 +287,7 @@ def run_loop(
 ) -> None:
     """Simulate n samples from the state y; drive (n + 1, 8), x_noise_m (n,).
 
-    e: a record of `extra.RECORD`, or None for the plain machine, which is compiled without it.
+    e: `extra.Parts`, or None for the plain machine, which is compiled without it.
 
     The record is filled in place; y ends at the state after the last sample.
     """
@@ -293,7 +297,7 @@ def run_loop(
     spools = new_spools(e, m.lag_s, 0.5 * h_s, len(x))
     at_once = m.lag_s <= 0.0
     if e is not None:
-        at_once = m.lag_s + e.spool_lag_s + e.spool_radps <= 0.0
+        at_once = m.lag_s + e.whole.spool_lag_s + e.whole.spool_radps <= 0.0
     for i in range(len(x)):
         record.signals[i, 1:] = y[:4]
         x_measured_m = quantise(seen_position(e, x, i, dt_s) + x_noise_m[i], x_step_m)

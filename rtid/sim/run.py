@@ -12,7 +12,7 @@ import numpy as np
 from firmware_bridge.samples import GAP, ROW, Samples
 from rtid.errors import RtidError
 from rtid.sim import extra_flows as state
-from rtid.sim.extra import NONE, as_record
+from rtid.sim.extra import NONE, parts_of
 from rtid.sim.loop import P_SUPPLY, P_TANK, X_REF, Machine, Record, run_loop
 from rtid.sim.motion import DT_S, MOTIONS, Motion, usual_duration_s
 from rtid.sim.plant import EDGES, FloatArray, Plant
@@ -118,7 +118,7 @@ def _integrate(
         extra_m3s=np.zeros((n, 2)),
     )
     start = _resting_state(plant, drive[0])
-    machine, e = _machine(plant), as_record(plant.extra)
+    machine, e = _machine(plant), parts_of(plant.extra)
     run_loop(machine, e, drive, x_noise_m, steps[X], steps[U], DT_S, substeps, start, record)
     signals = np.empty((n, 7))
     signals[:, [U, P_A, P_B, X, V]] = record.signals

@@ -18,12 +18,12 @@ from rtid.sim.plant import FloatArray
 
 PLAYS = 8
 PLAY_SPREAD = 0.35
-PILOT_REST = 0.02  # of stick_v per sample: slower than this, the pilot sticks
+PILOT_REST_V = 0.01  # per sample: slower than 10 V/s, the pilot sticks
 PILOT_LAG = 0.1  # of the rate it feels, per sample
 EDGE_SPEED = (0.97, 1.03, 1.0, 0.98, 1.02)  # natural frequencies of the five spools of one type
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def play(u_v: float, width_v: float, plays: FloatArray) -> float:
     """Command behind the play, V; plays (PLAYS,) are moved in place."""
     total = 0.0
@@ -35,20 +35,20 @@ def play(u_v: float, width_v: float, plays: FloatArray) -> float:
     return total / PLAYS
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def sticking_pilot(u_v: float, stick_v: float, pilot: FloatArray) -> float:
     """Command behind the pilot, V; pilot (3,) = place, felt rate, 1 while free, in place."""
     pilot[1] += PILOT_LAG * (abs(u_v - pilot[0]) - pilot[1])
     if abs(u_v - pilot[0]) > stick_v:
         pilot[2] = 1.0
-    elif pilot[1] < PILOT_REST * stick_v:
+    elif pilot[1] < PILOT_REST_V:
         pilot[2] = 0.0
     if pilot[2] == 1.0:
         pilot[0] = u_v
     return pilot[0]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def propagator(wn_radps: float, damping: float, h_s: float, p: FloatArray) -> None:
     """Fill p (4,) = (ww, wr, rw, rr) in place: deviation w - u and rate after h_s.
 
@@ -68,21 +68,23 @@ def propagator(wn_radps: float, damping: float, h_s: float, p: FloatArray) -> No
     p[2], p[3] = -decay * wn_radps * wn_radps * odd, decay * (even - drag)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def spool_table(e: Any, lag_s: float, h_s: float, table: FloatArray) -> None:
     """Fill table (5, 4) in place with the propagators of the five spools over h_s."""
     table[:] = 0.0
     for edge in range(5):
-        if e.spool_radps > 0.0:
-            propagator(e.spool_radps * EDGE_SPEED[edge], e.spool_damping, h_s, table[edge])
-        elif e.spool_lag_s > 0.0 and lag_s > 0.0:
-            wn = 1.0 / math.sqrt(lag_s * e.spool_lag_s)
-            propagator(wn, 0.5 * wn * (lag_s + e.spool_lag_s), h_s, table[edge])
-        elif lag_s + e.spool_lag_s > 0.0:
-            table[edge, 0] = math.exp(-h_s / (lag_s + e.spool_lag_s))
+        if e.whole.spool_radps > 0.0:
+            propagator(
+                e.whole.spool_radps * EDGE_SPEED[edge], e.whole.spool_damping, h_s, table[edge]
+            )
+        elif e.whole.spool_lag_s > 0.0 and lag_s > 0.0:
+            wn = 1.0 / math.sqrt(lag_s * e.whole.spool_lag_s)
+            propagator(wn, 0.5 * wn * (lag_s + e.whole.spool_lag_s), h_s, table[edge])
+        elif lag_s + e.whole.spool_lag_s > 0.0:
+            table[edge, 0] = math.exp(-h_s / (lag_s + e.whole.spool_lag_s))
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def move_spools(commands: FloatArray, table: FloatArray, w: FloatArray, rate: FloatArray) -> None:
     """Let the spools w (5,) with their rates (5,) go towards held commands, in place."""
     for edge in range(5):
@@ -91,7 +93,7 @@ def move_spools(commands: FloatArray, table: FloatArray, w: FloatArray, rate: Fl
         rate[edge] = p[2] * off + p[3] * r
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def travel(
     e: Any,
     lag_s: float,
@@ -103,10 +105,8 @@ def travel(
     w: FloatArray,
     rate: FloatArray,
 ) -> None:
-    """Move the spools over h_s, whose first until_s still see the commands `before`, in place."""
-    if until_s <= 0.0:
-        move_spools(after, table, w, rate)
-    elif until_s >= h_s:
+    """Move the spools over h_s, whose first until_s > 0 still see the commands `before`."""
+    if until_s >= h_s:
         move_spools(before, table, w, rate)
     else:
         part = np.empty((5, 4))
@@ -116,7 +116,7 @@ def travel(
         move_spools(after, part, w, rate)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def acting(pilot_v: FloatArray, i: int, late: int) -> float:
     """Pilot command that was given `late` samples before sample i; the first one before it."""
     return pilot_v[max(i - late, 0)]
