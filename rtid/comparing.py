@@ -1,15 +1,15 @@
 """The engineer's first question: does the data sheet explain this trace, or the learned map.
 
 Every map is held against the identification part and against the part that the fit has not seen,
-never mixed; a data sheet gets the bulk modulus that suits it best on the identification part.
+never mixed; a reference gets the bulk modulus that suits it best on the identification part.
+`compare_trace` holds the equation alone; `study` adds all that `rtid compare` shows.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,69 +18,189 @@ from rtid.compare import (
     Candidate,
     Comparison,
     Deviation,
+    Examination,
+    LearnedReference,
+    Reference,
     ReferenceMap,
+    Visit,
     block_rows,
     compare,
     deviations,
+    examine,
     learned,
+    places,
     refitted,
+    smooth_position,
 )
+from rtid.comparing_json import SCHEMA, as_json
 from rtid.datasheet import read_reference
 from rtid.estimator.flowmap import SHUT, VALID, FlowMap
 from rtid.estimator.published import publish
-from rtid.project import Project
-from rtid.replay import Replay
+from rtid.mapfiles import read_map
+from rtid.model import FloatArray
+from rtid.project import Project, load
+from rtid.replay import Replay, replay
 
 IDENTIFICATION, VALIDATION = "identification", "validation"
-SCHEMA = 1
+LEARNED = "learned"
+MAP_FILES = (".json", ".npz")
 
 
 @dataclass(frozen=True)
 class Held:
-    """One map held against the parts of a trace; beta_pa (chambers,) is what goes with it."""
+    """One map held against the parts of a trace; beta_pa (chambers,) is what goes with it.
+
+    examinations: by part, only in a `study`.
+    """
 
     name: str
     beta_pa: np.ndarray
     parts: dict[str, Comparison]
+    candidate: Candidate
+    examinations: dict[str, Examination] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class TraceComparison:
-    """Learned map first, then the reference if there is one; tables per block and per edge."""
+    """Learned map first, then the references; tables per block (by part) and per edge."""
 
     replay: Replay
     flowmap: FlowMap
-    reference: ReferenceMap | None
+    references: tuple[Reference, ...]
     held: tuple[Held, ...]
-    blocks: list[BlockRow]
-    deviations: list[Deviation]
+    blocks_of: dict[str, list[BlockRow]]
+    deviations_of: dict[str, list[Deviation]]
+
+    @property
+    def reference(self) -> Reference | None:
+        """The first reference."""
+        return self.references[0] if self.references else None
+
+    @property
+    def blocks(self) -> list[BlockRow]:
+        """Blocks and what they leave in the identification part."""
+        return self.blocks_of[IDENTIFICATION]
+
+    @property
+    def deviations(self) -> list[Deviation]:
+        """Learned map beside the first reference."""
+        return next(iter(self.deviations_of.values()), [])
 
 
-def compare_trace(result: Replay, reference: ReferenceMap | None = None) -> TraceComparison:
-    """Hold the learned map, and a reference, against a replayed trace."""
-    flowmap = publish(result.fit.solution)
-    spans = {IDENTIFICATION: result.identification_s}
-    if result.validation_s is not None:
-        spans[VALIDATION] = result.validation_s
-    chunks = {name: result.part(span) for name, span in spans.items()}
-    candidates = [learned(result.fit, flowmap)]
-    if reference is not None:
+def compare_trace(
+    result: Replay, *references: Reference | None, name: str = LEARNED
+) -> TraceComparison:
+    """Hold the learned map, called `name`, and references against a replayed trace."""
+    flowmap, chunks = publish(result.fit.solution), parts_of(result)
+    known = tuple(reference for reference in references if reference is not None)
+    candidates = [learned(result.fit, flowmap, name)]
+    for reference in known:
         weights = result.fit.weights
         candidates.append(refitted(result.model, reference, weights, chunks[IDENTIFICATION]))
     held = tuple(_hold(result, candidate, chunks) for candidate in candidates)
-    blocks = block_rows(result.fit.solution, held[0].parts[IDENTIFICATION])
-    differences = deviations(flowmap, reference) if reference is not None else []
-    return TraceComparison(result, flowmap, reference, held, blocks, differences)
+    blocks = {
+        title: block_rows(result.fit.solution, part, flowmap)
+        for title, part in held[0].parts.items()
+    }
+    differences = {reference.name: deviations(flowmap, reference) for reference in known}
+    return TraceComparison(result, flowmap, known, held, blocks, differences)
+
+
+def parts_of(result: Replay) -> dict[str, FloatArray]:
+    """Samples of the identification part and, where there is one, of the held-out part."""
+    spans = {IDENTIFICATION: result.identification_s}
+    if result.validation_s is not None:
+        spans[VALIDATION] = result.validation_s
+    return {title: result.part(span) for title, span in spans.items()}
 
 
 def _hold(result: Replay, candidate: Candidate, chunks: Mapping[str, np.ndarray]) -> Held:
-    parts = {name: compare(result.model, candidate, chunk) for name, chunk in chunks.items()}
-    return Held(candidate.name, 1.0 / candidate.compliance, parts)
+    parts = {
+        title: compare(result.model, candidate, chunk, seen=title == IDENTIFICATION)
+        for title, chunk in chunks.items()
+    }
+    return Held(candidate.name, 1.0 / candidate.compliance, parts, candidate)
 
 
-def find_reference(project: Project, path: Path | None) -> ReferenceMap | None:
-    """The data sheet at `path`, else those that the project names, else None."""
+def study(
+    result: Replay,
+    *references: Reference | None,
+    name: str = LEARNED,
+    extra_flow: Mapping[str, FloatArray] | None = None,
+) -> TraceComparison:
+    """`compare_trace` with every map examined: simulated pressures, correlations, CUSUM and more.
+
+    extra_flow: by part (samples - 1, chambers) in m3/s, what effects add to the modelled flow.
+    """
+    found = compare_trace(result, *references, name=name)
+    chunks, extra = parts_of(result), extra_flow or {}
+    positions = {title: smooth_position(result.model, chunk) for title, chunk in chunks.items()}
+    held = []
+    for one in found.held:
+        examinations: dict[str, Examination] = {}
+        for title, chunk in chunks.items():
+            seen = title == IDENTIFICATION
+            before = None if seen else examinations[IDENTIFICATION].equation
+            examinations[title] = examine(
+                result.model, one.candidate, chunk, seen, before, positions[title], extra.get(title)
+            )
+        equations = {title: e.equation for title, e in examinations.items()}
+        held.append(Held(one.name, one.beta_pa, equations, one.candidate, examinations))
+    blocks = {
+        title: block_rows(result.fit.solution, part, found.flowmap)
+        for title, part in held[0].parts.items()
+    }
+    return TraceComparison(
+        result, found.flowmap, found.references, tuple(held), blocks, found.deviations_of
+    )
+
+
+def opponent(first: TraceComparison, against: Path) -> TraceComparison:
+    """The study to be set beside the first; its map takes the file's name.
+
+    against: another project (.toml) for the same trace, or another trace for the same project.
+    """
+    project, trace = first.replay.project, first.replay.trace.path
+    if against.suffix.lower() == ".toml":
+        project = load(against)
+    else:
+        trace = against
+    return study(replay(project, trace), name=against.stem)
+
+
+def changes(first: TraceComparison, second: TraceComparison) -> list[Deviation]:
+    """The first learned map beside the second, for the edges that both have."""
+    other = LearnedReference(second.held[0].name, second.flowmap)
+    names = {edge.name for edge in second.flowmap.edges}
+    shared = FlowMap(tuple(edge for edge in first.flowmap.edges if edge.name in names))
+    return deviations(shared, other)
+
+
+def spans_of_block(found: TraceComparison, edge: str, i: int, j: int) -> list[tuple[float, float]]:
+    """When the working point of an edge was in block (i, j), in s from the first sample.
+
+    i counts along u, j along dp, from 0.  Raises NoSuchBlockError.
+    """
+    model, parts = found.replay.model, found.held[0].parts.values()
+    return [span for part in parts for span in places.spans_of_block(model, part, edge, i, j)]
+
+
+def blocks_in_span(found: TraceComparison, t0_s: float, t1_s: float) -> list[Visit]:
+    """Blocks that the edges' working points were in between two instants, longest stay first."""
+    model, total = found.replay.model, dict[tuple[str, int, int], float]()
+    for part in found.held[0].parts.values():
+        for visit in places.blocks_in_span(model, part, t0_s, t1_s):
+            key = visit.edge, visit.i, visit.j
+            total[key] = total.get(key, 0.0) + visit.time_s
+    visits = [Visit(*key, time_s) for key, time_s in total.items()]
+    return sorted(visits, key=lambda visit: -visit.time_s)
+
+
+def find_reference(project: Project, path: Path | None) -> Reference | None:
+    """The map at `path` (data sheet, or .json or .npz of `rtid export`), else the project's own."""
     if path is not None:
+        if path.suffix.lower() in MAP_FILES:
+            return LearnedReference(path.stem, read_map(path)[0])
         return read_reference(path)
     if not project.reference_maps:
         return None
@@ -89,59 +209,25 @@ def find_reference(project: Project, path: Path | None) -> ReferenceMap | None:
     return ReferenceMap("reference map", tables)
 
 
-def as_json(found: TraceComparison) -> dict[str, Any]:
-    """The comparison in plain JSON types, SI units; NaN is null."""
-    solution = found.replay.fit.solution
-    names = [chamber.name for chamber in found.replay.model.chambers]
-    return {
-        "schema": SCHEMA,
-        "trace": str(found.replay.trace.path),
-        "chambers": names,
-        "rho_of_fit": solution.rho,
-        "maps": [_held_json(held) for held in found.held],
-        "blocks": [_plain(vars(row)) for row in found.blocks],
-        "differences": [_deviation_json(d) for d in found.deviations],
-    }
-
-
-def _held_json(held: Held) -> dict[str, Any]:
-    parts = {
-        name: {
-            "rows": len(part.t_s),
-            "residual_rms_m3s": _plain(part.residual_rms_m3s) if len(part.t_s) else None,
-            "residual_share_of_rms_flow": _plain(part.residual_share) if len(part.t_s) else None,
-            "innovation_variance": _plain(part.rho),
-            "share_of_time_by_status": part.shares,
-        }
-        for name, part in held.parts.items()
-    }
-    return {"name": held.name, "beta_pa": _plain(held.beta_pa), "parts": parts}
-
-
-def _deviation_json(d: Deviation) -> dict[str, Any]:
-    return {
-        "edge": d.edge,
-        "u_v": _plain(d.w_v),
-        "dp_pa": _plain(d.dp_pa),
-        "flow_m3s": _plain(d.flow_m3s),
-        "sd_m3s": _plain(d.sd_m3s),
-        "reference_m3s": _plain(d.reference_m3s),
-        "status": d.status.tolist(),
-    }
-
-
-def _plain(value: Any) -> Any:
-    """Arrays as lists and NaN as None, all the way down."""
-    if isinstance(value, np.ndarray | np.generic):
-        return _plain(value.tolist())
-    if isinstance(value, dict):
-        return {key: _plain(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
 def share_on_own_data(part: Comparison) -> float:
     """Share of the time with a flow in which every open edge is on a valid block."""
     moving = 1.0 - part.shares[SHUT]
     return part.shares[VALID] / moving if moving > 0 else 1.0
+
+
+__all__ = [
+    "IDENTIFICATION",
+    "SCHEMA",
+    "VALIDATION",
+    "Held",
+    "TraceComparison",
+    "as_json",
+    "blocks_in_span",
+    "changes",
+    "compare_trace",
+    "find_reference",
+    "opponent",
+    "share_on_own_data",
+    "spans_of_block",
+    "study",
+]

@@ -79,9 +79,13 @@ def test_compare_in_words_and_pictures(trace: Path, sheet: Path, tmp_path: Path)
     text = call("compare", trace, "-p", project, "--map", sheet, "--pictures", folder)
     assert "With the learned map" in text
     assert "With the sheet map" in text
-    assert "Learned map minus data sheet" in text
-    names = {path.name for path in folder.iterdir()}
-    assert names == {"residual_learned.png", "residual_sheet.png", "maps.png", "slices.png"}
+    assert "Learned minus sheet" in text
+    assert "Simulated pressure: fit in %" in text
+    names = {path.stem for path in folder.iterdir()}
+    for one in ("learned", "sheet"):
+        of_map = ("residual", "pressure", "cusum", "dependence", "correlation")
+        assert names >= {f"{what}_{one}" for what in of_map}
+    assert names >= {"where_identification", "where_validation", "maps", "slices"}
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".json", ".npz"])

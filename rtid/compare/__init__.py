@@ -8,7 +8,7 @@ from rtid.compare.examination import Examination, examine
 from rtid.compare.extra import ExtraFlowError, with_extra_flow
 from rtid.compare.motion import smooth_position
 from rtid.compare.places import NoSuchBlockError, Visit, blocks_in_span, spans_of_block
-from rtid.compare.reference import ReferenceMap
+from rtid.compare.reference import LearnedReference, Reference, ReferenceMap
 from rtid.compare.simulation import FREE_RUN, HORIZONS_S, NoFreeRunError, Simulation, simulate
 from rtid.compare.tables import (
     PAPER_DP_PA,
@@ -34,8 +34,10 @@ __all__ = [
     "Examination",
     "ExtraFlowError",
     "Intervals",
+    "LearnedReference",
     "NoFreeRunError",
     "NoSuchBlockError",
+    "Reference",
     "ReferenceMap",
     "Simulation",
     "Visit",

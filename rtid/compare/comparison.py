@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtid.compare.extra import with_extra_flow
-from rtid.compare.reference import ReferenceMap
+from rtid.compare.reference import Reference
 from rtid.estimator.flowmap import EXTRAPOLATED, LEARNING, PRIOR, SHUT, VALID, FlowMap
 from rtid.estimator.record import RecordFit
 from rtid.estimator.solution import Solution
@@ -35,8 +35,7 @@ class Candidate:
     status (cells,) holds the words of `rtid.estimator.flowmap`; weights gives lag and noise slopes.
     terms (terms,): coefficients of the model's shared terms in units of their scales.
     fitted (cells, 6): the fit's own terms, before the orifice law and the blending of the published
-    map, NaN where it has none: what whitened innovations are taken from, where it is there;
-    unknowns: how many of them the fit has determined, in effect.
+    map, NaN where it has none: what whitened innovations are taken from, where it is there.
     """
 
     name: str
@@ -46,7 +45,6 @@ class Candidate:
     weights: Weights
     terms: FloatArray
     fitted: FloatArray | None = None
-    unknowns: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -112,9 +110,8 @@ def learned(fit: RecordFit, flowmap: FlowMap, name: str = "learned") -> Candidat
     status = np.concatenate([edge.status.ravel() for edge in flowmap.edges])
     compliance = fit.solution.compliance
     terms, theta = fit.solution.terms_theta, flowmap.theta_cells()
-    unknowns = fit.state.engine[0]["rows"] * len(compliance) - fit.solution.dof
     own = _fitted(fit.solution)
-    return Candidate(name, theta, compliance, status, fit.weights, terms, own, float(unknowns))
+    return Candidate(name, theta, compliance, status, fit.weights, terms, own)
 
 
 def _fitted(solution: Solution) -> FloatArray | None:
@@ -128,9 +125,7 @@ def _fitted(solution: Solution) -> FloatArray | None:
     return theta
 
 
-def refitted(
-    model: Model, reference: ReferenceMap, weights: Weights, chunk: FloatArray
-) -> Candidate:
+def refitted(model: Model, reference: Reference, weights: Weights, chunk: FloatArray) -> Candidate:
     """A reference map with each chamber's compliance fitted to the chunk, all else as it is."""
     theta, none = reference.theta_cells(model), np.zeros(len(model.terms))
     one = np.ones(len(model.chambers))

@@ -7,10 +7,7 @@ series that have nothing to do with each other
 
     var r_eu(k) = 1 / N_k  sum over j of rho_ee(j) rho_uu(j),
 
-so an input's own correlation counts as far as e is correlated too; N_k pairs of rows.  A fit with
-p unknowns has made its own residual a little anti-correlated within its blocks, by p / N at most
-times the share of the rows k apart that are in one block: the autocorrelation's lower band is so
-much further away.
+so an input's own correlation counts as far as e is correlated too; N_k pairs of rows.
 
 Positive lags: the input comes first, the model misses some of its effect.  Negative lags: e comes
 first, that is feedback, a controller that sees the sensors' noise, and no fault of the model.
@@ -37,15 +34,14 @@ VARIES = 3.0  # an input's standard deviation in those of its noise, below which
 class Correlation:
     """Of one chamber's innovations with a signal (itself: `itself`), lags_s and value (l,).
 
-    low, high (l,): 95 % of the lags of an unrelated signal lie within.
+    band (l,): half width, 95 % of the lags of an unrelated signal lie within.
     """
 
     chamber: str
     signal: str
     lags_s: FloatArray
     value: FloatArray
-    low: FloatArray
-    high: FloatArray
+    band: FloatArray
 
     @property
     def itself(self) -> bool:
@@ -63,17 +59,13 @@ class Correlation:
         return self._outside(self.lags_s < 0)
 
     def _outside(self, at: np.ndarray) -> float:
-        off = (self.value < self.low) | (self.value > self.high)
-        return float(np.mean(off[at])) if at.any() else 0.0
+        return float(np.mean(np.abs(self.value[at]) > self.band[at])) if at.any() else 0.0
 
 
-def correlations(
-    model: Model, part: Comparison, unknowns: float = 0.0, max_lag_s: float = MAX_LAG_S
-) -> list[Correlation]:
+def correlations(model: Model, part: Comparison, max_lag_s: float = MAX_LAG_S) -> list[Correlation]:
     """Autocorrelation of every chamber's innovations and their correlation with every input.
 
-    Inputs are the commands and the pressures that are no chamber's, as far as they vary.  unknowns:
-    of the fit, where it was made from this part.
+    Inputs are the commands and the pressures that are no chamber's, as far as they vary.
     """
     e = part.intervals.innovation
     at = np.flatnonzero(np.isfinite(e).all(axis=1))
@@ -86,11 +78,10 @@ def correlations(
     n, found = int(row[-1]) + 1, []
     known = np.zeros(n)
     known[row] = 1.0
-    dip = unknowns / len(at) * _together(part.intervals.cell[at], lags)
     for c, chamber in enumerate(model.chambers):
         error = _centred(row, e[at, c], n)
         own = _Series(error, known, (MEMORY + 1) * lags)
-        found.append(_auto(chamber.name, own, dip, step_s))
+        found.append(_auto(chamber.name, own, lags, step_s))
         for name, values in _inputs(model, part, at):
             other = _Series(_centred(row, values, n), known, (MEMORY + 1) * lags)
             found.append(_cross(chamber.name, name, own, other, lags, step_s))
@@ -131,19 +122,11 @@ class _Series:
         self.rho = (raw / pairs * scale)[: min(most, self.n - 1) + 1]
 
 
-def _together(cell: np.ndarray, lags: int) -> FloatArray:
-    """Share of the rows k = 1..lags apart between which no edge has changed its block (lags,)."""
-    changes = np.concatenate([[0], np.cumsum((np.diff(cell, axis=0) != 0).any(axis=1))])
-    some = np.unique(np.round(np.geomspace(1, lags, 16)).astype(int))
-    share = [float(np.mean(changes[k:] == changes[:-k])) for k in some]
-    return np.interp(np.arange(1, lags + 1), some, share)
-
-
-def _auto(chamber: str, own: _Series, dip: FloatArray, step_s: float) -> Correlation:
-    k = np.arange(1, len(dip) + 1)
+def _auto(chamber: str, own: _Series, lags: int, step_s: float) -> Correlation:
+    k = np.arange(1, lags + 1)
     lags_s = np.asarray(k * step_s)
     band = Z95 / np.sqrt(own.pairs[k])
-    return Correlation(chamber, "", lags_s, own.rho[k], -band - dip, band)
+    return Correlation(chamber, "", lags_s, own.rho[k], band)
 
 
 def _cross(
@@ -158,4 +141,4 @@ def _cross(
     taper = 1.0 - np.arange(1, most) / most
     related = 1.0 + 2.0 * float((taper * own.rho[1:most] * other.rho[1:most]).sum())
     band = Z95 * np.sqrt(max(related, 1.0 / own.n) / own.pairs[np.abs(k)])
-    return Correlation(chamber, name, lags_s, value, -band, band)
+    return Correlation(chamber, name, lags_s, value, band)

@@ -47,6 +47,11 @@ class Cusum:
     crosses_s: float | None
     change_s: float | None
 
+    @property
+    def largest(self) -> float:
+        """Largest share of the boundary that the sum reaches; above 1 it has crossed."""
+        return float(np.max(np.abs(self.value) / self.boundary)) if len(self.value) else 0.0
+
 
 def cusums(
     model: Model, part: Comparison, before: Comparison | None = None, level: float = LEVEL

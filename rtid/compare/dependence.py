@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtid.compare.comparison import Comparison
-from rtid.model import POSITION, FloatArray, Model
+from rtid.model import POSITION, VELOCITY, FloatArray, Model
 
 BINS, TIME_BINS = 16, 24
 LEAST_ROWS = 8  # rows that a bin needs
 EDGE = 0.005  # of the rows at either end of a signal's range are left to the outer bins
 RESTING = 0.02  # of the largest speed: slower is standstill
 MOST_LAG = 50
-TIME, VELOCITY = "time", "velocity"
+TIME, RATE = "time", "velocity"
 DIRECTIONS = ("retracting", "resting", "extending")
 
 
@@ -47,12 +47,13 @@ class Dependence:
 
 
 def against_signals(model: Model, part: Comparison, bins: int = BINS) -> list[Dependence]:
-    """Dependence on every signal that varies, and on the velocity that the position shows."""
+    """Dependence on every signal that varies; on the position's rate where no velocity is there."""
     found = []
     velocity = part.measured_m3s[:, 0] / (model.chambers[0].area_m2 * model.chambers[0].sign)
     columns = [(s.name, s.unit, part.signals[:, k]) for k, s in enumerate(model.signals)]
-    if any(s.kind == POSITION for s in model.signals):
-        columns.append((VELOCITY, "m/s", velocity))
+    kinds = [s.kind for s in model.signals]
+    if VELOCITY not in kinds and POSITION in kinds:
+        columns.append((RATE, "m/s", velocity))
     for name, unit, values in columns:
         if len(values) and np.ptp(values) > 1e-9 * (np.abs(values).max() + 1e-30):
             found.append(_binned(name, unit, values, _edges(values, bins), part))

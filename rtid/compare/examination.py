@@ -62,6 +62,6 @@ def examine(
         against_signals(model, equation),
         by_direction(model, equation),
         over_time(equation),
-        correlations(model, equation, candidate.unknowns if seen else 0.0),
+        correlations(model, equation),
         cusums(model, equation, before),
     )

@@ -8,12 +8,15 @@ drops, K = Q / sqrt(dp) may depend on dp too.  Outside the table's commands the 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rtid.errors import RtidError
+from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.orifice import root
 from rtid.estimator.published import cell_terms
 from rtid.model import FloatArray, Model
@@ -75,11 +78,53 @@ class ReferenceMap:
 
     def theta_cells(self, model: Model) -> FloatArray:
         """Its Taylor terms for all cells of the model's grids (cells, 6), for `kernels.explain`."""
-        parts = []
-        for edge in model.edges:
+        return theta_cells(model, self.flow)
 
-            def flow(w: FloatArray, dp: FloatArray, name: str = edge.name) -> FloatArray:
-                return self.flow(name, w, dp)
 
-            parts.append(cell_terms(edge.grid, flow))
-        return np.concatenate(parts)
+@dataclass(frozen=True)
+class LearnedReference:
+    """A map that was learned before, as a reference; its grids may differ from the model's."""
+
+    name: str
+    flowmap: FlowMap
+
+    def flow(self, edge: str, w_v: ArrayLike, dp_pa: ArrayLike) -> FloatArray:
+        """Q in m3/s at broadcast points; NaN off its grid.  Raises MissingEdgeError."""
+        known = [e.name for e in self.flowmap.edges]
+        if edge not in known:
+            text = f"{self.name}: no map for edge {edge!r}, only for {', '.join(known)}"
+            raise MissingEdgeError(text, "export it with the project of this machine")
+        return self.flowmap.flow(edge, w_v, dp_pa)
+
+    def theta_cells(self, model: Model) -> FloatArray:
+        """Its Taylor terms for all cells of the model's grids (cells, 6)."""
+        return theta_cells(model, self.flow)
+
+
+class Reference(Protocol):
+    """What both kinds of reference have in common."""
+
+    @property
+    def name(self) -> str:
+        """What it is called in tables and pictures."""
+
+    def flow(self, edge: str, w_v: ArrayLike, dp_pa: ArrayLike) -> FloatArray:
+        """Q in m3/s, NaN where it knows nothing."""
+
+    def theta_cells(self, model: Model) -> FloatArray:
+        """Taylor terms of all cells of the model's grids."""
+
+
+Flow = Callable[[str, FloatArray, FloatArray], FloatArray]
+
+
+def theta_cells(model: Model, flow: Flow) -> FloatArray:
+    """Taylor terms (cells, 6) of a known flow(edge, w, dp) for all cells of the model's grids."""
+    parts = []
+    for edge in model.edges:
+
+        def of_edge(w: FloatArray, dp: FloatArray, name: str = edge.name) -> FloatArray:
+            return flow(name, w, dp)
+
+        parts.append(cell_terms(edge.grid, of_edge))
+    return np.concatenate(parts)

@@ -51,6 +51,23 @@ class BlockRow:
 
 
 NEVER = "never visited in the data of the fit"
+# What a block has or lacks, in words; the first is identified, the last has no data.
+CAUSES = (
+    "identified",
+    "few rows",
+    "condition",
+    "spread too large",
+    "contradicted",
+    "never visited",
+)
+_BEGINS = {"condition": 2, "flow known": 3, "the machine": 4, "not visited": 4, "never": 5}
+
+
+def cause_of(row: BlockRow) -> str:
+    """One of CAUSES for a block."""
+    if row.status == VALID:
+        return CAUSES[0]
+    return CAUSES[next((k for text, k in _BEGINS.items() if row.reason.startswith(text)), 1)]
 
 
 def block_rows(
