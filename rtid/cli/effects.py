@@ -158,5 +158,5 @@ def _print_parameter(console: Console, p: Parameter) -> None:
     if p.unit in PRACTICAL and not (p.unit in ("m", "s") and p.high >= 1):
         unit, factor = PRACTICAL[p.unit]
         span += f" ({p.low * factor:.3g} to {p.high * factor:.3g} {unit})"
-    console.print(f"  {p.name}, {p.symbol}: {span}, {sign}", markup=False)
+    _paragraph(console, f"{p.name}, {p.symbol}: {span}, {sign}")
     _paragraph(console, p.meaning, 3 * INDENT)
