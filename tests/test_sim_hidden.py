@@ -110,7 +110,7 @@ def test_a_seat_leaks_when_shut_and_vanishes_when_open() -> None:
     s, w, q = run.truth.signals, run.truth.opening_v[:, 3], run.truth.flow("bt")
     drop = s[:, 2] - s[:, 4]
     shut, far = (w < 1.0) & (drop > 0.5e6), w > 3.5
-    assert q[shut] / np.sqrt(drop[shut]) == pytest.approx(9e-9, rel=0.02)
+    assert q[shut] / np.sqrt(drop[shut]) == pytest.approx(4.5e-9, rel=0.02)
     plain = run.plant.flow("bt", w[far], drop[far])
     assert np.abs(q[far] / plain - 1).max() < 0.02
     others = run.truth.flow("at")[run.truth.opening_v[:, 1] < 1.0]
@@ -138,7 +138,7 @@ def test_mass_balance_closes_with_leaks(name: str, where: str) -> None:
     assert balance(run).max() < 3e-4
     without = Run(run.plant, run.sensors, run.samples, run.truth)
     without.truth.extra_m3s[:] = 0.0
-    assert name == "valve_seat_leakage" or balance(without).max() > 2e-3
+    assert name == "valve_seat_leakage" or balance(without).max() > 1e-3
 
 
 def test_dead_volume_stores_oil() -> None:
@@ -177,10 +177,10 @@ def softer(run: Run) -> FloatArray:
 
 
 def test_air_softens_the_oil_at_low_pressure() -> None:
-    """1 / beta of the mixture is that of oil plus the stated share of isothermal air at 1.5 MPa."""
-    at = softness(hidden("entrained_air"), np.array([0.5e6, 1.5e6, 6e6]))
-    assert at[1] == pytest.approx(0.03 * 101325 / 1.5e6**2, rel=0.03)
-    assert at[0] > 7 * at[1] and at[2] < at[1] / 12
+    """1 / beta of the mixture is that of oil plus the stated share of isothermal air at 2.2 MPa."""
+    at = softness(hidden("entrained_air"), np.array([0.8e6, 2.2e6, 6e6]))
+    assert at[1] == pytest.approx(0.03 * 101325 / 2.2e6**2, rel=0.04)
+    assert at[0] > 6 * at[1] and at[2] < at[1] / 6
     run = rich(hidden("entrained_air", "strong"))
     assert balance(run, softer(run)).max() < 3e-4
     assert balance(run).max() > 1.5e-3
@@ -199,7 +199,7 @@ def test_gas_boils_out_below_its_pressure_alone() -> None:
 
 def test_a_hose_wall_stores_oil_and_stiffens() -> None:
     run = rich(hidden("hose_compliance", "strong", "a"))
-    wall = 1.5e-12 / (1 + (run.truth.signals[:, P_A] - 3e6) / 6e6)
+    wall = 1.5e-12 / (1 + (run.truth.signals[:, P_A] - 4e6) / 8e6)
     assert balance(run, np.array([wall, 0 * wall])).max() < 5e-4
     assert balance(run)[0] > 1.5e-3
 
@@ -254,11 +254,11 @@ def test_a_groove_leaks_in_its_place_and_a_lip_in_its_direction() -> None:
         run = rich(hidden(name, "strong"), 20.0)
         s, q = run.truth.signals, run.truth.extra_m3s[:, 1]
         drop, x, v = s[:, P_A] - s[:, P_B], s[:, 5], s[:, 6]
-        k, away = q / drop, np.abs(x - 0.27) > 0.07
-        top = (np.abs(x - 0.27) < 2e-3) & (v > 0.03)
+        k, away = q / drop, np.abs(x - 0.26) > 0.07
+        top = (np.abs(x - 0.26) < 2e-3) & (v > 0.03)
         assert k[top] == pytest.approx(HIDDEN[name].strengths[2], rel=0.12)
         assert np.abs(k[away]).max() < 0.01 * k.max()
-        back = (np.abs(x - 0.27) < 2e-3) & (v < -0.03)
+        back = (np.abs(x - 0.26) < 2e-3) & (v < -0.03)
         assert (k[back].max() < 0.01 * k.max()) == (name == "groove_one_way")
 
 
@@ -302,7 +302,7 @@ def test_gain_drift_warms_up_by_its_strength() -> None:
         "pa", w[open_], (s[:, 3] - s[:, 1])[open_]
     )
     t = np.arange(len(s))[open_] / len(s)
-    assert factor == pytest.approx(1 + 0.09 * np.expm1(-2 * t) / np.expm1(-2), rel=1e-4)
+    assert factor == pytest.approx(1 + 0.09 * np.expm1(-t / 1.5) / np.expm1(-1 / 1.5), rel=1e-4)
     linear = np.polyfit(t, factor, 1)[0]
     assert linear == pytest.approx(0.09, rel=0.1)
 

@@ -7,7 +7,7 @@ relief   q = k (d + sqrt(d^2 + w^2)) / 2, d = P - P_open    a poppet with a soft
 mixture  1 / beta_c = (V_gas / (kappa P) + V_oil / beta) / (V_gas + V_oil),
          V_gas = share (p0 / P)^(1/kappa), V_oil = (1 - share) exp(-(P - p0) / beta)
 hose     pi section: (V_h / 2 beta) dP_port/dt = valves - q,  I dq/dt = P_port - P_c - R q - r q|q|
-pump     C(P) dP_s/dt = Q_p tanh((P_set - P_s) / (R Q_p)) - flow drawn, C of an accumulator
+pump     P_s = P_set - D,  C(P_s) dD/dt = flow drawn - Q_p tanh(D / (R Q_p)), C of an accumulator
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from rtid.sim.plant import AB, AT, BT, PA, PB, Constants, FloatArray, metered_fl
 
 # the state of a machine with extra physics; the first four are the plain machine's
 P_A, P_B, X, V, PORT_A, PORT_B, LINE_A, LINE_B, DEAD_A, DEAD_B, HOSE_A, HOSE_B = range(12)
-SUPPLY, BRANCH, BRANCH_FLOW = range(12, 15)
-STATES = 15
+SUPPLY, DROOP, BRANCH, BRANCH_FLOW = range(12, 16)
+STATES = 16
 SUPPLY_IN, TANK_IN, BURST_IN = 0, 1, 4  # columns of the inputs
 
 ATMOSPHERE_PA = 1.013e5
 GAP_MEAN_PA, GAP_WIDENS_PA = 3e6, 20e6
 TRANSITION_PA = 3e4  # between laminar and turbulent in a leak
 SEAT_LAMINAR_PA = 1e5  # a seat's gap is finer than a metering edge
-KNEE_PA = 0.15e6  # width of the knee of a relief or make-up valve
-GROOVE_SHIFT_M, GROOVE_M = 0.02, 0.02  # from the middle of the stroke; half length
+KNEE_PA = 0.1e6  # width of the knee of a relief or make-up valve
+GROOVE_SHIFT_M, GROOVE_M = 0.01, 0.02  # from the middle of the stroke; half length
 GROOVE_SPEED_MPS = 0.01
 POLYTROPIC = 1.15
 DEAD_LAG_S = 2e-3  # of the pressure in a dead volume, behind its port
 HOSE_LAG_S = 1e-3
-HOSE_STIFF_PA = 6e6  # a hose is half as soft at 9 MPa as at 3 MPa
+HOSE_MEAN_PA, HOSE_STIFF_PA = 4e6, 8e6  # a hose is half as soft at 12 MPa as at 4 MPa
 HOSE_BORE_M, OIL_KGPM3, OIL_PAS = 13e-3, 870.0, 0.04
 HOSE_AREA_M2 = math.pi / 4 * HOSE_BORE_M**2
 INERTANCE_KGPM5 = OIL_KGPM3 / HOSE_AREA_M2  # per metre of hose
@@ -122,9 +122,8 @@ def edge_flow(c: Constants, seat: float, compensated: float, gain: float, dp_pa:
 
 @njit(cache=True, error_model="numpy")
 def tie_nodes(e: Any, p_supply_pa: float, y: FloatArray) -> None:
-    """Give the pressures at the valves, where nothing lies between, their neighbours' value."""
-    if e.whole.sag_pasm3 == 0.0:
-        y[SUPPLY] = p_supply_pa
+    """Set the pressures at the valves that follow from the others: where nothing lies between."""
+    y[SUPPLY] = p_supply_pa - y[DROOP]
     if e.whole.branch_kgpm4 == 0.0:
         y[BRANCH] = y[SUPPLY]
     if e.a.line_m == 0.0:
@@ -198,7 +197,7 @@ def chamber_rates(
         into -= r.dead_volume_m3 / c.beta_pa * dy[DEAD_A + chamber]
     if r.hose_m3ppa > 0.0:
         dy[HOSE_A + chamber] = (p - y[HOSE_A + chamber]) / HOSE_LAG_S
-        softness = 1.0 / (1.0 + (y[HOSE_A + chamber] - GAP_MEAN_PA) / HOSE_STIFF_PA)
+        softness = 1.0 / (1.0 + (y[HOSE_A + chamber] - HOSE_MEAN_PA) / HOSE_STIFF_PA)
         into -= r.hose_m3ppa * softness * dy[HOSE_A + chamber]
     room = volume * compressibility(c, e, r, p)
     dy[P_A + chamber] = (into + net - area * y[V]) / room
@@ -217,9 +216,9 @@ def supply_rates(e: Any, q: FloatArray, p_set_pa: float, y: FloatArray, dy: Floa
         ) / e.whole.branch_kgpm4
         to_pa = y[BRANCH_FLOW]
     if e.whole.sag_pasm3 > 0.0:
-        droop = (p_set_pa - y[SUPPLY]) / (e.whole.sag_pasm3 * PUMP_M3S)
+        delivered = PUMP_M3S * math.tanh(y[DROOP] / (e.whole.sag_pasm3 * PUMP_M3S))
         capacity = SUPPLY_LAG_S / e.whole.sag_pasm3 * (p_set_pa / y[SUPPLY]) ** ACCUMULATOR
-        dy[SUPPLY] = (PUMP_M3S * math.tanh(droop) - to_pa - q[PB]) / capacity
+        dy[DROOP] = (to_pa + q[PB] - delivered) / capacity
 
 
 @njit(cache=True, error_model="numpy")

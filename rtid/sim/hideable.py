@@ -23,7 +23,7 @@ EITHER = ("", *CHAMBERS)  # "" is both
 ANYWHERE = ("",)
 VALVES = EDGES[:4]
 LAMINAR, TURBULENT = "m3/s/Pa", "m3/s/sqrt(Pa)"
-MATERIAL_GAS_PA = 1.5e6  # where the stated share of air is as soft as isothermal air
+MATERIAL_GAS_PA = 2.2e6  # where the stated share of air is as soft as isothermal air
 
 
 class HiddenError(RtidError):
@@ -142,8 +142,8 @@ _CATALOGUE = (
     ("external_leakage_laminar", "gap to tank that widens with pressure",
      LAMINAR, (0.3e-12, 1e-12, 3e-12), CHAMBERS, _at("external_laminar", CHAMBERS)),
     ("valve_seat_leakage", "gap of the seat, at right angles to the opening, laminar foot 0.1 MPa",
-     TURBULENT, (1e-9, 3e-9, 9e-9), VALVES, _at("seat", EDGES)),
-    ("entrained_air", "volume of a polytropic mixture; share as soft as isothermal air at 1.5 MPa",
+     TURBULENT, (0.5e-9, 1.5e-9, 4.5e-9), VALVES, _at("seat", EDGES)),
+    ("entrained_air", "volume of a polytropic mixture; share as soft as isothermal air at 2.2 MPa",
      "1", (0.01, 0.03, 0.09), ANYWHERE, _air),
     ("extra_dead_volume", "blind volume behind a port, 2 ms late",
      "m3", (1.3e-4, 4e-4, 1.2e-3), EITHER, _at("dead_volume_m3", CHAMBERS)),
@@ -157,22 +157,22 @@ _CATALOGUE = (
      "V", (0.03, 0.1, 0.3), ANYWHERE, _number("play_v")),
     ("supply_sag", "saturating pump, polytropic accumulator; the column holds the set pressure",
      "Pa s/m3", (3.6e8, 1.1e9, 3.3e9), ANYWHERE, _number("sag_pasm3")),
-    ("relief_valve", "poppet with a soft knee of 0.15 MPa",
+    ("relief_valve", "poppet with a soft knee of 0.1 MPa",
      LAMINAR, (3e-12, 9e-12, 27e-12), CHAMBERS, _opening("relief", "relief_open_pa", 1.3, 0.78)),
-    ("valve_gain_drift", "all gains warm up exponentially over half the record",
+    ("valve_gain_drift", "all gains warm up exponentially, time constant 1.5 records",
      "1", (0.01, 0.03, 0.09), ANYWHERE, _number("gain_drift")),
     ("internal_leakage_turbulent", "sharp edge past the piston, laminar below 30 kPa",
      TURBULENT, (0.7e-9, 2e-9, 6e-9), ANYWHERE, _number("internal_turbulent")),
     ("external_leakage_turbulent", "sharp edge to tank, laminar below 30 kPa",
      TURBULENT, (0.4e-9, 1.2e-9, 3.6e-9), CHAMBERS, _at("external_turbulent", CHAMBERS)),
-    ("hose_compliance", "hose wall, 1 ms late, half as soft at 9 MPa as at 3 MPa",
+    ("hose_compliance", "hose wall, 1 ms late, half as soft at 12 MPa as at 4 MPa",
      "m3/Pa", (1.6e-13, 5e-13, 1.5e-12), EITHER, _at("hose_m3ppa", CHAMBERS)),
     ("spool_lag_first_order", "a second lag behind the spool's own 1.3 ms",
      "s", (1.5e-3, 5e-3, 15e-3), ANYWHERE, _number("spool_lag_s")),
     ("deadband_shift", "dead bands that are wider than before, each by 0.9 to 1.1 of it",
      "V", (0.05, 0.15, 0.45), ANYWHERE, _deadbands),
-    ("makeup_valve", "check valve with a soft knee of 0.15 MPa",
-     LAMINAR, (3e-12, 9e-12, 27e-12), CHAMBERS, _opening("makeup", "makeup_open_pa", 0.9, 0.18)),
+    ("makeup_valve", "check valve with a soft knee of 0.1 MPa",
+     LAMINAR, (3e-12, 9e-12, 27e-12), CHAMBERS, _opening("makeup", "makeup_open_pa", 1.0, 0.18)),
     ("cavitation", "share of the volume that boils out, with the square of what lacks",
      "1", (1.5e-3, 4.5e-3, 13e-3), ("b", "a"), _opening("released", "release_pa", 0.9, 0.25)),
     ("pressure_sensor_lag", "two equal lags of half the time one behind the other",
@@ -183,7 +183,7 @@ _CATALOGUE = (
      "s", (0.5e-3, 1.5e-3, 5e-3), ANYWHERE, _number("position_delay_s")),
     ("velocity_scale", "the velocity's sensor reads too much",
      "1", (0.02, 0.06, 0.2), ANYWHERE, _number("velocity_scale")),
-    ("position_dependent_leakage", "gap with a bell-shaped groove, 2 cm beyond mid-stroke",
+    ("position_dependent_leakage", "gap with a bell-shaped groove, 1 cm beyond mid-stroke",
      LAMINAR, (2e-12, 6e-12, 18e-12), ANYWHERE, _number("groove")),
     ("load_compensated_valve", "the flow's share that saturates above 0.2 MPa, as at 2 MPa",
      "1", (0.1, 0.3, 0.9), (*VALVES, ""), _at("compensated", EDGES)),
@@ -193,7 +193,7 @@ _VARIANTS = (
      "Pa s2/m3", (0.8e7, 2.4e7, 7e7), EITHER, _line_seen_at_valve, "line_dynamics"),
 )
 _OUTSIDE = (
-    ("groove_one_way", "groove 2 cm beyond mid-stroke whose lip opens while extending",
+    ("groove_one_way", "groove 1 cm beyond mid-stroke whose lip opens while extending",
      LAMINAR, (3e-12, 9e-12, 27e-12), ANYWHERE, _number("groove_one_way")),
     ("flow_bursts", "half sines of 0.05 to 0.3 s of either sign into A, 0.7 a second",
      "m3/s", (2e-6, 6e-6, 18e-6), ANYWHERE, _number("burst_m3s")),

@@ -1,6 +1,6 @@
 """Extra physics that runs by the clock: factors of the valve gains, bursts of flow.
 
-drift   1 + g (1 - exp(-t / tau)) / (1 - exp(-T / tau)), tau = T / 2: a machine that warms up
+drift   1 + g (1 - exp(-t / tau)) / (1 - exp(-T / tau)), tau = 1.5 T: a machine that warms up
 swing   1 + g sin(2 pi t / 7 s)
 """
 
@@ -12,6 +12,7 @@ from rtid.sim.extra import Extra
 from rtid.sim.plant import FloatArray
 
 SWING_S = 7.0
+WARM_UP = 1 / 1.5  # records per time constant
 BURSTS_PER_S = 0.7
 BURST_S = (0.05, 0.3)  # shortest and longest
 BURST_HEIGHT = (0.5, 1.5)
@@ -23,7 +24,7 @@ def schedule(e: Extra, rows: int, dt_s: float, rng: np.random.Generator) -> Floa
     columns = np.zeros((rows, 2))
     columns[:, 0] = 1.0
     if e.gain_drift:
-        columns[:, 0] += e.gain_drift * np.expm1(-2 * t_s / t_s[-1]) / np.expm1(-2.0)
+        columns[:, 0] += e.gain_drift * np.expm1(-WARM_UP * t_s / t_s[-1]) / np.expm1(-WARM_UP)
     if e.gain_swing:
         columns[:, 0] += e.gain_swing * np.sin(2 * np.pi * t_s / SWING_S)
     if e.burst_m3s:
