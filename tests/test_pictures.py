@@ -38,7 +38,13 @@ def part(rows: int = 4000, spike: float = 0.0) -> Comparison:
     if rows:
         modelled[rows // 3] -= spike
     cell = np.full((rows, 2), -1)
-    inner = Intervals(np.arange(rows + 1) / 50.0, cell, np.zeros((rows, 1)), np.zeros((rows, 4)))
+    inner = Intervals(
+        np.arange(rows + 1) / 50.0,
+        cell,
+        np.zeros((rows, 1)),
+        np.zeros((rows, 1)),
+        np.zeros((rows, 4)),
+    )
     shares, rho, signals = {"valid": 1.0}, np.ones(1), np.zeros((rows, 4))
     return Comparison("learned", t_s, measured, modelled, cell, shares, rho, signals, inner)
 

@@ -19,6 +19,7 @@ from rtid.estimator.flowmap import EXTRAPOLATED, LEARNING, PRIOR, SHUT, VALID, F
 from rtid.estimator.record import RecordFit
 from rtid.estimator.solution import Solution
 from rtid.estimator.state import Weights, build
+from rtid.kernels.engine import GAP_FLAG
 from rtid.kernels.explain import explain, filter_rows
 from rtid.kernels.layout import TERMS
 from rtid.model import TAYLOR, FloatArray, Model
@@ -52,14 +53,16 @@ class Intervals:
     """The samples of a comparison before any filter.
 
     t_s (n,); cell (n - 1, edges): grid cell of each edge over the interval, -1 shut; innovation
-    (n - 1, c): whitened, at the interval's end, NaN where no row: the first chamber's own, the
-    second's given the first; of the fit's own terms, where the candidate has them.
-    values (n - 1, m): the model's signals at the interval's start.
+    (n - 1, c): whitened, at the interval's end, the first chamber's own, the second's given the
+    first; begun anew after every interval whose flow does not stand on data.  NaN: no row, or such
+    an interval.  own (n - 1, c): the same of the fit's own terms instead of the published map's,
+    in the data of the fit.  values (n - 1, m): the model's signals at the interval's start.
     """
 
     t_s: FloatArray
     cell: NDArray[np.int64]
     innovation: FloatArray
+    own: FloatArray
     values: FloatArray
 
 
@@ -156,11 +159,10 @@ def compare(
     to these samples, so that its own terms hold in every block, else in the valid ones alone.
     """
     held = _hold(model, candidate, chunk, extra_flow)
-    innovation = held.innovation
-    if candidate.fitted is not None:
-        known = np.isfinite(candidate.fitted[:, 0]) & (seen | (candidate.status == VALID))
-        own = np.where(known[:, None], candidate.fitted, candidate.theta)
-        innovation = _hold(model, replace(candidate, theta=own), chunk, extra_flow).innovation
+    innovation = _innovation(model, candidate, chunk, extra_flow, held)
+    own = innovation
+    if seen and candidate.fitted is not None:
+        own = _innovation(model, _itself(candidate), chunk, extra_flow, held)
     rows = _rows(model, held, chunk)
     interval = np.clip(np.searchsorted(held.t_s, rows.t_s) - 1, 0, len(held.cell) - 1)
     return Comparison(
@@ -172,7 +174,13 @@ def compare(
         _shares(held, candidate.status),
         _mean_squares(held.innovation),
         rows.signals,
-        Intervals(held.t_s, held.cell, innovation, chunk[:-1, 2 : 2 + len(model.signals)]),
+        Intervals(
+            held.t_s,
+            held.cell,
+            innovation,
+            own,
+            chunk[:-1, 2 : 2 + len(model.signals)],
+        ),
     )
 
 
@@ -231,6 +239,33 @@ def _mean_squares(innovation: FloatArray) -> FloatArray:
     if not known.any():
         return np.full(innovation.shape[1], np.nan)
     return np.asarray(np.mean(innovation[known] ** 2, axis=0))
+
+
+def _itself(candidate: Candidate) -> Candidate:
+    """The candidate with the fit's own terms in all blocks that it has visited."""
+    assert candidate.fitted is not None
+    known = np.isfinite(candidate.fitted[:, 0])
+    theta = np.where(known[:, None], candidate.fitted, candidate.theta)
+    return replace(candidate, theta=theta, status=np.where(known, VALID, candidate.status))
+
+
+def _innovation(
+    model: Model,
+    candidate: Candidate,
+    chunk: FloatArray,
+    extra_flow: FloatArray | None,
+    held: _Held,
+) -> FloatArray:
+    """Whitened innovations, begun anew wherever a flow does not stand on data.
+
+    What an unknown flow has done to the volume would stay in them for seconds.
+    """
+    known = np.isin(candidate.status, (SHUT, VALID, REFERENCE))
+    unsure = ((held.cell >= 0) & ~known[held.cell]).any(axis=1)
+    unsure |= ~np.isfinite(held.flow).all(axis=1)
+    marked = chunk.copy()
+    marked[1:, 1] += np.where(unsure & (chunk[1:, 1].astype(int) & GAP_FLAG == 0), GAP_FLAG, 0)
+    return _hold(model, candidate, marked, extra_flow).innovation
 
 
 def _shares(held: _Held, status: NDArray[np.str_]) -> dict[str, float]:

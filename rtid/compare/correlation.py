@@ -67,7 +67,7 @@ def correlations(model: Model, part: Comparison, max_lag_s: float = MAX_LAG_S) -
 
     Inputs are the commands and the pressures that are no chamber's, as far as they vary.
     """
-    e = part.intervals.innovation
+    e = part.intervals.own
     at = np.flatnonzero(np.isfinite(e).all(axis=1))
     if len(at) < 16:
         return []

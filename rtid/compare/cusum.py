@@ -91,7 +91,7 @@ def _cusum(
 ) -> Cusum:
     parts = [part] if before is None else [before, part]
     own = [i for i, edge in enumerate(model.edges) if edge.sign(model.chambers[c]) != 0]
-    rows = [_rows(p, own, c) for p in parts]
+    rows = [_rows(p, own, c, before is None) for p in parts]
     t_s, e, key = (np.concatenate(columns) for columns in zip(*rows, strict=True))
     new = np.arange(len(e)) >= len(e) - len(rows[-1][0])
     w = recursive_residuals(e, np.unique(key, axis=0, return_inverse=True)[1].reshape(-1))
@@ -108,11 +108,17 @@ def _cusum(
     return Cusum(name, level, t_s, value, boundary, crosses, change)
 
 
-def _rows(part: Comparison, own: list[int], c: int) -> tuple[FloatArray, FloatArray, np.ndarray]:
-    """Instants, innovations and open blocks of the rows of chamber c."""
+def _rows(
+    part: Comparison, edges: list[int], c: int, fitted: bool
+) -> tuple[FloatArray, FloatArray, np.ndarray]:
+    """Instants, innovations and open blocks of the rows of chamber c.
+
+    fitted: of the fit's own terms, whose innovations are white in its own data.
+    """
     inner = part.intervals
-    known = np.isfinite(inner.innovation[:, c])
-    return inner.t_s[1:][known], inner.innovation[known, c], inner.cell[known][:, own]
+    e = (inner.own if fitted else inner.innovation)[:, c]
+    known = np.isfinite(e)
+    return inner.t_s[1:][known], e[known], inner.cell[known][:, edges]
 
 
 def _spread(w: FloatArray) -> float:
