@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtid.sim import loop
+from rtid.sim import equations, loop
 from rtid.sim import plant as plant_module
 from rtid.sim.motion import moves, rich
 from rtid.sim.plant import EDGES, Constants, Controller, FloatArray, Plant, Valve, smooth_plant
@@ -189,7 +189,7 @@ def test_leaving_the_sane_range_is_an_error() -> None:
 def test_the_loop_agrees_with_its_python_source(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ten samples of a moving machine, every kernel as plain Python, to the last bit or nearly."""
     compiled = simulate(draw(1), "rich", seed=2, duration_s=0.01)
-    for module in (plant_module, loop):
+    for module in (plant_module, equations, loop):
         for name, kernel in list(vars(module).items()):
             if hasattr(kernel, "py_func"):
                 monkeypatch.setattr(module, name, kernel.py_func)
@@ -206,8 +206,8 @@ def test_kernels_agree_with_their_python_source() -> None:
         assert plant_module.flow_gain(valve, w) == plant_module.flow_gain.py_func(valve, w)
     c, y = Constants(), np.array([3e6, 2e6, 0.2, 0.1])
     q, compiled, plain = np.full(5, 1e-4), np.zeros(4), np.zeros(4)
-    loop.rates(c, q, y, 10.0, compiled)
-    loop.rates.py_func(c, q, y, 10.0, plain)
+    equations.rates(c, q, y, 10.0, compiled)
+    equations.rates.py_func(c, q, y, 10.0, plain)
     assert np.array_equal(compiled, plain)
     assert loop.quantise(0.26, 0.1) == loop.quantise.py_func(0.26, 0.1) == pytest.approx(0.3)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 from rtid.sim.extra import Planted
@@ -18,14 +19,15 @@ MECHANICAL = tuple(MECHANICS)  # not in the pressure equations: a diagnosis has 
 def hide(plant: Plant, name: str, strength: float, where: str = "") -> Plant:
     """The plant with the effect in it, besides what it hides already; strength 0 changes nothing.
 
-    Raises HiddenError for an unknown name, an impossible place, a negative or repeated strength.
+    Raises HiddenError for an unknown name, an impossible place or strength, or where two effects
+    would set the same number.
     """
     effect = known(name)
     where = where or effect.places[0]
     if where not in effect.places:
         places = ", ".join(place for place in effect.places if place) or "the whole machine alone"
         raise HiddenError(f"{name}: cannot sit at {where!r}", f"it can sit at {places}")
-    if not 0.0 <= strength < float("inf"):
+    if not math.isfinite(strength) or (strength < 0.0 and not effect.signed):
         raise HiddenError(f"{name}: strength {strength:g}", "give a positive number")
     if any((name, where) == (h.name, h.where) for h in plant.hidden):
         raise HiddenError(f"{name}: hidden twice in one place", "hide it once, stronger")

@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from rtid.errors import RtidError
 from rtid.sim import extra_flows as flows
 from rtid.sim.extra import Extra
@@ -23,6 +25,7 @@ EITHER = ("", *CHAMBERS)  # "" is both
 ANYWHERE = ("",)
 VALVES = EDGES[:4]
 LAMINAR, TURBULENT = "m3/s/Pa", "m3/s/sqrt(Pa)"
+SPOOL_DAMPING = 0.9
 MATERIAL_GAS_PA = 2.2e6  # where the stated share of air is as soft as isothermal air
 
 
@@ -48,6 +51,7 @@ class Hidden:
     places: tuple[str, ...]
     apply: Callable[[Plant, float, str], Plant]
     catalogue: str
+    signed: bool = False  # a negative strength is possible, too
 
     def strength(self, level: str) -> float:
         """Strength of a level by name, or a number as text; HiddenError for anything else."""
@@ -61,6 +65,11 @@ class Hidden:
 
 
 def _extra(plant: Plant, **numbers: Any) -> Plant:
+    for name, value in numbers.items():
+        old = np.asarray(getattr(plant.extra, name))
+        if np.any((old != 0.0) & (old != value)):
+            remedy = "hide one of the two, or each in a place of its own"
+            raise HiddenError(f"{name}: another hidden effect has set it already", remedy)
     changed: Extra = plant.extra._replace(**numbers)
     return replace(plant, extra=changed)
 
@@ -112,7 +121,11 @@ def _line_seen_at_valve(plant: Plant, strength: float, where: str) -> Plant:
 
 
 def _spool(plant: Plant, strength: float, where: str) -> Plant:
-    return _extra(plant, spool_radps=strength, spool_damping=0.9)
+    return _extra(plant, spool_radps=strength, spool_damping=SPOOL_DAMPING, spool_order=2.0)
+
+
+def _second_lag(plant: Plant, strength: float, where: str) -> Plant:
+    return _extra(plant, spool_lag_s=strength, spool_order=1.0)
 
 
 def _deadbands(plant: Plant, strength: float, where: str) -> Plant:
@@ -168,7 +181,7 @@ _CATALOGUE = (
     ("hose_compliance", "hose wall, 1 ms late, half as soft at 12 MPa as at 4 MPa",
      "m3/Pa", (1.6e-13, 5e-13, 1.5e-12), EITHER, _at("hose_m3ppa", CHAMBERS)),
     ("spool_lag_first_order", "a second lag behind the spool's own 1.3 ms",
-     "s", (1.5e-3, 5e-3, 15e-3), ANYWHERE, _number("spool_lag_s")),
+     "s", (1.5e-3, 5e-3, 15e-3), ANYWHERE, _second_lag),
     ("deadband_shift", "dead bands that are wider than before, each by 0.9 to 1.1 of it",
      "V", (0.05, 0.15, 0.45), ANYWHERE, _deadbands),
     ("makeup_valve", "check valve with a soft knee of 0.1 MPa",
@@ -220,6 +233,7 @@ def _table(effects: Iterable[tuple[Any, ...]]) -> dict[str, Hidden]:
     return {effect[0]: Hidden(*effect) for effect in effects}
 
 
-KNOWN = _table([*((*effect, effect[0]) for effect in _CATALOGUE), *_VARIANTS])
+SIGNED = ("valve_gain_drift", "deadband_shift", "pressure_sensor_bias", "velocity_scale")
+KNOWN = _table([*((*effect, effect[0], effect[0] in SIGNED) for effect in _CATALOGUE), *_VARIANTS])
 BEYOND = _table((*effect, "") for effect in _OUTSIDE)
 MECHANICS = _table((*effect, "") for effect in _MECHANICAL)

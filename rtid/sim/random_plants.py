@@ -47,7 +47,9 @@ def draw(seed: int, *, cross_port: bool = False) -> Plant:
 
 
 def draw_hidden(seed: int, name: str, level: str = "middle", *, cross_port: bool = False) -> Plant:
-    """The machine with this number and an effect in it, at random +-30 % and in a random place.
+    """The machine with this number and an effect in it, varied +-30 %, in a random place.
+
+    Effects that can have either sign get a random one.
 
     level: weak, middle or strong.  Raises HiddenError for an unknown name or level.
     """
@@ -55,6 +57,8 @@ def draw_hidden(seed: int, name: str, level: str = "middle", *, cross_port: bool
     effect = known(name)
     strength = _vary(rng, effect.strength(level))
     where = effect.places[int(rng.integers(len(effect.places)))]
+    if effect.signed:
+        strength *= float(rng.choice([-1.0, 1.0]))
     return hide(draw(seed, cross_port=cross_port), name, strength, where)
 
 
