@@ -15,12 +15,16 @@ if TYPE_CHECKING:
 
 def draw(studies: Sequence[TraceComparison], folder: Path, suffix: str) -> list[Path]:
     """Draw every map of every study; the files written, names that tell map and picture."""
-    from rtid.pictures import save  # noqa: PLC0415 - matplotlib only where a picture is wanted
+    from rtid.pictures import beside, save  # noqa: PLC0415 - matplotlib only where it is wanted
 
     folder.mkdir(parents=True, exist_ok=True)
     drawn: dict[str, Figure] = {}
     for found in studies:
         drawn |= _of_study(found, "" if found is studies[0] else f"_{found.held[0].name}")
+    held = [one for found in studies for one in found.held]
+    if len(held) > 1:
+        examined = {one.name: one.examinations for one in held}
+        drawn["beside"] = beside(studies[0].replay.model, examined)
     return [save(figure, folder / f"{_safe(name)}.{suffix}") for name, figure in drawn.items()]
 
 

@@ -116,7 +116,7 @@ def _of_map(held: Held, names: list[str]) -> Iterator[str]:
         line += f", begun anew after: {bad}" if bad else ""
         if run.beyond_share > 0:
             line += (
-                f", {100 * run.beyond_share:.1g} % of the time beyond the grid along its tangent"
+                f", {100 * run.beyond_share:.1f} % of the time beyond the grid along its tangent"
             )
     elif found is not None:
         line += f"; no free run: {found.no_free_run}"

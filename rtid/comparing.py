@@ -155,17 +155,20 @@ def study(
     )
 
 
-def opponent(first: TraceComparison, against: Path) -> TraceComparison:
-    """The study to be set beside the first; its map takes the file's name.
+def compare_two(
+    project: Project, trace: Path, against: Path, *references: Reference | None
+) -> tuple[TraceComparison, TraceComparison]:
+    """Two studies side by side; their learned maps are called by the files that differ.
 
     against: another project (.toml) for the same trace, or another trace for the same project.
     """
-    project, trace = first.replay.project, first.replay.trace.path
+    other, other_trace, names = project, against, [trace.stem, against.stem]
     if against.suffix.lower() == ".toml":
-        project = load(against)
-    else:
-        trace = against
-    return study(replay(project, trace), name=against.stem)
+        other, other_trace, names[0] = load(against), trace, project.path.stem
+    if names[0] == names[1]:
+        names = [f"{name} {k}" for k, name in enumerate(names, 1)]
+    first = study(replay(project, trace), *references, name=names[0])
+    return first, study(replay(other, other_trace), name=names[1])
 
 
 def changes(first: TraceComparison, second: TraceComparison) -> list[Deviation]:
@@ -225,8 +228,8 @@ __all__ = [
     "blocks_in_span",
     "changes",
     "compare_trace",
+    "compare_two",
     "find_reference",
-    "opponent",
     "share_on_own_data",
     "spans_of_block",
     "study",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +12,38 @@ import pytest
 from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
 
-from rtid.compare import Comparison, Intervals
+from rtid.compare import (
+    FREE_RUN,
+    BlockRow,
+    Comparison,
+    Correlation,
+    Cusum,
+    Dependence,
+    Examination,
+    Intervals,
+    Simulation,
+)
+from rtid.compare.tables import CAUSES, NEVER
 from rtid.estimator.flowmap import VALID, FlowMap
 from rtid.estimator.published import publish
+from rtid.kernels.free_run import GAP, INSIDE
 from rtid.model import Model
-from rtid.pictures import coverage, maps, residual, save, slices
+from rtid.pictures import (
+    beside,
+    correlogram,
+    coverage,
+    cusum,
+    dependences,
+    maps,
+    pressures,
+    residual,
+    residual_map,
+    save,
+    slices,
+)
 from rtid.pictures.coverage import working_points
 from rtid.pictures.style import thin
+from rtid.pictures.where import HATCHES
 from tests.flow_maps import machine, orifice, solved
 
 
@@ -61,7 +87,95 @@ def drawings(model: Model, flowmap: FlowMap) -> dict[str, Figure]:
         "maps": maps(flowmap),
         "slices": slices(flowmap, flowmap, reference_name="sheet"),
         "residual": residual(model, {"identification": part(), "validation": part(300)}),
+        **examined(model),
     }
+
+
+def examination(rows: int = 2000) -> Examination:
+    """What an examination of one chamber looks like, with a change at 25 s."""
+    rng, t_s = np.random.default_rng(1), np.linspace(0.0, 40.0, rows)
+    p = 3e6 + 1e6 * np.sin(t_s)[:, None]
+    error = 1e4 * rng.standard_normal((rows, 1))
+    status = np.where(np.arange(rows) % 500 == 0, GAP, INSIDE)
+    run = Simulation(
+        FREE_RUN, np.inf, t_s, p, np.where(status[:, None] == GAP, np.nan, p + error), status
+    )
+    bins = np.linspace(-5, 5, 11)
+    mean = 1e-6 * bins[:-1, None]
+    rows_of, one = np.full(10, 50), np.ones(1)
+    binned = Dependence(
+        "u", "V", bins[:-1], bins[1:], bins[:-1], mean, 0 * mean + 2e-7, mean**2, rows_of, one
+    )
+    lags = np.linspace(-0.2, 0.2, 401)
+    cross = Correlation("a", "u", lags, 0.1 * np.sinc(20 * (lags - 0.05)), np.full(401, 0.02))
+    own = Correlation("a", "", lags[201:], 0.02 * rng.standard_normal(200), np.full(200, 0.02))
+    total = np.where(t_s > 25, 8 * (t_s - 25), 0.0)
+    found = Cusum("a", 0.05, t_s, total, 40 + t_s, 34.0, 25.0)
+    three = replace(
+        binned,
+        signal="direction",
+        **{k: v[:3] for k, v in vars(binned).items() if k not in ("signal", "unit", "explained")},
+    )
+    time = replace(binned, signal="time", unit="s")
+    return Examination(
+        part(rows), {FREE_RUN: run}, "", [binned], three, time, [own, cross], [found]
+    )
+
+
+def examined(model: Model) -> dict[str, Figure]:
+    one, two = examination(), examination(800)
+    return {
+        "pressures": pressures(
+            model, {"identification": one.simulations, "validation": two.simulations}
+        ),
+        "residual_map": residual_map(model, rows_of_blocks()),
+        "dependences": dependences(model, one.signals, one.direction, one.time),
+        "correlogram": correlogram(one.correlations),
+        "cusum": cusum({"identification": one.cusums, "validation": two.cusums}),
+        "beside": beside(model, {"one": {"identification": one}, "two": {"identification": two}}),
+    }
+
+
+def rows_of_blocks() -> list[BlockRow]:
+    reasons = ("", "3 rows, 20 needed", "condition number 1e9", "flow known to 2 %", NEVER)
+    return [
+        BlockRow(
+            "e0",
+            i,
+            j,
+            (1.0 + 0.25 * i, 1.25 + 0.25 * i),
+            (5e5 * j, 5e5 * j + 5e5),
+            rows=100,
+            dwell_s=1.0,
+            condition=1e3,
+            flow_m3s=1e-4,
+            sd_m3s=1e-6,
+            residual_rms_m3s=1e-6 * i if i % 3 else np.nan,
+            residual_share=0.01 * i,
+            status="learning" if reasons[j] else "valid",
+            reason=reasons[j],
+        )
+        for i in range(10)
+        for j in range(5)
+    ]
+
+
+def test_a_stopped_run_leaves_a_hole_in_its_line(model: Model) -> None:
+    figure = pressures(model, {"identification": examination().simulations})
+    lengths = [len(np.asarray(line.get_xdata())) for line in figure.axes[1].lines]
+    assert sum(n > 400 for n in lengths) == 4
+
+
+def test_every_reason_has_a_hatch_of_its_own(model: Model) -> None:
+    axis = residual_map(model, rows_of_blocks()).axes[0]
+    hatches = {c.get_hatch() for c in axis.collections if isinstance(c, PatchCollection)}
+    assert hatches >= {HATCHES[cause] for cause in CAUSES if cause not in (CAUSES[0], CAUSES[4])}
+
+
+def test_the_beginning_of_the_failure_is_marked(model: Model) -> None:
+    axis = cusum({"identification": examination().cusums}).axes[0]
+    marks = [line.get_xdata()[0] for line in axis.lines if line.get_label() == "begins to fail"]  # type: ignore[index]
+    assert marks == [25.0]
 
 
 @pytest.mark.parametrize("suffix", [".png", ".svg"])

@@ -52,7 +52,7 @@ def compare(
     residual, the simulated pressure (free run, 1 s and 0.1 s ahead), what the residual depends on,
     and whether the model begins to fail.
     """
-    from rtid.comparing import find_reference, opponent, study
+    from rtid.comparing import compare_two, find_reference, study
     from rtid.project import load
     from rtid.replay import replay
     from rtid.residualfile import refuse_format, write_residuals
@@ -63,9 +63,11 @@ def compare(
     loaded = load(project)
     sheets: list[Path | None] = [*maps] if maps else [None]
     references = [find_reference(loaded, sheet) for sheet in sheets]
-    studies = [study(replay(loaded, trace), *references)]
-    if against is not None:
-        studies.append(opponent(studies[0], against))
+    studies: Sequence[TraceComparison]
+    if against is None:
+        studies = [study(replay(loaded, trace), *references)]
+    else:
+        studies = compare_two(loaded, trace, against, *references)
     written = _draw(studies, pictures, picture_format) if pictures else []
     if table is not None:
         written.append(write_residuals(table, studies))

@@ -3,6 +3,7 @@
 Importing this package imports matplotlib: do it where a picture is wanted, not before.
 """
 
+from rtid.pictures.beside import beside
 from rtid.pictures.correlation import correlogram, cusum
 from rtid.pictures.coverage import coverage
 from rtid.pictures.dependence import dependences
@@ -13,6 +14,7 @@ from rtid.pictures.style import save
 from rtid.pictures.where import residual_map
 
 __all__ = [
+    "beside",
     "correlogram",
     "coverage",
     "cusum",

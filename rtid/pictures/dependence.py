@@ -62,6 +62,8 @@ def _panel(axis: Axes, found: Dependence, names: list[str]) -> None:
         axis.errorbar(x + shift, mean, error, ls=line, lw=0.7, capsize=1.5, label=label, **style)
         shares.append(f"{name} {100 * found.explained[c]:.0f} %")
     axis.set_title(f"{found.signal}   explains {', '.join(shares)}", fontsize=8.5)
+    if not by_name:
+        axis.xaxis.set_major_locator(mpl.ticker.MaxNLocator(5))
     axis.set_xlabel("" if by_name else f"{found.signal} in {unit}")
 
 
