@@ -19,6 +19,7 @@ LAYER = {
     "rtid.model": ESTIMATOR,
     "rtid.estimator": ESTIMATOR,
     "rtid.compare": ESTIMATOR,
+    "rtid.diagnose": ESTIMATOR,
     "rtid.effects": ESTIMATOR,
     "rtid.units": ESTIMATOR,
     "rtid.cli": COMMAND,

@@ -25,6 +25,7 @@ COMMANDS = {
     "replay": "Learn from a recorded trace: gates, blocks, bulk modulus, flow maps.",
     "compare": "Compare the learned maps with a data sheet.",
     "effects": "List the physical effects that may be missing in the model, or explain one.",
+    "diagnose": "Name the physical effect that is missing in the model, or say what would tell.",
     "export": "Write the learned maps as CSV, JSON or npz.",
 }
 

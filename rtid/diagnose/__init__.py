@@ -1,0 +1,1 @@
+"""Find the physical effect that a model is missing, and how sure that is."""

@@ -1,0 +1,361 @@
+"""Which physical effect is missing: score all, add the best, look back, and say what is not known.
+
+Each round scores every candidate beside the model so far; timing effects are refitted exactly where
+something large is left, because a bent map misleads their derivatives.  The best is added if it is
+significant, possible and material; when nothing more is, the verdict follows from what is left.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from rtid.diagnose.candidates import Candidate, causes
+from rtid.diagnose.clean import usable
+from rtid.diagnose.fit import Fit, Revision, fit, one_pass, prepare
+from rtid.diagnose.regression import LIMIT_SD, Score
+from rtid.diagnose.residual import Residual, residual
+from rtid.diagnose.search import Search
+from rtid.diagnose.timing import TIMINGS, Psi, Timing
+from rtid.model import FloatArray, Model
+
+GAIN = 16.0  # chi2 of the first effect: 60 candidates, 0.4 % for all of them together
+LATER_GAIN = 25.0  # of every further one
+MATERIAL = 0.003  # of the rms flow: what an effect must change of the held-out residual
+LARGE = 1.5  # rho above which timing effects are refitted whatever their score
+TIE, TIE_SHARE = 12.0, 0.03  # causes within so much of the best gain are not told apart
+MOST = 6  # effects that are added at most
+MOST_NEGLIGIBLE = 8  # that are looked at
+NOTICED = 0.01  # of the degrees of freedom: chi2 from which an immaterial effect stays in the model
+SHARE = 0.4  # of the misfit left that a cause must explain, once most of the first is explained,
+LEAST_SHARE = 0.1  # ... and before
+CLOSE = 3.0  # timings whose coarse cost is within this factor of the best are refitted finely
+
+MATCH_RHO = 1.10  # largest rho of a model that matches
+MATCHES, MISSING, AMBIGUOUS = "matches", "missing", "ambiguous"
+UNKNOWN, INSUFFICIENT = "unknown", "insufficient_data"
+
+Key = tuple[str, str]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A cause beside the model so far: what chi2 would fall by, and the revision with it."""
+
+    key: Key
+    gain: float
+    revision: Revision
+    column: int | None = None  # of the fit that scored it
+    fit: Fit | None = None
+
+
+@dataclass(frozen=True)
+class Found:
+    """An effect that was added: the fit with it, the residuals before and after."""
+
+    key: Key
+    alike: tuple[Key, ...]
+    gain: float
+    before: Residual
+    after: Residual
+
+
+@dataclass
+class State:
+    """State of a diagnosis."""
+
+    model: Model
+    chunk: FloatArray
+    held_out: FloatArray
+    progress: Callable[[str, float], None]
+    found: list[Found] = field(default_factory=list)
+    negligible: dict[Key, float] = field(default_factory=dict)
+    excess: float = 0.0  # chi2 of the first fit beyond what the noise gives
+    _coarse: Search | None = None
+
+    @property
+    def coarse(self) -> Search:
+        """The search on the coarse map, made when it is first needed."""
+        if self._coarse is None:
+            self._coarse = Search(self.model, self.chunk)
+        return self._coarse
+
+
+@dataclass(frozen=True)
+class Result:
+    """The first and the last fit, what was added on the way, what was left."""
+
+    first: Fit
+    last: Fit
+    found: tuple[Found, ...]
+    negligible: dict[Key, float]
+    scores: list[tuple[Candidate, Score]]
+    before: Residual
+    after: Residual
+    verdict: str
+    match_rho: float = MATCH_RHO
+
+
+def _silent(_what: str, _share: float) -> None:
+    pass
+
+
+def search(
+    model: Model,
+    chunk: FloatArray,
+    held_out: FloatArray,
+    progress: Callable[[str, float], None] = _silent,
+) -> Result:
+    """Diagnose a record; chunk and held_out (n, 2 + signals) as from `to_chunk`."""
+    chunk, held_out = usable(model, chunk), usable(model, held_out)
+    state = State(model, chunk, held_out, progress)
+    progress("fitting", 0.0)
+    first = present = fit(model, chunk, prepare(model, chunk), Revision())
+    before = last = residual(first, held_out)
+    state.excess = first.estimate.sse - first.regression.dof
+    for k in range(MOST):
+        progress("scoring", 0.1 + 0.8 * k / MOST)
+        added = _add_best(state, present, last)
+        if added is None:
+            break
+        present, last = added
+    present, last = _look_back(state, present, last)
+    scores = scored(present)
+    verdict = _verdict(state, first, present, scores)
+    return Result(
+        first, present, tuple(state.found), state.negligible, scores, before, last, verdict
+    )
+
+
+def scored(fit_: Fit) -> list[tuple[Candidate, Score]]:
+    """Every candidate that is not part of the revision, beside it."""
+    used = fit_.estimate.used
+    return [
+        (candidate, fit_.regression.score(used, fit_.first + k))
+        for k, candidate in enumerate(fit_.columns.candidates)
+        if candidate not in fit_.revision.effects
+    ]
+
+
+def _add_best(state: State, present: Fit, last: Residual) -> tuple[Fit, Residual] | None:
+    """Add the best cause that is significant and material; None when there is none.
+
+    One that is significant but changes next to nothing is only listed, unless it explains a part of
+    the misfit that would be found in another guise.
+    """
+    least = LATER_GAIN if state.found else GAIN
+    trials = [t for t in _trials(state, present) if t.gain > least]
+    for trial in sorted(trials, key=lambda t: -t.gain):
+        if trial.key in state.negligible or len(state.negligible) == MOST_NEGLIGIBLE:
+            continue
+        if not _explains(state, present, trial):
+            return None
+        now = trial.fit or fit(
+            state.model, state.chunk, present.weights, trial.revision, present.map, bank=False
+        )
+        now = one_pass(state.model, state.chunk, now.weights, now.revision, now.map, True)
+        after = residual(now, state.held_out)
+        share = min(material_share(last, after), own_share(now, trial, state.held_out))
+        if share < MATERIAL:
+            state.negligible[trial.key] = share
+            if now.rho > MATCH_RHO or trial.gain < NOTICED * present.regression.dof:
+                continue
+        else:
+            alike = _alike(state, trial, trials)
+            state.found.append(Found(trial.key, alike, trial.gain, last, after))
+        return now, after
+    return None
+
+
+def _explains(state: State, present: Fit, trial: Trial) -> bool:
+    """False where a cause is a small part of what is left behind an effect of the wrong form.
+
+    Once most of the first misfit is explained, the rest of a form that is nearly right would be
+    named as effects of their own.
+    """
+    left = present.estimate.sse - present.regression.dof
+    excess = state.excess
+    if present.rho < MATCH_RHO or excess <= 0:
+        return True
+    return trial.gain > (SHARE if left < (1 - NAMED) * excess else LEAST_SHARE) * left
+
+
+def _with(state: State, present: Fit, trial: Trial) -> Fit:
+    """The fit with a trial's revision, every candidate beside it."""
+    start, weights = (
+        (trial.fit.map, trial.fit.weights) if trial.fit else (present.map, present.weights)
+    )
+    return fit(state.model, state.chunk, weights, trial.revision, start)
+
+
+def material_share(before: Residual, after: Residual) -> float:
+    """What an effect takes off the held-out residual, root of the difference, of the rms flow."""
+    gone = before.rms_m3s**2 - after.rms_m3s**2
+    return float(np.sqrt(max(0.0, gone)) / max(before.flow_m3s, 1e-12))
+
+
+def own_share(now: Fit, trial: Trial, held_out: FloatArray) -> float:
+    """Size of an effect's own flow on the held-out part, of the rms flow: it cannot gain more."""
+    if trial.column is None:
+        return float("inf")
+    effect = now.revision.effects[-1]
+    whole = residual(now, held_out)
+    without = residual(now, held_out, leave_out=effect)
+    change = whole.left - without.left
+    return float(np.sqrt(np.mean(change**2)) / max(whole.flow_m3s, 1e-12)) if change.size else 0.0
+
+
+def _trials(state: State, present: Fit) -> list[Trial]:
+    """Every possible cause with its best shape: fixed columns, and timings where they matter."""
+    best = _best_by_key(present, scored(present))
+    trials = []
+    for key, (candidate, score) in best.items():
+        if key[1] == "command":
+            continue
+        revision = replace(present.revision, effects=(*present.revision.effects, candidate))
+        trials.append(Trial(key, score.gain, revision, score.column))
+    trials = _refined(state, present, trials)
+    scores = {key: s.gain for key, (_, s) in best.items() if key[1] == "command"}
+    return trials + _timing_trials(state, present, scores)
+
+
+def _best_by_key(
+    present: Fit, scores: list[tuple[Candidate, Score]]
+) -> dict[Key, tuple[Candidate, Score]]:
+    best: dict[Key, tuple[Candidate, Score]] = {}
+    for candidate, score in scores:
+        if not candidate.is_possible(physical(present, candidate, score.value)):
+            continue
+        if present.revision.has(candidate.key) and candidate.where != "":
+            continue
+        if candidate.key not in best or score.gain > best[candidate.key][1].gain:
+            best[candidate.key] = candidate, score
+    return best
+
+
+def physical(fit_: Fit, candidate: Candidate, value: float) -> float:
+    """A coefficient as the effect's parameter: a dead volume counts by the fitted modulus."""
+    if candidate.effect != "extra_dead_volume":
+        return value
+    names = [c.name for c in fit_.model.chambers]
+    at = [names.index(candidate.where)] if candidate.where in names else list(range(len(names)))
+    return float(value * np.mean(fit_.weights.compliance[at] / fit_.compliance[at]))
+
+
+def _refined(state: State, present: Fit, trials: list[Trial]) -> list[Trial]:
+    """Shapes between those of the bank, where they could matter, in one more pass."""
+    if not trials:
+        return trials
+    bar = max(GAIN, 0.2 * max(t.gain for t in trials))
+    shaped = {
+        t.key: t.revision.effects[-1]
+        for t in trials
+        if t.revision.effects[-1].shape is not None and t.gain > bar
+    }
+    more = [
+        (cause, shape)
+        for cause in causes(present.view)
+        if cause.candidate.key in shaped and cause.makes(shaped[cause.candidate.key])
+        for shape in cause.finer(shaped[cause.candidate.key].shape or 0.0)
+    ]
+    if not more:
+        return trials
+    finer = one_pass(
+        state.model, state.chunk, present.weights, present.revision, present.map, False, more
+    )
+    best = _best_by_key(finer, scored(finer))
+    found = []
+    for trial in trials:
+        candidate, score = best.get(trial.key, (None, None))
+        if candidate is not None and score is not None and score.gain > trial.gain:
+            effects = (*present.revision.effects, candidate)
+            revision = replace(present.revision, effects=effects)
+            found.append(Trial(trial.key, score.gain, revision, trial.column))
+        else:
+            found.append(trial)
+    return found
+
+
+def _timing_trials(state: State, present: Fit, scores: dict[Key, float]) -> list[Trial]:
+    """Exact refits with one timing more."""
+    open_ = [t for t in TIMINGS if not present.revision.has((t.effect, "command"))]
+    if present.rho < LARGE:
+        open_ = [t for t in open_ if scores.get((t.effect, "command"), 0.0) > GAIN]
+    if not open_ or not present.view.has_pressures:
+        return []
+    costs: list[tuple[float, Timing, Psi]] = []
+    for timing in open_:
+        psi, cost = state.coarse.best(timing, present)
+        costs.append((cost, timing, psi))
+    least = min(cost for cost, _, _ in costs)
+    trials: dict[Key, Trial] = {}
+    for cost, timing, psi in sorted(costs, key=lambda c: c[0]):
+        if cost > CLOSE * least:
+            continue
+        revision = replace(present.revision, timings=(*present.revision.timings, (timing, psi)))
+        now = fit(state.model, state.chunk, present.weights, revision, None, bank=False)
+        gain = present.estimate.sse - now.estimate.sse
+        if not _is_inside(now):
+            continue
+        key = (timing.effect, "command")
+        if key not in trials or gain > trials[key].gain:
+            trials[key] = Trial(key, gain, now.revision, None, now)
+    return list(trials.values())
+
+
+def _is_inside(now: Fit) -> bool:
+    """True where the timing that was added last did not end at a bound, nor at nothing."""
+    timing, psi = now.revision.timings[-1]
+    sd = now.estimate.sd(now.timing_columns(len(now.revision.timings) - 1)[0])
+    return timing.low[0] * 1.01 < psi[0] < timing.high[0] * 0.99 and psi[0] > 3.0 * sd
+
+
+def _alike(state: State, best: Trial, trials: list[Trial]) -> tuple[Key, ...]:
+    """Causes that this record does not tell from the best one: all but as good."""
+    close = best.gain - TIE - TIE_SHARE * best.gain
+    return tuple(
+        t.key
+        for t in trials
+        if t.key != best.key and t.gain > close and t.key not in state.negligible
+    )
+
+
+def _look_back(state: State, present: Fit, last: Residual) -> tuple[Fit, Residual]:
+    """Drop what has become superfluous."""
+    for effect in list(present.revision.effects) if len(present.revision.effects) > 1 else []:
+        column = present.column(effect)
+        estimate = present.estimate
+        gain = (estimate.value(column) / max(estimate.sd(column), 1e-300)) ** 2
+        possible = effect.is_possible(physical(present, effect, estimate.value(column)))
+        if gain > GAIN and possible:
+            continue
+        kept = tuple(e for e in present.revision.effects if e != effect)
+        revision = replace(present.revision, effects=kept)
+        present = fit(state.model, state.chunk, present.weights, revision, present.map)
+        last = residual(present, state.held_out)
+        state.found = [f for f in state.found if f.key != effect.key]
+        state.negligible.pop(effect.key, None)
+    return present, last
+
+
+NAMED = 0.5  # of the misfit that effects must explain to be named where something else remains
+
+
+def _verdict(state: State, first: Fit, last: Fit, scores: list[tuple[Candidate, Score]]) -> str:
+    if first.regression.rows < 1000 or not len(first.map.cells):
+        return INSUFFICIENT
+    dof = first.regression.dof
+    excess, left = first.estimate.sse - dof, last.estimate.sse - dof
+    explained = 1.0 - left / excess if excess > 0 else 1.0
+    if not state.found:
+        return MATCHES if last.rho < MATCH_RHO else UNKNOWN
+    if last.rho > MATCH_RHO and explained < NAMED:
+        return UNKNOWN
+    return AMBIGUOUS if any(f.alike for f in state.found[:1]) else MISSING
+
+
+def detection_limit(score: Score, rho: float) -> float:
+    """Smallest size that the record would have shown."""
+    return LIMIT_SD * score.sd * float(np.sqrt(max(1.0, rho)))

@@ -1,0 +1,136 @@
+"""The small regression that is left once the maps are taken out: [y | theta_beta | effects].
+
+With S the products after the projection and N what sensor noise adds to them on average, the
+corrected normal equations (S - N) theta = s have the variance (S - N)^-1 S (S - N)^-1 in units of
+the rows' noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rtid.model import FloatArray
+
+CLEARLY = 3.0  # standard deviations of the noise's own products by which a column must exceed it
+VANISHED = 1e-12  # share of a column's square that rounding leaves
+LIMIT_SD = 4.0  # an effect of so many standard deviations would have been seen
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """theta, cov of the columns `used`; sse: cost, comparable between sets of columns."""
+
+    used: tuple[int, ...]
+    theta: FloatArray
+    cov: FloatArray
+    sse: float
+
+    def value(self, column: int) -> float:
+        """Coefficient of a column."""
+        return float(self.theta[self.used.index(column)])
+
+    def sd(self, column: int) -> float:
+        """Its standard deviation, rows having unit variance."""
+        k = self.used.index(column)
+        return float(np.sqrt(max(0.0, self.cov[k, k])))
+
+
+@dataclass(frozen=True)
+class Score:
+    """One candidate beside the columns in use: coefficient, sd, what chi2 falls by, visibility.
+
+    visible: share of the column that the maps and the columns in use do not follow.
+    """
+
+    column: int
+    value: float
+    sd: float
+    gain: float
+    visible: float
+
+
+@dataclass(frozen=True)
+class Regression:
+    """The products, N the noise in them; column 0 is y.
+
+    s, noise (columns, columns); prior, mean (columns,): information and value of the priors;
+    own (columns,): squares of the columns before the maps were taken out; rows: of all segments;
+    dof: what the maps leave of them.
+    """
+
+    s: FloatArray
+    noise: FloatArray
+    prior: FloatArray
+    mean: FloatArray
+    own: FloatArray
+    dof: float
+    rows: int
+
+    def fit(self, used: tuple[int, ...]) -> Estimate:
+        """Least squares on some columns, errors in variables taken out."""
+        at = list(used)
+        plain = self.s[np.ix_(at, at)] + np.diag(self.prior[at])
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(plain), np.finfo(float).tiny))
+        outer = np.outer(scale, scale)
+        noise = self._bounded(at, plain) * outer
+        inverse = np.linalg.inv(plain * outer - noise)
+        right = (self.s[at, 0] + self.prior[at] * self.mean[at]) * scale
+        theta = inverse @ right
+        cov = inverse @ (plain * outer) @ inverse
+        theta, cov = theta * scale, cov * outer
+        left = self.s[0, 0] - 2.0 * self.s[0, at] @ theta + theta @ self.s[np.ix_(at, at)] @ theta
+        sse = float(left + self.prior[at] @ (theta - self.mean[at]) ** 2)
+        return Estimate(used, theta, cov, sse)
+
+    def _bounded(self, at: list[int], plain: FloatArray) -> FloatArray:
+        """The noise's products, less where they leave too little: then nothing can be told."""
+        noise = self.noise[np.ix_(at, at)]
+        if not noise.any():
+            return noise
+        scale = 1.0 / np.sqrt(np.diag(plain))
+        left = np.linalg.eigvalsh((plain - noise) * np.outer(scale, scale)).min()
+        share = CLEARLY * np.sqrt(2.0 / max(1, self.rows))
+        while left < share and noise.any():
+            noise = 0.8 * noise
+            left = np.linalg.eigvalsh((plain - noise) * np.outer(scale, scale)).min()
+            if np.abs(noise).max() < 1e-9 * np.abs(plain).max():
+                return np.zeros_like(noise)
+        return noise
+
+    def rho(self, estimate: Estimate) -> float:
+        """Residual variance in units of the sensors' noise."""
+        return estimate.sse / max(1.0, self.dof - len(estimate.used))
+
+    def score(self, used: tuple[int, ...], column: int) -> Score:
+        """A candidate beside the columns in use; one that never moved is not visible."""
+        if self.s[column, column] <= VANISHED * max(self.own[column], 1e-300):
+            return Score(column, 0.0, np.inf, 0.0, 0.0)
+        with_it = self.fit((*used, column))
+        value, sd = with_it.value(column), with_it.sd(column)
+        gain = (value / sd) ** 2 if sd > 0 else 0.0
+        left = self._left(used, column)
+        visible = float(np.sqrt(max(0.0, left / max(self.own[column], 1e-300))))
+        return Score(column, value, sd, gain, visible)
+
+    def _left(self, used: tuple[int, ...], column: int) -> float:
+        at = list(used)
+        own = self.s[column, column]
+        if not at:
+            return float(own)
+        cross = self.s[at, column]
+        gram = self.s[np.ix_(at, at)] + np.diag(self.prior[at] + 1e-300)
+        return float(own - cross @ np.linalg.solve(gram, cross))
+
+    def alike(self, used: tuple[int, ...], a: int, b: int) -> float:
+        """Correlation of two candidates after maps and columns in use are taken out."""
+        at = list(used)
+        both = [a, b]
+        gram = self.s[np.ix_(both, both)]
+        if at:
+            cross = self.s[np.ix_(at, both)]
+            inner = self.s[np.ix_(at, at)] + np.diag(self.prior[at] + 1e-300)
+            gram = gram - cross.T @ np.linalg.solve(inner, cross)
+        size = np.sqrt(max(gram[0, 0], 0.0) * max(gram[1, 1], 0.0))
+        return float(gram[0, 1] / size) if size > 0 else 0.0

@@ -1,0 +1,83 @@
+"""Find a timing parameter from afar: exact refits on a coarser map, then the fine one.
+
+The cost of a wrong delay is not a parabola: far from the truth the fitted map is bent, and its
+derivatives point nowhere.  So each timing is first tried at the values of its bank, and the best is
+closed in on; half the blocks per axis are enough to tell which is best.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from rtid.diagnose.candidates import Columns
+from rtid.diagnose.evidence import collect, project
+from rtid.diagnose.fit import Fit, prepare, split, transformed
+from rtid.diagnose.timing import Psi, Timing
+from rtid.estimator.state import Weights
+from rtid.model import FloatArray, Grid, Model
+
+ROW_S = 20e-3  # long rows are enough
+CLOSING = 5  # refits between the neighbours of the best of the bank
+
+
+def coarse(model: Model) -> Model:
+    """The same machine with every second border of its maps."""
+    edges = []
+    for edge in model.edges:
+        u, dp = (_thinned(b) for b in (edge.grid.u_v, edge.grid.dp_pa))
+        edges.append(replace(edge, grid=Grid(u, dp)))
+    return replace(model, edges=tuple(edges))
+
+
+def _thinned(border: FloatArray) -> FloatArray:
+    kept = border[::2]
+    return kept if kept[-1] == border[-1] else np.append(kept, border[-1])
+
+
+class Search:
+    """Costs of revisions on the coarse map of one record."""
+
+    def __init__(self, model: Model, chunk: FloatArray) -> None:
+        self.model, self.chunk = coarse(model), chunk
+        self.split = split(self.model)
+        self.weights: Weights = prepare(self.model, chunk)
+
+    def best(self, timing: Timing, beside: Fit) -> tuple[Psi, float]:
+        """The parameters of a timing that lower the cost most beside a fit, and the cost."""
+        bank = list(timing.bank)
+        cost = [self.cost(timing, psi, beside) for psi in bank]
+        k = int(np.argmin(cost))
+        ends = [np.log(psi[0]) for psi in bank]
+        ends = [2 * ends[0] - ends[1], *ends, 2 * ends[-1] - ends[-2]]
+        low, middle, high = ends[k : k + 3]
+        psi, best = bank[k], cost[k]
+        for _ in range(CLOSING):
+            below = middle - low > high - middle
+            trial = 0.5 * (low + middle) if below else 0.5 * (middle + high)
+            moved = (float(np.clip(np.exp(trial), timing.low[0] or 0.0, timing.high[0])), *psi[1:])
+            found = self.cost(timing, moved, beside)
+            if found < best:
+                low, high = (low, middle) if below else (middle, high)
+                middle, psi, best = trial, moved, found
+            elif below:
+                low = trial
+            else:
+                high = trial
+        return psi, best
+
+    def cost(self, timing: Timing, psi: Psi, beside: Fit) -> float:
+        """Residual sum of squares of a revision with one timing more."""
+        timings = (*beside.revision.timings, (timing, psi))
+        sent = transformed(self.model, self.chunk, timings)
+        weights = self.weights
+        if any(t.replaces_lag for t, _ in timings):
+            weights = replace(weights, lag_s=0.0)
+        columns = Columns(len(sent), len(self.model.chambers))
+        for effect in beside.revision.effects:
+            columns.add(beside.columns.volumes(beside.column(effect) - beside.first_given))
+        evidence = collect(self.split, sent, weights, columns.given(), row_s=ROW_S)
+        s = project(evidence, thorough=False).schur
+        theta = np.linalg.lstsq(s[1:, 1:], s[1:, 0], rcond=1e-12)[0]
+        return float(s[0, 0] - s[0, 1:] @ theta)

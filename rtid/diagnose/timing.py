@@ -1,0 +1,133 @@
+"""Effects between the command and the spool: the command that the map should have been given.
+
+A command u_k is held over [t_k, t_k+1]; a transformed one is the mean over that interval of what
+reaches the spool, and is held in its place.  Edges that open with u > 0 and with u < 0 may be parts
+of one spool, which follows the signed command, or valves of their own, each of which follows its
+part of the command and rests at zero meanwhile: so there is one command for either direction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.signal import cont2discrete, lfilter
+
+from rtid.kernels.jit import kernel
+from rtid.model import FloatArray
+
+Psi = tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Timing:
+    """A transformation of the command with parameters psi; `bank`: where a search starts.
+
+    apply(u (n,), dt_s, psi) -> (n,); low, high: bounds of psi; replaces_lag: it stands for the
+    declared lag of the spools instead of coming before it; is_linear: in the command;
+    own_spools: each direction follows its own part of the command.
+    """
+
+    effect: str
+    parameters: tuple[str, ...]
+    units: tuple[str, ...]
+    bank: tuple[Psi, ...]
+    low: Psi
+    high: Psi
+    apply: Callable[[FloatArray, float, Psi], FloatArray]
+    replaces_lag: bool = False
+    is_linear: bool = True
+    own_spools: bool = False
+
+    def on(self, command: FloatArray, direction: int, dt_s: float, psi: Psi) -> FloatArray:
+        """What reaches the spool of the edges of one direction (+1, -1)."""
+        if self.own_spools:
+            command = direction * np.maximum(0.0, direction * command)
+        return self.apply(command, dt_s, psi)
+
+    def change(
+        self, command: FloatArray, direction: int, dt_s: float, psi: Psi, k: int
+    ) -> FloatArray:
+        """Derivative (n,) of the transformed command with respect to psi[k], by differences."""
+        step = 0.02 * max(abs(psi[k]), 0.02 * abs(self.bank[0][k]))
+        above, below = list(psi), list(psi)
+        above[k], below[k] = min(psi[k] + step, self.high[k]), max(psi[k] - step, self.low[k])
+        wide = above[k] - below[k]
+        rise = self.on(command, direction, dt_s, tuple(above))
+        rise -= self.on(command, direction, dt_s, tuple(below))
+        return np.asarray(rise / wide)
+
+
+def delayed(u: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
+    """u(t - psi), mean over each interval."""
+    steps = max(0.0, psi[0]) / dt_s
+    whole = int(steps)
+    part = steps - whole
+    padded = np.concatenate([np.full(whole + 1, u[0]), u])
+    n = len(u)
+    return np.asarray((1.0 - part) * padded[1 : n + 1] + part * padded[:n])
+
+
+def lagged(u: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
+    """First-order lag of time constant psi, mean over each interval, exact for a held command."""
+    tau = max(psi[0], 1e-9)
+    fade = float(np.exp(-dt_s / tau))
+    start = lfilter([0.0, 1.0 - fade], [1.0, -fade], u - u[0]) + u[0]
+    return np.asarray(u + (start - u) * tau / dt_s * (1.0 - fade))
+
+
+def second_order(u: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
+    """Spool of natural frequency psi[0] rad/s and damping psi[1], mean over each interval."""
+    wn, zeta = psi
+    b, a, _ = cont2discrete(
+        (np.array([wn * wn]), np.array([1.0, 2.0 * zeta * wn, wn * wn])), dt_s, method="zoh"
+    )
+    start = lfilter(np.ravel(b), a, u - u[0]) + u[0]
+    return np.asarray(0.5 * (start + np.append(start[1:], start[-1])))
+
+
+def played(u: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
+    """Play of full width psi: the spool follows once the play is taken up."""
+    out = np.empty(len(u))
+    _play(np.ascontiguousarray(u), 0.5 * psi[0], out)
+    return out
+
+
+@kernel
+def _play(u: FloatArray, half: float, out: FloatArray) -> None:
+    at = u[0]
+    for k in range(len(u)):
+        at = min(max(at, u[k] - half), u[k] + half)
+        out[k] = at
+
+
+def _log(low: float, high: float, count: int) -> tuple[Psi, ...]:
+    return tuple((float(v),) for v in np.geomspace(low, high, count))
+
+
+_LAG = Timing(
+    "spool_lag_first_order",
+    ("time_constant",),
+    ("s",),
+    _log(2e-3, 60e-3, 4),
+    (0.0,),
+    (0.5,),
+    lagged,
+)
+_SPOOL = Timing(
+    "spool_lag_second_order", ("natural_frequency", "damping"), ("rad/s", "1"),
+    tuple((2.0 * zeta / t, zeta) for t in (60e-3, 20e-3, 6e-3, 2e-3) for zeta in (0.8,)),
+    (8.0, 0.3), (2000.0, 2.0), second_order, replaces_lag=True,
+)  # fmt: skip
+TIMINGS = (
+    Timing("input_delay", ("delay",), ("s",), _log(2e-3, 60e-3, 4), (0.0,), (0.5,), delayed),
+    _LAG,
+    replace(_LAG, own_spools=True),
+    _SPOOL,
+    replace(_SPOOL, own_spools=True),
+    Timing(
+        "valve_hysteresis", ("width",), ("V",), _log(0.05, 0.6, 3), (0.0,), (3.0,), played,
+        is_linear=False,
+    ),
+)  # fmt: skip

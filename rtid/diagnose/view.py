@@ -1,0 +1,173 @@
+"""A record as effects see it: signals by role, volumes, and the flows of the fitted map.
+
+Values at samples have n entries, means and volumes over intervals n - 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import savgol_filter
+
+from rtid.estimator.state import Weights, build
+from rtid.kernels.evidence import follow_map
+from rtid.kernels.layout import TERMS
+from rtid.model import PRESSURE, FloatArray, Model
+
+UNKNOWN = 10.0  # standard deviation of the flow in a block that was never visited, rated flows
+SMOOTH_S = 0.02  # half width of the window for derivatives of pressures, without delay
+
+
+@dataclass(frozen=True)
+class FlowMap:
+    """Terms (V, 6) of the blocks of the grid cells (V,), in units of the rated flows.
+
+    cov (V, 6, 6): their covariance, empty where nobody asked for it.
+    """
+
+    cells: NDArray[np.int64]
+    terms: FloatArray
+    cov: FloatArray
+
+
+@dataclass(frozen=True)
+class View:
+    """chunk (n, 2 + signals); compliance (chambers,) 1/Pa; along as from `follow_map`, 0 for NaN.
+
+    inside (n - 1,): every open edge is on its grid, and the record has no gap.
+    """
+
+    model: Model
+    chunk: FloatArray
+    compliance: FloatArray
+    along: FloatArray
+    inside: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, model: Model, chunk: FloatArray, weights: Weights, flowmap: FlowMap) -> View:
+        """The record beside a fitted map."""
+        rated = np.repeat(
+            [e.rated_q_m3s for e in model.edges],
+            [e.grid.shape[0] * e.grid.shape[1] for e in model.edges],
+        )
+        theta, cov = np.zeros((model.n_cells, TERMS)), np.zeros((model.n_cells, TERMS, TERMS))
+        theta[flowmap.cells] = flowmap.terms * rated[flowmap.cells, None]
+        cov += np.eye(TERMS) * (UNKNOWN * rated[:, None, None]) ** 2
+        if len(flowmap.cov):
+            cov[flowmap.cells] = flowmap.cov * rated[flowmap.cells, None, None] ** 2
+        state = build(model, weights)
+        along = np.empty((len(chunk) - 1, len(model.edges), 5))
+        cell = np.empty(along.shape[:2], np.int64)
+        follow_map(state.engine, state.cells, theta, cov, chunk, along, cell)
+        return cls(
+            model, chunk, weights.compliance, np.nan_to_num(along), np.isfinite(along[:, 0, 0])
+        )
+
+    @property
+    def n(self) -> int:
+        """Number of samples."""
+        return len(self.chunk)
+
+    @cached_property
+    def t_s(self) -> FloatArray:
+        """Instants of the samples (n,)."""
+        return np.asarray(self.chunk[:, 0])
+
+    @cached_property
+    def dt_s(self) -> FloatArray:
+        """Lengths of the intervals (n - 1,)."""
+        return np.diff(self.t_s)
+
+    @property
+    def step_s(self) -> float:
+        """The usual length of an interval."""
+        return float(np.median(self.dt_s))
+
+    def signal(self, name: str) -> FloatArray:
+        """A signal by its name (n,)."""
+        return np.asarray(self.chunk[:, 2 + self.model.column(name)])
+
+    @cached_property
+    def x_m(self) -> FloatArray:
+        """Measured position (n,)."""
+        return self.signal(self.model.position)
+
+    def pressure(self, c: int) -> FloatArray:
+        """Pressure of chamber c (n,)."""
+        return self.signal(self.model.chambers[c].pressure)
+
+    def volume(self, c: int) -> FloatArray:
+        """Volume of chamber c (n,)."""
+        chamber = self.model.chambers[c]
+        return chamber.v0_m3 + chamber.sign * chamber.area_m2 * self.x_m
+
+    @cached_property
+    def tank(self) -> FloatArray:
+        """Pressure of the tank (n,); 0 where no edge names one."""
+        names = {e.sink for e in self.model.edges} - self._chambers
+        return self.signal(sorted(names)[0]) if names else np.zeros(self.n)
+
+    @cached_property
+    def supply_name(self) -> str:
+        """Name of the supply's signal, "" where no edge names one."""
+        return next((e.source for e in self.model.edges if e.source not in self._chambers), "")
+
+    @property
+    def _chambers(self) -> set[str]:
+        return {chamber.pressure for chamber in self.model.chambers}
+
+    @cached_property
+    def supply_is_measured(self) -> bool:
+        """False where the supply's signal never moves: a nominal value, not a measurement."""
+        return bool(self.supply_name) and bool(np.ptp(self.signal(self.supply_name)) > 0)
+
+    def over_intervals(self, flow: FloatArray) -> FloatArray:
+        """Volume (n - 1,) of a flow at the samples (n,), linear between them."""
+        return np.asarray(0.5 * (flow[1:] + flow[:-1]) * self.dt_s)
+
+    def flow(self, i: int) -> FloatArray:
+        """Flow of edge i by the fitted map (n - 1,)."""
+        return np.asarray(self.along[:, i, 1])
+
+    def slope_u(self, i: int) -> FloatArray:
+        """dQ/dw of edge i (n - 1,), m3/s/V."""
+        return np.asarray(self.along[:, i, 2])
+
+    def slope_dp(self, i: int) -> FloatArray:
+        """dQ/ddp of edge i (n - 1,), m3/s/Pa."""
+        return np.asarray(self.along[:, i, 3])
+
+    def flow_sd(self) -> FloatArray:
+        """Largest standard deviation of the flows of open edges, as a share of the rated flow."""
+        rated = np.array([edge.rated_q_m3s for edge in self.model.edges])
+        return np.asarray((self.along[:, :, 4] / rated).max(axis=1))
+
+    def smooth(self, values: FloatArray, derivative: int = 0) -> FloatArray:
+        """Values without most of their noise and without delay, or their derivative per second."""
+        half = max(2, round(SMOOTH_S / self.step_s))
+        if len(values) <= 2 * half:
+            return np.zeros(len(values))
+        found = savgol_filter(values, 2 * half + 1, 2, deriv=derivative, delta=self.step_s)
+        return np.asarray(found)
+
+    def into_chamber(self, c: int, per_edge: list[FloatArray]) -> FloatArray:
+        """Sum over the edges of the sign with which they feed chamber c times per_edge (n - 1,)."""
+        signs = [edge.sign(self.model.chambers[c]) for edge in self.model.edges]
+        total = np.zeros(self.n - 1)
+        for sign, values in zip(signs, per_edge, strict=True):
+            if sign:
+                total += sign * values
+        return total
+
+    def chamber_flow(self, c: int) -> FloatArray:
+        """Flow of all valves into chamber c by the fitted map (n - 1,)."""
+        return self.into_chamber(c, [self.flow(i) for i in range(len(self.model.edges))])
+
+    @cached_property
+    def has_pressures(self) -> bool:
+        """True where every chamber's pressure is measured."""
+        kinds = {s.name: s.kind for s in self.model.signals}
+        return all(kinds.get(c.pressure) == PRESSURE for c in self.model.chambers)

@@ -1,0 +1,60 @@
+"""Diagnose a captured trace: from project file and log to what is missing in the model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from rtid.diagnose.diagnosis import Result, search
+from rtid.diagnose.report import Diagnosis, diagnosis
+from rtid.estimator.estimator import to_chunk
+from rtid.model import FloatArray, Model
+from rtid.project import Project
+from rtid.replay import NoSamplesError, Trace, model_for, read_trace
+
+HELD_OUT_SHARE = 0.25  # of a record without declared parts: its end
+
+
+@dataclass(frozen=True)
+class Diagnosed:
+    """A diagnosed trace: the search with every fit, and what is said of it."""
+
+    project: Project
+    model: Model
+    trace: Trace
+    result: Result
+    diagnosis: Diagnosis
+
+
+def _silent(_what: str, _share: float) -> None:
+    pass
+
+
+def diagnose_trace(
+    project: Project, path: Path, progress: Callable[[str, float], None] = _silent
+) -> Diagnosed:
+    """Diagnose one trace.  Raises NoSamplesError where there is nothing to learn from."""
+    progress("reading", 0.0)
+    trace = read_trace(project, path)
+    model = model_for(project, trace.samples)
+    identification, held_out = parts(project, model, trace)
+    result = search(model, identification, held_out, progress)
+    progress("done", 1.0)
+    return Diagnosed(project, model, trace, result, diagnosis(result))
+
+
+def parts(project: Project, model: Model, trace: Trace) -> tuple[FloatArray, FloatArray]:
+    """Identification and held-out part, chunks (n, 2 + signals); by default the end is held out."""
+    chunk = to_chunk(model, trace.samples, int(trace.samples.t_us[0]))
+    t_s, record = chunk[:, 0], project.sections.record
+    split = t_s[0] + (1.0 - HELD_OUT_SHARE) * (t_s[-1] - t_s[0])
+    learn = record.identification_s or (0.0, split)
+    test = record.validation_s or (split, float("inf"))
+    found = [chunk[(t_s >= low) & (t_s < high)] for low, high in (learn, test)]
+    for part, name in zip(found, ("identification", "validation"), strict=True):
+        if len(part) < 2:
+            raise NoSamplesError(
+                f"{trace.path}: no samples in the {name} part", "adapt [record] in the project file"
+            )
+    return found[0], found[1]
