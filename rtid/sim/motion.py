@@ -100,9 +100,14 @@ def sweep_record(plant: Plant, rng: np.random.Generator, duration_s: float) -> F
 
 
 def rich_record(plant: Plant, rng: np.random.Generator, duration_s: float) -> FloatArray:
-    """The same with steps of the command while learning, wandering supply, varying load."""
+    """The same with steps of the command while learning, wandering supply, varying load.
+
+    The load varies half as much while the machine moves from point to point: it would cavitate.
+    """
     drive = _everything(plant, rng, _record(plant, rng, duration_s))
     drive[round(IDENTIFICATION * duration_s / DT_S) :, DITHER] = 0.0
+    share = np.linspace(0, 1, len(drive))
+    drive[:, LOAD] *= np.interp(share, [IDENTIFICATION, VALIDATION], [1.0, 0.5])
     return drive
 
 
