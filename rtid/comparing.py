@@ -7,7 +7,7 @@ never mixed; a reference gets the bulk modulus that suits it best on the identif
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -91,13 +91,64 @@ def compare_trace(
     result: Replay, *references: Reference | None, name: str = LEARNED
 ) -> TraceComparison:
     """Hold the learned map, called `name`, and references against a replayed trace."""
-    flowmap, chunks = publish(result.fit.solution), parts_of(result)
+    chunks = parts_of(result)
+
+    def hold(candidate: Candidate) -> Held:
+        parts = {
+            title: compare(result.model, candidate, chunk, seen=title == IDENTIFICATION)
+            for title, chunk in chunks.items()
+        }
+        return Held(candidate.name, 1.0 / candidate.compliance, parts, candidate)
+
+    return _assembled(result, references, name, chunks[IDENTIFICATION], hold)
+
+
+def study(
+    result: Replay,
+    *references: Reference | None,
+    name: str = LEARNED,
+    extra_flow: Mapping[str, FloatArray] | None = None,
+) -> TraceComparison:
+    """`compare_trace` with every map examined: simulated pressures, correlations, CUSUM and more.
+
+    extra_flow: by part (samples - 1, chambers) in m3/s, what effects add to the modelled flow.
+    """
+    chunks, extra = parts_of(result), extra_flow or {}
+    positions = {title: smooth_position(result.model, chunk) for title, chunk in chunks.items()}
+
+    def hold(candidate: Candidate) -> Held:
+        found: dict[str, Examination] = {}
+        for title, chunk in chunks.items():
+            seen, before = title == IDENTIFICATION, found.get(IDENTIFICATION)
+            found[title] = examine(
+                result.model,
+                candidate,
+                chunk,
+                seen,
+                before.equation if before else None,
+                positions[title],
+                extra.get(title),
+            )
+        parts = {title: one.equation for title, one in found.items()}
+        return Held(candidate.name, 1.0 / candidate.compliance, parts, candidate, found)
+
+    return _assembled(result, references, name, chunks[IDENTIFICATION], hold)
+
+
+def _assembled(
+    result: Replay,
+    references: Sequence[Reference | None],
+    name: str,
+    chunk: FloatArray,
+    hold: Callable[[Candidate], Held],
+) -> TraceComparison:
+    """Everything about the maps, each held by `hold`; chunk: the identification part."""
+    flowmap = publish(result.fit.solution)
     known = tuple(reference for reference in references if reference is not None)
     candidates = [learned(result.fit, flowmap, name)]
-    for reference in known:
-        weights = result.fit.weights
-        candidates.append(refitted(result.model, reference, weights, chunks[IDENTIFICATION]))
-    held = tuple(_hold(result, candidate, chunks) for candidate in candidates)
+    weights = result.fit.weights
+    candidates += [refitted(result.model, reference, weights, chunk) for reference in known]
+    held = tuple(hold(candidate) for candidate in candidates)
     blocks = {
         title: block_rows(result.fit.solution, part, flowmap)
         for title, part in held[0].parts.items()
@@ -112,47 +163,6 @@ def parts_of(result: Replay) -> dict[str, FloatArray]:
     if result.validation_s is not None:
         spans[VALIDATION] = result.validation_s
     return {title: result.part(span) for title, span in spans.items()}
-
-
-def _hold(result: Replay, candidate: Candidate, chunks: Mapping[str, np.ndarray]) -> Held:
-    parts = {
-        title: compare(result.model, candidate, chunk, seen=title == IDENTIFICATION)
-        for title, chunk in chunks.items()
-    }
-    return Held(candidate.name, 1.0 / candidate.compliance, parts, candidate)
-
-
-def study(
-    result: Replay,
-    *references: Reference | None,
-    name: str = LEARNED,
-    extra_flow: Mapping[str, FloatArray] | None = None,
-) -> TraceComparison:
-    """`compare_trace` with every map examined: simulated pressures, correlations, CUSUM and more.
-
-    extra_flow: by part (samples - 1, chambers) in m3/s, what effects add to the modelled flow.
-    """
-    found = compare_trace(result, *references, name=name)
-    chunks, extra = parts_of(result), extra_flow or {}
-    positions = {title: smooth_position(result.model, chunk) for title, chunk in chunks.items()}
-    held = []
-    for one in found.held:
-        examinations: dict[str, Examination] = {}
-        for title, chunk in chunks.items():
-            seen = title == IDENTIFICATION
-            before = None if seen else examinations[IDENTIFICATION].equation
-            examinations[title] = examine(
-                result.model, one.candidate, chunk, seen, before, positions[title], extra.get(title)
-            )
-        equations = {title: e.equation for title, e in examinations.items()}
-        held.append(Held(one.name, one.beta_pa, equations, one.candidate, examinations))
-    blocks = {
-        title: block_rows(result.fit.solution, part, found.flowmap)
-        for title, part in held[0].parts.items()
-    }
-    return TraceComparison(
-        result, found.flowmap, found.references, tuple(held), blocks, found.deviations_of
-    )
 
 
 def compare_two(

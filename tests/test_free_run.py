@@ -14,6 +14,7 @@ from rtid.estimator.flowmap import VALID, EdgeMap, FlowMap
 from rtid.estimator.state import build, nominal_weights
 from rtid.estimator.windows import OVERLAP
 from rtid.kernels import free_run as module
+from rtid.kernels import published
 from rtid.kernels.free_run import BEYOND, GAP, INSIDE, OFF_GRID, START, STUCK
 from rtid.model import FloatArray, Grid, Lag, Model, Term
 from rtid.sim.declare import declared_model
@@ -140,9 +141,10 @@ def test_free_run_is_the_solution_of_the_equation(terms: tuple[Term, ...], lag_s
 
 def as_python(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every function of the kernel as Python."""
-    for name, value in vars(module).copy().items():
-        if hasattr(value, "py_func"):
-            monkeypatch.setattr(module, name, value.py_func)
+    for place in (module, published):
+        for name, value in vars(place).copy().items():
+            if hasattr(value, "py_func"):
+                monkeypatch.setattr(place, name, value.py_func)
 
 
 def test_compiled_and_plain_are_one(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,7 @@
 """See where a model agrees with the measurement and where it does not; arrays in, arrays out."""
 
-from rtid.compare.comparison import Candidate, Comparison, Intervals, compare, learned, refitted
+from rtid.compare.candidate import Candidate, learned
+from rtid.compare.comparison import Comparison, Intervals, compare, refitted
 from rtid.compare.correlation import Correlation, correlations
 from rtid.compare.cusum import Cusum, cusums, recursive_residuals
 from rtid.compare.dependence import Dependence, against_signals, by_direction, over_time

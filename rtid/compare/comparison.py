@@ -13,39 +13,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from rtid.compare.candidate import Candidate, itself
 from rtid.compare.extra import with_extra_flow
 from rtid.compare.reference import Reference
-from rtid.estimator.flowmap import EXTRAPOLATED, LEARNING, PRIOR, SHUT, VALID, FlowMap
-from rtid.estimator.record import RecordFit
-from rtid.estimator.solution import Solution
+from rtid.estimator.flowmap import EXTRAPOLATED, LEARNING, PRIOR, SHUT, VALID
 from rtid.estimator.state import Weights, build
 from rtid.kernels.engine import GAP_FLAG
 from rtid.kernels.explain import explain, filter_rows
-from rtid.kernels.layout import TERMS
-from rtid.model import TAYLOR, FloatArray, Model
+from rtid.model import FloatArray, Model
 
 REFERENCE, OUTSIDE = "reference", "outside"
 # The status of an interval is that of its least certain open edge: the last of this list.
 CERTAINTY = (SHUT, VALID, REFERENCE, LEARNING, EXTRAPOLATED, PRIOR, OUTSIDE)
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A map with its compressibility: theta (cells, 6) in m3/s, compliance (chambers,) in 1/Pa.
-
-    status (cells,) holds the words of `rtid.estimator.flowmap`; weights gives lag and noise slopes.
-    terms (terms,): coefficients of the model's shared terms in units of their scales.
-    fitted (cells, 6): the fit's own terms, before the orifice law and the blending of the published
-    map, NaN where it has none: what whitened innovations are taken from, where it is there.
-    """
-
-    name: str
-    theta: FloatArray
-    compliance: FloatArray
-    status: NDArray[np.str_]
-    weights: Weights
-    terms: FloatArray
-    fitted: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -108,26 +87,6 @@ class Comparison:
         return self.residual_rms_m3s / self.flow_rms_m3s
 
 
-def learned(fit: RecordFit, flowmap: FlowMap, name: str = "learned") -> Candidate:
-    """The published map with the compliance and lag of the fit."""
-    status = np.concatenate([edge.status.ravel() for edge in flowmap.edges])
-    compliance = fit.solution.compliance
-    terms, theta = fit.solution.terms_theta, flowmap.theta_cells()
-    own = _fitted(fit.solution)
-    return Candidate(name, theta, compliance, status, fit.weights, terms, own)
-
-
-def _fitted(solution: Solution) -> FloatArray | None:
-    """The fit's own terms (cells, 6), NaN where never visited; None where windows overlap."""
-    model = solution.model
-    if any(edge.basis != TAYLOR for edge in model.edges):
-        return None
-    theta, first = np.full((model.n_cells, TERMS), np.nan), model.first_cells
-    for b in solution.blocks:
-        theta[first[b.edge] + b.i * model.edges[b.edge].grid.shape[1] + b.j] = b.theta
-    return theta
-
-
 def refitted(model: Model, reference: Reference, weights: Weights, chunk: FloatArray) -> Candidate:
     """A reference map with each chamber's compliance fitted to the chunk, all else as it is."""
     theta, none = reference.theta_cells(model), np.zeros(len(model.terms))
@@ -162,7 +121,7 @@ def compare(
     innovation = _innovation(model, candidate, chunk, extra_flow, held)
     own = innovation
     if seen and candidate.fitted is not None:
-        own = _innovation(model, _itself(candidate), chunk, extra_flow, held)
+        own = _innovation(model, itself(candidate), chunk, extra_flow, held)
     rows = _rows(model, held, chunk)
     interval = np.clip(np.searchsorted(held.t_s, rows.t_s) - 1, 0, len(held.cell) - 1)
     return Comparison(
@@ -239,14 +198,6 @@ def _mean_squares(innovation: FloatArray) -> FloatArray:
     if not known.any():
         return np.full(innovation.shape[1], np.nan)
     return np.asarray(np.mean(innovation[known] ** 2, axis=0))
-
-
-def _itself(candidate: Candidate) -> Candidate:
-    """The candidate with the fit's own terms in all blocks that it has visited."""
-    assert candidate.fitted is not None
-    known = np.isfinite(candidate.fitted[:, 0])
-    theta = np.where(known[:, None], candidate.fitted, candidate.theta)
-    return replace(candidate, theta=theta, status=np.where(known, VALID, candidate.status))
 
 
 def _innovation(

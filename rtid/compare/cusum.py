@@ -91,10 +91,10 @@ def _cusum(
 ) -> Cusum:
     parts = [part] if before is None else [before, part]
     own = [i for i, edge in enumerate(model.edges) if edge.sign(model.chambers[c]) != 0]
-    rows = [_rows(p, own, c, before is None) for p in parts]
+    rows = [_rows(p, own, c, model.n_cells + 1, before is None) for p in parts]
     t_s, e, key = (np.concatenate(columns) for columns in zip(*rows, strict=True))
     new = np.arange(len(e)) >= len(e) - len(rows[-1][0])
-    w = recursive_residuals(e, np.unique(key, axis=0, return_inverse=True)[1].reshape(-1))
+    w = recursive_residuals(e, key)
     kept = np.isfinite(w) & new
     t_s, w, m = t_s[kept], w[kept], int(kept.sum())
     name = model.chambers[c].name
@@ -109,16 +109,18 @@ def _cusum(
 
 
 def _rows(
-    part: Comparison, edges: list[int], c: int, fitted: bool
+    part: Comparison, edges: list[int], c: int, base: int, fitted: bool
 ) -> tuple[FloatArray, FloatArray, np.ndarray]:
-    """Instants, innovations and open blocks of the rows of chamber c.
+    """Instants, innovations and open blocks of the rows of chamber c, a number per combination.
 
     fitted: of the fit's own terms, whose innovations are white in its own data.
     """
     inner = part.intervals
     e = (inner.own if fitted else inner.innovation)[:, c]
-    known = np.isfinite(e)
-    return inner.t_s[1:][known], e[known], inner.cell[known][:, edges]
+    known, key = np.isfinite(e), np.zeros(len(e), np.int64)
+    for k in edges:
+        key = key * base + inner.cell[:, k] + 1
+    return inner.t_s[1:][known], e[known], key[known]
 
 
 def _spread(w: FloatArray) -> float:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rtid.compare.comparison import Candidate, Comparison, compare
+from rtid.compare.candidate import Candidate
+from rtid.compare.comparison import Comparison, compare
 from rtid.compare.correlation import Correlation, correlations
 from rtid.compare.cusum import Cusum, cusums
 from rtid.compare.dependence import Dependence, against_signals, by_direction, over_time

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rtid.compare.comparison import Candidate
+from rtid.compare.candidate import Candidate
 from rtid.compare.extra import with_extra_flow
 from rtid.compare.motion import smooth_position
 from rtid.errors import RtidError
