@@ -37,11 +37,12 @@ from rtid.estimator.estimator import to_chunk
 from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.published import publish
 from rtid.estimator.record import RecordFit, fit_record
-from rtid.model import FloatArray, Model
+from rtid.model import POSITION, FloatArray, Grid, Model, Signal, Term
 from rtid.sim.declare import declared_model
 from rtid.sim.plant import Plant
 from rtid.sim.random_plants import draw
 from rtid.sim.run import simulate as run_plant
+from tests.test_other_plants import plant as other_plant
 
 SEEN_S = 25.0
 LEAK_M3SPPA = 0.4e-12
@@ -390,6 +391,38 @@ def test_a_plant_without_pressure_has_no_free_run(machine: Machine) -> None:
     chambers = tuple(replace(c, pressure="") for c in machine.model.chambers)
     with pytest.raises(NoFreeRunError, match="chamber a, b has no pressure"):
         simulate(replace(machine.model, chambers=chambers), machine.candidate, machine.new)
+
+
+def test_a_drive_without_pressures_is_examined_all_the_same() -> None:
+    """omega' = 40 u - 4 omega: the equation, its correlations and its CUSUM, but no free run."""
+    rng, n = np.random.default_rng(9), 20_000
+    decay = Term("decay", (("w", -1.0),), (("speed", 1),), 4.0)
+    grid = Grid(np.array([-10.0, -3.0, 3.0, 10.0]), np.array([-1.0, 1.0]))
+    model = other_plant("speed", grid, 300.0, Signal("w", POSITION, noise=0.05), (decay,))
+    u, w = np.repeat(rng.uniform(-9, 9, n // 80 + 1), 80)[:n], np.zeros(n)
+    for k in range(n - 1):
+        w[k + 1] = w[k] * np.exp(-4e-3) + 10 * u[k] * (1 - np.exp(-4e-3))
+    columns = (np.linspace(0, 1e-3 * (n - 1), n), np.ones(n), u, w + 0.05 * rng.standard_normal(n))
+    chunk = np.column_stack(columns)
+    fit = fit_record(model, chunk)
+    found = examine(model, learned(fit, publish(fit.solution)), chunk, seen=True)
+    assert found.simulations == {}
+    assert "speed has no pressure" in found.no_free_run
+    assert found.equation.rho[0] == pytest.approx(1.0, abs=0.05)
+    assert next(c for c in found.correlations if c.itself).outside < 0.12
+    assert found.cusums[0].crosses_s is None
+
+
+def test_a_position_that_comes_rarely(machine: Machine) -> None:
+    """x every 20 ms and interpolated between: the smoother still finds its way."""
+    chunk, x = machine.new.copy(), 2 + machine.model.column("x")
+    rare = np.arange(0, len(chunk), 20)
+    chunk[:, x] = np.interp(chunk[:, 0], chunk[rare, 0], chunk[rare, x])
+    chunk[:, 1] = np.isin(np.arange(len(chunk)), rare)
+    found = examine(machine.model, machine.candidate, chunk)
+    assert (found.simulations[FREE_RUN].fit_percent > 80).all()
+    step = found.correlations[0].lags_s[0]
+    assert step == pytest.approx(0.02)
 
 
 def test_nothing_to_examine(machine: Machine) -> None:
