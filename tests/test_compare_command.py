@@ -203,7 +203,7 @@ def test_every_figure_is_in_the_json(trace: Path) -> None:
     for part in found["maps"][0]["parts"].values():
         assert set(part["simulations"]) == {"free run", "1 s ahead", "0.1 s ahead"}
         run = part["simulations"]["free run"]
-        assert set(run["stops"]) == {"gap", "off_grid", "stuck"}
+        assert set(run["stops"]) == {"gap", "off_grid", "ran_away"}
         assert len(run["fit_percent"]) == 2
         assert {d["signal"] for d in part["residual_against"]} >= {"u", "p_a", "x"}
         assert part["residual_by_direction"]["rows"]

@@ -15,7 +15,7 @@ from rtid.estimator.state import build, nominal_weights
 from rtid.estimator.windows import OVERLAP
 from rtid.kernels import free_run as module
 from rtid.kernels import published
-from rtid.kernels.free_run import BEYOND, GAP, INSIDE, OFF_GRID, START, STUCK
+from rtid.kernels.free_run import BEYOND, GAP, INSIDE, OFF_GRID, RAN_AWAY, START
 from rtid.model import FloatArray, Grid, Lag, Model, Term
 from rtid.sim.declare import declared_model
 from rtid.sim.plant import Plant
@@ -207,7 +207,7 @@ def test_a_stiff_chamber_takes_more_steps_and_stays_exact() -> None:
     stiff = FlowMap(tuple(replace(e, theta=30.0 * e.theta) for e in flowmap.edges))
     chunk = signals(12)
     pressure, status = run(model, stiff, chunk)
-    assert not set(status) & {GAP, OFF_GRID, STUCK}
+    assert not set(status) & {GAP, OFF_GRID, RAN_AWAY}
     exact = truth(model, stiff, chunk, 1.3e-3)
     np.testing.assert_allclose(pressure, exact, rtol=0, atol=1.0)  # of 6 MPa
 
@@ -216,5 +216,16 @@ def test_a_map_that_is_no_machine_stops_and_does_not_hang() -> None:
     model, flowmap = machine()
     wild = FlowMap(tuple(replace(e, theta=1e12 * e.theta) for e in flowmap.edges))
     pressure, status = run(model, wild, signals(20))
-    assert STUCK in set(status)
-    assert np.isnan(pressure[status == STUCK]).all()
+    assert RAN_AWAY in set(status)
+    assert np.isnan(pressure[status == RAN_AWAY]).all()
+
+
+def test_a_pressure_far_out_of_its_sensor_s_range_begins_anew() -> None:
+    """The piston pulled out of a shut chamber: no oil can be at -30 MPa."""
+    model, flowmap = machine()
+    chunk = signals()
+    chunk[:, 2], chunk[:, 7] = 0.0, np.linspace(0.1, 0.4, len(chunk))
+    pressure, status = run(model, flowmap, chunk)
+    assert (status == RAN_AWAY).sum() > 3
+    assert np.nanmin(pressure) > -30e6
+    assert np.isfinite(pressure[-1]).all() or status[-1] == RAN_AWAY

@@ -28,7 +28,7 @@ HORIZONS_S = {FREE_RUN: np.inf, "1 s ahead": 1.0, "0.1 s ahead": 0.1}
 REASONS = {
     "gap": "gap in the trace, or a refused sample",
     "off_grid": "command off the grid of an open edge",
-    "stuck": "the simulated pressure ran away",
+    "ran_away": "the simulated pressure ran away",
 }
 
 

@@ -39,9 +39,9 @@ from rtid.kernels.published import foot_width, map_flow, rise
 FloatArray = NDArray[np.float64]
 
 # How the pressure of a sample came about.  BEYOND: a pressure drop was off its grid on the way.
-# GAP to STUCK end a run, which begins anew at that sample; no pressure is predicted there.
-START, INSIDE, BEYOND, GAP, OFF_GRID, STUCK = range(6)
-STATUSES = ("start", "inside", "beyond", "gap", "off_grid", "stuck")
+# GAP to RAN_AWAY end a run, which begins anew at that sample; no pressure is predicted there.
+START, INSIDE, BEYOND, GAP, OFF_GRID, RAN_AWAY = range(6)
+STATUSES = ("start", "inside", "beyond", "gap", "off_grid", "ran_away")
 
 TOLERANCE_PA = 0.01  # error of one step
 MOST_STEPS = 500  # in one interval; more: the model is no machine
@@ -190,12 +190,22 @@ def _interval(
                 code = BEYOND
             for c in range(e.n_chambers):
                 p[c] = trial[c]  # the last stage is the new state
-                if not abs(p[c]) < INSANE_PA:
-                    return STUCK, 1.0
+                if _is_away(e, c, p[c]):
+                    return RAN_AWAY, 1.0
         if s >= 1.0 - 1e-12:
             return code, h * max(1.0, min(GROW, factor))
         h *= max(SHRINK, min(GROW, factor))
-    return STUCK, 1.0
+    return RAN_AWAY, 1.0
+
+
+@part
+def _is_away(e: Any, c: int, p: float) -> bool:
+    """Whether a pressure is further out of its sensor's range than that range is wide."""
+    low, high = e.minimum[e.p_column[c]], e.maximum[e.p_column[c]]
+    span = high - low
+    if span < INSANE_PA:
+        return not (p >= low - span and p <= high + span)
+    return not abs(p) < INSANE_PA
 
 
 @part
