@@ -12,7 +12,7 @@ white and of equal variance as long as the model stays the same.  With probabili
 m rows, Q the upper tail of the normal distribution: a = 0.948 for 5 %.  The level is shared out
 among the chambers.  s^2 is the long-run variance, from differences of neighbouring batches: what
 the blocks' terms miss comes again and again and is no change.  The sum crosses some time after the
-change; the change itself is placed where a step in the mean of w fits best.
+change; the change itself is placed where, before that, a step in the mean of w fits best.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def _cusum(
     boundary = factor(level) * sqrt(m) * (1.0 + 2.0 * np.arange(1, m + 1) / m)
     out = np.flatnonzero(np.abs(value) > boundary)
     crosses = float(t_s[out[0]]) if len(out) else None
-    change = float(t_s[_change(value)]) if len(out) else None
+    change = float(t_s[_change(value, int(out[0]))]) if len(out) else None
     return Cusum(name, level, t_s, value, boundary, crosses, change)
 
 
@@ -134,10 +134,11 @@ def _spread(w: FloatArray) -> float:
     return sqrt(max(variance, 1e-300))
 
 
-def _change(value: FloatArray) -> int:
-    """Row after which the mean of the residuals steps (Bai 1994)."""
+def _change(value: FloatArray, crosses: int) -> int:
+    """Row after which the mean of the residuals steps (Bai 1994), before the sum crosses."""
     m = len(value)
     r = np.arange(1, m)
     bridge = np.abs(value[:-1] - r / m * value[-1]) / np.sqrt(r * (m - r))
     edge = max(1, round(TRIM * m))
-    return int(edge + bridge[edge : m - edge].argmax())
+    last = max(edge + 1, min(crosses, m - edge))
+    return int(min(crosses, edge + bridge[edge:last].argmax()))
