@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rtid.diagnose.diagnosis import Result, search
+from rtid.diagnose.parts import Part
 from rtid.diagnose.report import Diagnosis, diagnosis
 from rtid.estimator.estimator import to_chunk
 from rtid.model import FloatArray, Model
@@ -39,9 +40,17 @@ def diagnose_trace(
     trace = read_trace(project, path)
     model = model_for(project, trace.samples)
     identification, held_out = parts(project, model, trace)
-    result = search(model, identification, held_out, progress)
+    result = search(model, identification, held_out, progress, added_parts(project))
     progress("done", 1.0)
     return Diagnosed(project, model, trace, result, diagnosis(result))
+
+
+def added_parts(project: Project) -> tuple[Part, ...]:
+    """The effects that the project has added, in the order of addition."""
+    return tuple(
+        Part(a.effect, a.where, {n: p.value for n, p in a.parameters.items()}, a.own_spools)
+        for a in project.sections.added
+    )
 
 
 def parts(project: Project, model: Model, trace: Trace) -> tuple[FloatArray, FloatArray]:

@@ -13,8 +13,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from rtid.diagnose.candidates import Candidate, causes
-from rtid.diagnose.clean import usable
+from rtid.diagnose.clean import as_measured, usable
 from rtid.diagnose.fit import Fit, Revision, fit, one_pass, prepare
+from rtid.diagnose.parts import Part, recall
 from rtid.diagnose.regression import LIMIT_SD, Score
 from rtid.diagnose.residual import Residual, residual
 from rtid.diagnose.search import Search
@@ -72,7 +73,8 @@ class State:
     progress: Callable[[str, float], None]
     found: list[Found] = field(default_factory=list)
     negligible: dict[Key, float] = field(default_factory=dict)
-    excess: float = 0.0  # chi2 of the first fit beyond what the noise gives
+    excess: float = 0.0  # chi2 without any effect beyond what the noise gives
+    given: tuple[Part, ...] = ()  # effects that the model has already
     _coarse: Search | None = None
 
     @property
@@ -85,7 +87,7 @@ class State:
 
 @dataclass(frozen=True)
 class Result:
-    """The first and the last fit, what was added on the way, what was left."""
+    """The first and the last fit, what was given before, added on the way, and left."""
 
     first: Fit
     last: Fit
@@ -95,6 +97,7 @@ class Result:
     before: Residual
     after: Residual
     verdict: str
+    given: tuple[Part, ...] = ()
     match_rho: float = MATCH_RHO
 
 
@@ -107,14 +110,22 @@ def search(
     chunk: FloatArray,
     held_out: FloatArray,
     progress: Callable[[str, float], None] = _silent,
+    parts: tuple[Part, ...] = (),
 ) -> Result:
-    """Diagnose a record; chunk and held_out (n, 2 + signals) as from `to_chunk`."""
+    """Diagnose a record; chunk and held_out (n, 2 + signals) as from `to_chunk`.
+
+    parts: effects that the model has already.  Raises PartError where the record has none of them.
+    """
+    model = as_measured(model, chunk)
     chunk, held_out = usable(model, chunk), usable(model, held_out)
     state = State(model, chunk, held_out, progress)
     progress("fitting", 0.0)
-    first = present = fit(model, chunk, prepare(model, chunk), Revision())
+    weights = prepare(model, chunk)
+    first = present = fit(model, chunk, weights, recall(model, chunk, weights, parts))
+    state.given = parts
     before = last = residual(first, held_out)
-    state.excess = first.estimate.sse - first.regression.dof
+    bare = fit(model, chunk, weights, Revision(), bank=False) if parts else first
+    state.excess = bare.estimate.sse - bare.regression.dof
     for k in range(MOST):
         progress("scoring", 0.1 + 0.8 * k / MOST)
         added = _add_best(state, present, last)
@@ -123,9 +134,9 @@ def search(
         present, last = added
     present, last = _look_back(state, present, last)
     scores = scored(present)
-    verdict = _verdict(state, first, present, scores)
+    verdict = _verdict(state, present, last)
     return Result(
-        first, present, tuple(state.found), state.negligible, scores, before, last, verdict
+        first, present, tuple(state.found), state.negligible, scores, before, last, verdict, parts
     )
 
 
@@ -145,7 +156,7 @@ def _add_best(state: State, present: Fit, last: Residual) -> tuple[Fit, Residual
     One that is significant but changes next to nothing is only listed, unless it explains a part of
     the misfit that would be found in another guise.
     """
-    least = LATER_GAIN if state.found else GAIN
+    least = LATER_GAIN if state.found or state.given else GAIN
     trials = [t for t in _trials(state, present) if t.gain > least]
     for trial in sorted(trials, key=lambda t: -t.gain):
         if trial.key in state.negligible or len(state.negligible) == MOST_NEGLIGIBLE:
@@ -160,13 +171,19 @@ def _add_best(state: State, present: Fit, last: Residual) -> tuple[Fit, Residual
         share = min(material_share(last, after), own_share(now, trial, state.held_out))
         if share < MATERIAL:
             state.negligible[trial.key] = share
-            if now.rho > MATCH_RHO or trial.gain < NOTICED * present.regression.dof:
+            if not _is_noticed(present, trial):
                 continue
         else:
-            alike = _alike(state, trial, trials)
+            alike = alike_ones(state, trial, trials)
             state.found.append(Found(trial.key, alike, trial.gain, last, after))
         return now, after
     return None
+
+
+def _is_noticed(present: Fit, trial: Trial) -> bool:
+    """True for an immaterial cause that explains a fair part of the misfit all the same."""
+    dof = present.regression.dof
+    return trial.gain > max(NOTICED * dof, LEAST_SHARE * (present.estimate.sse - dof))
 
 
 def _explains(state: State, present: Fit, trial: Trial) -> bool:
@@ -209,21 +226,22 @@ def own_share(now: Fit, trial: Trial, held_out: FloatArray) -> float:
 
 def _trials(state: State, present: Fit) -> list[Trial]:
     """Every possible cause with its best shape: fixed columns, and timings where they matter."""
-    best = _best_by_key(present, scored(present))
+    best = best_by_key(present, scored(present))
     trials = []
     for key, (candidate, score) in best.items():
         if key[1] == "command":
             continue
         revision = replace(present.revision, effects=(*present.revision.effects, candidate))
         trials.append(Trial(key, score.gain, revision, score.column))
-    trials = _refined(state, present, trials)
+    trials = refined(state, present, trials)
     scores = {key: s.gain for key, (_, s) in best.items() if key[1] == "command"}
     return trials + _timing_trials(state, present, scores)
 
 
-def _best_by_key(
+def best_by_key(
     present: Fit, scores: list[tuple[Candidate, Score]]
 ) -> dict[Key, tuple[Candidate, Score]]:
+    """The candidate of each possible cause that chi2 would fall by most with."""
     best: dict[Key, tuple[Candidate, Score]] = {}
     for candidate, score in scores:
         if not candidate.is_possible(physical(present, candidate, score.value)):
@@ -244,7 +262,7 @@ def physical(fit_: Fit, candidate: Candidate, value: float) -> float:
     return float(value * np.mean(fit_.weights.compliance[at] / fit_.compliance[at]))
 
 
-def _refined(state: State, present: Fit, trials: list[Trial]) -> list[Trial]:
+def refined(state: State, present: Fit, trials: list[Trial]) -> list[Trial]:
     """Shapes between those of the bank, where they could matter, in one more pass."""
     if not trials:
         return trials
@@ -265,7 +283,7 @@ def _refined(state: State, present: Fit, trials: list[Trial]) -> list[Trial]:
     finer = one_pass(
         state.model, state.chunk, present.weights, present.revision, present.map, False, more
     )
-    best = _best_by_key(finer, scored(finer))
+    best = best_by_key(finer, scored(finer))
     found = []
     for trial in trials:
         candidate, score = best.get(trial.key, (None, None))
@@ -279,14 +297,19 @@ def _refined(state: State, present: Fit, trials: list[Trial]) -> list[Trial]:
 
 
 def _timing_trials(state: State, present: Fit, scores: dict[Key, float]) -> list[Trial]:
-    """Exact refits with one timing more."""
+    """Exact refits with one timing more, of those that may matter."""
     open_ = [t for t in TIMINGS if not present.revision.has((t.effect, "command"))]
     if present.rho < LARGE:
         open_ = [t for t in open_ if scores.get((t.effect, "command"), 0.0) > GAIN]
     if not open_ or not present.view.has_pressures:
         return []
+    return exact_trials(state, present, open_)
+
+
+def exact_trials(state: State, present: Fit, timings: list[Timing]) -> list[Trial]:
+    """Refits with one of these timings more, the best of each name."""
     costs: list[tuple[float, Timing, Psi]] = []
-    for timing in open_:
+    for timing in timings:
         psi, cost = state.coarse.best(timing, present)
         costs.append((cost, timing, psi))
     least = min(cost for cost, _, _ in costs)
@@ -312,7 +335,7 @@ def _is_inside(now: Fit) -> bool:
     return timing.low[0] * 1.01 < psi[0] < timing.high[0] * 0.99 and psi[0] > 3.0 * sd
 
 
-def _alike(state: State, best: Trial, trials: list[Trial]) -> tuple[Key, ...]:
+def alike_ones(state: State, best: Trial, trials: list[Trial]) -> tuple[Key, ...]:
     """Causes that this record does not tell from the best one: all but as good."""
     close = best.gain - TIE - TIE_SHARE * best.gain
     return tuple(
@@ -325,6 +348,8 @@ def _alike(state: State, best: Trial, trials: list[Trial]) -> tuple[Key, ...]:
 def _look_back(state: State, present: Fit, last: Residual) -> tuple[Fit, Residual]:
     """Drop what has become superfluous."""
     for effect in list(present.revision.effects) if len(present.revision.effects) > 1 else []:
+        if any(effect.key == given.key for given in state.given):
+            continue
         column = present.column(effect)
         estimate = present.estimate
         gain = (estimate.value(column) / max(estimate.sd(column), 1e-300)) ** 2
@@ -340,20 +365,29 @@ def _look_back(state: State, present: Fit, last: Residual) -> tuple[Fit, Residua
     return present, last
 
 
+SETTLED = 0.9  # of the misfit that negligible effects must explain to be all there is
 NAMED = 0.5  # of the misfit that effects must explain to be named where something else remains
 
 
-def _verdict(state: State, first: Fit, last: Fit, scores: list[tuple[Candidate, Score]]) -> str:
-    if first.regression.rows < 1000 or not len(first.map.cells):
+def _verdict(state: State, last: Fit, after: Residual) -> str:
+    if last.regression.rows < 1000 or not len(last.map.cells):
         return INSUFFICIENT
-    dof = first.regression.dof
-    excess, left = first.estimate.sse - dof, last.estimate.sse - dof
-    explained = 1.0 - left / excess if excess > 0 else 1.0
+    left = last.estimate.sse - last.regression.dof
+    explained = 1.0 - left / state.excess if state.excess > 0 else 1.0
+    is_explained = last.rho < MATCH_RHO or explained >= NAMED
     if not state.found:
-        return MATCHES if last.rho < MATCH_RHO else UNKNOWN
-    if last.rho > MATCH_RHO and explained < NAMED:
+        done = bool(state.given) and is_explained and remainder(after) < MATERIAL
+        done |= bool(state.negligible) and explained > SETTLED
+        return MATCHES if last.rho < MATCH_RHO or done else UNKNOWN
+    if not is_explained:
         return UNKNOWN
     return AMBIGUOUS if any(f.alike for f in state.found[:1]) else MISSING
+
+
+def remainder(held: Residual) -> float:
+    """What a residual has beyond the sensors' noise, of the rms flow."""
+    left = max(0.0, held.rms_m3s**2 - held.floor_m3s**2)
+    return float(np.sqrt(left) / max(held.flow_m3s, 1e-12))
 
 
 def detection_limit(score: Score, rho: float) -> float:

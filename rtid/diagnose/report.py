@@ -14,6 +14,7 @@ from scipy.stats import chi2
 from rtid.diagnose.candidates import Candidate
 from rtid.diagnose.diagnosis import Found, Key, Result, detection_limit, physical
 from rtid.diagnose.fit import Fit
+from rtid.diagnose.parts import OWN_TIME
 from rtid.diagnose.regression import Score
 from rtid.effects import catalogue
 
@@ -46,6 +47,15 @@ class Effect:
 
 
 @dataclass(frozen=True)
+class Added:
+    """An effect that the project has added, as fitted to this record."""
+
+    effect: str
+    where: str
+    parameters: dict[str, Value]
+
+
+@dataclass(frozen=True)
 class Unseen:
     """An effect that was not found: the smallest size that the record would have shown."""
 
@@ -71,6 +81,7 @@ class Diagnosis:
     """Everything that `rtid diagnose` says; residuals are root mean squares behind H_f."""
 
     verdict: str
+    added: tuple[Added, ...]
     found: tuple[Effect, ...]
     rho_before: float
     rho_after: float
@@ -106,6 +117,7 @@ def diagnosis(result: Result) -> Diagnosis:
     unseen = _not_found(result)
     return Diagnosis(
         verdict=result.verdict,
+        added=tuple(Added(*p.key, parameters(last, p.key)) for p in result.given),
         found=found if result.verdict != "unknown" else (),
         rho_before=result.first.rho,
         rho_after=last.rho,
@@ -131,7 +143,7 @@ def _effect(result: Result, found: Found) -> Effect:
         effect=found.key[0],
         where=found.key[1],
         cannot_be_told_from=tuple(_named(result, found.key, key) for key in found.alike),
-        parameters=_parameters(result.last, found.key),
+        parameters=parameters(result.last, found.key),
         p_value=float(min(1.0, tests * chi2.sf(found.gain, 1))),
         heldout_gain_pct=100.0 * (1.0 - after / before),
         heldout_residual_before_m3s=before,
@@ -144,26 +156,27 @@ def _named(result: Result, best: Key, other: Key) -> str:
     return other[0] if other[1] == best[1] else f"{other[0]} ({other[1]})"
 
 
-def _parameters(fit: Fit, key: Key) -> dict[str, Value]:
-    parameters: dict[str, Value] = {}
+def parameters(fit: Fit, key: Key) -> dict[str, Value]:
+    """The parameters of a cause that is part of a fit, by name."""
+    found: dict[str, Value] = {}
     spread = np.sqrt(max(1.0, fit.rho))
     for k, (timing, psi) in enumerate(fit.revision.timings):
         if (timing.effect, "command") == key:
             for name, unit, value, j in zip(
                 timing.parameters, timing.units, psi, fit.timing_columns(k), strict=True
             ):
-                parameters[name] = Value(value, fit.estimate.sd(j) * spread, unit)
+                found[name] = Value(value, fit.estimate.sd(j) * spread, unit)
     for effect in fit.revision.effects:
         if effect.key == key:
             column = fit.column(effect)
             value, sd = fit.estimate.value(column), fit.estimate.sd(column) * spread
             scale = physical(fit, effect, 1.0)
-            parameters[effect.parameter] = Value(scale * value, scale * sd, effect.unit)
+            found[effect.parameter] = Value(scale * value, scale * sd, effect.unit)
             if effect.shape is not None:
-                parameters[effect.shape_name] = Value(effect.shape, float("nan"), effect.shape_unit)
+                found[effect.shape_name] = Value(effect.shape, float("nan"), effect.shape_unit)
             if effect.lag_s > 0:
-                parameters["own_time_constant"] = Value(effect.lag_s, float("nan"), "s")
-    return parameters
+                found[OWN_TIME] = Value(effect.lag_s, float("nan"), "s")
+    return found
 
 
 def _not_found(result: Result) -> tuple[Unseen, ...]:
@@ -173,7 +186,7 @@ def _not_found(result: Result) -> tuple[Unseen, ...]:
         known = best.get(candidate.key)
         if known is None or score.sd < known[1].sd:
             best[candidate.key] = candidate, score
-    own = {f.key for f in result.found}
+    own = {f.key for f in result.found} | {p.key for p in result.given}
     seen = [
         _limit(result, candidate, score)
         for key, (candidate, score) in best.items()
@@ -210,10 +223,8 @@ def advice(result: Result, unseen: tuple[Unseen, ...]) -> tuple[str, ...]:
     for f in result.found:
         for key in f.alike:
             page = pages.get(f.key[0])
-            separates = dict(getattr(page, "separates", {}) or {}) if page else {}
-            text = separates.get(key[0])
-            if text:
-                found.append(f"To tell {f.key[0]} from {key[0]}: {text}")
+            if page is not None and key[0] in page.confounders:
+                found.append(f"To tell {f.key[0]} from {key[0]}: {page.separates}")
     hidden = sorted({u.effect for u in unseen if not u.visible and u.detection_limit is not None})
     for name in hidden:
         page = pages.get(name)

@@ -10,7 +10,7 @@ from firmware_bridge import catalog as catalogs
 from firmware_bridge.catalog import Catalog
 from rtid.effects import UserEffect
 from rtid.model import Model
-from rtid.project import build, effects, references, schema
+from rtid.project import added, build, effects, references, schema
 from rtid.project.errors import Problem, ProjectError
 from rtid.project.project import Project, Sections
 from rtid.project.sections import Raw, read_section
@@ -72,7 +72,7 @@ def _parse(path: Path) -> Raw:
 
 
 def _read_sections(raw: Raw) -> tuple[dict[str, Any], list[Problem]]:
-    known = [*SINGLE, *NAMED, "modes"]
+    known = [*SINGLE, *NAMED, "modes", "added"]
     problems = [
         Problem(name, "unknown section", nearest(name, known)) for name in raw if name not in known
     ]
@@ -88,6 +88,8 @@ def _read_sections(raw: Raw) -> tuple[dict[str, Any], list[Problem]]:
         if name in raw:
             parts[name], found = _read_named(kind, raw[name], name)
             problems += found
+    parts["added"], found = added.read(raw.get("added", []))
+    problems += found
     modes = raw.get("modes", {})
     if isinstance(modes, dict):
         lists = {mode: edges for mode, edges in modes.items() if isinstance(edges, list)}

@@ -9,6 +9,7 @@ from pathlib import Path
 from firmware_bridge.config import Assembly
 from rtid.effects import UserEffect
 from rtid.model import Model
+from rtid.project.added import AddedSection
 from rtid.project.schema import (
     BetaSection,
     ChamberSection,
@@ -50,6 +51,7 @@ class Sections:
     estimator: EstimatorSection = field(default_factory=EstimatorSection)
     record: RecordSection = field(default_factory=RecordSection)
     effects: dict[str, EffectSection] = field(default_factory=dict)
+    added: tuple[AddedSection, ...] = ()
 
 
 @dataclass(frozen=True)

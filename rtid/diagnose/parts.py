@@ -1,0 +1,98 @@
+"""What a project has added to its model, in plain values, and back to a revision.
+
+A part names its effect, its place and the parameters that it was found with.  Shapes and timings
+are taken from it as they are; coefficients are fitted anew to every record.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from rtid.diagnose.candidates import Candidate, causes
+from rtid.diagnose.fit import Fit, Revision, first_map, split, transformed
+from rtid.diagnose.timing import TIMINGS, Psi, Timing
+from rtid.diagnose.view import View
+from rtid.errors import RtidError
+from rtid.estimator.state import Weights
+from rtid.model import FloatArray, Model
+
+COMMAND = "command"  # where every timing sits
+OWN_TIME = "own_time_constant"  # name of the lag of an effect's own dynamics
+
+
+class PartError(RtidError):
+    """An effect of the project that this record has no column for."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """One effect that was added; parameters: name -> SI value; own_spools: as of `Timing`."""
+
+    effect: str
+    where: str
+    parameters: Mapping[str, float]
+    own_spools: bool = False
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """As of a candidate."""
+        return self.effect, self.where
+
+
+def part_of(fit: Fit, key: tuple[str, str], parameters: Mapping[str, float]) -> Part:
+    """The part that a cause of a fit becomes."""
+    own = any(t.own_spools for t, _ in fit.revision.timings if (t.effect, COMMAND) == key)
+    return Part(*key, parameters, own)
+
+
+def recall(model: Model, chunk: FloatArray, weights: Weights, parts: tuple[Part, ...]) -> Revision:
+    """The revision with these parts on a record, chunk (n, 2 + signals).
+
+    Raises PartError where a part fits no effect of this machine and record.
+    """
+    timings = tuple((t, psi) for p in parts if (found := _timing(p)) for t, psi in [found])
+    fixed = [p for p in parts if p.where != COMMAND]
+    if not fixed:
+        return Revision((), timings)
+    sent, whole = transformed(model, chunk, timings), split(model)
+    view = View.of(whole, sent, weights, first_map(whole, sent, weights))
+    offered = [cause.candidate for cause in causes(view)]
+    return Revision(tuple(_candidate(p, offered) for p in fixed), timings)
+
+
+def _timing(part: Part) -> tuple[Timing, Psi] | None:
+    if part.where != COMMAND:
+        return None
+    for timing in TIMINGS:
+        if (timing.effect, timing.own_spools) == (part.effect, part.own_spools):
+            return timing, tuple(_value(part, name) for name in timing.parameters)
+    raise _unfit(part, "is no effect on a command")
+
+
+def _candidate(part: Part, offered: list[Candidate]) -> Candidate:
+    lag_s = part.parameters.get(OWN_TIME, 0.0)
+    for candidate in offered:
+        is_it = candidate.key == part.key and candidate.parameter in part.parameters
+        if is_it and candidate.lag_s == lag_s:
+            return _shaped(candidate, part)
+    raise _unfit(part, "cannot act in this record")
+
+
+def _shaped(candidate: Candidate, part: Part) -> Candidate:
+    if not candidate.shape_name:
+        return candidate
+    return replace(candidate, shape=_value(part, candidate.shape_name))
+
+
+def _value(part: Part, name: str) -> float:
+    if name not in part.parameters:
+        raise _unfit(part, f"has no parameter {name}")
+    return part.parameters[name]
+
+
+def _unfit(part: Part, problem: str) -> PartError:
+    return PartError(
+        f"the project has added {part.effect} at {part.where}, which {problem}",
+        f"rtid drop {part.effect}, or correct [[added]] in the project file",
+    )
