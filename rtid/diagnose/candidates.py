@@ -25,8 +25,10 @@ ATMOSPHERE_PA = 101325.0
 LEAST_PA = 5e4  # below, gas and vapour follow other laws: cavitation
 RELIEF_LAGS_S = (0.0, 0.02, 0.06)  # own dynamics of a relief valve
 OPENINGS = 8  # opening pressures of a relief or make-up valve that are tried, over the range
+SAG_TIMES_S = (0.05, 0.15, 0.4, 1.2)
 PUMP_FLOWS = (0.3, 0.5, 0.7, 0.85, 0.95)  # quantiles of the demand that a pump may deliver
 VAPOUR_PA = (2e4, 5e4, 1e5, 1.5e5, 2e5)  # below which gas may come out of the oil
+GROOVE_M = 0.03  # half length of a worn place
 GROOVES = 5  # places along the stroke where a wall may be worn
 SEED = 20051005  # of the noise that stands for the sensors' own
 
@@ -69,6 +71,7 @@ class Cause:
     candidate: Candidate
     column: Callable[[float | None], Volumes]
     shapes: tuple[float, ...] = ()
+    offered: bool = True  # False: the record cannot hold it, but what another one taught counts
 
     def at(self, shape: float | None) -> Candidate:
         """The candidate with this shape."""
@@ -187,18 +190,16 @@ def _internal(view: View, where: str) -> Iterator[Cause]:
     ):
         yield _fixed(Candidate(effect, where, "coefficient", unit, most), _between, view, flow)
     low, high = float(view.x_m.min()), float(view.x_m.max())
-    if high - low > 1e-3:
-        width = (high - low) / GROOVES
 
-        def worn(at: float | None) -> Volumes:
-            near = np.clip(1.0 - np.abs(view.x_m - (at or 0.0)) / width, 0.0, 1.0)
-            return _between(view, drop * near)
+    def worn(at: float | None) -> Volumes:
+        near = np.clip(1.0 - np.abs(view.x_m - (at or 0.0)) / GROOVE_M, 0.0, 1.0)
+        return _between(view, drop * near)
 
-        yield Cause(
-            Candidate("position_dependent_leakage", where, "coefficient", LAMINAR, 1e-9,
-                      shape_name="position", shape_unit="m"),
-            worn, tuple(float(v) for v in low + width * (np.arange(GROOVES) + 0.5)),
-        )  # fmt: skip
+    yield Cause(
+        Candidate("position_dependent_leakage", where, "coefficient", LAMINAR, 1e-9,
+                  shape_name="position", shape_unit="m"),
+        worn, tuple(float(v) for v in np.linspace(low, high, GROOVES)), high - low > GROOVE_M,
+    )  # fmt: skip
 
 
 def _seats(view: View) -> Iterator[Cause]:
@@ -273,14 +274,14 @@ def _storage(view: View) -> Iterator[Cause]:
             Candidate("extra_dead_volume", where, "volume", "m3", 1e-2),
             _dead_volume, view, chambers,
         )  # fmt: skip
-        if len(chambers) == 1 and min(view.pressure(c).min() for c in chambers) < VAPOUR_PA[-1]:
+        if len(chambers) == 1:
+            lowest = min(float(view.pressure(c).min()) for c in chambers)
             yield Cause(
                 Candidate("cavitation", where, "compliance", "1/Pa", 1e-3,
                           shape_name="saturation_pressure", shape_unit="Pa"),
                 partial(_vapour, view, chambers),
-                VAPOUR_PA,
+                VAPOUR_PA, lowest < VAPOUR_PA[-1],
             )  # fmt: skip
-        if len(chambers) == 1:
             yield _fixed(
                 Candidate("hose_compliance", where, "compliance", "m3/Pa", 1e-11),
                 _hose, view, chambers,
@@ -340,33 +341,41 @@ def slope_to(view: View, c: int) -> FloatArray:
 
 
 def _supply(view: View) -> Iterator[Cause]:
-    """A pump that gives way: what is drawn beyond its flow comes out of the supply line.
+    """A supply that gives way to what is drawn, in two forms.
 
-    The line falls by the volume drawn, times its stiffness, and recovers up to the nominal value.
+    By a resistance behind a lag, as a pump's characteristic and its line are; or by the volume that
+    is drawn beyond a pump's flow, times the stiffness of the line, recovering to the nominal value.
     """
-    if not view.supply_name or view.supply_is_measured:
+    if not view.supply_name:
         return
     n_e = len(view.model.edges)
     fed = [i for i, e in enumerate(view.model.edges) if e.source == view.supply_name]
     demand = np.sum([_drawn(view, i) for i in fed], axis=0)
     slopes = [view.slope_dp(i) if i in fed else np.zeros(view.n - 1) for i in range(n_e)]
-    drawn = demand[demand > 0]
-    if not len(drawn):
-        return
-    bank = tuple(float(v) for v in np.quantile(drawn, PUMP_FLOWS))
+    drawn, unmeasured = demand[demand > 0], not view.supply_is_measured
+
+    def lowered(sag: FloatArray) -> Volumes:
+        return {
+            c: -view.into_chamber(c, slopes) * sag * view.dt_s
+            for c in range(len(view.model.chambers))
+        }
+
+    bank = tuple(float(v) for v in np.quantile(drawn, PUMP_FLOWS)) if len(drawn) else ()
 
     def make(pump: float | None) -> Volumes:
         missing = np.empty(len(demand))
         draw_down(demand - (pump or 0.0), view.dt_s, missing)
-        return {
-            c: -view.into_chamber(c, slopes) * missing * view.dt_s
-            for c in range(len(view.model.chambers))
-        }
+        return lowered(missing)
 
+    yield Cause(
+        Candidate("supply_sag", view.supply_name, "resistance", "Pa s/m3", 1e12,
+                  shape_name="time_constant", shape_unit="s"),
+        lambda tau: lowered(lagged(demand, view.step_s, tau or 0.0)), SAG_TIMES_S, unmeasured,
+    )  # fmt: skip
     yield Cause(
         Candidate("supply_sag", view.supply_name, "stiffness", "Pa/m3", 1e12,
                   shape_name="pump_flow", shape_unit="m3/s"),
-        make, bank,
+        make, bank, unmeasured,
     )  # fmt: skip
 
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
+from rtid.diagnose.view import has_noise
 from rtid.kernels.engine import GAP_FLAG
 from rtid.model import PRESSURE, FloatArray, Model
 
@@ -17,6 +20,17 @@ def saturated(model: Model, chunk: FloatArray) -> NDArray[np.bool_]:
             value, reach = chunk[:, 2 + j], 1.5 * signal.resolution
             found |= (value <= signal.minimum + reach) | (value >= signal.maximum - reach)
     return found
+
+
+def as_measured(model: Model, chunk: FloatArray) -> Model:
+    """The model with no noise on pressures that are no measurements but computed values."""
+    signals = tuple(
+        replace(s, noise=0.0, resolution=0.0)
+        if s.kind == PRESSURE and not has_noise(chunk[:, 2 + j])
+        else s
+        for j, s in enumerate(model.signals)
+    )
+    return replace(model, signals=signals)
 
 
 def usable(model: Model, chunk: FloatArray) -> FloatArray:

@@ -283,7 +283,7 @@ def _offer(
         own = [e for e in revision.effects if cause.makes(e)]
         for effect in own:
             columns.offer(effect, cause.column(effect.shape))
-        if bank and not own:
+        if bank and not own and cause.offered:
             for shape in cause.shapes or (None,):
                 columns.offer(cause.at(shape), cause.column(shape))
     for cause, shape in more:

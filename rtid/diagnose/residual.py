@@ -108,7 +108,7 @@ def _noise(fit: Fit, view: View) -> FloatArray:
     noise = {
         name: np.sqrt(variance(model, name)) * rng.standard_normal(view.n)
         for name in sorted(names)
-        if np.ptp(view.signal(name)) > 0
+        if variance(model, name) > 0
     }
     still = np.zeros(view.n)
     found = np.empty((view.n - 1, len(model.chambers)))

@@ -17,8 +17,15 @@ from rtid.kernels.evidence import follow_map
 from rtid.kernels.layout import TERMS
 from rtid.model import PRESSURE, FloatArray, Model
 
+COMPUTED = 1e-5  # of the largest value: second differences of a measurement are larger
 UNKNOWN = 10.0  # standard deviation of the flow in a block that was never visited, rated flows
 SMOOTH_S = 0.02  # half width of the window for derivatives of pressures, without delay
+
+
+def has_noise(values: FloatArray) -> bool:
+    """False for a signal that a computer made: most of its second differences are nearly zero."""
+    bend = np.abs(np.diff(values, 2))
+    return bool(np.median(bend) > COMPUTED * max(float(np.abs(values).max()), 1e-300))
 
 
 @dataclass(frozen=True)
@@ -121,8 +128,8 @@ class View:
 
     @cached_property
     def supply_is_measured(self) -> bool:
-        """False where the supply's signal never moves: a nominal value, not a measurement."""
-        return bool(self.supply_name) and bool(np.ptp(self.signal(self.supply_name)) > 0)
+        """False where the supply's signal has no noise: a nominal value, not a measurement."""
+        return bool(self.supply_name) and has_noise(self.signal(self.supply_name))
 
     def over_intervals(self, flow: FloatArray) -> FloatArray:
         """Volume (n - 1,) of a flow at the samples (n,), linear between them."""
