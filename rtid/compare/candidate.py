@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rtid.estimator.flowmap import VALID, FlowMap
+from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.record import RecordFit
 from rtid.estimator.solution import Solution
 from rtid.estimator.state import Weights
@@ -60,4 +60,4 @@ def itself(candidate: Candidate) -> Candidate:
         return candidate
     known = np.isfinite(candidate.fitted[:, 0])
     theta = np.where(known[:, None], candidate.fitted, candidate.theta)
-    return replace(candidate, theta=theta, status=np.where(known, VALID, candidate.status))
+    return replace(candidate, theta=theta)

@@ -121,7 +121,7 @@ def compare(
     innovation = _innovation(model, candidate, chunk, extra_flow, held)
     own = innovation
     if seen and candidate.fitted is not None:
-        own = _innovation(model, itself(candidate), chunk, extra_flow, held)
+        own = _hold(model, itself(candidate), chunk, extra_flow).innovation
     rows = _rows(model, held, chunk)
     interval = np.clip(np.searchsorted(held.t_s, rows.t_s) - 1, 0, len(held.cell) - 1)
     return Comparison(
