@@ -26,6 +26,10 @@ COMMANDS = {
     "compare": "Compare the learned maps with a data sheet.",
     "effects": "List the physical effects that may be missing in the model, or explain one.",
     "diagnose": "Name the physical effect that is missing in the model, or say what would tell.",
+    "add": "Make a missing effect part of the model, and see the error fall.",
+    "drop": "Take an effect out of the model again.",
+    "undo": "Take the last change of the model back.",
+    "history": "List what was added to the model and dropped, and what it brought.",
     "export": "Write the learned maps as CSV, JSON or npz.",
 }
 

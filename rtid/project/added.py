@@ -68,7 +68,8 @@ class AddedSection(Section):
     trace: str = ""
     reason: str = ""
     parameters: dict[str, ParameterSection] = Field(
-        min_length=1, description="[added.parameters.coefficient]"
+        min_length=1,
+        description='parameters = {coefficient = {value = 5.8e-12, unit = "m3/s/Pa"}}',
     )
     errors: ErrorsSection = ErrorsSection()
 
@@ -85,13 +86,29 @@ def read(raw: Any) -> tuple[tuple[AddedSection, ...], list[Problem]]:
     found: dict[tuple[str, str], AddedSection] = {}
     problems: list[Problem] = []
     for k, table in enumerate(raw):
-        section, more = read_section(AddedSection, table, f"added[{k}]")
+        section, more = _read_one(table, f"added[{k}]")
         problems += more
         if section and section.key in found:
             problems.append(Problem(f"added[{k}]", "is added twice", "keep one"))
         elif section:
             found[section.key] = section
     return tuple(found.values()), problems
+
+
+def _read_one(raw: Any, path: str) -> tuple[AddedSection | None, list[Problem]]:
+    """One of them, each parameter judged as a table of its own."""
+    tables = raw.get("parameters") if isinstance(raw, dict) else None
+    if not isinstance(tables, dict):
+        return read_section(AddedSection, raw, path)
+    parameters: dict[str, ParameterSection] = {}
+    problems: list[Problem] = []
+    for name, table in tables.items():
+        section, more = read_section(ParameterSection, table, f"{path}.parameters.{name}")
+        problems += more
+        parameters |= {name: section} if section else {}
+    if problems:
+        return None, problems
+    return read_section(AddedSection, raw | {"parameters": parameters}, path)
 
 
 def text_with(text: str, sections: tuple[AddedSection, ...]) -> str:

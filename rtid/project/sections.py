@@ -6,7 +6,7 @@ Paths are those of the file: `edges.pa.dp_grid_mpa[3]`, whatever the field is ca
 
 from __future__ import annotations
 
-from typing import Any, TypeVar, get_args
+from typing import Any, TypeVar, get_args, get_origin
 
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
@@ -73,6 +73,8 @@ def _to_si(kind: type[Section], raw: Raw, path: str) -> tuple[Raw, dict[str, str
 def _nested(kind: type[Section], field: str) -> type[Section] | None:
     """The section type of a field that is a section itself, e.g. [dynamics.spool_lag]."""
     annotation = kind.model_fields[field].annotation
+    if get_origin(annotation) is dict:
+        return None
     for choice in (annotation, *get_args(annotation)):
         if isinstance(choice, type) and issubclass(choice, Section):
             return choice

@@ -1,0 +1,55 @@
+"""`rtid add`: make a missing effect part of the model, and see the error fall."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rtid.cli.exits import Exit, refuse_truncated
+from rtid.errors import RtidError
+
+
+def add(
+    words: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="[EFFECT[:WHERE]] TRACE",
+            help="The effect (what `rtid diagnose` names, without it), and a CAN log or table.",
+        ),
+    ],
+    project: Annotated[Path, typer.Option("--project", "-p", help="Project file.")],
+    force: Annotated[
+        bool, typer.Option("--force", help="Add it even if the held-out error does not fall.")
+    ] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say what would be; write nothing.")
+    ] = False,
+    reason: Annotated[str, typer.Option(help="Why, for the history.")] = "",
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Refit with one effect more, show both errors before and after, and write it to the project.
+
+    The project file keeps its comments; `rtid undo` restores it byte for byte.
+    """
+    if len(words) > 2:
+        raise RtidError(f"too many arguments: {' '.join(words[2:])}", "", Exit.USAGE)
+    name, trace = words if len(words) == 2 else ("", words[0])
+    from rtid.present import progress_bar
+    from rtid.revised_text import as_json as plain
+    from rtid.revised_text import show
+    from rtid.revising import add as add_effect
+
+    effect, _, where = name.partition(":")
+    with progress_bar(hidden=as_json) as progress:
+        done = add_effect(
+            project, Path(trace), effect, where,
+            force=force, dry_run=dry_run, reason=reason, progress=progress,
+        )  # fmt: skip
+    if as_json:
+        print(json.dumps({"trace": trace} | plain(done)))
+    else:
+        show(done)
+    refuse_truncated(Path(trace), done.counters)

@@ -1,0 +1,42 @@
+"""`rtid drop`: take an effect out of the model again."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rtid.cli.exits import refuse_truncated
+
+
+def drop(
+    effect: Annotated[str, typer.Argument(metavar="EFFECT[:WHERE]", help="An added effect.")],
+    project: Annotated[Path, typer.Option("--project", "-p", help="Project file.")],
+    trace: Annotated[
+        Path | None, typer.Argument(help="CAN log or table: also say what it costs.")
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say what would be; write nothing.")
+    ] = False,
+    reason: Annotated[str, typer.Option(help="Why, for the history.")] = "",
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Take an effect out of the project's model; with a trace, show errors before and after."""
+    from rtid.present import progress_bar
+    from rtid.revised_text import as_json as plain
+    from rtid.revised_text import show
+    from rtid.revising import drop as drop_effect
+
+    name, _, where = effect.partition(":")
+    with progress_bar(hidden=as_json or trace is None) as progress:
+        done = drop_effect(
+            project, name, where, trace, dry_run=dry_run, reason=reason, progress=progress
+        )
+    if as_json:
+        print(json.dumps(plain(done)))
+    else:
+        show(done)
+    if trace is not None:
+        refuse_truncated(trace, done.counters)

@@ -1,0 +1,24 @@
+"""`rtid history`: what was added to the model and dropped, when, why, and what it brought."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def history(
+    project: Annotated[Path, typer.Option("--project", "-p", help="Project file.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """List the changes of the model: date, effect, errors before and after, noise floor, reason."""
+    from rtid.revised_text import SCHEMA, plain, show_history
+    from rtid.revising import history as changes_of
+
+    changes = changes_of(project)
+    if as_json:
+        print(json.dumps({"schema": SCHEMA, "changes": [plain(change) for change in changes]}))
+    else:
+        show_history(changes)

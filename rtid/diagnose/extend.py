@@ -1,0 +1,205 @@
+"""Add one effect by name: fit the model without and with it, and hold both against both parts.
+
+Shapes and timings are found as the diagnosis finds them; whether the effect deserves its place is
+judged by the same limits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rtid.diagnose.clean import usable
+from rtid.diagnose.diagnosis import (
+    GAIN,
+    LEAST_SHARE,
+    MATCH_RHO,
+    MATERIAL,
+    Key,
+    State,
+    Trial,
+    alike_ones,
+    best_by_key,
+    exact_trials,
+    material_share,
+    own_share,
+    physical,
+    refined,
+    scored,
+)
+from rtid.diagnose.fit import Fit, fit, one_pass, prepare
+from rtid.diagnose.parts import COMMAND, Part, recall
+from rtid.diagnose.residual import Residual, residual
+from rtid.diagnose.timing import TIMINGS
+from rtid.errors import RtidError
+from rtid.model import FloatArray, Model
+from rtid.units import nearest
+
+
+class RefusedError(RtidError):
+    """The effect cannot be added, or does not deserve it; the text has the figures."""
+
+    exit_code = 4
+
+
+@dataclass(frozen=True)
+class Standing:
+    """A model on a record, every candidate beside it, and what it leaves of both parts."""
+
+    state: State
+    fit: Fit
+    identification: Residual
+    held_out: Residual
+
+    @classmethod
+    def of(cls, state: State, found: Fit) -> Standing:
+        """A fit held against both parts."""
+        return cls(state, found, residual(found, state.chunk), residual(found, state.held_out))
+
+
+@dataclass(frozen=True)
+class Extension:
+    """An effect that was tried: chi2 fell by `gain`; against: why it should not be added."""
+
+    key: Key
+    gain: float
+    before: Standing
+    after: Standing
+    against: tuple[str, ...]
+
+
+def _silent(_what: str, _share: float) -> None:
+    pass
+
+
+def begin(
+    model: Model,
+    chunk: FloatArray,
+    held_out: FloatArray,
+    parts: tuple[Part, ...] = (),
+    progress: Callable[[str, float], None] = _silent,
+    first: Fit | None = None,
+) -> Standing:
+    """The model with its parts on a record; chunk and held_out (n, 2 + signals).
+
+    first: its fit, where that is known.
+    """
+    chunk, held_out = usable(model, chunk), usable(model, held_out)
+    state = State(model, chunk, held_out, progress, given=parts)
+    if first is None:
+        weights = prepare(model, chunk)
+        first = fit(model, chunk, weights, recall(model, chunk, weights, parts))
+    return Standing.of(state, first)
+
+
+def extend(present: Standing, effect: str, where: str = "") -> Extension:
+    """The model with one effect more, at the place where it explains most unless one is named.
+
+    Raises RefusedError where the machine or the record offers no such effect, where its size would
+    be impossible, and where several places explain the same.
+    """
+    state = present.state
+    trials = _timings(present, effect, where) or _flows(present, effect, where)
+    best = max(trials, key=lambda t: t.gain)
+    alike = alike_ones(state, best, trials)
+    if alike:
+        choices = " or ".join(f"{effect}:{place}" for _, place in (best.key, *alike))
+        raise RefusedError(f"{effect} explains as much at several places", f"name one: {choices}")
+    now = best.fit or fit(
+        state.model, state.chunk, present.fit.weights, best.revision, present.fit.map, bank=False
+    )
+    now = one_pass(state.model, state.chunk, now.weights, now.revision, now.map, True)
+    after = Standing.of(state, now)
+    return Extension(best.key, best.gain, present, after, tuple(_against(present, after, best)))
+
+
+def _timings(present: Standing, effect: str, where: str) -> list[Trial]:
+    """Refits with a timing of that name; none if there is no such timing."""
+    timings = [t for t in TIMINGS if t.effect == effect]
+    if not timings:
+        return []
+    _refuse_place(effect, where, [COMMAND])
+    if present.fit.revision.has((effect, COMMAND)):
+        raise _already(effect, COMMAND)
+    found = exact_trials(present.state, present.fit, timings)
+    if not found:
+        raise RefusedError(
+            f"{effect} at {COMMAND}: the fit ends at nothing, or at a bound of its parameters",
+            "`rtid diagnose` says what this record would have shown",
+        )
+    return found
+
+
+def _flows(present: Standing, effect: str, where: str) -> list[Trial]:
+    """The columns of that name, each with its best shape."""
+    fit_ = present.fit
+    offered = [(c, s) for c, s in scored(fit_) if c.effect == effect]
+    taken = [e.where for e in fit_.revision.effects if e.effect == effect]
+    places = list(dict.fromkeys([*taken, *(c.where for c, _ in offered)]))
+    if not places:
+        raise RefusedError(
+            f"{effect} has no column in the pressure equations of this machine and record",
+            f"`rtid effects {effect}` says what it acts on and which signals it needs",
+        )
+    _refuse_place(effect, where, places)
+    if where in taken or set(places) == set(taken):
+        raise _already(effect, where or taken[0])
+    offered = [(c, s) for c, s in offered if where in ("", c.where)]
+    possible = best_by_key(fit_, offered)
+    if not possible:
+        candidate, score = max(offered, key=lambda o: o[1].gain)
+        value = physical(fit_, candidate, score.value)
+        raise RefusedError(
+            f"{effect} at {candidate.where} would have {candidate.parameter} {value:.3g} "
+            f"{candidate.unit}, which is physically impossible",
+            "something else is missing: `rtid diagnose` names it",
+        )
+    trials = []
+    for key, (candidate, score) in possible.items():
+        revision = replace(fit_.revision, effects=(*fit_.revision.effects, candidate))
+        trials.append(Trial(key, score.gain, revision, score.column))
+    return refined(present.state, fit_, trials)
+
+
+def _refuse_place(effect: str, where: str, places: list[str]) -> None:
+    if where and where not in places:
+        raise RefusedError(
+            f"{effect} does not act at {where!r} of this machine", nearest(where, places)
+        )
+
+
+def _already(effect: str, where: str) -> RefusedError:
+    return RefusedError(
+        f"{effect} at {where} is part of the model already", f"`rtid drop {effect}` takes it out"
+    )
+
+
+def _against(before: Standing, after: Standing, trial: Trial) -> Iterator[str]:
+    """What speaks against an effect, with figures."""
+    old, new = before.held_out, after.held_out
+    figures = f"held-out error {_percent(old)} without it, {_percent(new)} with it"
+    if not np.isfinite(new.rms_m3s + old.rms_m3s):
+        yield "the held-out part has no place where the map is known"
+        return
+    if new.rms_m3s >= old.rms_m3s:
+        yield f"it does not lower the held-out error: {figures}"
+    elif material_share(old, new) < MATERIAL or _own(after, trial) < MATERIAL:
+        yield f"it changes next to nothing: {figures}"
+    if trial.gain <= GAIN:
+        yield f"it is not significant: chi2 falls by {max(0.0, trial.gain):.1f}, {GAIN:.0f} needed"
+    left = before.fit.estimate.sse - before.fit.regression.dof
+    if before.fit.rho > MATCH_RHO and trial.gain < LEAST_SHARE * left:
+        yield (
+            f"it explains {100 * max(0.0, trial.gain) / left:.2g} % of the misfit: "
+            f"something else is missing first ({figures})"
+        )
+
+
+def _own(after: Standing, trial: Trial) -> float:
+    return own_share(after.fit, trial, after.state.held_out)
+
+
+def _percent(held: Residual) -> str:
+    return f"{100 * held.rms_m3s / held.flow_m3s:.2f} %"
