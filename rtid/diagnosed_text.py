@@ -30,7 +30,7 @@ def show(found: Diagnosis) -> None:
 
 def sentences(found: Diagnosis) -> list[str]:
     """The verdict in plain words."""
-    lines = [_head(found)]
+    lines = [*_added(found), _head(found)]
     lines += [_one(found, effect) for effect in found.found]
     if found.something_remains:
         lines.append(
@@ -41,6 +41,11 @@ def sentences(found: Diagnosis) -> list[str]:
         names = ", ".join(f"{title(s.effect)} ({s.where})" for s in found.negligible)
         lines.append(f"Present but negligible: {names}.")
     return lines + [f"{text}" for text in found.advice[:4]]
+
+
+def _added(found: Diagnosis) -> list[str]:
+    names = ", ".join(f"{title(a.effect)} at {a.where}" for a in found.added)
+    return [f"The model has {names}, added before."] if names else []
 
 
 def _head(found: Diagnosis) -> str:

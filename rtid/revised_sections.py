@@ -10,7 +10,7 @@ import numpy as np
 
 from rtid.diagnose.extend import Extension, Standing
 from rtid.diagnose.report import Value, parameters
-from rtid.diagnose.residual import Residual
+from rtid.diagnose.residual import ROWS_PER_S, Residual
 from rtid.project.added import AddedSection, ChangeSection, ErrorsSection, ParameterSection
 
 
@@ -62,6 +62,7 @@ def errors_between(before: Standing, after: Standing) -> ErrorsSection:
         heldout_pct=_pair(*(_share(s.held_out) for s in (before, after))),
         noise_floor_m3s=_finite(after.held_out.floor_m3s),
         noise_floor_pct=_finite(100 * after.held_out.floor_m3s / after.held_out.flow_m3s),
+        judged_s=len(after.held_out.t_s) / ROWS_PER_S,
     )
 
 

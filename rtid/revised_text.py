@@ -24,7 +24,7 @@ def show(done: Revised) -> None:
     """Print what a command did, or would do."""
     console = _console()
     for change in done.changes:
-        for line in sentences(change):
+        for line in sentences(change, done.is_written):
             console.print(line, markup=False)
     if done.note:
         console.print(done.note, markup=False)
@@ -35,17 +35,18 @@ def show(done: Revised) -> None:
         console.print(f"{done.project} is as it was: a trial", markup=False)
 
 
-def sentences(change: Change) -> list[str]:
+def sentences(change: Change, is_written: bool = True) -> list[str]:
     """One change in plain words, with bars of the held-out error where it was judged."""
+    verb = "is" if is_written else "would be"
     name = f"{title(change.effect)} at {change.where}"
     if change.change == UNDO:
         return [f"Change {change.undoes} is taken back: {name}."]
     if change.change == ADD:
         values = change.section["parameters"].items()
         sizes = ", ".join(f"{n.replace('_', ' ')} {_quantity(v)}" for n, v in values)
-        lines = [f"{name} is part of the model: {sizes}."]
+        lines = [f"{name} {verb} part of the model: {sizes}."]
     else:
-        lines = [f"{name} is no longer part of the model."]
+        lines = [f"{name} {verb} no longer part of the model."]
     return lines + _errors(change.errors)
 
 
@@ -54,24 +55,27 @@ def _quantity(value: Mapping[str, Any]) -> str:
 
 
 def _errors(errors: Mapping[str, Any]) -> list[str]:
+    """Sentences on both parts; none where no trace was there to judge by."""
     if not errors:
         return []
-    rho, lines = errors.get("rho", {}), []
-    if len(rho) == 2:
+    rho, learned = errors.get("rho", {}), errors.get("identification_pct", {})
+    held, floor = errors.get("heldout_pct", {}), errors.get("noise_floor_pct")
+    lines = []
+    if len(rho) == len(learned) == 2:
         lines.append(
-            f"Residual variance of the identification part: {rho['before']:.3g} times the noise "
-            f"before, {rho['after']:.3g} after."
+            f"Identification part: error {_fall(learned)}; residual variance {rho['before']:.3g} "
+            f"times the noise before, {rho['after']:.3g} after."
         )
-    floor = errors.get("noise_floor_pct")
-    for part, words in (("identification", "identification part"), ("heldout", "held-out part")):
-        pair = errors.get(f"{part}_pct", {})
-        if len(pair) == 2:
-            below = "" if floor is None else f"; the sensors' floor is {floor:.2f} %"
-            lines.append(
-                f"Error of the {words}: {pair['before']:.2f} % of the rms flow before, "
-                f"{pair['after']:.2f} % after{below if part == 'heldout' else ''}."
-            )
-    return lines + bars(errors.get("heldout_pct", {}), floor)
+    if len(held) == 2 and floor is not None:
+        lines.append(
+            f"Held-out part: error {_fall(held)}; the sensors' floor is {floor:.2f} % "
+            f"(over the {errors.get('judged_s', 0.0):.1f} s where the map is known)."
+        )
+    return lines + bars(held, floor)
+
+
+def _fall(pair: Mapping[str, float]) -> str:
+    return f"{pair['before']:.2f} % of the rms flow before, {pair['after']:.2f} % after"
 
 
 def bars(pair: Mapping[str, float], floor: float | None) -> list[str]:
@@ -92,14 +96,14 @@ def show_history(changes: Sequence[Change]) -> None:
     """Print the table of all changes."""
     table = Table(title="history: errors in % of the rms flow", title_justify="left")
     for name in ("", "date", "change", "identification", "held-out", "floor", "reason"):
-        table.add_column(name)
+        table.add_column(name, overflow="fold", no_wrap=name in ("date", "identification"))
     alive = {change.number for change in standing(changes)}
     for c in changes:
         taken_back = c.change != UNDO and c.number not in alive
         table.add_row(
             str(c.number),
-            c.date[:16].replace("T", " "),
-            f"{c.change} {c.effect} ({c.where})" + (", taken back" if taken_back else ""),
+            c.date[:10],
+            f"{c.change} {c.effect}:{c.where}" + (" (taken back)" if taken_back else ""),
             _arrow(c.errors.get("identification_pct", {})),
             _arrow(c.errors.get("heldout_pct", {})),
             f"{c.errors['noise_floor_pct']:.2f}" if "noise_floor_pct" in c.errors else "",

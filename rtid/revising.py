@@ -65,7 +65,8 @@ def add(
         _refuse_unknown(effect, loaded)
         present, counters = _begin(loaded, trace, progress)
         progress("fitting with the effect", 0.5)
-        extensions, note = [extend(present, effect, where)], ""
+        extensions = [extend(present, effect, where)]
+        note = extensions[0].better and f"{extensions[0].better}."
         if not force:
             _refuse_useless(extensions[0])
     else:
@@ -163,7 +164,7 @@ def _refuse_useless(extension: Extension) -> None:
         effect, where = extension.key
         raise RefusedError(
             f"{effect} at {where} is refused: {'; '.join(extension.against)}",
-            "`rtid diagnose` names what is missing; --force adds it all the same",
+            f"{extension.better}; ".lstrip("; ") + "--force adds it all the same",
         )
 
 

@@ -17,6 +17,8 @@ from rtid.diagnose.diagnosis import (
     LEAST_SHARE,
     MATCH_RHO,
     MATERIAL,
+    TIE,
+    TIE_SHARE,
     Key,
     State,
     Trial,
@@ -61,13 +63,17 @@ class Standing:
 
 @dataclass(frozen=True)
 class Extension:
-    """An effect that was tried: chi2 fell by `gain`; against: why it should not be added."""
+    """An effect that was tried: chi2 fell by `gain`; against: why it should not be added.
+
+    better: in plain words, a cause that would explain clearly more, else empty.
+    """
 
     key: Key
     gain: float
     before: Standing
     after: Standing
     against: tuple[str, ...]
+    better: str
 
 
 def _silent(_what: str, _share: float) -> None:
@@ -112,7 +118,8 @@ def extend(present: Standing, effect: str, where: str = "") -> Extension:
     )
     now = one_pass(state.model, state.chunk, now.weights, now.revision, now.map, True)
     after = Standing.of(state, now)
-    return Extension(best.key, best.gain, present, after, tuple(_against(present, after, best)))
+    against = tuple(_against(present, after, best))
+    return Extension(best.key, best.gain, present, after, against, _better(present, best))
 
 
 def _timings(present: Standing, effect: str, where: str) -> list[Trial]:
@@ -185,8 +192,10 @@ def _against(before: Standing, after: Standing, trial: Trial) -> Iterator[str]:
         return
     if new.rms_m3s >= old.rms_m3s:
         yield f"it does not lower the held-out error: {figures}"
-    elif material_share(old, new) < MATERIAL or _own(after, trial) < MATERIAL:
+    elif material_share(old, new) < MATERIAL:
         yield f"it changes next to nothing: {figures}"
+    elif (own := own_share(after.fit, trial, after.state.held_out)) < MATERIAL:
+        yield f"its own flow on the held-out part is {100 * own:.2g} % of the rms flow: {figures}"
     if trial.gain <= GAIN:
         yield f"it is not significant: chi2 falls by {max(0.0, trial.gain):.1f}, {GAIN:.0f} needed"
     left = before.fit.estimate.sse - before.fit.regression.dof
@@ -197,8 +206,16 @@ def _against(before: Standing, after: Standing, trial: Trial) -> Iterator[str]:
         )
 
 
-def _own(after: Standing, trial: Trial) -> float:
-    return own_share(after.fit, trial, after.state.held_out)
+def _better(present: Standing, trial: Trial) -> str:
+    """The fixed column that chi2 would fall by clearly more with."""
+    best = best_by_key(present.fit, scored(present.fit))
+    gains = {key: score.gain for key, (_, score) in best.items() if key[1] != COMMAND}
+    key = max(gains, key=lambda k: gains[k], default=trial.key)
+    if key == trial.key or gains[key] <= trial.gain * (1 + TIE_SHARE) + TIE:
+        return ""
+    return (
+        f"{key[0]} at {key[1]} would explain {gains[key] / max(trial.gain, 1.0):.1f} times as much"
+    )
 
 
 def _percent(held: Residual) -> str:

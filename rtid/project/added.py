@@ -21,7 +21,7 @@ from typing import Any
 import tomlkit
 from pydantic import Field
 from tomlkit import TOMLDocument
-from tomlkit.items import AoT, InlineTable, Table
+from tomlkit.items import InlineTable, Table
 
 from rtid.project.errors import Problem
 from rtid.project.schema import Section
@@ -46,7 +46,8 @@ class ChangeSection(Section):
 class ErrorsSection(Section):
     """[added.errors]: root mean square residuals behind H_f, also in per cent of the rms flow.
 
-    rho: residual variance of the identification part, of the sensors' noise.
+    rho: residual variance of the identification part, of the sensors' noise; judged_s: of the
+    held-out part, where the map is known well enough.
     """
 
     rho: ChangeSection = ChangeSection()
@@ -56,6 +57,7 @@ class ErrorsSection(Section):
     heldout_pct: ChangeSection = ChangeSection()
     noise_floor_m3s: float | None = Field(default=None, ge=0)
     noise_floor_pct: float | None = Field(default=None, ge=0)
+    judged_s: float | None = Field(default=None, ge=0)
 
 
 class AddedSection(Section):
@@ -139,12 +141,12 @@ def _update(table: Table, section: AddedSection) -> None:
 
 
 def _append(document: TOMLDocument, sections: list[AddedSection]) -> None:
+    if sections and "added" not in document:
+        document["added"] = tomlkit.aot()
     for section in sections:
-        if not isinstance(document.get("added"), AoT):
-            if not tomlkit.dumps(document).endswith("\n\n"):
-                document.add(tomlkit.nl())
-            document["added"] = tomlkit.aot()
-        document["added"].append(_table(section))
+        table = _table(section)
+        table.trivia.indent = "\n"  # an empty line before it
+        document["added"].append(table)
 
 
 def _table(section: AddedSection) -> Table:
