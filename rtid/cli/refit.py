@@ -1,0 +1,51 @@
+"""`rtid refit`: fit a plant by its equations to a record, and find what its equations miss."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def refit(
+    plant: Annotated[Path, typer.Argument(help="Plant file (TOML) with the equations.")],
+    table: Annotated[Path, typer.Argument(help="Record: CSV, Parquet, .mat.")],
+    diagnose: Annotated[
+        bool, typer.Option("--diagnose", help="Find the effects that are missing and add them.")
+    ] = False,
+    add: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--add", help="EFFECT:WHERE, e.g. overflow:x1; may be given twice (see `rtid effects`)."
+        ),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Fit parameters and initial states of a plant so that its free run follows the record.
+
+    For plants with a state that nobody measures, and for nonlinear parameters.  The validation part
+    is never used to fit or to choose.
+    """
+    from rtid.compared_text import make_console
+    from rtid.refitted import as_json as to_json
+    from rtid.refitted import tell
+    from rtid.refitting import load_plant, load_records, run
+
+    keys = tuple(_key(text) for text in add or ())
+    file = load_plant(plant)
+    found = run(file, load_records(file, table), keys, with_diagnosis=diagnose)
+    if as_json:
+        print(json.dumps(to_json(found)))
+    else:
+        tell(make_console(), found)
+
+
+def _key(text: str) -> tuple[str, str]:
+    effect, _, where = text.partition(":")
+    if not (effect and where):
+        raise typer.BadParameter(
+            f"{text!r} names no effect and place", param_hint="--add EFFECT:WHERE, overflow:x1"
+        )
+    return effect, where

@@ -1,0 +1,289 @@
+"""Fit of a plant to a record by the error of its free run, from many starts.
+
+    minimise  sum over samples and outputs of  ((y - g(x(t; p, x0))) / scale)^2
+
+The parameters' covariance counts the memory of the residual; directions in which the record says
+nothing are named.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from rtid.effects.tree import FloatArray
+from rtid.output_error.plant import Parameter, Plant, PlantError, Record
+from rtid.output_error.simulation import Simulator, resolved
+from rtid.output_error.statistics import covariance, memory
+
+STARTS = 64  # random starts that are run
+POLISHED = 3  # the best of them that are fitted
+MOST_RUNS = 60
+ROUGH_RUNS = 8  # of the fit from a start that competes with others
+FINE, ROUGH = 1e-6, 1e-3  # relative change of the sum of squares that ends a fit
+ILL_CONDITIONED = 1e6  # of the Jacobian with columns of unit length
+ROUNDING = 1e-5  # step of the differences, of a parameter's scale
+FAR = 1e3  # residual of a run that has left every range, in units of the output
+INFINITE_RANGE = 10.0  # of the start value, where a parameter has no bounds
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted plant: values (unknowns,), residual (n, outputs), jacobian (n, outputs, unknowns).
+
+    The residual is NaN where nothing was measured or used.
+    """
+
+    simulator: Simulator
+    values: FloatArray
+    output: FloatArray
+    states: FloatArray
+    residual: FloatArray
+    jacobian: FloatArray
+    mask: NDArray[np.bool_]
+
+    @property
+    def plant(self) -> Plant:
+        """The plant that was fitted."""
+        return self.simulator.plant
+
+    @property
+    def sse(self) -> float:
+        """Sum of squares in units of the outputs' scales."""
+        scaled = self.residual / scales(self.simulator)
+        return float(np.nansum(scaled**2))
+
+    @property
+    def rmse(self) -> FloatArray:
+        """Root mean square of the free run's error per output, in its unit."""
+        return np.sqrt(np.nanmean(self.residual**2, axis=0))
+
+    @property
+    def samples(self) -> int:
+        """Number of residuals."""
+        return int(np.isfinite(self.residual).sum())
+
+    @cached_property
+    def worth(self) -> float:
+        """Number of independent samples that the residuals are worth."""
+        columns = self.residual.T
+        return float(sum(np.isfinite(e).sum() / memory(e)[0] for e in columns))
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Covariance (unknowns, unknowns) of the values; zero at those that stand at a bound."""
+        scale = scales(self.simulator)
+        free = self.free
+        found = np.zeros((len(self.values), len(self.values)))
+        some = covariance(self.jacobian[:, :, free] / scale[:, None], self.residual / scale)
+        found[np.ix_(free, free)] = some
+        return found
+
+    @property
+    def sd(self) -> FloatArray:
+        """Standard deviation of every value; NaN where it stands at a bound."""
+        spread = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        return np.where(self.free, spread, np.nan)
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """Which values are not held by a bound."""
+        low, high = bounds(self.plant.unknowns)
+        near = 1e-6 * steps(self.plant.unknowns)
+        return (self.values - low > near) & (high - self.values > near)
+
+    @cached_property
+    def condition(self) -> tuple[float, tuple[str, ...]]:
+        """Condition of the scaled Jacobian, and the unknowns of its weakest direction if ill."""
+        free = np.flatnonzero(self.free)
+        flat = (self.jacobian / scales(self.simulator)[:, None])[self.mask][:, free]
+        length = np.linalg.norm(flat, axis=0)
+        names = [self.plant.unknowns[k].name for k in free]
+        if not len(free):
+            return 1.0, ()
+        if not length.all():
+            return np.inf, tuple(n for n, size in zip(names, length, strict=True) if not size)
+        _, sizes, directions = np.linalg.svd(flat / length, full_matrices=False)
+        number = float(sizes[0] / max(sizes[-1], 1e-300))
+        weak = np.abs(directions[-1]) > 0.1
+        ill = number > ILL_CONDITIONED
+        return number, tuple(n for n, w in zip(names, weak, strict=True) if w and ill)
+
+    def value(self, name: str) -> tuple[float, float]:
+        """Value and standard deviation of one unknown."""
+        k = [p.name for p in self.plant.unknowns].index(name)
+        return float(self.values[k]), float(self.sd[k])
+
+
+def bounds(unknowns: tuple[Parameter, ...]) -> tuple[FloatArray, FloatArray]:
+    """Lowest and highest values."""
+    return np.array([p.low for p in unknowns]), np.array([p.high for p in unknowns])
+
+
+def steps(unknowns: tuple[Parameter, ...]) -> FloatArray:
+    """The scale of every unknown."""
+    found = []
+    for p in unknowns:
+        width = p.high - p.low
+        size = max(abs(p.start), 0.01 * width if np.isfinite(width) else 0.0)
+        found.append(size or 1.0)
+    return np.array(found)
+
+
+def scales(simulator: Simulator) -> FloatArray:
+    """What the error of each output is divided by: its noise where known, else its spread."""
+    noise = np.array([o.noise for o in simulator.plant.outputs])
+    spread = np.nanstd(simulator.record.y, axis=0)
+    if not (spread > 0).all():
+        raise PlantError("an output does not move", "a fit needs a record with motion")
+    return spread if np.isnan(noise).any() else noise
+
+
+class _Problem:
+    """The least-squares problem in scaled unknowns; `open` are those that may move."""
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        values: FloatArray,
+        opened: NDArray[np.bool_],
+        mask: NDArray[np.bool_],
+    ) -> None:
+        self.simulator, self.values, self.open = simulator, values, opened
+        self.mask = mask
+        unknowns = simulator.plant.unknowns
+        self.step, (self.low, self.high) = steps(unknowns), bounds(unknowns)
+        self.scale = scales(simulator)
+
+    def errors(self, lanes: FloatArray) -> FloatArray:
+        """Scaled errors (samples used, lanes) for values (unknowns, lanes)."""
+        y, _ = self.simulator.run(np.ascontiguousarray(lanes))
+        wrong = (y - self.simulator.record.y[:, :, None]) / self.scale[:, None]
+        return np.nan_to_num(wrong[self.mask], nan=FAR, posinf=FAR, neginf=-FAR)
+
+    def full(self, z: FloatArray) -> FloatArray:
+        values = self.values.copy()
+        values[self.open] = z * self.step[self.open]
+        return np.clip(values, self.low, self.high)
+
+    def error(self, z: FloatArray) -> FloatArray:
+        return self.errors(self.full(z)[:, None])[:, 0]
+
+    def slopes(self, z: FloatArray) -> FloatArray:
+        """Jacobian (samples used, open unknowns) by central differences, one run of all lanes."""
+        values, index = self.full(z), np.flatnonzero(self.open)
+        lanes = np.repeat(values[:, None], 2 * len(index), axis=1)
+        h = ROUNDING * self.step[index]
+        for k, i in enumerate(index):
+            lanes[i, 2 * k] = min(values[i] + h[k], self.high[i])
+            lanes[i, 2 * k + 1] = max(values[i] - h[k], self.low[i])
+        apart = (lanes[index, 0::2] - lanes[index, 1::2]).diagonal() / self.step[index]
+        e = self.errors(lanes)
+        return (e[:, 0::2] - e[:, 1::2]) / apart
+
+    def solve(
+        self, start: FloatArray, most: int, tolerance: float = FINE
+    ) -> tuple[FloatArray, float]:
+        """Best values from a start, and half their sum of squares."""
+        low = self.low[self.open] / self.step[self.open]
+        high = self.high[self.open] / self.step[self.open]
+        at = start[self.open] / self.step[self.open]
+        inset = 1e-9 * np.maximum(1.0, np.abs(at))  # scipy wants a start inside
+        at = np.clip(at, low + inset, high - inset)
+        done = least_squares(
+            self.error,
+            at,
+            self.slopes,
+            (low, high),
+            x_scale="jac",
+            max_nfev=most,
+            ftol=tolerance,
+            xtol=1e-8,
+        )
+        return self.full(done.x), float(done.cost)
+
+
+def fit(
+    plant: Plant,
+    record: Record,
+    starts: FloatArray | None = None,
+    *,
+    mask: NDArray[np.bool_] | None = None,
+    polished: int = POLISHED,
+    most_runs: int = MOST_RUNS,
+    sub_steps: int = 1,
+    fixed_step: bool = False,
+    only_initial: bool = False,
+) -> Fit:
+    """Fit all unknowns, or only the initial values of the states.
+
+    starts (lanes, unknowns): where to start, the best of them are polished; None draws them between
+    the bounds.  mask (n, outputs): which outputs count.  sub_steps: at least so many per sample,
+    exactly so many with a fixed step.
+    """
+    used = record.used if mask is None else mask & record.used
+    unknowns = plant.unknowns
+    lanes = drawn(unknowns) if starts is None else np.atleast_2d(starts)
+    opened = np.ones(len(unknowns), bool)
+    if only_initial:
+        opened[: len(plant.parameters)] = False
+    simulator = (
+        Simulator(plant, record, sub_steps)
+        if fixed_step
+        else _resolved(plant, record, lanes, sub_steps)
+    )
+    problem = _Problem(simulator, lanes[0].copy(), opened, used)
+    best = _best_start(problem, lanes, polished, most_runs)
+    finer = simulator if fixed_step else resolved(plant, record, best, simulator.sub_steps)
+    if finer.sub_steps > simulator.sub_steps:
+        problem = _Problem(finer, best, opened, used)
+        best, _ = problem.solve(best, most_runs)
+    return _finished(problem, best)
+
+
+def _resolved(plant: Plant, record: Record, lanes: FloatArray, least: int) -> Simulator:
+    """The step that the first start that can be run asks for."""
+    for values in lanes[:-1]:
+        try:
+            return resolved(plant, record, values, least)
+        except PlantError:
+            continue
+    return resolved(plant, record, lanes[-1], least)
+
+
+def _best_start(problem: _Problem, lanes: FloatArray, polished: int, most_runs: int) -> FloatArray:
+    cost = (problem.errors(lanes.T) ** 2).sum(axis=0)
+    order = np.argsort(cost)[:polished]
+    if len(order) > 1:  # a few steps show which starts lead to the same place
+        rough = [problem.solve(lanes[k], ROUGH_RUNS, ROUGH) for k in order]
+        return problem.solve(min(rough, key=lambda r: r[1])[0], most_runs)[0]
+    return problem.solve(lanes[order[0]], most_runs)[0]
+
+
+def _finished(problem: _Problem, values: FloatArray) -> Fit:
+    simulator = problem.simulator
+    y, states = simulator.run(values[:, None])
+    residual = np.where(problem.mask, simulator.record.y - y[:, :, 0], np.nan)
+    whole = _Problem(simulator, values, np.ones(len(values), bool), np.ones_like(problem.mask))
+    slopes = whole.slopes(values / whole.step) / whole.step
+    jacobian = slopes.reshape(*residual.shape, len(values)) * whole.scale[:, None]
+    return Fit(simulator, values, y[:, :, 0], states[:, :, 0], residual, jacobian, problem.mask)
+
+
+def drawn(unknowns: tuple[Parameter, ...], n: int = STARTS) -> FloatArray:
+    """Start values (n, unknowns): the given ones first, then drawn between the bounds."""
+    rng = np.random.default_rng(0)
+    found = np.empty((n, len(unknowns)))
+    for k, p in enumerate(unknowns):
+        reach = INFINITE_RANGE * max(abs(p.start), 1.0)
+        low, high = max(p.low, p.start - reach), min(p.high, p.start + reach)
+        if low > 0 and high / low > 10:
+            found[:, k] = np.exp(rng.uniform(np.log(low), np.log(high), n))
+        else:
+            found[:, k] = rng.uniform(low, high, n)
+    found[0] = [p.start for p in unknowns]
+    return found
