@@ -1,0 +1,180 @@
+"""Add, drop, undo: the whole cycle on simulated records, from the diagnosis and back."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from shutil import copy
+
+import pytest
+
+from rtid.cli import main
+from rtid.cli.exits import Exit
+from rtid.diagnose.extend import RefusedError
+from rtid.diagnosing import diagnose_trace
+from rtid.effects import EffectError
+from rtid.project import load
+from rtid.project.history import path_of
+from rtid.revising import add, drop, history, undo
+from rtid.sim.hidden import hide_wish
+from rtid.sim.plant import Plant
+from rtid.sim.recording import write_run
+from rtid.sim.run import simulate
+
+LEAK, DRIFT = "internal_leakage_laminar", "valve_gain_drift"
+TRUTH = 2e-12  # m3/s/Pa, of the middle strength
+
+
+def recorded(folder: Path, wish: str, duration_s: float) -> Path:
+    """A record with something hidden; its project file, with a comment of the user."""
+    trace = folder / "trace.parquet"
+    write_run(trace, simulate(hide_wish(Plant(), wish), "rich", 0, duration_s), 0, "rich")
+    project = folder / "trace.toml"
+    project.write_text(project.read_text() + "# the pump was changed in May\n")
+    return project
+
+
+@pytest.fixture(scope="module")
+def leaking(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return recorded(tmp_path_factory.mktemp("leak"), f"{LEAK}=middle", 40.0)
+
+
+@pytest.fixture
+def project(leaking: Path, tmp_path: Path) -> Path:
+    return Path(copy(leaking, tmp_path / "machine.toml"))
+
+
+@pytest.fixture(scope="module")
+def trace(leaking: Path) -> Path:
+    return leaking.with_name("trace.parquet")
+
+
+def ends(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as end:
+        main.run([str(a) for a in arguments])
+    return int(end.value.code or 0)
+
+
+def test_diagnose_add_matches_undo_and_named_again(
+    project: Path, trace: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old = project.read_bytes()
+    assert ends("add", trace, "--project", project, "--json") == Exit.OK
+    done = json.loads(capsys.readouterr().out)
+    assert [(c["effect"], c["where"]) for c in done["changes"]] == [(LEAK, "a-b")]
+    assert project.read_bytes().startswith(old), "what the user wrote stays, comments and all"
+
+    (section,) = load(project).sections.added
+    errors, size = section.errors, section.parameters["coefficient"]
+    assert size.value == pytest.approx(TRUTH, rel=0.15)
+    assert size.unit == "m3/s/Pa" and 0 < (size.sd or 0) < 0.1 * TRUTH
+    assert (errors.rho.before or 0) > 50 and (errors.rho.after or 9) < 1.5
+    for pair in (errors.identification_pct, errors.heldout_pct):
+        assert (pair.after or 9) < 0.25 * (pair.before or 0)
+    assert (errors.heldout_m3s.after or 9) < 1.3 * (errors.noise_floor_m3s or 0)
+    assert section.date is not None and section.trace == trace.name
+    assert section.reason.startswith("named by the diagnosis")
+
+    after = diagnose_trace(load(project), trace).diagnosis
+    assert (after.verdict, after.found) == ("matches", ())
+    assert [(a.effect, a.where) for a in after.added] == [(LEAK, "a-b")]
+    assert after.added[0].parameters["coefficient"].value == pytest.approx(size.value, rel=1e-2)
+    assert after.rho_before == pytest.approx(errors.rho.after, rel=0.05)
+    assert LEAK not in {u.effect for u in after.not_found}
+    with pytest.raises(RefusedError, match="matches"):
+        add(project, trace)
+
+    assert ends("undo", "--project", project) == Exit.OK
+    assert project.read_bytes() == old
+    again = diagnose_trace(load(project), trace).diagnosis
+    assert [(f.effect, f.where) for f in again.found] == [(LEAK, "a-b")]
+
+    capsys.readouterr()
+    assert ends("history", "--project", project, "--json") == Exit.OK
+    told = json.loads(capsys.readouterr().out)["changes"]
+    assert [c["change"] for c in told] == ["add", "undo"]
+    assert told[1]["errors"]["heldout_pct"]["after"] == errors.heldout_pct.before
+
+
+def test_two_adds_then_two_undos(project: Path, trace: Path) -> None:
+    texts = [project.read_bytes()]
+    add(project, trace, LEAK, "a-b", reason="the seal is old")
+    texts.append(project.read_bytes())
+    first = load(project).sections.added[0]
+    done = add(project, trace, DRIFT, force=True)
+    assert done.is_written and done.changes[0].reason.startswith("forced: ")
+    both = load(project).sections.added
+    assert [s.effect for s in both] == [LEAK, DRIFT]
+    assert both[0].reason == "the seal is old" and both[0].errors == first.errors
+    assert both[0].parameters != first.parameters, "refitted with the second one"
+
+    cost = drop(project, LEAK, trace=trace, dry_run=True).changes[0].errors
+    assert cost["heldout_pct"]["after"] > 4 * cost["heldout_pct"]["before"]
+    for text in reversed(texts):
+        undo(project)
+        assert project.read_bytes() == text
+    assert len(history(project)) == 4
+
+
+def test_a_wrong_effect_is_refused_with_figures(
+    project: Path, trace: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old = project.read_bytes()
+    assert ends("add", DRIFT, trace, "--project", project) == Exit.NEGATIVE
+    told = capsys.readouterr().err
+    assert "does not lower the held-out error" in told and " % with it" in told
+    assert LEAK in told, "and what would explain more"
+    assert project.read_bytes() == old
+    assert not path_of(project).exists()
+
+
+def test_a_trial_writes_nothing(
+    project: Path, trace: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old = project.read_bytes()
+    assert ends("add", LEAK, trace, "--project", project, "--dry-run") == Exit.OK
+    told = capsys.readouterr().out
+    assert "would be part of the model" in told and "Held-out part: error" in told
+    assert project.read_bytes() == old
+    assert sorted(p.name for p in project.parent.iterdir()) == ["machine.toml"]
+
+
+def test_bad_names_are_refused_before_the_fit(project: Path) -> None:
+    nowhere = Path("no such trace")
+    with pytest.raises(EffectError) as caught:
+        add(project, nowhere, "internal_leakage_laminr")
+    assert LEAK in caught.value.remedy
+    project.chmod(0o444)
+    with pytest.raises(Exception, match="read-only"):
+        add(project, nowhere, LEAK)
+
+
+@pytest.mark.parametrize(
+    ("effect", "where", "told"),
+    [
+        (LEAK, "b", "does not act at 'b'"),
+        ("coulomb_friction", "", "has no column"),
+        ("input_delay", "a", "does not act at 'a'"),
+    ],
+)
+def test_what_this_machine_cannot_have(
+    project: Path, trace: Path, effect: str, where: str, told: str
+) -> None:
+    with pytest.raises(RefusedError, match=told) as caught:
+        add(project, trace, effect, where)
+    assert caught.value.remedy
+
+
+def test_a_set_of_equals_needs_a_choice(tmp_path: Path) -> None:
+    """20 s do not tell a delay from a spool of second order."""
+    project = recorded(tmp_path, "input_delay=middle", 20.0)
+    old, trace = project.read_bytes(), project.with_name("trace.parquet")
+    with pytest.raises(RefusedError, match="apart") as caught:
+        add(project, trace)
+    assert "input_delay:command" in caught.value.remedy
+    assert project.read_bytes() == old
+    chosen = add(project, trace, "input_delay", force=True)
+    delay = chosen.changes[0].section["parameters"]["delay"]
+    assert delay["value"] == pytest.approx(5e-3, rel=0.1)
+    undo(project)
+    assert project.read_bytes() == old
