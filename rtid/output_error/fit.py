@@ -20,6 +20,7 @@ from rtid.output_error.plant import Parameter, Plant, PlantError, Record
 from rtid.output_error.simulation import Simulator, resolved
 from rtid.output_error.statistics import covariance, memory
 
+ALL, PARAMETERS, INITIAL = "all", "parameters", "initial values"  # what a fit may move
 STARTS = 64  # random starts that are run
 POLISHED = 3  # the best of them that are fitted
 MOST_RUNS = 60
@@ -217,9 +218,9 @@ def fit(
     most_runs: int = MOST_RUNS,
     sub_steps: int = 1,
     fixed_step: bool = False,
-    only_initial: bool = False,
+    only: str = ALL,
 ) -> Fit:
-    """Fit all unknowns, or only the initial values of the states.
+    """Fit all unknowns, or only the parameters, or only the initial values of the states.
 
     starts (lanes, unknowns): where to start, the best of them are polished; None draws them between
     the bounds.  mask (n, outputs): which outputs count.  sub_steps: at least so many per sample,
@@ -229,8 +230,9 @@ def fit(
     unknowns = plant.unknowns
     lanes = drawn(unknowns) if starts is None else np.atleast_2d(starts)
     opened = np.ones(len(unknowns), bool)
-    if only_initial:
-        opened[: len(plant.parameters)] = False
+    if only != ALL:
+        opened[: len(plant.parameters)] = only == PARAMETERS
+        opened[len(plant.parameters) :] = only == INITIAL
     simulator = (
         Simulator(plant, record, sub_steps)
         if fixed_step

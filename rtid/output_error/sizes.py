@@ -31,7 +31,7 @@ from rtid.output_error.plant import Plant, named, substituted
 LANES = 48  # start values of a candidate
 LARGEST = 10.0  # amplitude of a term, in units of the largest term of its rate
 FASTEST = 4.0  # rate of an effect, per sample
-CREEP = 0.01  # of a velocity's rms: below it a friction that reverses its sign is taken as linear
+CREEP = 0.005  # of a velocity's rms: below it a friction that reverses its sign is taken as linear
 JITTER = 0.3  # by which the present values are moved in every second start
 
 

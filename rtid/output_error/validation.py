@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rtid.effects.tree import FloatArray
-from rtid.output_error.fit import Fit, fit
+from rtid.output_error.fit import INITIAL, PARAMETERS, Fit, fit
 from rtid.output_error.plant import Plant, Record
 from rtid.output_error.simulation import Simulator
 
@@ -17,7 +17,8 @@ NOISE_WEIGHT = 20.0  # sum of the squared weights of a third difference
 def left_out(found: Fit, folds: int = FOLDS) -> FloatArray:
     """Errors (n, outputs) of the free run in each block by a fit to the other blocks.
 
-    The run goes through the whole record each time: the inputs are known everywhere.
+    The run goes through the whole record each time: the inputs are known everywhere, and the states
+    begin as in the fit to all (without the first block nothing else would tell).
     """
     simulator = found.simulator
     block = np.arange(len(found.residual)) * folds // len(found.residual)
@@ -32,6 +33,7 @@ def left_out(found: Fit, folds: int = FOLDS) -> FloatArray:
             most_runs=FOLD_RUNS,
             sub_steps=simulator.sub_steps,
             fixed_step=True,
+            only=PARAMETERS,
         )
         here = block == k
         errors[here] = (simulator.record.y - other.output)[here]
@@ -48,7 +50,7 @@ def on_record(found: Fit, record: Record, *, same_start: bool) -> FloatArray:
         simulator = Simulator(found.plant, record, found.simulator.sub_steps)
         return np.asarray(record.y - simulator.run(found.values[:, None])[0][:, :, 0])
     steps = found.simulator.sub_steps
-    other = fit(found.plant, record, found.values, sub_steps=steps, only_initial=True)
+    other = fit(found.plant, record, found.values, sub_steps=steps, only=INITIAL)
     return other.residual
 
 
