@@ -28,11 +28,13 @@ MATERIAL = 0.003  # of the rms flow: what an effect must change of the held-out 
 LARGE = 1.5  # rho above which timing effects are refitted whatever their score
 TIE, TIE_SHARE = 12.0, 0.03  # causes within so much of the best gain are not told apart
 MOST = 6  # effects that are added at most
+WORSE = 1.02  # held-out residual, as a share, that an immaterial effect may not raise
 MOST_NEGLIGIBLE = 4  # that are looked at
 NOTICED = 0.01  # of the degrees of freedom: chi2 from which an immaterial effect stays in the model
 SHARE = 0.4  # of the misfit left that a cause must explain, once most of the first is explained,
 LEAST_SHARE = 0.1  # ... and before
-CLOSE = 3.0  # timings whose coarse cost is within this factor of the best are refitted finely
+CLOSE = 0.9  # timings whose coarse gain is this share of the best are refitted finely
+PROMISING = 0.3  # share of the best gain that a timing's bank must reach to be closed in on
 
 MATCH_RHO = 1.10  # largest rho of a model that matches
 MATCHES, MISSING, AMBIGUOUS = "matches", "missing", "ambiguous"
@@ -171,8 +173,10 @@ def _add_best(state: State, present: Fit, last: Residual) -> tuple[Fit, Residual
         share = min(material_share(last, after), own_share(now, trial, state.held_out))
         if share < MATERIAL:
             state.negligible[trial.key] = share
-            if not _is_noticed(present, trial):
+            if not _is_noticed(present, trial) or after.rms_m3s > WORSE * last.rms_m3s:
                 continue
+            for other in alike_ones(state, trial, trials):
+                state.negligible[other] = share
         else:
             alike = alike_ones(state, trial, trials)
             state.found.append(Found(trial.key, alike, trial.gain, last, after))
@@ -235,7 +239,8 @@ def _trials(state: State, present: Fit) -> list[Trial]:
         trials.append(Trial(key, score.gain, revision, score.column))
     trials = refined(state, present, trials)
     scores = {key: s.gain for key, (_, s) in best.items() if key[1] == "command"}
-    return trials + _timing_trials(state, present, scores)
+    other = max((t.gain for t in trials if t.key not in state.negligible), default=0.0)
+    return trials + _timing_trials(state, present, scores, other)
 
 
 def best_by_key(
@@ -296,35 +301,41 @@ def refined(state: State, present: Fit, trials: list[Trial]) -> list[Trial]:
     return found
 
 
-def _timing_trials(state: State, present: Fit, scores: dict[Key, float]) -> list[Trial]:
+def _timing_trials(
+    state: State, present: Fit, scores: dict[Key, float], other: float
+) -> list[Trial]:
     """Exact refits with one timing more, of those that may matter."""
     open_ = [t for t in TIMINGS if not present.revision.has((t.effect, "command"))]
     if present.rho < LARGE:
         open_ = [t for t in open_ if scores.get((t.effect, "command"), 0.0) > GAIN]
     if not open_ or not present.view.has_pressures:
         return []
-    return exact_trials(state, present, open_)
+    return exact_trials(state, present, open_, other)
 
 
-def exact_trials(state: State, present: Fit, timings: list[Timing]) -> list[Trial]:
-    """Refits with one of these timings more, the best of each name."""
-    costs: list[tuple[float, Timing, Psi]] = []
+def exact_trials(
+    state: State, present: Fit, timings: list[Timing], other: float = 0.0
+) -> list[Trial]:
+    """Refits with one of these timings more, the best of each name.
+
+    other: the best gain of any other cause; what cannot come close to it is left out.
+    """
+    gains: list[tuple[float, Timing, Psi]] = []
     for timing in timings:
-        psi, cost = state.coarse.best(timing, present)
-        costs.append((cost, timing, psi))
-    least = min(cost for cost, _, _ in costs)
+        psi, gain = state.coarse.best(timing, present, PROMISING * other)
+        gains.append((gain, timing, psi))
+    most = max(other, *(gain for gain, _, _ in gains))
     trials: dict[Key, Trial] = {}
-    for cost, timing, psi in sorted(costs, key=lambda c: c[0]):
-        if cost > CLOSE * least:
+    for gain, timing, psi in gains:
+        if gain < CLOSE * most:
             continue
         revision = replace(present.revision, timings=(*present.revision.timings, (timing, psi)))
         now = fit(state.model, state.chunk, present.weights, revision, None, bank=False)
-        gain = present.estimate.sse - now.estimate.sse
         if not _is_inside(now):
             continue
-        key = (timing.effect, "command")
-        if key not in trials or gain > trials[key].gain:
-            trials[key] = Trial(key, gain, now.revision, None, now)
+        exact, key = present.estimate.sse - now.estimate.sse, (timing.effect, "command")
+        if key not in trials or exact > trials[key].gain:
+            trials[key] = Trial(key, exact, now.revision, None, now)
     return list(trials.values())
 
 
@@ -365,7 +376,6 @@ def _look_back(state: State, present: Fit, last: Residual) -> tuple[Fit, Residua
     return present, last
 
 
-SETTLED = 0.9  # of the misfit that negligible effects must explain to be all there is
 NAMED = 0.5  # of the misfit that effects must explain to be named where something else remains
 
 
@@ -376,9 +386,9 @@ def _verdict(state: State, last: Fit, after: Residual) -> str:
     explained = 1.0 - left / state.excess if state.excess > 0 else 1.0
     is_explained = last.rho < MATCH_RHO or explained >= NAMED
     if not state.found:
-        done = bool(state.given) and is_explained and remainder(after) < MATERIAL
-        done |= bool(state.negligible) and explained > SETTLED
-        return MATCHES if last.rho < MATCH_RHO or done else UNKNOWN
+        # what is left behind effects too small to matter is too small to matter itself
+        small = bool(state.given or state.negligible) and remainder(after) < MATERIAL
+        return MATCHES if last.rho < MATCH_RHO or small else UNKNOWN
     if not is_explained:
         return UNKNOWN
     return AMBIGUOUS if any(f.alike for f in state.found[:1]) else MISSING

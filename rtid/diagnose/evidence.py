@@ -1,16 +1,14 @@
-"""What a record says about every column at once: products of whitened rows, by segment of time.
+"""What a record says about every column at once: the products of its whitened rows.
 
-A segment holds the Gram matrix of the columns that move within it,
+    G = sum over the rows of [y | theta_beta | given | map]' [y | theta_beta | given | map],
 
-    G_s = sum over its rows of [y | theta_beta | given | map]' [y | theta_beta | given | map],
-
-so that totals, folds, robust variances and what is left after the maps are taken out follow from
-linear algebra alone, without another pass over the record.
+and what is left of the first three once the maps are free to follow them: their Schur complement.
+Rows are taken in segments of time, in which only some blocks move or still ring.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +26,7 @@ IntArray = NDArray[np.int64]
 
 ROW_S = 10e-3  # positions measured within so long make one row
 SEGMENT_S = 0.5
+FIRST_BLOCKS = 64  # for which there is room at first
 PLACES = 256  # blocks that can ring within one segment
 QUIET = 1e-3  # a column whose whitened state is smaller adds nothing to an innovation
 
@@ -50,57 +49,24 @@ class Given:
 
 
 @dataclass(frozen=True)
-class Segment:
-    """Rows between two instants: the columns that moved (k,) and their products (k, k)."""
-
-    columns: IntArray
-    gram: FloatArray
-    rows: int
-    start_s: float
-    end_s: float
-
-
-@dataclass(frozen=True)
 class Evidence:
-    """All segments; n_head = 1 + chambers + given columns; cells (V,): blocks in their order."""
+    """Products of all whitened columns: the lower triangle of gram (size, size).
 
-    segments: tuple[Segment, ...]
+    n_head = 1 + chambers + given columns; cells (V,): blocks in their order; rows: scalar ones.
+    """
+
+    gram: FloatArray
     n_head: int
-    n_chambers: int
     cells: IntArray
-
-    @property
-    def rows(self) -> int:
-        """Number of scalar rows."""
-        return self.n_chambers * sum(s.rows for s in self.segments)
-
-    @property
-    def size(self) -> int:
-        """Number of columns."""
-        return self.n_head + TERMS * len(self.cells)
+    rows: int
 
     def squares(self) -> FloatArray:
         """Squares of all columns (size,)."""
-        total = np.zeros(self.size)
-        for segment in self.segments:
-            total[segment.columns] += segment.gram.diagonal()
-        return total
-
-    def gram(self) -> FloatArray:
-        """Products of all columns (size, size)."""
-        total = np.zeros((self.size, self.size))
-        for segment in self.segments:
-            kernel.add_products(total, segment.columns, segment.gram)
-        return total
+        return np.asarray(self.gram.diagonal().copy())
 
 
 def collect(
-    model: Model,
-    chunk: FloatArray,
-    weights: Weights,
-    given: Given,
-    row_s: float = ROW_S,
-    segment_s: float = SEGMENT_S,
+    model: Model, chunk: FloatArray, weights: Weights, given: Given, row_s: float = ROW_S
 ) -> Evidence:
     """One pass over a record, chunk (n, 2 + signals), with all given columns."""
     group = rows_per_group(chunk, row_s)
@@ -109,19 +75,16 @@ def collect(
     e.engine[0]["p_var_pa2"] /= group
     n_c = len(model.chambers)
     head, step_s = 1 + n_c + given.n, float(np.median(np.diff(chunk[:, 0])))
-    pass_ = _Pass(head, n_c, model.n_cells, max(1, round(segment_s / (group * step_s))))
-    segments, at = [], 0
-    starts = np.arange(0, len(chunk), max(1, round(segment_s / step_s)))
-    ends = np.append(starts[1:], len(chunk))
-    for end in ends:
+    taken = _Pass(head, n_c, model.n_cells, max(1, round(SEGMENT_S / (group * step_s))))
+    at = 0
+    for end in [*range(0, len(chunk), max(1, round(SEGMENT_S / step_s)))[1:], len(chunk)]:
         while at < end:
-            begun = at
             at = kernel.collect(
-                e.engine, e.cells, chunk, at, int(end), group,
-                given.series, given.source, given.sign, *pass_.arrays,
+                e.engine, e.cells, chunk, at, end, group,
+                given.series, given.source, given.sign, *taken.arrays,
             )  # fmt: skip
-            segments.append(pass_.take(chunk[begun, 0], chunk[at - 1, 0]))
-    return _compact(segments, head, n_c)
+            taken.add()
+    return taken.evidence()
 
 
 def rows_per_group(chunk: FloatArray, row_s: float) -> int:
@@ -131,38 +94,57 @@ def rows_per_group(chunk: FloatArray, row_s: float) -> int:
 
 
 class _Pass:
-    """The arrays that `kernel.collect` changes, from segment to segment."""
+    """The arrays that `kernel.collect` changes, and the products so far."""
 
     def __init__(self, head: int, n_c: int, n_cells: int, most_rows: int) -> None:
         width = head + TERMS * PLACES
-        self.head = head
+        self.head, self.n_rows = head, 0
         self.d, self.later = np.zeros((n_c, width)), np.zeros((n_c, width))
         self.place = np.full(n_cells, -1)
         self.cell_of = np.full(PLACES, -1)
         self.counts = np.array([0, 0, 0, head])
         self.noise = np.zeros((4, 2, 2))
         self.rows = np.zeros((most_rows + 2, n_c, width))
+        self.cells: list[int] = []
+        self.number = np.full(n_cells, -1)  # of a cell's block among those visited
+        self.total = np.zeros((head + TERMS * FIRST_BLOCKS,) * 2)
 
     @property
     def arrays(self) -> tuple[NDArray[np.generic], ...]:
         return self.d, self.later, self.place, self.cell_of, self.counts, self.noise, self.rows
 
-    def take(self, start_s: float, end_s: float) -> Segment:
-        """The rows so far as one segment; blocks that have fallen silent give their places back."""
+    def evidence(self) -> Evidence:
+        """The products of everything that was added."""
+        size = self.head + TERMS * len(self.cells)
+        return Evidence(self.total[:size, :size], self.head, np.array(self.cells, int), self.n_rows)
+
+    def add(self) -> None:
+        """Add the products of the rows so far; blocks that fell silent give their places back."""
         n, local = int(self.counts[kernel.N_ROWS]), int(self.counts[kernel.N_LOCAL])
         used = self.head + TERMS * local
         rows = self.rows[:n, :, :used].reshape(n * len(self.d), used)
-        columns = np.concatenate([np.arange(self.head), self._global(local)])
         with one_thread():
-            segment = Segment(columns, rows.T @ rows, n, start_s, end_s)
+            gram = rows.T @ rows
+        columns = self._columns(local)  # may enlarge the total
+        kernel.add_products(self.total, columns, gram)
+        self.n_rows += len(rows)
         self._forget_silent(rows, local)
         self.rows[:n, :, :used] = 0.0  # blocks to come take up columns in the middle of a segment
         self.counts[kernel.N_ROWS] = 0
-        return segment
 
-    def _global(self, local: int) -> IntArray:
-        first = self.head + TERMS * self.cell_of[:local]
-        return np.asarray((first[:, None] + np.arange(TERMS)).ravel())
+    def _columns(self, local: int) -> IntArray:
+        """Columns of the head and of the local blocks among all; new blocks get a number."""
+        for cell in self.cell_of[:local][self.number[self.cell_of[:local]] < 0]:
+            self.number[cell] = len(self.cells)
+            self.cells.append(int(cell))
+        size = self.head + TERMS * len(self.cells)
+        if size > len(self.total):
+            larger = np.zeros((2 * size,) * 2)
+            larger[: len(self.total), : len(self.total)] = self.total
+            self.total = larger
+        first = self.head + TERMS * self.number[self.cell_of[:local]]
+        own = (first[:, None] + np.arange(TERMS)).ravel()
+        return np.concatenate([np.arange(self.head), own])
 
     def _forget_silent(self, rows: FloatArray, local: int) -> None:
         """Keep the blocks whose last rows still move, and those with something due."""
@@ -182,20 +164,6 @@ class _Pass:
         self.cell_of[: len(kept)] = old[kept]
         self.place[old[kept]] = np.arange(len(kept))
         self.counts[kernel.N_LOCAL] = len(kept)
-
-
-def _compact(segments: list[Segment], head: int, n_c: int) -> Evidence:
-    """Number the map columns by visited block."""
-    firsts = [s.columns[head::TERMS] for s in segments]
-    cells = np.unique(np.concatenate(firsts)) if firsts else np.zeros(0, np.int64)
-    found = []
-    for segment, first in zip(segments, firsts, strict=True):
-        if segment.rows:
-            at = head + TERMS * np.searchsorted(cells, first)
-            own = (at[:, None] + np.arange(TERMS)).ravel()
-            columns = np.concatenate([np.arange(head), own])
-            found.append(replace(segment, columns=columns))
-    return Evidence(tuple(found), head, n_c, (cells - head) // TERMS)
 
 
 @dataclass(frozen=True)
@@ -220,17 +188,18 @@ def project(evidence: Evidence, thorough: bool = True) -> Projected:
     their degrees of freedom.
     """
     h = evidence.n_head
-    gram = evidence.gram()
-    matrix = gram[h:, h:]
+    gram = evidence.gram
+    matrix = gram[h:, h:].copy()
     matrix[np.diag_indices_from(matrix)] += PRIOR_SD**-2
     scale = 1.0 / np.sqrt(np.diag(matrix))
     matrix *= scale[:, None]
     matrix *= scale
+    own = np.tril(gram[:h, :h]) + np.tril(gram[:h, :h], -1).T
     with one_thread():
         lower = cho_factor(matrix, lower=True, overwrite_a=True, check_finite=False)
         coefficients = cho_solve(lower, gram[h:, :h] * scale[:, None], check_finite=False)
         coefficients *= scale[:, None]
-        schur = gram[:h, :h] - gram[h:, :h].T @ coefficients
+        schur = own - gram[h:, :h].T @ coefficients
         used, cov = float(len(matrix)), np.zeros((0, TERMS, TERMS))
         if thorough:
             cov = _covariances(lower[0], scale)

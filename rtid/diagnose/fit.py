@@ -343,12 +343,12 @@ def _regression(
 def _moved(found: Fit) -> tuple[Revision, Weights] | None:
     """Revision and weights with timing parameters moved to where the derivatives point."""
     settled, weights, lag = True, found.weights, found.model.lag
-    estimate = found.estimate
+    estimate, spread = found.estimate, np.sqrt(max(1.0, found.rho))
     if not found.revision.replaces_lag and lag.tolerance_s > 0:
         at = 1 + len(found.model.chambers)
         moved = found.weights.lag_s + estimate.value(at)
         moved = float(np.clip(moved, 0.0, lag.nominal_s + 3 * lag.tolerance_s))
-        if abs(moved - found.weights.lag_s) > max(SETTLED * estimate.sd(at), 2e-5):
+        if abs(moved - found.weights.lag_s) > max(SETTLED * spread * estimate.sd(at), 2e-5):
             settled, weights = False, replace(weights, lag_s=moved)
     timings = []
     for k, (timing, psi) in enumerate(found.revision.timings):
@@ -357,7 +357,7 @@ def _moved(found: Fit) -> tuple[Revision, Weights] | None:
             reach = REACH * max(abs(value), abs(timing.bank[0][j]) * 0.1)
             step = float(np.clip(estimate.value(at), -reach, reach))
             target = float(np.clip(value + step, timing.low[j], timing.high[j]))
-            if abs(target - value) > max(SETTLED * estimate.sd(at), 2e-3 * abs(value)):
+            if abs(target - value) > max(SETTLED * spread * estimate.sd(at), 2e-3 * abs(value)):
                 settled = False
             new.append(target)
         timings.append((timing, tuple(new)))

@@ -13,7 +13,7 @@ import numpy as np
 
 from rtid.diagnose.candidates import Columns
 from rtid.diagnose.evidence import collect, project
-from rtid.diagnose.fit import Fit, prepare, split, transformed
+from rtid.diagnose.fit import Fit, Timings, prepare, split, transformed
 from rtid.diagnose.timing import Psi, Timing
 from rtid.estimator.state import Weights
 from rtid.model import FloatArray, Grid, Model
@@ -44,11 +44,16 @@ class Search:
         self.split = split(self.model)
         self.weights: Weights = prepare(self.model, chunk)
 
-    def best(self, timing: Timing, beside: Fit) -> tuple[Psi, float]:
-        """The parameters of a timing that lower the cost most beside a fit, and the cost."""
-        bank = list(timing.bank)
-        cost = [self.cost(timing, psi, beside) for psi in bank]
+    def best(self, timing: Timing, beside: Fit, enough: float) -> tuple[Psi, float]:
+        """The parameters of a timing that lower the cost most beside a fit, and by how much.
+
+        enough: a bank that lowers it by less is not closed in on.
+        """
+        bank, before = list(timing.bank), self.cost((), beside)
+        cost = [self.cost(((timing, psi),), beside) for psi in bank]
         k = int(np.argmin(cost))
+        if before - cost[k] < enough:
+            return bank[k], before - cost[k]
         ends = [np.log(psi[0]) for psi in bank]
         ends = [2 * ends[0] - ends[1], *ends, 2 * ends[-1] - ends[-2]]
         low, middle, high = ends[k : k + 3]
@@ -57,7 +62,7 @@ class Search:
             below = middle - low > high - middle
             trial = 0.5 * (low + middle) if below else 0.5 * (middle + high)
             moved = (float(np.clip(np.exp(trial), timing.low[0] or 0.0, timing.high[0])), *psi[1:])
-            found = self.cost(timing, moved, beside)
+            found = self.cost(((timing, moved),), beside)
             if found < best:
                 low, high = (low, middle) if below else (middle, high)
                 middle, psi, best = trial, moved, found
@@ -65,11 +70,11 @@ class Search:
                 low = trial
             else:
                 high = trial
-        return psi, best
+        return psi, before - best
 
-    def cost(self, timing: Timing, psi: Psi, beside: Fit) -> float:
-        """Residual sum of squares of a revision with one timing more."""
-        timings = (*beside.revision.timings, (timing, psi))
+    def cost(self, more: Timings, beside: Fit) -> float:
+        """Residual sum of squares of a revision with more timings."""
+        timings = (*beside.revision.timings, *more)
         sent = transformed(self.model, self.chunk, timings)
         weights = self.weights
         if any(t.replaces_lag for t, _ in timings):

@@ -323,8 +323,10 @@ def _map_at(e: Any, theta: FloatArray, cov: FloatArray, along: FloatArray, cell:
 
 @kernel
 def add_products(total: FloatArray, columns: IntArray, gram: FloatArray) -> None:
-    """total[columns, columns] += gram, in place."""
+    """Lower triangle of total[columns, columns] += gram, in place."""
     for i in range(len(columns)):
-        row, own = total[columns[i]], gram[i]
+        at = columns[i]
+        row, own = total[at], gram[i]
         for j in range(len(columns)):
-            row[columns[j]] += own[j]
+            if columns[j] <= at:
+                row[columns[j]] += own[j]
