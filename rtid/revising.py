@@ -12,7 +12,7 @@ from itertools import takewhile
 from pathlib import Path
 
 from rtid.diagnose.diagnosis import AMBIGUOUS, MATCHES, MISSING, Found
-from rtid.diagnose.extend import Extension, RefusedError, Standing, begin, extend
+from rtid.diagnose.extend import UNJUDGED, Extension, RefusedError, Standing, extend, stand
 from rtid.diagnosing import added_parts, diagnose_trace, parts
 from rtid.effects import effect as page_of
 from rtid.errors import RtidError
@@ -70,7 +70,7 @@ def add(
         if not force:
             _refuse_useless(extensions[0])
     else:
-        extensions, note, counters = _named(loaded, trace, progress)
+        extensions, note, counters = _named(loaded, trace, force, progress)
     steps, sections = [], loaded.sections.added
     for extension in extensions:
         sections = extended(sections, extension, trace.name, reason or _why(effect, extension))
@@ -98,7 +98,7 @@ def drop(
     if trace is not None:
         present, counters = _begin(loaded, trace, progress)
         state, left = present.state, tuple(p for p in added_parts(loaded) if p.key != gone.key)
-        after = begin(state.model, state.chunk, state.held_out, left, progress)
+        after = stand(state.model, state.chunk, state.held_out, left, progress)
         errors, kept = errors_between(present, after), refreshed(kept, after)
     change = _change(DROP, gone, text, reason, trace.name if trace else "")
     change = replace(change, errors=plain(errors))
@@ -156,7 +156,7 @@ def _begin(project: Project, trace: Path, progress: Progress) -> tuple[Standing,
     model = model_for(project, read_.samples)
     chunks = parts(project, model, read_)
     progress("fitting", 0.1)
-    return begin(model, *chunks, added_parts(project), progress), read_.counters
+    return stand(model, *chunks, added_parts(project), progress), read_.counters
 
 
 def _refuse_useless(extension: Extension) -> None:
@@ -169,7 +169,7 @@ def _refuse_useless(extension: Extension) -> None:
 
 
 def _named(
-    project: Project, trace: Path, progress: Progress
+    project: Project, trace: Path, force: bool, progress: Progress
 ) -> tuple[list[Extension], str, dict[str, int]]:
     """What the diagnosis names, added one after the other; a set of equals needs a choice."""
     found = diagnose_trace(project, trace, lambda what, share: progress(what, 0.7 * share))
@@ -186,11 +186,13 @@ def _named(
         raise _choice(result.found[0])
     note = str(_choice(result.found[len(clear)])) if len(clear) < len(result.found) else ""
     model, chunks = found.model, parts(project, found.model, found.trace)
-    present = begin(model, *chunks, added_parts(project), first=result.first)
+    present = stand(model, *chunks, added_parts(project))
     extensions: list[Extension] = []
     for f in clear:
         progress(f"adding {f.key[0]}", 0.7 + 0.3 * len(extensions) / len(clear))
         extensions.append(extend(present, *f.key))
+        if UNJUDGED in extensions[-1].against and not force:
+            _refuse_useless(extensions[-1])
         present = extensions[-1].after
     return extensions, note, found.trace.counters
 
@@ -204,7 +206,7 @@ def _choice(found: Found) -> RefusedError:
 
 
 def _why(effect: str, extension: Extension) -> str:
-    if extension.against:
+    if extension.against and (effect or UNJUDGED in extension.against):
         return "forced: " + "; ".join(extension.against)
     by = "chosen by name" if effect else "named by the diagnosis"
     return f"{by}; chi2 fell by {extension.gain:.3g}"

@@ -118,15 +118,10 @@ def search(
 
     parts: effects that the model has already.  Raises PartError where the record has none of them.
     """
-    model = as_measured(model, chunk)
-    chunk, held_out = usable(model, chunk), usable(model, held_out)
-    state = State(model, chunk, held_out, progress)
-    progress("fitting", 0.0)
-    weights = prepare(model, chunk)
-    first = present = fit(model, chunk, weights, recall(model, chunk, weights, parts))
-    state.given = parts
-    before = last = residual(first, held_out)
-    bare = fit(model, chunk, weights, Revision(), bank=False) if parts else first
+    state, first = begin(model, chunk, held_out, progress, parts)
+    present = first
+    before = last = residual(first, state.held_out)
+    bare = _bare(state, first)
     state.excess = bare.estimate.sse - bare.regression.dof
     for k in range(MOST):
         progress("scoring", 0.1 + 0.8 * k / MOST)
@@ -140,6 +135,30 @@ def search(
     return Result(
         first, present, tuple(state.found), state.negligible, scores, before, last, verdict, parts
     )
+
+
+def begin(
+    model: Model,
+    chunk: FloatArray,
+    held_out: FloatArray,
+    progress: Callable[[str, float], None],
+    parts: tuple[Part, ...],
+) -> tuple[State, Fit]:
+    """The usable part of a record, and the model with its parts fitted to it."""
+    model = as_measured(model, chunk)
+    chunk, held_out = usable(model, chunk), usable(model, held_out)
+    progress("fitting", 0.0)
+    weights = prepare(model, chunk)
+    first = fit(model, chunk, weights, recall(model, chunk, weights, parts))
+    return State(model, chunk, held_out, progress, given=parts), first
+
+
+def _bare(state: State, first: Fit) -> Fit:
+    """The fit without any effect."""
+    if not state.given:
+        return first
+    weights = replace(first.weights, lag_s=state.model.lag.nominal_s)
+    return fit(state.model, state.chunk, weights, Revision(), bank=False)
 
 
 def scored(fit_: Fit) -> list[tuple[Candidate, Score]]:

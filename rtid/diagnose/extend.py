@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rtid.diagnose.clean import usable
 from rtid.diagnose.diagnosis import (
     GAIN,
     LEAST_SHARE,
@@ -23,6 +22,7 @@ from rtid.diagnose.diagnosis import (
     State,
     Trial,
     alike_ones,
+    begin,
     best_by_key,
     exact_trials,
     material_share,
@@ -31,13 +31,15 @@ from rtid.diagnose.diagnosis import (
     refined,
     scored,
 )
-from rtid.diagnose.fit import Fit, fit, one_pass, prepare
-from rtid.diagnose.parts import COMMAND, Part, recall
+from rtid.diagnose.fit import Fit, fit, one_pass
+from rtid.diagnose.parts import COMMAND, Part
 from rtid.diagnose.residual import Residual, residual
 from rtid.diagnose.timing import TIMINGS
 from rtid.errors import RtidError
 from rtid.model import FloatArray, Model
 from rtid.units import nearest
+
+UNJUDGED = "the held-out part has no place where the map is known well enough to judge"
 
 
 class RefusedError(RtidError):
@@ -80,24 +82,15 @@ def _silent(_what: str, _share: float) -> None:
     pass
 
 
-def begin(
+def stand(
     model: Model,
     chunk: FloatArray,
     held_out: FloatArray,
     parts: tuple[Part, ...] = (),
     progress: Callable[[str, float], None] = _silent,
-    first: Fit | None = None,
 ) -> Standing:
-    """The model with its parts on a record; chunk and held_out (n, 2 + signals).
-
-    first: its fit, where that is known.
-    """
-    chunk, held_out = usable(model, chunk), usable(model, held_out)
-    state = State(model, chunk, held_out, progress, given=parts)
-    if first is None:
-        weights = prepare(model, chunk)
-        first = fit(model, chunk, weights, recall(model, chunk, weights, parts))
-    return Standing.of(state, first)
+    """The model with its parts on a record; chunk and held_out (n, 2 + signals)."""
+    return Standing.of(*begin(model, chunk, held_out, progress, parts))
 
 
 def extend(present: Standing, effect: str, where: str = "") -> Extension:
@@ -188,7 +181,7 @@ def _against(before: Standing, after: Standing, trial: Trial) -> Iterator[str]:
     old, new = before.held_out, after.held_out
     figures = f"held-out error {_percent(old)} without it, {_percent(new)} with it"
     if not np.isfinite(new.rms_m3s + old.rms_m3s):
-        yield "the held-out part has no place where the map is known"
+        yield UNJUDGED
         return
     if new.rms_m3s >= old.rms_m3s:
         yield f"it does not lower the held-out error: {figures}"

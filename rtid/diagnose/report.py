@@ -127,7 +127,7 @@ def diagnosis(result: Result) -> Diagnosis:
         rms_flow_m3s=result.after.flow_m3s,
         beta_pa=tuple(float(b) for b in 1.0 / last.compliance),
         lag_s=last.weights.lag_s,
-        something_remains=bool(found) and last.rho > result.match_rho,
+        something_remains=bool(found or result.given) and last.rho > result.match_rho,
         not_found=unseen,
         negligible=tuple(
             Small(effect, where, share) for (effect, where), share in result.negligible.items()
