@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from shutil import copy
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from rtid.cli import main
 from rtid.cli.exits import Exit
 from rtid.diagnose.extend import RefusedError
-from rtid.diagnosing import diagnose_trace
+from rtid.diagnose.fit import prepare
+from rtid.diagnose.parts import COMMAND, Part, PartError, recall
+from rtid.diagnosing import diagnose_trace, parts
 from rtid.effects import EffectError
 from rtid.project import load
 from rtid.project.history import path_of
+from rtid.replay import read_trace
 from rtid.revising import add, drop, history, undo
 from rtid.sim.hidden import hide_wish
 from rtid.sim.plant import Plant
@@ -176,5 +182,64 @@ def test_a_set_of_equals_needs_a_choice(tmp_path: Path) -> None:
     chosen = add(project, trace, "input_delay", force=True)
     delay = chosen.changes[0].section["parameters"]["delay"]
     assert delay["value"] == pytest.approx(5e-3, rel=0.1)
+    assert diagnose_trace(load(project), trace).diagnosis.verdict == "matches"
     undo(project)
     assert project.read_bytes() == old
+
+
+def found(effect: str, where: str, *alike: tuple[str, str]) -> Any:
+    return SimpleNamespace(key=(effect, where), alike=alike)
+
+
+def test_all_that_is_clear_is_added_and_the_choice_is_told(
+    project: Path, trace: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The diagnosis of a record with three effects, the last of which has a double."""
+    old, whole = project.read_bytes(), load(project)
+    read = read_trace(whole, trace)
+    named = [
+        found(LEAK, "a-b"),
+        found("pressure_sensor_lag", "a"),
+        found("relief_valve", "a", ("external_leakage_laminar", "a")),
+    ]
+    result, diagnosis = SimpleNamespace(found=named), SimpleNamespace(verdict="missing")
+    told = SimpleNamespace(model=whole.model, trace=read, result=result, diagnosis=diagnosis)
+    monkeypatch.setattr("rtid.revising.diagnose_trace", lambda *_: told)
+
+    done = add(project, trace)
+    assert [c.effect for c in done.changes] == [LEAK, "pressure_sensor_lag"]
+    assert "relief_valve:a and external_leakage_laminar:a" in done.note
+    sections = load(project).sections.added
+    assert [s.effect for s in sections] == [LEAK, "pressure_sensor_lag"]
+    assert sections[1].errors.rho.before == sections[0].errors.rho.after
+    assert undo(project).changes[0].effect == "pressure_sensor_lag"
+    assert [s.effect for s in load(project).sections.added] == [LEAK]
+    undo(project)
+    assert project.read_bytes() == old
+
+
+def test_parts_come_back_with_their_shapes(project: Path, trace: Path) -> None:
+    whole = load(project)
+    chunk, _ = parts(whole, whole.model, read_trace(whole, trace))
+    weights = prepare(whole.model, chunk)
+    lag = Part("spool_lag_first_order", COMMAND, {"time_constant": 4e-3}, own_spools=True)
+    delay = Part("input_delay", COMMAND, {"delay": 3e-3})
+    relief = Part(
+        "relief_valve", "b", {"slope": 1e-11, "opening_pressure": 3e6, "own_time_constant": 0.02}
+    )
+    again = recall(whole.model, chunk, weights, (delay, relief, lag))
+    assert [(t.effect, t.own_spools, psi) for t, psi in again.timings] == [
+        ("input_delay", False, (3e-3,)),
+        ("spool_lag_first_order", True, (4e-3,)),
+    ]
+    (candidate,) = again.effects
+    assert candidate.key == ("relief_valve", "b")
+    assert (candidate.shape, candidate.lag_s) == (3e6, 0.02)
+    for wrong, told in (
+        (replace(relief, effect="coulomb_friction"), "cannot act in this record"),
+        (replace(relief, parameters={"slope": 1.0}), "has no parameter opening_pressure"),
+        (replace(delay, effect="no_such_timing"), "is no effect on a command"),
+    ):
+        with pytest.raises(PartError, match=told) as caught:
+            recall(whole.model, chunk, weights, (wrong,))
+        assert "rtid drop" in caught.value.remedy
