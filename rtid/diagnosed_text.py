@@ -5,6 +5,7 @@ from __future__ import annotations
 from rich.console import Console
 from rich.table import Table
 
+from rtid.diagnose.diagnosis import MATERIAL
 from rtid.diagnose.report import Diagnosis, Effect, Unseen, Value
 from rtid.effects import catalogue
 
@@ -32,7 +33,12 @@ def sentences(found: Diagnosis) -> list[str]:
     """The verdict in plain words."""
     lines = [*_added(found), _head(found)]
     lines += [_one(found, effect) for effect in found.found]
-    if found.something_remains:
+    if found.something_remains and found.verdict == "matches":
+        lines.append(
+            "What remains beyond the noise is immaterial: less than "
+            f"{100 * MATERIAL:g} % of the rms flow."
+        )
+    elif found.something_remains:
         lines.append(
             f"Something else remains: the residual variance is still {found.rho_after:.2f} times "
             "the noise."

@@ -37,6 +37,8 @@ def add(
     if len(words) > 2:
         raise RtidError(f"too many arguments: {' '.join(words[2:])}", "", Exit.USAGE)
     name, trace = words if len(words) == 2 else ("", words[0])
+    if not Path(trace).exists():
+        raise RtidError(f"{trace}: no such file", "rtid add [EFFECT[:WHERE]] TRACE -p PROJECT")
     from rtid.present import progress_bar
     from rtid.revised_text import as_json as plain
     from rtid.revised_text import show
