@@ -19,14 +19,14 @@ from rtid.output_error.fit import Fit
 from rtid.output_error.insertion import everywhere
 from rtid.output_error.model import Key, Model, exchanged, polished, refit, with_effect, without
 from rtid.output_error.plant import Plant, Record
-from rtid.output_error.statistics import differ_by, f_test
+from rtid.output_error.statistics import f_test
 from rtid.output_error.validation import left_out, rms, sensor_noise
 
 ALPHA = 0.01  # chance of a false alarm over all candidates of a round
 PATIENCE = 2  # insignificant additions in a row that end the search
 MOST = 6  # effects that are added at most
 MATERIAL = 0.003  # of the output's spread: what an effect must take off the held-out error
-TOLD_APART = 2.0  # standard errors by which a rival's squared errors must be larger
+TOLD_APART = 12.0  # of twice the log likelihood: by so much a rival must be worse
 BETTER = 2.0  # of the information criterion: what an exchange must gain
 CLEAN = 1.2  # mean square of the residual in units of the sensors' noise
 EXPLAINED = 0.8  # of the misfit: less, with something left behind, is no explanation
@@ -213,8 +213,8 @@ def _rivals(less: Model, model: Model, key: Key) -> list[Model]:
 
 def _alike(model: Model, rivals: list[Model]) -> tuple[Key, ...]:
     """Effects that do as well as far as the record can tell."""
-    own = model.fit.residual
-    close = [m for m in rivals if differ_by(own, m.fit.residual) < TOLD_APART]
+    worse = model.fit.worth * np.log([m.fit.sse / model.fit.sse for m in rivals])
+    close = [m for m, gap in zip(rivals, worse, strict=True) if gap < TOLD_APART]
     return tuple(m.keys[-1] for m in sorted(close, key=lambda m: m.fit.sse))
 
 

@@ -65,14 +65,3 @@ def f_test(before: float, after: float, more: int, worth: float, parameters: int
     """Chance that so many more parameters take the sum of squares down by accident."""
     dof = max(worth - parameters, 1.0)
     return float(fisher.sf(max(before / after - 1.0, 0.0) * dof / more, more, dof))
-
-
-def differ_by(a: FloatArray, b: FloatArray) -> float:
-    """By how many standard errors the squares of residual b exceed those of a (n, outputs).
-
-    The standard error counts the memory of the difference (Diebold and Mariano).
-    """
-    difference = np.nansum(b**2 - a**2, axis=1)
-    tau, _ = memory(difference - difference.mean())
-    spread = float(difference.std()) * np.sqrt(tau / len(difference))
-    return float(difference.mean()) / max(spread, 1e-300)
