@@ -27,7 +27,7 @@ from rtid.sim.plant import Plant
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 
-LEAK, DRIFT = "internal_leakage_laminar", "valve_gain_drift"
+LEAK, WRONG = "internal_leakage_laminar", "position_sensor_delay"
 TRUTH = 2e-12  # m3/s/Pa, of the middle strength
 
 
@@ -107,10 +107,10 @@ def test_two_adds_then_two_undos(project: Path, trace: Path) -> None:
     add(project, trace, LEAK, "a-b", reason="the seal is old")
     texts.append(project.read_bytes())
     first = load(project).sections.added[0]
-    done = add(project, trace, DRIFT, force=True)
+    done = add(project, trace, WRONG, force=True)
     assert done.is_written and done.changes[0].reason.startswith("forced: ")
     both = load(project).sections.added
-    assert [s.effect for s in both] == [LEAK, DRIFT]
+    assert [s.effect for s in both] == [LEAK, WRONG]
     assert both[0].reason == "the seal is old" and both[0].errors == first.errors
     assert both[0].parameters != first.parameters, "refitted with the second one"
 
@@ -126,7 +126,7 @@ def test_a_wrong_effect_is_refused_with_figures(
     project: Path, trace: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     old = project.read_bytes()
-    assert ends("add", DRIFT, trace, "--project", project) == Exit.NEGATIVE
+    assert ends("add", WRONG, trace, "--project", project) == Exit.NEGATIVE
     told = capsys.readouterr().err
     assert "does not lower the held-out error" in told and " % with it" in told
     assert LEAK in told, "and what would explain more"
