@@ -17,9 +17,10 @@ from rich.table import Table
 from rtid.comparing_json import plain
 from rtid.effects.tree import written
 from rtid.output_error.diagnosis import AMBIGUOUS, MATCHES, UNKNOWN, Diagnosis, Found, rho
-from rtid.output_error.fit import scales
-from rtid.output_error.insertion import AMPLITUDE, GAP, INPUT, TIME, Added, page_of, unit_of
+from rtid.output_error.entries import AMPLITUDE, GAP, INPUT, TIME, page_of
+from rtid.output_error.insertion import Added, unit_of
 from rtid.output_error.model import Key, Model
+from rtid.output_error.problem import scales
 from rtid.output_error.statistics import covariance
 from rtid.refitting import Refitted
 

@@ -14,14 +14,16 @@ from rtid.effects import Expression
 from rtid.effects.dimension import dimension, dimension_of_unit, unit_of_dimension
 from rtid.effects.tree import FloatArray, Node, written
 from rtid.output_error import Input, Output, Parameter, Plant, PlantError, Record, State, refit
+from rtid.output_error.entries import ENTRIES
 from rtid.output_error.fit import fit
-from rtid.output_error.insertion import ENTRIES, everywhere, insert, places, unit_of
+from rtid.output_error.insertion import everywhere, insert, places, unit_of
 from rtid.output_error.plant import FIRST_ORDER, ZERO_ORDER, named, substituted
 from rtid.output_error.simulation import Simulator
 from rtid.output_error.statistics import memory
 from rtid.output_error.validation import on_record, rms
+from rtid.plantfile import load_plant
 from rtid.project.errors import ProjectError
-from rtid.refitting import load_plant, load_records
+from rtid.refitting import load_records
 
 EXAMPLE = Path(__file__).parents[1] / "rtid" / "project" / "examples" / "cascaded_tanks.toml"
 

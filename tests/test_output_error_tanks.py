@@ -16,8 +16,9 @@ import pytest
 from rtid.output_error import refit
 from rtid.output_error.diagnosis import AMBIGUOUS, MISSING
 from rtid.output_error.validation import on_record, rms
+from rtid.plantfile import load_plant
 from rtid.refitted import as_json, sentences
-from rtid.refitting import Records, Refitted, load_plant, load_records, run
+from rtid.refitting import Records, Refitted, load_records, run
 
 EXAMPLE = Path(__file__).parents[1] / "rtid" / "project" / "examples" / "cascaded_tanks.toml"
 

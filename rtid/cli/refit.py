@@ -29,13 +29,17 @@ def refit(
     is never used to fit or to choose.
     """
     from rtid.compared_text import make_console
+    from rtid.plantfile import load_plant
+    from rtid.present import progress_bar
     from rtid.refitted import as_json as to_json
     from rtid.refitted import tell
-    from rtid.refitting import load_plant, load_records, run
+    from rtid.refitting import load_records, run
 
     keys = tuple(_key(text) for text in add or ())
     file = load_plant(plant)
-    found = run(file, load_records(file, table), keys, with_diagnosis=diagnose)
+    records = load_records(file, table)
+    with progress_bar(hidden=as_json) as progress:
+        found = run(file, records, keys, with_diagnosis=diagnose, progress=progress)
     if as_json:
         print(json.dumps(to_json(found)))
     else:

@@ -13,10 +13,10 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from rtid.effects.tree import FloatArray
 from rtid.output_error.plant import Parameter, Plant, PlantError, Record
+from rtid.output_error.problem import ROUGH, Problem, bounds, scales, steps
 from rtid.output_error.simulation import Simulator, resolved
 from rtid.output_error.statistics import covariance, memory
 
@@ -25,10 +25,7 @@ STARTS = 64  # random starts that are run
 POLISHED = 3  # the best of them that are fitted
 MOST_RUNS = 60
 ROUGH_RUNS = 8  # of the fit from a start that competes with others
-FINE, ROUGH = 1e-6, 1e-3  # relative change of the sum of squares that ends a fit
 ILL_CONDITIONED = 1e6  # of the Jacobian with columns of unit length
-ROUNDING = 1e-5  # step of the differences, of a parameter's scale
-FAR = 1e3  # residual of a run that has left every range, in units of the output
 INFINITE_RANGE = 10.0  # of the start value, where a parameter has no bounds
 
 
@@ -120,94 +117,6 @@ class Fit:
         return float(self.values[k]), float(self.sd[k])
 
 
-def bounds(unknowns: tuple[Parameter, ...]) -> tuple[FloatArray, FloatArray]:
-    """Lowest and highest values."""
-    return np.array([p.low for p in unknowns]), np.array([p.high for p in unknowns])
-
-
-def steps(unknowns: tuple[Parameter, ...]) -> FloatArray:
-    """The scale of every unknown."""
-    found = []
-    for p in unknowns:
-        width = p.high - p.low
-        size = max(abs(p.start), 0.01 * width if np.isfinite(width) else 0.0)
-        found.append(size or 1.0)
-    return np.array(found)
-
-
-def scales(simulator: Simulator) -> FloatArray:
-    """What the error of each output is divided by: its noise where known, else its spread."""
-    noise = np.array([o.noise for o in simulator.plant.outputs])
-    spread = np.nanstd(simulator.record.y, axis=0)
-    if not (spread > 0).all():
-        raise PlantError("an output does not move", "a fit needs a record with motion")
-    return spread if np.isnan(noise).any() else noise
-
-
-class _Problem:
-    """The least-squares problem in scaled unknowns; `open` are those that may move."""
-
-    def __init__(
-        self,
-        simulator: Simulator,
-        values: FloatArray,
-        opened: NDArray[np.bool_],
-        mask: NDArray[np.bool_],
-    ) -> None:
-        self.simulator, self.values, self.open = simulator, values, opened
-        self.mask = mask
-        unknowns = simulator.plant.unknowns
-        self.step, (self.low, self.high) = steps(unknowns), bounds(unknowns)
-        self.scale = scales(simulator)
-
-    def errors(self, lanes: FloatArray) -> FloatArray:
-        """Scaled errors (samples used, lanes) for values (unknowns, lanes)."""
-        y, _ = self.simulator.run(np.ascontiguousarray(lanes))
-        wrong = (y - self.simulator.record.y[:, :, None]) / self.scale[:, None]
-        return np.nan_to_num(wrong[self.mask], nan=FAR, posinf=FAR, neginf=-FAR)
-
-    def full(self, z: FloatArray) -> FloatArray:
-        values = self.values.copy()
-        values[self.open] = z * self.step[self.open]
-        return np.clip(values, self.low, self.high)
-
-    def error(self, z: FloatArray) -> FloatArray:
-        return self.errors(self.full(z)[:, None])[:, 0]
-
-    def slopes(self, z: FloatArray) -> FloatArray:
-        """Jacobian (samples used, open unknowns) by central differences, one run of all lanes."""
-        values, index = self.full(z), np.flatnonzero(self.open)
-        lanes = np.repeat(values[:, None], 2 * len(index), axis=1)
-        h = ROUNDING * self.step[index]
-        for k, i in enumerate(index):
-            lanes[i, 2 * k] = min(values[i] + h[k], self.high[i])
-            lanes[i, 2 * k + 1] = max(values[i] - h[k], self.low[i])
-        apart = (lanes[index, 0::2] - lanes[index, 1::2]).diagonal() / self.step[index]
-        e = self.errors(lanes)
-        return (e[:, 0::2] - e[:, 1::2]) / apart
-
-    def solve(
-        self, start: FloatArray, most: int, tolerance: float = FINE
-    ) -> tuple[FloatArray, float]:
-        """Best values from a start, and half their sum of squares."""
-        low = self.low[self.open] / self.step[self.open]
-        high = self.high[self.open] / self.step[self.open]
-        at = start[self.open] / self.step[self.open]
-        inset = 1e-9 * np.maximum(1.0, np.abs(at))  # scipy wants a start inside
-        at = np.clip(at, low + inset, high - inset)
-        done = least_squares(
-            self.error,
-            at,
-            self.slopes,
-            (low, high),
-            x_scale="jac",
-            max_nfev=most,
-            ftol=tolerance,
-            xtol=1e-8,
-        )
-        return self.full(done.x), float(done.cost)
-
-
 def fit(
     plant: Plant,
     record: Record,
@@ -238,11 +147,11 @@ def fit(
         if fixed_step
         else _resolved(plant, record, lanes, sub_steps)
     )
-    problem = _Problem(simulator, lanes[0].copy(), opened, used)
+    problem = Problem(simulator, lanes[0].copy(), opened, used)
     best = _best_start(problem, lanes, polished, most_runs)
     finer = simulator if fixed_step else resolved(plant, record, best, simulator.sub_steps)
     if finer.sub_steps > simulator.sub_steps:
-        problem = _Problem(finer, best, opened, used)
+        problem = Problem(finer, best, opened, used)
         best, _ = problem.solve(best, most_runs)
     return _finished(problem, best)
 
@@ -257,7 +166,7 @@ def _resolved(plant: Plant, record: Record, lanes: FloatArray, least: int) -> Si
     return resolved(plant, record, lanes[-1], least)
 
 
-def _best_start(problem: _Problem, lanes: FloatArray, polished: int, most_runs: int) -> FloatArray:
+def _best_start(problem: Problem, lanes: FloatArray, polished: int, most_runs: int) -> FloatArray:
     cost = (problem.errors(lanes.T) ** 2).sum(axis=0)
     order = np.argsort(cost)[:polished]
     if len(order) > 1:  # a few steps show which starts lead to the same place
@@ -266,11 +175,11 @@ def _best_start(problem: _Problem, lanes: FloatArray, polished: int, most_runs: 
     return problem.solve(lanes[order[0]], most_runs)[0]
 
 
-def _finished(problem: _Problem, values: FloatArray) -> Fit:
+def _finished(problem: Problem, values: FloatArray) -> Fit:
     simulator = problem.simulator
     y, states = simulator.run(values[:, None])
     residual = np.where(problem.mask, simulator.record.y - y[:, :, 0], np.nan)
-    whole = _Problem(simulator, values, np.ones(len(values), bool), np.ones_like(problem.mask))
+    whole = Problem(simulator, values, np.ones(len(values), bool), np.ones_like(problem.mask))
     slopes = whole.slopes(values / whole.step) / whole.step
     jacobian = slopes.reshape(*residual.shape, len(values)) * whole.scale[:, None]
     return Fit(simulator, values, y[:, :, 0], states[:, :, 0], residual, jacobian, problem.mask)

@@ -8,9 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rtid.effects.tree import FloatArray
-from rtid.output_error.fit import Fit, bounds, drawn, fit
-from rtid.output_error.insertion import RATE, Added, Insertion, insert
+from rtid.output_error.entries import RATE
+from rtid.output_error.fit import Fit, drawn, fit
+from rtid.output_error.insertion import Added, Insertion, insert
 from rtid.output_error.plant import Plant, PlantError, Record
+from rtid.output_error.problem import bounds
 from rtid.output_error.sizes import sized, starts
 
 QUICK_RUNS, POLISHED = 20, 2  # runs of the fit of a candidate, and of how many of its starts

@@ -13,19 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rtid.effects.tree import FloatArray, Node, derivative, evaluate, names_of, number
+from rtid.output_error.entries import AMPLITUDE, GAP, INPUT, RATE, SHARE, SPEED, STATE, TIME
 from rtid.output_error.fit import Fit
-from rtid.output_error.insertion import (
-    AMPLITUDE,
-    GAP,
-    INPUT,
-    RATE,
-    SHARE,
-    SPEED,
-    STATE,
-    TIME,
-    Added,
-    Insertion,
-)
+from rtid.output_error.insertion import Added, Insertion
 from rtid.output_error.plant import Plant, named, substituted
 
 LANES = 48  # start values of a candidate
