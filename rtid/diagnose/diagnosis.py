@@ -278,7 +278,12 @@ def best_by_key(
 
 
 def physical(fit_: Fit, candidate: Candidate, value: float) -> float:
-    """A coefficient as the effect's parameter: a dead volume counts by the fitted modulus."""
+    """A coefficient as the effect's parameter.
+
+    A dead volume counts by the fitted modulus, a drift over the length of the record.
+    """
+    if candidate.effect == "valve_gain_drift":
+        return value * float(fit_.view.t_s[-1] - fit_.view.t_s[0])
     if candidate.effect != "extra_dead_volume":
         return value
     names = [c.name for c in fit_.model.chambers]

@@ -1,0 +1,162 @@
+"""Rows of every column at once are the rows of the estimator; means of rows lose nothing."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rtid.diagnose import evidence
+from rtid.diagnose.evidence import Given, collect, project
+from rtid.estimator.record import run
+from rtid.estimator.state import build, nominal_weights
+from rtid.estimator.sums import Sums
+from rtid.kernels import evidence as kernel
+from rtid.kernels.layout import TERMS
+from tests.diagnose.records import record
+
+ROOT = Path(__file__).parents[2]
+
+
+def nothing(n: int) -> Given:
+    return Given(np.zeros((n - 1, 1)), np.zeros((0, 2), np.int64), np.zeros((0, 2)))
+
+
+def full(gram: np.ndarray) -> np.ndarray:
+    return np.tril(gram) + np.tril(gram, -1).T
+
+
+@pytest.mark.parametrize(("quiet", "within"), [(1e-9, 1e-8), (evidence.QUIET, 1e-4)])
+def test_rows_are_those_of_the_estimator(
+    quiet: float, within: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One position per row: the same products as the recursive sums, in units of their sizes.
+
+    A block is dropped when its whitened state is below QUIET, which is all that is lost.  A sweep:
+    the estimator begins a new memory where more blocks ring than it has places for.
+    """
+    monkeypatch.setattr(evidence, "QUIET", quiet)
+    model, chunk, _ = record(motion="sweep")
+    chunk = chunk[:4000]
+    weights = nominal_weights(model)
+    found = collect(model, chunk, weights, nothing(len(chunk)), row_s=1e-3)
+    sums = Sums.of(run(model, chunk, weights))
+    normal = sums.normal()
+    assert run(model, chunk, weights).counters["restart_memory"] == 0
+    place = {cell: k for k, cell in enumerate(found.cells)}
+    blocks = [3 + TERMS * place[cell] for cell in sums.cells]
+    at = [1, 2, *(first + j for first in blocks for j in range(TERMS))]
+    gram = full(found.gram)
+    size = np.sqrt(np.outer(np.diag(normal.gram), np.diag(normal.gram)))
+    assert np.abs((gram[np.ix_(at, at)] - normal.gram) / size).max() < within
+    assert gram[0, 0] == pytest.approx(normal.square, rel=1e-9)
+    assert found.rows == 2 * normal.rows
+
+
+def test_a_given_column_is_its_own_sum() -> None:
+    """-V dP given from outside has the products of the built-in column."""
+    model, chunk, _ = record()
+    chunk = chunk[:5000]
+    weights = nominal_weights(model)
+    series = []
+    for c, chamber in enumerate(model.chambers):
+        p = chunk[:, 2 + model.column(chamber.pressure)]
+        v = chamber.v0_m3 + chamber.sign * chamber.area_m2 * chunk[:, 2 + model.column("x")]
+        series.append(-weights.compliance[c] * 0.5 * (v[1:] + v[:-1]) * np.diff(p))
+    given = Given(np.stack(series, axis=1), np.array([[0, 0], [1, 1]]), np.eye(2))
+    gram = full(collect(model, chunk, weights, given).gram)
+    assert gram[3:5, 3:5] == pytest.approx(gram[1:3, 1:3], rel=1e-9)
+    assert gram[0, 3:5] == pytest.approx(gram[0, 1:3], rel=1e-9)
+
+
+def test_means_of_positions_keep_the_information() -> None:
+    """Rows of 10 ms know the bulk modulus: its variance is at most 1.3 times that of 1 ms."""
+    model, chunk, _ = record()
+    weights = nominal_weights(model)
+    left = [
+        project(collect(model, chunk, weights, nothing(len(chunk)), row_s=s)).schur[1, 1]
+        for s in (1e-3, 1e-2)
+    ]
+    assert left[0] / left[1] < 1.3
+
+
+def test_a_gap_starts_anew() -> None:
+    """Half a record, a gap, the other half: the products of both halves add up."""
+    model, chunk, _ = record()
+    chunk = chunk[:6000].copy()
+    weights = nominal_weights(model)
+    chunk[3000, 1] = 3
+    whole = collect(model, chunk, weights, nothing(6000), row_s=1e-3)
+    halves = [
+        collect(model, part, weights, nothing(3000), row_s=1e-3)
+        for part in (chunk[:3000], chunk[3000:])
+    ]
+    assert whole.gram[0, 0] == pytest.approx(sum(h.gram[0, 0] for h in halves), rel=1e-9)
+    assert whole.rows == sum(h.rows for h in halves)
+
+
+CODE = """
+import pickle, sys
+import numpy as np
+from numba import config
+from rtid.kernels import evidence, tables
+from tests.diagnose import test_evidence as own
+
+def with_attributes(kernel):
+    return lambda engine, cells, *rest: kernel(
+        *(a.view((np.record, a.dtype)) for a in (engine, cells)), *rest)
+
+if config.DISABLE_JIT:  # interpreted, e.running needs a record type
+    tables.clear, evidence.collect = map(with_attributes, (tables.clear, evidence.collect))
+with open(sys.argv[1], "rb") as file:
+    model, chunk = pickle.load(file)
+gram = own.collect(model, chunk, own.nominal_weights(model), own.nothing(len(chunk))).gram
+print(" ".join(float(v).hex() for v in own.full(gram)[:9].ravel()))
+"""
+
+
+def test_interpreted_kernels_give_the_same(tmp_path: Path) -> None:
+    """With numba switched off: the same Python source, the same sums to 1e-9."""
+    model, chunk, _ = record()
+    (tmp_path / "record").write_bytes(pickle.dumps((model, chunk[:400])))
+    found = []
+    for disabled in ("0", "1"):
+        environment = {**os.environ, "NUMBA_DISABLE_JIT": disabled, "PYTHONPATH": str(ROOT)}
+        command = [sys.executable, "-c", CODE, str(tmp_path / "record")]
+        done = subprocess.run(
+            command, check=True, stdout=subprocess.PIPE, text=True, env=environment, cwd=ROOT
+        )
+        found.append(np.array([float.fromhex(v) for v in done.stdout.split()]))
+    assert found[0] == pytest.approx(found[1], rel=1e-9, abs=1e-6)
+
+
+def test_the_map_is_followed_with_its_slopes() -> None:
+    """Q, dQ/dw and dQ/ddp along a record are those of the terms, by finite differences of Q."""
+    model, chunk, _ = record()
+    chunk = chunk[:2000]
+    rng = np.random.default_rng(1)
+    theta = rng.standard_normal((model.n_cells, TERMS)) * 1e-4
+
+    def flows(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        state = build(model)
+        along = np.empty((len(samples) - 1, len(model.edges), 5))
+        cell = np.empty(along.shape[:2], np.int64)
+        cov = np.zeros((model.n_cells, TERMS, TERMS))
+        kernel.follow_map(state.engine, state.cells, theta, cov, samples, along, cell)
+        return along, cell
+
+    along, cell = flows(chunk)
+    shifted = chunk.copy()
+    shifted[:, 2 + model.column("p_supply")] += 100.0
+    moved, cell_moved = flows(shifted)
+    edge = [e.name for e in model.edges].index("pa")
+    same = (cell[:, edge] >= 0) & (cell[:, edge] == cell_moved[:, edge])
+    rise = (moved[same, edge, 1] - along[same, edge, 1]) / 100.0
+    slope = 0.5 * (moved[same, edge, 3] + along[same, edge, 3])
+    assert same.sum() > 100
+    assert rise == pytest.approx(slope, rel=1e-6, abs=1e-16)

@@ -1,0 +1,89 @@
+"""What reaches the spool: exact for a held command, in units, limits and sign."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+from rtid.diagnose import timing
+from rtid.diagnose.timing import TIMINGS, delayed, lagged, played, second_order
+
+DT = 1e-3
+
+
+def steps(seed: int, n: int = 400) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.repeat(rng.uniform(-5, 5, n // 20), 20)
+
+
+def test_a_delay_of_whole_samples_shifts() -> None:
+    u = steps(1)
+    assert delayed(u, DT, (0.007,))[7:] == pytest.approx(u[:-7])
+
+
+@given(st.floats(0.0, 0.02))
+def test_a_delay_passes_the_mean_on(tau: float) -> None:
+    """The area under a pulse stays what it was, wherever within a sample the delay ends."""
+    u = np.zeros(200)
+    u[50:60] = 1.0
+    assert delayed(u, DT, (tau,)).sum() == pytest.approx(10.0, rel=1e-9)
+
+
+def exact_mean(rate: Callable[..., list[float]], u: np.ndarray, start: list[float]) -> np.ndarray:
+    """Means over each interval of the first state of a system driven by a held command."""
+    y, means = np.array(start), []
+    for value in u:
+        done = solve_ivp(rate, (0, DT), np.append(y, 0.0), args=(value,), rtol=1e-9, atol=1e-12)
+        y = done.y[:-1, -1]
+        means.append(done.y[-1, -1] / DT)
+    return np.array(means)
+
+
+def test_a_lag_is_exact() -> None:
+    u, tau = steps(2, 100), 4e-3
+    expected = exact_mean(lambda t, y, v: [(v - y[0]) / tau, y[0]], u, [u[0]])
+    assert lagged(u, DT, (tau,)) == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_second_order_spool() -> None:
+    """Means by the trapezoid: its error is (wn dt)^2 / 12 of a step."""
+    u, wn, zeta = steps(3, 100), 200.0, 0.7
+    expected = exact_mean(
+        lambda t, y, v: [y[1], wn * wn * (v - y[0]) - 2 * zeta * wn * y[1], y[0]], u, [u[0], 0.0]
+    )
+    error = np.abs(second_order(u, DT, (wn, zeta)) - expected)[:-1]
+    assert error.max() < 1.1 * (wn * DT) ** 2 / 12 * np.ptp(u)
+
+
+@given(st.integers(0, 1000), st.floats(0.0, 2.0))
+def test_play_stays_within_half_its_width(seed: int, width: float) -> None:
+    u = steps(seed)
+    out = played(u, DT, (width,))
+    assert np.abs(out - u).max() <= 0.5 * width + 1e-12
+    assert np.array_equal(timing._play.py_func(u, 0.5 * width, w := np.empty(len(u))) or w, out)
+
+
+@pytest.mark.parametrize("effect", TIMINGS, ids=lambda t: f"{t.effect}{t.own_spools}")
+def test_nothing_is_left_of_the_command_s_steady_value(effect: timing.Timing) -> None:
+    """A constant command reaches the spool unchanged; valves of their own rest at zero."""
+    u = np.full(300, 2.0)
+    psi = effect.bank[0]
+    assert effect.on(u, 1, DT, psi) == pytest.approx(u, abs=1e-9)
+    assert effect.on(u, -1, DT, psi) == pytest.approx(0 * u if effect.own_spools else u, abs=1e-9)
+
+
+@pytest.mark.parametrize("effect", TIMINGS, ids=lambda t: f"{t.effect}{t.own_spools}")
+def test_derivatives_point_the_way(effect: timing.Timing) -> None:
+    """A small step of each parameter changes the command as its derivative says."""
+    u, psi = np.cumsum(steps(5)) / 50, effect.bank[1]
+    for k, value in enumerate(psi):
+        moved = list(psi)
+        moved[k] = 1.01 * value
+        change = effect.on(u, 1, DT, tuple(moved)) - effect.on(u, 1, DT, psi)
+        slope = effect.change(u, 1, DT, psi, k) * 0.01 * value
+        assert np.linalg.norm(change - slope) < 0.25 * np.linalg.norm(change) + 1e-9
