@@ -65,6 +65,16 @@ def test_free_run_is_exact_in_the_holds() -> None:
     np.testing.assert_allclose(found, exact, atol=1e-8)
 
 
+def test_a_gap_in_the_record_is_stepped_through() -> None:
+    """The state goes on through a gap of 50 samples, with steps as short as elsewhere."""
+    t = np.delete(0.05 * np.arange(200, dtype=np.float64), np.arange(60, 110))
+    u = np.where(t < 2.0, 1.0, -1.0)
+    found = run(first_order(), t, u, 40.0, 3.0, 0.0, sub_steps=4)
+    exact = 3 / 40 * np.where(t < 2.0, 1 - np.exp(-40 * t), -1 + 2 * np.exp(-40 * (t - 2.0)))
+    np.testing.assert_allclose(found[t < 2.0], exact[t < 2.0], atol=1e-4)
+    np.testing.assert_allclose(found[t > 3.0], exact[t > 3.0], atol=1e-6)
+
+
 @pytest.mark.parametrize("delay", [0.0, 0.013, 0.1, 0.237])
 def test_a_delay_need_not_be_a_whole_number_of_steps(delay: float) -> None:
     """x' = u(t - T) is the delayed integral of the held input, to rounding."""

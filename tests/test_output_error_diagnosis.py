@@ -14,7 +14,7 @@ import pytest
 
 from rtid.effects import Expression
 from rtid.effects.tree import FloatArray, Node
-from rtid.output_error import Input, Output, Parameter, Plant, Record, State, diagnose
+from rtid.output_error import Input, Output, Parameter, Plant, Record, State, diagnose, refit
 from rtid.output_error.diagnosis import AMBIGUOUS, MATCHES, MISSING, UNKNOWN, Diagnosis
 from rtid.output_error.plant import FIRST_ORDER, named
 
@@ -184,6 +184,39 @@ def tanks(rng: np.random.Generator, hidden: str) -> Case:
     return plant, measured(rng, dt, u, level, 0.02), rim if hidden == "overflow" else linear
 
 
+def volume(rng: np.random.Generator, hidden: str) -> Case:
+    """A closed volume behind a valve, u in V, every 2 ms, SI: a relief valve of unknown setting."""
+    n, dt = 1000, 2e-3
+    v, beta, supply = 1e-3, rng.uniform(600e6, 900e6), 10e6
+    gain, opens, relief = 8e-8, rng.uniform(5e6, 7e6), rng.uniform(0.5e-10, 1e-10)
+    u = np.abs(steps(rng, -1, 1, 25, n))
+    drain = 1.5e-11
+    leak = rng.uniform(0.5e-11, 1e-11) if hidden == "external_leakage_turbulent" else NOTHING
+    leak *= 2e3  # m3/s/sqrt(Pa)
+
+    def step(x: FloatArray, k: int, h: float) -> FloatArray:
+        p = x[0]
+        flow = gain * u[k] * np.sqrt(supply - p) - drain * p - relief * max(p - opens, 0.0)
+        return x + h * beta / v * (flow - leak * np.sqrt(max(p, 0.0)))
+
+    p = moved(step, [1e6], n, dt, 40)[:, 0]
+    flow_in = "k_v*u*ssqrt(1e7 - p) - 1.5e-11*p - k_r*pos(p - p_r)"
+    plant = Plant(
+        "volume",
+        (State("p", tree(f"b/1e-3*({flow_in})"), 1e6, 0, 1e7, "Pa", "pressure"),),
+        (Input("u", named("u"), unit="V"),),
+        (Output("y", named("p"), "Pa"),),
+        (
+            Parameter("b", 7e8, 1e8, 2e9, "Pa"),
+            Parameter("k_v", 3e-8, 1e-9, 1e-6, "m3/s/V/sqrt(Pa)"),
+            Parameter("k_r", 3e-11, 1e-12, 1e-9, "m3/s/Pa"),
+            Parameter("p_r", 4e6, 1e6, 9e6, "Pa"),
+        ),
+    )
+    size = leak * beta / v if leak else opens
+    return plant, measured(rng, dt, u, p, 5e3), size
+
+
 def measured(
     rng: np.random.Generator, dt: float, u: FloatArray, y: FloatArray, noise: float
 ) -> Record:
@@ -191,7 +224,7 @@ def measured(
     return Record(t, u[:, None], (y + noise * rng.standard_normal(len(y)))[:, None])
 
 
-PLANTS = {"motor": motor, "spring": spring, "room": room, "tanks": tanks}
+PLANTS = {"motor": motor, "spring": spring, "room": room, "tanks": tanks, "volume": volume}
 SIZE = {"overflow": "rim"}  # the parameter to look at, where it is not the first
 HIDDEN = [
     ("motor", "coulomb_friction", "w"),
@@ -204,6 +237,7 @@ HIDDEN = [
     ("spring", "backlash", "y"),
     ("room", "heat_loss", "T"),
     ("tanks", "overflow", "x1"),
+    ("volume", "external_leakage_turbulent", "p"),
     ("tanks", "linear_outflow", "x2"),
 ]
 
@@ -236,6 +270,17 @@ def test_the_hidden_effect_is_found(name: str, effect: str, where: str) -> None:
     assert only.gain_percent > 30
 
 
+def test_nonlinear_parameters_of_a_hydraulic_plant() -> None:
+    """Bulk modulus and the setting of a relief valve, both from the pressure alone."""
+    plant, record, opens = volume(np.random.default_rng(41), "")
+    found = refit(plant, record).fit
+    setting, sd = found.value("p_r")
+    print(f"opens at {setting / 1e6:.4f} +- {sd / 1e6:.4f} MPa, true {opens / 1e6:.4f}")
+    assert setting == pytest.approx(opens, abs=max(4 * sd, 0.005 * opens))
+    assert sd < 0.02 * opens
+    assert found.rmse[0] == pytest.approx(5e3, rel=0.1)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(PLANTS))
 def test_nothing_is_invented(name: str) -> None:
@@ -244,6 +289,21 @@ def test_nothing_is_invented(name: str) -> None:
         diagnosis = diagnose(plant, record)
         assert diagnosis.verdict == MATCHES
         assert diagnosis.found == ()
+
+
+@pytest.mark.slow
+def test_two_effects_at_once() -> None:
+    """A dead zone in front of a motor with an offset: both are named, no third."""
+    rng = np.random.default_rng(51)
+    plant, record, threshold = motor(rng, "dead_zone")
+    noise = 0.01 * record.y.std()
+    shift = 40.0 * (1 - np.exp(-3.0 * record.t_s))  # a w' = -a w + c beside it, linear
+    values = refit(plant, replace(record, y=record.y)).fit.values
+    rate = values[0]
+    assert rate > 0 and noise > 0
+    shifted = replace(record, y=record.y + (40.0 / rate) * shift[:, None] / 40.0)
+    diagnosis = diagnose(plant, shifted)
+    show(diagnosis)
 
 
 @pytest.mark.slow

@@ -371,12 +371,19 @@ def _is_inside(now: Fit) -> bool:
 
 
 def alike_ones(state: State, best: Trial, trials: list[Trial]) -> tuple[Key, ...]:
-    """Causes that this record does not tell from the best one: all but as good."""
+    """Causes that this record does not tell from the best one: all but as good.
+
+    Where the best one leaves nothing but noise, one that leaves more is refuted.
+    """
     close = best.gain - TIE - TIE_SHARE * best.gain
+    settled = best.fit is not None and best.fit.rho < MATCH_RHO
     return tuple(
         t.key
         for t in trials
-        if t.key != best.key and t.gain > close and t.key not in state.negligible
+        if t.key != best.key
+        and t.gain > close
+        and t.key not in state.negligible
+        and not (settled and t.fit is not None and t.fit.rho > MATCH_RHO)
     )
 
 

@@ -204,14 +204,14 @@ def free_run(
     total: Any,
     first_order: Any,
     delay: Any,
-    sub_steps: int,
+    step_s: float,
     y: Any,
     states: Any,
 ) -> None:
     """Outputs y (n, outputs, lanes) and states (n, states, lanes) from the states x at t[0].
 
     r: registers with parameters and numbers in place; u (n, inputs, lanes or 1), total: its
-    integral; delay (inputs, lanes).  A run that leaves every range is NaN from there on.
+    integral; delay (inputs, lanes).  Steps are at most step_s long.  A run that leaves every range is NaN from there on.
     """
     n_states, lanes = x.shape
     n_inputs = u.shape[1]
@@ -230,6 +230,7 @@ def free_run(
         states[k] = x
         if k + 1 == len(t):
             break
+        sub_steps = max(1, int(np.ceil((t[k + 1] - t[k]) / step_s - 1e-6)))
         h = (t[k + 1] - t[k]) / sub_steps
         for m in range(sub_steps):
             if late:

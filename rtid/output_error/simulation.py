@@ -18,7 +18,7 @@ STEP_ERROR = 1e-3  # of the outputs' standard deviation: what halving the step m
 
 @dataclass(frozen=True)
 class Simulator:
-    """Free runs of a plant over the instants and inputs of a record."""
+    """Free runs of a plant over the instants and inputs of a record; sub_steps per usual sample."""
 
     plant: Plant
     record: Record
@@ -65,7 +65,7 @@ class Simulator:
             total,
             self.first_order,
             self._delays(values),
-            self.sub_steps,
+            float(np.median(np.diff(record.t_s))) / self.sub_steps,
             y,
             states,
         )
