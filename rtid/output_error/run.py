@@ -211,7 +211,8 @@ def free_run(
     """Outputs y (n, outputs, lanes) and states (n, states, lanes) from the states x at t[0].
 
     r: registers with parameters and numbers in place; u (n, inputs, lanes or 1), total: its
-    integral; delay (inputs, lanes).  Steps are at most step_s long.  A run that leaves every range is NaN from there on.
+    integral; delay (inputs, lanes).  Steps are at most step_s long.  A run that leaves every range
+    is NaN from there on.
     """
     n_states, lanes = x.shape
     n_inputs = u.shape[1]
