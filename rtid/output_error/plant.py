@@ -1,7 +1,7 @@
 """A plant by its equations, x' = f(x, u, p), y = g(x, u, p), with states that nobody measures.
 
 Right sides are trees of `rtid.effects.tree` over the names of states, inputs and parameters.  An
-input acts as `acts` says, e.g. behind a dead zone; it may come late or through a gap (play).
+input acts as `acts` says, e.g. behind a dead zone; it may come late.
 """
 
 from __future__ import annotations
@@ -16,9 +16,7 @@ from rtid.effects.tree import NAME, ONE, ZERO, FloatArray, Node
 from rtid.errors import RtidError
 
 ANY = "any"
-QUANTITIES = ("level", "pressure", "temperature", "velocity", "displacement", ANY)
 ZERO_ORDER, FIRST_ORDER = "zero", "first"
-FREE, FIRST_INPUT = "free", "first input"
 
 
 class PlantError(RtidError):
@@ -62,7 +60,7 @@ class State:
 class Input:
     """One input as it is recorded, and what the equations see of it.
 
-    acts: over the input's own name, parameters and states.  delay, play: names of parameters.
+    acts: over the input's own name, parameters and states.  delay: the name of a parameter.
     """
 
     name: str
@@ -70,7 +68,6 @@ class Input:
     hold: str = ZERO_ORDER
     unit: str = ""
     delay: str = ""
-    play: str = ""
 
 
 @dataclass(frozen=True)

@@ -99,22 +99,22 @@ def _found(t: Any, at: float, k: int) -> int:
 
 
 @part
-def _volume(t: Any, u: Any, total: Any, i: int, j: int, at: float, k: int) -> float:
-    """Integral of the held input i of lane j up to the instant, which is in interval k."""
+def _volume(t: Any, u: Any, total: Any, i: int, at: float, k: int) -> float:
+    """Integral of the held input i up to the instant, which is in interval k."""
     if k < 0:
-        return u[0, i, j] * (at - t[0])
-    return total[k, i, j] + u[k, i, j] * (at - t[k])
+        return u[0, i] * (at - t[0])
+    return total[k, i] + u[k, i] * (at - t[k])
 
 
 @part
-def _linear(t: Any, u: Any, i: int, j: int, at: float, k: int) -> float:
-    """Value of the input i of lane j at the instant in interval k, linear between samples."""
+def _linear(t: Any, u: Any, i: int, at: float, k: int) -> float:
+    """Value of the input i at the instant in interval k, linear between samples."""
     if k < 0:
-        return u[0, i, j]
+        return u[0, i]
     if k + 1 == len(t):
-        return u[k, i, j]
+        return u[k, i]
     share = (at - t[k]) / (t[k + 1] - t[k])
-    return u[k, i, j] + share * (u[k + 1, i, j] - u[k, i, j])
+    return u[k, i] + share * (u[k + 1, i] - u[k, i])
 
 
 @part
@@ -130,38 +130,34 @@ def _late(
     w: Any,
 ) -> None:
     """Delayed inputs w (3, inputs, lanes) at begin, middle and end of [start, start + h]."""
-    last = u.shape[2] - 1
     for i in range(u.shape[1]):
         for j in range(delay.shape[1]):
-            source = min(j, last)
             begin = start - delay[i, j]
             k = _found(t, begin, at[i, j])
             at[i, j] = k
             if first_order[i]:
-                w[0, i, j] = _linear(t, u, i, source, begin, k)
+                w[0, i, j] = _linear(t, u, i, begin, k)
                 middle, end = begin + 0.5 * h, begin + h
-                w[1, i, j] = _linear(t, u, i, source, middle, _found(t, middle, k))
-                w[2, i, j] = _linear(t, u, i, source, end, _found(t, end, k))
+                w[1, i, j] = _linear(t, u, i, middle, _found(t, middle, k))
+                w[2, i, j] = _linear(t, u, i, end, _found(t, end, k))
                 continue
-            before = _volume(t, u, total, i, source, begin, k)
+            before = _volume(t, u, total, i, begin, k)
             end = begin + h
-            after = _volume(t, u, total, i, source, end, _found(t, end, k))
+            after = _volume(t, u, total, i, end, _found(t, end, k))
             w[0, i, j] = w[1, i, j] = w[2, i, j] = (after - before) / h
 
 
 @part
 def _in_time(u: Any, first_order: Any, k: int, share: float, h: float, w: Any) -> None:
     """The same without delay: from `share` of the interval k on, over a share h of it."""
-    last = u.shape[2] - 1
     for stage in range(3):
         along = share + 0.5 * stage * h
         for i in range(u.shape[1]):
             for j in range(w.shape[2]):
-                source = min(j, last)
-                here = u[k, i, source]
+                here = u[k, i]
                 w[stage, i, j] = here
                 if first_order[i]:
-                    w[stage, i, j] = here + along * (u[k + 1, i, source] - here)
+                    w[stage, i, j] = here + along * (u[k + 1, i] - here)
 
 
 @part
@@ -210,7 +206,7 @@ def free_run(
 ) -> None:
     """Outputs y (n, outputs, lanes) and states (n, states, lanes) from the states x at t[0].
 
-    r: registers with parameters and numbers in place; u (n, inputs, lanes or 1), total: its
+    r: registers with parameters and numbers in place; u (n, inputs), total: its
     integral; delay (inputs, lanes).  Steps are at most step_s long.  A run that leaves every range
     is NaN from there on.
     """
@@ -223,7 +219,7 @@ def free_run(
     for k in range(len(t)):
         for i in range(n_inputs):
             for j in range(lanes):  # at a sample a held input is what acts from here on
-                r[n_states + i, j] = u[k, i, min(j, u.shape[2] - 1)]
+                r[n_states + i, j] = u[k, i]
         r[:n_states] = x
         _execute(output_code, r)
         for o in range(len(outputs)):

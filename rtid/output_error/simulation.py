@@ -47,10 +47,9 @@ class Simulator:
         r[first : first + n_parameters] = values[:n_parameters]
         last = program.first_number + len(program.numbers)
         r[program.first_number : last] = program.numbers[:, None]
-        u = self._inputs(values)
-        steps = np.diff(record.t_s)[:, None, None]
+        u = np.ascontiguousarray(record.u)
         total = np.zeros_like(u)
-        total[1:] = np.cumsum(u[:-1] * steps, axis=0)
+        total[1:] = np.cumsum(u[:-1] * np.diff(record.t_s)[:, None], axis=0)
         y = np.empty((len(record.t_s), len(plant.outputs), lanes))
         states = np.empty((len(record.t_s), len(plant.states), lanes))
         free_run(
@@ -59,7 +58,7 @@ class Simulator:
             program.output_code,
             program.outputs,
             r,
-            self._initial(values, u),
+            self._initial(values),
             record.t_s,
             u,
             total,
@@ -71,13 +70,13 @@ class Simulator:
         )
         return self._played(y, values), states
 
-    def _initial(self, values: FloatArray, u: FloatArray) -> FloatArray:
+    def _initial(self, values: FloatArray) -> FloatArray:
         """States at the first sample (states, lanes)."""
         x = np.empty((len(self.plant.states), values.shape[1]))
         names = [i.name for i in self.plant.inputs]
         free = iter(values[len(self.plant.parameters) :])
         for row, state in zip(x, self.plant.states, strict=True):
-            row[:] = u[0, names.index(state.follows)] if state.follows else next(free)
+            row[:] = self.record.u[0, names.index(state.follows)] if state.follows else next(free)
         return x
 
     def _of(self, values: FloatArray, name: str) -> FloatArray:
@@ -90,17 +89,6 @@ class Simulator:
             if given.delay:
                 row[:] = self._of(values, given.delay)
         return found
-
-    def _inputs(self, values: FloatArray) -> FloatArray:
-        """Inputs (n, inputs, lanes or 1), behind their gaps."""
-        u = np.ascontiguousarray(self.record.u)[:, :, None]
-        if not any(i.play for i in self.plant.inputs):
-            return u
-        u = np.repeat(u, values.shape[1], axis=2)
-        for i, given in enumerate(self.plant.inputs):
-            if given.play:
-                _behind_gap(u[:, i], self._of(values, given.play))
-        return u
 
     def _played(self, y: FloatArray, values: FloatArray) -> FloatArray:
         for o, output in enumerate(self.plant.outputs):
