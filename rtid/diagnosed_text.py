@@ -128,9 +128,9 @@ def _found_table(found: Diagnosis) -> Table:
 
 
 def _unseen_table(found: Diagnosis) -> Table:
-    table = Table(title="not found: the smallest size that this record would have shown",
+    table = Table(title="not found, and the smallest size that this record would have shown",
                   title_justify="left")  # fmt: skip
-    for name in ("effect", "where", "detection limit", "why"):
+    for name in ("effect", "where", "detection limit", "remark"):
         table.add_column(name)
     rows: list[Unseen] = sorted(found.not_found, key=lambda u: not u.visible)
     for unseen in [u for u in rows if u.detection_limit is not None][: 3 * SHOWN]:

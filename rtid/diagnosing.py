@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rtid.diagnose.diagnosis import Result, search
@@ -38,7 +38,7 @@ def diagnose_trace(
     """Diagnose one trace.  Raises NoSamplesError where there is nothing to learn from."""
     progress("reading", 0.0)
     trace = read_trace(project, path)
-    model = model_for(project, trace.samples)
+    model = replace(model_for(project, trace.samples), own_effects=project.effects)
     identification, held_out = parts(project, model, trace)
     result = search(model, identification, held_out, progress, added_parts(project))
     progress("done", 1.0)

@@ -16,6 +16,7 @@ this module knows a file.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -210,6 +211,7 @@ class Model:
     # where a block is coupled to all that were visited within its memory, and cost information.
     recent_blocks: int = 64
     mode: str = NONE  # the signal that carries the number of the working mode
+    own_effects: tuple[Any, ...] = ()  # `rtid.effects.UserEffect`s that the diagnosis offers
 
     @property
     def n_cells(self) -> int:

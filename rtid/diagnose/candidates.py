@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.signal import lfilter
 
+from rtid import effects
 from rtid.diagnose.evidence import Given
 from rtid.diagnose.view import View
 from rtid.estimator.state import variance
@@ -139,7 +140,17 @@ def causes(view: View) -> list[Cause]:
     """Every effect whose column is known once the map is: flows, storage, supply, drift."""
     if not view.has_pressures:
         return []
-    makers = (_leaks, _seats, _valves_on_chambers, _storage, _lines, _supply, _drift, _sensors)
+    makers = (
+        _leaks,
+        _seats,
+        _valves_on_chambers,
+        _storage,
+        _lines,
+        _supply,
+        _drift,
+        _sensors,
+        _own,
+    )
     return [cause for make in makers for cause in make(view)]
 
 
@@ -439,6 +450,27 @@ def _late_position(view: View) -> Volumes:
         swept = view.chamber_flow(c) - view.compliance[c] * view.volume(c)[:-1] * rate
         late[c] = -np.diff(swept, prepend=swept[:1])
     return late
+
+
+def _own(view: View) -> Iterator[Cause]:
+    """Effects that the user has defined: one cause per combination of their shape parameters."""
+    names = [chamber.name for chamber in view.model.chambers]
+    seen = effects.View(view.model, view.t_s, view.chunk[:, 2:])
+    for effect in view.model.own_effects:
+        signs = {names.index(name): sign for name, sign in effect.signs}
+        for shape in effect.bank():
+            parameter = ", ".join(["coefficient", *(f"{k} = {v:g}" for k, v in shape.items())])
+            candidate = Candidate(
+                effect.name, "own effect", parameter, effect.unit, effect.largest, effect.sign
+            )
+            yield _fixed(candidate, _own_volumes, effect, seen, shape, signs)
+
+
+def _own_volumes(
+    effect: effects.UserEffect, seen: effects.View, shape: dict[str, float], signs: dict[int, int]
+) -> Volumes:
+    volume = effect.volume(seen, shape)
+    return {c: sign * volume for c, sign in signs.items()}
 
 
 def add_echoes(view: View, columns: Columns, first: int) -> None:

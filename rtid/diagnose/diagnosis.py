@@ -29,6 +29,7 @@ LARGE = 1.5  # rho above which timing effects are refitted whatever their score
 TIE, TIE_SHARE = 12.0, 0.03  # causes within so much of the best gain are not told apart
 MOST = 6  # effects that are added at most
 WORSE = 1.02  # held-out residual, as a share, that an immaterial effect may not raise
+LEAST_ROWS = 50  # filtered rows that a held-out part must have, or the other part judges
 MOST_NEGLIGIBLE = 4  # that are looked at
 NOTICED = 0.01  # of the degrees of freedom: chi2 from which an immaterial effect stays in the model
 SHARE = 0.4  # of the misfit left that a cause must explain, once most of the first is explained,
@@ -117,9 +118,12 @@ def search(
     """Diagnose a record; chunk and held_out (n, 2 + signals) as from `to_chunk`.
 
     parts: effects that the model has already.  Raises PartError where the record has none of them.
+    Where the map is known over next to nothing of the held-out part, the record itself judges.
     """
     state, first = begin(model, chunk, held_out, progress, parts)
     present = first
+    if len(residual(first, state.held_out).t_s) < LEAST_ROWS:
+        state.held_out = state.chunk
     before = last = residual(first, state.held_out)
     bare = _bare(state, first)
     state.excess = bare.estimate.sse - bare.regression.dof
@@ -407,7 +411,7 @@ def _look_back(state: State, present: Fit, last: Residual) -> tuple[Fit, Residua
     return present, last
 
 
-NAMED = 0.5  # of the misfit that effects must explain to be named where something else remains
+NAMED = 0.8  # of the misfit that effects must explain to be named where something else remains
 
 
 def _verdict(state: State, last: Fit, after: Residual) -> str:

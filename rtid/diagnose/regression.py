@@ -14,7 +14,7 @@ import numpy as np
 from rtid.model import FloatArray
 
 CLEARLY = 3.0  # standard deviations of the noise's own products by which a column must exceed it
-VANISHED = 1e-12  # share of a column's square that rounding leaves
+VANISHED = 1e-10  # share of a column's square that rounding leaves
 LIMIT_SD = 4.0  # an effect of so many standard deviations would have been seen
 
 
@@ -104,13 +104,13 @@ class Regression:
         return estimate.sse / max(1.0, self.dof - len(estimate.used))
 
     def score(self, used: tuple[int, ...], column: int) -> Score:
-        """A candidate beside the columns in use; one that never moved is not visible."""
-        if self.s[column, column] <= VANISHED * max(self.own[column], 1e-300):
+        """A candidate beside the columns in use; what these follow entirely is not visible."""
+        left = self._left(used, column)
+        if left <= VANISHED * max(self.own[column], 1e-300):
             return Score(column, 0.0, np.inf, 0.0, 0.0)
         with_it = self.fit((*used, column))
         value, sd = with_it.value(column), with_it.sd(column)
         gain = (value / sd) ** 2 if sd > 0 else 0.0
-        left = self._left(used, column)
         visible = float(np.sqrt(max(0.0, left / max(self.own[column], 1e-300))))
         return Score(column, value, sd, gain, visible)
 

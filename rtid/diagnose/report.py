@@ -205,16 +205,23 @@ def _limit(result: Result, candidate: Candidate, score: Score) -> Unseen:
     fit, unit = result.last, candidate.unit
     limit = physical(fit, candidate, detection_limit(score, fit.rho))
     if candidate.parameter == "share":  # of a timing: times the value that its column was made for
-        limit, unit = limit * (candidate.shape or 0.0), candidate.shape_unit
-    largest = candidate.largest * (candidate.shape or 1.0 if candidate.parameter == "share" else 1)
-    visible = np.isfinite(limit) and score.visible > VISIBLE and limit < largest
+        limit, unit = _of_timing(candidate, limit), candidate.shape_unit
+        visible = np.isfinite(limit) and score.visible > VISIBLE
+    else:
+        visible = score.visible > VISIBLE and limit < candidate.largest
     if candidate.key in result.negligible:
         reason = "present, negligible: it changes next to nothing on the held-out part"
     elif visible:
-        reason = "nothing of this size: the record would have shown it"
+        reason = ""
     else:
         reason = f"the maps follow {100 * (1 - score.visible**2):.2f} % of it in this record"
     return Unseen(candidate.effect, candidate.where, float(limit), unit, bool(visible), reason)
+
+
+def _of_timing(candidate: Candidate, share: float) -> float:
+    """Share of a timing as its parameter: a spool is the slower the lower its frequency."""
+    shape = candidate.shape or 0.0
+    return shape / share if candidate.shape_name == "natural_frequency" else shape * share
 
 
 def advice(result: Result, unseen: tuple[Unseen, ...]) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from rtid.kernels.explain import filter_rows
 from rtid.model import FloatArray
 
 WN_RAD_S, ZETA, ROWS_PER_S = 2 * np.pi * 10, 0.8, 50.0
-KNOWN = 0.0015  # of the rated flow: where the map is known worse, nothing is judged
+KNOWN = 0.004  # of the rated flow: where the map is known worse, nothing is judged
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,106 @@
+"""One simulated machine with something hidden in it, diagnosed and judged against the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from math import sqrt
+from multiprocessing import get_context
+
+from rtid.diagnose.diagnosis import search
+from rtid.diagnose.report import Diagnosis, diagnosis
+from rtid.estimator.estimator import to_chunk
+from rtid.sim.declare import declared_model
+from rtid.sim.hidden import HIDDEN, MECHANICAL, OUTSIDE
+from rtid.sim.random_plants import draw, draw_hidden
+from rtid.sim.run import SimulationError, simulate
+from tests.campaign.plants import WORKERS, grid
+
+RECORD_S, LEARN_S, TEST_S = 110.0, 80.0, 83.0
+NONE = "none"
+
+RIGHT, IN_SET, NEGLIGIBLE, SILENT, UNKNOWN, WRONG = (
+    "right", "in a set", "negligible", "not seen", "unknown", "wrong name"
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is drawn: the machine's number, what is hidden, how much of it, the motion."""
+
+    seed: int
+    effect: str = NONE
+    level: str = "middle"
+    motion: str = "rich_record"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A judged diagnosis; named: the first effect that was named, "" where none was."""
+
+    case: Case
+    judgement: str
+    named: str
+    verdict: str
+    rho_before: float
+    rho_after: float
+
+
+def outcomes(cases: Iterable[Case]) -> Iterator[Outcome]:
+    """Outcomes of all machines that could be simulated, on WORKERS processes."""
+    with ProcessPoolExecutor(WORKERS, get_context("spawn")) as pool:
+        for found in pool.map(outcome, cases):
+            if found is not None:
+                yield found
+
+
+def outcome(case: Case) -> Outcome | None:
+    """One case; None where the drawn machine leaves its stroke or cavitates."""
+    plant = (
+        draw(case.seed) if case.effect == NONE else draw_hidden(case.seed, case.effect, case.level)
+    )
+    try:
+        run = simulate(plant, case.motion, case.seed, RECORD_S)
+    except SimulationError:
+        return None
+    model = declared_model(plant, seed=case.seed, grid=grid(plant.p_supply_pa))
+    chunk = to_chunk(model, run.samples, 0)
+    t_s = chunk[:, 0]
+    found = diagnosis(search(model, chunk[t_s < LEARN_S], chunk[t_s >= TEST_S]))
+    named = found.found[0].effect if found.found else ""
+    return Outcome(
+        case, judge(case, found), named, found.verdict, found.rho_before, found.rho_after
+    )
+
+
+def truth(effect: str) -> str:
+    """The catalogue's name of what was hidden, "" for nothing that the catalogue knows."""
+    if effect == NONE or effect in OUTSIDE or effect in MECHANICAL:
+        return ""
+    return HIDDEN[effect].catalogue or effect
+
+
+def judge(case: Case, found: Diagnosis) -> str:
+    """What the diagnosis is worth."""
+    true = truth(case.effect)
+    if not found.found:
+        if true and true in {small.effect for small in found.negligible}:
+            return NEGLIGIBLE
+        return UNKNOWN if found.verdict == "unknown" else SILENT
+    names = [effect.effect for effect in found.found]
+    sets = [{n.split(" ")[0] for n in e.cannot_be_told_from} for e in found.found]
+    if true and names[0] == true and not sets[0]:
+        return RIGHT
+    if true and any(true == n or true in s for n, s in zip(names, sets, strict=True)):
+        return IN_SET if all(len(s) <= 2 for s in sets) else WRONG
+    return WRONG
+
+
+def wilson(hits: int, n: int, z: float = 1.96) -> tuple[float, float]:
+    """Wilson's 95 % interval of a share."""
+    if n == 0:
+        return 0.0, 1.0
+    p = hits / n
+    middle, half = p + z * z / (2 * n), z * sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    return (middle - half) / (1 + z * z / n), (middle + half) / (1 + z * z / n)
