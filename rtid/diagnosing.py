@@ -6,14 +6,18 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from rtid.diagnose.diagnosis import Result, search
 from rtid.diagnose.parts import Part
 from rtid.diagnose.report import Diagnosis, diagnosis
-from rtid.estimator.estimator import to_chunk
+from rtid.effects import UserEffect
+from rtid.estimator.estimator import Estimator, to_chunk
 from rtid.model import FloatArray, Model
 from rtid.project import Project
 from rtid.replay import NoSamplesError, Trace, model_for, read_trace
 
+MIN_LIVE_S = 10.0
 HELD_OUT_SHARE = 0.25  # of a record without declared parts: its end
 
 
@@ -43,6 +47,28 @@ def diagnose_trace(
     result = search(model, identification, held_out, progress, added_parts(project))
     progress("done", 1.0)
     return Diagnosed(project, model, trace, result, diagnosis(result))
+
+
+def diagnose_live(
+    estimator: Estimator, more: tuple[Part, ...] = (), own_effects: tuple[UserEffect, ...] = ()
+) -> Diagnosis:
+    """What is missing in a running estimator's model, by the samples in its ring buffer.
+
+    The newest quarter is held out.  The estimator is not changed, and may go on in its thread: the
+    samples are copied first.  Raises NoSamplesError without a ring buffer ([upkeep] history_s), or
+    where it holds less than MIN_LIVE_S.
+    """
+    history = estimator.history
+    chunk = history.chunk() if history is not None else np.zeros((0, 2))
+    held_s = chunk[-1, 0] - chunk[0, 0] if len(chunk) else 0.0
+    if held_s < MIN_LIVE_S:
+        raise NoSamplesError(
+            f"{held_s:.1f} s of samples are kept, a diagnosis needs {MIN_LIVE_S:g} s",
+            "set upkeep.history_s in the project file, 120 for instance, and let the machine move",
+        )
+    held_out = chunk[:, 0] >= chunk[-1, 0] - HELD_OUT_SHARE * held_s
+    model = replace(estimator.model, own_effects=own_effects)
+    return diagnosis(search(model, chunk[~held_out], chunk[held_out], parts=more))
 
 
 def added_parts(project: Project) -> tuple[Part, ...]:
