@@ -26,6 +26,7 @@ from rtid.refitting import Refitted
 
 SCHEMA = 1
 LIMIT_SD = 4.0  # standard deviations that an effect must have to be seen
+BEYOND = "it would act only beyond what this record reaches, or changes nothing in it: "
 FADING = (AMPLITUDE, INPUT, TIME, GAP)  # kinds of parameters at whose zero the effect is gone
 
 
@@ -105,7 +106,7 @@ def _not_found(d: Diagnosis) -> Iterator[dict[str, Any]]:
             "parameter": added.label,
             "unit": _unit(model, key, added),
             "visible": visible,
-            "reason": "" if visible else page_of(key[0]).visible_when,
+            "reason": "" if visible else BEYOND + page_of(key[0]).visible_when,
         }
 
 
@@ -165,7 +166,7 @@ def _equations(model: Model) -> Iterator[tuple[str, str]]:
 
 
 def _spoken(key: Key) -> str:
-    return f"{page_of(key[0]).title.lower()} ({key[0]}) at {key[1]}"
+    return f"{page_of(key[0]).title.lower()} at {key[1]}"
 
 
 def tell(console: Console, found: Refitted) -> None:
@@ -219,6 +220,9 @@ def _diagnosis_sentences(d: Diagnosis) -> Iterator[str]:
         if f.alike:
             names = " or ".join(_spoken(key) for key in f.alike)
             yield f"  It cannot be told from {names}."
+    if d.found:
+        names = " ".join(f"--add {effect}:{where}" for effect, where in d.last.keys)
+        yield f"To fit with what was found: {names}."
     for f in d.negligible:
         yield f"Present but negligible: {_spoken(f.key)}."
     yield from advice(d)
@@ -240,8 +244,8 @@ def _not_found_table(d: Diagnosis) -> Table:
     for head in ("effect", "at", "limit", "unit"):
         table.add_column(head)
     for row in _not_found(d):
-        size = (
-            f"{row['parameter']} {row['detection_limit']:.3g}" if row["visible"] else "not visible"
-        )
+        size = "only beyond the record"
+        if row["visible"]:
+            size = f"{row['parameter']} {row['detection_limit']:.3g}"
         table.add_row(row["effect"], row["where"], size, row["unit"])
     return table

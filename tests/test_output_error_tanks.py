@@ -79,4 +79,5 @@ def test_the_report_names_what_the_diagnosis_found(diagnosed: Refitted) -> None:
     assert {"verdict", "not_found", "negligible", "advice"} <= told.keys()
     limits = [r["detection_limit"] for r in told["not_found"] if r["visible"]]
     assert limits and all(np.isfinite(limit) and limit > 0 for limit in limits)
+    assert "saturation" not in {r["effect"] for r in told["not_found"] if r["visible"]}
     assert all(r["reason"] for r in told["not_found"] if not r["visible"])

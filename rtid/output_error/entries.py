@@ -10,9 +10,10 @@ from rtid.output_error.plant import PlantError
 from rtid.units import nearest
 
 # What sets the size of a parameter: the term that it multiplies, a signal, a time of the record.
-AMPLITUDE, INPUT, STATE, SPEED, GAP, TIME, RATE, SHARE = (
+AMPLITUDE, INPUT, LIMIT, STATE, SPEED, GAP, TIME, RATE, SHARE = (
     "amplitude",
     "input",
+    "limit",
     "state",
     "speed",
     "gap",
@@ -43,7 +44,7 @@ ENTRIES = {
     "viscous_friction": Entry(("velocity",), {"coefficient": AMPLITUDE}),
     "stribeck_friction": Entry(("velocity",), {"force": AMPLITUDE, "velocity": SPEED}),
     "cubic_stiffness": Entry(("velocity",), {"coefficient": AMPLITUDE}),
-    "saturation": Entry((), {"limit": INPUT}),
+    "saturation": Entry((), {"limit": LIMIT}),
     "dead_zone": Entry((), {"threshold": INPUT}),
     "pure_delay": Entry((), {"delay": TIME}),
     "first_order_lag": Entry((), {"time_constant": TIME}),

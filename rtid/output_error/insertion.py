@@ -26,6 +26,7 @@ from rtid.output_error.entries import (
     ENTRIES,
     GAP,
     INPUT,
+    LIMIT,
     RATE,
     SHARE,
     SPEED,
@@ -249,7 +250,7 @@ def unit_of(plant: Plant, effect_name: str, where: str, added: Added) -> str:
     units = {s.name: s.unit for s in plant.states} | {i.name: i.unit for i in plant.inputs}
     units |= {o.name: o.unit for o in plant.outputs}
     unit = units.get(where, "")
-    if added.kind in (INPUT, STATE, SPEED, GAP):
+    if added.kind in (INPUT, LIMIT, STATE, SPEED, GAP):
         return unit
     if added.kind in (TIME, RATE, SHARE):
         return {TIME: "s", RATE: "1/s", SHARE: "1"}[added.kind]

@@ -155,4 +155,7 @@ def substituted(node: Node, by: Mapping[str, Node]) -> Node:
     """The tree with names replaced by trees."""
     if node.op == NAME:
         return by.get(node.name, node)
-    return replace(node, args=tuple(substituted(arg, by) for arg in node.args))
+    args = tuple(substituted(arg, by) for arg in node.args)
+    if node.op == "-" and args[1] == ZERO:
+        return args[0]
+    return replace(node, args=args)

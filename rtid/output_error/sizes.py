@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rtid.effects.tree import FloatArray, Node, derivative, evaluate, names_of, number
-from rtid.output_error.entries import AMPLITUDE, GAP, INPUT, RATE, SHARE, SPEED, STATE, TIME
+from rtid.output_error.entries import AMPLITUDE, GAP, INPUT, LIMIT, RATE, SHARE, SPEED, STATE, TIME
 from rtid.output_error.fit import Fit
 from rtid.output_error.insertion import Added, Insertion
 from rtid.output_error.plant import Plant, named, substituted
@@ -81,6 +81,7 @@ def _range(insertion: Insertion, added: Added, present: Fit) -> Range:
         return _amplitude(insertion, added, present)
     sizes: dict[str, Callable[[], Range]] = {
         INPUT: lambda: _input(insertion, present),
+        LIMIT: lambda: _input(insertion, present),
         STATE: lambda: _level(insertion, present),
         SPEED: lambda: _speed(insertion, present),
         GAP: lambda: _gap(insertion, present),
