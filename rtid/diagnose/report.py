@@ -13,12 +13,14 @@ from scipy.stats import chi2
 
 from rtid.diagnose.candidates import Candidate
 from rtid.diagnose.diagnosis import Found, Key, Result, detection_limit, physical
+from rtid.diagnose.experiment import limits
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.parts import OWN_TIME
 from rtid.diagnose.regression import Score
 from rtid.effects import catalogue
 
 SCHEMA = 1
+WORTH = 2.0  # times better that an experiment must be to be proposed
 VISIBLE = 2e-3  # share of a column that must be left beside the maps
 HYDRAULIC = ("flow", "storage", "timing", "supply", "map")
 
@@ -237,4 +239,24 @@ def advice(result: Result, unseen: tuple[Unseen, ...]) -> tuple[str, ...]:
         page = pages.get(name)
         if page is not None and page.visible_when:
             found.append(f"{name} cannot be seen in this record: {page.visible_when}")
-    return tuple(dict.fromkeys(found))
+    return tuple(dict.fromkeys(found + _experiment(result, unseen)))
+
+
+def _experiment(result: Result, unseen: tuple[Unseen, ...]) -> list[str]:
+    """What a wandering supply would show, computed from this record's own motion."""
+    closed = {(u.effect, u.where) for u in unseen if not u.visible}
+    closed |= {key for f in result.found for key in (f.key, *f.alike) if f.alike}
+    best: dict[Key, tuple[float, float]] = {}
+    for candidate, (before, after) in (limits(result.last) if closed else {}).items():
+        if candidate.key in closed and np.isfinite(after) and after > 0:
+            scale = physical(result.last, candidate, 1.0)
+            known = best.get(candidate.key)
+            if known is None or scale * after < known[1]:
+                best[candidate.key] = scale * before, scale * after
+    units = {c.key: c.unit for c, _ in result.scores}
+    return [
+        f"Supply varied by 20 % in the same motion: {effect} ({where}) would be seen from "
+        f"{after:.2g} {units.get((effect, where), '')} on, instead of {before:.2g}."
+        for (effect, where), (before, after) in best.items()
+        if before > WORTH * after
+    ]
