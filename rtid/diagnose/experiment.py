@@ -1,8 +1,9 @@
 """Which motion would show more: detection limits of this record, had its supply been varied.
 
-A chamber that is fed follows its supply: at the same motion and commands the pressure drops stay
-what they were, and P_c = p_s - dp moves with p_s.  That is what a constant supply hides, where any
-function of P_c is one of dp.  So the record is rewritten with a wandering supply, every column is
+Under the same load and motion the pressures of the chambers stay what they were; the drop over a
+valve that feeds one moves with the supply, and the controller moves the command so that the flow
+stays:  du = - (dQ/ddp / dQ/du) dp_s.  That is what a constant supply hides, where any function of
+P_c = p_s - dp is one of dp.  So the record is rewritten with a wandering supply, every column is
 made anew, and the standard deviations follow without simulating a machine.
 """
 
@@ -16,7 +17,8 @@ from rtid.diagnose.regression import LIMIT_SD
 from rtid.model import FloatArray
 
 SWING, RATES_HZ = 0.2, (0.03, 0.11)  # of the supply
-SETTLE_S = 0.05  # within which a chamber that is fed anew takes up its supply
+STEEP = 0.05  # of the largest dQ/du: a command that hardly opens its valve is left alone
+MOST_V = 2.0  # that the command is moved by
 
 Limits = dict[Candidate, tuple[float, float]]
 
@@ -32,13 +34,15 @@ def varied_supply(fit: Fit) -> FloatArray | None:
     wander = sum(np.sin(2 * np.pi * rate * t_s) for rate in RATES_HZ) / len(RATES_HZ)
     rise = SWING * np.median(chunk[:, supply]) * wander
     chunk[:, supply] += rise
-    for chamber in declared.chambers:
-        fed = np.zeros(view.n)
-        for i, edge in enumerate(declared.edges):
-            if edge.source == view.supply_name and edge.sign(chamber) > 0:
-                fed[:-1] = np.maximum(fed[:-1], view.flow(i) > 0.0)
-        share = view.smooth_steps(fed, SETTLE_S)
-        chunk[:, 2 + declared.column(chamber.pressure)] += share * rise
+    for i, edge in enumerate(declared.edges):
+        if edge.source == view.supply_name:
+            slope = view.slope_u(i)
+            steep = slope > STEEP * max(float(slope.max()), 1e-300)
+            moved = np.where(steep, -view.slope_dp(i) * rise[:-1], 0.0) / np.where(
+                steep, slope, 1.0
+            )
+            command = 2 + declared.column(edge.command)
+            chunk[:-1, command] += edge.direction * np.clip(moved, -MOST_V, MOST_V)
     return chunk
 
 

@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter, savgol_filter
+from scipy.signal import savgol_filter
 
 from rtid.estimator.state import Weights, build
 from rtid.kernels.evidence import follow_map
@@ -151,11 +151,6 @@ class View:
         """Largest standard deviation of the flows of open edges, as a share of the rated flow."""
         rated = np.array([edge.rated_q_m3s for edge in self.model.edges])
         return np.asarray((self.along[:, :, 4] / rated).max(axis=1))
-
-    def smooth_steps(self, values: FloatArray, tau_s: float) -> FloatArray:
-        """Values behind a first-order lag (n,)."""
-        fade = float(np.exp(-self.step_s / tau_s))
-        return np.asarray(lfilter([1 - fade], [1, -fade], values))
 
     def smooth(self, values: FloatArray, derivative: int = 0) -> FloatArray:
         """Values without most of their noise and without delay, or their derivative per second."""
