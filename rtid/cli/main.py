@@ -27,6 +27,7 @@ COMMANDS = {
     "refit": "Fit a plant by its equations to a record, and find what they miss.",
     "effects": "List the physical effects that may be missing in the model, or explain one.",
     "diagnose": "Name the physical effect that is missing in the model, or say what would tell.",
+    "report": "Write the story of a trace as one HTML file with pictures.",
     "add": "Make a missing effect part of the model, and see the error fall.",
     "drop": "Take an effect out of the model again.",
     "undo": "Take the last change of the model back.",

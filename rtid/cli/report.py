@@ -1,0 +1,40 @@
+"""`rtid report`: the story of a captured trace as one HTML file, readable without a network."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rtid.cli.exits import refuse_truncated
+
+
+def report(
+    trace: Annotated[Path, typer.Argument(help="CAN log or table.")],
+    project: Annotated[Path, typer.Option("--project", "-p", help="Project file.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="HTML file to write.")] = Path(
+        "report.html"
+    ),
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Write one HTML file that tells what the model misses: verdict, errors, pictures, tables.
+
+    Everything is inside the file: it can be mailed, printed and read with the network off.
+    """
+    from rtid.diagnosed_text import sentences
+    from rtid.present import progress_bar
+    from rtid.project import load
+    from rtid.reporting import report as write_report
+
+    loaded = load(project)
+    with progress_bar(hidden=as_json) as progress:
+        written = write_report(loaded, trace, output, progress)
+    if as_json:
+        print(json.dumps(written.as_json()))
+    else:
+        for sentence in sentences(written.told.diagnosed.diagnosis):
+            print(sentence)
+        print(f"wrote {output}, {written.size / 1e3:.0f} kB")
+    refuse_truncated(trace, written.told.diagnosed.trace.counters)

@@ -1,0 +1,205 @@
+"""What a report tells: diagnosis, residuals before and after, ranking, history."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+
+from rtid.compare import Comparison, Dependence, Intervals, against_signals, over_time
+from rtid.diagnose.candidates import Candidate
+from rtid.diagnose.clean import usable
+from rtid.diagnose.diagnosis import LEAST_ROWS, physical, scored
+from rtid.diagnose.fit import Fit
+from rtid.diagnose.regression import Score
+from rtid.diagnose.report import parameters
+from rtid.diagnose.residual import WN_RAD_S, ZETA, Residual, residual
+from rtid.diagnosing import Diagnosed, diagnose_trace, parts
+from rtid.model import FloatArray, Model
+from rtid.project import Project
+from rtid.project.history import Change, read
+
+SIGNALS = 5  # whose residual is shown: those that explain most of it
+
+Progress = Callable[[str, float], None]
+Key = tuple[str, str]
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """A candidate: effect and place, clarity in standard deviations before and after (None: found).
+
+    value, std, unit: its coefficient beside the last model, or as fitted; is_possible: of a sign
+    and size that physics allows; per_shape: the value of a
+    timing of which the coefficient is a share, "" where it is none; limit: detection limit, SI.
+    """
+
+    key: Key
+    before: float | None
+    after: float | None
+    value: float
+    std: float
+    unit: str
+    is_possible: bool = True
+    per_shape: tuple[float, str] | None = None
+    limit: float | None = None
+    limit_unit: str = ""
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a report tells: the diagnosis, the residual of both parts before and after, the ranking.
+
+    after is None and depends_after is empty where nothing was found.
+    """
+
+    diagnosed: Diagnosed
+    chambers: tuple[str, ...]
+    before: tuple[Residual, Residual]
+    after: tuple[Residual, Residual] | None
+    depends_before: tuple[Dependence, ...]
+    depends_after: tuple[Dependence, ...]
+    ranking: tuple[Ranked, ...]
+    history: tuple[Change, ...]
+    trace_sha256: str
+    date: str
+
+    @property
+    def judges(self) -> int:
+        """The part that judges: the held-out one, or 0, the record, where too little is known."""
+        return 1 if len(self.before[1].t_s) >= LEAST_ROWS else 0
+
+
+def _silent(_what: str, _share: float) -> None:
+    pass
+
+
+def tell(project: Project, trace: Path, progress: Progress = _silent) -> Told:
+    """Diagnose a trace once and gather what its report shows."""
+    found = diagnose_trace(project, trace, progress)
+    first, last = found.result.first, found.result.last
+    chunks = [usable(first.declared, part) for part in parts(project, found.model, found.trace)]
+    before = _both(first, chunks)
+    after = _both(last, chunks) if found.diagnosis.found else None
+    depends = _telling(
+        _depends(first.declared, before, chunks),
+        _depends(first.declared, after, chunks) if after else (),
+    )
+    return Told(
+        found,
+        tuple(chamber.name for chamber in found.model.chambers),
+        before,
+        after,
+        *depends,
+        _ranking(found),
+        tuple(read(project.path)),
+        _sha256(trace),
+        datetime.now().astimezone().isoformat(" ", "seconds"),
+    )
+
+
+def _both(fit: Fit, chunks: list[FloatArray]) -> tuple[Residual, Residual]:
+    return residual(fit, chunks[0]), residual(fit, chunks[1])
+
+
+def _depends(
+    model: Model, both: tuple[Residual, Residual], chunks: list[FloatArray]
+) -> tuple[Dependence, ...]:
+    """The residual of both parts against every signal that varies, and time."""
+    t_s = np.concatenate([part.t_s for part in both])
+    measured, left = (
+        np.concatenate([getattr(part, name) for part in both]) for name in ("measured", "left")
+    )
+    chunk = np.concatenate(chunks)
+    chunk = chunk[np.argsort(chunk[:, 0], kind="stable")]
+    at_s = t_s - 2 * ZETA / WN_RAD_S  # the filter's delay at low frequencies
+    values = [np.interp(at_s, chunk[:, 0], chunk[:, 2 + j]) for j in range(len(model.signals))]
+    empty = np.empty((0, len(model.chambers)))
+    part = Comparison(
+        name="",
+        t_s=t_s,
+        measured_m3s=measured,
+        modelled_m3s=measured - left,
+        cell=np.zeros((len(t_s), len(model.edges)), np.int64),
+        shares={},
+        rho=np.ones(len(model.chambers)),
+        signals=np.stack(values, axis=1),
+        intervals=Intervals(t_s[:0], np.zeros((0, 0), np.int64), empty, empty, empty),
+    )
+    return (*against_signals(model, part), over_time(part)) if len(t_s) else ()
+
+
+def _telling(
+    before: tuple[Dependence, ...], after: tuple[Dependence, ...]
+) -> tuple[tuple[Dependence, ...], tuple[Dependence, ...]]:
+    """Of both, the signals on which the first depends most, and time, in their order."""
+    by_share = sorted(before[:-1], key=lambda d: -float(d.explained.max()))
+    shown = {d.signal for d in [*by_share[:SIGNALS], *before[-1:]]}
+    first, second = (tuple(d for d in found if d.signal in shown) for found in (before, after))
+    return first, second
+
+
+def _ranking(found: Diagnosed) -> tuple[Ranked, ...]:
+    """The clearest candidates of the first model, and what became of them."""
+    result, diagnosis = found.result, found.diagnosis
+    before = {key: np.sqrt(score.gain) for key, (_, score) in _best(result.first).items()}
+    last = _best(result.last)
+    inside = {(e.effect, e.where) for e in diagnosis.found}
+    limits = {(u.effect, u.where): u for u in diagnosis.not_found if u.visible}
+    ranked = []
+    for key in {**before, **last, **dict.fromkeys(inside)}:
+        own = _fitted(result.last, key) if key in inside else _scored(result.last, last.get(key))
+        if own is None:
+            continue
+        limit, sd = limits.get(key), before.get(key)
+        one = replace(own, key=key, before=None if sd is None else float(sd))
+        if limit is not None:
+            one = replace(one, limit=limit.detection_limit, limit_unit=limit.unit)
+        ranked.append(one)
+    ranked.sort(key=lambda r: (r.key not in inside, -(r.before or r.after or 0.0)))
+    return tuple(ranked)
+
+
+def _best(fit: Fit) -> dict[Key, tuple[Candidate, Score]]:
+    """The clearest column of every cause beside a fit."""
+    best: dict[Key, tuple[Candidate, Score]] = {}
+    for candidate, score in scored(fit):
+        known = best.get(candidate.key)
+        if score.gain > 0 and (known is None or score.gain > known[1].gain):
+            best[candidate.key] = candidate, score
+    return best
+
+
+def _scored(fit: Fit, one: tuple[Candidate, Score] | None) -> Ranked | None:
+    """A candidate beside the last model; None where the record does not hold it."""
+    if one is None:
+        return None
+    candidate, score = one
+    value, std = (physical(fit, candidate, v) for v in (score.value, score.sd))
+    timing = candidate.parameter == "share" and candidate.shape is not None
+    per = (float(candidate.shape or 0.0), candidate.shape_unit) if timing else None
+    return Ranked(
+        candidate.key,
+        None,
+        float(np.sqrt(score.gain)),
+        value,
+        std,
+        candidate.unit,
+        candidate.is_possible(score.value),
+        per,
+    )
+
+
+def _fitted(fit: Fit, key: Key) -> Ranked | None:
+    """An effect that is part of the last model, by its first parameter."""
+    first = next(iter(parameters(fit, key).values()), None)
+    return None if first is None else Ranked(key, None, None, first.value, first.std, first.unit)
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
