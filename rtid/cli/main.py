@@ -23,7 +23,7 @@ COMMANDS = {
     "check": "Judge a project file against a trace: rates, gaps, ranges, signs, units.",
     "simulate": "Record a simulated machine as a trace, with its project file.",
     "replay": "Learn from a recorded trace: gates, blocks, bulk modulus, flow maps.",
-    "compare": "Compare the learned maps with a data sheet.",
+    "compare": "Hold models, maps and traces against measurements: where the model fails.",
     "refit": "Fit a plant by its equations to a record, and find what they miss.",
     "effects": "List the physical effects that may be missing in the model, or explain one.",
     "diagnose": "Name the physical effect that is missing in the model, or say what would tell.",
