@@ -113,6 +113,9 @@ def _errors(told: Told) -> str:
         (f"+ {title(e.effect)} ({e.where})", _share(told, e.heldout_residual_after_m3s))
         for e in found.found
     ]
+    last = _share(told, found.heldout_residual_after_m3s)
+    if found.found and found.negligible and not np.isclose(last, steps[-1][1], rtol=0.01):
+        steps.append(("+ what is present but negligible", last))
     floor = _share(told, found.noise_floor_m3s)
     if not all(np.isfinite([floor, *(v for _, v in steps)])):
         return section("Error", "<p>No flow of the record could be judged.</p>")

@@ -37,6 +37,7 @@ BEFORE, AFTER = (ORANGE, "o"), (BLUE, "s")  # colour and marker
 POINTS = 500  # pairs of least and largest value that a line shows
 GAP = 5.0  # steps: no line across a longer one
 Z95 = 1.96
+SHOWN = 0.96  # of the bins lie wholly within the scale
 INSIDE = 0.25  # of the axis: a longer bar has its figure inside
 UNITS = {"Pa": ("MPa", MPA), "m": ("mm", 1e3), "m/s": ("mm/s", 1e3)}
 WEAKEST = 0.1  # standard deviations at the left end of the ranking
@@ -168,6 +169,7 @@ def dependences(
             axis.axhspan(-floor_m3s * LPM, floor_m3s * LPM, color=PALE, lw=0, zorder=0)
             axis.axhline(0.0, color=GREY, lw=0.5, zorder=0.5)
         _explained(axes, list(models.values()))
+        axes[0, 0].set_ylim(*_scale(models))
         for axis, name in zip(axes[0], chambers, strict=True):
             axis.set_title(f"chamber {name}", fontweight="bold")
         for axis in axes[:, 0]:
@@ -177,6 +179,16 @@ def dependences(
         labels.append("± rms of the sensors' noise")
         figure.legend(handles, labels, ncols=3, loc="outside lower center")
     return figure
+
+
+def _scale(models: Mapping[str, Sequence[Dependence]]) -> tuple[float, float]:
+    """One scale for all panels; a few bins with hardly any rows may have longer error bars."""
+    bins = [
+        np.abs(d.mean_m3s) + Z95 * d.error_m3s for d in next(iter(models.values())) if len(d.rows)
+    ]
+    values = np.concatenate([b.ravel() for b in bins]) if bins else np.ones(1)
+    most = 1.4 * LPM * max(float(np.quantile(values, SHOWN)), 1e-12)
+    return -most, most
 
 
 def _explained(axes: np.ndarray, models: Sequence[Sequence[Dependence]]) -> None:
