@@ -78,15 +78,8 @@ def collect(
     for k in range(first, last):
         if counts[N_ROWS] >= len(rows) or counts[N_LOCAL] + e.n_edges > len(cell_of):
             return k
-        for j in range(2 + e.n_signals):
-            e.sample[j] = chunk[k, j]
-        sample, flags, dt = e.sample, int(e.sample[1]), step_s(e, e.sample[0])
-        whole = acceptable(e, sample)
-        joined = whole and e.running and 0.0 < dt <= e.max_gap_s and (flags & GAP_FLAG) == 0
-        if joined:
-            if dt != e.dt_s:
-                set_step(e, dt)
-            joined = working_points(e, sample, dt)[0]
+        whole, joined, dt = _take(e, chunk, k)
+        sample, flags = e.sample, int(e.sample[1])
         if joined:
             share = (group - counts[IN_GROUP]) / group
             _add_head(e, sample, dt, share, series[k - 1], source, sign, d, later)
@@ -102,6 +95,21 @@ def collect(
             if whole and (flags & ROW_FLAG) != 0:
                 _begin(e, sample, group, d, later, counts, noise)
     return last
+
+
+@inlined
+def _take(e: Any, chunk: FloatArray, k: int) -> tuple[bool, bool, float]:
+    """Sample k into e.sample: (it can be used, it continues the last one on the grids, step)."""
+    for j in range(2 + e.n_signals):
+        e.sample[j] = chunk[k, j]
+    sample, flags, dt = e.sample, int(e.sample[1]), step_s(e, e.sample[0])
+    whole = acceptable(e, sample)
+    joined = whole and e.running and 0.0 < dt <= e.max_gap_s and (flags & GAP_FLAG) == 0
+    if joined:
+        if dt != e.dt_s:
+            set_step(e, dt)
+        joined = working_points(e, sample, dt)[0]
+    return whole, joined, dt
 
 
 @inlined
@@ -267,15 +275,8 @@ def follow_map(
     """
     e = engine[0]
     for k in range(len(chunk)):
-        for j in range(2 + e.n_signals):
-            e.sample[j] = chunk[k, j]
-        sample, flags, dt = e.sample, int(e.sample[1]), step_s(e, e.sample[0])
-        whole = acceptable(e, sample)
-        joined = whole and e.running and 0.0 < dt <= e.max_gap_s and (flags & GAP_FLAG) == 0
-        if joined:
-            if dt != e.dt_s:
-                set_step(e, dt)
-            joined = working_points(e, sample, dt)[0]
+        whole, joined, _ = _take(e, chunk, k)
+        sample, flags = e.sample, int(e.sample[1])
         if joined:
             _map_at(e, theta, cov, along[k - 1], cell[k - 1])
             remember(e, sample)
