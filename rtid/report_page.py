@@ -85,17 +85,22 @@ def _share(told: Told, residual_m3s: float) -> float:
     return 100.0 * residual_m3s / told.diagnosed.diagnosis.rms_flow_m3s
 
 
+def _percent(told: Told, residual_m3s: float) -> str:
+    share = _share(told, residual_m3s)
+    return f"{share:.2f} %" if np.isfinite(share) else "not known"
+
+
 def _key_figures(told: Told) -> str:
     found = told.diagnosed.diagnosis
-    before = f"{_share(told, found.heldout_residual_before_m3s):.2f} %"
-    after = f"{_share(told, found.heldout_residual_after_m3s):.2f} %"
+    before = _percent(told, found.heldout_residual_before_m3s)
+    after = _percent(told, found.heldout_residual_after_m3s)
     rho = f"{found.rho_before:.3g}"
     beta = " / ".join(f"{b / 1e6:.0f}" for b in found.beta_pa)
     if found.found:
         before, rho = f"{before} → {after}", f"{rho} → {found.rho_after:.3g}"
     cards = {
         f"error on the {PARTS[told.judges]}, of the rms flow": before,
-        "what the sensors alone leave": f"{_share(told, found.noise_floor_m3s):.2f} %",
+        "what the sensors alone leave": _percent(told, found.noise_floor_m3s),
         "residual variance, of the noise": rho,
         f"bulk modulus {' / '.join(told.chambers)}": f"{beta} MPa",
     }

@@ -109,8 +109,10 @@ def _both(fit: Fit, chunks: list[FloatArray]) -> tuple[Residual, Residual]:
 def _depends(
     model: Model, both: tuple[Residual, Residual], chunks: list[FloatArray]
 ) -> tuple[Dependence, ...]:
-    """The residual of both parts against every signal that varies, and time."""
+    """The residual of both parts against every signal that varies, and time; () without."""
     t_s = np.concatenate([part.t_s for part in both])
+    if not len(t_s):
+        return ()
     measured, left = (
         np.concatenate([getattr(part, name) for part in both]) for name in ("measured", "left")
     )
@@ -130,7 +132,7 @@ def _depends(
         signals=np.stack(values, axis=1),
         intervals=Intervals(t_s[:0], np.zeros((0, 0), np.int64), empty, empty, empty),
     )
-    return (*against_signals(model, part), over_time(part)) if len(t_s) else ()
+    return (*against_signals(model, part), over_time(part))
 
 
 def _telling(

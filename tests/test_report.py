@@ -6,13 +6,16 @@ import base64
 import hashlib
 import json
 import re
+from dataclasses import replace
 from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from rtid.cli.main import run
+from rtid.diagnose.residual import Residual
 from rtid.diagnosed_text import sentences
 from rtid.diagnosing import added_parts
 from rtid.errors import RtidError
@@ -201,6 +204,34 @@ def test_a_disk_that_refuses_leaves_no_half_file(
     with pytest.raises(RtidError, match="No space left"):
         report(found.project, found.trace.path, tmp_path / "report.html")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_record_of_which_nothing_could_be_judged_has_a_page_too(leaking: Reported) -> None:
+    told, none = leaking.told, np.empty((0, 2))
+    empty, nan = Residual(np.empty(0), none, none, none), float("nan")
+    found = replace(
+        told.diagnosed.diagnosis,
+        verdict="insufficient_data",
+        found=(),
+        heldout_residual_before_m3s=nan,
+        heldout_residual_after_m3s=nan,
+        noise_floor_m3s=nan,
+    )
+    bare = replace(
+        told,
+        diagnosed=replace(told.diagnosed, diagnosis=found),
+        before=(empty, empty),
+        after=None,
+        depends_before=(),
+        depends_after=(),
+        ranking=(),
+    )
+    reader = Reader()
+    reader.feed(page(bare))
+    words = "".join(reader.words)
+    assert "The record holds too little motion to tell." in words
+    assert "No flow of this record could be judged." in words
+    assert "nan" not in words.split()
 
 
 def test_the_same_story_gives_the_same_page(leaking: Reported) -> None:
