@@ -169,9 +169,9 @@ def _dependences(told: Told) -> str:
         models[AFTER] = told.depends_after
     floor = told.diagnosed.diagnosis.noise_floor_m3s
     caption = (
-        "Mean residual over bins of the signals that explain most of it and of time, over the "
-        "whole record, with its 95 % interval; in the corner the share of the residual's "
-        "variance that the bins explain. "
+        "Mean residual over bins of position, pressures, the signals that explain most of it and "
+        "time, over the whole record, with its 95 % interval; in the corner the share of the "
+        "residual's variance that the bins explain. "
         "A trend says what the model misses; a right model lies on the zero line. The grey band is "
         "the rms of the sensors' noise."
     )
@@ -186,16 +186,16 @@ def _ranking(told: Told) -> str:
     ranks = [Rank(named(r.key), r.before, r.after) for r in told.ranking[:RANKED]]
     caption = (
         "How clearly the record shows each effect when it is added alone to the model: its "
-        "coefficient in standard deviations. While something large is missing, many effects "
-        "imitate it; "
+        "coefficient in standard deviations. "
     )
     caption += (
+        "While something large is missing, many effects imitate it; "
         "the squares show what is left of them once the effect in orange is part of the model. A "
         f"square right of the dashed line was not added where it changes less than "
         f"{100 * MATERIAL:g} % of the rms flow, explains little of what is left, or has an "
         "impossible sign or size."
         if told.after
-        else f"nothing beyond {limit:g} counts here unless it is also possible and material."
+        else f"Nothing beyond {limit:g} counts unless it is also possible and material."
     )
     return section(
         "Candidates",

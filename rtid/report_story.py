@@ -23,7 +23,7 @@ from rtid.model import FloatArray, Model
 from rtid.project import Project
 from rtid.project.history import Change, read
 
-SIGNALS = 5  # whose residual is shown: those that explain most of it
+SIGNALS = 5  # against which the residual is shown
 
 Progress = Callable[[str, float], None]
 Key = tuple[str, str]
@@ -86,6 +86,7 @@ def tell(project: Project, trace: Path, progress: Progress = _silent) -> Told:
     before = _both(first, chunks)
     after = _both(last, chunks) if found.diagnosis.found else None
     depends = _telling(
+        first.declared,
         _depends(first.declared, before, chunks),
         _depends(first.declared, after, chunks) if after else (),
     )
@@ -136,10 +137,13 @@ def _depends(
 
 
 def _telling(
-    before: tuple[Dependence, ...], after: tuple[Dependence, ...]
+    model: Model, before: tuple[Dependence, ...], after: tuple[Dependence, ...]
 ) -> tuple[tuple[Dependence, ...], tuple[Dependence, ...]]:
-    """Of both, the signals on which the first depends most, and time, in their order."""
-    by_share = sorted(before[:-1], key=lambda d: -float(d.explained.max()))
+    """Of both: position, chamber pressures, the signals on which the first depends most, time."""
+    always = {model.position, *(c.pressure for c in model.chambers)}
+    by_share = sorted(
+        before[:-1], key=lambda d: (d.signal not in always, -float(d.explained.max()))
+    )
     shown = {d.signal for d in [*by_share[:SIGNALS], *before[-1:]]}
     first, second = (tuple(d for d in found if d.signal in shown) for found in (before, after))
     return first, second

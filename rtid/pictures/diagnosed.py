@@ -37,7 +37,7 @@ BEFORE, AFTER = (ORANGE, "o"), (BLUE, "s")  # colour and marker
 POINTS = 500  # pairs of least and largest value that a line shows
 GAP = 5.0  # steps: no line across a longer one
 Z95 = 1.96
-SHOWN = 0.96  # of the bins lie wholly within the scale
+SHOWN = 0.96  # of the error bars lie wholly within the scale
 INSIDE = 0.25  # of the axis: a longer bar has its figure inside
 UNITS = {"Pa": ("MPa", MPA), "m": ("mm", 1e3), "m/s": ("mm/s", 1e3)}
 WEAKEST = 0.1  # standard deviations at the left end of the ranking
@@ -182,13 +182,12 @@ def dependences(
 
 
 def _scale(models: Mapping[str, Sequence[Dependence]]) -> tuple[float, float]:
-    """One scale for all panels; a few bins with hardly any rows may have longer error bars."""
-    bins = [
-        np.abs(d.mean_m3s) + Z95 * d.error_m3s for d in next(iter(models.values())) if len(d.rows)
-    ]
-    values = np.concatenate([b.ravel() for b in bins]) if bins else np.ones(1)
-    most = 1.4 * LPM * max(float(np.quantile(values, SHOWN)), 1e-12)
-    return -most, most
+    """One scale for all panels, with every mean; bins of few rows may have longer error bars."""
+    found = [d for one in models.values() for d in one]
+    means = np.concatenate([np.abs(d.mean_m3s).ravel() for d in found])
+    ends = np.concatenate([(np.abs(d.mean_m3s) + Z95 * d.error_m3s).ravel() for d in found])
+    most = max(1.1 * means.max(), 1.4 * np.quantile(ends, SHOWN)) if len(means) else 1.0
+    return -LPM * most, LPM * most
 
 
 def _explained(axes: np.ndarray, models: Sequence[Sequence[Dependence]]) -> None:
