@@ -32,6 +32,11 @@ def show(found: Diagnosis) -> None:
 def sentences(found: Diagnosis) -> list[str]:
     """The verdict in plain words."""
     lines = [*_added(found), _head(found)]
+    if not found.held_out_judged:
+        lines.append(
+            "The map is known over too little of the held-out part: the errors are those of the "
+            "record that taught the model."
+        )
     lines += [_one(found, effect) for effect in found.found]
     if found.something_remains and found.verdict == "matches":
         lines.append(

@@ -103,6 +103,7 @@ class Result:
     verdict: str
     given: tuple[Part, ...] = ()
     match_rho: float = MATCH_RHO
+    held_out_judged: bool = True  # False: too little of it is known, and the record itself judged
 
 
 def _silent(_what: str, _share: float) -> None:
@@ -123,7 +124,8 @@ def search(
     """
     state, first = begin(model, chunk, held_out, progress, parts)
     present = first
-    if len(residual(first, state.held_out).t_s) < LEAST_ROWS:
+    judged = len(residual(first, state.held_out).t_s) >= LEAST_ROWS
+    if not judged:
         state.held_out = state.chunk
     before = last = residual(first, state.held_out)
     bare = _bare(state, first)
@@ -137,9 +139,11 @@ def search(
     present, last = _look_back(state, present, last)
     scores = scored(present)
     verdict = _verdict(state, present, last)
+    found, negligible = tuple(state.found), state.negligible
     return Result(
-        first, present, tuple(state.found), state.negligible, scores, before, last, verdict, parts
-    )
+        first, present, found, negligible, scores, before, last, verdict, parts,
+        held_out_judged=judged,
+    )  # fmt: skip
 
 
 def begin(

@@ -94,6 +94,7 @@ class Diagnosis:
     beta_pa: tuple[float, ...]
     lag_s: float
     something_remains: bool
+    held_out_judged: bool
     not_found: tuple[Unseen, ...]
     negligible: tuple[Small, ...]
     advice: tuple[str, ...]
@@ -130,6 +131,7 @@ def diagnosis(result: Result) -> Diagnosis:
         beta_pa=tuple(float(b) for b in 1.0 / last.compliance),
         lag_s=last.weights.lag_s,
         something_remains=bool(found or result.given) and last.rho > result.match_rho,
+        held_out_judged=result.held_out_judged,
         not_found=unseen,
         negligible=tuple(
             Small(effect, where, share) for (effect, where), share in result.negligible.items()
@@ -253,10 +255,10 @@ def _experiment(result: Result, unseen: tuple[Unseen, ...]) -> list[str]:
             known = best.get(candidate.key)
             if known is None or scale * after < known[1]:
                 best[candidate.key] = scale * before, scale * after
-    units = {c.key: c.unit for c, _ in result.scores}
+    units = {c.key: "" if c.unit == "1" else f" {c.unit}" for c, _ in result.scores}
     return [
         f"Supply varied by 20 % in the same motion: {effect} ({where}) would be seen from "
-        f"{after:.2g} {units.get((effect, where), '')} on, instead of {before:.2g}."
+        f"{after:.2g}{units.get((effect, where), '')} on, instead of {before:.2g}."
         for (effect, where), (before, after) in best.items()
         if before > WORTH * after
     ]

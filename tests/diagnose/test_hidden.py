@@ -10,6 +10,7 @@ import pytest
 from rtid.diagnose.candidates import ATMOSPHERE_PA
 from rtid.diagnose.diagnosis import search
 from rtid.diagnose.report import Diagnosis, Effect, diagnosis
+from rtid.diagnosed_text import sentences
 from rtid.effects import from_expression, names_of_model
 from tests.diagnose.records import record
 
@@ -108,3 +109,13 @@ def test_an_effect_of_the_user_s_own_is_offered_and_found() -> None:
     found = diagnosis(search(replace(model, own_effects=(own,)), chunk, held_out))
     names = {found.found[0].effect, *(n.split(" ")[0] for n in found.found[0].cannot_be_told_from)}
     assert names == {"gap_of_the_piston", "internal_leakage_laminar"}
+
+
+def test_the_record_judges_where_little_of_the_held_out_part_is_known() -> None:
+    """Half a second held out: the errors are those of the record, and the text says so."""
+    model, chunk, held_out = record("internal_leakage_laminar", 4e-12)
+    found = diagnosis(search(model, chunk, held_out[:500]))
+    assert not found.held_out_judged
+    assert found.found[0].effect == "internal_leakage_laminar"
+    assert np.isfinite(found.heldout_residual_after_m3s)
+    assert any("too little" in sentence for sentence in sentences(found))
