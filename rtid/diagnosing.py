@@ -15,7 +15,7 @@ from rtid.effects import UserEffect
 from rtid.estimator.estimator import Estimator, to_chunk
 from rtid.model import FloatArray, Model
 from rtid.project import Project
-from rtid.replay import NoSamplesError, Trace, model_for, read_trace
+from rtid.replay import NoSamplesError, Trace, model_for, read_trace, replay
 
 MIN_LIVE_S = 10.0
 HELD_OUT_SHARE = 0.25  # of a record without declared parts: its end
@@ -41,12 +41,17 @@ def diagnose_trace(
 ) -> Diagnosed:
     """Diagnose one trace.  Raises NoSamplesError where there is nothing to learn from."""
     progress("reading", 0.0)
-    trace = read_trace(project, path)
+    trace = trace_of(project, path)
     model = replace(model_for(project, trace.samples), own_effects=project.effects)
     identification, held_out = parts(project, model, trace)
     result = search(model, identification, held_out, progress, added_parts(project))
     progress("done", 1.0)
     return Diagnosed(project, model, trace, result, diagnosis(result))
+
+
+def trace_of(project: Project, path: Path) -> Trace:
+    """The samples of a trace, at the message ages that it shows where nobody has declared them."""
+    return replay(project, path).trace if project.offset_tolerance_s else read_trace(project, path)
 
 
 def diagnose_live(

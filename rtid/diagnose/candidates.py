@@ -363,7 +363,8 @@ def _supply(view: View) -> Iterator[Cause]:
     fed = [i for i, e in enumerate(view.model.edges) if e.source == view.supply_name]
     demand = np.sum([_drawn(view, i) for i in fed], axis=0)
     slopes = [view.slope_dp(i) if i in fed else np.zeros(view.n - 1) for i in range(n_e)]
-    drawn, unmeasured = demand[demand > 0], not view.supply_is_measured
+    drawn = demand[demand > 0]
+    unmeasured = len(drawn) > 0 and not view.supply_is_measured
 
     def lowered(sag: FloatArray) -> Volumes:
         return {

@@ -149,9 +149,10 @@ class _Pass:
     def _forget_silent(self, rows: FloatArray, local: int) -> None:
         """Keep the blocks whose last rows still move, and those with something due."""
         head = self.head
-        tail = np.abs(rows[-len(self.d) :, head:]).reshape(-1, local, TERMS)
+        n_c = len(self.d)
+        tail = np.abs(rows[-n_c:, head:]).reshape(min(n_c, len(rows)), local, TERMS)
         loud = tail.max(axis=(0, 2), initial=0.0) > QUIET if len(rows) else np.ones(local, bool)
-        due = self.later[:, head : head + TERMS * local].reshape(-1, local, TERMS)
+        due = self.later[:, head : head + TERMS * local].reshape(n_c, local, TERMS)
         loud |= np.abs(due).max(axis=(0, 2), initial=0.0) > 0
         old = self.cell_of[:local].copy()
         kept = np.flatnonzero(loud)
@@ -211,5 +212,6 @@ def project(evidence: Evidence, thorough: bool = True) -> Projected:
 def _covariances(lower: FloatArray, scale: FloatArray) -> FloatArray:
     """Covariance of each block's terms (V, 6, 6), effects held."""
     inverse = np.tril(dtrtri(lower, lower=1)[0]) * scale
-    blocks = inverse.reshape(len(inverse), -1, TERMS).transpose(1, 2, 0)
+    n = len(inverse)
+    blocks = inverse.reshape(n, n // TERMS, TERMS).transpose(1, 2, 0)
     return np.asarray(blocks @ blocks.transpose(0, 2, 1))

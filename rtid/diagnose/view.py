@@ -17,15 +17,19 @@ from rtid.kernels.evidence import follow_map
 from rtid.kernels.layout import TERMS
 from rtid.model import PRESSURE, FloatArray, Model
 
-COMPUTED = 1e-5  # of the largest value: second differences of a measurement are larger
+TURNS = 0.05  # share of changes that reverse the one before: 2/3 for noise, next to 0 for motion
 UNKNOWN = 10.0  # standard deviation of the flow in a block that was never visited, rated flows
 SMOOTH_S = 0.02  # half width of the window for derivatives of pressures, without delay
 
 
 def has_noise(values: FloatArray) -> bool:
-    """False for a signal that a computer made: most of its second differences are nearly zero."""
-    bend = np.abs(np.diff(values, 2))
-    return bool(np.median(bend) > COMPUTED * max(float(np.abs(values).max()), 1e-300))
+    """False for a computed value: a measurement turns back at a fair share of its changes.
+
+    Repeats do not count, so that held and interpolated measurements are told as well.
+    """
+    change = np.diff(values)
+    change = change[change != 0.0]
+    return len(change) > 2 and bool(np.mean(change[1:] * change[:-1] < 0.0) > TURNS)
 
 
 @dataclass(frozen=True)
