@@ -28,7 +28,7 @@ ROW_S = 10e-3  # positions measured within so long make one row
 SEGMENT_S = 0.5
 FIRST_BLOCKS = 64  # for which there is room at first
 PLACES = 256  # blocks that can ring within one segment
-QUIET = 1e-3  # a column whose whitened state is smaller adds nothing to an innovation
+QUIET = 1e-3  # a column whose state is a smaller part of a row's noise adds nothing to rows
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class _Pass:
         self.place = np.full(n_cells, -1)
         self.cell_of = np.full(PLACES, -1)
         self.counts = np.array([0, 0, 0, head])
-        self.noise = np.zeros((4, 2, 2))
+        self.noise = np.zeros((5, 2, 2))
         self.rows = np.zeros((most_rows + 2, n_c, width))
         self.cells: list[int] = []
         self.number = np.full(n_cells, -1)  # of a cell's block among those visited
@@ -128,7 +128,7 @@ class _Pass:
         columns = self._columns(local)  # may enlarge the total
         kernel.add_products(self.total, columns, gram)
         self.n_rows += len(rows)
-        self._forget_silent(rows, local)
+        self._forget_silent(local)
         self.rows[:n, :, :used] = 0.0  # blocks to come take up columns in the middle of a segment
         self.counts[kernel.N_ROWS] = 0
 
@@ -146,12 +146,12 @@ class _Pass:
         own = (first[:, None] + np.arange(TERMS)).ravel()
         return np.concatenate([np.arange(self.head), own])
 
-    def _forget_silent(self, rows: FloatArray, local: int) -> None:
-        """Keep the blocks whose last rows still move, and those with something due."""
-        head = self.head
-        n_c = len(self.d)
-        tail = np.abs(rows[-n_c:, head:]).reshape(min(n_c, len(rows)), local, TERMS)
-        loud = tail.max(axis=(0, 2), initial=0.0) > QUIET if len(rows) else np.ones(local, bool)
+    def _forget_silent(self, local: int) -> None:
+        """Keep the blocks that would still move a row, and those with something due."""
+        head, n_c = self.head, len(self.d)
+        sd = np.sqrt(self.noise[kernel.LAST].diagonal()[:n_c])[:, None, None]
+        state = np.abs(self.d[:, head : head + TERMS * local]).reshape(n_c, local, TERMS)
+        loud = (state / np.maximum(sd, 1e-300)).max(axis=(0, 2), initial=0.0) > QUIET
         due = self.later[:, head : head + TERMS * local].reshape(n_c, local, TERMS)
         loud |= np.abs(due).max(axis=(0, 2), initial=0.0) > 0
         old = self.cell_of[:local].copy()

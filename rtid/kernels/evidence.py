@@ -42,8 +42,8 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 IN_GROUP, N_LOCAL, N_ROWS, N_HEAD = range(4)  # entries of `counts`
-# entries of `noise`: P, and the flow noise since the last row times 1, a and a^2
-GAP, PLAIN, SHARED, SQUARED = range(4)
+# entries of `noise`: P, the flow noise since the last row times 1, a and a^2, and the last row's S
+GAP, PLAIN, SHARED, SQUARED, LAST = range(5)
 
 
 @kernel
@@ -70,7 +70,7 @@ def collect(
     engine (1,), cells: a freshly built state.  series (n - 1, s): volumes per interval, m3; given
     column j takes sign[j, c] times series source[j, c] in chamber c.  d, later (chambers, width):
     state of the columns and what is due after the next row; place (cells,): local place of a cell's
-    block or -1; cell_of (places,): the inverse; counts, noise (4, 2, 2): see above; rows (most,
+    block or -1; cell_of (places,): the inverse; counts, noise (5, 2, 2): see above; rows (most,
     chambers, width): whitened rows.  All of these are changed in place.  Stops early when places
     or rows run out.
     """
@@ -133,6 +133,7 @@ def _begin(
     for c in range(e.n_chambers):
         for b in range(e.n_chambers):
             noise[GAP, c, b] = group * e.cov[c, b]
+            noise[LAST, c, b] = noise[GAP, c, b]
             e.cov[c, b] = 0.0
     counts[IN_GROUP] = 0
     d[:] = 0.0
@@ -221,7 +222,7 @@ def _whiten(
     n, row = counts[N_HEAD] + TERMS * counts[N_LOCAL], rows[counts[N_ROWS]]
     s00 = noise[GAP, 0, 0] + noise[SQUARED, 0, 0] + position_noise(e, 0, 0)
     c00 = noise[GAP, 0, 0] + noise[SHARED, 0, 0]
-    i0 = 1.0 / math.sqrt(s00)
+    i0, noise[LAST, 0, 0] = 1.0 / math.sqrt(s00), s00
     if e.n_chambers == 1:
         keep = 1.0 - c00 / s00
         for j in range(n):
@@ -233,7 +234,7 @@ def _whiten(
         s11 = noise[GAP, 1, 1] + noise[SQUARED, 1, 1] + position_noise(e, 1, 1)
         c01 = noise[GAP, 0, 1] + noise[SHARED, 0, 1]
         c11 = noise[GAP, 1, 1] + noise[SHARED, 1, 1]
-        half = s01 * i0
+        half, noise[LAST, 1, 1] = s01 * i0, s11
         i1 = 1.0 / math.sqrt(s11 - half * half)
         det = 1.0 / (s00 * s11 - s01 * s01)
         k00, k01 = (c00 * s11 - c01 * s01) * det, (c01 * s00 - c00 * s01) * det
@@ -250,7 +251,7 @@ def _whiten(
             k00 * c01 + k01 * c11 + k10 * c00 + k11 * c01
         )
         noise[GAP, 1, 0] = noise[GAP, 0, 1]
-    noise[PLAIN:] = 0.0
+    noise[PLAIN:LAST] = 0.0
     later[:, :n] = 0.0
     counts[IN_GROUP] = 0
     counts[N_ROWS] += 1
