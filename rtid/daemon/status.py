@@ -1,0 +1,254 @@
+"""What the daemon says of itself: plain dataclasses that a page, a shell or a test can poll.
+
+`Daemon.status` is the newest one in the process; from elsewhere `read` takes it from the file
+STATUS_FILE in the state folder, which is replaced each second.  Times are seconds, pressures Pa,
+commands V: SI throughout.  Everything is JSON: NaN and infinities are None.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from dataclasses import asdict, dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import TypeAdapter
+
+from rtid.errors import RtidError
+
+SCHEMA = 1
+STATUS_FILE = "status.json"
+
+SignalVerdict = Literal["ok", "silent", "frozen", "out_of_range", "not_available", "implausible"]
+Learning = Literal["waiting", "learning", "held", "suspended", "stopped"]
+
+
+class StatusError(RtidError):
+    """There is no status to read, or one of another version."""
+
+
+@dataclass(frozen=True)
+class Distribution:
+    """A histogram of durations: counts[k] lie in [edges_us[k], edges_us[k + 1])."""
+
+    count: int = 0
+    p50_us: float = 0.0
+    p99_us: float = 0.0
+    p999_us: float = 0.0
+    max_us: float = 0.0
+    edges_us: tuple[float, ...] = ()
+    counts: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class LoopHealth:
+    """The fixed-rate loop since its start; `*_1s` are of the last second.
+
+    An overrun is a tick that ended after the next one was due; `causes` says why, by count: what
+    the loop itself did ("upkeep", "handover", "backlog", "work") or what was done to it ("late").
+    """
+
+    rate_hz: float
+    ticks: int = 0
+    overruns: int = 0
+    skipped: int = 0  # deadlines that passed during overruns
+    causes: dict[str, int] = field(default_factory=dict)
+    lateness: Distribution = Distribution()  # wake-up after its deadline
+    work: Distribution = Distribution()  # from wake-up to the end of the tick
+    lateness_1s: Distribution = Distribution()
+    work_1s: Distribution = Distribution()
+    scheduling: str = "other"  # "fifo 60" when promoted
+    memory_locked: bool = False
+
+
+@dataclass(frozen=True)
+class BusHealth:
+    """Where the frames come from; `refused` by reason: error frames, overruns of the queue, ..."""
+
+    interface: str
+    channel: str
+    state: Literal["open", "reopening", "failed", "closed"] = "closed"
+    frames: int = 0
+    frames_per_s: float = 0.0
+    queued: int = 0
+    reopened: int = 0
+    refused: dict[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class MessageHealth:
+    """One CAN message over the last second; `refused` counts since the start, by reason."""
+
+    name: str
+    can_id: int
+    nominal_hz: float
+    rate_hz: float = 0.0
+    age_s: float | None = None  # since its last good frame; None before the first
+    gap_s: float = 0.0  # longest silence of the last second
+    verdict: Literal["ok", "silent", "late", "too_fast", "damaged"] = "silent"
+    refused: dict[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class SignalHealth:
+    """One signal of the samples: its newest value and its range over the last second."""
+
+    name: str
+    kind: str
+    unit: str
+    message: str
+    value: float | None = None
+    minimum: float | None = None
+    maximum: float | None = None
+    rate_hz: float = 0.0
+    age_s: float | None = None
+    gap_s: float = 0.0
+    verdict: SignalVerdict = "silent"
+
+
+@dataclass(frozen=True)
+class EdgeHealth:
+    """The map of one edge: cells by status, of the blocks and of the published map."""
+
+    name: str
+    blocks: dict[str, int] = field(default_factory=dict)  # learning, valid, stale, invalid
+    cells: dict[str, int] = field(default_factory=dict)  # valid, learning, extrapolated, ...
+    progress: float = 0.0  # mean share of the way to valid, over visited blocks
+
+
+@dataclass(frozen=True)
+class Chamber:
+    """Bulk modulus of one chamber with its standard deviation, Pa; None before it is known."""
+
+    name: str
+    beta_pa: float | None = None
+    beta_sd_pa: float | None = None
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What was learned by the last publication; `stale` while its samples are older than allowed.
+
+    version counts publications of a changed map; samples, rows and refused count since the start
+    of learning, a restored state included.
+    """
+
+    state: Learning = "waiting"
+    reason: str = ""
+    version: int = 0
+    age_s: float | None = None  # of the newest sample that it holds
+    stale: bool = True
+    samples: int = 0
+    rows: int = 0
+    rho: float | None = None
+    surprise: float | None = None  # mean square of the last rows against the map held, in noise
+    chambers: tuple[Chamber, ...] = ()
+    edges: tuple[EdgeHealth, ...] = ()
+    refused: dict[str, int] = field(default_factory=dict)  # all gates: bridge, watch, estimator
+
+
+@dataclass(frozen=True)
+class Store:
+    """Whether what was learned would survive a power cut."""
+
+    state: Literal["none", "saved", "NOT SAVED"] = "none"
+    reason: str = ""
+    age_s: float | None = None  # of the newest snapshot on disk
+    restored: str = ""  # what the start found: "fresh", or the snapshot that was taken up
+    recording: str = ""  # file that frames are written to
+    dropped_frames: int = 0  # not recorded, because the disk was too slow
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The last diagnosis; `content` is the JSON of docs/diagnosis.md."""
+
+    at_unix_s: float
+    verdict: str
+    text: str
+    effects: tuple[str, ...] = ()
+    over_s: tuple[float, float] = (0.0, 0.0)  # samples it saw, seconds before `at_unix_s`
+    content: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """Something that somebody has to look at; over when `until_unix_s` is set."""
+
+    name: str
+    text: str
+    since_unix_s: float
+    until_unix_s: float | None = None
+    kind: Literal["bus", "sensor", "plant", "store", "loop"] = "bus"
+    trace: str = ""  # recording of the seconds around it
+
+
+@dataclass(frozen=True)
+class Status:
+    """Everything at one moment."""
+
+    name: str
+    pid: int
+    started_unix_s: float
+    now_unix_s: float
+    loop: LoopHealth
+    bus: BusHealth
+    messages: tuple[MessageHealth, ...] = ()
+    signals: tuple[SignalHealth, ...] = ()
+    estimate: Estimate = Estimate()
+    store: Store = Store()
+    verdict: Verdict | None = None
+    diagnosing: bool = False
+    alarms: tuple[Alarm, ...] = ()  # those that are on, then the last that are over
+    rss_anon_mb: float = 0.0
+    schema: int = SCHEMA
+
+    def to_json(self) -> str:
+        """One line of JSON."""
+        return json.dumps(_plain(asdict(self)))
+
+
+def _plain(value: Any) -> Any:
+    """JSON knows no NaN."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    return value
+
+
+def from_json(text: str | bytes) -> Status:
+    """The status that `to_json` wrote.  Raises StatusError if it is none of this version."""
+    try:
+        found = _adapter().validate_json(text)
+    except ValueError as error:
+        raise StatusError(f"not a status of rtid ({error})", "are both of one version?") from error
+    if found.schema != SCHEMA:
+        raise StatusError(f"status of schema {found.schema}, this program reads {SCHEMA}")
+    return found
+
+
+@cache
+def _adapter() -> TypeAdapter[Status]:
+    return TypeAdapter(Status)
+
+
+def write(folder: Path, status: Status) -> None:
+    """Replace the status file; no fsync, it says nothing after a power cut."""
+    temporary = folder / (STATUS_FILE + ".part")
+    temporary.write_text(status.to_json(), "utf-8")
+    os.replace(temporary, folder / STATUS_FILE)
+
+
+def read(folder: Path) -> Status:
+    """The newest status of the daemon that keeps its state in this folder."""
+    path = folder / STATUS_FILE
+    try:
+        return from_json(path.read_bytes())
+    except FileNotFoundError:
+        raise StatusError(f"{path}: no daemon has run here", "start it with `rtid run`") from None
