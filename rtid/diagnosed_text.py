@@ -5,8 +5,8 @@ from __future__ import annotations
 from rich.console import Console
 from rich.table import Table
 
-from rtid.diagnose.diagnosis import MATERIAL
 from rtid.diagnose.report import Diagnosis, Effect, Unseen, Value
+from rtid.diagnose.verdict import MATERIAL
 from rtid.effects import catalogue
 
 LPM = 6e4  # L/min per m3/s

@@ -15,8 +15,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import rtid
-from rtid.diagnose.diagnosis import GAIN, MATERIAL
 from rtid.diagnose.residual import ROWS_PER_S, Residual
+from rtid.diagnose.trials import GAIN
+from rtid.diagnose.verdict import MATERIAL
 from rtid.diagnosed_text import LPM, sentences, title
 from rtid.pictures.diagnosed import Rank, dependences, errors, flows, ranking
 from rtid.pictures.style import STYLE

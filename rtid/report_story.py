@@ -13,11 +13,12 @@ import numpy as np
 from rtid.compare import Comparison, Dependence, Intervals, against_signals, over_time
 from rtid.diagnose.candidates import Candidate
 from rtid.diagnose.clean import usable
-from rtid.diagnose.diagnosis import LEAST_ROWS, physical, scored
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.regression import Score
 from rtid.diagnose.report import parameters
 from rtid.diagnose.residual import WN_RAD_S, ZETA, Residual, residual
+from rtid.diagnose.trials import physical, scored
+from rtid.diagnose.verdict import LEAST_ROWS
 from rtid.diagnosing import Diagnosed, diagnose_trace, parts
 from rtid.model import FloatArray, Model
 from rtid.project import Project

@@ -11,15 +11,16 @@ from dataclasses import dataclass, replace
 from itertools import takewhile
 from pathlib import Path
 
-from rtid.diagnose.diagnosis import AMBIGUOUS, MATCHES, MISSING, Found
 from rtid.diagnose.extend import UNJUDGED, Extension, RefusedError, Standing, extend, stand
-from rtid.diagnosing import added_parts, diagnose_trace, parts
+from rtid.diagnose.trials import Found
+from rtid.diagnose.verdict import AMBIGUOUS, MATCHES, MISSING
+from rtid.diagnosing import added_parts, diagnose_trace, parts, trace_of
 from rtid.effects import effect as page_of
 from rtid.errors import RtidError
 from rtid.project import Project, load
 from rtid.project.added import AddedSection, ErrorsSection, text_with
 from rtid.project.history import ADD, DROP, UNDO, Change, digest, read, standing, text_of, write
-from rtid.replay import model_for, read_trace
+from rtid.replay import model_for
 from rtid.revised_sections import errors_between, extended, now, plain, refreshed, turned
 from rtid.units import nearest
 
@@ -152,7 +153,7 @@ def _refuse_unknown(effect: str, project: Project) -> None:
 
 def _begin(project: Project, trace: Path, progress: Progress) -> tuple[Standing, dict[str, int]]:
     progress("reading", 0.0)
-    read_ = read_trace(project, trace)
+    read_ = trace_of(project, trace)
     model = model_for(project, read_.samples)
     chunks = parts(project, model, read_)
     progress("fitting", 0.1)

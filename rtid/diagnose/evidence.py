@@ -150,8 +150,8 @@ class _Pass:
         """Keep the blocks that would still move a row, and those with something due."""
         head, n_c = self.head, len(self.d)
         sd = np.sqrt(self.noise[kernel.LAST].diagonal()[:n_c])[:, None, None]
-        state = np.abs(self.d[:, head : head + TERMS * local]).reshape(n_c, local, TERMS)
-        loud = (state / np.maximum(sd, 1e-300)).max(axis=(0, 2), initial=0.0) > QUIET
+        size = np.abs(self.d[:, head : head + TERMS * local]).reshape(n_c, local, TERMS)
+        loud = (size / np.maximum(sd, 1e-300)).max(axis=(0, 2), initial=0.0) > QUIET
         due = self.later[:, head : head + TERMS * local].reshape(n_c, local, TERMS)
         loud |= np.abs(due).max(axis=(0, 2), initial=0.0) > 0
         old = self.cell_of[:local].copy()

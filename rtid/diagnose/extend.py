@@ -11,18 +11,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rtid.diagnose.diagnosis import (
+from rtid.diagnose.diagnosis import LEAST_SHARE, begin
+from rtid.diagnose.fit import Fit, fit, one_pass
+from rtid.diagnose.parts import COMMAND, Part
+from rtid.diagnose.residual import Residual, residual
+from rtid.diagnose.timing import TIMINGS
+from rtid.diagnose.trials import (
     GAIN,
-    LEAST_SHARE,
     MATCH_RHO,
-    MATERIAL,
     TIE,
     TIE_SHARE,
     Key,
     State,
     Trial,
     alike_ones,
-    begin,
     best_by_key,
     exact_trials,
     material_share,
@@ -31,10 +33,7 @@ from rtid.diagnose.diagnosis import (
     refined,
     scored,
 )
-from rtid.diagnose.fit import Fit, fit, one_pass
-from rtid.diagnose.parts import COMMAND, Part
-from rtid.diagnose.residual import Residual, residual
-from rtid.diagnose.timing import TIMINGS
+from rtid.diagnose.verdict import MATERIAL
 from rtid.errors import RtidError
 from rtid.model import FloatArray, Model
 from rtid.units import nearest
@@ -159,7 +158,7 @@ def _flows(present: Standing, effect: str, where: str) -> list[Trial]:
     trials = []
     for key, (candidate, score) in possible.items():
         revision = replace(fit_.revision, effects=(*fit_.revision.effects, candidate))
-        trials.append(Trial(key, score.gain, revision, score.column))
+        trials.append(Trial(key, score.gain, revision))
     return refined(present.state, fit_, trials)
 
 

@@ -12,11 +12,12 @@ import numpy as np
 from scipy.stats import chi2
 
 from rtid.diagnose.candidates import Candidate
-from rtid.diagnose.diagnosis import Found, Key, Result, detection_limit, physical
+from rtid.diagnose.diagnosis import Result
 from rtid.diagnose.experiment import limits
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.parts import OWN_TIME
 from rtid.diagnose.regression import Score
+from rtid.diagnose.trials import Found, Key, detection_limit, physical
 from rtid.effects import catalogue
 
 SCHEMA = 1

@@ -1,0 +1,261 @@
+"""Causes on trial: each one beside the model so far, and what chi2 would fall by with it.
+
+Causes with a column of their own are scored in the one regression; timing effects are refitted
+exactly where something large is left, because a bent map misleads their derivatives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from rtid.diagnose.candidates import Candidate, causes
+from rtid.diagnose.fit import Fit, Revision, fit, one_pass
+from rtid.diagnose.parts import Part
+from rtid.diagnose.regression import LIMIT_SD, Score
+from rtid.diagnose.residual import Residual, residual
+from rtid.diagnose.search import Search
+from rtid.diagnose.timing import TIMINGS, Psi, Timing
+from rtid.model import FloatArray, Model
+
+GAIN = 16.0  # chi2 of the first effect: 60 candidates, 0.4 % for all of them together
+LARGE = 1.5  # rho above which timing effects are refitted whatever their score
+TIE, TIE_SHARE = 12.0, 0.03  # causes within so much of the best gain are not told apart
+CLOSE = 0.9  # timings whose coarse gain is this share of the best are refitted finely
+PROMISING = 0.3  # share of the best gain that a timing's bank must reach to be closed in on
+MATCH_RHO = 1.10  # largest rho of a model that matches
+
+Key = tuple[str, str]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A cause beside the model so far: what chi2 would fall by, and the revision with it.
+
+    fit: the exact refit of a timing; a cause with a column of its own is fitted when it is chosen.
+    """
+
+    key: Key
+    gain: float
+    revision: Revision
+    fit: Fit | None = None
+
+    @property
+    def n_parameters(self) -> int:
+        """Parameters that the cause brings."""
+        if self.fit is not None:
+            return len(self.revision.timings[-1][1])
+        return 1 + (self.revision.effects[-1].shape is not None)
+
+
+@dataclass(frozen=True)
+class Found:
+    """An effect that was added: the fit with it, the residuals before and after."""
+
+    key: Key
+    alike: tuple[Key, ...]
+    gain: float
+    before: Residual
+    after: Residual
+
+
+@dataclass
+class State:
+    """State of a diagnosis."""
+
+    model: Model
+    chunk: FloatArray
+    held_out: FloatArray
+    progress: Callable[[str, float], None]
+    found: list[Found] = field(default_factory=list)
+    negligible: dict[Key, float] = field(default_factory=dict)
+    excess: float = 0.0  # chi2 without any effect beyond what the noise gives
+    given: tuple[Part, ...] = ()  # effects that the model has already
+    _coarse: Search | None = None
+
+    @property
+    def coarse(self) -> Search:
+        """The search on the coarse map, made when it is first needed."""
+        if self._coarse is None:
+            self._coarse = Search(self.model, self.chunk)
+        return self._coarse
+
+
+def scored(fit_: Fit) -> list[tuple[Candidate, Score]]:
+    """Every candidate that is not part of the revision, beside it."""
+    used = fit_.estimate.used
+    return [
+        (candidate, fit_.regression.score(used, fit_.first + k))
+        for k, candidate in enumerate(fit_.columns.candidates)
+        if candidate not in fit_.revision.effects
+    ]
+
+
+def trials_of(state: State, present: Fit) -> list[Trial]:
+    """Every possible cause with its best shape: fixed columns, and timings where they matter."""
+    best = best_by_key(present, scored(present))
+    trials = []
+    for key, (candidate, score) in best.items():
+        if key[1] == "command":
+            continue
+        revision = replace(present.revision, effects=(*present.revision.effects, candidate))
+        trials.append(Trial(key, score.gain, revision))
+    trials = refined(state, present, trials)
+    scores = {key: s.gain for key, (_, s) in best.items() if key[1] == "command"}
+    other = max((t.gain for t in trials if t.key not in state.negligible), default=0.0)
+    return trials + _timing_trials(state, present, scores, other)
+
+
+def best_by_key(
+    present: Fit, scores: list[tuple[Candidate, Score]]
+) -> dict[Key, tuple[Candidate, Score]]:
+    """The candidate of each possible cause that chi2 would fall by most with."""
+    best: dict[Key, tuple[Candidate, Score]] = {}
+    for candidate, score in scores:
+        if not candidate.is_possible(physical(present, candidate, score.value)):
+            continue
+        if present.revision.has(candidate.key):
+            continue
+        if candidate.key not in best or score.gain > best[candidate.key][1].gain:
+            best[candidate.key] = candidate, score
+    return best
+
+
+def physical(fit_: Fit, candidate: Candidate, value: float) -> float:
+    """A coefficient as the effect's parameter.
+
+    A dead volume counts by the fitted modulus, a drift over the length of the record.
+    """
+    if candidate.effect == "valve_gain_drift":
+        return value * float(fit_.view.t_s[-1] - fit_.view.t_s[0])
+    if candidate.effect != "extra_dead_volume":
+        return value
+    names = [c.name for c in fit_.model.chambers]
+    at = [names.index(candidate.where)] if candidate.where in names else list(range(len(names)))
+    return float(value * np.mean(fit_.weights.compliance[at] / fit_.compliance[at]))
+
+
+def refined(state: State, present: Fit, trials: list[Trial]) -> list[Trial]:
+    """Shapes between those of the bank, where they could matter, in one more pass."""
+    if not trials:
+        return trials
+    bar = max(GAIN, 0.2 * max(t.gain for t in trials))
+    shaped = {
+        t.key: t.revision.effects[-1]
+        for t in trials
+        if t.revision.effects[-1].shape is not None and t.gain > bar
+    }
+    more = [
+        (cause, shape)
+        for cause in causes(present.view)
+        if cause.candidate.key in shaped and cause.makes(shaped[cause.candidate.key])
+        for shape in cause.finer(shaped[cause.candidate.key].shape or 0.0)
+    ]
+    if not more:
+        return trials
+    finer = one_pass(
+        state.model, state.chunk, present.weights, present.revision, present.map, False, more
+    )
+    best = best_by_key(finer, scored(finer))
+    found = []
+    for trial in trials:
+        candidate, score = best.get(trial.key, (None, None))
+        if candidate is not None and score is not None and score.gain > trial.gain:
+            effects = (*present.revision.effects, candidate)
+            revision = replace(present.revision, effects=effects)
+            found.append(Trial(trial.key, score.gain, revision))
+        else:
+            found.append(trial)
+    return found
+
+
+def _timing_trials(
+    state: State, present: Fit, scores: dict[Key, float], other: float
+) -> list[Trial]:
+    """Exact refits with one timing more, of those that may matter."""
+    open_ = [t for t in TIMINGS if not present.revision.has((t.effect, "command"))]
+    if present.rho < LARGE:
+        open_ = [t for t in open_ if scores.get((t.effect, "command"), 0.0) > GAIN]
+    if not open_ or not present.view.has_pressures:
+        return []
+    return exact_trials(state, present, open_, other)
+
+
+def exact_trials(
+    state: State, present: Fit, timings: list[Timing], other: float = 0.0
+) -> list[Trial]:
+    """Refits with one of these timings more, the best of each name.
+
+    other: the best gain of any other cause; what cannot come close to it is left out.
+    """
+    gains: list[tuple[float, Timing, Psi]] = []
+    for timing in timings:
+        psi, gain = state.coarse.best(timing, present, PROMISING * other)
+        gains.append((gain, timing, psi))
+    most = max(other, *(gain for gain, _, _ in gains))
+    trials: dict[Key, Trial] = {}
+    for gain, timing, psi in gains:
+        if gain < CLOSE * most:
+            continue
+        revision = replace(present.revision, timings=(*present.revision.timings, (timing, psi)))
+        now = fit(state.model, state.chunk, present.weights, revision, None, bank=False)
+        if not _is_inside(now):
+            continue
+        exact, key = present.estimate.sse - now.estimate.sse, (timing.effect, "command")
+        if key not in trials or exact > trials[key].gain:
+            trials[key] = Trial(key, exact, now.revision, now)
+    return list(trials.values())
+
+
+def _is_inside(now: Fit) -> bool:
+    """True where the timing that was added last did not end at a bound, nor at nothing."""
+    timing, psi = now.revision.timings[-1]
+    sd = now.estimate.sd(now.timing_columns(len(now.revision.timings) - 1)[0])
+    return timing.low[0] * 1.01 < psi[0] < timing.high[0] * 0.99 and psi[0] > 3.0 * sd
+
+
+def alike_ones(state: State, best: Trial, trials: list[Trial]) -> tuple[Key, ...]:
+    """Causes that this record does not tell from the best one: all but as good.
+
+    Where the best one leaves nothing but noise, one that leaves more is refuted.
+    """
+    close = best.gain - TIE - TIE_SHARE * best.gain
+    settled = best.fit is not None and best.fit.rho < MATCH_RHO
+    return tuple(
+        t.key
+        for t in trials
+        if t.key != best.key
+        and t.gain > close
+        and t.key not in state.negligible
+        and not (settled and t.fit is not None and t.fit.rho > MATCH_RHO)
+    )
+
+
+def simplest(best: Trial, trials: list[Trial], alike: tuple[Key, ...]) -> Trial:
+    """Of causes that this record does not tell apart, the one with the fewest parameters."""
+    equals = [best, *(t for t in trials if t.key in alike)]
+    return min(equals, key=lambda t: (t.n_parameters, -t.gain))
+
+
+def material_share(before: Residual, after: Residual) -> float:
+    """What an effect takes off the held-out residual, root of the difference, of the rms flow."""
+    gone = before.rms_m3s**2 - after.rms_m3s**2
+    return float(np.sqrt(max(0.0, gone)) / max(before.flow_m3s, 1e-12))
+
+
+def own_share(now: Fit, trial: Trial, held_out: FloatArray) -> float:
+    """Size of an effect's own flow on the held-out part, of the rms flow; inf for a timing."""
+    if trial.fit is not None:
+        return float("inf")
+    effect = now.revision.effects[-1]
+    whole = residual(now, held_out)
+    without = residual(now, held_out, leave_out=effect)
+    change = whole.left - without.left
+    return float(np.sqrt(np.mean(change**2)) / max(whole.flow_m3s, 1e-12)) if change.size else 0.0
+
+
+def detection_limit(score: Score, rho: float) -> float:
+    """Smallest size that the record would have shown."""
+    return LIMIT_SD * score.sd * float(np.sqrt(max(1.0, rho)))

@@ -1,0 +1,43 @@
+"""What a search amounts to: the model matches, something is missing, or nobody can tell."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rtid.diagnose.fit import Fit
+from rtid.diagnose.residual import Residual
+from rtid.diagnose.trials import MATCH_RHO, State
+
+MATERIAL = 0.003  # of the rms flow: what an effect must change of the held-out residual
+NAMED = 0.8  # of the misfit that effects must explain to be named where something else remains
+LEAST_ROWS = 50  # filtered rows that a part must have to be judged by
+LEAST_EVIDENCE = 1000  # scalar rows of the record
+
+MATCHES, MISSING, AMBIGUOUS = "matches", "missing", "ambiguous"
+UNKNOWN, INSUFFICIENT = "unknown", "insufficient_data"
+
+
+def can_judge(held: Residual) -> bool:
+    """True where the map is known over enough of a part to hold the model against it."""
+    return len(held.t_s) >= LEAST_ROWS
+
+
+def verdict(state: State, last: Fit, after: Residual) -> str:
+    """The verdict on a search that ended with this fit and what it leaves of the held-out part."""
+    if last.regression.rows < LEAST_EVIDENCE or not can_judge(after):
+        return INSUFFICIENT
+    if not state.found:
+        # what is left may be no noise, and still be too small to matter
+        is_small = last.rho < MATCH_RHO or remainder(after) < MATERIAL
+        return MATCHES if is_small else UNKNOWN
+    left = last.estimate.sse - last.regression.dof
+    explained = 1.0 - left / state.excess if state.excess > 0 else 1.0
+    if last.rho >= MATCH_RHO and explained < NAMED:
+        return UNKNOWN
+    return AMBIGUOUS if any(f.alike for f in state.found[:1]) else MISSING
+
+
+def remainder(held: Residual) -> float:
+    """What a residual has beyond the sensors' noise, of the rms flow."""
+    left = max(0.0, held.rms_m3s**2 - held.floor_m3s**2)
+    return float(np.sqrt(left) / max(held.flow_m3s, 1e-12))
