@@ -65,6 +65,13 @@ class Assembler:
         add_counts(total, self._source_counts)
         return total
 
+    @property
+    def messages(self) -> Records:
+        """LAST (m,) of the declared messages, in their order: a view; `gap_us` may be reset."""
+        state = self._cycle or self._multirate
+        assert state is not None
+        return state.last
+
     def push(self, frames: Frames) -> Samples:
         """The samples that became complete with these frames (n frames, in order of arrival)."""
         add_counts(self._source_counts, frames.refused)

@@ -64,7 +64,16 @@ ROLE = np.dtype(
         ("table_count", np.int32),  # 0: factor and offset
     ]
 )
-LAST = np.dtype([("t_us", np.int64), ("counter", np.int64), ("seen", np.bool_)])
+LAST = np.dtype(
+    [
+        ("t_us", np.int64),
+        ("counter", np.int64),
+        ("seen", np.bool_),
+        ("good", np.int64),  # frames admitted so far
+        ("gap_us", np.int64),  # longest time between two of them, since somebody set it to 0
+        ("refused", np.int64, len(REASONS)),
+    ]
+)
 
 
 class Plan(NamedTuple):
@@ -95,6 +104,13 @@ def find_message(messages: Records, can_id: np.uint32, channel: np.uint8) -> Int
 
 
 @inlined
+def _refuse(last: Record, reason: Integer, counts: NDArray[np.int64]) -> None:
+    """Count a refusal for the message and for all of them."""
+    last.refused[reason] += 1
+    counts[reason] += 1
+
+
+@inlined
 def check_sequence(
     row: Record, last: Record, t_us: Integer, counter: Integer, counts: NDArray[np.int64]
 ) -> Integer:
@@ -109,7 +125,7 @@ def check_sequence(
         if dt <= row.late_us and 2 * step > np.int64(row.counter_mask) + 1:
             return OUT_OF_ORDER
         if dt > 0 and step != 1:
-            counts[COUNTER_JUMP] += 1
+            _refuse(last, COUNTER_JUMP, counts)
     return OUT_OF_ORDER if dt <= 0 else OK
 
 
@@ -176,20 +192,23 @@ def admit(
     values are not available still moves the counter on: it was received.
     """
     if length != row.length:
-        counts[WRONG_LENGTH] += 1
+        _refuse(last, WRONG_LENGTH, counts)
         return WRONG_LENGTH
     if row.crc_byte >= 0:
         expected = e2e.crc8(word, row.length, row.crc_byte, row.data_id)
         if expected != (word >> np.uint64(8 * row.crc_byte)) & np.uint64(0xFF):
-            counts[CRC] += 1
+            _refuse(last, CRC, counts)
             return CRC
     counter = np.int64(-1)
     if row.counter >= 0:
         counter = np.int64(bits.raw_bits(word, layouts[row.counter]))
     reason = check_sequence(row, last, t_us, counter, counts)
     if reason == OK:
+        if last.seen:
+            last.gap_us = max(last.gap_us, t_us - last.t_us)
+        last.good += 1
         last.t_us, last.counter, last.seen = t_us, counter, True
         reason = read_roles(row, roles, layouts, codes, tables, word, values)
     if reason != OK:
-        counts[reason] += 1
+        _refuse(last, reason, counts)
     return reason
