@@ -66,6 +66,11 @@ class Assembler:
         return total
 
     @property
+    def declared(self) -> Records:
+        """MESSAGE (m,) of the declared messages, in their order."""
+        return self._plan.messages
+
+    @property
     def messages(self) -> Records:
         """LAST (m,) of the declared messages, in their order: a view; `gap_us` may be reset."""
         state = self._cycle or self._multirate

@@ -1,5 +1,7 @@
 """Learning from a live bus: frames as they arrive through the same Assembler and Estimator.
 
+    frames -> Senders -> Assembler -> Frozen -> Estimator
+
 A trace can be fed through python-can's virtual bus, at any pace; the recorded stamps are kept, so
 the result equals the one from the log bit for bit.
 """
@@ -16,40 +18,86 @@ import numpy as np
 
 from firmware_bridge.assemble import Assembler
 from firmware_bridge.catalog import Catalog
-from firmware_bridge.config import Assembly
-from firmware_bridge.frames import Frames, empty, to_messages
+from firmware_bridge.config import CYCLE, Assembly
+from firmware_bridge.frames import Frames, add_counts, empty, to_messages
+from firmware_bridge.frozen import REASON as FROZEN
+from firmware_bridge.frozen import Frozen, run_limit
 from firmware_bridge.playback import SEND_TIMEOUT_S, send
+from firmware_bridge.samples import Samples
+from firmware_bridge.senders import Senders
 from firmware_bridge.sources.can_bus import CanBus
 from firmware_bridge.sources.live import LiveSource
-from rtid.estimator.estimator import Estimator
-from rtid.model import Model
+from rtid.estimator.estimator import Estimator, to_chunk
+from rtid.model import COMMAND, MODE, FloatArray, Model
 
 QUIET_READS = 5  # the bus is over when its sender has ended and so many reads found nothing
 
 
 class Learner:
-    """Frames in, a growing estimate out: what the daemon and the bus replay have in common."""
+    """Frames in, a growing estimate out: what the daemon and the bus replay have in common.
+
+    `learns` = False keeps the samples, for a diagnosis, and leaves the estimate as it is.
+    """
 
     def __init__(self, model: Model, catalog: Catalog, assembly: Assembly) -> None:
         self.assembler = Assembler(catalog, assembly)
+        self.senders = Senders(self.assembler.declared)
+        self.frozen = Frozen(_run_limits(model, assembly))
         self.estimator = Estimator(model)
+        self.learns = True
         self.frames = 0
         self._compile()
 
     def _compile(self) -> None:
         """Have all kernels compiled before the first frame: it would wait for seconds."""
-        self.assembler.push(empty(0))
-        self.estimator.state.advance(np.empty((0, 2 + len(self.estimator.model.signals))))
+        samples = self.assembler.push(self.senders.push(empty(0)))
+        self.estimator.state.advance(
+            np.empty((len(self.frozen.push(samples)), 2 + len(self.estimator.model.signals)))
+        )
         self.estimator.solution()
 
-    def push(self, frames: Frames) -> None:
-        """Take frames in their order of arrival."""
+    def push(self, frames: Frames) -> FloatArray:
+        """Take frames in their order of arrival; the samples they made, rows as in `to_chunk`."""
         self.frames += len(frames)
-        self.estimator.update(self.assembler.push(frames))
+        return self._take(self.assembler.push(self.senders.push(frames)))
 
-    def finish(self) -> None:
+    def finish(self) -> FloatArray:
         """Take the last sample, which waited for its successor."""
-        self.estimator.update(self.assembler.finish())
+        return self._take(self.assembler.finish())
+
+    def _take(self, samples: Samples) -> FloatArray:
+        estimator = self.estimator
+        samples = self.frozen.push(samples)
+        if estimator.origin_us is None and len(samples):
+            estimator.origin_us = int(samples.t_us[0])
+        chunk = to_chunk(estimator.model, samples, estimator.origin_us or 0)
+        if self.learns:
+            estimator.advance(chunk)
+        elif estimator.history is not None:
+            estimator.history.append(chunk)
+        return chunk
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Everything that was refused or restarted so far, by reason."""
+        total = dict(self.assembler.counters)
+        add_counts(total, {FROZEN: self.frozen.refused})
+        add_counts(total, self.estimator.counters)
+        return total
+
+
+def _run_limits(model: Model, assembly: Assembly) -> list[int]:
+    """How often each signal of the assembly may repeat (0: any number)."""
+    sources = 1 if assembly.mode == CYCLE else len(assembly.messages)
+    declared = {signal.name: signal for signal in model.signals}
+    limits = []
+    for source in assembly.signals:
+        signal = declared.get(source.name)
+        steady = signal is None or source.constant is not None or signal.kind in (COMMAND, MODE)
+        limits.append(
+            0 if signal is None or steady else run_limit(signal.noise, signal.resolution, sources)
+        )
+    return limits
 
 
 def listen(

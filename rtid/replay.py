@@ -140,9 +140,8 @@ def replay(
     trace = read_trace(project, path)
     model = model_for(project, trace.samples)
     progress("learning as on board", 0.2)
-    live = Estimator(model)
     if bus_speed is None:
-        live.update(trace.samples)
+        live = _as_on_board(project, model, trace)
     else:
         live = _through_bus(project, model, trace, bus_speed, progress)
     progress("refining weights, lag and offsets", 0.5)
@@ -152,6 +151,18 @@ def replay(
     chunk = to_chunk(model, trace.samples, int(trace.samples.t_us[0]))
     validation = project.sections.record.validation_s
     return Replay(project, model, trace, live, fit, chunk, span, validation)
+
+
+def _as_on_board(project: Project, model: Model, trace: Trace) -> Estimator:
+    """The estimate from the frames, through the gates of the daemon; a table has passed its own."""
+    if trace.frames is None:
+        live = Estimator(model)
+        live.update(trace.samples)
+        return live
+    learner = Learner(model, catalog_of(project), project.assembly)
+    learner.push(trace.frames)
+    learner.finish()
+    return learner.estimator
 
 
 def _through_bus(
