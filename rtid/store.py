@@ -1,12 +1,18 @@
-"""Snapshots: the estimator's whole memory in one npz file, with schema and restore key.
+"""Snapshots: the estimator's whole memory in one file, with schema, restore key and CRC.
 
-A snapshot continues bit for bit; it is refused where it belongs to another project or schema.
+A snapshot continues bit for bit; it is refused where it belongs to another project or schema, or
+where a single byte of it is wrong.  The file is an npz with its CRC-32 behind it.  `Generations`
+keeps the last two: whatever happens while one is written, the other one is whole.
 """
 
 from __future__ import annotations
 
+import io
 import json
 import os
+import struct
+import zlib
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -20,7 +26,10 @@ from rtid.estimator.state import State, Weights
 from rtid.estimator.sums import Sums
 from rtid.model import Model
 
-SCHEMA = 3
+SCHEMA = 4
+RELEARN = "learn again with `rtid replay` or `rtid run`"
+SEAL = struct.Struct("<4sL")  # behind the npz: mark, CRC-32 of all bytes before
+MARK = b"RTID"
 FOLD = ("shared", "blocks", "pairs", "tiles", "noise", "rows", "compliance", "innovation")
 WEIGHTS = ("slopes", "compliance", "missed")
 ARRAYS = ("engine", "cells", "closed", "blocks", "pairs")
@@ -30,11 +39,15 @@ class SnapshotError(RtidError):
     """The file is no snapshot, or one of another project, schema or program version."""
 
 
-def save(path: Path, estimator: Estimator, digest: str) -> None:
-    """Write a snapshot; the file appears whole or not at all."""
+def save(path: Path, estimator: Estimator, digest: str, serial: int = 0) -> None:
+    """Write a snapshot; the file appears whole or not at all, and is on the disk on return.
+
+    serial: number of the snapshot, for `Generations`.
+    """
     header = {
         "schema": SCHEMA,
         "digest": digest,
+        "serial": serial,
         "origin_us": estimator.origin_us,
         "turns": estimator.turns,
         "due_s": estimator.due_s,
@@ -48,25 +61,31 @@ def save(path: Path, estimator: Estimator, digest: str) -> None:
         arrays |= {f"fold{k}_{name}": getattr(fold, name) for name in FOLD}
     if estimator.history is not None:
         arrays |= {f"history_{k}": a for k, a in estimator.history.to_arrays().items()}
+    arrays["header"] = np.array(json.dumps(header))
+    memory = io.BytesIO()
+    np.savez_compressed(memory, **arrays)
+    content = memory.getvalue()
+    write_whole(path, content + SEAL.pack(MARK, zlib.crc32(content)))
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Replace a file by these bytes, so that after a power cut there is the old one or the new."""
     temporary = path.with_name(path.name + ".part")
     with temporary.open("wb") as file:
-        arrays["header"] = np.array(json.dumps(header))
-        np.savez_compressed(file, **arrays)
+        file.write(content)
         file.flush()
         os.fsync(file.fileno())
     os.replace(temporary, path)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
 
 
 def load(path: Path, model: Model, digest: str) -> Estimator:
     """Restore an estimator.  Raises SnapshotError with the reason, FileNotFoundError."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            header = json.loads(str(file["header"]))
-            content = {name: file[name] for name in file.files if name != "header"}
-    except (ValueError, KeyError, OSError, EOFError, BadZipFile) as error:
-        if isinstance(error, FileNotFoundError):
-            raise
-        raise SnapshotError(f"{path}: not a snapshot of rtid ({error})") from error
+    header, content = _read(path)
     _check(path, header, digest)
     weights = None
     if "slopes" in content:
@@ -75,16 +94,30 @@ def load(path: Path, model: Model, digest: str) -> Estimator:
     estimator = Estimator(model, weights)
     for name, array in zip(ARRAYS, estimator.state.arrays, strict=True):
         if content[name].dtype != array.dtype:
-            raise SnapshotError(f"{path}: {name} has another layout", "learn again with `replay`")
+            raise SnapshotError(f"{path}: {name} has another layout", RELEARN)
     estimator.state = State(*(content[name] for name in ARRAYS))
-    estimator.origin_us, estimator.turns = header["origin_us"], header["turns"]
+    estimator.origin_us, estimator.turns = header["origin_us"], int(header["turns"])
     estimator.due_s = float(header["due_s"])
     estimator.folds = [_fold(content, k) for k in range(model.upkeep.folds)]
-    if estimator.history is not None:
+    if estimator.history is not None and "history_rows" in content:
         stored = {k: a for k, a in content.items() if k.startswith("history_")}
         kept = {name.removeprefix("history_"): array for name, array in stored.items()}
         estimator.history = History.from_arrays(kept)
     return estimator
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Header and arrays of a file whose seal is whole."""
+    whole = path.read_bytes()
+    content, seal = whole[: -SEAL.size], whole[-SEAL.size :]
+    if len(seal) < SEAL.size or SEAL.unpack(seal) != (MARK, zlib.crc32(content)):
+        raise SnapshotError(f"{path}: not a snapshot of rtid, or damaged", RELEARN)
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as file:
+            header = json.loads(str(file["header"]))
+            return header, {name: file[name] for name in file.files if name != "header"}
+    except (ValueError, KeyError, OSError, EOFError, BadZipFile) as error:
+        raise SnapshotError(f"{path}: not a snapshot of rtid ({error})", RELEARN) from error
 
 
 def _fold(content: dict[str, Any], k: int) -> Sums:
@@ -100,3 +133,56 @@ def _check(path: Path, header: dict[str, object], digest: str) -> None:
             f"{path}: learned with another project (geometry, sensors or grid differ)",
             "use the project file that made it, or learn again with `rtid replay`",
         )
+
+
+@dataclass(frozen=True)
+class Restored:
+    """What a start found: the estimator or None, in words, and each file that was of no use."""
+
+    estimator: Estimator | None
+    text: str
+    refused: tuple[str, ...] = ()
+
+
+class Generations:
+    """The last two snapshots of a folder, `state-0.npz` and `state-1.npz`, written in turn."""
+
+    def __init__(self, folder: Path, digest: str) -> None:
+        self._folder, self._digest = folder, digest
+        self._serial = 0
+
+    def path(self, serial: int) -> Path:
+        """Where the snapshot of this number goes."""
+        return self._folder / f"state-{serial % 2}.npz"
+
+    def save(self, estimator: Estimator) -> Path:
+        """Replace the older one; OSError where the disk does not take it."""
+        path = self.path(self._serial + 1)
+        save(path, estimator, self._digest, self._serial + 1)
+        self._serial += 1
+        return path
+
+    def restore(self, model: Model) -> Restored:
+        """The newest whole snapshot of this project; further ones are written behind it.
+
+        What belongs to another project or schema is kept under another name, never overwritten.
+        """
+        found: list[tuple[int, Path]] = []
+        refused = []
+        for path in (self.path(0), self.path(1)):
+            try:
+                header, _ = _read(path)
+                _check(path, header, self._digest)
+                found.append((int(header["serial"]), path))
+            except FileNotFoundError:
+                continue
+            except SnapshotError as error:
+                refused.append(str(error))
+                os.replace(path, path.with_suffix(".refused.npz"))
+        for serial, path in sorted(found, reverse=True):
+            self._serial = max(self._serial, serial)
+            try:
+                return Restored(load(path, model, self._digest), path.name, tuple(refused))
+            except SnapshotError as error:
+                refused.append(str(error))
+        return Restored(None, "fresh", tuple(refused))

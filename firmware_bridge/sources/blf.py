@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import datetime
 import itertools
+import os
 import re
 import struct
 import zlib
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -179,7 +180,62 @@ def _is_cut(raw: bytes, pieces: list[Piece]) -> bool:
 
 def write(path: Path, frames: Frames) -> None:
     """Write frames as a BLF file, in bulk; python-can and Vector tools read it."""
-    start_ms = int(frames.t_us.min()) // 1000 if len(frames) else 0
+    with Writer(path, int(frames.t_us.min()) if len(frames) else 0) as log:
+        log.write(frames)
+
+
+class Writer:
+    """A BLF file that grows: what was written is on its way to disk after each `write`.
+
+    A file that nobody closed is read up to its last container, and counted as truncated.
+    start_us: stamps count from here; its year must lie after 1990 to be kept.
+    """
+
+    def __init__(self, path: Path, start_us: int) -> None:
+        self._start_ms = self._stop_ms = start_us // 1000
+        self._file_bytes = self._content_bytes = HEADER_BYTES
+        self._objects = 0
+        self._file = path.open("wb", buffering=0)
+        self._write_header()
+
+    @property
+    def size(self) -> int:
+        """Bytes in the file."""
+        return self._file_bytes
+
+    def write(self, frames: Frames) -> None:
+        """Append frames, of at least the start's time; OSError where the disk takes no more."""
+        if not len(frames):
+            return
+        content = _inner(frames, self._start_ms).tobytes()
+        parts = [content[k : k + WRITE_BYTES] for k in range(0, len(content), WRITE_BYTES)]
+        packed = b"".join(map(_container, parts))
+        self._file.write(packed)
+        self._file_bytes += len(packed)
+        self._content_bytes += len(content) + 32 * len(parts)
+        self._objects += len(frames)
+        self._stop_ms = max(self._stop_ms, int(frames.t_us.max()) // 1000)
+        self._write_header()
+
+    def close(self) -> None:
+        """Release the file; harmless when called again."""
+        self._file.close()
+
+    def _write_header(self) -> None:
+        sizes = self._file_bytes, self._content_bytes
+        self._file.seek(0)
+        self._file.write(_header(sizes, self._objects, self._start_ms, self._stop_ms))
+        self._file.seek(0, os.SEEK_END)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _inner(frames: Frames, start_ms: int) -> NDArray[np.void]:
+    """The frames as objects of the inner chain."""
     objects = np.zeros(len(frames), CAN_OBJECT)
     objects["signature"], objects["header_size"], objects["header_version"] = SIGNATURE, 32, 1
     objects["size"], objects["type"], objects["flags"] = CAN_OBJECT.itemsize, 86, 2
@@ -187,12 +243,7 @@ def write(path: Path, frames: Frames) -> None:
     objects["channel"] = frames.channel.astype(np.uint16) + 1
     objects["length"], objects["can_id"] = frames.length, frames.can_id
     objects["data"] = frames.data
-    content = objects.tobytes()
-    parts = [content[k : k + WRITE_BYTES] for k in range(0, len(content), WRITE_BYTES)]
-    packed = [_container(part) for part in parts]
-    sizes = HEADER_BYTES + sum(map(len, packed)), HEADER_BYTES + len(content) + 32 * len(parts)
-    stop_ms = int(frames.t_us.max()) // 1000 if len(frames) else 0
-    path.write_bytes(_header(sizes, len(frames), start_ms, stop_ms) + b"".join(packed))
+    return objects
 
 
 def _container(content: bytes) -> bytes:

@@ -96,7 +96,7 @@ class Estimator:
             self._fade(news, changed)
         self.folds[fold] = self.folds[fold] + without_surprise(news, changed)
         if upkeep.innovation_sd > 0:
-            self._hold()
+            self.hold(self.solution())
 
     def _fade(self, news: Sums, changed: IntArray) -> None:
         """Let the past give up what the news replace, and what they contradict."""
@@ -115,14 +115,14 @@ class Estimator:
         enough = blocks["judged"] >= gates.min_rows
         return news.cells[enough & (blocks["surprise"] > gates.max_surprise * blocks["judged"])]
 
-    def _hold(self) -> None:
-        """Let the valid part of the present map judge the rows to come, once beta is known."""
-        solution, engine = self.solution(), self.state.engine[0]
+    def hold(self, solution: Solution) -> bool:
+        """Let the valid part of a map judge the rows to come; False while beta is not known."""
+        engine = self.state.engine[0]
         pressures = np.array([bool(c.pressure) for c in self.model.chambers])
         uncertain = np.sqrt(np.diag(solution.compliance_cov)) > KNOWN * solution.compliance
         if (uncertain & pressures).any():
             engine["gate_sd"] = 0.0
-            return
+            return False
         n_c, m = len(solution.scale_pa), len(solution.terms)
         valid = np.array([block.status == VALID for block in solution.blocks], bool)
         theta = solution.unknowns[n_c + m :].reshape(-1, TERMS)
@@ -132,6 +132,7 @@ class Estimator:
         engine["gate_sd"] = self.model.upkeep.innovation_sd
         engine["admits_all"] = 0
         engine["gate_rows"] = self.model.upkeep.innovation_rows
+        return True
 
     @property
     def sums(self) -> Sums:

@@ -30,6 +30,7 @@ SINGLE: dict[str, type[schema.Section]] = {
     "dynamics": schema.DynamicsSection,
     "estimator": schema.EstimatorSection,
     "record": schema.RecordSection,
+    "daemon": schema.DaemonSection,
 }
 NAMED: dict[str, type[schema.Section]] = {
     "messages": schema.MessageSection,

@@ -13,6 +13,7 @@ from rtid.project.added import AddedSection
 from rtid.project.schema import (
     BetaSection,
     ChamberSection,
+    DaemonSection,
     DynamicsSection,
     EdgeDefaults,
     EdgeSection,
@@ -50,6 +51,7 @@ class Sections:
     dynamics: DynamicsSection = field(default_factory=DynamicsSection)
     estimator: EstimatorSection = field(default_factory=EstimatorSection)
     record: RecordSection = field(default_factory=RecordSection)
+    daemon: DaemonSection = field(default_factory=DaemonSection)
     effects: dict[str, EffectSection] = field(default_factory=dict)
     added: tuple[AddedSection, ...] = ()
 

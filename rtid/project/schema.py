@@ -295,3 +295,16 @@ class RecordSection(Section):
 
     identification_s: Annotated[Interval | None, TIME] = None
     validation_s: Annotated[Interval | None, TIME] = None
+
+
+class DaemonSection(Section):
+    """[daemon]: `rtid run`, its rates and what it keeps; `folder` is relative to the file."""
+
+    rate_hz: Annotated[float, FREQUENCY] = Field(default=1000.0, ge=1, le=20_000)
+    publish_s: Annotated[float, TIME] = Field(default=10.0, gt=0)
+    store_s: Annotated[float, TIME] = Field(default=30.0, gt=0)
+    diagnose_s: Annotated[float, TIME] = Field(default=600.0, gt=0)
+    max_age_s: Annotated[float, TIME] = Field(default=0.05, gt=0)
+    priority: int = Field(default=0, ge=0, le=99)
+    record_mb: int = Field(default=200, ge=0)
+    folder: str | None = None
