@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rtid.diagnose.candidates import Candidate, Cause, Columns, Volumes, add_echoes, causes
+from rtid.diagnose.candidates import Candidate, Cause, Columns, Shape, Volumes
+from rtid.diagnose.causes import add_echoes, causes
 from rtid.diagnose.evidence import Projected, collect, project
 from rtid.diagnose.regression import Estimate, Regression
 from rtid.diagnose.timing import TIMINGS, Psi, Timing
@@ -136,7 +137,7 @@ def one_pass(
     revision: Revision,
     start: FlowMap | None,
     bank: bool,
-    more: Iterable[tuple[Cause, float]] = (),
+    more: Iterable[tuple[Cause, Shape]] = (),
     thorough: bool = True,
 ) -> Fit:
     """Fit with the timing parameters where they are; more: causes to add with other shapes.
@@ -276,7 +277,7 @@ def _offer(
     columns: Columns,
     revision: Revision,
     bank: bool,
-    more: Iterable[tuple[Cause, float]],
+    more: Iterable[tuple[Cause, Shape]],
 ) -> None:
     """Columns of the revision's effects, and of all that is to be scored."""
     for cause in causes(view) if bank or revision.effects else ():
@@ -284,7 +285,7 @@ def _offer(
         for effect in own:
             columns.offer(effect, cause.column(effect.shape))
         if bank and not own and cause.offered:
-            for shape in cause.shapes or (None,):
+            for shape in cause.shapes:
                 columns.offer(cause.at(shape), cause.column(shape))
     for cause, shape in more:
         columns.offer(cause.at(shape), cause.column(shape))
@@ -310,9 +311,9 @@ def _offer_timings(view: View, columns: Columns, revision: Revision) -> None:
                     "share",
                     "1",
                     20.0,
-                    shape=psi[0],
-                    shape_name=timing.parameters[0],
-                    shape_unit=timing.units[0],
+                    shape=psi[:1],
+                    shape_names=timing.parameters[:1],
+                    shape_units=timing.units[:1],
                 ),
                 opening_change(view, change),
             )

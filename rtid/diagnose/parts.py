@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from rtid.diagnose.candidates import Candidate, causes
+from rtid.diagnose.candidates import Candidate
+from rtid.diagnose.causes import causes
 from rtid.diagnose.fit import Fit, Revision, first_map, split, transformed
 from rtid.diagnose.timing import TIMINGS, Psi, Timing
 from rtid.diagnose.view import View
@@ -18,7 +19,6 @@ from rtid.estimator.state import Weights
 from rtid.model import FloatArray, Model
 
 COMMAND = "command"  # where every timing sits
-OWN_TIME = "own_time_constant"  # name of the lag of an effect's own dynamics
 
 
 class PartError(RtidError):
@@ -71,18 +71,11 @@ def _timing(part: Part) -> tuple[Timing, Psi] | None:
 
 
 def _candidate(part: Part, offered: list[Candidate]) -> Candidate:
-    lag_s = part.parameters.get(OWN_TIME, 0.0)
     for candidate in offered:
-        is_it = candidate.key == part.key and candidate.parameter in part.parameters
-        if is_it and candidate.lag_s == lag_s:
-            return _shaped(candidate, part)
+        if candidate.key == part.key and candidate.parameter in part.parameters:
+            shape = tuple(_value(part, name) for name in candidate.shape_names)
+            return replace(candidate, shape=shape)
     raise _unfit(part, "cannot act in this record")
-
-
-def _shaped(candidate: Candidate, part: Part) -> Candidate:
-    if not candidate.shape_name:
-        return candidate
-    return replace(candidate, shape=_value(part, candidate.shape_name))
 
 
 def _value(part: Part, name: str) -> float:

@@ -15,7 +15,6 @@ from rtid.diagnose.candidates import Candidate
 from rtid.diagnose.diagnosis import Result
 from rtid.diagnose.experiment import limits
 from rtid.diagnose.fit import Fit
-from rtid.diagnose.parts import OWN_TIME
 from rtid.diagnose.regression import Score
 from rtid.diagnose.trials import Found, Key, detection_limit, physical
 from rtid.effects import catalogue
@@ -177,10 +176,8 @@ def parameters(fit: Fit, key: Key) -> dict[str, Value]:
             value, sd = fit.estimate.value(column), fit.estimate.sd(column) * spread
             scale = physical(fit, effect, 1.0)
             found[effect.parameter] = Value(scale * value, scale * sd, effect.unit)
-            if effect.shape is not None:
-                found[effect.shape_name] = Value(effect.shape, float("nan"), effect.shape_unit)
-            if effect.lag_s > 0:
-                found[OWN_TIME] = Value(effect.lag_s, float("nan"), "s")
+            shape = zip(effect.shape_names, effect.shape, effect.shape_units, strict=True)
+            found |= {name: Value(at, float("nan"), unit) for name, at, unit in shape}
     return found
 
 
@@ -210,7 +207,7 @@ def _limit(result: Result, candidate: Candidate, score: Score) -> Unseen:
     fit, unit = result.last, candidate.unit
     limit = physical(fit, candidate, detection_limit(score, fit.rho))
     if candidate.parameter == "share":  # of a timing: times the value that its column was made for
-        limit, unit = _of_timing(candidate, limit), candidate.shape_unit
+        limit, unit = _of_timing(candidate, limit), candidate.shape_units[0]
         visible = np.isfinite(limit) and score.visible > VISIBLE
     else:
         visible = score.visible > VISIBLE and limit < candidate.largest
@@ -225,8 +222,8 @@ def _limit(result: Result, candidate: Candidate, score: Score) -> Unseen:
 
 def _of_timing(candidate: Candidate, share: float) -> float:
     """Share of a timing as its parameter: a spool is the slower the lower its frequency."""
-    shape = candidate.shape or 0.0
-    return shape / share if candidate.shape_name == "natural_frequency" else shape * share
+    (shape,), (name,) = candidate.shape, candidate.shape_names
+    return shape / share if name == "natural_frequency" else shape * share
 
 
 def advice(result: Result, unseen: tuple[Unseen, ...]) -> tuple[str, ...]:

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rtid.diagnose.candidates import SEED, Candidate, causes
+from rtid.diagnose.candidates import Candidate
+from rtid.diagnose.causes import SEED, causes
 from rtid.diagnose.fit import Fit, transformed
 from rtid.diagnose.view import View
 from rtid.estimator.state import variance

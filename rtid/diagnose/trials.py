@@ -11,7 +11,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from rtid.diagnose.candidates import Candidate, causes
+from rtid.diagnose.candidates import Candidate
+from rtid.diagnose.causes import causes
 from rtid.diagnose.fit import Fit, Revision, fit, one_pass
 from rtid.diagnose.parts import Part
 from rtid.diagnose.regression import LIMIT_SD, Score
@@ -25,6 +26,9 @@ LARGE = 1.5  # rho above which timing effects are refitted whatever their score
 TIE, TIE_SHARE = 12.0, 0.03  # causes within so much of the best gain are not told apart
 CLOSE = 0.9  # timings whose coarse gain is this share of the best are refitted finely
 PROMISING = 0.3  # share of the best gain that a timing's bank must reach to be closed in on
+SHARE_OF_BEST = 0.2  # of the best gain that a cause must have for its shape to be refined
+ROUNDS = 8  # of refinement, each with half the step of the last
+SETTLED = 2e-3  # of the gain: what a round must add for another one
 MATCH_RHO = 1.10  # largest rho of a model that matches
 
 Key = tuple[str, str]
@@ -47,7 +51,12 @@ class Trial:
         """Parameters that the cause brings."""
         if self.fit is not None:
             return len(self.revision.timings[-1][1])
-        return 1 + (self.revision.effects[-1].shape is not None)
+        return 1 + len(self.effect.shape)
+
+    @property
+    def effect(self) -> Candidate:
+        """The candidate of a cause with a column of its own."""
+        return self.revision.effects[-1]
 
 
 @dataclass(frozen=True)
@@ -100,8 +109,7 @@ def trials_of(state: State, present: Fit) -> list[Trial]:
     for key, (candidate, score) in best.items():
         if key[1] == "command":
             continue
-        revision = replace(present.revision, effects=(*present.revision.effects, candidate))
-        trials.append(Trial(key, score.gain, revision))
+        trials.append(Trial(key, score.gain, _with(present, candidate)))
     trials = refined(state, present, trials)
     scores = {key: s.gain for key, (_, s) in best.items() if key[1] == "command"}
     other = max((t.gain for t in trials if t.key not in state.negligible), default=0.0)
@@ -138,37 +146,36 @@ def physical(fit_: Fit, candidate: Candidate, value: float) -> float:
 
 
 def refined(state: State, present: Fit, trials: list[Trial]) -> list[Trial]:
-    """Shapes between those of the bank, where they could matter, in one more pass."""
-    if not trials:
-        return trials
-    bar = max(GAIN, 0.2 * max(t.gain for t in trials))
-    shaped = {
-        t.key: t.revision.effects[-1]
-        for t in trials
-        if t.revision.effects[-1].shape is not None and t.gain > bar
-    }
-    more = [
-        (cause, shape)
-        for cause in causes(present.view)
-        if cause.candidate.key in shaped and cause.makes(shaped[cause.candidate.key])
-        for shape in cause.finer(shaped[cause.candidate.key].shape or 0.0)
-    ]
-    if not more:
-        return trials
-    finer = one_pass(
-        state.model, state.chunk, present.weights, present.revision, present.map, False, more
-    )
-    best = best_by_key(finer, scored(finer))
-    found = []
-    for trial in trials:
-        candidate, score = best.get(trial.key, (None, None))
-        if candidate is not None and score is not None and score.gain > trial.gain:
-            effects = (*present.revision.effects, candidate)
-            revision = replace(present.revision, effects=effects)
-            found.append(Trial(trial.key, score.gain, revision))
-        else:
-            found.append(trial)
-    return found
+    """Shapes between those of the bank, where they could matter: one pass per round for all."""
+    bar = max(GAIN, SHARE_OF_BEST * max((t.gain for t in trials), default=0.0))
+    at = {t.key: t for t in trials}
+    open_ = {t.key for t in trials if t.effect.shape and t.gain > bar}
+    for k in range(ROUNDS):
+        if not open_:
+            break
+        effects = {key: at[key].effect for key in open_}
+        more = [
+            (cause, shape)
+            for cause in causes(present.view)
+            if cause.candidate.key in effects and cause.makes(effects[cause.candidate.key])
+            for shape in cause.about(effects[cause.candidate.key].shape, 0.5**k)
+        ]
+        finer = one_pass(
+            state.model, state.chunk, present.weights, present.revision, present.map, False, more
+        )
+        best = best_by_key(finer, scored(finer))
+        for key in list(open_):
+            candidate, score = best.get(key, (at[key].effect, None))
+            rise = score.gain - at[key].gain if score is not None else 0.0
+            if score is not None and rise > 0:
+                at[key] = replace(at[key], gain=score.gain, revision=_with(present, candidate))
+            if rise < max(TIE, SETTLED * at[key].gain):
+                open_.discard(key)
+    return list(at.values())
+
+
+def _with(present: Fit, candidate: Candidate) -> Revision:
+    return replace(present.revision, effects=(*present.revision.effects, candidate))
 
 
 def _timing_trials(

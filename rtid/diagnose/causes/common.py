@@ -1,0 +1,38 @@
+"""What several columns are made of."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.signal import lfilter
+
+from rtid.diagnose.view import View
+from rtid.model import FloatArray
+
+
+def ssqrt(z: FloatArray) -> FloatArray:
+    """sign(z) sqrt |z|."""
+    return np.asarray(np.sign(z) * np.sqrt(np.abs(z)))
+
+
+def lagged(values: FloatArray, step_s: float, lag_s: float) -> FloatArray:
+    """First-order lag, started at the first value; none for 0."""
+    if lag_s <= 0.0:
+        return values
+    fade = float(np.exp(-step_s / lag_s))
+    return np.asarray(lfilter([1 - fade], [1, -fade], values - values[0]) + values[0])
+
+
+def stored(view: View, c: int, what: FloatArray) -> FloatArray:
+    """- V d(what) over each interval (n - 1,), V in the middle of it."""
+    v = view.volume(c)
+    return np.asarray(-0.5 * (v[1:] + v[:-1]) * np.diff(what))
+
+
+def slope_to(view: View, c: int) -> FloatArray:
+    """Change of the flow into chamber c per Pa of its own pressure (n - 1,), negative."""
+    chamber = view.model.chambers[c]
+    toward = [
+        int(edge.source == chamber.pressure) - int(edge.sink == chamber.pressure)
+        for edge in view.model.edges
+    ]
+    return view.into_chamber(c, [k * view.slope_dp(i) for i, k in enumerate(toward)])

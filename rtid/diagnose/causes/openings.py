@@ -1,0 +1,54 @@
+"""Valves that open at a pressure: a poppet with its own time constant and hysteresis.
+
+Q = K max(0, P* - P_r),  P* the pressure behind a play of the width of the hysteresis
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from rtid.diagnose.candidates import (
+    LAMINAR,
+    Candidate,
+    Cause,
+    Shape,
+    Volumes,
+)
+from rtid.diagnose.causes.common import lagged
+from rtid.diagnose.timing import played
+from rtid.diagnose.view import View
+
+OPENINGS = 8  # opening pressures that are tried, over the range
+OWN_TIMES_S = (0.0, 0.02, 0.06)
+HYSTERESIS = 0.04  # of the highest pressure: where the search begins
+
+
+def openings(view: View) -> Iterator[Cause]:
+    """A relief and a make-up valve on each chamber."""
+    for c in range(len(view.model.chambers)):
+        yield _opening(view, "relief_valve", c, 1.0)
+        yield _opening(view, "makeup_valve", c, -1.0)
+
+
+def _opening(view: View, effect: str, c: int, sign: float) -> Cause:
+    """A valve that lets out (sign +1) above its opening pressure, or in (-1) below it."""
+    p, smooth = view.pressure(c), view.smooth(view.pressure(c))
+    low, high = (float(v) for v in np.quantile(p, [0.002, 0.998]))
+    pressures = tuple(float(v) for v in np.linspace(low, high, OPENINGS + 2)[1:-1])
+
+    def make(shape: Shape) -> Volumes:
+        opening, own_time_s, hysteresis = shape
+        # a play follows extremes: those of the noise would widen it
+        poppet = played(smooth, view.step_s, (hysteresis,)) if hysteresis > 0.0 else p
+        flow = -sign * np.maximum(0.0, sign * (poppet - opening))
+        return {c: view.over_intervals(lagged(flow, view.step_s, own_time_s))}
+
+    candidate = Candidate(
+        effect, view.model.chambers[c].name, "slope", LAMINAR, 1e-7,
+        shape_names=("opening_pressure", "own_time_constant", "hysteresis"),
+        shape_units=("Pa", "s", "Pa"),
+    )  # fmt: skip
+    times_s = OWN_TIMES_S if sign > 0 else (0.0,)  # a check valve is quick
+    return Cause(candidate, make, (pressures, times_s, (0.0, HYSTERESIS * high)), banked=2)
