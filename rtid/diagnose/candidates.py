@@ -19,7 +19,8 @@ from rtid.diagnose.view import View
 from rtid.model import FloatArray
 
 LAMINAR, TURBULENT = "m3/s/Pa", "m3/s/sqrt(Pa)"
-STEPS = (-1.0, -0.5, 0.5, 1.0)  # about a shape, in steps of its bank
+STEPS = (-1.0, -0.5, 0.5, 1.0)  # about a shape, in steps of its axes
+SLOPE_STEP = 0.05  # the same, for derivatives
 
 Volumes = dict[int, FloatArray]  # chamber -> (n - 1,) m3
 Shape = tuple[float, ...]
@@ -82,13 +83,28 @@ class Cause:
         """True for a candidate of this cause, whatever its shape."""
         return replace(candidate, shape=()) == self.candidate
 
+    def spacing(self, k: int) -> float:
+        """Distance of the values of axis k to begin with."""
+        return float(np.max(np.diff(self.axes[k]))) if len(self.axes[k]) > 1 else 0.0
+
+    def bounds(self, k: int) -> tuple[float, float]:
+        """Between which nonlinear parameter k may be: positive, and not far beyond its axis."""
+        axis, spacing = self.axes[k], self.spacing(k)
+        return max(axis[0] - spacing, min(axis[0], 0.0)), axis[-1] + spacing
+
+    def slope(self, shape: Shape, k: int) -> Volumes:
+        """Derivative of the column with respect to nonlinear parameter k, by differences."""
+        step = SLOPE_STEP * self.spacing(k)
+        above, below = ((*shape[:k], shape[k] + s, *shape[k + 1 :]) for s in (step, -step))
+        low = self.column(below)
+        return {c: (high - low[c]) / (2.0 * step) for c, high in self.column(above).items()}
+
     def about(self, shape: Shape, step: float) -> tuple[Shape, ...]:
         """Shapes that differ from one in one parameter by up to `step` of its axis' spacing."""
         found = []
-        for k, axis in enumerate(self.axes):
-            spacing = step * float(np.max(np.diff(axis))) if len(axis) > 1 else 0.0
+        for k in range(len(self.axes)):
             for part in STEPS:
-                value = max(shape[k] + part * spacing, min(axis[0], 0.0))
+                value = float(np.clip(shape[k] + part * step * self.spacing(k), *self.bounds(k)))
                 if value != shape[k]:
                     found.append((*shape[:k], value, *shape[k + 1 :]))
         return tuple(dict.fromkeys(found))

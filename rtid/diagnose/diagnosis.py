@@ -193,11 +193,11 @@ def _look_back(state: State, present: Fit, last: Residual) -> tuple[Fit, Residua
     for effect in list(present.revision.effects) if len(present.revision.effects) > 1 else []:
         if any(effect.key == given.key for given in state.given):
             continue
-        column = present.column(effect)
-        estimate = present.estimate
-        gain = (estimate.value(column) / max(estimate.sd(column), 1e-300)) ** 2
+        column, estimate = present.column(effect), present.estimate
+        own = {column, *present.shape_columns(effect).values()}
+        without = present.regression.fit(tuple(k for k in estimate.used if k not in own))
         possible = effect.is_possible(physical(present, effect, estimate.value(column)))
-        if gain > GAIN and possible:
+        if without.sse - estimate.sse > GAIN and possible:
             continue
         kept = tuple(e for e in present.revision.effects if e != effect)
         revision = replace(present.revision, effects=kept)

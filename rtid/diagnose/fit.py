@@ -1,12 +1,13 @@
 """Fit one revision of the model to a record: maps, compliances, effects and timing together.
 
-Timing parameters enter as their derivative columns and are moved until nothing is left to move
-(Gauss-Newton); the declared lag of the spools is one of them, held by its tolerance.
+Timing parameters and the shapes of effects enter as their derivative columns and are moved until
+nothing is left to move (Gauss-Newton); the declared lag of the spools is one of them, held by its
+tolerance.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,7 +30,9 @@ from rtid.model import FloatArray, Model
 PASSES = 5  # of Gauss-Newton
 SETTLED = 0.2  # of a standard deviation: a step as short ends it
 REACH = 0.6  # of a timing parameter: the longest step
+SHAPE_REACH = 0.5  # the same of an effect's nonlinear parameter, in steps of its axis
 LAG_STEP_S = 5e-5
+RIDGE = 1e-9  # of the square of a shape's column: more than rounding leaves
 HELD = 1e30  # information of a parameter that is held
 
 IntArray = NDArray[np.int64]
@@ -60,7 +63,8 @@ class Fit:
 
     declared: the machine as declared; model: the same with split commands; sent: the record with
     the commands as they reach the spools.  The columns of the regression are
-    y, theta_beta per chamber, timing parameters up to `first`, candidates, echoes.
+    y, theta_beta per chamber, timing parameters, shapes up to `first`, candidates, echoes.
+    shapes: (effect, nonlinear parameter) of each column of shapes.
     """
 
     declared: Model
@@ -75,6 +79,7 @@ class Fit:
     estimate: Estimate
     map: FlowMap
     first: int
+    shapes: tuple[tuple[int, int], ...] = ()
 
     @property
     def rho(self) -> float:
@@ -99,8 +104,14 @@ class Fit:
     def timing_columns(self, k: int) -> range:
         """Columns of the parameters of timing k."""
         lengths = [len(psi) for _, psi in self.revision.timings]
-        at = self.first - sum(lengths) + sum(lengths[:k])
+        at = self.first - len(self.shapes) - sum(lengths) + sum(lengths[:k])
         return range(at, at + lengths[k])
+
+    def shape_columns(self, effect: Candidate) -> dict[int, int]:
+        """Columns of an effect's nonlinear parameters that are free, by their number."""
+        at = self.revision.effects.index(effect)
+        first = self.first - len(self.shapes)
+        return {k: first + j for j, (e, k) in enumerate(self.shapes) if e == at}
 
 
 def prepare(model: Model, chunk: FloatArray) -> Weights:
@@ -153,20 +164,23 @@ def one_pass(
     view = View.of(model, sent, weights, start)
     columns = Columns(len(chunk), len(model.chambers))
     n_timing = _add_timing(view, columns, before, weights, revision)
+    shapes = tuple(_add_shapes(view, columns, revision))
     _offer(view, columns, revision, bank, more)
-    add_echoes(view, columns, n_timing)
+    add_echoes(view, columns, n_timing + len(shapes))
     evidence = collect(model, sent, weights, columns.given())
     projected = project(evidence, thorough)
     n_c = len(model.chambers)
     regression = _regression(
         model, weights, revision, projected, columns, evidence.squares(), evidence.rows
     )
-    first = 1 + n_c + n_timing
+    first = 1 + n_c + n_timing + len(shapes)
+    weak = slice(first - len(shapes), first)
+    regression.prior[weak] = RIDGE * regression.own[weak]
     at = [first + columns.candidates.index(e) for e in revision.effects]
     estimate = regression.fit((*range(1, first), *at))
     found = FlowMap(evidence.cells, _terms(projected, estimate), projected.cov)
     parts = sent, weights, revision, view, columns, projected, regression, estimate
-    return Fit(declared, model, *parts, found, first)
+    return Fit(declared, model, *parts, found, first, shapes)
 
 
 def split(model: Model) -> Model:
@@ -247,6 +261,22 @@ def _add_timing(
             columns.add(opening_change(view, change))
             n += 1
     return n
+
+
+def _add_shapes(view: View, columns: Columns, revision: Revision) -> Iterator[tuple[int, int]]:
+    """Derivative columns of the nonlinear parameters of effects, but for those at a bound."""
+    for e, effect in enumerate(revision.effects):
+        cause = _cause(view, effect)
+        for k, value in enumerate(effect.shape):
+            low, high = cause.bounds(k)
+            slope = cause.slope(effect.shape, k) if low < value < high else {}
+            if any(np.any(series != 0.0) for series in slope.values()):
+                columns.add(slope)
+                yield e, k
+
+
+def _cause(view: View, effect: Candidate) -> Cause:
+    return next(cause for cause in causes(view) if cause.makes(effect))
 
 
 def _change(
@@ -362,4 +392,21 @@ def _moved(found: Fit) -> tuple[Revision, Weights] | None:
                 settled = False
             new.append(target)
         timings.append((timing, tuple(new)))
-    return None if settled else (replace(found.revision, timings=tuple(timings)), weights)
+    effects = [_reshaped(found, effect) for effect in found.revision.effects]
+    settled = settled and effects == list(found.revision.effects)
+    revision = Revision(tuple(effects), tuple(timings))
+    return None if settled else (revision, weights)
+
+
+def _reshaped(found: Fit, effect: Candidate) -> Candidate:
+    """An effect with its nonlinear parameters moved by what their derivatives took."""
+    size, shape = found.estimate.value(found.column(effect)), list(effect.shape)
+    cause = _cause(found.view, effect)
+    if size == 0.0:
+        return effect
+    for k, at in found.shape_columns(effect).items():
+        step, sd = found.estimate.value(at) / size, found.estimate.sd(at) / abs(size)
+        reach = SHAPE_REACH * cause.spacing(k)
+        if abs(step) > max(SETTLED * np.sqrt(max(1.0, found.rho)) * sd, 1e-3 * cause.spacing(k)):
+            shape[k] = float(np.clip(shape[k] + np.clip(step, -reach, reach), *cause.bounds(k)))
+    return replace(effect, shape=tuple(shape))

@@ -176,8 +176,10 @@ def parameters(fit: Fit, key: Key) -> dict[str, Value]:
             value, sd = fit.estimate.value(column), fit.estimate.sd(column) * spread
             scale = physical(fit, effect, 1.0)
             found[effect.parameter] = Value(scale * value, scale * sd, effect.unit)
-            shape = zip(effect.shape_names, effect.shape, effect.shape_units, strict=True)
-            found |= {name: Value(at, float("nan"), unit) for name, at, unit in shape}
+            free = fit.shape_columns(effect)
+            for k, name in enumerate(effect.shape_names):
+                sd = fit.estimate.sd(free[k]) * spread / abs(value) if k in free else float("nan")
+                found[name] = Value(effect.shape[k], sd, effect.shape_units[k])
     return found
 
 
