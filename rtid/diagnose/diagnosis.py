@@ -200,7 +200,7 @@ def _look_back(state: State, present: Fit, last: Residual) -> tuple[Fit, Residua
         if without.sse - estimate.sse > GAIN and possible:
             continue
         kept = tuple(e for e in present.revision.effects if e != effect)
-        revision = replace(present.revision, effects=kept)
+        revision = replace(present.revision, effects=kept, sizes=())
         present = fit(state.model, state.chunk, present.weights, revision, present.map)
         last = residual(present, state.held_out)
         state.found = [f for f in state.found if f.key != effect.key]

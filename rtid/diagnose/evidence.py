@@ -66,9 +66,18 @@ class Evidence:
 
 
 def collect(
-    model: Model, chunk: FloatArray, weights: Weights, given: Given, row_s: float = ROW_S
+    model: Model,
+    chunk: FloatArray,
+    weights: Weights,
+    given: Given,
+    row_s: float = ROW_S,
+    soft: FloatArray | None = None,
 ) -> Evidence:
-    """One pass over a record, chunk (n, 2 + signals), with all given columns."""
+    """One pass over a record, chunk (n, 2 + signals), with all given columns.
+
+    soft (n, chambers): white variance of each measured position's equation, m6, beyond that of the
+    model without effects.
+    """
     group = rows_per_group(chunk, row_s)
     e = build(model, weights)
     e.engine[0]["x_var_m2"] /= group
@@ -76,12 +85,13 @@ def collect(
     n_c = len(model.chambers)
     head, step_s = 1 + n_c + given.n, float(np.median(np.diff(chunk[:, 0])))
     taken = _Pass(head, n_c, model.n_cells, max(1, round(SEGMENT_S / (group * step_s))))
+    soft = np.zeros((len(chunk), n_c)) if soft is None else soft / group
     at = 0
     for end in [*range(0, len(chunk), max(1, round(SEGMENT_S / step_s)))[1:], len(chunk)]:
         while at < end:
             at = kernel.collect(
                 e.engine, e.cells, chunk, at, end, group,
-                given.series, given.source, given.sign, *taken.arrays,
+                given.series, given.source, given.sign, soft, *taken.arrays,
             )  # fmt: skip
             taken.add()
     return taken.evidence()

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtid.diagnose.candidates import Candidate, Cause, Columns, Shape, Volumes
-from rtid.diagnose.causes import add_echoes, causes
+from rtid.diagnose.causes import add_echoes, causes, softness
 from rtid.diagnose.evidence import Projected, collect, project
 from rtid.diagnose.regression import Estimate, Regression
 from rtid.diagnose.timing import TIMINGS, Psi, Timing
@@ -23,11 +23,12 @@ from rtid.diagnose.view import FlowMap, View
 from rtid.estimator.factor import SHARED_PRIOR
 from rtid.estimator.record import refined, run
 from rtid.estimator.solution import sketch
-from rtid.estimator.state import Weights
+from rtid.estimator.state import Weights, variance
 from rtid.kernels.layout import TERMS
 from rtid.model import FloatArray, Model
 
 PASSES = 5  # of Gauss-Newton
+SIZED = 0.05  # share by which the sizes of effects may still change
 SETTLED = 0.2  # of a standard deviation: a step as short ends it
 REACH = 0.6  # of a timing parameter: the longest step
 SHAPE_REACH = 0.5  # the same of an effect's nonlinear parameter, in steps of its axis
@@ -41,10 +42,14 @@ Timings = tuple[tuple[Timing, Psi], ...]
 
 @dataclass(frozen=True)
 class Revision:
-    """What was added to a model: effects with their shapes, timings with their parameters."""
+    """What was added to a model: effects with their shapes, timings with their parameters.
+
+    sizes: coefficients of the effects as fitted last, which weigh the rows.
+    """
 
     effects: tuple[Candidate, ...] = ()
     timings: Timings = ()
+    sizes: tuple[tuple[Candidate, float], ...] = ()
 
     @property
     def replaces_lag(self) -> bool:
@@ -167,7 +172,7 @@ def one_pass(
     shapes = tuple(_add_shapes(view, columns, revision))
     _offer(view, columns, revision, bank, more)
     add_echoes(view, columns, n_timing + len(shapes))
-    evidence = collect(model, sent, weights, columns.given())
+    evidence = collect(model, sent, weights, columns.given(), soft=softened(view, revision.sizes))
     projected = project(evidence, thorough)
     n_c = len(model.chambers)
     regression = _regression(
@@ -181,6 +186,21 @@ def one_pass(
     found = FlowMap(evidence.cells, _terms(projected, estimate), projected.cov)
     parts = sent, weights, revision, view, columns, projected, regression, estimate
     return Fit(declared, model, *parts, found, first, shapes)
+
+
+def softened(view: View, sizes: tuple[tuple[Candidate, float], ...]) -> FloatArray:
+    """What storage effects add to the white variance of each row's equation (n, chambers), m6.
+
+    The noise of a pressure moves what is stored: sd_P times V / beta and the effects' own share.
+    """
+    more = np.zeros((view.n, len(view.model.chambers)))
+    for c, chamber in enumerate(view.model.chambers):
+        own = sum((size * softness(view, c, e) for e, size in sizes), np.zeros(view.n))
+        if own.any():
+            plain = view.volume(c) * view.compliance[c]
+            noise = variance(view.model, chamber.pressure) * view.model.pressure_share
+            more[:, c] = ((plain + own) ** 2 - plain**2) * noise
+    return more
 
 
 def split(model: Model) -> Model:
@@ -392,9 +412,12 @@ def _moved(found: Fit) -> tuple[Revision, Weights] | None:
                 settled = False
             new.append(target)
         timings.append((timing, tuple(new)))
-    effects = [_reshaped(found, effect) for effect in found.revision.effects]
-    settled = settled and effects == list(found.revision.effects)
-    revision = Revision(tuple(effects), tuple(timings))
+    effects = tuple(_reshaped(found, effect) for effect in found.revision.effects)
+    sizes = [found.estimate.value(found.column(effect)) for effect in found.revision.effects]
+    known = [size for _, size in found.revision.sizes]
+    settled = settled and effects == found.revision.effects and len(known) == len(sizes)
+    settled = settled and np.allclose(known, sizes, rtol=SIZED)
+    revision = Revision(effects, tuple(timings), tuple(zip(effects, sizes, strict=True)))
     return None if settled else (revision, weights)
 
 

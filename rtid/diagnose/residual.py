@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rtid.diagnose.candidates import Candidate
-from rtid.diagnose.causes import SEED, causes
+from rtid.diagnose.causes import SEED, causes, softness
 from rtid.diagnose.fit import Fit, transformed
 from rtid.diagnose.view import View
 from rtid.estimator.state import variance
@@ -112,12 +112,16 @@ def _noise(fit: Fit, view: View) -> FloatArray:
         if variance(model, name) > 0
     }
     still = np.zeros(view.n)
+    own = [
+        sum((value * softness(view, c, e) for e, value in effect_values(fit)), still)
+        for c in range(len(model.chambers))
+    ]
     found = np.empty((view.n - 1, len(model.chambers)))
     for c, chamber in enumerate(model.chambers):
-        p, v = noise.get(chamber.pressure, still), view.volume(c)[:-1]
+        p, v = noise.get(chamber.pressure, still), view.volume(c)
         x_rate = np.diff(noise.get(model.position, still)) / view.dt_s
         found[:, c] = chamber.sign * chamber.area_m2 * x_rate
-        found[:, c] += fit.compliance[c] * v * np.diff(p) / view.dt_s
+        found[:, c] += np.diff((fit.compliance[c] * v + own[c]) * p) / view.dt_s
         slopes = []
         for i, edge in enumerate(model.edges):
             dp = noise.get(edge.source, still) - noise.get(edge.sink, still)

@@ -57,6 +57,7 @@ def collect(
     series: FloatArray,
     source: IntArray,
     sign: FloatArray,
+    soft: FloatArray,
     d: FloatArray,
     later: FloatArray,
     place: IntArray,
@@ -68,7 +69,9 @@ def collect(
     """Rows of the samples first <= k < last of chunk (n, 2 + signals); returns where it stopped.
 
     engine (1,), cells: a freshly built state.  series (n - 1, s): volumes per interval, m3; given
-    column j takes sign[j, c] times series source[j, c] in chamber c.  d, later (chambers, width):
+    column j takes sign[j, c] times series source[j, c] in chamber c.  soft (n, chambers): white
+    variance of a row at each sample beyond that of the declared model, m6.  d, later (chambers,
+    width):
     state of the columns and what is due after the next row; place (cells,): local place of a cell's
     block or -1; cell_of (places,): the inverse; counts, noise (5, 2, 2): see above; rows (most,
     chambers, width): whitened rows.  All of these are changed in place.  Stops early when places
@@ -89,11 +92,11 @@ def collect(
             if (flags & ROW_FLAG) != 0:
                 counts[IN_GROUP] += 1
                 if counts[IN_GROUP] == group:
-                    _whiten(e, d, later, counts, noise, rows)
+                    _whiten(e, soft[k], d, later, counts, noise, rows)
         else:
             e.running = 0
             if whole and (flags & ROW_FLAG) != 0:
-                _begin(e, sample, group, d, later, counts, noise)
+                _begin(e, sample, group, soft[k], d, later, counts, noise)
     return last
 
 
@@ -117,6 +120,7 @@ def _begin(
     e: Any,
     sample: FloatArray,
     group: int,
+    soft: FloatArray,
     d: FloatArray,
     later: FloatArray,
     counts: IntArray,
@@ -132,7 +136,7 @@ def _begin(
     noise[:] = 0.0
     for c in range(e.n_chambers):
         for b in range(e.n_chambers):
-            noise[GAP, c, b] = group * e.cov[c, b]
+            noise[GAP, c, b] = group * (e.cov[c, b] + (soft[c] if b == c else 0.0))
             noise[LAST, c, b] = noise[GAP, c, b]
             e.cov[c, b] = 0.0
     counts[IN_GROUP] = 0
@@ -216,11 +220,17 @@ def _count_noise(e: Any, share: float, noise: FloatArray) -> None:
 
 @part
 def _whiten(
-    e: Any, d: FloatArray, later: FloatArray, counts: IntArray, noise: FloatArray, rows: FloatArray
+    e: Any,
+    soft: FloatArray,
+    d: FloatArray,
+    later: FloatArray,
+    counts: IntArray,
+    noise: FloatArray,
+    rows: FloatArray,
 ) -> None:
     """One whitened row of all columns, then d <- d - K d + what was due later."""
     n, row = counts[N_HEAD] + TERMS * counts[N_LOCAL], rows[counts[N_ROWS]]
-    s00 = noise[GAP, 0, 0] + noise[SQUARED, 0, 0] + position_noise(e, 0, 0)
+    s00 = noise[GAP, 0, 0] + noise[SQUARED, 0, 0] + position_noise(e, 0, 0) + soft[0]
     c00 = noise[GAP, 0, 0] + noise[SHARED, 0, 0]
     i0, noise[LAST, 0, 0] = 1.0 / math.sqrt(s00), s00
     if e.n_chambers == 1:
@@ -231,7 +241,7 @@ def _whiten(
         noise[GAP, 0, 0] += noise[PLAIN, 0, 0] - c00 * c00 / s00
     else:
         s01 = noise[GAP, 0, 1] + noise[SQUARED, 0, 1] + position_noise(e, 0, 1)
-        s11 = noise[GAP, 1, 1] + noise[SQUARED, 1, 1] + position_noise(e, 1, 1)
+        s11 = noise[GAP, 1, 1] + noise[SQUARED, 1, 1] + position_noise(e, 1, 1) + soft[1]
         c01 = noise[GAP, 0, 1] + noise[SHARED, 0, 1]
         c11 = noise[GAP, 1, 1] + noise[SHARED, 1, 1]
         half, noise[LAST, 1, 1] = s01 * i0, s11

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
@@ -22,6 +22,7 @@ from rtid.estimator.state import variance
 from rtid.model import FloatArray
 
 ATMOSPHERE_PA = 101325.0
+SMALL_PA = 1e3  # for derivatives
 LEAST_PA = 5e4  # below, gas and vapour follow other laws: cavitation
 VAPOUR_PA = (2e4, 5e4, 1e5, 1.5e5, 2e5)  # below which gas may come out of the oil
 SEED = 20051005  # of the noise that stands for the sensors' own
@@ -89,23 +90,27 @@ def add_echoes(view: View, columns: Columns, first: int) -> None:
         noise[c] = sd * rng.standard_normal(view.n)
         echo = columns.add({c: view.compliance[c] * stored(view, c, noise[c])})
         columns.echo_of[1 + c] = 1 + n_c + echo
-    by_place = places(view)
     for k, candidate in enumerate(columns.candidates):
-        make = _NOISY.get(candidate.effect)
-        if make is not None:
-            volumes = {
-                c: make(view, c, noise[c], candidate.shape) for c in by_place[candidate.where]
-            }
+        soft = {c: softness(view, c, candidate) for c in noise}
+        volumes = {c: -np.diff(soft[c] * noise[c]) for c in noise if soft[c].any()}
+        if volumes:
             columns.echo_of[1 + n_c + first + k] = 1 + n_c + columns.add(volumes)
 
 
-def _air_echo(view: View, c: int, noise: FloatArray, shape: Shape) -> FloatArray:
-    p, kappa = view.pressure(c), shape[0]
-    return stored(view, c, air(p + noise, kappa) - air(p, kappa))
-
-
-_NOISY: dict[str, Callable[[View, int, FloatArray, Shape], FloatArray]] = {
-    "entrained_air": _air_echo,
-    "extra_dead_volume": lambda view, c, noise, _: -view.compliance[c] * np.diff(noise),
-    "hose_compliance": lambda view, c, noise, _: -np.diff(noise),
-}
+def softness(view: View, c: int, candidate: Candidate) -> FloatArray:
+    """What one unit of a storage effect takes up in chamber c per Pa (n,), m3/Pa; 0 for others."""
+    p, still = view.pressure(c), np.zeros(view.n)
+    if c not in places(view).get(candidate.where, ()):
+        return still
+    match candidate.effect:
+        case "entrained_air":
+            kappa = candidate.shape[0]
+            rise = air(p + SMALL_PA, kappa) - air(p - SMALL_PA, kappa)
+            return np.asarray(view.volume(c) * rise / (2.0 * SMALL_PA))
+        case "extra_dead_volume":
+            return still + view.compliance[c]
+        case "hose_compliance":
+            return still + 1.0
+        case "cavitation":
+            return view.volume(c) * (p < candidate.shape[0])
+    return still
