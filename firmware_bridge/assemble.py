@@ -66,6 +66,11 @@ class Assembler:
         return total
 
     @property
+    def source_counters(self) -> dict[str, int]:
+        """What the source and the gates before this one left out, by reason."""
+        return dict(self._source_counts)
+
+    @property
     def declared(self) -> Records:
         """MESSAGE (m,) of the declared messages, in their order."""
         return self._plan.messages

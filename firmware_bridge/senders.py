@@ -1,9 +1,13 @@
 """A second sender with the same identifier: its message comes faster than it is declared.
 
-Frames are counted in windows of 100 ms of stamps (of ten periods for slow messages).  More than 1.5
-times what the period gives, and two for jitter, and the message is refused, from there until 0.5 s
-after the last such window: nobody can tell which sender is right.  All frames count, also those
-that a CRC or counter would refuse.  No clock is asked: pieces of any size give the same.
+Each frame fills a bucket by one, and time empties it by 1.25 frames per period T:
+
+    level <- max(0, level + 1 - 1.25 dt / T),   a second sender:  level > clip(75 ms / T, 3, 75)
+
+Two senders fill it in about 100 ms.  A sender or an adapter that was held up sends what is late at
+once: a silence gives credit for the frames that it owes.  From an overflow on the message is
+refused until 0.5 s after the last one: nobody can tell which sender is right.  All frames count,
+also those that a CRC or counter would refuse.  No clock is asked: pieces of any size give the same.
 """
 
 from __future__ import annotations
@@ -14,10 +18,12 @@ from numpy.typing import NDArray
 from firmware_bridge import frames as fr
 from firmware_bridge.checks import find_message
 from firmware_bridge.frames import Frames
-from firmware_bridge.jit import Records, kernel
+from firmware_bridge.jit import Integer, Record, Records, inlined, kernel
 
-WINDOW_US, LEAST_PERIODS = 100_000, 10
-FACTOR, JITTER = 1.5, 2
+LEAK = 1.25
+FULL_US, LEAST_FULL, MOST_FULL = 75_000.0, 3.0, 75.0
+SILENCE = 1.5  # periods
+CREDIT_US = 2_000_000.0  # what a silence gives is forgotten with this time constant
 HOLD_US = 500_000
 REASON = "too_fast"
 
@@ -25,13 +31,32 @@ SENDER = np.dtype(
     [
         ("can_id", np.uint32),
         ("channel", np.int16),  # -1: any
-        ("window_us", np.int64),
-        ("most", np.int64),  # frames in one window
-        ("start_us", np.int64),  # of the present window
-        ("count", np.int64),  # frames in it
+        ("period_us", np.float64),
+        ("full", np.float64),
+        ("level", np.float64),
+        ("credit", np.float64),  # frames that are owed
+        ("last_us", np.int64),
         ("until_us", np.int64),  # refused before this time
+        ("seen", np.bool_),
     ]
 )
+
+
+@inlined
+def _fill(one: Record, t_us: Integer) -> None:
+    """One frame more in the bucket."""
+    periods = (t_us - one.last_us) / one.period_us if one.seen else 1.0
+    if periods < 0.0 and t_us < one.last_us - HOLD_US:  # the clock was set back
+        one.until_us, periods = t_us, 1.0
+    periods = max(periods, 0.0)
+    one.credit *= max(0.0, 1.0 - periods * one.period_us / CREDIT_US)
+    if periods > SILENCE:
+        one.credit = min(one.credit + periods - 1.0, CREDIT_US / one.period_us)
+    one.level = max(0.0, one.level + 1.0 - LEAK * periods)
+    used = min(one.credit, one.level)
+    one.level -= used
+    one.credit -= used
+    one.last_us, one.seen = t_us, True
 
 
 @kernel
@@ -48,15 +73,11 @@ def mark(
         m = find_message(senders, can_id[i], channel[i])
         if m < 0:
             continue
-        one, t = senders[m], t_us[i]
-        if t - one.start_us >= one.window_us or t < one.start_us - one.window_us:
-            one.start_us, one.count = t, 0
-            if one.until_us > t + HOLD_US:  # the clock was set back
-                one.until_us = t
-        one.count += 1
-        if one.count > one.most:
-            one.until_us = t + HOLD_US
-        if t < one.until_us:
+        one = senders[m]
+        _fill(one, t_us[i])
+        if one.level > one.full:
+            one.until_us = t_us[i] + HOLD_US
+        if t_us[i] < one.until_us:
             keep[i] = False
             refused += 1
     return refused
@@ -70,11 +91,9 @@ class Senders:
 
     def __init__(self, messages: Records) -> None:
         self._senders = np.zeros(len(messages), SENDER)
-        for name in ("can_id", "channel"):
+        for name in ("can_id", "channel", "period_us"):
             self._senders[name] = messages[name]
-        window = np.maximum(WINDOW_US, LEAST_PERIODS * messages["period_us"])
-        self._senders["window_us"] = window
-        self._senders["most"] = np.ceil(FACTOR * window / messages["period_us"]) + JITTER
+        self._senders["full"] = np.clip(FULL_US / messages["period_us"], LEAST_FULL, MOST_FULL)
         self._last_us = 0
 
     def push(self, frames: Frames) -> Frames:

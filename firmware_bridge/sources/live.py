@@ -57,6 +57,16 @@ class Source(ABC):
     def is_over(self) -> bool:
         """Whether it was stopped and everything has been read."""
 
+    @property
+    @abstractmethod
+    def is_down(self) -> bool:
+        """Whether it has failed and is being opened again."""
+
+    @property
+    @abstractmethod
+    def queued(self) -> int:
+        """Items that wait to be read."""
+
     def __iter__(self) -> Iterator[Frames]:
         """Batches until `stop` is called and the queue is empty; never an empty batch."""
         while not self.is_over:
@@ -92,6 +102,7 @@ class LiveSource(Source, Generic[Item]):
         self._arrived = threading.Condition()
         self._stopped = threading.Event()
         self._error: Exception | None = None
+        self._down = False
         self._thread = threading.Thread(target=self._run, name="rtid-receive", daemon=True)
 
     @abstractmethod
@@ -151,6 +162,16 @@ class LiveSource(Source, Generic[Item]):
         return self._stopped.is_set() and not self._queue
 
     @property
+    def is_down(self) -> bool:
+        """See `Source.is_down`."""
+        return self._down
+
+    @property
+    def queued(self) -> int:
+        """See `Source.queued`."""
+        return len(self._queue)
+
+    @property
     def is_due(self) -> bool:
         """Whether `read` would return at once."""
         return bool(self._queue) or self._error is not None or self._stopped.is_set()
@@ -171,8 +192,10 @@ class LiveSource(Source, Generic[Item]):
         try:
             return self._receive()
         except Exception:
+            self._down = True
             if not self._reopened():
                 raise
+            self._down = False
             return self._seam()
 
     def _reopened(self) -> bool:

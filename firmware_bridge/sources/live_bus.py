@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
+import can
+
 from firmware_bridge.frames import channel_number
 from firmware_bridge.sources.can_bus import CanBus
 from firmware_bridge.sources.live import LiveSource, Source, SourceError
@@ -17,6 +19,12 @@ from firmware_bridge.sources.several import Several
 from firmware_bridge.sources.slcan import Slcan
 
 ON_PORTS = ("serial", "slcan")
+# What makes an adapter not even acknowledge; socketcan has it in `ip link ... listen-only on`.
+LISTENING: dict[str, dict[str, Any]] = {
+    "vector": {"listen_only": True},
+    "kvaser": {"driver_mode": False},
+    "pcan": {"state": can.BusState.PASSIVE},
+}
 
 
 def open_live(
@@ -64,7 +72,8 @@ def _open_one(
     if interface == "slcan" and channel is not None:
         return Slcan(channel, bitrate, reopen_s=reopen_s, **options)
     speed = {} if bitrate is None else {"bitrate": bitrate}
-    return CanBus(interface, channel, can_ids, reopen_s, **speed, **options)
+    options = LISTENING.get(interface, {}) | speed | options
+    return CanBus(interface, channel, can_ids, reopen_s, **options)
 
 
 def _numbers(names: list[str]) -> list[int]:

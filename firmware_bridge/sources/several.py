@@ -53,6 +53,16 @@ class Several(Source):
         """See `Source.is_over`."""
         return all(source.is_over for source in self._sources.values())
 
+    @property
+    def is_down(self) -> bool:
+        """See `Source.is_down`."""
+        return any(source.is_down for source in self._sources.values())
+
+    @property
+    def queued(self) -> int:
+        """See `Source.queued`."""
+        return sum(source.queued for source in self._sources.values())
+
     def _is_due(self) -> bool:
         return any(source.is_due for source in self._sources.values())
 

@@ -32,10 +32,3 @@ class Histogram:
             if n and seen >= wanted:
                 return min(EDGES_US[k + 1] if k + 1 < len(EDGES_US) else self.max_us, self.max_us)
         return 0.0
-
-    def merge(self, other: Histogram) -> None:
-        """Count everything that the other one holds."""
-        for k, n in enumerate(other.counts):
-            self.counts[k] += n
-        self.count += other.count
-        self.max_us = max(self.max_us, other.max_us)

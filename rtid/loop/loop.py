@@ -31,7 +31,8 @@ class LoopStatistics:
 class Loop:
     """Calls `work(now_ns)` at a fixed rate from the calling thread until `stop`.
 
-    work returns what it did beyond the usual, "" for nothing.
+    work returns what it did beyond the usual, "" for nothing.  `total` counts since the start,
+    `last_second` over the last whole second's ticks; other threads may read both.
     """
 
     def __init__(
@@ -42,7 +43,8 @@ class Loop:
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         self.period_ns = round(1e9 / rate_hz)
-        self.total, self._recent = LoopStatistics(), LoopStatistics()
+        self.total, self.last_second = LoopStatistics(), LoopStatistics()
+        self._recent, self._per_second = LoopStatistics(), max(1, round(rate_hz))
         self._work, self._clock_ns, self._sleep = work, clock_ns, sleep
         self._stopped = False
 
@@ -60,24 +62,18 @@ class Loop:
                 now_ns = self._clock_ns()
             due_ns = self._tick(due_ns, now_ns)
 
-    def recent(self) -> LoopStatistics:
-        """What happened since this was last asked; only the loop's own thread may ask."""
-        recent, self._recent = self._recent, LoopStatistics()
-        self.total.lateness.merge(recent.lateness)
-        self.total.work.merge(recent.work)
-        return recent
-
     def _tick(self, due_ns: int, start_ns: int) -> int:
         """Work once; the next deadline."""
+        if self._recent.ticks == self._per_second:
+            self.last_second, self._recent = self._recent, LoopStatistics()
         cpu_ns = time.thread_time_ns()
         done = self._work(start_ns)
         cpu_ns = time.thread_time_ns() - cpu_ns
         end_ns = self._clock_ns()
-        recent = self._recent
-        for part in (self.total, recent):
+        for part in (self.total, self._recent):
             part.ticks += 1
-        recent.lateness.add((start_ns - due_ns) * 1e-3)
-        recent.work.add((end_ns - start_ns) * 1e-3)
+            part.lateness.add((start_ns - due_ns) * 1e-3)
+            part.work.add((end_ns - start_ns) * 1e-3)
         next_ns = due_ns + self.period_ns
         if end_ns <= next_ns:
             return next_ns

@@ -72,12 +72,17 @@ def test_a_late_wake_up_is_told_from_long_work() -> None:
 
 def test_every_tick_is_in_both_histograms() -> None:
     loop = run([300_000] * 50, [20_000] * 50)
-    recent = loop.recent()
-    assert recent.work.count == recent.lateness.count == loop.total.ticks == 50
-    assert recent.work.quantile_us(0.5) == pytest.approx(300, rel=0.11)
-    assert recent.lateness.max_us == pytest.approx(20)
-    assert loop.recent().ticks == 0
-    assert loop.total.work.count == 50
+    total = loop.total
+    assert total.work.count == total.lateness.count == total.ticks == 50
+    assert total.work.quantile_us(0.5) == pytest.approx(300, rel=0.11)
+    assert total.lateness.max_us == pytest.approx(20)
+
+
+def test_the_last_second_stands_beside_the_total() -> None:
+    loop = run([300_000] * 1000 + [700_000] * 1000 + [1])
+    assert loop.last_second.ticks == 1000
+    assert loop.last_second.work.quantile_us(0.5) == pytest.approx(700, rel=0.11)
+    assert loop.total.work.quantile_us(0.25) == pytest.approx(300, rel=0.11)
 
 
 @pytest.mark.parametrize("share", [0.5, 0.99, 0.999, 1.0])

@@ -1,0 +1,113 @@
+"""`rtid run`: the on-board daemon, beside a real controller for months."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rtid.cli.exits import Exit
+from rtid.errors import RtidError
+
+if TYPE_CHECKING:
+    from firmware_bridge.sources.live import Source
+    from rtid.project import Project
+
+TEST_BUSES = ("udp_multicast", "virtual")  # nobody on them can be trusted: they ask for a word
+LOG_SERVICE_S = 60.0
+
+
+def run(
+    project: Annotated[Path, typer.Argument(help="Project file.")],
+    bus: Annotated[
+        str | None,
+        typer.Option(help="INTERFACE[:CHANNEL] in place of the file's, e.g. socketcan:can0."),
+    ] = None,
+    for_s: Annotated[
+        float | None, typer.Option("--for", min=0.1, help="Seconds to run; until stopped without.")
+    ] = None,
+    rate_hz: Annotated[
+        float | None,
+        typer.Option("--rate", min=1, max=20_000, help="Of the loop."),
+    ] = None,
+    state: Annotated[
+        Path | None, typer.Option(help="Folder of snapshots, history, alarms; else the file's.")
+    ] = None,
+    test_bus: Annotated[
+        bool, typer.Option("--test-bus", help="Allow udp_multicast and virtual: no authentication.")
+    ] = False,
+    fresh: Annotated[
+        bool, typer.Option("--fresh", help="Do not go on with what the folder holds.")
+    ] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print the last status as JSON at the end.")
+    ] = False,
+) -> None:
+    """Learn on board: listen to the bus (never send), keep state, raise alarms, diagnose.
+
+    One line of statistics each second on a terminal, each minute in a log; `rtid status` tells more
+    from another shell.  SIGTERM and Ctrl-C end it in good order, with what was learned stored.
+    """
+    from rtid.daemon import log
+    from rtid.daemon.configure import configured, state_folder
+    from rtid.daemon.daemon import Bus, Daemon, stopped_by_signals
+    from rtid.project import load
+
+    log.set_up()
+    loaded = configured(load(project), rate_hz)
+    source = loaded.sections.source
+    wanted = bus or f"{source.interface or ''}:{source.channel or ''}"
+    interface, _, channel = wanted.partition(":")
+    _refuse_untrusted(interface, project, test_bus)
+    folder = state or state_folder(loaded)
+    if fresh:
+        _set_aside(folder)
+    chosen = Bus(interface, channel, _opener(loaded, interface, channel))
+    daemon = Daemon(loaded, chosen, folder, 1.0 if sys.stderr.isatty() else LOG_SERVICE_S)
+    with stopped_by_signals(daemon):
+        last = daemon.run(for_s)
+    if as_json:
+        print(last.to_json())
+
+
+def _refuse_untrusted(interface: str, project: Path, test_bus: bool) -> None:
+    if not interface:
+        raise RtidError(
+            f"{project}: source.interface is missing",
+            "name a bus: --bus socketcan:can0",
+            Exit.USAGE,
+        )
+    if interface in TEST_BUSES and not test_bus:
+        raise RtidError(
+            f"{interface}: anybody may write to it, and nobody signs what he writes",
+            "add --test-bus if that is what you want",
+            Exit.USAGE,
+        )
+
+
+def _opener(loaded: Project, interface: str, channel: str) -> Callable[[], Source]:
+    """How to open the bus, listening only, with the frames of the project alone."""
+    from firmware_bridge.catalog import load as load_catalog
+    from firmware_bridge.sources.live_bus import open_live
+
+    assert loaded.dbc is not None
+    catalog = load_catalog(loaded.dbc)
+    can_ids = [catalog.can_id(message.name) for message in loaded.assembly.messages]
+    bitrate = loaded.sections.source.bitrate
+    return lambda: open_live(
+        interface,
+        channel or None,
+        bitrate=bitrate if interface not in (*TEST_BUSES, "serial", "socketcan") else None,
+        can_ids=None if interface in ("serial", "slcan") else can_ids,
+        reopen_s=math.inf,
+    )
+
+
+def _set_aside(folder: Path) -> None:
+    """Keep what the folder holds under another name."""
+    for path in folder.glob("state-[01].npz"):
+        path.replace(path.with_suffix(".before.npz"))

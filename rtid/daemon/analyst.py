@@ -1,0 +1,199 @@
+"""The helper that solves, publishes, judges, records and saves: `python -m rtid.daemon.analyst`.
+
+It has time: its disk may be slow, a solve may take seconds.  What it cannot do it says.
+"""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+import sys
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+from rtid.daemon.chronicle import Chronicle
+from rtid.daemon.jobs import (
+    Answer,
+    Batch,
+    Found,
+    Handover,
+    Job,
+    Note,
+    NotSaved,
+    Publication,
+    Ready,
+    Recall,
+    Recalled,
+    Recording,
+    Saved,
+)
+from rtid.daemon.judge import Judge
+from rtid.daemon.pipe import Pipe
+from rtid.daemon.recorder import Recorder
+from rtid.daemon.status import EdgeHealth
+from rtid.errors import RtidError
+from rtid.estimator.estimator import Estimator
+from rtid.estimator.flowmap import FlowMap
+from rtid.estimator.published import publish
+from rtid.estimator.solution import Solution
+from rtid.mapfiles import provenance, write_map
+from rtid.project import Project, load
+from rtid.store import Generations
+
+T = TypeVar("T")
+NICE = 5
+MAP_FILE = "map.npz"
+KEPT = 3  # handovers that can be recalled
+FLOOD_S = 10.0  # the same refusal of the disk is told at most this often
+
+
+class Analyst:
+    """Takes jobs, answers through `answer`."""
+
+    def __init__(self, project: Project, folder: Path, answer: Callable[[Answer], None]) -> None:
+        self._answer, self._project = answer, project
+        self._chambers = [chamber.name for chamber in project.model.chambers]
+        self._generations = Generations(folder, project.digest)
+        limit_bytes = project.sections.daemon.record_mb << 20
+        self._folder = folder
+        self._recorder: Recorder | None = None
+        self._limit_bytes = limit_bytes
+        self._chronicle: Chronicle | None = None
+        self._judge: Judge | None = None
+        self._told: dict[str, float] = {}
+        self._handed: deque[Handover] = deque(maxlen=KEPT)
+
+    def take(self, job: Job) -> None:
+        """Do one job."""
+        if isinstance(job, Batch):
+            self._batch(job)
+        elif isinstance(job, Handover):
+            self._handover(job)
+        elif isinstance(job, Note):
+            self._note(job)
+        elif isinstance(job, Recall) and self._handed:
+            wanted = [one for one in self._handed if one.number <= job.number]
+            found = wanted[-1] if wanted else self._handed[0]
+            self._answer(Recalled(found.number, found.estimator))
+        elif isinstance(job, Found) and job.verdict is not None:
+            verdict = job.verdict
+            self._guarded("history", lambda: self._history().note_verdict(verdict))
+
+    def close(self) -> None:
+        """Close the files."""
+        if self._recorder is not None:
+            self._recorder.close()
+        if self._chronicle is not None:
+            self._chronicle.close()
+
+    def _batch(self, batch: Batch) -> None:
+        if self._judge is not None:
+            judgement = self._judge.push(batch.chunk)
+            if judgement is not None:
+                self._answer(judgement)
+        frames = batch.frames
+        if frames is not None and self._limit_bytes:
+            self._guarded("recording", lambda: self._record().write(frames))
+
+    def _handover(self, job: Handover) -> None:
+        if job.store:
+            path = self._guarded("snapshot", lambda: self._generations.save(job.estimator))
+            if path is not None:
+                self._answer(Saved(job.number, str(path)))
+        if job.publish and len(job.estimator.sums.blocks):
+            self._handed.append(job)
+            self._publish(job)
+
+    def _publish(self, job: Handover) -> None:
+        start_s = time.monotonic()
+        solution = job.estimator.solution()
+        self._judge = Judge(job, solution)
+        flow_map = publish(solution)
+        found = Publication(
+            job.number,
+            flow_map,
+            solution.beta_pa,
+            solution.beta_sd_pa,
+            float(solution.rho),
+            float(job.estimator.state.engine[0]["t_s"]),
+            edges_of(job.estimator, solution, flow_map),
+            time.monotonic() - start_s,
+        )
+        self._answer(found)
+        self._guarded("map", lambda: self._write_map(flow_map, solution))
+        self._guarded("history", lambda: self._history().note_publication(found, self._chambers))
+
+    def _write_map(self, flow_map: FlowMap, solution: Solution) -> None:
+        """Replace the map in the folder, for the page and for `rtid compare --map`."""
+        told = provenance(solution, self._project.name, self._project.digest, "rtid run")
+        temporary = self._folder / f"part-{MAP_FILE}"
+        write_map(temporary, flow_map, told)
+        os.replace(temporary, self._folder / MAP_FILE)
+
+    def _note(self, note: Note) -> None:
+        self._guarded("history", lambda: self._history().note_alarm(note.alarm))
+        if note.keep and self._limit_bytes:
+            alarm = note.alarm
+            keep = self._guarded(
+                "recording", lambda: self._record().keep(alarm.name, alarm.since_unix_s)
+            )
+            kept = {alarm.name: keep} if keep else {}
+            self._answer(Recording(self._recorder.path if self._recorder else "", kept))
+
+    def _record(self) -> Recorder:
+        if self._recorder is None:
+            self._recorder = Recorder(self._folder, self._limit_bytes)
+        return self._recorder
+
+    def _history(self) -> Chronicle:
+        if self._chronicle is None:
+            self._chronicle = Chronicle(self._folder)
+        return self._chronicle
+
+    def _guarded(self, what: str, action: Callable[[], T]) -> T | None:
+        """Do something with the disk; a refusal is told, and tried again with the next job."""
+        try:
+            return action()
+        except (OSError, sqlite3.Error) as error:
+            now_s = time.monotonic()
+            if now_s >= self._told.get(what, 0.0):
+                self._told[what] = now_s + FLOOD_S
+                self._answer(NotSaved(what, str(error)))
+        return None
+
+
+def edges_of(estimator: Estimator, solution: Solution, flow_map: FlowMap) -> tuple[EdgeHealth, ...]:
+    """Blocks and cells of each edge by status."""
+    found = []
+    for i, edge in enumerate(estimator.model.edges):
+        mine = [block for block in solution.blocks if block.edge == i]
+        cells = Counter(str(status) for status in flow_map.edges[i].status.ravel())
+        progress = sum(block.progress for block in mine) / max(1, len(mine))
+        blocks = Counter(block.status for block in mine)
+        found.append(EdgeHealth(edge.name, dict(blocks), dict(cells), progress))
+    return tuple(found)
+
+
+def main() -> None:
+    """Serve the daemon at the other end of the pipe until it says None or is gone."""
+    fd, project, folder = sys.argv[1:]
+    pipe = Pipe(int(fd))
+    os.nice(NICE)
+    analyst = Analyst(load(project), Path(folder), pipe.send)
+    pipe.send(Ready())
+    try:
+        while (job := pipe.receive()) is not None:
+            try:
+                analyst.take(job)
+            except RtidError as error:
+                pipe.send(NotSaved("analysis", str(error)))
+    except (EOFError, OSError):
+        pass  # the daemon is gone; what it had was stored by the last job
+    analyst.close()
+
+
+if __name__ == "__main__":
+    main()

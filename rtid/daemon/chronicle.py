@@ -1,0 +1,63 @@
+"""History in SQLite (WAL): estimates, alarms and verdicts over months, readable while it grows."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import time
+from pathlib import Path
+
+from rtid.daemon.jobs import Publication
+from rtid.daemon.status import Alarm, Verdict
+
+FILE = "history.sqlite"
+TABLES = """
+CREATE TABLE IF NOT EXISTS estimate (unix_s REAL, chamber TEXT, beta_pa REAL, beta_sd_pa REAL);
+CREATE TABLE IF NOT EXISTS map (unix_s REAL, edge TEXT, valid INTEGER, visited INTEGER, rho REAL);
+CREATE TABLE IF NOT EXISTS alarm (unix_s REAL, name TEXT, kind TEXT, text TEXT, over INTEGER);
+CREATE TABLE IF NOT EXISTS verdict (unix_s REAL, verdict TEXT, text TEXT, content TEXT);
+CREATE INDEX IF NOT EXISTS estimate_time ON estimate (unix_s);
+CREATE INDEX IF NOT EXISTS map_time ON map (unix_s);
+"""
+
+
+class Chronicle:
+    """One row per event; sqlite3.Error where the disk does not take it."""
+
+    def __init__(self, folder: Path) -> None:
+        self._database = sqlite3.connect(folder / FILE, isolation_level=None)
+        self._database.execute("PRAGMA journal_mode=WAL")
+        self._database.execute("PRAGMA synchronous=NORMAL")
+        self._database.executescript(TABLES)
+
+    def note_publication(self, found: Publication, chambers: list[str]) -> None:
+        """One row per chamber and per edge."""
+        now_s = time.time()
+        estimates = [
+            (now_s, name, float(beta), float(sd))
+            for name, beta, sd in zip(chambers, found.beta_pa, found.beta_sd_pa, strict=True)
+        ]
+        maps = [
+            (now_s, e.name, e.blocks.get("valid", 0), sum(e.blocks.values()), found.rho)
+            for e in found.edges
+        ]
+        self._database.execute("BEGIN")
+        self._database.executemany("INSERT INTO estimate VALUES (?, ?, ?, ?)", estimates)
+        self._database.executemany("INSERT INTO map VALUES (?, ?, ?, ?, ?)", maps)
+        self._database.execute("COMMIT")
+
+    def note_alarm(self, alarm: Alarm) -> None:
+        """One row when it begins and one when it is over."""
+        over = alarm.until_unix_s is not None
+        when_s = alarm.until_unix_s if alarm.until_unix_s is not None else alarm.since_unix_s
+        row = (when_s, alarm.name, alarm.kind, alarm.text, over)
+        self._database.execute("INSERT INTO alarm VALUES (?, ?, ?, ?, ?)", row)
+
+    def note_verdict(self, found: Verdict) -> None:
+        """One row per diagnosis."""
+        row = (found.at_unix_s, found.verdict, found.text, json.dumps(found.content))
+        self._database.execute("INSERT INTO verdict VALUES (?, ?, ?, ?)", row)
+
+    def close(self) -> None:
+        """Write everything back."""
+        self._database.close()

@@ -1,0 +1,217 @@
+"""The daemon put together: restore, compile, open the bus, loop, and end in good order.
+
+main thread    the loop: take frames, learn, hand copies over        (SCHED_FIFO if wished)
+rtid-receive   only queues what the bus delivers
+rtid-keeper    hears answers, raises alarms, tells the status
+analyst        a process: solves, publishes, judges, records, saves
+diagnoser      a process per diagnosis
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import signal
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+
+from firmware_bridge import frames as fr
+from firmware_bridge.sources import candump
+from firmware_bridge.sources.live import Source
+from rtid.daemon.core import Core
+from rtid.daemon.diagnosing import Diagnosing
+from rtid.daemon.helper import Helper
+from rtid.daemon.jobs import Answer
+from rtid.daemon.keeper import Facts, Keeper
+from rtid.daemon.log import logger
+from rtid.daemon.status import Status
+from rtid.errors import RtidError
+from rtid.live import Learner
+from rtid.loop import realtime
+from rtid.loop.loop import Loop
+from rtid.project import Project
+from rtid.replay import catalog_of
+from rtid.store import Generations
+
+ANALYST = "rtid.daemon.analyst"
+LOCK_FILE = "lock"
+
+
+class DaemonError(RtidError):
+    """The daemon cannot begin; the text says what to change."""
+
+
+@dataclass(frozen=True)
+class Bus:
+    """How to open the bus: `open` is called once everything is compiled."""
+
+    interface: str
+    channel: str
+    open: Callable[[], Source]
+
+
+class Daemon:
+    """One machine, one bus, one state folder."""
+
+    def __init__(self, project: Project, bus: Bus, folder: Path, log_every_s: float = 1.0) -> None:
+        if project.noise_unknown:
+            names = ", ".join(project.noise_unknown)
+            raise DaemonError(
+                f"{project.path}: the noise of {names} is to be estimated; on board it is needed",
+                "record a trace, let `rtid check` tell the noise, and write it into the file",
+            )
+        self._project, self._bus, self._folder = project, bus, folder
+        self._log_every_s = log_every_s
+        self._loop: Loop | None = None
+        self._keeper: Keeper | None = None
+        self._answers: deque[Answer] = deque()  # of the helpers, for the keeper
+
+    @property
+    def status(self) -> Status | None:
+        """The newest status; None before the bus is open."""
+        return self._keeper.status if self._keeper is not None else None
+
+    def stop(self) -> None:
+        """End in good order, from any thread or a signal handler."""
+        if self._loop is not None:
+            self._loop.stop()
+
+    def run(self, for_s: float | None = None) -> Status:
+        """Run until stopped, or for so many seconds; the last status.
+
+        Raises DaemonError, SourceError where the bus cannot be opened or has failed for good.
+        """
+        folder = self._folder
+        folder.mkdir(parents=True, exist_ok=True)
+        with _locked(folder / LOCK_FILE):
+            learner = Learner(
+                self._project.model, catalog_of(self._project), self._project.assembly
+            )
+            restored = self._restore(learner)
+            analyst = Helper(ANALYST, [str(self._project.path), str(folder)], self._answers.append)
+            diagnosing = Diagnosing(self._project, self._answers.append)
+            try:
+                with self._bus.open() as source:
+                    core = Core(self._project, learner, source, analyst)
+                    facts = Facts(
+                        self._project,
+                        folder,
+                        self._bus.interface,
+                        self._bus.channel,
+                        restored,
+                        *self._prepare(),
+                        time.time(),
+                        self._log_every_s,
+                    )
+                    self._keeper = Keeper(facts, core, analyst, diagnosing, self._answers)
+                    return self._run(core, analyst, for_s)
+            finally:
+                diagnosing.stop()
+                analyst.stop(0.0)
+
+    def _run(self, core: Core, analyst: Helper, for_s: float | None) -> Status:
+        """Loop, then store what was learned."""
+        keeper = self._keeper
+        assert keeper is not None
+        rate_hz = self._project.sections.daemon.rate_hz
+        end_ns = time.monotonic_ns() + round(1e9 * for_s) if for_s is not None else None
+        self._loop = loop = Loop(rate_hz, _until(core.tick, end_ns, self.stop))
+        keeper.loop = loop
+        keeper.start()
+        logger.info("running %s on %s %s at %g Hz", self._project.name, self._bus.interface,
+                    self._bus.channel, rate_hz)  # fmt: skip
+        try:
+            loop.run()
+        except BaseException:
+            self._dump(core)
+            raise
+        finally:
+            core.notifier.tell("STOPPING=1")
+            core.source.stop()
+            core.finish(publish=for_s is not None)
+            if not analyst.stop():
+                logger.error("NOT SAVED: the last snapshot could not be written in time")
+            keeper.stop()
+            logger.info("stopped")
+        return keeper.status
+
+    def _restore(self, learner: Learner) -> str:
+        """Go on with the newest whole snapshot of this project."""
+        found = Generations(self._folder, self._project.digest).restore(learner.estimator.model)
+        for text in found.refused:
+            logger.warning("refused %s", text)
+        if found.estimator is not None:
+            found.estimator.history = learner.estimator.history
+            learner.estimator = found.estimator
+        logger.info("state %s", found.text)
+        return found.text
+
+    def _prepare(self) -> tuple[str, bool]:
+        """Scheduling and memory of the loop's thread, as far as the system grants it."""
+        priority = self._project.sections.daemon.priority
+        realtime.settle_interpreter()
+        realtime.sharpen_timer()
+        if not priority:
+            return "other", False
+        locked = realtime.lock_memory()
+        granted = realtime.promote(priority)
+        if not (granted and locked):
+            logger.warning("priority %d: scheduling granted=%s, memory locked=%s; needs "
+                           "CAP_SYS_NICE and CAP_IPC_LOCK", priority, granted, locked)  # fmt: skip
+        return (f"fifo {priority}" if granted else "other"), locked
+
+    def _dump(self, core: Core) -> None:
+        """Keep the last frames and the reason of a failure."""
+        stamp = time.strftime("%Y%m%d-%H%M%S", time.gmtime())
+        with contextlib.suppress(OSError):
+            (self._folder / f"failure-{stamp}.txt").write_text(traceback.format_exc(), "utf-8")
+            candump.write(self._folder / f"failure-{stamp}.log", fr.concatenate(list(core.last)))
+            logger.error("failed; the last frames are in %s/failure-%s.log", self._folder, stamp)
+
+
+def _until(
+    tick: Callable[[int], str], end_ns: int | None, stop: Callable[[], None]
+) -> Callable[[int], str]:
+    """The tick, which stops the loop at end_ns."""
+    if end_ns is None:
+        return tick
+
+    def timed(now_ns: int) -> str:
+        if now_ns >= end_ns:
+            stop()
+        return tick(now_ns)
+
+    return timed
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Only one daemon per state folder."""
+    with path.open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise DaemonError(
+                f"{path.parent}: another daemon keeps its state here", "stop it, or name a folder"
+            ) from None
+        yield
+
+
+@contextlib.contextmanager
+def stopped_by_signals(daemon: Daemon) -> Iterator[None]:
+    """SIGTERM and SIGINT end the daemon in good order; only from the main thread."""
+
+    def stop(_number: int, _frame: FrameType | None) -> None:
+        daemon.stop()
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

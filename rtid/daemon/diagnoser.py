@@ -1,0 +1,56 @@
+"""The helper that diagnoses: one process per diagnosis, whose memory goes with it.
+
+`python -m rtid.daemon.diagnoser FD PROJECT`: one job in, one answer out.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from dataclasses import replace
+
+from rtid.daemon.jobs import Diagnose, Found
+from rtid.daemon.pipe import Pipe
+from rtid.daemon.status import Verdict
+from rtid.diagnosed_text import sentences
+from rtid.diagnosing import added_parts, diagnose_live
+from rtid.errors import RtidError
+from rtid.estimator.estimator import Estimator
+from rtid.model import Upkeep
+from rtid.project import Project, load
+
+NICE = 10
+
+
+def diagnose(job: Diagnose, project: Project) -> Found:
+    """The verdict on these samples, or why there is none."""
+    span_s = float(job.chunk[-1, 0] - job.chunk[0, 0]) if len(job.chunk) else 0.0
+    now_s = time.time()
+    upkeep = Upkeep(history_s=span_s + 1.0, history_rows_per_s=len(job.chunk) / (span_s + 1.0) + 1)
+    estimator = Estimator(replace(job.model, upkeep=upkeep))
+    assert estimator.history is not None
+    estimator.history.append(job.chunk)
+    try:
+        found = diagnose_live(estimator, added_parts(project), project.effects)
+    except RtidError as error:
+        return Found(None, str(error))
+    effects = tuple(f"{e.effect} ({e.where})" if e.where else e.effect for e in found.found)
+    text = " ".join(sentences(found)[:3])
+    return Found(Verdict(now_s, found.verdict, text, effects, (span_s, 0.0), found.as_json()))
+
+
+def main() -> None:
+    """Serve the daemon at the other end of the pipe."""
+    fd, path = sys.argv[1:]
+    os.nice(NICE)
+    pipe, project = Pipe(int(fd)), load(path)
+    try:
+        while (job := pipe.receive()) is not None:
+            pipe.send(diagnose(job, project))
+    except (EOFError, OSError):
+        pass  # the daemon is gone
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,115 @@
+"""When to ask what is missing: now and then, and repeatedly once the plant has changed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from rtid.daemon.helper import Helper
+from rtid.daemon.jobs import Answer, Diagnose, Found
+from rtid.daemon.log import logger
+from rtid.daemon.status import Verdict
+from rtid.estimator.estimator import Estimator
+from rtid.estimator.history import History
+from rtid.model import FloatArray
+from rtid.project import Project
+
+AFTER_CHANGE_S = (20.0, 35.0, 55.0)  # of samples since the change
+LEAST_S = 30.0  # of samples for a diagnosis in between
+LIMIT_S = 240.0  # a diagnosis that takes longer is given up
+BEING_WRITTEN = 100  # rows at most that one tick appends
+DIAGNOSER = "rtid.daemon.diagnoser"
+
+
+class Diagnosing:
+    """One diagnosis at a time, each in a process of its own."""
+
+    def __init__(self, project: Project, answer: Callable[[Answer], None]) -> None:
+        self._project, self._answer = project, answer
+        self._every_s = project.sections.daemon.diagnose_s
+        self._next_s = time.monotonic() + self._every_s
+        self._helper: Helper | None = None
+        self._started_s = 0.0
+        self._since_s: float | None = None  # sample time of the change
+        self._stage = 0
+        self.verdict: Verdict | None = None
+        self.is_of_change = False
+
+    @property
+    def is_running(self) -> bool:
+        """Whether one is under way."""
+        return self._helper is not None
+
+    def begin(self, since_s: float) -> None:
+        """The plant has changed at this sample time."""
+        self._since_s, self._stage, self.is_of_change = since_s, 0, False
+
+    def end(self) -> None:
+        """The plant is as before."""
+        self._since_s, self.is_of_change = None, False
+
+    def look(self, estimator: Estimator, newest_s: float) -> None:
+        """Begin a diagnosis if one is due, give up one that takes too long.
+
+        newest_s: time of the newest sample, as in `to_chunk`.
+        """
+        if self._helper is not None:
+            if time.monotonic() - self._started_s > LIMIT_S:
+                logger.warning("diagnosis given up after %.0f s", LIMIT_S)
+                self._end_helper()
+            return
+        history = estimator.history
+        if history is None:
+            return
+        if self._since_s is not None:
+            self._look_at_change(estimator, newest_s - self._since_s)
+        elif time.monotonic() >= self._next_s and history.held_s >= LEAST_S:
+            self._next_s = time.monotonic() + self._every_s
+            self._begin(estimator, history.span_s)
+
+    def take(self, found: Found) -> None:
+        """An answer has come."""
+        self._end_helper()
+        if found.verdict is None:
+            logger.info("no diagnosis: %s", found.reason)
+            return
+        self.verdict = found.verdict
+        self.is_of_change = self._since_s is not None
+        logger.info("diagnosis verdict=%s text=%r", found.verdict.verdict, found.verdict.text)
+
+    def _look_at_change(self, estimator: Estimator, held_s: float) -> None:
+        if self._stage < len(AFTER_CHANGE_S) and held_s >= AFTER_CHANGE_S[self._stage]:
+            self._stage += 1
+            self._begin(estimator, held_s)
+
+    def _begin(self, estimator: Estimator, span_s: float) -> None:
+        assert estimator.history is not None
+        chunk = newest(estimator.history, span_s)
+        self._started_s = time.monotonic()
+        self._helper = Helper(DIAGNOSER, [str(self._project.path)], self._answer, restarts=False)
+        self._helper.put(Diagnose(self._project.model, chunk))
+
+    def _end_helper(self) -> None:
+        if self._helper is not None:
+            self._helper.stop(0.0)
+            self._helper = None
+
+    def stop(self) -> None:
+        """End a diagnosis under way."""
+        self._end_helper()
+
+
+def newest(history: History, span_s: float) -> FloatArray:
+    """The last span_s seconds of a ring that another thread writes to; rows as in `to_chunk`.
+
+    Rows that were overwritten while they were copied stand before a step back of time, one that was
+    not yet written stands at the very end; a clock that was set is a step back as well.
+    """
+    chunk = history.chunk(span_s)
+    back = np.flatnonzero(np.diff(chunk[:, 0]) <= 0)
+    if len(back) and back[-1] >= len(chunk) - BEING_WRITTEN:
+        chunk = chunk[: back[-1] + 1]
+        back = back[:-1]
+    return chunk[back[-1] + 1 :] if len(back) else chunk

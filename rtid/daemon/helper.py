@@ -1,0 +1,131 @@
+"""A process beside the daemon: jobs go to it through a bounded queue, its answers come back.
+
+Solving, saving and diagnosing in another thread would hold up python-can's receiver and the loop:
+they share one interpreter.  The loop only appends to a queue; when the helper is slow, the oldest
+job of a kind that may be dropped goes, and is counted.  A helper that dies is started again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+
+from rtid.daemon.jobs import Answer, Batch, Found, Job
+from rtid.daemon.pipe import Pipe, pair
+
+QUEUED = 500  # batches that may wait: a slow disk or a long solve
+RESTART_S = (1.0, 60.0)  # first and longest pause before a helper is started again
+
+
+class Helper:
+    """One `python -m MODULE FD ARGUMENTS...`; `answer` is called from its own thread.
+
+    failures counts how often it had to be started again; with restarts = False its end is answered
+    by Found without a verdict.
+    """
+
+    def __init__(
+        self,
+        module: str,
+        arguments: list[str],
+        answer: Callable[[Answer], None],
+        restarts: bool = True,
+    ) -> None:
+        self._restarts = restarts
+        self._command = [sys.executable, "-m", module]
+        self._arguments, self._answer = arguments, answer
+        self._jobs: deque[Job] = deque()
+        self._wake = threading.Condition()
+        self._stopping = False
+        self.dropped = self.failures = 0
+        self.process: subprocess.Popen[bytes] | None = None
+        self._feeder = threading.Thread(target=self._run, name=f"rtid-{module}", daemon=True)
+        self._feeder.start()
+
+    def put(self, job: Job) -> None:
+        """Queue a job; never waits."""
+        with self._wake:
+            if len(self._jobs) >= QUEUED:
+                self._drop_one()
+            self._jobs.append(job)
+            self._wake.notify()
+
+    @property
+    def queued(self) -> int:
+        """Jobs that wait."""
+        return len(self._jobs)
+
+    def stop(self, timeout_s: float = 20.0) -> bool:
+        """Let it finish all jobs, then end it; False if it had to be killed."""
+        with self._wake:
+            self._stopping = True
+            self._wake.notify()
+        self._feeder.join(timeout_s)
+        process = self.process
+        if process is not None and process.poll() is None:
+            process.kill()
+            process.wait()
+            return False
+        return not self._feeder.is_alive()
+
+    def _drop_one(self) -> None:
+        for k, job in enumerate(self._jobs):
+            if isinstance(job, Batch):
+                del self._jobs[k]
+                self.dropped += len(job.frames) if job.frames is not None else 0
+                return
+
+    def _run(self) -> None:
+        pause_s = RESTART_S[0]
+        while not self._stopping or self._jobs:
+            started_s = time.monotonic()
+            with contextlib.suppress(OSError):
+                self._serve()
+            if self._stopping:
+                return
+            if not self._restarts:
+                self._answer(Found(None, "the helper has ended"))
+                return
+            self.failures += 1
+            if time.monotonic() - started_s > RESTART_S[1]:
+                pause_s = RESTART_S[0]
+            time.sleep(pause_s)
+            pause_s = min(2 * pause_s, RESTART_S[1])
+
+    def _serve(self) -> None:
+        """Start the process and feed it until it ends or nothing more is to be done."""
+        ours, theirs = pair()
+        command = [*self._command, str(theirs), *self._arguments]
+        self.process = subprocess.Popen(command, pass_fds=[theirs], stdin=subprocess.DEVNULL)
+        os.close(theirs)
+        pipe = Pipe(ours)
+        listener = threading.Thread(target=self._listen, args=(pipe,), daemon=True)
+        listener.start()
+        try:
+            while (job := self._next()) is not None:
+                pipe.send(job)
+            pipe.send(None)
+            self.process.wait()
+        finally:
+            listener.join(1.0)
+            pipe.close()
+
+    def _next(self) -> Job | None:
+        """The next job; None when it is time to end."""
+        with self._wake:
+            while not self._jobs and not self._stopping:
+                self._wake.wait(0.5)
+                if self.process is not None and self.process.poll() is not None:
+                    raise BrokenPipeError("the helper has ended")
+            return self._jobs.popleft() if self._jobs else None
+
+    def _listen(self, pipe: Pipe) -> None:
+        with contextlib.suppress(EOFError, OSError):
+            while True:
+                self._answer(pipe.receive())

@@ -1,0 +1,131 @@
+"""What the loop hands to its helper processes, and what they answer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from firmware_bridge.frames import Frames
+from rtid.daemon.status import Alarm, EdgeHealth, Verdict
+from rtid.estimator.estimator import Estimator
+from rtid.estimator.flowmap import FlowMap
+from rtid.model import FloatArray, Model
+
+
+@dataclass(frozen=True)
+class Handover:
+    """The estimator as it was at one moment, without its ring of samples: solve it, and store it.
+
+    number: grows by one; publish = False only stores.
+    """
+
+    number: int
+    estimator: Estimator
+    publish: bool
+    store: bool
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Samples to judge by the map held, rows as in `to_chunk`, and frames to record."""
+
+    chunk: FloatArray
+    frames: Frames | None
+
+
+@dataclass(frozen=True)
+class Note:
+    """An alarm for the history; with `keep` its trace is kept as well."""
+
+    alarm: Alarm
+    keep: bool
+
+
+@dataclass(frozen=True)
+class Recall:
+    """Give back the estimator of this handover, one of the last three."""
+
+    number: int
+
+
+@dataclass(frozen=True)
+class Diagnose:
+    """Samples to diagnose, rows as in `to_chunk`."""
+
+    model: Model
+    chunk: FloatArray
+
+
+@dataclass(frozen=True)
+class Ready:
+    """The helper has compiled everything and takes jobs."""
+
+
+@dataclass(frozen=True)
+class Publication:
+    """What a handover says once it is solved."""
+
+    number: int
+    flow_map: FlowMap
+    beta_pa: FloatArray
+    beta_sd_pa: FloatArray
+    rho: float
+    t_s: float  # of the newest sample in it, as in `to_chunk`
+    edges: tuple[EdgeHealth, ...]
+    solved_s: float  # how long that took
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """How well the map of handover `number` foretells the samples that came behind it.
+
+    surprise: mean square of whitened innovations over `rows` of them; 1 is noise.
+    """
+
+    number: int
+    surprise: float
+    rows: int
+    t_s: float
+
+
+@dataclass(frozen=True)
+class Recalled:
+    """Answer to Recall: the oldest one there is where the wanted one is not."""
+
+    number: int
+    estimator: Estimator
+
+
+@dataclass(frozen=True)
+class Saved:
+    """A snapshot is on the disk."""
+
+    number: int
+    path: str
+
+
+@dataclass(frozen=True)
+class NotSaved:
+    """The disk did not take it; what was learned is still in memory."""
+
+    what: str  # "snapshot", "recording" or "history"
+    reason: str
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Where frames go now, and the folder in which an alarm's trace was kept."""
+
+    path: str
+    kept: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Found:
+    """Answer to Diagnose: a verdict, or the reason why there is none."""
+
+    verdict: Verdict | None
+    reason: str = ""
+
+
+Job = Handover | Batch | Note | Recall | Diagnose | Found
+Answer = Ready | Publication | Judgement | Recalled | Saved | NotSaved | Recording | Found

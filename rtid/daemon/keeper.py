@@ -1,0 +1,284 @@
+"""The housekeeper: a thread beside the loop that hears answers, raises alarms and tells the status.
+
+It looks ten times a second and tells once a second; it only reads what the loop counts.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from rtid.daemon import status as st
+from rtid.daemon.alarms import Alarms
+from rtid.daemon.core import Core
+from rtid.daemon.diagnosing import Diagnosing
+from rtid.daemon.helper import Helper
+from rtid.daemon.jobs import (
+    Answer,
+    Found,
+    Judgement,
+    Note,
+    NotSaved,
+    Publication,
+    Ready,
+    Recall,
+    Recalled,
+    Recording,
+    Saved,
+)
+from rtid.daemon.log import logger
+from rtid.daemon.plant import PlantWatch
+from rtid.daemon.story import line, loop_health, resident_mb
+from rtid.loop.loop import Loop
+from rtid.project import Project
+
+LOOK_S = 0.1
+OVERLOAD = 0.05  # share of ticks lost in a second that is worth an alarm
+GRACE_S = 15.0  # a save may take so long before its absence is an alarm
+
+
+@dataclass
+class Facts:
+    """What does not change while the daemon runs."""
+
+    project: Project
+    folder: Path
+    interface: str
+    channel: str
+    restored: str
+    scheduling: str
+    memory_locked: bool
+    started_unix_s: float
+    log_every_s: float
+
+
+class Keeper:
+    """Looks after everything that is not the loop; `status` is the newest one."""
+
+    def __init__(
+        self,
+        facts: Facts,
+        core: Core,
+        analyst: Helper,
+        diagnosing: Diagnosing,
+        answers: deque[Answer],
+    ) -> None:
+        self._facts, self._core, self._analyst = facts, core, analyst
+        self._diagnosing = diagnosing
+        self.loop: Loop | None = None
+        self.alarms = Alarms(self._told)
+        self.plant = PlantWatch()
+        self.publication: Publication | None = None
+        self._version = 0
+        self._answers = answers  # of the helpers, appended from their threads
+        self._not_saved: dict[str, str] = {}
+        self._saved_s: float | None = None
+        self._started_s = time.monotonic()
+        self._recording = ""
+        self._recalling = False
+        self._is_ready = False
+        self._frames_before, self._told_s = 0, 0.0
+        self._lost = 0
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="rtid-keeper", daemon=True)
+        self.status = self._make_status(time.monotonic_ns())
+
+    def start(self) -> None:
+        """Begin to look."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Look once more, tell the last status, and end."""
+        self._stopped.set()
+        if self._thread.is_alive():
+            self._thread.join(5.0)
+        self._listen()
+        self._tell(time.monotonic_ns())
+
+    def _run(self) -> None:
+        next_s = time.monotonic()
+        while not self._stopped.wait(LOOK_S):
+            try:
+                self._listen()
+                self._look()
+                if time.monotonic() >= next_s:
+                    next_s = time.monotonic() + 1.0
+                    self._tell(time.monotonic_ns())
+            except Exception:  # the keeper must not die: without it nobody hears of anything
+                logger.exception("keeper failed")
+
+    def _listen(self) -> None:
+        while self._answers:
+            answer = self._answers.popleft()
+            if isinstance(answer, Ready):
+                self._core.busy = False
+            elif isinstance(answer, Publication):
+                self.publication, self._core.busy = answer, False
+                self._version += 1
+            elif isinstance(answer, Judgement):
+                if self.plant.push(answer):
+                    self._plant_changed()
+            elif isinstance(answer, Saved):
+                self._saved_s, self._not_saved = time.monotonic(), {}
+            elif isinstance(answer, NotSaved):
+                self._not_saved[answer.what] = answer.reason
+            elif isinstance(answer, Recording):
+                self._recording = answer.path
+                for name, folder in answer.kept.items():
+                    self.alarms.keep(name, folder)
+            elif isinstance(answer, Recalled):
+                self._recalling, self._core.swap = False, answer.estimator
+            elif isinstance(answer, Found):
+                self._analyst.put(answer)
+                self._diagnosing.take(answer)
+
+    def _plant_changed(self) -> None:
+        """Stop learning and go back to what was learned before, or go on."""
+        self._core.learner.learns = not self.plant.changed
+        if self.plant.changed:
+            logger.warning("plant changed: learning is suspended, surprise=%.1f level=%.1f",
+                           self.plant.surprise or 0.0, self.plant.level)  # fmt: skip
+            self._analyst.put(Recall(self.plant.trusted))
+            self._diagnosing.begin(self.plant.since_s)
+        else:
+            logger.info("plant as before: learning goes on")
+            self._diagnosing.end()
+
+    def _look(self) -> None:
+        """Raise and clear alarms."""
+        learner, source, project = self._core.learner, self._core.source, self._facts.project
+        names = [message.name for message in project.assembly.messages]
+        doubted = [n for n, bad in zip(names, learner.senders.doubted, strict=True) if bad]
+        text = f"{', '.join(doubted)}: faster than declared; a second sender, or a wrong period?"
+        self.alarms.put("second_sender", "bus", text if doubted else "")
+        signals = [source.name for source in project.assembly.signals]
+        frozen = [n for n, bad in zip(signals, learner.frozen.doubted, strict=True) if bad]
+        text = f"{', '.join(frozen)}: does not move as its noise would; learning has stopped"
+        self.alarms.put("sensor_frozen", "sensor", text if frozen else "")
+        text = f"{self._facts.interface} {self._facts.channel}: failed, is being opened again"
+        self.alarms.put("bus_down", "bus", text if source.is_down else "")
+        self.alarms.put("not_saved", "store", self._why_not_saved())
+        self.alarms.put("plant_changed", "plant", self._plant_text())
+        self._diagnosing.look(self._core.learner.estimator, self._core.newest_s)
+
+    def _plant_text(self) -> str:
+        if not self.plant.changed:
+            return ""
+        text = "the machine no longer does what the map says; learning is suspended"
+        verdict = self._diagnosing.verdict
+        if verdict is not None and self._diagnosing.is_of_change:
+            text += f". {verdict.text}"
+        return text
+
+    def _why_not_saved(self) -> str:
+        if self._not_saved:
+            return "NOT SAVED: " + "; ".join(f"{w}: {r}" for w, r in self._not_saved.items())
+        limit_s = self._facts.project.sections.daemon.store_s + GRACE_S
+        since_s = self._started_s if self._saved_s is None else self._saved_s
+        late = time.monotonic() - since_s > limit_s
+        if late and self._core.samples and self._core.learner.learns:
+            return f"NOT SAVED: no snapshot for {time.monotonic() - since_s:.0f} s"
+        return ""
+
+    def _told(self, alarm: st.Alarm) -> None:
+        begins = alarm.until_unix_s is None
+        logger.log(30 if begins else 20, "alarm %s name=%s kind=%s text=%r",
+                   "on" if begins else "over", alarm.name, alarm.kind, alarm.text)  # fmt: skip
+        self._analyst.put(Note(alarm, keep=begins))
+
+    def _tell(self, now_ns: int) -> None:
+        """Status, file, log line."""
+        self.status = self._make_status(now_ns)
+        loop = self.status.loop
+        lost, self._lost = loop.overruns + loop.skipped - self._lost, loop.overruns + loop.skipped
+        text = f"{lost} of {loop.rate_hz:.0f} ticks lost in a second; since the start {loop.causes}"
+        self.alarms.put("overload", "loop", text if lost > OVERLOAD * loop.rate_hz else "")
+        if time.monotonic() - self._told_s >= self._facts.log_every_s - 0.5:
+            self._told_s = time.monotonic()
+            logger.info(line(self.status))
+        if not self._is_ready and self._core.samples:
+            self._is_ready = True
+            self._core.notifier.tell("READY=1", "STATUS=learning")
+        try:
+            st.write(self._facts.folder, self.status)
+        except OSError as error:
+            self._not_saved["status"] = str(error)
+        else:
+            self._not_saved.pop("status", None)
+
+    def _make_status(self, now_ns: int) -> st.Status:
+        facts, core = self._facts, self._core
+        messages, signals = core.health.take(now_ns)
+        frames, self._frames_before = core.frames - self._frames_before, core.frames
+        counters = core.learner.counters
+        bus = st.BusHealth(
+            facts.interface,
+            facts.channel,
+            "reopening" if core.source.is_down else "open",
+            core.frames,
+            float(frames),
+            core.source.queued,
+            counters.get("reopened", 0),
+            core.learner.assembler.source_counters,
+        )
+        return st.Status(
+            name=facts.project.name,
+            pid=os.getpid(),
+            started_unix_s=facts.started_unix_s,
+            now_unix_s=time.time(),
+            loop=loop_health(self.loop, facts.project, facts.scheduling, facts.memory_locked),
+            bus=bus,
+            messages=messages,
+            signals=signals,
+            estimate=self._estimate(now_ns, counters),
+            store=self._store(),
+            verdict=self._diagnosing.verdict,
+            diagnosing=self._diagnosing.is_running,
+            alarms=self.alarms.all,
+            rss_anon_mb=resident_mb(),
+        )
+
+    def _estimate(self, now_ns: int, counters: dict[str, int]) -> st.Estimate:
+        core, daemon = self._core, self._facts.project.sections.daemon
+        age_s = core.lag.age_s(now_ns // 1000)
+        found = self.publication
+        learning: st.Learning = "learning" if core.samples else "waiting"
+        reason = ""
+        if not core.learner.learns:
+            learning, reason = "suspended", "the plant has changed"
+        elif any(a.name in ("sensor_frozen", "second_sender") for a in self.alarms.on):
+            learning, reason = "held", self.alarms.on[0].text
+        shown = st.Estimate(
+            state=learning,
+            reason=reason,
+            version=self._version,
+            age_s=age_s,
+            stale=age_s is None or age_s > daemon.max_age_s,
+            samples=counters.get("samples", 0),
+            rows=counters.get("rows", 0),
+            surprise=self.plant.surprise,
+            refused=counters,
+        )
+        if found is None:
+            return shown
+        names = [chamber.name for chamber in self._facts.project.model.chambers]
+        rows = zip(names, found.beta_pa, found.beta_sd_pa, strict=True)
+        chambers = tuple(st.Chamber(name, float(beta), float(sd)) for name, beta, sd in rows)
+        return replace(shown, rho=found.rho, chambers=chambers, edges=found.edges)
+
+    def _store(self) -> st.Store:
+        age_s = None if self._saved_s is None else time.monotonic() - self._saved_s
+        why = self._why_not_saved()
+        state = "NOT SAVED" if why else ("saved" if self._saved_s is not None else "none")
+        return st.Store(
+            state=state,  # type: ignore[arg-type]
+            reason=why,
+            age_s=age_s,
+            restored=self._facts.restored,
+            recording=self._recording,
+            dropped_frames=self._analyst.dropped,
+        )
