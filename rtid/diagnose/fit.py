@@ -28,7 +28,7 @@ from rtid.kernels.layout import TERMS
 from rtid.model import FloatArray, Model
 
 PASSES = 5  # of Gauss-Newton
-SIZED = 0.05  # share by which the sizes of effects may still change
+SIZED = 0.05  # share by which compliances and sizes of effects may still change: they weigh
 SETTLED = 0.2  # of a standard deviation: a step as short ends it
 REACH = 0.6  # of a timing parameter: the longest step
 SHAPE_REACH = 0.5  # the same of an effect's nonlinear parameter, in steps of its axis
@@ -416,7 +416,11 @@ def _moved(found: Fit) -> tuple[Revision, Weights] | None:
     sizes = [found.estimate.value(found.column(effect)) for effect in found.revision.effects]
     known = [size for _, size in found.revision.sizes]
     settled = settled and effects == found.revision.effects and len(known) == len(sizes)
-    settled = settled and np.allclose(known, sizes, rtol=SIZED)
+    settled = settled and np.allclose(known, sizes, rtol=SIZED, atol=0.0)
+    low, high = sorted(1.0 / bound for bound in found.model.beta_bounds_pa)
+    compliance = np.clip(found.compliance, low, high)
+    if not np.allclose(compliance, found.weights.compliance, rtol=SIZED, atol=0.0):
+        settled, weights = False, replace(weights, compliance=compliance)
     revision = Revision(effects, tuple(timings), tuple(zip(effects, sizes, strict=True)))
     return None if settled else (revision, weights)
 
