@@ -1,7 +1,7 @@
 """Any live source of frames by the name of its interface, as a project file has it.
 
-"serial" (COBS frames of a controller) and "slcan" are read by our own bulk sources, every other
-interface through python-can.
+"serial" (COBS frames of a controller), "slcan" and "udp_multicast" are read by our own sources,
+every other interface through python-can.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from firmware_bridge.sources.live import LiveSource, Source, SourceError
 from firmware_bridge.sources.serial_port import SerialPort
 from firmware_bridge.sources.several import Several
 from firmware_bridge.sources.slcan import Slcan
+from firmware_bridge.sources.udp import UdpMulticast
 
 ON_PORTS = ("serial", "slcan")
 # What makes an adapter not even acknowledge; socketcan has it in `ip link ... listen-only on`.
@@ -71,6 +72,8 @@ def _open_one(
         return SerialPort(channel, reopen_s=reopen_s, **options)
     if interface == "slcan" and channel is not None:
         return Slcan(channel, bitrate, reopen_s=reopen_s, **options)
+    if interface == "udp_multicast":
+        return UdpMulticast(channel, can_ids, reopen_s, **options)
     speed = {} if bitrate is None else {"bitrate": bitrate}
     options = LISTENING.get(interface, {}) | speed | options
     return CanBus(interface, channel, can_ids, reopen_s, **options)

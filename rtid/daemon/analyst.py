@@ -14,6 +14,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
+import numpy as np
+
 from rtid.daemon.chronicle import Chronicle
 from rtid.daemon.jobs import (
     Answer,
@@ -109,14 +111,16 @@ class Analyst:
 
     def _publish(self, job: Handover) -> None:
         start_s = time.monotonic()
-        solution = job.estimator.solution()
-        self._judge = Judge(job, solution)
-        flow_map = publish(solution)
+        with np.errstate(divide="ignore"):  # compliance 0: the motion has not shown it yet
+            solution = job.estimator.solution()
+            self._judge = Judge(job, solution)
+            flow_map = publish(solution)
+            beta_pa, beta_sd_pa = solution.beta_pa, solution.beta_sd_pa
         found = Publication(
             job.number,
             flow_map,
-            solution.beta_pa,
-            solution.beta_sd_pa,
+            beta_pa,
+            beta_sd_pa,
             float(solution.rho),
             float(job.estimator.state.engine[0]["t_s"]),
             edges_of(job.estimator, solution, flow_map),
