@@ -33,14 +33,8 @@ from rtid.report_tables import (
     text,
 )
 from rtid.report_template import PAGE
+from rtid.report_verdicts import VERDICTS
 
-VERDICTS = {
-    "matches": ("good", "The model matches"),
-    "missing": ("found", "Something is missing, and has a name"),
-    "ambiguous": ("open", "Something is missing: one of a set"),
-    "unknown": ("open", "Something unknown is missing"),
-    "insufficient_data": ("open", "Too little motion to tell"),
-}
 PARTS = "identification part", "held-out part"
 RANKED = 16  # candidates that are shown
 BEFORE, AFTER = "model as it is", "with what was found"

@@ -13,9 +13,10 @@ import numpy as np
 from rtid.compare import Comparison, Dependence, Intervals, against_signals, over_time
 from rtid.diagnose.candidates import Candidate
 from rtid.diagnose.clean import usable
+from rtid.diagnose.diagnosis import Result
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.regression import Score
-from rtid.diagnose.report import parameters
+from rtid.diagnose.report import Diagnosis, parameters
 from rtid.diagnose.residual import WN_RAD_S, ZETA, Residual, residual
 from rtid.diagnose.trials import physical, scored
 from rtid.diagnose.verdict import LEAST_ROWS
@@ -97,7 +98,7 @@ def tell(project: Project, trace: Path, progress: Progress = _silent) -> Told:
         before,
         after,
         *depends,
-        _ranking(found),
+        ranked(found.result, found.diagnosis),
         tuple(read(project.path)),
         _sha256(trace),
         datetime.now().astimezone().isoformat(" ", "seconds"),
@@ -150,9 +151,8 @@ def _telling(
     return first, second
 
 
-def _ranking(found: Diagnosed) -> tuple[Ranked, ...]:
+def ranked(result: Result, diagnosis: Diagnosis) -> tuple[Ranked, ...]:
     """The clearest candidates of the first model, and what became of them."""
-    result, diagnosis = found.result, found.diagnosis
     before = {key: np.sqrt(score.gain) for key, (_, score) in _best(result.first).items()}
     last = _best(result.last)
     inside = {(e.effect, e.where) for e in diagnosis.found}
@@ -187,8 +187,8 @@ def _scored(fit: Fit, one: tuple[Candidate, Score] | None) -> Ranked | None:
         return None
     candidate, score = one
     value, std = (physical(fit, candidate, v) for v in (score.value, score.sd))
-    timing = candidate.parameter == "share" and candidate.shape is not None
-    per = (float(candidate.shape or 0.0), candidate.shape_unit) if timing else None
+    timing = candidate.parameter == "share" and bool(candidate.shape)
+    per = (candidate.shape[0], candidate.shape_units[0]) if timing else None
     return Ranked(
         candidate.key,
         None,

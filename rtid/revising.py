@@ -76,7 +76,7 @@ def add(
     for extension in extensions:
         sections = extended(sections, extension, trace.name, reason or _why(effect, extension))
         before, text = text, text_with(text, sections)
-        steps.append((_change(ADD, sections[-1], before, sections[-1].reason, trace.name), text))
+        steps.append((change_of(ADD, sections[-1], before, sections[-1].reason, trace.name), text))
     return _done(project, steps, note, counters, dry_run)
 
 
@@ -101,7 +101,7 @@ def drop(
         state, left = present.state, tuple(p for p in added_parts(loaded) if p.key != gone.key)
         after = stand(state.model, state.chunk, state.held_out, left, progress)
         errors, kept = errors_between(present, after), refreshed(kept, after)
-    change = _change(DROP, gone, text, reason, trace.name if trace else "")
+    change = change_of(DROP, gone, text, reason, trace.name if trace else "")
     change = replace(change, errors=plain(errors))
     return _done(project, [(change, text_with(text, kept))], "", counters, dry_run)
 
@@ -235,8 +235,8 @@ def _reversed(sections: tuple[AddedSection, ...], last: Change) -> tuple[AddedSe
     return (*kept, AddedSection.model_validate_json(json.dumps(last.section)))
 
 
-def _change(kind: str, section: AddedSection, before: str, reason: str, trace: str) -> Change:
-    """A line of the history that `write` will number."""
+def change_of(kind: str, section: AddedSection, before: str, reason: str, trace: str) -> Change:
+    """A line of the history, which `history.write` will number."""
     return Change(
         number=0,
         date=now().isoformat(),

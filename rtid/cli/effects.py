@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import textwrap
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
@@ -76,6 +75,8 @@ def _group(group: list[Effect]) -> Table:
 
 
 def _print_page(page: Effect) -> None:
+    from rtid.effects.page import readable
+
     console = _console()
     console.print(f"[bold]{page.title}[/bold]  ({page.name})")
     _paragraph(console, page.summary)
@@ -106,13 +107,6 @@ def _paragraph(console: Console, text: str, indent: int = INDENT) -> None:
     width = console.width - indent - INDENT
     lines = textwrap.wrap(text, width, break_long_words=False, break_on_hyphens=False)
     console.print(textwrap.indent("\n".join(lines), " " * indent), markup=False)
-
-
-def readable(line: str) -> str:
-    """An equation as it is printed: d/dt, powers and products as on paper."""
-    line = re.sub(r"\bddt\(", "d/dt(", line).replace(" * ", " · ")
-    line = re.sub(r"\*\*(\w+)", r"^\1", line).replace("**", "^")
-    return re.sub(r"d/dt\((\w+)\)", r"d\1/dt", line)
 
 
 def _symbols(page: Effect) -> Table:

@@ -154,3 +154,10 @@ def words_of(equation: tuple[str, ...]) -> tuple[str, ...]:
 def _symbol(name: str, text: str) -> Symbol:
     unit, _, meaning = text.partition(":")
     return Symbol(name, unit.strip(), meaning.strip())
+
+
+def readable(line: str) -> str:
+    """An equation as it is printed: d/dt, powers and products as on paper."""
+    line = re.sub(r"\bddt\(", "d/dt(", line).replace(" * ", " · ")
+    line = re.sub(r"\*\*(\w+)", r"^\1", line).replace("**", "^")
+    return re.sub(r"d/dt\((\w+)\)", r"d\1/dt", line)

@@ -10,9 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from rtid.colours import BLUE, GREY, HELD_OUT, INK, KPA, LPM, SEEN
 from rtid.compare import FREE_RUN, Examination
 from rtid.model import Model
-from rtid.pictures.style import BLUE, GREY, HELD_OUT, INK, KPA, LPM, SEEN, STYLE, thin
+from rtid.pictures.style import STYLE, thin
 
 LIMIT = 0.998  # quantile of the errors that the common scale shows
 

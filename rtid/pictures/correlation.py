@@ -10,8 +10,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from rtid.colours import BLUE, GREY, HELD_OUT, INK, ORANGE, SEEN
 from rtid.compare import Correlation, Cusum
-from rtid.pictures.style import BLUE, GREY, HELD_OUT, INK, ORANGE, SEEN, STYLE, thin
+from rtid.pictures.style import STYLE, thin
 
 BAND, FEEDBACK = "#cfe3f0", "#f3f3f1"
 

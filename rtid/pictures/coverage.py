@@ -8,9 +8,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from rtid.colours import GREY, INK, LINE, MPA
 from rtid.estimator.flowmap import EdgeMap, FlowMap
 from rtid.model import Edge, FloatArray, Model
-from rtid.pictures.style import FILL, GREY, INK, LABELS, LINE, MPA, STYLE, label_outer, panels
+from rtid.pictures.style import FILL, LABELS, STYLE, label_outer, panels
 
 DOTS = 6000  # samples drawn per edge
 

@@ -10,14 +10,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from rtid.colours import CHAMBERS, GREY, LPM, MARKERS, UNITS
 from rtid.compare import Dependence
 from rtid.compare.dependence import DIRECTIONS
 from rtid.model import Model
-from rtid.pictures.style import CHAMBERS, GREY, LPM, MARKERS, MPA, STYLE
+from rtid.pictures.style import STYLE
 
 Z95 = 1.96
 COLUMNS = 3
-SHOWN = {"Pa": ("MPa", MPA), "m": ("mm", 1e3), "m/s": ("mm/s", 1e3)}
 
 
 def dependences(
@@ -42,7 +42,7 @@ def dependences(
 
 
 def _panel(axis: Axes, found: Dependence, names: list[str]) -> None:
-    unit, factor = SHOWN.get(found.unit, (found.unit, 1.0))
+    unit, factor = UNITS.get(found.unit, (found.unit, 1.0))
     axis.axhline(0.0, color=GREY, lw=0.6)
     by_name = found.signal == "direction"
     x = np.arange(len(found.rows)) if by_name else found.centre * factor

@@ -16,22 +16,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from rtid.colours import BLUE, GREY, HELD_OUT, INK, LINE, LPM, ORANGE, PALE, SEEN, UNITS
 from rtid.compare import Dependence
 from rtid.diagnose.residual import Residual
-from rtid.pictures.style import (
-    BLUE,
-    GREY,
-    HELD_OUT,
-    INK,
-    LINE,
-    LPM,
-    MPA,
-    ORANGE,
-    PALE,
-    SEEN,
-    STYLE,
-    thin,
-)
+from rtid.pictures.style import STYLE, thin
 
 BEFORE, AFTER = (ORANGE, "o"), (BLUE, "s")  # colour and marker
 POINTS = 500  # pairs of least and largest value that a line shows
@@ -39,7 +27,6 @@ GAP = 5.0  # steps: no line across a longer one
 Z95 = 1.96
 SHOWN = 0.96  # of the error bars lie wholly within the scale
 INSIDE = 0.25  # of the axis: a longer bar has its figure inside
-UNITS = {"Pa": ("MPa", MPA), "m": ("mm", 1e3), "m/s": ("mm/s", 1e3)}
 WEAKEST = 0.1  # standard deviations at the left end of the ranking
 
 

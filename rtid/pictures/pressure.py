@@ -12,9 +12,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from rtid.colours import BLUE, GREY, HELD_OUT, INK, KPA, MPA, ORANGE, SEEN
 from rtid.compare import FREE_RUN, Simulation
 from rtid.model import FloatArray, Model
-from rtid.pictures.style import BLUE, GREY, HELD_OUT, INK, KPA, MPA, ORANGE, SEEN, STYLE, thin
+from rtid.pictures.style import STYLE, thin
 
 
 def pressures(

@@ -7,9 +7,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from rtid.colours import BLUE, GREY, INK, LPM, ORANGE
 from rtid.compare.comparison import Comparison
 from rtid.model import FloatArray, Model
-from rtid.pictures.style import BLUE, GREY, INK, LPM, ORANGE, STYLE, thin
+from rtid.pictures.style import STYLE, thin
 
 
 def residual(model: Model, parts: dict[str, Comparison]) -> Figure:

@@ -11,15 +11,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from rtid.colours import GREY, INK, PALE
 from rtid.estimator.flowmap import EXTRAPOLATED, LEARNING, PRIOR, SHUT, VALID
 from rtid.model import FloatArray
 
-LPM, MPA, KPA = 6e4, 1e-6, 1e-3  # display units: L/min per m3/s, MPa and kPa per Pa
-
-BLUE, ORANGE, GREEN = "#0072b2", "#d55e00", "#009e73"  # Okabe and Ito
-CHAMBERS, MARKERS = (BLUE, ORANGE), ("o", "s")  # one of each per chamber
-SEEN, HELD_OUT = "#e6f0f7", "#fdf1dc"  # shades of what the fit has seen, and has not
-INK, GREY, LINE, PALE = "#333333", "#8c8c8c", "#c4c4c4", "#e4e4e4"
 FILL = {VALID: "#b9d9ec", LEARNING: "#f6e3b4", EXTRAPOLATED: "white", PRIOR: "white", SHUT: PALE}
 LABELS = {
     VALID: "valid",

@@ -1,0 +1,210 @@
+"""Add: the error falls. Bars of every revision, what it leaves before and after, undo, history."""
+
+from __future__ import annotations
+
+from html import escape
+from math import isfinite
+
+import numpy as np
+from bokeh.layouts import column, row
+from bokeh.models import ColumnDataSource, UIElement
+
+from rtid.colours import BLUE, LPM, MPA, ORANGE
+from rtid.compare import FREE_RUN
+from rtid.diagnose.report import Value
+from rtid.diagnosed_text import quantity, title
+from rtid.project.added import AddedSection
+from rtid.report_tables import text
+from rtid.ui.compare_view import EMPTY, TimePlots
+from rtid.ui.fragments import button
+from rtid.ui.lines import Line
+from rtid.ui.look import Look
+from rtid.ui.session import Revision, Session
+from rtid.ui.theme import INK_TAG
+
+
+class AddView:
+    """Simulated pressure and residual of the newest revision over those of the one before."""
+
+    def __init__(self, look: Look, plots: TimePlots) -> None:
+        self._time = plots
+        self.has_runs = any(part.runs for part in look.parts.values())
+        self._sources: list[dict[str, ColumnDataSource]] = []
+        rows: list[UIElement] = []
+        for chamber in look.model.chambers:
+            sources, name = {}, chamber.name
+            if self.has_runs:
+                made = plots.plot("MPa", f"chamber {name}: pressure, free run")
+                sources["measured"] = plots.line(made, EMPTY, INK_TAG, 1.4)
+                sources["before"] = plots.line(made, EMPTY, ORANGE, 1.0)
+                sources["after"] = plots.line(made, EMPTY, BLUE, 1.0)
+                rows.append(row(made, sizing_mode="stretch_both"))
+            left = plots.plot("L/min", f"chamber {name}: residual of the flow")
+            sources["left_before"] = plots.line(left, EMPTY, ORANGE, 0.8)
+            sources["left_after"] = plots.line(left, EMPTY, BLUE, 0.8)
+            rows.append(row(left, sizing_mode="stretch_both"))
+            self._sources.append(sources)
+        left.xaxis.axis_label = "time in s"
+        self.root = column(*rows, sizing_mode="stretch_both")
+
+    def show(self, revisions: list[Revision]) -> None:
+        """The newest revision, and the one before it if there is one."""
+        after = revisions[-1].look if len(revisions) > 1 else None
+        before = revisions[-2].look if after else revisions[-1].look
+        for c, sources in enumerate(self._sources):
+            if self.has_runs:
+                self._time.change(sources["measured"], _measured(before, c))
+                self._time.change(sources["before"], _simulated(before, c))
+                self._time.change(sources["after"], _simulated(after, c) if after else EMPTY)
+            self._time.change(sources["left_before"], _left(before, c))
+            self._time.change(sources["left_after"], _left(after, c) if after else EMPTY)
+        self._time.refresh()
+
+
+def _measured(look: Look, c: int) -> Line:
+    runs = [part.runs[FREE_RUN] for part in look.parts.values() if part.runs]
+    return Line.joined([(r.t_s, r.measured_pa[:, c] * MPA) for r in runs])
+
+
+def _simulated(look: Look, c: int) -> Line:
+    runs = [part.runs[FREE_RUN] for part in look.parts.values() if part.runs]
+    return Line.joined(
+        [(r.t_s, np.where(r.predicted, r.simulated_pa[:, c], np.nan) * MPA) for r in runs]
+    )
+
+
+def _left(look: Look, c: int) -> Line:
+    parts = [part.equation for part in look.parts.values()]
+    return Line.joined([(e.t_s, e.residual_m3s[:, c] * LPM) for e in parts])
+
+
+def errors_of(session: Session) -> tuple[list[tuple[str, float, bool]], float]:
+    """Name, held-out error in % of the rms flow, and whether it is expected; the sensors' floor."""
+    bars: list[tuple[str, float, bool]] = []
+    floor = float("nan")
+    for k, revision in enumerate(session.revisions):
+        told, errors = revision.told, revision.section and revision.section.errors
+        value = float("nan")
+        if told is not None:
+            found = told.diagnosis
+            value = 100 * found.heldout_residual_before_m3s / found.rms_flow_m3s
+            floor = 100 * found.noise_floor_m3s / found.rms_flow_m3s
+        if errors and errors.heldout_pct.after is not None:
+            value = errors.heldout_pct.after
+            floor = errors.noise_floor_pct or floor
+        bars.append((name_of(revision, k), value, False))
+    if session.named is not None and session.last and session.last.told:
+        found = session.last.told.diagnosis
+        after = 100 * found.found[0].heldout_residual_after_m3s / found.rms_flow_m3s
+        bars.append((f"+ {title(found.found[0].effect)}, foretold", after, True))
+    return bars, floor
+
+
+def name_of(revision: Revision, number: int) -> str:
+    """What a revision is called."""
+    if revision.section is None:
+        return "model as it is" if not revision.sections else "model with what the project has"
+    sign = "+" if revision.change == "add" else "−"
+    return f"{sign} {title(revision.section.effect)} ({revision.section.where})"
+
+
+def bars(session: Session) -> str:
+    """The error of every revision against the sensors' floor, and what can be done."""
+    shown, floor = errors_of(session)
+    known = [value for _, value, _ in shown if isfinite(value)]
+    if not known:
+        return '<h2>The error of the model</h2><p class="says">It is being measured.</p>'
+    most = 1.12 * max(*known, floor if isfinite(floor) else 0.0)
+    rows, before = "", 100.0
+    for k, (name, value, is_foretold) in enumerate(shown):
+        width = 100 * value / most if isfinite(value) else 0.0
+        rows += (
+            f'<div class="name">{text(name)}</div><div class="track"><div class="bar'
+            f'{" first" if k == 0 and len(shown) > 1 else ""}" style="width:{width:.2f}%;'
+            f'--from:{before:.2f}%{";opacity:.35" if is_foretold else ""}" '
+            f'data-error="{value:.4f}">'
+            f'</div><span style="left:{min(width, 80):.2f}%">{value:.2f} %</span>'
+            f'<div class="floor" style="left:{100 * floor / most:.2f}%"></div></div>'
+        )
+        before = width
+    return (
+        f'<h2>Error on motion that the model has not seen</h2><div class="bars">{rows}</div>'
+        f'<p class="key">in % of the rms flow; dashed: what the sensors alone leave, '
+        f"{floor:.2f} %</p>{_actions(session)}{_effects(session)}{_history(session)}"
+    )
+
+
+def _actions(session: Session) -> str:
+    last = session.last
+    unsaved = sum(not r.is_saved for r in session.revisions)
+    made = ""
+    if session.named is not None:
+        effect, where = session.named
+        made += button(
+            f"Add {title(effect).lower()}", "add", kind="main", effect=effect, where=where
+        )
+    made += " " + button("Undo", "undo", off=last is None or last.is_saved)
+    label = f"Save {unsaved} to the project" if unsaved else "Saved"
+    made += " " + button(label, "save", off=not unsaved)
+    made += " " + button("Write the report", "export", what="report")
+    return f"<p>{made}</p>"
+
+
+def _effects(session: Session) -> str:
+    sections = session.last.sections if session.last else ()
+    if not sections:
+        return ""
+    items = "".join(
+        f'<div class="card"><b>{text(title(s.effect))}</b> at {text(s.where)}: {_sizes(s)} '
+        f"{button('Drop', 'drop', effect=s.effect, where=s.where)}</div>"
+        for s in sections
+    )
+    return f"<h3>In the model</h3>{items}"
+
+
+def _sizes(section: AddedSection) -> str:
+    return text(
+        ", ".join(
+            f"{name.replace('_', ' ')} "
+            f"{quantity(Value(p.value, p.sd if p.sd is not None else float('nan'), p.unit))}"
+            for name, p in section.parameters.items()
+        )
+    )
+
+
+def _history(session: Session) -> str:
+    rows = []
+    for k, revision in enumerate(session.revisions):
+        errors = revision.section.errors if revision.section else None
+        fall = ""
+        if (
+            errors
+            and errors.heldout_pct.before is not None
+            and errors.heldout_pct.after is not None
+        ):
+            fall = f"{errors.heldout_pct.before:.2f} → {errors.heldout_pct.after:.2f} %"
+        state = "in the project" if revision.is_saved else "not saved"
+        rows.append(f"<tr><td>{k}</td><td>{text(name_of(revision, k))}</td><td class='n'>{fall}"
+                    f"</td><td>{escape(state)}</td></tr>")  # fmt: skip
+    return f"<h3>History of this session</h3><table>{''.join(rows)}</table>"
+
+
+def sentence(session: Session) -> str:
+    """What the picture says and what to do next."""
+    shown, floor = errors_of(session)
+    if len(session.revisions) > 1:
+        before, after = shown[len(session.revisions) - 2][1], shown[len(session.revisions) - 1][1]
+        return (
+            f"Orange: before the last change, blue: after it; black: measured. The held-out error "
+            f"went from {before:.2f} % to {after:.2f} %, the sensors' floor is {floor:.2f} %. The "
+            "project file is as it was until you save."
+        )
+    if session.named is not None:
+        return (
+            "Orange: what the model leaves now; black: measured. Add what the diagnosis names, and "
+            "see how much of it goes. Nothing is written until you save; undo takes it back."
+        )
+    return (
+        "Orange: what the model leaves; black: measured. The diagnosis names nothing to add; "
+        "Why has a button to try any effect all the same."
+    )

@@ -1,0 +1,257 @@
+"""Compare: measured and modelled pressures and flows of every chamber, what is left below."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from bokeh.events import DoubleTap, SelectionGeometry
+from bokeh.layouts import column, row
+from bokeh.models import (
+    BoxAnnotation,
+    BoxSelectTool,
+    BoxZoomTool,
+    ColumnDataSource,
+    Range1d,
+    Title,
+    UIElement,
+    WheelZoomTool,
+)
+from bokeh.plotting import figure
+
+from rtid.colours import BLUE, HELD_OUT, INK, KPA, LPM, MPA, ORANGE, SEEN
+from rtid.compare import FREE_RUN, HORIZONS_S
+from rtid.ui.fragments import button, choice
+from rtid.ui.lines import Line
+from rtid.ui.look import Look
+from rtid.ui.theme import INK_TAG, LIT, plot, styled
+
+DARK = {SEEN: "#182a36", HELD_OUT: "#33290f"}
+NAMES = {"identification": "identification", "validation": "held out"}
+RUNS = list(HORIZONS_S)
+MARGIN = 0.01  # of the record, at either end
+Spans = list[tuple[float, float]]
+
+
+class TimePlots:
+    """Plots over time that are zoomed together; every zoom thins their lines anew."""
+
+    def __init__(
+        self, parts: dict[str, tuple[float, float]], on_span: Callable[[float, float], None]
+    ) -> None:
+        self._parts = parts
+        low, high = min(a for a, _ in parts.values()), max(b for _, b in parts.values())
+        margin = MARGIN * (high - low)
+        self.whole = low - margin, high + margin
+        self.x = Range1d(*self.whole, bounds=self.whole)
+        self._lines: list[tuple[Line, ColumnDataSource]] = []
+        self._lit = ColumnDataSource({"x0": [], "x1": []})
+        self._plots: list[figure] = []
+        self._on_span = on_span
+        self.drag = "zoom"
+
+    def plot(self, label: str, title: str = "") -> figure:
+        """One more plot on the common time."""
+        zoom, select = BoxZoomTool(dimensions="width"), BoxSelectTool(dimensions="width")
+        select.overlay.fill_color, select.overlay.fill_alpha = LIT, 0.2
+        wheel = WheelZoomTool(dimensions="width")
+        made = plot(label, x_range=self.x, title=title, tools=[zoom, select, wheel, "xpan"])
+        made.toolbar.active_drag, made.toolbar.active_scroll = zoom, wheel
+        made.vstrip(
+            x0="x0", x1="x1", source=self._lit, fill_color=LIT, fill_alpha=0.35, line_color=LIT,
+            line_alpha=0.8, line_width=0.8,
+        )  # fmt: skip
+        self._shade(made)
+        made.on_event(DoubleTap, lambda _: self.show_whole())
+        made.on_event(SelectionGeometry, self._selected)
+        self._plots.append(made)
+        return made
+
+    def line(self, made: figure, line: Line, colour: str, width: float) -> ColumnDataSource:
+        """A line in a plot."""
+        source = ColumnDataSource({"t": [], "y": []})
+        drawn = made.line("t", "y", source=source, line_width=width)
+        drawn.glyph.line_color = INK if colour == INK_TAG else colour
+        drawn.nonselection_glyph = None
+        if colour == INK_TAG:
+            drawn.glyph.tags = [INK_TAG]
+        self._lines.append((line, source))
+        return source
+
+    def change(self, source: ColumnDataSource, line: Line) -> None:
+        """Another line in the same place."""
+        self._lines = [one for one in self._lines if one[1] is not source] + [(line, source)]
+
+    @property
+    def seen(self) -> tuple[float, float]:
+        """The span of time that is seen."""
+        ends: list[Any] = [self.x.start, self.x.end]
+        return float(min(ends)), float(max(ends))
+
+    def refresh(self) -> None:
+        """Thin every line for what is seen now."""
+        low, high = self.seen
+        for line, source in self._lines:
+            t, y = line.between(low, high)
+            source.data = {"t": t, "y": y}
+
+    def _shade(self, made: figure) -> None:
+        """What the fit has seen, and what it has not."""
+        for name, (low, high) in self._parts.items():
+            colour = SEEN if name == "identification" else HELD_OUT
+            box = BoxAnnotation(left=low, right=high, fill_color=colour, fill_alpha=1.0)
+            box.line_color, box.level = None, "image"
+            box.tags = [{"light": colour, "dark": DARK[colour]}]
+            made.add_layout(box)
+
+    def light(self, spans: Spans) -> None:
+        """Mark time spans."""
+        self._lit.data = {"x0": [a for a, _ in spans], "x1": [b for _, b in spans]}
+
+    def set_drag(self, mode: str) -> None:
+        """Dragging zooms or selects a span."""
+        self.drag = mode if mode in ("zoom", "span") else "zoom"
+        kind = BoxZoomTool if self.drag == "zoom" else BoxSelectTool
+        for made in self._plots:
+            made.toolbar.active_drag = next(t for t in made.toolbar.tools if isinstance(t, kind))
+
+    def zoom(self, factor: float) -> None:
+        """In or out about the middle."""
+        low, high = self.seen
+        self._to(0.5 * (low + high) - 0.5 * factor * (high - low), factor * (high - low))
+
+    def pan(self, share: float) -> None:
+        """Earlier or later by a share of what is seen."""
+        low, high = self.seen
+        self._to(low + share * (high - low), high - low)
+
+    def show_whole(self) -> None:
+        """The whole record."""
+        self.x.update(start=self.whole[0], end=self.whole[1])
+
+    def _to(self, low: float, width: float) -> None:
+        width = min(width, self.whole[1] - self.whole[0])
+        low = float(np.clip(low, self.whole[0], self.whole[1] - width))
+        self.x.update(start=low, end=low + width)
+
+    def _selected(self, event: SelectionGeometry) -> None:
+        where: Any = event.geometry
+        if event.final and where and "x0" in where:
+            ends = float(where["x0"]), float(where["x1"])
+            self._on_span(min(ends), max(ends))
+
+
+def spans_of(look: Look) -> dict[str, tuple[float, float]]:
+    """When the parts of a record begin and end."""
+    found = {n: p.equation.intervals.t_s for n, p in look.parts.items()}
+    return {n: (float(t[0]), float(t[-1])) for n, t in found.items() if len(t)}
+
+
+class CompareView:
+    """The first page: whether the model explains the record."""
+
+    def __init__(self, look: Look, plots: TimePlots) -> None:
+        self.look, self.run = look, FREE_RUN
+        self._time = plots
+        self._sources: list[dict[str, ColumnDataSource]] = []
+        self._titles: list[Title] = []
+        self.has_runs = any(part.runs for part in look.parts.values())
+        self.root = row(*self._columns(), sizing_mode="stretch_both")
+
+    def _columns(self) -> list[UIElement]:
+        columns: list[Any] = []
+        for chamber in self.look.model.chambers:
+            made: dict[str, figure] = {}
+            if self.has_runs:
+                made["p"] = self._time.plot("MPa", " ")
+                made["e"] = self._time.plot("kPa")
+            made["q"] = self._time.plot("L/min", f"chamber {chamber.name}: flow")
+            made["r"] = self._time.plot("L/min")
+            sources = {}
+            if self.has_runs:
+                sources["pm"] = self._time.line(made["p"], EMPTY, INK_TAG, 1.4)
+                sources["ps"] = self._time.line(made["p"], EMPTY, ORANGE, 1.0)
+                sources["pe"] = self._time.line(made["e"], EMPTY, BLUE, 0.8)
+            sources["qm"] = self._time.line(made["q"], EMPTY, INK_TAG, 1.4)
+            sources["qs"] = self._time.line(made["q"], EMPTY, ORANGE, 1.0)
+            sources["qr"] = self._time.line(made["r"], EMPTY, BLUE, 0.8)
+            self._sources.append(sources)
+            self._titles.append(styled(Title(text=" ")))
+            made["p" if self.has_runs else "q"].title = self._titles[-1]
+            list(made.values())[-1].xaxis.axis_label = "time in s"
+            for p in list(made.values())[:-1]:
+                p.xaxis.major_label_text_font_size = "0px"
+                p.min_border_bottom = 0
+            parts = [
+                row(p, sizing_mode="stretch_both", styles={"flex": weight})
+                for p, weight in zip(made.values(), ("1.5", "1", "1.5", "1.15"), strict=False)
+            ]
+            columns.append(column(*parts, sizing_mode="stretch_both"))
+        return columns
+
+    def show(self, look: Look, run: str | None = None) -> None:
+        """Another revision, or another horizon of the simulation."""
+        self.look, self.run = look, run if run in RUNS else self.run
+        parts = list(look.parts.values())
+        for c, sources in enumerate(self._sources):
+            if self.has_runs:
+                runs = [part.runs[self.run] for part in parts if part.runs]
+                lines = {
+                    "pm": [(r.t_s, r.measured_pa[:, c] * MPA) for r in runs],
+                    "ps": [(r.t_s, _where(r.predicted, r.simulated_pa[:, c] * MPA)) for r in runs],
+                    "pe": [(r.t_s, r.error_pa[:, c] * KPA) for r in runs],
+                }
+            else:
+                lines = {}
+            rows = [part.equation for part in parts]
+            lines["qm"] = [(e.t_s, e.measured_m3s[:, c] * LPM) for e in rows]
+            lines["qs"] = [(e.t_s, e.modelled_m3s[:, c] * LPM) for e in rows]
+            lines["qr"] = [(e.t_s, e.residual_m3s[:, c] * LPM) for e in rows]
+            for name, pieces in lines.items():
+                self._time.change(sources[name], Line.joined(pieces))
+            self._titles[c].text = self._title(c)
+        self._time.refresh()
+
+    def _title(self, c: int) -> str:
+        name = self.look.model.chambers[c].name
+        if not self.has_runs:
+            return f"chamber {name}: flow"
+        fits = ", ".join(
+            f"{part.runs[self.run].fit_percent[c]:.1f} % {NAMES.get(title, title)}"
+            for title, part in self.look.parts.items()
+            if part.runs
+        )
+        return f"chamber {name}: pressure, {self.run} - fit {fits}"
+
+    def fragments(self) -> dict[str, str]:
+        """Tools above and the sentence below."""
+        tools = choice("run", RUNS, self.run) if self.has_runs else ""
+        tools += (
+            f"<span><label>drag </label>{choice('drag', ['zoom', 'span'], self._time.drag, 'mode')}"
+            f"</span>{button('whole record', 'whole')}"
+            '<span class="key"><b style="color:var(--ink)">—</b> measured '
+            f'<b style="color:{ORANGE}">—</b> model <b style="color:{BLUE}">—</b> difference '
+            "&nbsp; blue ground: taught the model, yellow: held out</span>"
+        )
+        return {"compare_tools": tools, "compare_says": self._sentence()}
+
+    def _sentence(self) -> str:
+        shares = {
+            NAMES.get(t, t): 100 * float(np.sqrt(np.mean(p.equation.residual_share**2)))
+            for t, p in self.look.parts.items()
+            if len(p.equation.t_s)
+        }
+        left = " and ".join(f"{v:.2g} % ({n})" for n, v in shares.items())
+        text = (
+            f"The learned map leaves <b>{left}</b> of the flow unexplained (lower plots). In the "
+            "upper plots the model runs on its own pressures: what it gets wrong adds up. "
+        )
+        return text + "Next: <b>Where</b> shows in which part of which valve's map it fails."
+
+
+def _where(known: Any, values: Any) -> Any:
+    return np.where(known, values, np.nan)
+
+
+EMPTY = Line(np.empty(0), np.empty(0))

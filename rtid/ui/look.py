@@ -1,0 +1,107 @@
+"""One revision of the model held against a record: plain arrays, from which pictures are made.
+
+A revision with effects is learned like the first one, from the record behind its timings, with the
+flow of its effects as known shared terms (`compare.with_extra_flow`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rtid.compare import (
+    HORIZONS_S,
+    BlockRow,
+    Comparison,
+    Dependence,
+    Simulation,
+    against_signals,
+    block_rows,
+    compare,
+    learned,
+    over_time,
+    simulate,
+    smooth_position,
+)
+from rtid.compare.extra import with_extra_flow
+from rtid.compare.simulation import why_no_free_run
+from rtid.comparing import parts_of
+from rtid.diagnose.causes import causes
+from rtid.diagnose.fit import Fit
+from rtid.diagnose.residual import effect_values, transformed_like
+from rtid.diagnose.view import View
+from rtid.estimator.flowmap import FlowMap
+from rtid.estimator.published import publish
+from rtid.estimator.record import fit_record
+from rtid.model import FloatArray, Lag, Model
+from rtid.replay import Replay
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of the record: equation residual, simulated pressures, dependences, blocks.
+
+    runs: by the names of `HORIZONS_S`, empty where the machine has no pressures to simulate.
+    """
+
+    equation: Comparison
+    runs: dict[str, Simulation]
+    depends: list[Dependence]
+    blocks: list[BlockRow]
+
+
+@dataclass(frozen=True)
+class Look:
+    """A revision held against every part of the record, and its published map."""
+
+    model: Model
+    parts: dict[str, Part]
+    flowmap: FlowMap
+    beta_pa: FloatArray
+    beta_sd_pa: FloatArray
+    lag_s: float
+
+
+def look(result: Replay) -> Look:
+    """Hold what was learned from a record against it."""
+    flowmap = publish(result.fit.solution)
+    solution, candidate = result.fit.solution, learned(result.fit, flowmap)
+    own = [signal.name for signal in result.project.model.signals] + ["velocity"]
+    parts = {}
+    for title, chunk in parts_of(result).items():
+        equation = compare(result.model, candidate, chunk)
+        runs = {}
+        if not why_no_free_run(result.model) and len(chunk) > 1:
+            x = smooth_position(result.model, chunk)
+            runs = {
+                name: simulate(result.model, candidate, chunk, name, position_m=x)
+                for name in HORIZONS_S
+            }
+        depends = [d for d in against_signals(result.model, equation) if d.signal in own]
+        depends.append(over_time(equation))
+        parts[title] = Part(equation, runs, depends, block_rows(solution, equation, flowmap))
+    beta, sd = solution.beta_pa, solution.beta_sd_pa
+    return Look(result.model, parts, flowmap, beta, sd, result.fit.lag_s)
+
+
+def revised(first: Replay, fit: Fit) -> Replay:
+    """The record learned from anew, with the effects and timings of a fitted revision."""
+    sent, model = transformed_like(fit, first.chunk), fit.model
+    if fit.revision.replaces_lag:
+        model = replace(model, lag=Lag())
+    extra = extra_flow(fit, sent) if fit.revision.effects else None
+    model, _, chunk = with_extra_flow(model, np.zeros(len(model.terms)), sent, extra)
+    result = replace(first, model=model, chunk=chunk)
+    return replace(result, fit=fit_record(model, result.part(first.identification_s)))
+
+
+def extra_flow(fit: Fit, sent: FloatArray) -> FloatArray:
+    """What the effects of a revision add to every chamber (n - 1, chambers), m3/s."""
+    view = View.of(fit.model, sent, fit.weights, fit.map)
+    flow = np.zeros((view.n - 1, len(fit.model.chambers)))
+    for effect, value in effect_values(fit):
+        cause = next(k for k in causes(view) if k.makes(effect))
+        for c, volume in cause.column(effect.shape).items():
+            flow[:, c] += value * volume / view.dt_s
+    return flow

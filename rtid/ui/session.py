@@ -1,0 +1,193 @@
+"""What all pages show: the record, the stack of revisions, what was diagnosed, what is going on.
+
+Pages listen; the worker's answers arrive here.  Nothing is written to the project file until the
+user asks for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rtid.errors import RtidError
+from rtid.project.added import AddedSection
+from rtid.ui.desk import Added, Opened, Saved, Told
+from rtid.ui.look import Look
+from rtid.ui.worker import Worker
+
+Key = tuple[str, str]
+Listener = Callable[[str], None]
+LOADING, READY, FAILED = "loading", "ready", "failed"
+
+
+@dataclass
+class Revision:
+    """A model of the stack; change: what led to it, "" for the first."""
+
+    look: Look
+    sections: tuple[AddedSection, ...]
+    change: str = ""
+    section: AddedSection | None = None
+    told: Told | None = None
+    is_saved: bool = False
+
+
+@dataclass
+class Session:
+    """One record on one desk; every method returns at once."""
+
+    project: Path
+    trace: Path | None
+    worker: Worker
+    sheet: Path | None = None
+    state: str = LOADING
+    doing: str = "starting"
+    share: float = 0.0
+    trouble: tuple[str, str] = ("", "")
+    note: str = ""
+    opened: Opened | None = None
+    revisions: list[Revision] = field(default_factory=list)
+    listeners: list[Listener] = field(default_factory=list)
+    prepared: set[tuple[int, Key]] = field(default_factory=set)
+    _is_adding: bool = False
+
+    def open(self) -> None:
+        """Read the record."""
+        if self.trace is None:
+            self.state, self.doing = READY, ""
+            return
+        self._ask(
+            "open", self.project, self.trace, self.sheet, then=self._opened, failed=self._not_opened
+        )
+
+    @property
+    def last(self) -> Revision | None:
+        """The newest revision."""
+        return self.revisions[-1] if self.revisions else None
+
+    @property
+    def named(self) -> Key | None:
+        """The effect that the diagnosis of the newest revision names first; None where none."""
+        told = self.last.told if self.last else None
+        found = told.diagnosis.found if told else ()
+        return (found[0].effect, found[0].where) if found and not self._is_adding else None
+
+    def add(self, effect: str, where: str) -> None:
+        """Make an effect part of the model."""
+        if self.worker.is_busy and not self.is_prepared((effect, where)):
+            self.doing = "finishing what was begun"
+        last = self.last
+        named = last.told.diagnosis.found if last and last.told else ()
+        chosen = (effect, where) in [(f.effect, f.where) for f in named]
+        reason = "named by the diagnosis" if chosen else "chosen by name"
+        self._ask("add", effect, where, reason, then=self._added("add"))
+
+    def drop(self, effect: str, where: str) -> None:
+        """Take an effect out of the model."""
+        self._ask("drop", effect, where, then=self._added("drop"))
+
+    def undo(self) -> None:
+        """Take the last change of this session back."""
+        if len(self.revisions) > 1 and not self.revisions[-1].is_saved:
+            self._ask("back", then=self._taken_back)
+
+    def save(self) -> None:
+        """Write the changes of this session to the project file."""
+        self._ask("save", then=self._saved)
+
+    def export(self, what: str) -> None:
+        """Write a map, a table or a report beside the record."""
+        self._ask("export", what, then=self._noted)
+
+    def is_prepared(self, key: Key) -> bool:
+        """True where adding it takes no time."""
+        return (len(self.revisions), key) in self.prepared
+
+    def tell(self, what: str) -> None:
+        """Let all pages know that something has changed: "state", "looks" or "told"."""
+        for listener in list(self.listeners):
+            listener(what)
+
+    def _ask(
+        self,
+        method: str,
+        *arguments: object,
+        then: Callable[..., None],
+        failed: Callable[[RtidError], None] | None = None,
+    ) -> None:
+        def done(result: object) -> None:
+            self.doing, self.share, self.trouble = "", 0.0, ("", "")
+            then(result)
+
+        self.note, self.trouble = "", ("", "")
+        self.doing, self.share = self.doing or "working", 0.0
+        self.worker.ask(
+            method, *arguments, then=done, failed=failed or self._failed, progress=self._progress
+        )
+        self.tell("state")
+
+    def _progress(self, text: str, share: float) -> None:
+        self.doing, self.share = text, share
+        self.tell("state")
+
+    def _failed(self, error: RtidError) -> None:
+        self.doing, self.trouble = "", (str(error), error.remedy)
+        self.tell("state")
+
+    def _not_opened(self, error: RtidError) -> None:
+        self.state = FAILED
+        self._failed(error)
+
+    def _opened(self, opened: Opened) -> None:
+        self.state, self.opened = READY, opened
+        self.revisions = [Revision(opened.look, opened.added, is_saved=True)]
+        self.tell("looks")
+        self._diagnose()
+
+    def _diagnose(self) -> None:
+        revision = self.last
+        if revision is None or revision.told is not None:
+            return
+
+        def told(result: Told) -> None:
+            revision.told = result
+            self.tell("told")
+            self._prepare(revision)
+
+        self._ask("diagnose", then=told)
+
+    def _prepare(self, revision: Revision) -> None:
+        """Have the next revision ready before the user asks for it."""
+        found = revision.told.diagnosis.found if revision.told else ()
+        if found and revision is self.last:
+            key, number = (found[0].effect, found[0].where), len(self.revisions)
+
+            def ready(_: None) -> None:
+                self.prepared.add((number, key))
+                self.tell("state")
+
+            self.worker.ask("prepare", *key, then=ready, failed=lambda _: None)
+
+    def _added(self, change: str) -> Callable[[Added], None]:
+        def added(result: Added) -> None:
+            revision = Revision(result.look, result.sections, change, result.section)
+            self.revisions.append(revision)
+            self.note = result.note
+            self.tell("looks")
+            self._diagnose()
+
+        return added
+
+    def _taken_back(self, _: None) -> None:
+        self.revisions.pop()
+        self.tell("looks")
+
+    def _saved(self, saved: Saved) -> None:
+        for revision in self.revisions:
+            revision.is_saved = True
+        self._noted(saved.note)
+
+    def _noted(self, note: str) -> None:
+        self.note = note
+        self.tell("state")

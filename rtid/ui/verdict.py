@@ -1,0 +1,64 @@
+"""The lines above every view: which record, what goes on, and the verdict with the next step."""
+
+from __future__ import annotations
+
+from rtid.diagnosed_text import sentences, title
+from rtid.report_tables import text
+from rtid.report_verdicts import VERDICTS
+from rtid.ui.fragments import button
+from rtid.ui.session import FAILED, Session
+
+
+def record_line(session: Session) -> str:
+    """The machine, the record and what it holds."""
+    opened = session.opened
+    if opened is None:
+        return text(session.trace.name if session.trace else session.project.name)
+    return text(
+        f"{opened.project} · {opened.trace} · {opened.duration_s:.0f} s, {opened.samples:,} samples"
+    )
+
+
+def work_line(session: Session) -> str:
+    """What is being done, or what came of it."""
+    if session.trouble[0]:
+        message, remedy = session.trouble
+        return f'<span class="bad">{text(message)}</span> {text(remedy)}'
+    if session.doing:
+        return (
+            f'{text(session.doing)} ...<progress max="1" value="{session.share:.2f}" '
+            f'aria-label="progress"></progress>'
+        )
+    return text(session.note)
+
+
+def strip(session: Session) -> str:
+    """The verdict in one sentence, and the button that follows from it."""
+    last = session.last
+    if session.state == FAILED or session.trace is None:
+        return ""
+    if last is None or last.told is None:
+        heading = "Looking for what is missing" if last else "Opening the record"
+        return f"<h1>{heading}</h1><p>{_waiting(session)}</p>"
+    found = last.told.diagnosis
+    kind, heading = VERDICTS[found.verdict]
+    words = sentences(found)
+    start = len(found.added) > 0
+    said = text(" ".join(words[start + 1 :][:1] if found.found else words[:2]))
+    offer = ""
+    if session.named is not None:
+        effect, where = session.named
+        label = f"Add {title(effect).lower()}"
+        offer = button(label, "add", kind="main", effect=effect, where=where)
+    elif len(session.revisions) > 1 and not last.is_saved:
+        offer = button("Save to project", "save", kind="main") + button("Undo", "undo")
+    return f'<h1 class="{kind}">{text(heading)}</h1><p>{said}</p>{offer}'
+
+
+def _waiting(session: Session) -> str:
+    if session.last is None:
+        return "Reading, learning the maps, simulating the pressures: some seconds."
+    return (
+        "Every known effect is held beside the model. Meanwhile: how well does it explain the "
+        "record, and where does it fail?"
+    )

@@ -1,0 +1,185 @@
+"""Where: in which part of which valve's map the model fails, when that was, and what it follows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from bokeh.layouts import column, row
+from bokeh.models import ColumnDataSource, Range1d, Title, UIElement, Whisker
+from bokeh.plotting import figure
+
+from rtid.colours import CHAMBERS, GREY, LPM, MARKERS, UNITS
+from rtid.compare import BlockRow, Dependence
+from rtid.compare.tables import CAUSES, cause_of
+from rtid.report_tables import text
+from rtid.ui.blocks import HATCHES, ML_PER_MIN, BlockPlots, Key, quantities, round_up
+from rtid.ui.compare_view import EMPTY, NAMES, TimePlots
+from rtid.ui.fragments import button, choice, select
+from rtid.ui.lines import Line
+from rtid.ui.look import Look
+from rtid.ui.theme import plot, styled
+
+Z95 = 1.96
+LARGEST = 0.98  # quantile of the blocks' residuals at which the scale ends
+
+
+class WhereView:
+    """Planes of all valves on the left; residual over time and over a signal on the right."""
+
+    def __init__(self, look: Look, plots: TimePlots, on_block: Callable[[Key], None]) -> None:
+        self.look = look
+        self.part = "validation" if "validation" in look.parts else next(iter(look.parts))
+        self.quantity = "residual"
+        self._time = plots
+        every = [b for part in look.parts.values() for b in part.blocks]
+        values = [b.residual_rms_m3s * ML_PER_MIN for b in every if np.isfinite(b.residual_rms_m3s)]
+        top = round_up(float(np.quantile(values, LARGEST))) if values else 1.0
+        self._quantities = quantities(top)
+        self.planes = BlockPlots(look.model, every, on_block)
+        self._reach, self._heading = Range1d(0, 1), styled(Title(text=" "))
+        self.signal = self._depends[0].signal if self._depends else ""
+        self._lines: list[ColumnDataSource] = []
+        self.side = self._side()
+        self.chosen: Key | None = None
+        self.words = ""
+
+    @property
+    def maps(self) -> UIElement:
+        """The planes."""
+        return self.planes.root
+
+    @property
+    def _depends(self) -> list[Dependence]:
+        return self.look.parts[self.part].depends
+
+    @property
+    def blocks(self) -> list[BlockRow]:
+        """Of the part that is shown."""
+        return self.look.parts[self.part].blocks
+
+    def _side(self) -> UIElement:
+        chambers = self.look.model.chambers
+        strips: list[figure] = []
+        for c, chamber in enumerate(chambers):
+            strip = self._time.plot("L/min", f"residual of chamber {chamber.name} over time")
+            self._lines.append(self._time.line(strip, EMPTY, CHAMBERS[c], 0.8))
+            strips.append(strip)
+        strips[-1].xaxis.axis_label = "time in s"
+        self._over = plot("L/min", x_range=self._reach)
+        self._over.title = self._heading
+        self._over.hspan(0.0, line_color=GREY, line_width=0.6)
+        self._bins: list[ColumnDataSource] = []
+        for c, chamber in enumerate(chambers):
+            source = ColumnDataSource({"x": [], "mean": [], "low": [], "high": []})
+            self._over.scatter(
+                "x", "mean", source=source, marker=("circle", "square")[MARKERS[c] == "s"],
+                color=CHAMBERS[c], size=6, legend_label=f"chamber {chamber.name}, mean ± 95 %",
+            )  # fmt: skip
+            self._over.line("x", "mean", source=source, color=CHAMBERS[c], line_width=0.8)
+            whisker = Whisker(base="x", lower="low", upper="high", source=source)
+            whisker.line_color, whisker.upper_head, whisker.lower_head = CHAMBERS[c], None, None
+            self._over.add_layout(whisker)
+            self._bins.append(source)
+        legend = self._over.legend[0]
+        legend.label_text_font_size, legend.padding, legend.border_line_color = "10px", 3, None
+        legend.background_fill_alpha, legend.orientation = 0.6, "horizontal"
+        parts = [row(s, sizing_mode="stretch_both") for s in (*strips, self._over)]
+        return column(*parts, sizing_mode="stretch_both")
+
+    def show(self, look: Look | None = None) -> None:
+        """Draw what is chosen, of another revision if one is given."""
+        self.look = look or self.look
+        for c, source in enumerate(self._lines):
+            parts = [p.equation for p in self.look.parts.values()]
+            pieces = [(e.t_s, e.residual_m3s[:, c] * LPM) for e in parts]
+            self._time.change(source, Line.joined(pieces))
+        self._time.refresh()
+        self.planes.show(self.blocks, self._quantities[self.quantity])
+        self._show_signal()
+
+    def choose(self, what: str, name: str) -> None:
+        """Another quantity, part or signal."""
+        if what == "quantity" and name in self._quantities:
+            self.quantity = name
+        elif what == "part" and name in self.look.parts:
+            self.part = name
+        elif what == "signal" and name in [d.signal for d in self._depends]:
+            self.signal = name
+        self.planes.show(self.blocks, self._quantities[self.quantity])
+        self._show_signal()
+
+    def mark(self, key: Key | None, words: str) -> None:
+        """A block that was pointed at, and what to say of it."""
+        self.chosen, self.words = key, words
+        self.planes.light([key] if key else [])
+
+    @property
+    def worst(self) -> BlockRow | None:
+        """The block with the largest share of the residual."""
+        return max(self.blocks, key=lambda b: b.residual_share, default=None)
+
+    def _show_signal(self) -> None:
+        found = next((d for d in self._depends if d.signal == self.signal), None)
+        if found is None:
+            return
+        unit, factor = UNITS.get(found.unit, (found.unit, 1.0))
+        x = found.centre * factor
+        for c, source in enumerate(self._bins):
+            mean, error = found.mean_m3s[:, c] * LPM, Z95 * found.error_m3s[:, c] * LPM
+            source.data = {"x": x, "mean": mean, "low": mean - error, "high": mean + error}
+        margin = 0.03 * float(np.ptp(x)) if len(x) else 1.0
+        self._reach.update(start=float(x.min()) - margin, end=float(x.max()) + margin)
+        shares = ", ".join(
+            f"{chamber.name} {100 * found.explained[c]:.0f} %"
+            for c, chamber in enumerate(self.look.model.chambers)
+        )
+        self._heading.text = f"residual over {found.signal}: it explains {shares}"
+        self._over.xaxis.axis_label = f"{found.signal} in {unit}"
+
+    def fragments(self) -> dict[str, str]:
+        """Tools above, and what the picture says."""
+        parts = {name: NAMES.get(name, name) for name in self.look.parts}
+        signals = [d.signal for d in self._depends]
+        tools = (
+            select("quantity", list(self._quantities), self.quantity, "blocks show")
+            + self._scale()
+            + select("part", parts, self.part, "of")
+            + select("signal", signals, self.signal, "residual over")
+            + "<span><label>drag </label>"
+            + choice("drag", ["zoom", "span"], self._time.drag, "mode")
+            + "</span>"
+            + button("largest error", "worst")
+            + button("forget marks", "forget")
+        )
+        return {"where_tools": tools, "where_says": self._sentence()}
+
+    def _scale(self) -> str:
+        q = self._quantities[self.quantity]
+        if q.name == "status":
+            return ""
+        stops = ", ".join(q.palette[:: max(1, len(q.palette) // 8)])
+        kind = ", decades" if q.is_log else ""
+        return (
+            f'<span class="key">{q.low:g}<i class="scale" style="background:'
+            f'linear-gradient(90deg, {stops})"></i>{q.high:g} {text(q.unit)}{kind}</span>'
+        )
+
+    def _sentence(self) -> str:
+        present = dict.fromkeys(cause_of(b) for b in self.blocks)
+        marks = {" ": "", ".": "dots", "/": "/ hatching", "\\": "\\ hatching", "x": "x hatching"}
+        reasons = ", ".join(
+            f"{marks.get(HATCHES[c], HATCHES[c])} {c}" for c in CAUSES[1:] if c in present
+        )
+        hatched = f" Not identified: {text(reasons)}." if reasons else ""
+        if self.words:
+            return f"{self.words}{hatched}"
+        worst = self.worst
+        if worst is None:
+            return "No block was visited in this part."
+        return (
+            f"The block <b>{text(worst.edge)} {worst.u_v[0]:g} to {worst.u_v[1]:g} V</b> holds "
+            f"{100 * worst.residual_share:.0f} % of the residual of its chambers. Click a block: "
+            "its time spans light up here and in Compare; drag a span: its blocks are outlined. "
+            f"A map that fails everywhere alike lacks an effect, not data: see <b>Why</b>.{hatched}"
+        )

@@ -1,0 +1,169 @@
+"""Why: what was found and how sure, the ranking of all candidates, and the page of an effect."""
+
+from __future__ import annotations
+
+from math import log10
+
+from rtid.diagnose.report import Diagnosis, Effect, Unseen, Value
+from rtid.diagnosed_text import quantity, sentences, title
+from rtid.effects import catalogue
+from rtid.effects import effect as page_of
+from rtid.effects.page import Effect as Page
+from rtid.effects.page import EffectError, readable
+from rtid.report_story import Ranked
+from rtid.report_tables import named, text
+from rtid.report_verdicts import VERDICTS
+from rtid.ui.desk import Told
+from rtid.ui.fragments import button, table
+
+MOST = 18  # candidates that are shown
+WIDEST = 150.0  # pixels of the longest bar
+NAN = float("nan")
+
+
+def fragments(told: Told | None, page: str, may_add: bool) -> dict[str, str]:
+    """The ranking on the left, the page of the chosen effect on the right."""
+    if told is None:
+        waiting = '<p class="says">Every known effect is being held beside the model.</p>'
+        return {"why_ranking": waiting, "why_page": effect_page(page)}
+    found = told.diagnosis
+    parts = [*(_found(found, e) for e in found.found), _ranking(told, may_add), *_unseen(found)]
+    if not found.found:
+        kind, heading = VERDICTS[found.verdict]
+        words = " ".join(sentences(found)[:3])
+        parts.insert(0, f'<div class="card"><h2 class="{kind}">{heading}</h2>{text(words)}</div>')
+    chosen = page or next((e.effect for e in found.found), "")
+    return {"why_ranking": "".join(parts), "why_page": effect_page(chosen)}
+
+
+def _link(name: str, label: str) -> str:
+    return button(label, "page", kind="link", name=name) if name in catalogue() else text(label)
+
+
+def _share(found: Diagnosis, residual_m3s: float) -> str:
+    return f"{100 * residual_m3s / found.rms_flow_m3s:.2f} %"
+
+
+def _found(found: Diagnosis, effect: Effect) -> str:
+    """What was found: size with interval, held-out gain, what it may be confused with."""
+    sizes = "".join(
+        f"<dt>{text(name.replace('_', ' '))}</dt><dd>{text(_interval(value))}</dd>"
+        for name, value in effect.parameters.items()
+    )
+    before, after = effect.heldout_residual_before_m3s, effect.heldout_residual_after_m3s
+    alike = ", ".join(title(name.partition(" (")[0]) for name in effect.cannot_be_told_from)
+    told_apart = (
+        f"cannot be told from {alike} in this record" if alike else "no other known effect does"
+    )
+    return (
+        f'<div class="card"><h2 class="found">{_link(effect.effect, title(effect.effect))} '
+        f"at {text(effect.where)}</h2><dl>{sizes}<dt>held-out error</dt><dd>"
+        f"{_share(found, before)} → <b>{_share(found, after)}</b> of the rms flow; the sensors' "
+        f"floor is {_share(found, found.noise_floor_m3s)}</dd><dt>explains as much</dt>"
+        f"<dd>{text(told_apart)}</dd><dt>by chance</dt><dd>p = {effect.p_value:.1g}</dd></dl></div>"
+    )
+
+
+def _interval(value: Value) -> str:
+    """With its 95 % interval."""
+    if value.std != value.std:
+        return quantity(value)
+    return quantity(Value(value.value, 1.96 * value.std, value.unit)) + " (95 %)"
+
+
+def _ranking(told: Told, may_add: bool) -> str:
+    """All candidates by how clearly the record shows each, with a button to add it."""
+    most = max((r.before or r.after or 0.0 for r in told.ranking), default=1.0) or 1.0
+    rows = [_rank(one, most, may_add) for one in told.ranking[:MOST]]
+    head = ("effect", "how clearly|", "", "size", "")
+    says = (
+        "How clearly the record shows each effect when it is added alone: its coefficient in "
+        "standard deviations (bar: logarithmic). While something large is missing, many effects "
+        "imitate it; → is what is left of them once the orange one is in the model. "
+        "Next: add what is found, or open an effect's page."
+    )
+    return f'<h3>All candidates</h3><p class="says">{text(says)}</p>{table(head, rows)}'
+
+
+def _rank(one: Ranked, most: float, may_add: bool) -> tuple[str, ...]:
+    before = one.before if one.before is not None else one.after or 0.0
+    own = one.after is None
+    width = WIDEST * _log(before) / max(_log(most), 1e-9)
+    bar = f'<span class="clear{" own" if own else ""}" style="width:{width:.0f}px"></span>'
+    sd = f"{before:.3g}" + (f" → {one.after:.2g}" if one.after is not None else "")
+    size = quantity(Value(one.value, one.std, one.unit))
+    remark = "" if one.is_possible else ", not possible"
+    can = may_add and one.is_possible
+    add = button("Add", "add", effect=one.key[0], where=one.key[1]) if can else ""
+    return _link(one.key[0], named(one.key)), text(sd), bar, text(size + remark), add
+
+
+def _log(value: float) -> float:
+    return log10(max(value, 1.0)) if value >= 1 else 0.02
+
+
+def _unseen(found: Diagnosis) -> list[str]:
+    """Detection limits, and what the record cannot show."""
+    seen = [u for u in found.not_found if u.visible and u.detection_limit is not None]
+    blind = [u for u in found.not_found if not u.visible]
+    head = ("effect", "where", "smallest size that would have shown", "remark")
+    parts = []
+    if seen:
+        rows = [(*_place(u), text(_limit(u)), text(u.reason)) for u in seen]
+        parts.append("<h3>Looked for and not found</h3>" + table(head, rows))
+    if blind:
+        hidden = [(*_place(u), text(u.reason)) for u in blind]
+        parts.append("<h3>This record cannot show</h3>" + table(("effect", "where", "why"), hidden))
+    if found.advice:
+        items = "".join(f"<li>{text(a)}</li>" for a in found.advice)
+        parts.append(f"<h3>What motion would tell more</h3><ul>{items}</ul>")
+    return parts
+
+
+def _place(unseen: Unseen) -> tuple[str, str]:
+    return _link(unseen.effect, title(unseen.effect)), text(unseen.where)
+
+
+def _limit(unseen: Unseen) -> str:
+    return quantity(Value(unseen.detection_limit or 0.0, NAN, unseen.unit))
+
+
+def effect_page(name: str) -> str:
+    """Equation, signature in the residual, reference."""
+    if not name:
+        return '<p class="says">Click an effect: its equation, its signature, its reference.</p>'
+    try:
+        page = page_of(name)
+    except EffectError:
+        return f'<h2>{text(title(name))}</h2><p class="says">an effect of your own</p>'
+    return _page(page)
+
+
+def _page(page: Page) -> str:
+    lines = "\n".join(readable(line) for line in page.equation)
+    symbols = "".join(
+        f"<dt>{text(s.name)}{text(f' ({s.unit})' if s.unit else '')}</dt><dd>{text(s.meaning)}</dd>"
+        for s in page.symbols
+    )
+    sizes = "".join(
+        f"<dt>{text(p.name.replace('_', ' '))}, {text(p.symbol)}</dt><dd>{p.low:g} to {p.high:g} "
+        f"{text('' if p.unit == '1' else p.unit)}. {text(p.meaning)}</dd>"
+        for p in page.parameters
+    )
+    invisible = "<p><b>Structurally invisible:</b> a free map swallows it.</p>"
+    rest = "".join(
+        f"<h3>{heading}</h3>{text(words)}"
+        for heading, words in (
+            ("In the residual", page.signature),
+            ("Looks like", ", ".join(title(name) for name in page.confounders)),
+            ("What tells them apart", page.separates),
+            ("Visible when", page.visible_when),
+            ("Reference", page.reference),
+        )
+        if words
+    )
+    return (
+        f"<h2>{text(page.title)}</h2><p>{text(page.summary)}</p>"
+        f"{invisible if page.invisible else ''}<pre>{text(lines)}</pre><dl>{symbols}{sizes}</dl>"
+        f"{rest}"
+    )

@@ -1,0 +1,123 @@
+"""The desk in a process of its own: jobs in, progress and results out, one after the other."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from typing import Any
+
+from rtid.errors import RtidError
+
+Then = Callable[[Any], None]
+Progress = Callable[[str, float], None]
+ENDED = "the worker has ended", "start `rtid ui` again"
+
+
+class WorkerError(RtidError):
+    """A job failed for a reason that is not the user's, or its process has ended."""
+
+    exit_code = 1
+
+
+@dataclass(frozen=True)
+class Job:
+    """A method of the desk, its arguments, and who waits for progress, result or refusal."""
+
+    method: str
+    arguments: tuple[Any, ...]
+    then: Then
+    failed: Callable[[RtidError], None]
+    progress: Progress
+
+
+def serve(pipe: Connection) -> None:
+    """Work until the pipe is closed.  Runs in the worker's process."""
+    from rtid.ui.desk import Desk  # noqa: PLC0415 - only the worker imports the estimator's weight
+
+    desk = Desk(lambda text, share: pipe.send(("progress", (text, share))))
+    while True:
+        try:
+            method, arguments = pipe.recv()
+        except (EOFError, OSError, KeyboardInterrupt):
+            return
+        try:
+            pipe.send(("done", getattr(desk, method)(*arguments)))
+        except RtidError as error:
+            pipe.send(("refused", (str(error), error.remedy)))
+        except OSError as error:
+            pipe.send(("refused", (f"{error.filename or method}: {error.strerror}", "")))
+        except KeyboardInterrupt:
+            return
+        except Exception as error:
+            pipe.send(("refused", (f"{method} failed: {type(error).__name__}: {error}", "")))
+
+
+class Worker:
+    """The server's side: `ask` returns at once, answers arrive through `on_loop`."""
+
+    def __init__(self, on_loop: Callable[[Callable[[], None]], None]) -> None:
+        self._on_loop = on_loop
+        self._jobs: list[Job] = []
+        self._pipe, theirs = get_context("spawn").Pipe()
+        self._process = get_context("spawn").Process(target=serve, args=(theirs,), daemon=True)
+        self._process.start()
+        theirs.close()
+        threading.Thread(target=self._listen, daemon=True).start()
+
+    @property
+    def is_busy(self) -> bool:
+        """True while a job is waited for."""
+        return bool(self._jobs)
+
+    def ask(
+        self,
+        method: str,
+        *arguments: Any,
+        then: Then,
+        failed: Callable[[RtidError], None],
+        progress: Progress = lambda text, share: None,
+    ) -> None:
+        """Queue a job; call from the loop's thread."""
+        self._jobs.append(Job(method, arguments, then, failed, progress))
+        if len(self._jobs) == 1:
+            self._begin()
+
+    def stop(self) -> None:
+        """End the process, whatever it does."""
+        self._process.terminate()
+        self._process.join(5.0)
+
+    def _begin(self) -> None:
+        job = self._jobs[0]
+        try:
+            self._pipe.send((job.method, job.arguments))
+        except OSError:
+            self._take("refused", ENDED)
+
+    def _listen(self) -> None:
+        """Pass on what the worker says, from a thread of its own."""
+        while True:
+            try:
+                kind, content = self._pipe.recv()
+            except (EOFError, OSError):
+                self._on_loop(partial(self._take, "refused", ENDED))
+                return
+            self._on_loop(partial(self._take, kind, content))
+
+    def _take(self, kind: str, content: Any) -> None:
+        if not self._jobs:
+            return
+        if kind == "progress":
+            self._jobs[0].progress(*content)
+            return
+        job = self._jobs.pop(0)
+        if self._jobs:
+            self._begin()
+        if kind == "done":
+            job.then(content)
+        else:
+            job.failed(WorkerError(*content))
