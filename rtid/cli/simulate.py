@@ -19,7 +19,7 @@ from rtid.sim.motion import MOTIONS
 from rtid.sim.plant import Plant
 from rtid.sim.random_plants import draw
 from rtid.sim.recording import TABLE_SUFFIX, write_run
-from rtid.sim.run import Run
+from rtid.sim.run import Change, Run
 from rtid.sim.run import simulate as run_machine
 
 
@@ -40,6 +40,10 @@ def simulate(
             "number in SI units; repeatable.  An unknown EFFECT lists all."
         ),
     ] = None,
+    hide_at_s: Annotated[
+        float | None,
+        typer.Option("--hide-at", min=0.0, help="Seconds into the run at which that begins."),
+    ] = None,
     motion: Annotated[str, typer.Option(help=" | ".join(MOTIONS))] = "sweep",
     duration_s: Annotated[
         float | None, typer.Option("--duration", min=0.01, help="Seconds; 80, a record 110.")
@@ -58,10 +62,16 @@ def simulate(
     speaks live instead of, or after, writing.
     """
     _check_arguments(trace, bus, motion, plant, cross_port)
+    if hide_at_s is not None and not hide:
+        raise _usage("--hide-at: nothing is hidden", "add --hide EFFECT")
     machine = Plant() if plant is None else draw(plant, cross_port=cross_port)
     for wish in hide or ():
         machine = hide_wish(machine, wish)
-    run = run_machine(machine, motion, seed, duration_s)
+    if hide_at_s is None:
+        run = run_machine(machine, motion, seed, duration_s)
+    else:
+        healthy = Plant() if plant is None else draw(plant, cross_port=cross_port)
+        run = run_machine(healthy, motion, seed, duration_s, change=Change(hide_at_s, machine))
     hidden = [planted._asdict() for planted in machine.hidden]
     result = {"samples": len(run.samples), "beta_pa": machine.beta_pa, "hidden": hidden}
     written = write_run(trace, run, seed, motion) if trace else []

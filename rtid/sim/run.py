@@ -5,7 +5,7 @@ u at sample k acts until sample k + 1; sensors are read at sample k, before the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -26,6 +26,7 @@ __all__ = [
     "P_B",
     "P_S",
     "P_T",
+    "Change",
     "Run",
     "Sensors",
     "SimulationError",
@@ -64,8 +65,16 @@ class Truth:
 
 
 @dataclass(frozen=True)
+class Change:
+    """What a plant becomes at a time; the valves' spools start again from their middle."""
+
+    at_s: float
+    plant: Plant
+
+
+@dataclass(frozen=True)
 class Run:
-    """One simulated record."""
+    """One simulated record; `plant` is that of its end."""
 
     plant: Plant
     sensors: Sensors
@@ -80,12 +89,14 @@ def simulate(
     duration_s: float | None = None,
     sensors: Sensors | None = None,
     substeps: int = 10,
+    change: Change | None = None,
 ) -> Run:
     """Run the closed loop for duration_s at 1 kHz; the same arguments give identical samples.
 
     motion: a name in `motion.MOTIONS` or a function of that kind; duration_s: 80 s, and 110 s for
-    a record with its validation part, unless told.  Raises SimulationError if the
-    machine leaves its stroke, cavitates, or a pressure exceeds its sensor's range.
+    a record with its validation part, unless told; change: what the plant becomes while it runs.
+    Raises SimulationError if the machine leaves its stroke, cavitates, or a pressure exceeds its
+    sensor's range.
     """
     sensors = sensors or Sensors()
     motion_rng, noise_rng, burst_rng = (np.random.default_rng([seed, i]) for i in (2, 3, 6))
@@ -93,19 +104,52 @@ def simulate(
     if duration_s is None:
         duration_s = usual_duration_s(motion if isinstance(motion, str) else "")
     drive = build(plant, motion_rng, duration_s)
-    clocked = schedule(plant.extra, len(drive), DT_S, burst_rng)
     noise = noise_rng.standard_normal((len(drive) - 1, 7)) * sensors.noise()
-    drive = np.column_stack([drive, clocked])
-    truth, x_measured_m = _integrate(plant, drive, noise[:, X].copy(), sensors, substeps)
+    plants, ends = [plant], [0, len(noise)]
+    if change is not None and 0 < round(change.at_s / DT_S) < len(noise):
+        plants, ends = [plant, change.plant], [0, round(change.at_s / DT_S), len(noise)]
+    truths: list[Truth] = []
+    values: list[FloatArray] = []
+    y = np.zeros(0)
+    for present, first, end in zip(plants, ends, ends[1:], strict=False):
+        clocked = schedule(present.extra, len(drive), DT_S, burst_rng)
+        rows = np.column_stack([drive, clocked])[first : end + 1]
+        y = _taken_over(present, y, rows[0]) if len(y) else _resting_state(present, rows[0])
+        truth, seen = _part(present, rows, noise[first:end], sensors, substeps, y)
+        truths.append(truth)
+        values.append(seen)
+    return Run(plants[-1], sensors, _samples(np.concatenate(values)), _joined(truths))
+
+
+def _part(
+    plant: Plant,
+    drive: FloatArray,
+    noise: FloatArray,
+    sensors: Sensors,
+    substeps: int,
+    start: FloatArray,
+) -> tuple[Truth, FloatArray]:
+    """Truth and sensors' values (n, 7) of n samples of one plant from a state, changed in place."""
+    truth, x_measured_m = _integrate(plant, drive, noise[:, X].copy(), sensors, substeps, start)
     _check_sane(plant, truth, sensors)
     seen = see(plant.extra, truth.signals, truth.ports_pa, drive[:-1, P_SUPPLY], noise, DT_S)
     values = sensors.quantise(seen)
     values[:, U], values[:, X] = truth.signals[:, U], x_measured_m
-    return Run(plant, sensors, _samples(values), truth)
+    return truth, values
+
+
+def _joined(parts: list[Truth]) -> Truth:
+    columns = (np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Truth))
+    return Truth(*columns)
 
 
 def _integrate(
-    plant: Plant, drive: FloatArray, x_noise_m: FloatArray, sensors: Sensors, substeps: int
+    plant: Plant,
+    drive: FloatArray,
+    x_noise_m: FloatArray,
+    sensors: Sensors,
+    substeps: int,
+    start: FloatArray,
 ) -> tuple[Truth, FloatArray]:
     n, steps = len(x_noise_m), sensors.resolution()
     five = np.empty((3, n, 5))
@@ -117,7 +161,6 @@ def _integrate(
         nodes_pa=np.empty((n, 3)),
         extra_m3s=np.zeros((n, 2)),
     )
-    start = _resting_state(plant, drive[0])
     machine, e = _machine(plant), parts_of(plant.extra)
     run_loop(machine, e, drive, x_noise_m, steps[X], steps[U], DT_S, substeps, start, record)
     signals = np.empty((n, 7))
@@ -146,13 +189,24 @@ def _resting_state(plant: Plant, drive: FloatArray) -> FloatArray:
     c, x_m = plant.constants, float(drive[X_REF])
     p_b = 0.3 * plant.p_supply_pa
     p_a = (plant.gravity_n(x_m) + p_b * c.area_b_m2) / c.area_a_m2
+    return _spread(plant, np.array([p_a, p_b, x_m, 0.0]), drive)
+
+
+def _taken_over(plant: Plant, before: FloatArray, drive: FloatArray) -> FloatArray:
+    """The state of a machine that goes on as this plant: the piston and its chambers stay."""
+    return _spread(plant, before[:4].copy(), drive)
+
+
+def _spread(plant: Plant, piston: FloatArray, drive: FloatArray) -> FloatArray:
+    """A whole state from P_A, P_B, x, v (4,): all nodes at the pressures of their chambers."""
     if plant.extra == NONE:
-        return np.array([p_a, p_b, x_m, 0.0])
+        return piston
     y = np.zeros(state.STATES)
+    p_a, p_b = piston[:2]
     y[[state.P_A, state.PORT_A, state.DEAD_A, state.HOSE_A]] = p_a
     y[[state.P_B, state.PORT_B, state.DEAD_B, state.HOSE_B]] = p_b
     y[[state.SUPPLY, state.BRANCH]] = drive[P_SUPPLY]
-    y[state.X] = x_m
+    y[[state.X, state.V]] = piston[2:]
     return y
 
 
