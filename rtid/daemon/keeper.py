@@ -188,7 +188,7 @@ class Keeper:
         begins = alarm.until_unix_s is None
         logger.log(30 if begins else 20, "alarm %s name=%s kind=%s text=%r",
                    "on" if begins else "over", alarm.name, alarm.kind, alarm.text)  # fmt: skip
-        self._analyst.put(Note(alarm, keep=begins))
+        self._analyst.put(Note(alarm, keep=begins and alarm.kind != "loop"))
 
     def _tell(self, now_ns: int) -> None:
         """Status, file, log line."""
