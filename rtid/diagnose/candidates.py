@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from rtid.diagnose.evidence import Given
 from rtid.diagnose.view import View
 from rtid.model import FloatArray
 
@@ -123,44 +122,30 @@ def places(view: View) -> dict[str, tuple[int, ...]]:
 
 @dataclass
 class Columns:
-    """Candidates and their series, in the order in which they were added."""
+    """Candidates and columns, in the order in which they were added.
 
-    n: int
-    n_chambers: int
+    condense: what a series per interval (n - 1,) adds to the rows (rows,), which is all that is
+    kept, and only until it is `released`.
+    """
+
+    condense: Callable[[FloatArray], FloatArray]
     candidates: list[Candidate] = field(default_factory=list)
     echo_of: dict[int, int] = field(default_factory=dict)  # column -> its echo's column
-    _series: list[FloatArray] = field(default_factory=list)
-    _source: list[list[int]] = field(default_factory=list)
-    _sign: list[list[float]] = field(default_factory=list)
+    n: int = 0
+    _columns: list[Volumes] = field(default_factory=list)
 
     def add(self, volumes: Volumes) -> int:
-        """Another column; its number.  The same array twice is stored once."""
-        source, sign = [0] * self.n_chambers, [0.0] * self.n_chambers
-        for c, series in volumes.items():
-            known = [k for k, s in enumerate(self._series) if s is series]
-            source[c], sign[c] = (known[0] if known else len(self._series)), 1.0
-            if not known:
-                self._series.append(series)
-        self._source.append(source)
-        self._sign.append(sign)
-        return len(self._source) - 1
-
-    def volumes(self, column: int) -> Volumes:
-        """The series of a column by chamber."""
-        pairs = zip(self._source[column], self._sign[column], strict=True)
-        return {c: self._series[k] for c, (k, sign) in enumerate(pairs) if sign}
+        """Another column; its number."""
+        self._columns.append({c: self.condense(series) for c, series in volumes.items()})
+        self.n += 1
+        return self.n - 1
 
     def offer(self, candidate: Candidate, volumes: Volumes) -> None:
         """Another candidate; candidates come before echoes."""
         self.candidates.append(candidate)
         self.add(volumes)
 
-    def given(self) -> Given:
-        """All columns as `evidence.collect` takes them."""
-        series = np.stack(self._series, axis=1) if self._series else np.zeros((self.n - 1, 1))
-        shape = (len(self._source), self.n_chambers)
-        return Given(
-            np.ascontiguousarray(series),
-            np.array(self._source, np.int64).reshape(shape),
-            np.array(self._sign, np.float64).reshape(shape),
-        )
+    def released(self) -> list[Volumes]:
+        """What all columns add to the rows, chamber -> (rows,); kept no longer."""
+        columns, self._columns = self._columns, []
+        return columns

@@ -11,10 +11,11 @@ from dataclasses import dataclass, replace
 
 from rtid.diagnose.candidates import Candidate
 from rtid.diagnose.clean import as_measured, usable
-from rtid.diagnose.fit import Fit, Revision, fit, one_pass, prepare
+from rtid.diagnose.fit import Fit, fit, one_pass, prepare
 from rtid.diagnose.parts import Part, recall
 from rtid.diagnose.regression import Score
 from rtid.diagnose.residual import Residual, residual
+from rtid.diagnose.revision import Revision
 from rtid.diagnose.trials import (
     GAIN,
     MATCH_RHO,
@@ -84,13 +85,15 @@ def search(
         before = residual(first, state.held_out)
     bare = _bare(state, first)
     state.excess = bare.estimate.sse - bare.regression.dof
-    present, last = _extended(state, first, before) if can_judge(before) else (first, before)
+    present, first, last = first, first.light(), before
+    if can_judge(before):
+        present, last = _extended(state, present, before)
     said = verdict(state, present, last)
     if said == UNKNOWN:  # what explains a part of it only is not named, and not counted
         present, last, state.found = first, before, []
     found, negligible = tuple(state.found), state.negligible
     return Result(
-        first, present, found, negligible, scored(present), before, last, said, parts,
+        first, present.light(), found, negligible, scored(present), before, last, said, parts,
         held_out_judged=judged,
     )  # fmt: skip
 
@@ -164,9 +167,9 @@ def _add_best(state: State, present: Fit, last: Residual) -> tuple[Fit, Residual
 def _with(state: State, present: Fit, trial: Trial) -> Fit:
     """The fit with a trial's revision, every candidate beside it."""
     now = trial.fit or fit(
-        state.model, state.chunk, present.weights, trial.revision, present.map, bank=False
+        state.model, state.chunk, present.weights, trial.revision, present, bank=False
     )
-    return one_pass(state.model, state.chunk, now.weights, now.revision, now.map, True)
+    return one_pass(state.model, state.chunk, now.weights, now.revision, now, True)
 
 
 def _is_noticed(present: Fit, trial: Trial) -> bool:
@@ -201,7 +204,7 @@ def _look_back(state: State, present: Fit, last: Residual) -> tuple[Fit, Residua
             continue
         kept = tuple(e for e in present.revision.effects if e != effect)
         revision = replace(present.revision, effects=kept, sizes=())
-        present = fit(state.model, state.chunk, present.weights, revision, present.map)
+        present = fit(state.model, state.chunk, present.weights, revision, present)
         last = residual(present, state.held_out)
         state.found = [f for f in state.found if f.key != effect.key]
         state.negligible.pop(effect.key, None)

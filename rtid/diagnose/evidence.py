@@ -3,21 +3,26 @@
     G = sum over the rows of [y | theta_beta | given | map]' [y | theta_beta | given | map],
 
 and what is left of the first three once the maps are free to follow them: their Schur complement.
-Rows are taken in segments of time, in which only some blocks move or still ring.
+What the rows hold of the maps depends on the commands and the weights alone: it is collected once,
+and serves any given columns.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
-from scipy.linalg.lapack import dtrtri
+from scipy.linalg.blas import dtrsm
+from scipy.linalg.lapack import dpotrf, dtrtri, dtrtrs
 
+from rtid.diagnose.candidates import Volumes
 from rtid.estimator.factor import PRIOR_SD, one_thread
 from rtid.estimator.state import Weights, build
 from rtid.kernels import evidence as kernel
+from rtid.kernels import products
 from rtid.kernels.engine import ROW_FLAG
 from rtid.kernels.layout import TERMS
 from rtid.model import FloatArray, Model
@@ -25,55 +30,136 @@ from rtid.model import FloatArray, Model
 IntArray = NDArray[np.int64]
 
 ROW_S = 10e-3  # positions measured within so long make one row
-SEGMENT_S = 0.5
-FIRST_BLOCKS = 64  # for which there is room at first
-PLACES = 256  # blocks that can ring within one segment
-QUIET = 1e-3  # a column whose state is a smaller part of a row's noise adds nothing to rows
+SPAN = 10  # rows in which only few blocks move
+QUIET = 1e-9  # a block whose whitened state is smaller adds nothing to an innovation
+ENTRIES = 4  # per row, for which there is room at first
 
 
 @dataclass(frozen=True)
-class Given:
-    """Columns known beforehand: series (n - 1, s) volumes per interval in m3.
+class Rows:
+    """A record as rows, as from `kernel.integrate`: what they hold, and how they are whitened.
 
-    Column j takes sign[j, c] times series source[j, c] in chamber c; both (columns, chambers).
+    cells (V,): blocks in the order of their first visit; sign (V, 2): of their edges; start, block,
+    terms: what the blocks add to each row; row_of, share (n - 1,): rows of the intervals; own
+    (rows, chambers, 1 + chambers): y and theta_beta; fresh, whiten, keep: the whitener; soft: as
+    given to `rows_of`.
     """
 
-    series: FloatArray
-    source: IntArray
+    cells: IntArray
     sign: FloatArray
+    start: IntArray
+    block: IntArray
+    terms: FloatArray
+    row_of: IntArray
+    share: FloatArray
+    own: FloatArray
+    fresh: NDArray[np.bool_]
+    whiten: FloatArray
+    keep: FloatArray
+    soft: FloatArray
 
     @property
     def n(self) -> int:
-        """Number of columns."""
-        return len(self.source)
+        """Number of scalar rows."""
+        return self.own.shape[0] * self.own.shape[1]
+
+    def condensed(self, series: FloatArray) -> FloatArray:
+        """What a series (n - 1,) of volumes per interval adds to each row (rows,)."""
+        out = np.empty(len(self.own))
+        kernel.condense(np.ascontiguousarray(series), self.row_of, self.share, self.fresh, out)
+        return out
+
+    def maps(self) -> FloatArray:
+        """Products of the maps' columns: the lower triangle of an array (6 V, 6 V)."""
+        gram = np.zeros((TERMS * len(self.cells),) * 2)
+        products.maps(
+            self.sign, self.start, self.block, self.terms, self.fresh, self.whiten, self.keep,
+            SPAN, QUIET, gram,
+        )  # fmt: skip
+        return gram
+
+    def head(self, given: Iterable[Volumes]) -> tuple[FloatArray, FloatArray]:
+        """Products of [y | theta_beta | given]: among themselves (h, h), and of the maps (6 V, h).
+
+        given: condensed columns, chamber -> (rows,).
+        """
+        given = list(given)
+        columns = self._columns(given)
+        products.whitened(columns, self.fresh, self.whiten, self.keep)
+        flat = columns.reshape(self.n, -1)
+        with one_thread():
+            own = flat.T @ flat
+        products.adjoint(columns, self.fresh, self.whiten, self.keep)
+        cross = np.zeros((TERMS * len(self.cells), columns.shape[2]))
+        products.cross(columns, self.sign, self.start, self.block, self.terms, self.fresh, cross)
+        return own, cross
+
+    def _columns(self, given: list[Volumes]) -> FloatArray:
+        """What all of them add to the rows (rows, chambers, h)."""
+        rows, n_c, first = self.own.shape
+        columns = np.zeros((rows, n_c, first + len(given)))
+        columns[:, :, :first] = self.own
+        for j, volumes in enumerate(given):
+            for c, values in volumes.items():
+                columns[:, c, first + j] = values
+        return columns
+
+    @cached_property
+    def factor(self) -> Factor:
+        """Cholesky factor of the maps' products and their prior."""
+        return Factor.of(self.maps())
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """Products of all whitened columns: the lower triangle of gram (size, size).
+class Factor:
+    """U' U = products and prior, scaled: upper (6 V, 6 V) in Fortran order, scale (6 V,)."""
 
-    n_head = 1 + chambers + given columns; cells (V,): blocks in their order; rows: scalar ones.
-    """
+    upper: FloatArray
+    scale: FloatArray
 
-    gram: FloatArray
-    n_head: int
-    cells: IntArray
-    rows: int
+    @classmethod
+    def of(cls, gram: FloatArray) -> Factor:
+        """Factor of the lower triangle of gram, which is used up."""
+        scale = np.empty(len(gram))
+        products.scaled(gram, PRIOR_SD**-2, scale)
+        with one_thread():
+            upper = dpotrf(gram.T, lower=0, clean=0, overwrite_a=1)[0] if len(gram) else gram
+        return cls(upper, scale)
 
-    def squares(self) -> FloatArray:
-        """Squares of all columns (size,)."""
-        return np.asarray(self.gram.diagonal().copy())
+    def half(self, right: FloatArray) -> FloatArray:
+        """L^-1 scale right' for right (6 V, m), which is used up: (m, 6 V)."""
+        right *= self.scale[:, None]
+        if not len(right):
+            return right.T
+        with one_thread():
+            return np.asarray(dtrsm(1.0, self.upper, right.T, side=1, overwrite_b=1))
+
+    def whole(self, half: FloatArray) -> FloatArray:
+        """Solution (6 V,) for what `half` gave of one right-hand side."""
+        if not len(half):
+            return half
+        with one_thread():
+            return np.asarray(dtrtrs(self.upper, half)[0] * self.scale)
+
+    @cached_property
+    def covariances(self) -> FloatArray:
+        """Diagonal blocks (V, 6, 6) of the inverse: covariance of each block's terms."""
+        cov = np.zeros((len(self.scale) // TERMS, TERMS, TERMS))
+        if len(cov):
+            with one_thread():
+                inverse = dtrtri(self.upper, lower=0)[0]
+            products.covariances(inverse.T, self.scale, cov)
+        return cov
 
 
-def collect(
+def rows_of(
     model: Model,
     chunk: FloatArray,
     weights: Weights,
-    given: Given,
     row_s: float = ROW_S,
     soft: FloatArray | None = None,
-) -> Evidence:
-    """One pass over a record, chunk (n, 2 + signals), with all given columns.
+) -> Rows:
+    """One pass over a record, chunk (n, 2 + signals).
 
     soft (n, chambers): white variance of each measured position's equation, m6, beyond that of the
     model without effects.
@@ -82,146 +168,90 @@ def collect(
     e = build(model, weights)
     e.engine[0]["x_var_m2"] /= group
     e.engine[0]["p_var_pa2"] /= group
-    n_c = len(model.chambers)
-    head, step_s = 1 + n_c + given.n, float(np.median(np.diff(chunk[:, 0])))
-    taken = _Pass(head, n_c, model.n_cells, max(1, round(SEGMENT_S / (group * step_s))))
-    soft = np.zeros((len(chunk), n_c)) if soft is None else soft / group
+    n, most = len(chunk), _measured(chunk).sum() // group + 1
+    counts, noise = np.zeros(4, np.int64), np.zeros((4, 2, 2))
+    row_of, share = np.full(max(0, n - 1), kernel.NO_ROW), np.zeros(max(0, n - 1))
+    own, fresh = np.zeros((most + 2, 2, 3)), np.zeros(most, np.bool_)
+    whiten, keep = np.zeros((most, 3)), np.zeros((most, 2, 2))
+    start, cell, terms = np.zeros(most + 2, np.int64), *_entries(ENTRIES * most)
+    soft = np.zeros((n, len(model.chambers))) if soft is None else soft
     at = 0
-    for end in [*range(0, len(chunk), max(1, round(SEGMENT_S / step_s)))[1:], len(chunk)]:
-        while at < end:
-            at = kernel.collect(
-                e.engine, e.cells, chunk, at, end, group,
-                given.series, given.source, given.sign, soft, *taken.arrays,
-            )  # fmt: skip
-            taken.add()
-    return taken.evidence()
+    while True:
+        at = kernel.integrate(
+            e.engine, e.cells, chunk, soft / group, at, group, counts, noise, row_of, share, own,
+            fresh, whiten, keep, start, cell, terms,
+        )  # fmt: skip
+        if at == n:
+            break
+        more, more_terms = _entries(len(cell))
+        cell, terms = np.append(cell, more), np.append(terms, more_terms, axis=0)
+    rows, n_c = int(counts[kernel.N_ROWS]), len(model.chambers)
+    entries = int(start[rows])
+    cells, block = _numbered(cell[:entries])
+    return Rows(
+        cells, _signs(model)[cells], start[: rows + 1], block, terms[:entries].copy(), row_of,
+        share, own[:rows, :n_c, : 1 + n_c].copy(), fresh[:rows], whiten[:rows], keep[:rows], soft,
+    )  # fmt: skip
+
+
+def _entries(count: int) -> tuple[IntArray, FloatArray]:
+    return np.empty(count, np.int64), np.empty((count, 2, TERMS))
+
+
+def _numbered(cell: IntArray) -> tuple[IntArray, IntArray]:
+    """Cells in the order of their first visit, and the number of each entry's."""
+    cells, first, number = np.unique(cell, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    place = np.empty(len(order), np.int64)
+    place[order] = np.arange(len(order))
+    return cells[order], place[number]
+
+
+def _signs(model: Model) -> FloatArray:
+    """Sign with which the edge of each cell feeds each chamber (cells, 2)."""
+    sign = np.zeros((model.n_cells, 2))
+    at = 0
+    for edge in model.edges:
+        n = edge.grid.shape[0] * edge.grid.shape[1]
+        for c, chamber in enumerate(model.chambers):
+            sign[at : at + n, c] = edge.sign(chamber)
+        at += n
+    return sign
 
 
 def rows_per_group(chunk: FloatArray, row_s: float) -> int:
     """Measured positions per row: as many as come within row_s."""
-    measured = chunk[(chunk[:, 1].astype(int) & ROW_FLAG) != 0, 0]
+    measured = chunk[_measured(chunk), 0]
     return max(1, round(row_s / float(np.median(np.diff(measured)))) if len(measured) > 1 else 1)
 
 
-class _Pass:
-    """The arrays that `kernel.collect` changes, and the products so far."""
-
-    def __init__(self, head: int, n_c: int, n_cells: int, most_rows: int) -> None:
-        width = head + TERMS * PLACES
-        self.head, self.n_rows = head, 0
-        self.d, self.later = np.zeros((n_c, width)), np.zeros((n_c, width))
-        self.place = np.full(n_cells, -1)
-        self.cell_of = np.full(PLACES, -1)
-        self.counts = np.array([0, 0, 0, head])
-        self.noise = np.zeros((5, 2, 2))
-        self.rows = np.zeros((most_rows + 2, n_c, width))
-        self.cells: list[int] = []
-        self.number = np.full(n_cells, -1)  # of a cell's block among those visited
-        self.total = np.zeros((head + TERMS * FIRST_BLOCKS,) * 2)
-
-    @property
-    def arrays(self) -> tuple[NDArray[np.generic], ...]:
-        return self.d, self.later, self.place, self.cell_of, self.counts, self.noise, self.rows
-
-    def evidence(self) -> Evidence:
-        """The products of everything that was added."""
-        size = self.head + TERMS * len(self.cells)
-        return Evidence(self.total[:size, :size], self.head, np.array(self.cells, int), self.n_rows)
-
-    def add(self) -> None:
-        """Add the products of the rows so far; blocks that fell silent give their places back."""
-        n, local = int(self.counts[kernel.N_ROWS]), int(self.counts[kernel.N_LOCAL])
-        used = self.head + TERMS * local
-        rows = self.rows[:n, :, :used].reshape(n * len(self.d), used)
-        with one_thread():
-            gram = rows.T @ rows
-        columns = self._columns(local)  # may enlarge the total
-        kernel.add_products(self.total, columns, gram)
-        self.n_rows += len(rows)
-        self._forget_silent(local)
-        self.rows[:n, :, :used] = 0.0  # blocks to come take up columns in the middle of a segment
-        self.counts[kernel.N_ROWS] = 0
-
-    def _columns(self, local: int) -> IntArray:
-        """Columns of the head and of the local blocks among all; new blocks get a number."""
-        for cell in self.cell_of[:local][self.number[self.cell_of[:local]] < 0]:
-            self.number[cell] = len(self.cells)
-            self.cells.append(int(cell))
-        size = self.head + TERMS * len(self.cells)
-        if size > len(self.total):
-            larger = np.zeros((2 * size,) * 2)
-            larger[: len(self.total), : len(self.total)] = self.total
-            self.total = larger
-        first = self.head + TERMS * self.number[self.cell_of[:local]]
-        own = (first[:, None] + np.arange(TERMS)).ravel()
-        return np.concatenate([np.arange(self.head), own])
-
-    def _forget_silent(self, local: int) -> None:
-        """Keep the blocks that would still move a row, and those with something due."""
-        head, n_c = self.head, len(self.d)
-        sd = np.sqrt(self.noise[kernel.LAST].diagonal()[:n_c])[:, None, None]
-        size = np.abs(self.d[:, head : head + TERMS * local]).reshape(n_c, local, TERMS)
-        loud = (size / np.maximum(sd, 1e-300)).max(axis=(0, 2), initial=0.0) > QUIET
-        due = self.later[:, head : head + TERMS * local].reshape(n_c, local, TERMS)
-        loud |= np.abs(due).max(axis=(0, 2), initial=0.0) > 0
-        old = self.cell_of[:local].copy()
-        kept = np.flatnonzero(loud)
-        for state in (self.d, self.later):
-            moved = state[:, head:].reshape(len(state), -1, TERMS)[:, kept].copy()
-            state[:, head:] = 0.0
-            state[:, head : head + TERMS * len(kept)] = moved.reshape(len(state), -1)
-        self.place[old] = -1
-        self.cell_of[:] = -1
-        self.cell_of[: len(kept)] = old[kept]
-        self.place[old[kept]] = np.arange(len(kept))
-        self.counts[kernel.N_LOCAL] = len(kept)
+def _measured(chunk: FloatArray) -> NDArray[np.bool_]:
+    return (chunk[:, 1].astype(int) & ROW_FLAG) != 0
 
 
 @dataclass(frozen=True)
 class Projected:
     """What is left of y and the head columns once every map is free to follow them.
 
-    schur (head, head): products after the projection; coefficients (map columns, head): what the
-    maps take of each; dof: rows less what the maps use up; cov
-    (V, 6, 6): of the blocks' terms, effects held.
+    schur (h, h): products after the projection; own (h,): squares before it; half (h, 6 V): what
+    the maps take of each, see `Factor.half`.
     """
 
     schur: FloatArray
-    coefficients: FloatArray
-    dof: float
-    cov: FloatArray
+    own: FloatArray
+    half: FloatArray
+    factor: Factor
+
+    def terms(self, used: list[int], theta: FloatArray) -> FloatArray:
+        """Terms (V, 6) of the maps with these coefficients of the columns used."""
+        left = self.half[0] - theta @ self.half[used]
+        return self.factor.whole(left).reshape(-1, TERMS)
 
 
-def project(evidence: Evidence, thorough: bool = True) -> Projected:
-    """Take the maps out of all head columns.
-
-    thorough = False leaves out the covariances of the maps, and with them what the priors leave of
-    their degrees of freedom.
-    """
-    h = evidence.n_head
-    gram = evidence.gram
-    matrix = gram[h:, h:].copy()
-    matrix[np.diag_indices_from(matrix)] += PRIOR_SD**-2
-    scale = 1.0 / np.sqrt(np.diag(matrix))
-    matrix *= scale[:, None]
-    matrix *= scale
-    own = np.tril(gram[:h, :h]) + np.tril(gram[:h, :h], -1).T
+def project(rows: Rows, given: Iterable[Volumes]) -> Projected:
+    """Take the maps out of y, theta_beta and all given columns, condensed to the rows."""
+    own, cross = rows.head(given)
+    half = rows.factor.half(cross)
     with one_thread():
-        lower = cho_factor(matrix, lower=True, overwrite_a=True, check_finite=False)
-        coefficients = cho_solve(lower, gram[h:, :h] * scale[:, None], check_finite=False)
-        coefficients *= scale[:, None]
-        schur = own - gram[h:, :h].T @ coefficients
-        used, cov = float(len(matrix)), np.zeros((0, TERMS, TERMS))
-        if thorough:
-            cov = _covariances(lower[0], scale)
-            used -= float(np.einsum("bii->", cov)) * PRIOR_SD**-2
-    schur = 0.5 * (schur + schur.T)
-    return Projected(schur, coefficients, evidence.rows - used, cov)
-
-
-def _covariances(lower: FloatArray, scale: FloatArray) -> FloatArray:
-    """Covariance of each block's terms (V, 6, 6), effects held."""
-    inverse = np.tril(dtrtri(lower, lower=1)[0]) * scale
-    n = len(inverse)
-    blocks = inverse.reshape(n, n // TERMS, TERMS).transpose(1, 2, 0)
-    return np.asarray(blocks @ blocks.transpose(0, 2, 1))
+        schur = own - half @ half.T
+    return Projected(0.5 * (schur + schur.T), own.diagonal().copy(), half, rows.factor)

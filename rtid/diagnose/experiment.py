@@ -51,7 +51,7 @@ def limits(fit: Fit) -> Limits:
     chunk = varied_supply(fit)
     if chunk is None or not fit.columns.candidates:
         return {}
-    other = one_pass(fit.declared, chunk, fit.weights, fit.revision, fit.map, bank=True)
+    other = one_pass(fit.declared, chunk, fit.weights, fit.revision, fit, bank=True)
     found: Limits = {}
     for k, candidate in enumerate(fit.columns.candidates):
         if candidate in fit.revision.effects or candidate not in other.columns.candidates:

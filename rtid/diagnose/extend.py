@@ -106,9 +106,9 @@ def extend(present: Standing, effect: str, where: str = "") -> Extension:
         choices = " or ".join(f"{effect}:{place}" for _, place in (best.key, *alike))
         raise RefusedError(f"{effect} explains as much at several places", f"name one: {choices}")
     now = best.fit or fit(
-        state.model, state.chunk, present.fit.weights, best.revision, present.fit.map, bank=False
+        state.model, state.chunk, present.fit.weights, best.revision, present.fit, bank=False
     )
-    now = one_pass(state.model, state.chunk, now.weights, now.revision, now.map, True)
+    now = one_pass(state.model, state.chunk, now.weights, now.revision, now, True)
     after = Standing.of(state, now)
     against = tuple(_against(present, after, best))
     return Extension(best.key, best.gain, present, after, against, _better(present, best))

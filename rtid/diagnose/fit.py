@@ -7,20 +7,20 @@ tolerance.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rtid.diagnose.bank import add_shapes, add_timing, cause_of, offer
 from rtid.diagnose.candidates import Candidate, Cause, Columns, Shape, Volumes
-from rtid.diagnose.causes import add_echoes, causes, softness
-from rtid.diagnose.evidence import Projected, collect, project
+from rtid.diagnose.causes import add_echoes, softness
+from rtid.diagnose.commands import commands, split, transformed
+from rtid.diagnose.evidence import Projected, Rows, project, rows_of
 from rtid.diagnose.regression import Estimate, Regression
-from rtid.diagnose.timing import TIMINGS, Psi, Timing
-from rtid.diagnose.timing import lagged as lagged_command
+from rtid.diagnose.revision import Revision
 from rtid.diagnose.view import FlowMap, View
-from rtid.estimator.factor import SHARED_PRIOR
+from rtid.estimator.factor import PRIOR_SD, SHARED_PRIOR
 from rtid.estimator.record import refined, run
 from rtid.estimator.solution import sketch
 from rtid.estimator.state import Weights, variance
@@ -32,34 +32,9 @@ SIZED = 0.05  # share by which compliances and sizes of effects may still change
 SETTLED = 0.2  # of a standard deviation: a step as short ends it
 REACH = 0.6  # of a timing parameter: the longest step
 SHAPE_REACH = 0.5  # the same of an effect's nonlinear parameter, in steps of its axis
-LAG_STEP_S = 5e-5
 RIDGE = 1e-9  # of the square of a shape's column: more than rounding leaves
 HELD = 1e30  # information of a parameter that is held
-
-IntArray = NDArray[np.int64]
-Timings = tuple[tuple[Timing, Psi], ...]
-
-
-@dataclass(frozen=True)
-class Revision:
-    """What was added to a model: effects with their shapes, timings with their parameters.
-
-    sizes: coefficients of the effects as fitted last, which weigh the rows.
-    """
-
-    effects: tuple[Candidate, ...] = ()
-    timings: Timings = ()
-    sizes: tuple[tuple[Candidate, float], ...] = ()
-
-    @property
-    def replaces_lag(self) -> bool:
-        """True where a timing stands for the declared lag of the spools."""
-        return any(timing.replaces_lag for timing, _ in self.timings)
-
-    def has(self, key: tuple[str, str]) -> bool:
-        """True where a cause is part of it."""
-        names = [t.effect for t, _ in self.timings]
-        return key in [e.key for e in self.effects] or key[0] in names
+NO_COV = np.zeros((0, TERMS, TERMS))  # of maps whose covariance nobody asked for
 
 
 @dataclass(frozen=True)
@@ -69,7 +44,8 @@ class Fit:
     declared: the machine as declared; model: the same with split commands; sent: the record with
     the commands as they reach the spools.  The columns of the regression are
     y, theta_beta per chamber, timing parameters, shapes up to `first`, candidates, echoes.
-    shapes: (effect, nonlinear parameter) of each column of shapes.
+    shapes: (effect, nonlinear parameter) of each column of shapes.  rows: of the record, for
+    another fit with the same commands and weights; large.
     """
 
     declared: Model
@@ -79,12 +55,12 @@ class Fit:
     revision: Revision
     view: View
     columns: Columns
-    projected: Projected
     regression: Regression
     estimate: Estimate
     map: FlowMap
     first: int
     shapes: tuple[tuple[int, int], ...] = ()
+    rows: Rows | None = None
 
     @property
     def rho(self) -> float:
@@ -101,6 +77,10 @@ class Fit:
     def first_given(self) -> int:
         """Number of columns before the given ones: y and theta_beta."""
         return 1 + len(self.model.chambers)
+
+    def light(self) -> Fit:
+        """The same without the rows."""
+        return replace(self, rows=None)
 
     def column(self, candidate: Candidate) -> int:
         """Column of a candidate."""
@@ -129,16 +109,15 @@ def fit(
     chunk: FloatArray,
     weights: Weights,
     revision: Revision,
-    start: FlowMap | None = None,
+    start: Fit | None = None,
     bank: bool = True,
 ) -> Fit:
-    """Fit a revision to chunk (n, 2 + signals); start: the map to begin with.
+    """Fit a revision to chunk (n, 2 + signals); start: the fit to begin with.
 
     bank: also make the columns of every candidate, to score them.
     """
     for _ in range(PASSES):
-        found = one_pass(model, chunk, weights, revision, start, bank=False, thorough=False)
-        start = found.map
+        start = found = one_pass(model, chunk, weights, revision, start, False, thorough=False)
         moved = _moved(found)
         if moved is None:
             break
@@ -151,222 +130,92 @@ def one_pass(
     chunk: FloatArray,
     weights: Weights,
     revision: Revision,
-    start: FlowMap | None,
+    start: Fit | None,
     bank: bool,
     more: Iterable[tuple[Cause, Shape]] = (),
     thorough: bool = True,
 ) -> Fit:
     """Fit with the timing parameters where they are; more: causes to add with other shapes.
 
-    thorough = False: SSE and coefficients alone.
+    start: the fit whose map gives the columns.  thorough = False: without the covariances of the
+    maps, and with them what the priors leave of their degrees of freedom.
     """
-    before = commands(model, chunk)
     if revision.replaces_lag:
         weights = replace(weights, lag_s=0.0)
     declared, sent = model, transformed(model, chunk, revision.timings)
     model = split(declared)
-    start = start or first_map(model, sent, weights)
-    view = View.of(model, sent, weights, start)
-    columns = Columns(len(chunk), len(model.chambers))
-    n_timing = _add_timing(view, columns, before, weights, revision)
-    shapes = tuple(_add_shapes(view, columns, revision))
-    _offer(view, columns, revision, bank, more)
+    soft = softened(model, sent, weights, revision.sizes)
+    rows = _same_rows(start, sent, weights, soft) or rows_of(model, sent, weights, soft=soft)
+    view = View.of(model, sent, weights, start.map if start else _map_alone(model, rows))
+    columns = Columns(rows.condensed)
+    n_timing = add_timing(view, columns, commands(declared, chunk), weights, revision)
+    shapes = tuple(add_shapes(view, columns, revision))
+    first = 1 + len(model.chambers) + n_timing + len(shapes)
+    offer(view, columns, revision, bank, more)
     add_echoes(view, columns, n_timing + len(shapes))
-    evidence = collect(model, sent, weights, columns.given(), soft=softened(view, revision.sizes))
-    projected = project(evidence, thorough)
-    n_c = len(model.chambers)
-    regression = _regression(
-        model, weights, revision, projected, columns, evidence.squares(), evidence.rows
-    )
-    first = 1 + n_c + n_timing + len(shapes)
+    projected = project(rows, columns.released())
+    cov = rows.factor.covariances if thorough else NO_COV
+    dof = rows.n - TERMS * len(rows.cells) + float(np.einsum("bii->", cov)) * PRIOR_SD**-2
+    regression = _regression(model, weights, revision, projected, columns, rows.n, dof)
     weak = slice(first - len(shapes), first)
     regression.prior[weak] = RIDGE * regression.own[weak]
     at = [first + columns.candidates.index(e) for e in revision.effects]
     estimate = regression.fit((*range(1, first), *at))
-    found = FlowMap(evidence.cells, _terms(projected, estimate), projected.cov)
-    parts = sent, weights, revision, view, columns, projected, regression, estimate
-    return Fit(declared, model, *parts, found, first, shapes)
+    found = FlowMap(rows.cells, projected.terms(list(estimate.used), estimate.theta), cov)
+    parts = sent, weights, revision, view, columns, regression, estimate
+    return Fit(declared, model, *parts, found, first, shapes, rows)
 
 
-def softened(view: View, sizes: tuple[tuple[Candidate, float], ...]) -> FloatArray:
+def _same_rows(
+    start: Fit | None, sent: FloatArray, weights: Weights, soft: FloatArray
+) -> Rows | None:
+    """The rows of a fit, where they are those of this record with these weights."""
+    if start is None or start.rows is None or start.weights.lag_s != weights.lag_s:
+        return None
+    known = start.weights
+    pairs = (
+        (known.slopes, weights.slopes),
+        (known.compliance, weights.compliance),
+        (known.missed, weights.missed),
+        (start.rows.soft, soft),
+        (start.sent, sent),
+    )
+    return start.rows if all(np.array_equal(a, b) for a, b in pairs) else None
+
+
+def softened(
+    model: Model, chunk: FloatArray, weights: Weights, sizes: tuple[tuple[Candidate, float], ...]
+) -> FloatArray:
     """What storage effects add to the white variance of each row's equation (n, chambers), m6.
 
     The noise of a pressure moves what is stored: sd_P times V / beta and the effects' own share.
     """
-    more = np.zeros((view.n, len(view.model.chambers)))
-    for c, chamber in enumerate(view.model.chambers):
+    view = View(model, chunk, weights.compliance, np.zeros((0, 0, 5)), np.zeros(0, bool))
+    more = np.zeros((view.n, len(model.chambers)))
+    for c, chamber in enumerate(model.chambers):
         own = sum((size * softness(view, c, e) for e, size in sizes), np.zeros(view.n))
         if own.any():
             plain = view.volume(c) * view.compliance[c]
-            noise = variance(view.model, chamber.pressure) * view.model.pressure_share
+            noise = variance(model, chamber.pressure) * model.pressure_share
             more[:, c] = ((plain + own) ** 2 - plain**2) * noise
     return more
 
 
-def split(model: Model) -> Model:
-    """The same machine with a command of its own for either direction of every command."""
-    signals, edges = list(model.signals), []
-    for name in sorted({edge.command for edge in model.edges}):
-        signal = model.signals[model.column(name)]
-        signals += [replace(signal, name=_half(name, d)) for d in (1, -1)]
-    for edge in model.edges:
-        edges.append(replace(edge, command=_half(edge.command, edge.direction)))
-    return replace(model, signals=tuple(signals), edges=tuple(edges))
-
-
-def _half(name: str, direction: int) -> str:
-    return name + ("+" if direction > 0 else "-")
-
-
-def commands(model: Model, chunk: FloatArray) -> dict[str, tuple[int, FloatArray]]:
-    """Direction and command (n,) as sent, by the names of the split machine."""
-    found: dict[str, tuple[int, FloatArray]] = {}
-    for name in sorted({edge.command for edge in model.edges}):
-        u = chunk[:, 2 + model.column(name)]
-        found |= {_half(name, d): (d, u) for d in (1, -1)}
-    return found
-
-
-def transformed(model: Model, chunk: FloatArray, timings: Timings) -> FloatArray:
-    """The record of the split machine: commands as the timings let them reach the spools."""
-    dt_s = float(np.median(np.diff(chunk[:, 0])))
-    sent = [_through(u, d, dt_s, timings) for d, u in commands(model, chunk).values()]
-    return np.column_stack([chunk, *sent])
-
-
-def _through(u: FloatArray, direction: int, dt_s: float, timings: Timings) -> FloatArray:
-    for timing, psi in timings:
-        u = timing.on(u, direction, dt_s, psi)
-    return u
+def columns_of_effects(found: Fit) -> list[Volumes]:
+    """Volumes per interval of the effects of a fit, for coefficients of 1."""
+    return [cause_of(found.view, e).column(e.shape) for e in found.revision.effects]
 
 
 def first_map(model: Model, chunk: FloatArray, weights: Weights) -> FlowMap:
     """The maps fitted without any effect."""
-    evidence = collect(model, chunk, weights, Columns(len(chunk), len(model.chambers)).given())
-    projected, n_c = project(evidence, thorough=False), len(model.chambers)
+    return _map_alone(model, rows_of(model, chunk, weights))
+
+
+def _map_alone(model: Model, rows: Rows) -> FlowMap:
+    projected, n_c = project(rows, ()), len(model.chambers)
     s = projected.schur
     theta = np.asarray(np.linalg.solve(s[1:, 1:] + SHARED_PRIOR * np.eye(n_c), s[1:, 0]))
-    estimate = Estimate(tuple(range(1, 1 + n_c)), theta, np.eye(n_c), 0.0)
-    return FlowMap(evidence.cells, _terms(projected, estimate), projected.cov)
-
-
-def _terms(projected: Projected, estimate: Estimate) -> FloatArray:
-    taken = projected.coefficients[:, list(estimate.used)] @ estimate.theta
-    return np.asarray((projected.coefficients[:, 0] - taken).reshape(-1, TERMS))
-
-
-def _add_timing(
-    view: View, columns: Columns, sent: dict[str, tuple[int, FloatArray]], weights: Weights,
-    revision: Revision,
-) -> int:  # fmt: skip
-    """Derivative columns of the lag and of every timing parameter; their number.
-
-    sent: the commands before any timing.
-    """
-    dt_s, n = view.step_s, 0
-    if not revision.replaces_lag:
-        above, below = weights.lag_s + LAG_STEP_S, max(0.0, weights.lag_s - LAG_STEP_S)
-        change = {}
-        for name in sent:
-            u = view.signal(name)
-            rise = lagged_command(u, dt_s, (above,)) - lagged_command(u, dt_s, (below,))
-            change[name] = rise / (above - below)
-        columns.add(opening_change(view, change))
-        n += 1
-    for k, (_, psi) in enumerate(revision.timings):
-        for j in range(len(psi)):
-            change = {
-                name: _change(u, d, dt_s, revision.timings, k, j) for name, (d, u) in sent.items()
-            }
-            columns.add(opening_change(view, change))
-            n += 1
-    return n
-
-
-def _add_shapes(view: View, columns: Columns, revision: Revision) -> Iterator[tuple[int, int]]:
-    """Derivative columns of the nonlinear parameters of effects, but for those at a bound."""
-    for e, effect in enumerate(revision.effects):
-        cause = _cause(view, effect)
-        for k, value in enumerate(effect.shape):
-            low, high = cause.bounds(k)
-            slope = cause.slope(effect.shape, k) if low < value < high else {}
-            if any(np.any(series != 0.0) for series in slope.values()):
-                columns.add(slope)
-                yield e, k
-
-
-def _cause(view: View, effect: Candidate) -> Cause:
-    return next(cause for cause in causes(view) if cause.makes(effect))
-
-
-def _change(
-    u: FloatArray, direction: int, dt_s: float, timings: Timings, k: int, j: int
-) -> FloatArray:
-    """How the command at the spool follows parameter j of timing k, those behind it held."""
-    timing, psi = timings[k]
-    before = _through(u, direction, dt_s, timings[:k])
-    change = timing.change(before, direction, dt_s, psi, j)
-    for behind, held in timings[k + 1 :]:  # linear ones pass it on, play lets it through
-        if behind.is_linear:
-            change = behind.apply(change, dt_s, held)
-    return change
-
-
-def opening_change(view: View, change: dict[str, FloatArray]) -> Volumes:
-    """Volumes per interval and chamber of a small change of the commands (n,), in the blocks."""
-    flows = [
-        view.slope_u(i) * edge.direction * change[edge.command][:-1]
-        for i, edge in enumerate(view.model.edges)
-    ]
-    n_c = len(view.model.chambers)
-    return {c: view.into_chamber(c, flows) * view.dt_s for c in range(n_c)}
-
-
-def _offer(
-    view: View,
-    columns: Columns,
-    revision: Revision,
-    bank: bool,
-    more: Iterable[tuple[Cause, Shape]],
-) -> None:
-    """Columns of the revision's effects, and of all that is to be scored."""
-    for cause in causes(view) if bank or revision.effects else ():
-        own = [e for e in revision.effects if cause.makes(e)]
-        for effect in own:
-            columns.offer(effect, cause.column(effect.shape))
-        if bank and not own and cause.offered:
-            for shape in cause.shapes:
-                columns.offer(cause.at(shape), cause.column(shape))
-    for cause, shape in more:
-        columns.offer(cause.at(shape), cause.column(shape))
-    if bank:
-        _offer_timings(view, columns, revision)
-
-
-def _offer_timings(view: View, columns: Columns, revision: Revision) -> None:
-    """What each timing of the bank would change, first order in the opening; coefficient 1."""
-    names = {e.command: e.direction for e in view.model.edges}
-    for timing in TIMINGS:
-        if revision.has((timing.effect, "command")) or timing.own_spools:
-            continue
-        for psi in timing.bank:
-            change = {
-                name: timing.on(view.signal(name), d, view.step_s, psi) - view.signal(name)
-                for name, d in names.items()
-            }
-            columns.offer(
-                Candidate(
-                    timing.effect,
-                    "command",
-                    "share",
-                    "1",
-                    20.0,
-                    shape=psi[:1],
-                    shape_names=timing.parameters[:1],
-                    shape_units=timing.units[:1],
-                ),
-                opening_change(view, change),
-            )
+    return FlowMap(rows.cells, projected.terms(list(range(1, 1 + n_c)), theta), NO_COV)
 
 
 def _regression(
@@ -375,8 +224,8 @@ def _regression(
     revision: Revision,
     projected: Projected,
     columns: Columns,
-    own: FloatArray,
     rows: int,
+    dof: float,
 ) -> Regression:
     n_c, head = len(model.chambers), len(projected.schur)
     noise, prior, mean = np.zeros((head, head)), np.zeros(head), np.zeros(head)
@@ -388,7 +237,7 @@ def _regression(
         tolerance = model.lag.tolerance_s
         prior[1 + n_c] = tolerance**-2 if tolerance > 0 else HELD
         mean[1 + n_c] = model.lag.nominal_s - weights.lag_s
-    return Regression(projected.schur, noise, prior, mean, own[:head], projected.dof, rows)
+    return Regression(projected.schur, noise, prior, mean, projected.own, dof, rows)
 
 
 def _moved(found: Fit) -> tuple[Revision, Weights] | None:
@@ -428,7 +277,7 @@ def _moved(found: Fit) -> tuple[Revision, Weights] | None:
 def _reshaped(found: Fit, effect: Candidate) -> Candidate:
     """An effect with its nonlinear parameters moved by what their derivatives took."""
     size, shape = found.estimate.value(found.column(effect)), list(effect.shape)
-    cause = _cause(found.view, effect)
+    cause = cause_of(found.view, effect)
     if size == 0.0:
         return effect
     for k, at in found.shape_columns(effect).items():

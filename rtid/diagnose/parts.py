@@ -11,7 +11,9 @@ from dataclasses import dataclass, replace
 
 from rtid.diagnose.candidates import Candidate
 from rtid.diagnose.causes import causes
-from rtid.diagnose.fit import Fit, Revision, first_map, split, transformed
+from rtid.diagnose.commands import split, transformed
+from rtid.diagnose.fit import Fit, first_map
+from rtid.diagnose.revision import Revision
 from rtid.diagnose.timing import TIMINGS, Psi, Timing
 from rtid.diagnose.view import View
 from rtid.errors import RtidError

@@ -12,7 +12,8 @@ import numpy as np
 
 from rtid.diagnose.candidates import Candidate
 from rtid.diagnose.causes import SEED, causes, softness
-from rtid.diagnose.fit import Fit, transformed
+from rtid.diagnose.commands import transformed
+from rtid.diagnose.fit import Fit
 from rtid.diagnose.view import View
 from rtid.estimator.state import variance
 from rtid.kernels.explain import filter_rows

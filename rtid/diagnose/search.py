@@ -12,8 +12,9 @@ from dataclasses import replace
 import numpy as np
 
 from rtid.diagnose.candidates import Columns
-from rtid.diagnose.evidence import collect, project
-from rtid.diagnose.fit import Fit, Timings, prepare, split, transformed
+from rtid.diagnose.commands import Timings, split, transformed
+from rtid.diagnose.evidence import project, rows_of
+from rtid.diagnose.fit import Fit, columns_of_effects, prepare
 from rtid.diagnose.timing import Psi, Timing
 from rtid.estimator.state import Weights
 from rtid.model import FloatArray, Grid, Model
@@ -79,10 +80,10 @@ class Search:
         weights = self.weights
         if any(t.replaces_lag for t, _ in timings):
             weights = replace(weights, lag_s=0.0)
-        columns = Columns(len(sent), len(self.model.chambers))
-        for effect in beside.revision.effects:
-            columns.add(beside.columns.volumes(beside.column(effect) - beside.first_given))
-        evidence = collect(self.split, sent, weights, columns.given(), row_s=ROW_S)
-        s = project(evidence, thorough=False).schur
+        rows = rows_of(self.split, sent, weights, ROW_S)
+        columns = Columns(rows.condensed)
+        for volumes in columns_of_effects(beside):
+            columns.add(volumes)
+        s = project(rows, columns.released()).schur
         theta = np.linalg.lstsq(s[1:, 1:], s[1:, 0], rcond=1e-12)[0]
         return float(s[0, 0] - s[0, 1:] @ theta)

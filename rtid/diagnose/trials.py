@@ -13,10 +13,11 @@ import numpy as np
 
 from rtid.diagnose.candidates import Candidate
 from rtid.diagnose.causes import causes
-from rtid.diagnose.fit import Fit, Revision, fit, one_pass
+from rtid.diagnose.fit import Fit, fit, one_pass
 from rtid.diagnose.parts import Part
 from rtid.diagnose.regression import LIMIT_SD, Score
 from rtid.diagnose.residual import Residual, residual
+from rtid.diagnose.revision import Revision
 from rtid.diagnose.search import Search
 from rtid.diagnose.timing import TIMINGS, Psi, Timing
 from rtid.model import FloatArray, Model
@@ -161,7 +162,7 @@ def refined(state: State, present: Fit, trials: list[Trial]) -> list[Trial]:
             for shape in cause.about(effects[cause.candidate.key].shape, 0.5**k)
         ]
         finer = one_pass(
-            state.model, state.chunk, present.weights, present.revision, present.map, False, more
+            state.model, state.chunk, present.weights, present.revision, present, False, more
         )
         best = best_by_key(finer, scored(finer))
         for key in list(open_):
@@ -212,7 +213,7 @@ def exact_trials(
             continue
         exact, key = present.estimate.sse - now.estimate.sse, (timing.effect, "command")
         if key not in trials or exact > trials[key].gain:
-            trials[key] = Trial(key, exact, now.revision, now)
+            trials[key] = Trial(key, exact, now.revision, now.light())
     return list(trials.values())
 
 

@@ -1,17 +1,15 @@
-"""Whitened rows of every column at once, for the diagnosis of a record.
+"""A record as rows: what each row holds of y, of -V dP and of the maps, and how rows are whitened.
 
-Columns stand in the order
+Rows are means over m = `group` measured positions.  An increment that comes after i of them is in
+the mean with the share a = (m - i) / m, and the rest of it is added after the row.  So the flow
+noise q of an interval enters the row and the gap alike, and the whitener of `rows` becomes one with
+correlated noise:
 
-    [ y | theta_beta per chamber | given series | 6 terms per block that still rings ]
+    S = P + sum a^2 q + R / m,  K = (P + sum a q) S^-1,  P <- P + sum q - K S K'
 
-A *given* column is any flow, integrated per interval beforehand.  Rows are means over m = `group`
-measured positions.  An increment that comes after i of them is in the mean with the share
-a = (m - i) / m, and the rest of it is added after the row.  So the flow noise q of an interval
-enters the row and the gap alike, and the whitener of `rows` becomes one with correlated noise:
-
-    S = P + sum a^2 q + R / m,  K = (P + sum a q) S^-1,  P <- P + sum q - K S K',  d <- d - K d
-
-with row = L^-1 d as before; for m = 1 it is the same.
+With b_r what a column adds to row r, its rows are  d_r = (I - K_r-1) d_r-1 + b_r,  L_r^-1 d_r,
+with L L' = S; for m = 1 it is the same as in `rows`.  All of it is known before any column is: the
+columns of the maps are kept as they are, six terms per row and block that moved.
 """
 
 from __future__ import annotations
@@ -22,155 +20,121 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rtid.kernels.engine import (
-    GAP_FLAG,
-    ROW_FLAG,
-    SHUT,
-    acceptable,
-    commanded,
-    remember,
-    set_step,
-    step_s,
-    working_points,
-)
+from rtid.kernels.engine import ROW_FLAG, SHUT, remember
 from rtid.kernels.increments import flow_noise, mean_terms
 from rtid.kernels.jit import inlined, kernel, part
 from rtid.kernels.layout import TERMS
-from rtid.kernels.rows import position_noise, start_whitener
+from rtid.kernels.rows import over, position_noise
+from rtid.kernels.taking import begin, take
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-IN_GROUP, N_LOCAL, N_ROWS, N_HEAD = range(4)  # entries of `counts`
-# entries of `noise`: P, the flow noise since the last row times 1, a and a^2, and the last row's S
-GAP, PLAIN, SHARED, SQUARED, LAST = range(5)
+IN_GROUP, N_ROWS, N_ENTRIES, GROUP_AT = range(4)  # entries of `counts`
+# entries of `noise`: P, and the flow noise since the last row times 1, a and a^2
+GAP, PLAIN, SHARED, SQUARED = range(4)
+NO_ROW = -1
 
 
 @kernel
-def collect(
+def integrate(
     engine: Any,
     cells: Any,
     chunk: FloatArray,
-    first: int,
-    last: int,
-    group: int,
-    series: FloatArray,
-    source: IntArray,
-    sign: FloatArray,
     soft: FloatArray,
-    d: FloatArray,
-    later: FloatArray,
-    place: IntArray,
-    cell_of: IntArray,
+    first: int,
+    group: int,
     counts: IntArray,
     noise: FloatArray,
-    rows: FloatArray,
+    row_of: IntArray,
+    share: FloatArray,
+    own: FloatArray,
+    fresh: NDArray[np.bool_],
+    whiten: FloatArray,
+    keep: FloatArray,
+    start: IntArray,
+    cell: IntArray,
+    terms: FloatArray,
 ) -> int:
-    """Rows of the samples first <= k < last of chunk (n, 2 + signals); returns where it stopped.
+    """Rows of the samples k >= first of chunk (n, 2 + signals); returns where it stopped.
 
-    engine (1,), cells: a freshly built state.  series (n - 1, s): volumes per interval, m3; given
-    column j takes sign[j, c] times series source[j, c] in chamber c.  soft (n, chambers): white
-    variance of a row at each sample beyond that of the declared model, m6.  d, later (chambers,
-    width):
-    state of the columns and what is due after the next row; place (cells,): local place of a cell's
-    block or -1; cell_of (places,): the inverse; counts, noise (5, 2, 2): see above; rows (most,
-    chambers, width): whitened rows.  All of these are changed in place.  Stops early when places
-    or rows run out.
+    engine (1,), cells: a freshly built state.  soft (n, chambers): white variance of a row at each
+    sample beyond that of the declared model, m6.  row_of, share (n - 1,): row of an interval or -1,
+    and its share a.  own (rows + 1, 2, 3): y and theta_beta per chamber; fresh (rows,): the row has
+    none before it; whiten (rows, 3): 1 / L00, S01 / L00, 1 / L11; keep (rows, 2, 2): I - K.  Group
+    r has the entries start[r] to start[r + 1] of cell (most,) and terms (most, 2, 6): what an open
+    block adds to row r and to the next, m3 into a chamber that the edge feeds.  counts (4,),
+    noise (4, 2, 2): see above.  All of these are changed in place.  Stops early when entries run
+    out.
     """
     e = engine[0]
-    for k in range(first, last):
-        if counts[N_ROWS] >= len(rows) or counts[N_LOCAL] + e.n_edges > len(cell_of):
+    for k in range(first, len(chunk)):
+        if counts[N_ENTRIES] + e.n_edges > len(cell):
             return k
-        whole, joined, dt = _take(e, chunk, k)
+        whole, joined, dt = take(e, chunk, k)
         sample, flags = e.sample, int(e.sample[1])
         if joined:
-            share = (group - counts[IN_GROUP]) / group
-            _add_head(e, sample, dt, share, series[k - 1], source, sign, d, later)
-            _add_blocks(e, cells, dt, share, d, later, place, cell_of, counts)
-            _count_noise(e, share, noise)
+            a, r = (group - counts[IN_GROUP]) / group, counts[N_ROWS]
+            row_of[k - 1], share[k - 1] = r, a
+            _add_own(e, sample, dt, a, own[r], own[r + 1])
+            _add_blocks(e, cells, dt, a, counts, start[r], cell, terms)
+            _count_noise(e, a, noise)
             remember(e, sample)
             if (flags & ROW_FLAG) != 0:
                 counts[IN_GROUP] += 1
                 if counts[IN_GROUP] == group:
-                    _whiten(e, soft[k], d, later, counts, noise, rows)
+                    _close_row(e, soft[k], noise, whiten[r], keep[r])
+                    counts[IN_GROUP], counts[GROUP_AT] = 0, k
+                    counts[N_ROWS] += 1
+                    start[r + 1] = counts[N_ENTRIES]
         else:
             e.running = 0
             if whole and (flags & ROW_FLAG) != 0:
-                _begin(e, sample, group, soft[k], d, later, counts, noise)
-    return last
+                begin(e, sample)
+                row_of[counts[GROUP_AT] : k] = NO_ROW
+                _begin_rows(e, soft[k], group, counts, noise, own, fresh, start)
+                counts[GROUP_AT] = k
+    return len(chunk)
 
 
 @inlined
-def _take(e: Any, chunk: FloatArray, k: int) -> tuple[bool, bool, float]:
-    """Sample k into e.sample: (it can be used, it continues the last one on the grids, step)."""
-    for j in range(2 + e.n_signals):
-        e.sample[j] = chunk[k, j]
-    sample, flags, dt = e.sample, int(e.sample[1]), step_s(e, e.sample[0])
-    whole = acceptable(e, sample)
-    joined = whole and e.running and 0.0 < dt <= e.max_gap_s and (flags & GAP_FLAG) == 0
-    if joined:
-        if dt != e.dt_s:
-            set_step(e, dt)
-        joined = working_points(e, sample, dt)[0]
-    return whole, joined, dt
-
-
-@inlined
-def _begin(
+def _begin_rows(
     e: Any,
-    sample: FloatArray,
-    group: int,
     soft: FloatArray,
-    d: FloatArray,
-    later: FloatArray,
+    group: int,
     counts: IntArray,
     noise: FloatArray,
+    own: FloatArray,
+    fresh: NDArray[np.bool_],
+    start: IntArray,
 ) -> None:
-    """Start at one measured position, which has `group` times the white noise of a row."""
-    remember(e, sample)
-    e.running = 1
-    for i in range(e.n_edges):
-        e.w_v[i] = commanded(e, i)
-        e.cell[i, 0] = SHUT
-    start_whitener(e)
+    """Forget a group that was begun; one position has `group` times the white noise of a row."""
+    r = counts[N_ROWS]
+    counts[IN_GROUP], counts[N_ENTRIES] = 0, start[r]
     noise[:] = 0.0
     for c in range(e.n_chambers):
         for b in range(e.n_chambers):
             noise[GAP, c, b] = group * (e.cov[c, b] + (soft[c] if b == c else 0.0))
-            noise[LAST, c, b] = noise[GAP, c, b]
             e.cov[c, b] = 0.0
-    counts[IN_GROUP] = 0
-    d[:] = 0.0
-    later[:] = 0.0
+    own[r : r + 2] = 0.0
+    if r < len(fresh):
+        fresh[r] = True
 
 
 @inlined
-def _add_head(
-    e: Any,
-    sample: FloatArray,
-    dt: float,
-    share: float,
-    series: FloatArray,
-    source: IntArray,
-    sign: FloatArray,
-    d: FloatArray,
-    later: FloatArray,
+def _add_own(
+    e: Any, sample: FloatArray, dt: float, a: float, now: FloatArray, later: FloatArray
 ) -> None:
-    """What the interval adds to y, -V dP and the given columns."""
-    x0, x1, given = e.values[e.x_column], sample[2 + e.x_column], 1 + e.n_chambers
+    """What the interval adds to y and -V dP, now and in the next row."""
+    x0, x1 = e.values[e.x_column], sample[2 + e.x_column]
     for c in range(e.n_chambers):
         dx = e.area_m2[c] * (x1 - x0)
         v = e.v0_m3[c] + 0.5 * e.area_m2[c] * (x0 + x1)
         dp = -e.compliance[c] * v * (sample[2 + e.p_column[c]] - e.values[e.p_column[c]])
-        d[c, 0] += share * dx
-        later[c, 0] += (1.0 - share) * dx
-        d[c, 1 + c] += share * dp
-        later[c, 1 + c] += (1.0 - share) * dp
-        for j in range(len(source)):
-            if sign[j, c] != 0.0:
-                value = sign[j, c] * series[source[j, c]]
-                d[c, given + j] += share * value
-                later[c, given + j] += (1.0 - share) * value
+        now[c, 0] += a * dx
+        later[c, 0] += (1.0 - a) * dx
+        now[c, 1 + c] += a * dp
+        later[c, 1 + c] += (1.0 - a) * dp
         e.cov[c, c] += e.q_floor[c] * dt
 
 
@@ -179,12 +143,11 @@ def _add_blocks(
     e: Any,
     cells: Any,
     dt: float,
-    share: float,
-    d: FloatArray,
-    later: FloatArray,
-    place: IntArray,
-    cell_of: IntArray,
+    a: float,
     counts: IntArray,
+    first: int,
+    cell: IntArray,
+    terms: FloatArray,
 ) -> None:
     """What the interval adds to the terms of the blocks that the working points are in."""
     for i in range(e.n_edges):
@@ -192,79 +155,80 @@ def _add_blocks(
         if e.cell[i, 0] == SHUT:
             continue
         at = e.first_cell[i] + e.cell[i, 0] * e.n_dp[i] + e.cell[i, 1]
-        if place[at] < 0:
-            place[at] = counts[N_LOCAL]
-            cell_of[counts[N_LOCAL]] = at
-            counts[N_LOCAL] += 1
+        n = first
+        while n < counts[N_ENTRIES] and cell[n] != at:
+            n += 1
+        if n == counts[N_ENTRIES]:
+            cell[n] = at
+            terms[n] = 0.0
+            counts[N_ENTRIES] += 1
         mean_terms(e, i, e.cell[i, 0], e.cell[i, 1])
-        column = counts[N_HEAD] + TERMS * place[at]
-        for c in range(e.n_chambers):
-            flow = e.sign[i, c] * e.scale_m3s[i] * dt
-            for j in range(TERMS):
-                d[c, column + j] += share * flow * e.phi[j]
-                later[c, column + j] += (1.0 - share) * flow * e.phi[j]
+        flow = e.scale_m3s[i] * dt
+        for j in range(TERMS):
+            terms[n, 0, j] += a * flow * e.phi[j]
+            terms[n, 1, j] += (1.0 - a) * flow * e.phi[j]
         flow_noise(e, i, cells[at].slope, cells[at].missed, dt)
 
 
 @inlined
-def _count_noise(e: Any, share: float, noise: FloatArray) -> None:
+def _count_noise(e: Any, a: float, noise: FloatArray) -> None:
     """Move the flow noise of one interval from e.cov to where the next row finds it."""
     for c in range(e.n_chambers):
         for b in range(e.n_chambers):
             q = e.cov[c, b]
             noise[PLAIN, c, b] += q
-            noise[SHARED, c, b] += share * q
-            noise[SQUARED, c, b] += share * share * q
+            noise[SHARED, c, b] += a * q
+            noise[SQUARED, c, b] += a * a * q
             e.cov[c, b] = 0.0
 
 
 @part
-def _whiten(
-    e: Any,
-    soft: FloatArray,
-    d: FloatArray,
-    later: FloatArray,
-    counts: IntArray,
-    noise: FloatArray,
-    rows: FloatArray,
+def _close_row(
+    e: Any, soft: FloatArray, noise: FloatArray, whiten: FloatArray, keep: FloatArray
 ) -> None:
-    """One whitened row of all columns, then d <- d - K d + what was due later."""
-    n, row = counts[N_HEAD] + TERMS * counts[N_LOCAL], rows[counts[N_ROWS]]
+    """L and I - K of one row, and P behind it."""
     s00 = noise[GAP, 0, 0] + noise[SQUARED, 0, 0] + position_noise(e, 0, 0) + soft[0]
     c00 = noise[GAP, 0, 0] + noise[SHARED, 0, 0]
-    i0, noise[LAST, 0, 0] = 1.0 / math.sqrt(s00), s00
+    i0 = 1.0 / math.sqrt(s00)
     if e.n_chambers == 1:
-        keep = 1.0 - c00 / s00
-        for j in range(n):
-            row[0, j] = i0 * d[0, j]
-            d[0, j] = keep * d[0, j] + later[0, j]
+        whiten[0], keep[0, 0] = i0, 1.0 - c00 / s00
         noise[GAP, 0, 0] += noise[PLAIN, 0, 0] - c00 * c00 / s00
     else:
         s01 = noise[GAP, 0, 1] + noise[SQUARED, 0, 1] + position_noise(e, 0, 1)
         s11 = noise[GAP, 1, 1] + noise[SQUARED, 1, 1] + position_noise(e, 1, 1) + soft[1]
         c01 = noise[GAP, 0, 1] + noise[SHARED, 0, 1]
         c11 = noise[GAP, 1, 1] + noise[SHARED, 1, 1]
-        half, noise[LAST, 1, 1] = s01 * i0, s11
-        i1 = 1.0 / math.sqrt(s11 - half * half)
+        half = s01 * i0
+        whiten[0], whiten[1], whiten[2] = i0, half, 1.0 / math.sqrt(s11 - half * half)
         det = 1.0 / (s00 * s11 - s01 * s01)
-        k00, k01 = (c00 * s11 - c01 * s01) * det, (c01 * s00 - c00 * s01) * det
-        k10, k11 = (c01 * s11 - c11 * s01) * det, (c11 * s00 - c01 * s01) * det
-        for j in range(n):
-            d0, d1 = d[0, j], d[1, j]
-            row[0, j] = i0 * d0
-            row[1, j] = i1 * (d1 - half * i0 * d0)
-            d[0, j] = d0 - k00 * d0 - k01 * d1 + later[0, j]
-            d[1, j] = d1 - k10 * d0 - k11 * d1 + later[1, j]
+        k00, k01, k10, k11 = over(c00, c01, c11, s00, s01, s11, det)
+        keep[0, 0], keep[0, 1], keep[1, 0], keep[1, 1] = 1.0 - k00, -k01, -k10, 1.0 - k11
         noise[GAP, 0, 0] += noise[PLAIN, 0, 0] - k00 * c00 - k01 * c01
         noise[GAP, 1, 1] += noise[PLAIN, 1, 1] - k10 * c01 - k11 * c11
         noise[GAP, 0, 1] += noise[PLAIN, 0, 1] - 0.5 * (
             k00 * c01 + k01 * c11 + k10 * c00 + k11 * c01
         )
         noise[GAP, 1, 0] = noise[GAP, 0, 1]
-    noise[PLAIN:LAST] = 0.0
-    later[:, :n] = 0.0
-    counts[IN_GROUP] = 0
-    counts[N_ROWS] += 1
+    noise[PLAIN:] = 0.0
+
+
+@kernel
+def condense(
+    series: FloatArray,
+    row_of: IntArray,
+    share: FloatArray,
+    fresh: NDArray[np.bool_],
+    out: FloatArray,
+) -> None:
+    """What a series (n - 1,) per interval adds to each row; out (rows,) is changed in place."""
+    rows = len(out)
+    out[:] = 0.0
+    for k in range(len(series)):
+        r, a = row_of[k], share[k]
+        if 0 <= r < rows:
+            out[r] += a * series[k]
+            if r + 1 < rows and not fresh[r + 1]:
+                out[r + 1] += (1.0 - a) * series[k]
 
 
 @kernel
@@ -286,7 +250,7 @@ def follow_map(
     """
     e = engine[0]
     for k in range(len(chunk)):
-        whole, joined, _ = _take(e, chunk, k)
+        whole, joined, _ = take(e, chunk, k)
         sample, flags = e.sample, int(e.sample[1])
         if joined:
             _map_at(e, theta, cov, along[k - 1], cell[k - 1])
@@ -297,11 +261,7 @@ def follow_map(
             cell[k - 1] = SHUT
         e.running = 0
         if whole and (flags & ROW_FLAG) != 0:
-            remember(e, sample)
-            e.running = 1
-            for i in range(e.n_edges):
-                e.w_v[i] = commanded(e, i)
-                e.cell[i, 0] = SHUT
+            begin(e, sample)
 
 
 @part
@@ -331,14 +291,3 @@ def _map_at(e: Any, theta: FloatArray, cov: FloatArray, along: FloatArray, cell:
         along[i, 2] = hu * (th[1] + 2.0 * th[3] * phi[1] + th[5] * phi[2])
         along[i, 3] = hp * (th[2] + 2.0 * th[4] * phi[2] + th[5] * phi[1])
         along[i, 4] = math.sqrt(max(0.0, variance))
-
-
-@kernel
-def add_products(total: FloatArray, columns: IntArray, gram: FloatArray) -> None:
-    """Lower triangle of total[columns, columns] += gram, in place."""
-    for i in range(len(columns)):
-        at = columns[i]
-        row, own = total[at], gram[i]
-        for j in range(len(columns)):
-            if columns[j] <= at:
-                row[columns[j]] += own[j]

@@ -12,22 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rtid.kernels.engine import (
-    GAP_FLAG,
-    ROW_FLAG,
-    SHUT,
-    acceptable,
-    commanded,
-    remember,
-    set_step,
-    step_s,
-    working_points,
-)
+from rtid.kernels.engine import ROW_FLAG, SHUT, remember
 from rtid.kernels.holds import second_order
 from rtid.kernels.increments import flow_noise, mean_terms, mean_windowed, term_rates
 from rtid.kernels.jit import inlined, kernel, part
 from rtid.kernels.layout import TAYLOR, TERMS
-from rtid.kernels.rows import fade, innovations, start_whitener
+from rtid.kernels.rows import fade, innovations
+from rtid.kernels.taking import begin, take
 
 FloatArray = NDArray[np.float64]
 
@@ -57,21 +48,14 @@ def explain(
     e = engine[0]
     gap, work = np.zeros(2), np.zeros((2, 2))
     for k in range(len(chunk)):
-        for j in range(2 + e.n_signals):
-            e.sample[j] = chunk[k, j]
-        sample, flags, dt = e.sample, int(e.sample[1]), step_s(e, e.sample[0])
-        whole = acceptable(e, sample)
-        joined = whole and e.running and dt > 0.0 and dt <= e.max_gap_s
-        joined = joined and (flags & GAP_FLAG) == 0
+        whole, joined, dt = take(e, chunk, k)
+        sample, flags = e.sample, int(e.sample[1])
         if k > 0:
             flow[k - 1] = np.nan
             innovation[k - 1] = np.nan
             cell[k - 1] = SHUT
-            if joined:
-                joined = _one(
-                    e, cells, theta, compliance, sample, dt, flow[k - 1], cell[k - 1], gap
-                )
         if joined:
+            _one(e, cells, theta, compliance, sample, dt, flow[k - 1], cell[k - 1], gap)
             remember(e, sample)
             if (flags & ROW_FLAG) != 0:
                 _innovate(e, gap, work, innovation[k - 1])
@@ -79,17 +63,7 @@ def explain(
             e.running = 0
             gap[:] = 0.0
             if whole and (flags & ROW_FLAG) != 0:
-                _begin(e, sample)
-
-
-@inlined
-def _begin(e: Any, sample: FloatArray) -> None:
-    remember(e, sample)
-    e.running = 1
-    for i in range(e.n_edges):
-        e.w_v[i] = commanded(e, i)
-        e.cell[i, 0] = SHUT
-    start_whitener(e)
+                begin(e, sample)
 
 
 @inlined
@@ -103,12 +77,8 @@ def _one(
     flow: FloatArray,
     cell: Any,
     gap: FloatArray,
-) -> bool:
-    """One interval; False where a working point is off the grid."""
-    if dt != e.dt_s:
-        set_step(e, dt)
-    if not working_points(e, sample, dt)[0]:
-        return False
+) -> None:
+    """One interval, whose working points are on the grids."""
     x0, x1 = e.values[e.x_column], sample[2 + e.x_column]
     for c in range(e.n_chambers):
         rate = (sample[2 + e.p_column[c]] - e.values[e.p_column[c]]) / dt
@@ -130,7 +100,6 @@ def _one(
             flow_noise(e, i, cells[at].slope, cells[at].missed, dt)
     for c in range(e.n_chambers):
         gap[c] += (flow[MEASURED + 2 * c] - flow[MODELLED + 2 * c]) * dt
-    return True
 
 
 @inlined

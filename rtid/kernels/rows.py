@@ -101,6 +101,19 @@ def _add_column_noise(
     echo[2] = k10 * k10 * s00 + 2.0 * k10 * k11 * s01 + k11 * k11 * s11 + b * b * v
 
 
+@inlined
+def over(
+    c00: float, c01: float, c11: float, s00: float, s01: float, s11: float, det: float
+) -> tuple[float, float, float, float]:
+    """C S^-1 of two symmetric matrices, row by row; det = 1 / (s00 s11 - s01^2)."""
+    return (
+        (c00 * s11 - c01 * s01) * det,
+        (c01 * s00 - c00 * s01) * det,
+        (c01 * s11 - c11 * s01) * det,
+        (c11 * s00 - c01 * s01) * det,
+    )
+
+
 @part
 def integral_row_one(e: Any) -> None:
     """Row and decay for one chamber."""
@@ -131,8 +144,7 @@ def integral_row_two(e: Any) -> None:
     half = s01 * i0
     i1 = 1.0 / math.sqrt(s11 - half * half)
     det = 1.0 / (s00 * s11 - s01 * s01)
-    k00, k01 = (r00 * s11 - r01 * s01) * det, (r01 * s00 - r00 * s01) * det
-    k10, k11 = (r01 * s11 - r11 * s01) * det, (r11 * s00 - r01 * s01) * det
+    k00, k01, k10, k11 = over(r00, r01, r11, s00, s01, s11, det)
     for j in range(n):
         d0, d1 = d[0, j], d[1, j]
         row[0, j] = i0 * d0

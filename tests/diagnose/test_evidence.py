@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from rtid.diagnose import evidence
-from rtid.diagnose.evidence import Given, collect, project
+from rtid.diagnose.candidates import Volumes
+from rtid.diagnose.evidence import Rows, project, rows_of
 from rtid.estimator.record import run
 from rtid.estimator.state import build, nominal_weights
 from rtid.estimator.sums import Sums
@@ -23,12 +24,12 @@ from tests.diagnose.records import record
 ROOT = Path(__file__).parents[2]
 
 
-def nothing(n: int) -> Given:
-    return Given(np.zeros((n - 1, 1)), np.zeros((0, 2), np.int64), np.zeros((0, 2)))
-
-
-def full(gram: np.ndarray) -> np.ndarray:
-    return np.tril(gram) + np.tril(gram, -1).T
+def gram_of(rows: Rows, given: list[Volumes] | None = None) -> np.ndarray:
+    """Products of all columns: head, then maps."""
+    own, cross = rows.head(given or [])
+    maps = rows.maps()
+    maps = np.tril(maps) + np.tril(maps, -1).T
+    return np.block([[own, cross.T], [cross, maps]])
 
 
 @pytest.mark.parametrize(("quiet", "within"), [(1e-9, 1e-8), (evidence.QUIET, 1e-4)])
@@ -44,18 +45,18 @@ def test_rows_are_those_of_the_estimator(
     model, chunk, _ = record(motion="sweep")
     chunk = chunk[:4000]
     weights = nominal_weights(model)
-    found = collect(model, chunk, weights, nothing(len(chunk)), row_s=1e-3)
+    found = rows_of(model, chunk, weights, row_s=1e-3)
     sums = Sums.of(run(model, chunk, weights))
     normal = sums.normal()
     assert run(model, chunk, weights).counters["restart_memory"] == 0
     place = {cell: k for k, cell in enumerate(found.cells)}
     blocks = [3 + TERMS * place[cell] for cell in sums.cells]
     at = [1, 2, *(first + j for first in blocks for j in range(TERMS))]
-    gram = full(found.gram)
+    gram = gram_of(found)
     size = np.sqrt(np.outer(np.diag(normal.gram), np.diag(normal.gram)))
     assert np.abs((gram[np.ix_(at, at)] - normal.gram) / size).max() < within
     assert gram[0, 0] == pytest.approx(normal.square, rel=1e-9)
-    assert found.rows == 2 * normal.rows
+    assert found.n == 2 * normal.rows
 
 
 def test_a_given_column_is_its_own_sum() -> None:
@@ -68,8 +69,8 @@ def test_a_given_column_is_its_own_sum() -> None:
         p = chunk[:, 2 + model.column(chamber.pressure)]
         v = chamber.v0_m3 + chamber.sign * chamber.area_m2 * chunk[:, 2 + model.column("x")]
         series.append(-weights.compliance[c] * 0.5 * (v[1:] + v[:-1]) * np.diff(p))
-    given = Given(np.stack(series, axis=1), np.array([[0, 0], [1, 1]]), np.eye(2))
-    gram = full(collect(model, chunk, weights, given).gram)
+    rows = rows_of(model, chunk, weights)
+    gram, _ = rows.head([{c: rows.condensed(s)} for c, s in enumerate(series)])
     assert gram[3:5, 3:5] == pytest.approx(gram[1:3, 1:3], rel=1e-9)
     assert gram[0, 3:5] == pytest.approx(gram[0, 1:3], rel=1e-9)
 
@@ -78,10 +79,7 @@ def test_means_of_positions_keep_the_information() -> None:
     """Rows of 10 ms know the bulk modulus: its variance is at most 1.3 times that of 1 ms."""
     model, chunk, _ = record()
     weights = nominal_weights(model)
-    left = [
-        project(collect(model, chunk, weights, nothing(len(chunk)), row_s=s)).schur[1, 1]
-        for s in (1e-3, 1e-2)
-    ]
+    left = [project(rows_of(model, chunk, weights, row_s=s), []).schur[1, 1] for s in (1e-3, 1e-2)]
     assert left[0] / left[1] < 1.3
 
 
@@ -91,13 +89,11 @@ def test_a_gap_starts_anew() -> None:
     chunk = chunk[:6000].copy()
     weights = nominal_weights(model)
     chunk[3000, 1] = 3
-    whole = collect(model, chunk, weights, nothing(6000), row_s=1e-3)
-    halves = [
-        collect(model, part, weights, nothing(3000), row_s=1e-3)
-        for part in (chunk[:3000], chunk[3000:])
-    ]
-    assert whole.gram[0, 0] == pytest.approx(sum(h.gram[0, 0] for h in halves), rel=1e-9)
-    assert whole.rows == sum(h.rows for h in halves)
+    whole = rows_of(model, chunk, weights, row_s=1e-3)
+    halves = [rows_of(model, part, weights, row_s=1e-3) for part in (chunk[:3000], chunk[3000:])]
+    squares = [gram_of(rows)[0, 0] for rows in (whole, *halves)]
+    assert squares[0] == pytest.approx(sum(squares[1:]), rel=1e-9)
+    assert whole.n == sum(h.n for h in halves)
 
 
 CODE = """
@@ -112,11 +108,11 @@ def with_attributes(kernel):
         *(a.view((np.record, a.dtype)) for a in (engine, cells)), *rest)
 
 if config.DISABLE_JIT:  # interpreted, e.running needs a record type
-    tables.clear, evidence.collect = map(with_attributes, (tables.clear, evidence.collect))
+    tables.clear, evidence.integrate = map(with_attributes, (tables.clear, evidence.integrate))
 with open(sys.argv[1], "rb") as file:
     model, chunk = pickle.load(file)
-gram = own.collect(model, chunk, own.nominal_weights(model), own.nothing(len(chunk))).gram
-print(" ".join(float(v).hex() for v in own.full(gram)[:9].ravel()))
+gram = own.gram_of(own.rows_of(model, chunk, own.nominal_weights(model)))
+print(" ".join(float(v).hex() for v in gram[:9].ravel()))
 """
 
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from rtid.diagnose.experiment import limits
-from rtid.diagnose.fit import Fit, Revision, fit, prepare
+from rtid.diagnose.fit import Fit, fit, prepare
 from rtid.diagnose.regression import LIMIT_SD
+from rtid.diagnose.revision import Revision
 from tests.diagnose.records import record
 
 pytestmark = pytest.mark.hidden_effect

@@ -84,7 +84,7 @@ def add_echoes(view: View, columns: Columns, first: int) -> None:
     first: number of given columns before the candidates.
     """
     rng = np.random.default_rng(SEED)
-    n_c, noise = columns.n_chambers, {}
+    n_c, noise = len(view.model.chambers), {}
     for c, chamber in enumerate(view.model.chambers):
         sd = np.sqrt(variance(view.model, chamber.pressure) * view.model.pressure_share)
         noise[c] = sd * rng.standard_normal(view.n)

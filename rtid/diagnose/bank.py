@@ -1,0 +1,121 @@
+"""Columns of one pass: derivatives of what may move, effects of the revision, all to be scored."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from rtid.diagnose.candidates import Candidate, Cause, Columns, Shape, Volumes
+from rtid.diagnose.causes import causes
+from rtid.diagnose.commands import change_of
+from rtid.diagnose.revision import Revision
+from rtid.diagnose.timing import TIMINGS
+from rtid.diagnose.timing import lagged as lagged_command
+from rtid.diagnose.view import View
+from rtid.estimator.state import Weights
+from rtid.model import FloatArray
+
+LAG_STEP_S = 5e-5
+
+
+def add_timing(
+    view: View, columns: Columns, sent: dict[str, tuple[int, FloatArray]], weights: Weights,
+    revision: Revision,
+) -> int:  # fmt: skip
+    """Derivative columns of the lag and of every timing parameter; their number.
+
+    sent: the commands before any timing.
+    """
+    dt_s, n = view.step_s, 0
+    if not revision.replaces_lag:
+        above, below = weights.lag_s + LAG_STEP_S, max(0.0, weights.lag_s - LAG_STEP_S)
+        change = {}
+        for name in sent:
+            u = view.signal(name)
+            rise = lagged_command(u, dt_s, (above,)) - lagged_command(u, dt_s, (below,))
+            change[name] = rise / (above - below)
+        columns.add(opening_change(view, change))
+        n += 1
+    for k, (_, psi) in enumerate(revision.timings):
+        for j in range(len(psi)):
+            change = {
+                name: change_of(u, d, dt_s, revision.timings, k, j) for name, (d, u) in sent.items()
+            }
+            columns.add(opening_change(view, change))
+            n += 1
+    return n
+
+
+def add_shapes(view: View, columns: Columns, revision: Revision) -> Iterator[tuple[int, int]]:
+    """Derivative columns of the nonlinear parameters of effects, but for those at a bound."""
+    for e, effect in enumerate(revision.effects):
+        cause = cause_of(view, effect)
+        for k, value in enumerate(effect.shape):
+            low, high = cause.bounds(k)
+            slope = cause.slope(effect.shape, k) if low < value < high else {}
+            if any(np.any(series != 0.0) for series in slope.values()):
+                columns.add(slope)
+                yield e, k
+
+
+def cause_of(view: View, effect: Candidate) -> Cause:
+    """The cause that made a candidate."""
+    return next(cause for cause in causes(view) if cause.makes(effect))
+
+
+def opening_change(view: View, change: dict[str, FloatArray]) -> Volumes:
+    """Volumes per interval and chamber of a small change of the commands (n,), in the blocks."""
+    flows = [
+        view.slope_u(i) * edge.direction * change[edge.command][:-1]
+        for i, edge in enumerate(view.model.edges)
+    ]
+    n_c = len(view.model.chambers)
+    return {c: view.into_chamber(c, flows) * view.dt_s for c in range(n_c)}
+
+
+def offer(
+    view: View,
+    columns: Columns,
+    revision: Revision,
+    bank: bool,
+    more: Iterable[tuple[Cause, Shape]],
+) -> None:
+    """Columns of the revision's effects, and of all that is to be scored."""
+    for cause in causes(view) if bank or revision.effects else ():
+        own = [e for e in revision.effects if cause.makes(e)]
+        for effect in own:
+            columns.offer(effect, cause.column(effect.shape))
+        if bank and not own and cause.offered:
+            for shape in cause.shapes:
+                columns.offer(cause.at(shape), cause.column(shape))
+    for cause, shape in more:
+        columns.offer(cause.at(shape), cause.column(shape))
+    if bank:
+        _offer_timings(view, columns, revision)
+
+
+def _offer_timings(view: View, columns: Columns, revision: Revision) -> None:
+    """What each timing of the bank would change, first order in the opening; coefficient 1."""
+    names = {e.command: e.direction for e in view.model.edges}
+    for timing in TIMINGS:
+        if revision.has((timing.effect, "command")) or timing.own_spools:
+            continue
+        for psi in timing.bank:
+            change = {
+                name: timing.on(view.signal(name), d, view.step_s, psi) - view.signal(name)
+                for name, d in names.items()
+            }
+            columns.offer(
+                Candidate(
+                    timing.effect,
+                    "command",
+                    "share",
+                    "1",
+                    20.0,
+                    shape=psi[:1],
+                    shape_names=timing.parameters[:1],
+                    shape_units=timing.units[:1],
+                ),
+                opening_change(view, change),
+            )

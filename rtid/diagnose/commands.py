@@ -1,0 +1,67 @@
+"""The commands of a record as they reach the spools.
+
+Edges that open with u > 0 and with u < 0 may be parts of one spool or valves of their own (see
+`timing`), so the machine is given a command for either direction.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from rtid.diagnose.timing import Psi, Timing
+from rtid.model import FloatArray, Model
+
+Timings = tuple[tuple[Timing, Psi], ...]
+
+
+def split(model: Model) -> Model:
+    """The same machine with a command of its own for either direction of every command."""
+    signals, edges = list(model.signals), []
+    for name in sorted({edge.command for edge in model.edges}):
+        signal = model.signals[model.column(name)]
+        signals += [replace(signal, name=_half(name, d)) for d in (1, -1)]
+    for edge in model.edges:
+        edges.append(replace(edge, command=_half(edge.command, edge.direction)))
+    return replace(model, signals=tuple(signals), edges=tuple(edges))
+
+
+def _half(name: str, direction: int) -> str:
+    return name + ("+" if direction > 0 else "-")
+
+
+def commands(model: Model, chunk: FloatArray) -> dict[str, tuple[int, FloatArray]]:
+    """Direction and command (n,) as sent, by the names of the split machine."""
+    found: dict[str, tuple[int, FloatArray]] = {}
+    for name in sorted({edge.command for edge in model.edges}):
+        u = chunk[:, 2 + model.column(name)]
+        found |= {_half(name, d): (d, u) for d in (1, -1)}
+    return found
+
+
+def transformed(model: Model, chunk: FloatArray, timings: Timings) -> FloatArray:
+    """The record of the split machine: commands as the timings let them reach the spools."""
+    dt_s = float(np.median(np.diff(chunk[:, 0])))
+    sent = [through(u, d, dt_s, timings) for d, u in commands(model, chunk).values()]
+    return np.column_stack([chunk, *sent])
+
+
+def through(u: FloatArray, direction: int, dt_s: float, timings: Timings) -> FloatArray:
+    """What timings let through of a command (n,) to the edges of one direction."""
+    for timing, psi in timings:
+        u = timing.on(u, direction, dt_s, psi)
+    return u
+
+
+def change_of(
+    u: FloatArray, direction: int, dt_s: float, timings: Timings, k: int, j: int
+) -> FloatArray:
+    """How the command at the spool follows parameter j of timing k, those behind it held."""
+    timing, psi = timings[k]
+    before = through(u, direction, dt_s, timings[:k])
+    change = timing.change(before, direction, dt_s, psi, j)
+    for behind, held in timings[k + 1 :]:  # linear ones pass it on, play lets it through
+        if behind.is_linear:
+            change = behind.apply(change, dt_s, held)
+    return change

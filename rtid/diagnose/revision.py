@@ -1,0 +1,30 @@
+"""What was added to a model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from rtid.diagnose.candidates import Candidate
+from rtid.diagnose.commands import Timings
+
+
+@dataclass(frozen=True)
+class Revision:
+    """What was added to a model: effects with their shapes, timings with their parameters.
+
+    sizes: coefficients of the effects as fitted last, which weigh the rows.
+    """
+
+    effects: tuple[Candidate, ...] = ()
+    timings: Timings = ()
+    sizes: tuple[tuple[Candidate, float], ...] = ()
+
+    @property
+    def replaces_lag(self) -> bool:
+        """True where a timing stands for the declared lag of the spools."""
+        return any(timing.replaces_lag for timing, _ in self.timings)
+
+    def has(self, key: tuple[str, str]) -> bool:
+        """True where a cause is part of it."""
+        names = [t.effect for t, _ in self.timings]
+        return key in [e.key for e in self.effects] or key[0] in names
