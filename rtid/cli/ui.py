@@ -20,7 +20,8 @@ def ui(
         str, typer.Option(help="Address to serve on; beyond 127.0.0.1 it takes a token.")
     ] = "127.0.0.1",
     state: Annotated[
-        Path | None, typer.Option(help="State folder of a running daemon, for the live page.")
+        Path | None,
+        typer.Option(help="State folder of a running daemon, for the live page; else the file's."),
     ] = None,
     sheet: Annotated[
         Path | None,
@@ -39,14 +40,28 @@ def ui(
         if path is not None and not path.exists():
             raise RtidError(f"{path}: no such file", "rtid ui PROJECT [TRACE]")
     _refuse_without_bokeh()
+    from rtid.daemon.configure import state_folder
+    from rtid.project import load
     from rtid.ui.server import Workbench, serve
+
+    loaded = load(project)
+    folder = state or state_folder(loaded)
 
     def ready(bench: Workbench) -> None:
         print(f"{bench.url}  (Ctrl-C ends it)", flush=True)
         if open_page:
             typer.launch(bench.url)
 
-    serve(ready, project=project, trace=trace, state=state, host=host, port=port, sheet=sheet)
+    serve(
+        ready,
+        project=project,
+        trace=trace,
+        state=folder,
+        host=host,
+        port=port,
+        sheet=sheet,
+        model=loaded.model,
+    )
 
 
 def _refuse_without_bokeh() -> None:

@@ -10,17 +10,20 @@ from bokeh.layouts import column, row
 from bokeh.models import ColumnDataSource, UIElement
 
 from rtid.colours import BLUE, LPM, MPA, ORANGE
-from rtid.compare import FREE_RUN
+from rtid.compare import FREE_RUN, BlockRow
 from rtid.diagnose.report import Value
 from rtid.diagnosed_text import quantity, title
 from rtid.project.added import AddedSection
 from rtid.report_tables import text
-from rtid.ui.compare_view import EMPTY, TimePlots
-from rtid.ui.fragments import button
+from rtid.ui.blocks import ML_PER_MIN, Quantity, quantities, round_up
+from rtid.ui.compare_view import EMPTY, NAMES, TimePlots
+from rtid.ui.fragments import button, table
 from rtid.ui.lines import Line
 from rtid.ui.look import Look
 from rtid.ui.session import Revision, Session
 from rtid.ui.theme import INK_TAG
+
+INSIDE = 25.0  # % of the track from which a bar has its figure inside
 
 
 class AddView:
@@ -118,19 +121,63 @@ def bars(session: Session) -> str:
     rows, before = "", 100.0
     for k, (name, value, is_foretold) in enumerate(shown):
         width = 100 * value / most if isfinite(value) else 0.0
-        rows += (
-            f'<div class="name">{text(name)}</div><div class="track"><div class="bar'
-            f'{" first" if k == 0 and len(shown) > 1 else ""}" style="width:{width:.2f}%;'
-            f'--from:{before:.2f}%{";opacity:.35" if is_foretold else ""}" '
-            f'data-error="{value:.4f}">'
-            f'</div><span style="left:{min(width, 80):.2f}%">{value:.2f} %</span>'
-            f'<div class="floor" style="left:{100 * floor / most:.2f}%"></div></div>'
-        )
+        kind = "first" if k == 0 and len(shown) > 1 else "foretold" if is_foretold else ""
+        rows += _bar(name, value, kind, width, before, 100 * floor / most)
         before = width
     return (
         f'<h2>Error on motion that the model has not seen</h2><div class="bars">{rows}</div>'
         f'<p class="key">in % of the rms flow; dashed: what the sensors alone leave, '
-        f"{floor:.2f} %</p>{_actions(session)}{_effects(session)}{_history(session)}"
+        f"{floor:.2f} %</p>{_actions(session)}{_planes(session)}{_effects(session)}"
+        f"{_history(session, shown)}"
+    )
+
+
+def _bar(name: str, value: float, kind: str, width: float, start: float, floor: float) -> str:
+    """One bar, `width` % of the track; it grows or shrinks from `start`."""
+    is_long = width > INSIDE
+    place = f"right:{100 - width:.2f}%" if is_long else f"left:{width:.2f}%"
+    return (
+        f'<div class="name">{text(name)}</div><div class="track"><div class="bar {kind}" '
+        f'style="width:{width:.2f}%;--from:{start:.2f}%" data-error="{value:.4f}"></div>'
+        f'<span class="{"in" if is_long else ""}" style="{place}">{value:.2f} %</span>'
+        f'<div class="floor" style="left:{floor:.2f}%"></div></div>'
+    )
+
+
+def _planes(session: Session) -> str:
+    """The residual maps before and after the last change, one colour scale."""
+    if len(session.revisions) < 2:
+        return ""
+    looks = [revision.look for revision in session.revisions[-2:]]
+    part = "validation" if "validation" in looks[0].parts else next(iter(looks[0].parts))
+    every = [b for look in looks for b in look.parts[part].blocks]
+    values = [b.residual_rms_m3s for b in every if isfinite(b.residual_rms_m3s)]
+    scale = quantities(round_up(ML_PER_MIN * max(values, default=1.0)))["residual"]
+    rows = ""
+    for word, look in zip(("before", "after"), looks, strict=True):
+        planes = "".join(
+            _plane([b for b in look.parts[part].blocks if b.edge == e.name], scale)
+            for e in look.model.edges
+        )
+        rows += f'<div class="key">{word}</div><div class="planes">{planes}</div>'
+    return (
+        f"<h3>Residual per block, 0 to {scale.high:g} {scale.unit}, on the "
+        f'{NAMES.get(part, part)} part</h3><div class="bars">{rows}</div>'
+    )
+
+
+def _plane(blocks: list[BlockRow], scale: Quantity) -> str:
+    """One valve's blocks, small."""
+    if not blocks:
+        return ""
+    wide, high = (1 + max(getattr(b, k) for b in blocks) for k in ("i", "j"))
+    cells = "".join(
+        f'<rect x="{b.i}" y="{high - 1 - b.j}" width="1" height="1" fill="{scale.colour(b)}"/>'
+        for b in blocks
+    )
+    return (
+        f'<svg viewBox="0 0 {wide} {high}" preserveAspectRatio="none" role="img" '
+        f'aria-label="{escape(blocks[0].edge)}"><title>{text(blocks[0].edge)}</title>{cells}</svg>'
     )
 
 
@@ -172,21 +219,17 @@ def _sizes(section: AddedSection) -> str:
     )
 
 
-def _history(session: Session) -> str:
-    rows = []
+def _history(session: Session, shown: list[tuple[str, float, bool]]) -> str:
+    rows, before = [], ""
     for k, revision in enumerate(session.revisions):
-        errors = revision.section.errors if revision.section else None
-        fall = ""
-        if (
-            errors
-            and errors.heldout_pct.before is not None
-            and errors.heldout_pct.after is not None
-        ):
-            fall = f"{errors.heldout_pct.before:.2f} → {errors.heldout_pct.after:.2f} %"
+        name, value, _ = shown[k]
+        now = f"{value:.2f} %" if isfinite(value) else ""
+        fall = f"{before} → {now}" if before and now else now
         state = "in the project" if revision.is_saved else "not saved"
-        rows.append(f"<tr><td>{k}</td><td>{text(name_of(revision, k))}</td><td class='n'>{fall}"
-                    f"</td><td>{escape(state)}</td></tr>")  # fmt: skip
-    return f"<h3>History of this session</h3><table>{''.join(rows)}</table>"
+        rows.append((f"{k}", text(name), text(fall), state))
+        before = now
+    head = ("", "revision", "held-out error|", "")
+    return f"<h3>History of this session</h3>{table(head, rows)}"
 
 
 def sentence(session: Session) -> str:

@@ -48,7 +48,7 @@ class DeskViews:
             self._place("compare", self._compare.root)
         elif view == "where" and self._where is None:
             self._where = WhereView(self._look, self._time, self._mark_block)
-            self._where.show()
+            self._show_revision(len(self.session.revisions) - 1)
             self._place("where_maps", self._where.maps)
             self._place("where_time", self._where.side)
         elif view == "add" and self._add is None:
@@ -62,13 +62,21 @@ class DeskViews:
             self._place("map", self._map.root)
         self._tell()
 
+    def prepare(self) -> bool:
+        """Make one more view before it is looked at; False where all are made."""
+        made = {"where": self._where, "add": self._add, "map": self._map, "compare": self._compare}
+        missing = [name for name, view in made.items() if view is None]
+        if missing:
+            self.show(missing[0])
+        return len(missing) > 1
+
     def refresh(self, what: str) -> None:
         """Show what has changed in the session."""
         if what == "looks":
             if self._compare:
                 self._compare.show(self._look)
-            if self._where:
-                self._where.show(self._look)
+            self._forget()
+            self._show_revision(len(self.session.revisions) - 1)
             if self._add:
                 self._add.show(self.session.revisions)
             if self._map:
@@ -86,6 +94,8 @@ class DeskViews:
             self._where.choose(what, name)
         elif what in ("edge", "beside", "along", "second") and self._map:
             self._map.choose(what, name)
+        elif what == "revision" and self._where and name in self._where.revisions:
+            self._show_revision(self._where.revisions.index(name))
         elif what == "page":
             self._page = name
         elif what == "worst" and self._where and self._where.worst:
@@ -96,6 +106,16 @@ class DeskViews:
         else:
             self._move(what, asked)
         self._tell()
+
+    def _show_revision(self, number: int) -> None:
+        """Where the model fails, of one of the revisions."""
+        if self._where is None:
+            return
+        revisions = self.session.revisions
+        names = [f"{k} {add_view.name_of(r, k)}" for k, r in enumerate(revisions)]
+        self._where.revisions = names if len(names) > 1 else []
+        self._where.revision = names[number]
+        self._where.show(revisions[number].look)
 
     def _move(self, what: str, asked: dict[str, str]) -> None:
         """Through time."""

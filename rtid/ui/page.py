@@ -18,6 +18,7 @@ from rtid.ui.live import Live
 from rtid.ui.session import FAILED, Session
 from rtid.ui.verdict import record_line, strip, work_line
 
+PAUSE_MS = 700  # between views that are made ahead
 STATIC = Path(__file__).parent / "static"
 VIEWS = ("compare", "where", "why", "add", "map", "live")
 ROOTS = ("compare", "where_maps", "where_time", "add", "map")
@@ -49,6 +50,7 @@ class Page:
         self.doc, self.session, self.live = doc, session, live
         self._sent: dict[str, str] = {}
         self._is_open = False
+        self._seen, self._beats = "", 0
         self._view = "live" if session.trace is None else "compare"
         self._channel = Channel(name="channel")
         self._roots = {name: column(name=name, sizing_mode="stretch_both") for name in ROOTS}
@@ -78,6 +80,7 @@ class Page:
         session = self.session
         if session.revisions and self._desk is None:
             self._desk = DeskViews(session, self._roots, self._put)
+            self._soon(self._prepare)
         if self._desk is not None:
             self._desk.refresh(what)
             self._desk.show(self._view)
@@ -89,6 +92,14 @@ class Page:
                 "cover": self._cover(),
             }
         )
+
+    def _soon(self, do: Callable[[], None]) -> None:
+        self.doc.add_timeout_callback(do, PAUSE_MS)
+
+    def _prepare(self) -> None:
+        """Make the views that nobody looks at yet, one after the other."""
+        if self._desk is not None and self._desk.prepare():
+            self._soon(self._prepare)
 
     def _cover(self) -> str:
         """What stands in the place of the views while there is nothing to show in them."""
@@ -117,7 +128,7 @@ class Page:
             self._view = asked.get("name", "") if asked.get("name") in VIEWS else self._view
             self._refresh("view")
         elif what == "seen":
-            self.live.seen(asked.get("number", ""))
+            self._seen = asked.get("number", "")
         elif what == "add" and "effect" not in asked:
             self._add_named()
         elif what in SESSION_ACTIONS:
@@ -131,9 +142,16 @@ class Page:
             self.session.add(*key)
 
     def _beat(self) -> None:
-        """Five times a second: the live page, where it is looked at and has kept up."""
-        if self._view == "live" and self.live.is_due():
-            self._put(self.live.fragments())
+        """Five times a second: the live page, where it is looked at.
+
+        The next update is made when the page has drawn the one before: a slow reader misses some,
+        and nothing piles up.
+        """
+        if self._view == "live" and self._sent.get("seen", "") == self._seen:
+            now = self.live.fragments()
+            if any(self._sent.get(place) != html for place, html in now.items()):
+                self._beats += 1
+                self._put(now | {"seen": str(self._beats)})
 
 
 SESSION_ACTIONS: dict[str, Callable[[Session, dict[str, str]], None]] = {

@@ -68,10 +68,12 @@ class Session:
 
     @property
     def named(self) -> Key | None:
-        """The effect that the diagnosis of the newest revision names first; None where none."""
+        """The one effect that the newest diagnosis names first; None: none, or a set."""
         told = self.last.told if self.last else None
         found = told.diagnosis.found if told else ()
-        return (found[0].effect, found[0].where) if found and not self._is_adding else None
+        if not found or found[0].cannot_be_told_from or self._is_adding:
+            return None
+        return found[0].effect, found[0].where
 
     def add(self, effect: str, where: str) -> None:
         """Make an effect part of the model."""
@@ -81,6 +83,7 @@ class Session:
         named = last.told.diagnosis.found if last and last.told else ()
         chosen = (effect, where) in [(f.effect, f.where) for f in named]
         reason = "named by the diagnosis" if chosen else "chosen by name"
+        self._is_adding = True
         self._ask("add", effect, where, reason, then=self._added("add"))
 
     def drop(self, effect: str, where: str) -> None:
@@ -132,7 +135,7 @@ class Session:
         self.tell("state")
 
     def _failed(self, error: RtidError) -> None:
-        self.doing, self.trouble = "", (str(error), error.remedy)
+        self.doing, self.trouble, self._is_adding = "", (str(error), error.remedy), False
         self.tell("state")
 
     def _not_opened(self, error: RtidError) -> None:
@@ -173,6 +176,7 @@ class Session:
         def added(result: Added) -> None:
             revision = Revision(result.look, result.sections, change, result.section)
             self.revisions.append(revision)
+            self._is_adding = False
             self.note = result.note
             self.tell("looks")
             self._diagnose()

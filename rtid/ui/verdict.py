@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from rtid.diagnosed_text import sentences, title
+from rtid.project.history import ADD
 from rtid.report_tables import text
 from rtid.report_verdicts import VERDICTS
 from rtid.ui.fragments import button
-from rtid.ui.session import FAILED, Session
+from rtid.ui.session import FAILED, Revision, Session
 
 
 def record_line(session: Session) -> str:
@@ -37,6 +38,8 @@ def strip(session: Session) -> str:
     last = session.last
     if session.state == FAILED or session.trace is None:
         return ""
+    if last is not None and last.told is None and last.section is not None:
+        return _just_changed(last)
     if last is None or last.told is None:
         heading = "Looking for what is missing" if last else "Opening the record"
         return f"<h1>{heading}</h1><p>{_waiting(session)}</p>"
@@ -53,6 +56,18 @@ def strip(session: Session) -> str:
     elif len(session.revisions) > 1 and not last.is_saved:
         offer = button("Save to project", "save", kind="main") + button("Undo", "undo")
     return f'<h1 class="{kind}">{text(heading)}</h1><p>{said}</p>{offer}'
+
+
+def _just_changed(last: Revision) -> str:
+    """The change, before the new model is diagnosed."""
+    section = last.section
+    pair = section.errors.heldout_pct if section else None
+    heading = "Added" if last.change == ADD else "Dropped"
+    words = f"{title(section.effect)} at {section.where}. " if section else ""
+    if pair and pair.before is not None and pair.after is not None:
+        words += f"The held-out error went from {pair.before:.2f} % to {pair.after:.2f} %. "
+    words += "Looking whether anything else is missing ..."
+    return f'<h1 class="good">{heading}</h1><p>{text(words)}</p>{button("Undo", "undo")}'
 
 
 def _waiting(session: Session) -> str:

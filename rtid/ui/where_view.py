@@ -43,6 +43,8 @@ class WhereView:
         self.side = self._side()
         self.chosen: Key | None = None
         self.words = ""
+        self.revisions: list[str] = []  # names, where there are several to choose from
+        self.revision = ""
 
     @property
     def maps(self) -> UIElement:
@@ -141,7 +143,8 @@ class WhereView:
         """Tools above, and what the picture says."""
         parts = {name: NAMES.get(name, name) for name in self.look.parts}
         signals = [d.signal for d in self._depends]
-        tools = (
+        tools = select("revision", self.revisions, self.revision, "model") if self.revisions else ""
+        tools += (
             select("quantity", list(self._quantities), self.quantity, "blocks show")
             + self._scale()
             + select("part", parts, self.part, "of")

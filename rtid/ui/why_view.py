@@ -60,8 +60,25 @@ def _found(found: Diagnosis, effect: Effect) -> str:
         f"at {text(effect.where)}</h2><dl>{sizes}<dt>held-out error</dt><dd>"
         f"{_share(found, before)} → <b>{_share(found, after)}</b> of the rms flow; the sensors' "
         f"floor is {_share(found, found.noise_floor_m3s)}</dd><dt>explains as much</dt>"
-        f"<dd>{text(told_apart)}</dd><dt>by chance</dt><dd>p = {effect.p_value:.1g}</dd></dl></div>"
+        f"<dd>{text(told_apart)}</dd><dt>by chance</dt><dd>"
+        f"{_chance(effect.p_value)}</dd></dl>{_choices(effect)}</div>"
     )
+
+
+def _chance(p: float) -> str:
+    return f"p = {p:.1g}" if p > 0 else "p below 1e-300"
+
+
+def _choices(effect: Effect) -> str:
+    """A button for each of a set that the record does not tell apart."""
+    if not effect.cannot_be_told_from:
+        return ""
+    members = [(effect.effect, effect.where)]
+    for name in effect.cannot_be_told_from:
+        other, _, where = name.rstrip(")").partition(" (")
+        members.append((other, where or effect.where))
+    made = "".join(button(f"Add {named(m)}", "add", effect=m[0], where=m[1]) for m in members)
+    return f"<p>{text('The record leaves the choice to you: ')}{made}</p>"
 
 
 def _interval(value: Value) -> str:
