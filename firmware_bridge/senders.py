@@ -4,7 +4,8 @@ Each frame fills a bucket by one, and time empties it by 1.25 frames per period 
 
     level <- max(0, level + 1 - 1.25 dt / T),   a second sender:  level > clip(75 ms / T, 3, 75)
 
-Two senders fill it in about 100 ms.  A sender or an adapter that was held up sends what is late at
+It does not overflow: two senders fill it in about 100 ms, and it is empty 0.3 s after the second
+one has ended.  A sender or an adapter that was held up sends what is late at
 once: a silence gives credit for the frames that it owes.  From an overflow on the message is
 refused until 0.5 s after the last one: nobody can tell which sender is right.  All frames count,
 also those that a CRC or counter would refuse.  No clock is asked: pieces of any size give the same.
@@ -52,7 +53,7 @@ def _fill(one: Record, t_us: Integer) -> None:
     one.credit *= max(0.0, 1.0 - periods * one.period_us / CREDIT_US)
     if periods > SILENCE:
         one.credit = min(one.credit + periods - 1.0, CREDIT_US / one.period_us)
-    one.level = max(0.0, one.level + 1.0 - LEAK * periods)
+    one.level = min(max(0.0, one.level + 1.0 - LEAK * periods), one.full + 1.0)
     used = min(one.credit, one.level)
     one.level -= used
     one.credit -= used
