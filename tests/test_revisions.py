@@ -234,7 +234,7 @@ def test_parts_come_back_with_their_shapes(project: Path, trace: Path) -> None:
     ]
     (candidate,) = again.effects
     assert candidate.key == ("relief_valve", "b")
-    assert (candidate.shape, candidate.lag_s) == (3e6, 0.02)
+    assert candidate.shape == (3e6, 0.02, 0.0)
     for wrong, told in (
         (replace(relief, effect="coulomb_friction"), "cannot act in this record"),
         (replace(relief, parameters={"slope": 1.0}), "has no parameter opening_pressure"),

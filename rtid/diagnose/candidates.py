@@ -92,11 +92,15 @@ class Cause:
         return max(axis[0] - spacing, min(axis[0], 0.0)), axis[-1] + spacing
 
     def slope(self, shape: Shape, k: int) -> Volumes:
-        """Derivative of the column with respect to nonlinear parameter k, by differences."""
+        """Derivative of the column with respect to nonlinear parameter k."""
+        return self.slope_of(self.column, shape, k)
+
+    def slope_of(self, make: Callable[[Shape], Volumes], shape: Shape, k: int) -> Volumes:
+        """Derivative of anything made with a shape, by differences."""
         step = SLOPE_STEP * self.spacing(k)
         above, below = ((*shape[:k], shape[k] + s, *shape[k + 1 :]) for s in (step, -step))
-        low = self.column(below)
-        return {c: (high - low[c]) / (2.0 * step) for c, high in self.column(above).items()}
+        low = make(below)
+        return {c: (high - low[c]) / (2.0 * step) for c, high in make(above).items()}
 
     def about(self, shape: Shape, step: float) -> tuple[Shape, ...]:
         """Shapes that differ from one in one parameter by up to `step` of its axis' spacing."""

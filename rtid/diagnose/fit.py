@@ -14,7 +14,7 @@ import numpy as np
 
 from rtid.diagnose.bank import add_shapes, add_timing, cause_of, offer
 from rtid.diagnose.candidates import Candidate, Cause, Columns, Shape, Volumes
-from rtid.diagnose.causes import add_echoes, softness
+from rtid.diagnose.causes import add_echoes, total_softness
 from rtid.diagnose.commands import commands, split, transformed
 from rtid.diagnose.evidence import Projected, Rows, project, rows_of
 from rtid.diagnose.regression import Estimate, Regression
@@ -152,7 +152,8 @@ def one_pass(
     shapes = tuple(add_shapes(view, columns, revision))
     first = 1 + len(model.chambers) + n_timing + len(shapes)
     offer(view, columns, revision, bank, more)
-    add_echoes(view, columns, n_timing + len(shapes))
+    slopes = [(cause_of(view, e), e.shape, k) for i, k in shapes for e in [revision.effects[i]]]
+    add_echoes(view, columns, n_timing, slopes)
     projected = project(rows, columns.released())
     cov = rows.factor.covariances if thorough else NO_COV
     dof = rows.n - TERMS * len(rows.cells) + float(np.einsum("bii->", cov)) * PRIOR_SD**-2
@@ -192,12 +193,11 @@ def softened(
     """
     view = View(model, chunk, weights.compliance, np.zeros((0, 0, 5)), np.zeros(0, bool))
     more = np.zeros((view.n, len(model.chambers)))
+    own = total_softness(view, sizes)
     for c, chamber in enumerate(model.chambers):
-        own = sum((size * softness(view, c, e) for e, size in sizes), np.zeros(view.n))
-        if own.any():
-            plain = view.volume(c) * view.compliance[c]
-            noise = variance(model, chamber.pressure) * model.pressure_share
-            more[:, c] = ((plain + own) ** 2 - plain**2) * noise
+        plain = view.volume(c) * view.compliance[c]
+        noise = variance(model, chamber.pressure) * model.pressure_share
+        more[:, c] = ((plain + own[:, c]) ** 2 - plain**2) * noise
     return more
 
 

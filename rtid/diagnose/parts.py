@@ -7,9 +7,9 @@ are taken from it as they are; coefficients are fitted anew to every record.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-from rtid.diagnose.candidates import Candidate
+from rtid.diagnose.candidates import Candidate, Cause
 from rtid.diagnose.causes import causes
 from rtid.diagnose.commands import split, transformed
 from rtid.diagnose.fit import Fit, first_map
@@ -59,7 +59,7 @@ def recall(model: Model, chunk: FloatArray, weights: Weights, parts: tuple[Part,
         return Revision((), timings)
     sent, whole = transformed(model, chunk, timings), split(model)
     view = View.of(whole, sent, weights, first_map(whole, sent, weights))
-    offered = [cause.candidate for cause in causes(view)]
+    offered = causes(view)
     return Revision(tuple(_candidate(p, offered) for p in fixed), timings)
 
 
@@ -72,15 +72,19 @@ def _timing(part: Part) -> tuple[Timing, Psi] | None:
     raise _unfit(part, "is no effect on a command")
 
 
-def _candidate(part: Part, offered: list[Candidate]) -> Candidate:
-    for candidate in offered:
+def _candidate(part: Part, offered: list[Cause]) -> Candidate:
+    for cause in offered:
+        candidate = cause.candidate
         if candidate.key == part.key and candidate.parameter in part.parameters:
-            shape = tuple(_value(part, name) for name in candidate.shape_names)
-            return replace(candidate, shape=shape)
+            names = zip(candidate.shape_names, cause.axes, strict=True)
+            return cause.at(tuple(_value(part, name, axis[0]) for name, axis in names))
     raise _unfit(part, "cannot act in this record")
 
 
-def _value(part: Part, name: str) -> float:
+def _value(part: Part, name: str, usual: float = 1.0) -> float:
+    """A parameter of a part; one that is usually zero may be left out."""
+    if name not in part.parameters and usual == 0.0:
+        return 0.0
     if name not in part.parameters:
         raise _unfit(part, f"has no parameter {name}")
     return part.parameters[name]

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import eigh
 
 from rtid.model import FloatArray
 
@@ -90,14 +91,11 @@ class Regression:
         if not noise.any():
             return noise
         scale = 1.0 / np.sqrt(np.diag(plain))
-        left = np.linalg.eigvalsh((plain - noise) * np.outer(scale, scale)).min()
-        share = CLEARLY * np.sqrt(2.0 / max(1, self.rows))
-        while left < share and noise.any():
-            noise = 0.8 * noise
-            left = np.linalg.eigvalsh((plain - noise) * np.outer(scale, scale)).min()
-            if np.abs(noise).max() < 1e-9 * np.abs(plain).max():
-                return np.zeros_like(noise)
-        return noise
+        most = 1.0 - CLEARLY * np.sqrt(2.0 / max(1, self.rows))
+        # the largest share that noise has of any combination of the columns
+        outer = np.outer(scale, scale)
+        share = float(eigh(noise * outer, plain * outer, eigvals_only=True)[-1])
+        return noise * min(1.0, most / share) if share > 0.0 else noise
 
     def rho(self, estimate: Estimate) -> float:
         """Residual variance in units of the sensors' noise."""

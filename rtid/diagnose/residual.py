@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rtid.diagnose.candidates import Candidate
-from rtid.diagnose.causes import SEED, causes, softness
+from rtid.diagnose.causes import SEED, causes, total_softness
 from rtid.diagnose.commands import transformed
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.view import View
@@ -113,16 +113,13 @@ def _noise(fit: Fit, view: View) -> FloatArray:
         if variance(model, name) > 0
     }
     still = np.zeros(view.n)
-    own = [
-        sum((value * softness(view, c, e) for e, value in effect_values(fit)), still)
-        for c in range(len(model.chambers))
-    ]
+    own = total_softness(view, effect_values(fit))
     found = np.empty((view.n - 1, len(model.chambers)))
     for c, chamber in enumerate(model.chambers):
         p, v = noise.get(chamber.pressure, still), view.volume(c)
         x_rate = np.diff(noise.get(model.position, still)) / view.dt_s
         found[:, c] = chamber.sign * chamber.area_m2 * x_rate
-        found[:, c] += np.diff((fit.compliance[c] * v + own[c]) * p) / view.dt_s
+        found[:, c] += np.diff((fit.compliance[c] * v + own[:, c]) * p) / view.dt_s
         slopes = []
         for i, edge in enumerate(model.edges):
             dp = noise.get(edge.source, still) - noise.get(edge.sink, still)

@@ -143,7 +143,7 @@ def physical(fit_: Fit, candidate: Candidate, value: float) -> float:
         return value
     names = [c.name for c in fit_.model.chambers]
     at = [names.index(candidate.where)] if candidate.where in names else list(range(len(names)))
-    return float(value * np.mean(fit_.weights.compliance[at] / fit_.compliance[at]))
+    return float(value * np.mean(fit_.weights.compliance[at]) / np.mean(fit_.compliance[at]))
 
 
 def refined(state: State, present: Fit, trials: list[Trial]) -> list[Trial]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rtid.diagnose.candidates import ATMOSPHERE_PA
+from rtid.diagnose.causes.storage import ATMOSPHERE_PA
 from rtid.diagnose.diagnosis import search
 from rtid.diagnose.report import Diagnosis, Effect, diagnosis
 from rtid.diagnosed_text import sentences

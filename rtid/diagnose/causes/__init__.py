@@ -8,11 +8,11 @@ from rtid.diagnose.causes.lines import lines
 from rtid.diagnose.causes.openings import openings
 from rtid.diagnose.causes.own import own
 from rtid.diagnose.causes.sensors import drift, sensors
-from rtid.diagnose.causes.storage import SEED, add_echoes, softness, storage
+from rtid.diagnose.causes.storage import SEED, add_echoes, storage, total_softness
 from rtid.diagnose.causes.supply import supply
 from rtid.diagnose.view import View
 
-__all__ = ["SEED", "add_echoes", "causes", "softness"]
+__all__ = ["SEED", "add_echoes", "causes", "total_softness"]
 
 MAKERS = (leaks, seats, openings, storage, lines, supply, drift, sensors, own)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import partial
 
 import numpy as np
@@ -66,7 +66,8 @@ def _stored_gas(view: View, chambers: tuple[int, ...], shape: Shape) -> Volumes:
 
 
 def _dead_volume(view: View, chambers: tuple[int, ...]) -> Volumes:
-    return {c: -view.compliance[c] * np.diff(view.pressure(c)) for c in chambers}
+    compliance = _compliance(view, chambers)
+    return {c: -compliance * np.diff(view.pressure(c)) for c in chambers}
 
 
 def _hose(view: View, chambers: tuple[int, ...]) -> Volumes:
@@ -78,10 +79,13 @@ def _vapour(view: View, chambers: tuple[int, ...], shape: Shape) -> Volumes:
     return {c: stored(view, c, -below[c]) for c in chambers}
 
 
-def add_echoes(view: View, columns: Columns, first: int) -> None:
-    """Echoes of theta_beta and of every storage candidate: the same columns of noise alone.
+def add_echoes(
+    view: View, columns: Columns, first: int, slopes: list[tuple[Cause, Shape, int]]
+) -> None:
+    """Echoes of theta_beta and of every storage column: the same columns of noise alone.
 
-    first: number of given columns before the candidates.
+    first: number of given columns before the slopes and the candidates; slopes: cause, shape and
+    parameter of each derivative column.
     """
     rng = np.random.default_rng(SEED)
     n_c, noise = len(view.model.chambers), {}
@@ -90,27 +94,49 @@ def add_echoes(view: View, columns: Columns, first: int) -> None:
         noise[c] = sd * rng.standard_normal(view.n)
         echo = columns.add({c: view.compliance[c] * stored(view, c, noise[c])})
         columns.echo_of[1 + c] = 1 + n_c + echo
-    for k, candidate in enumerate(columns.candidates):
-        soft = {c: softness(view, c, candidate) for c in noise}
-        volumes = {c: -np.diff(soft[c] * noise[c]) for c in noise if soft[c].any()}
-        if volumes:
-            columns.echo_of[1 + n_c + first + k] = 1 + n_c + columns.add(volumes)
+
+    def soft(cause: Cause, shape: Shape) -> Volumes:
+        return softness(view, cause.at(shape))
+
+    taken_up = [cause.slope_of(partial(soft, cause), shape, k) for cause, shape, k in slopes]
+    taken_up += [softness(view, candidate) for candidate in columns.candidates]
+    for k, by_chamber in enumerate(taken_up):
+        if by_chamber:
+            echo = columns.add({c: -np.diff(m * noise[c]) for c, m in by_chamber.items()})
+            columns.echo_of[1 + n_c + first + k] = 1 + n_c + echo
 
 
-def softness(view: View, c: int, candidate: Candidate) -> FloatArray:
-    """What one unit of a storage effect takes up in chamber c per Pa (n,), m3/Pa; 0 for others."""
-    p, still = view.pressure(c), np.zeros(view.n)
-    if c not in places(view).get(candidate.where, ()):
-        return still
+def softness(view: View, candidate: Candidate) -> Volumes:
+    """What one unit of a storage effect takes up per Pa, by chamber (n,), m3/Pa; {} for others."""
+    chambers = places(view).get(candidate.where, ())
     match candidate.effect:
         case "entrained_air":
-            kappa = candidate.shape[0]
-            rise = air(p + SMALL_PA, kappa) - air(p - SMALL_PA, kappa)
-            return np.asarray(view.volume(c) * rise / (2.0 * SMALL_PA))
+            return {c: _gas_softness(view, c, candidate.shape[0]) for c in chambers}
         case "extra_dead_volume":
-            return still + view.compliance[c]
+            return {c: np.full(view.n, _compliance(view, chambers)) for c in chambers}
         case "hose_compliance":
-            return still + 1.0
+            return {c: np.ones(view.n) for c in chambers}
         case "cavitation":
-            return view.volume(c) * (p < candidate.shape[0])
-    return still
+            below = {c: view.pressure(c) < candidate.shape[0] for c in chambers}
+            return {c: view.volume(c) * below[c] for c in chambers}
+    return {}
+
+
+def _gas_softness(view: View, c: int, kappa: float) -> FloatArray:
+    p = view.pressure(c)
+    rise = air(p + SMALL_PA, kappa) - air(p - SMALL_PA, kappa)
+    return np.asarray(view.volume(c) * rise / (2.0 * SMALL_PA))
+
+
+def _compliance(view: View, chambers: tuple[int, ...]) -> float:
+    """One oil: the compliance that the chambers have between them, 1/Pa."""
+    return float(np.mean(view.compliance[list(chambers)]))
+
+
+def total_softness(view: View, sizes: Iterable[tuple[Candidate, float]]) -> FloatArray:
+    """What effects of these sizes take up per Pa (n, chambers), m3/Pa."""
+    total = np.zeros((view.n, len(view.model.chambers)))
+    for candidate, size in sizes:
+        for c, one in softness(view, candidate).items():
+            total[:, c] += size * one
+    return total
