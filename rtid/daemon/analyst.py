@@ -186,7 +186,9 @@ def main() -> None:
     fd, project, folder = sys.argv[1:]
     pipe = Pipe(int(fd))
     os.nice(NICE)
-    analyst = Analyst(load(project), Path(folder), pipe.send)
+    loaded = load(project)
+    Estimator(loaded.model).solution()  # compiles
+    analyst = Analyst(loaded, Path(folder), pipe.send)
     pipe.send(Ready())
     try:
         while (job := pipe.receive()) is not None:

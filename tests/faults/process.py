@@ -1,0 +1,150 @@
+"""`rtid run` in a process of its own, with somebody on its bus and a listening service manager."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from random import Random
+
+from rtid.daemon.status import Status, StatusError, from_json, read
+from rtid.live import Learner
+from rtid.project import Project
+from rtid.store import Generations
+from tests.faults.harness import machine
+
+LIMIT_S = 60.0
+
+
+@dataclass
+class Daemon:
+    """A running daemon: its process, state folder, multicast group, and what it told systemd."""
+
+    process: subprocess.Popen[str]
+    folder: Path
+    group: str
+    started_s: float
+    told: list[tuple[float, str]] = field(default_factory=list)  # seconds since the start, message
+
+    def status(self) -> Status | None:
+        """The newest one; None before the first."""
+        with contextlib.suppress(StatusError):
+            return read(self.folder)
+        return None
+
+    def is_its_own(self, status: Status) -> bool:
+        """Whether this process told it, not one before it."""
+        return status.pid == self.process.pid
+
+    def wait(self, what: Callable[[Status], bool], limit_s: float = LIMIT_S) -> float:
+        """Seconds until the status says so; fails after limit_s."""
+        start_s = time.monotonic()
+        while time.monotonic() - start_s < limit_s:
+            found = self.status()
+            if found is not None and what(found):
+                return time.monotonic() - start_s
+            assert self.process.poll() is None, self.process.communicate()[1]
+            time.sleep(0.02)
+        raise AssertionError(f"not within {limit_s} s: {self.status()}")
+
+    def stop(self, limit_s: float = LIMIT_S) -> Status:
+        """SIGTERM, and its last status."""
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGTERM)
+        out, err = self.process.communicate(timeout=limit_s)
+        assert self.process.returncode == 0, err
+        return from_json(out)
+
+    def analyst(self) -> int:
+        """Process id of its helper."""
+        found = subprocess.run(
+            ["pgrep", "-P", str(self.process.pid), "-f", "rtid.daemon.analyst"],
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        return int(found.stdout.split()[0])
+
+
+def a_group() -> str:
+    """A multicast group that nobody else uses."""
+    return "239.74." + ".".join(str(Random(os.urandom(8)).randint(1, 254)) for _ in range(2))
+
+
+@contextlib.contextmanager
+def daemon(folder: Path, *options: str, settings: str = "", group: str = "") -> Iterator[Daemon]:
+    """`rtid run` on a multicast group of its own; killed at the end where it still runs."""
+    (folder / "notify").unlink(missing_ok=True)
+    project = folder / "machine.toml"
+    source = machine().trace.with_suffix(".toml").read_text("utf-8")
+    project.write_text(f"{source}\n[daemon]\n{settings}\n", "utf-8")
+    group = group or a_group()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(folder / "notify"))
+        environment = os.environ | {
+            "NOTIFY_SOCKET": str(folder / "notify"), "WATCHDOG_USEC": "1000000",
+            "NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1",
+        }  # fmt: skip
+        state = folder / "state"
+        command = [
+            sys.executable, "-m", "rtid", "run", str(project), "--bus", f"udp_multicast:{group}",
+            "--test-bus", "--json", "--state", str(state), *options,
+        ]  # fmt: skip
+        process = subprocess.Popen(
+            command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        started = Daemon(process, state, group, time.monotonic())
+        threading.Thread(target=_listen, args=(manager, started), daemon=True).start()
+        try:
+            yield started
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                process.send_signal(signal.SIGCONT)
+            process.kill()
+            process.wait()
+
+
+def _listen(manager: socket.socket, started: Daemon) -> None:
+    with contextlib.suppress(OSError):
+        while True:
+            text = manager.recv(4096).decode()
+            started.told.append((time.monotonic() - started.started_s, text))
+
+
+@contextlib.contextmanager
+def sender(
+    group: str, seconds: float, speed: float = 1.0, loops: int = 1, trace: Path | None = None
+) -> Iterator[subprocess.Popen[str]]:
+    """Somebody who sends the machine's frames; ended at the end."""
+    command = [
+        sys.executable, "-m", "tests.faults.sender", str(trace or machine().trace), group,
+        str(seconds), str(speed), str(loops),
+    ]  # fmt: skip
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+def stored(folder: Path, project: Project) -> Learner:
+    """A learner with what the daemon left behind."""
+    learner = machine().learner()
+    found = Generations(folder, project.digest).restore(project.model)
+    assert found.estimator is not None, found
+    learner.estimator = found.estimator
+    return learner
+
+
+def recorded(folder: Path) -> int:
+    """Frames in the recording of a state folder."""
+    from firmware_bridge.sources import open_log
+
+    return sum(len(open_log(path)) for path in sorted((folder / "recording").glob("*.blf")))

@@ -1,0 +1,70 @@
+"""Frames of a trace over udp_multicast, from a process of its own: `python -m tests.faults.sender`.
+
+Arguments: TRACE GROUP SECONDS SPEED LOOPS.  Datagrams are those of python-can, made beforehand;
+stamps are the trace's, and go on in the next loop.  Prints the number of frames sent.
+"""
+
+from __future__ import annotations
+
+import socket
+import sys
+import time
+from pathlib import Path
+
+import msgpack
+
+from firmware_bridge.frames import Frames
+from firmware_bridge.sources import open_log
+from firmware_bridge.sources.udp import PORT
+
+PIECE_S = 0.002  # what is due is sent so often
+
+
+def datagrams(frames: Frames, shift_s: float) -> list[bytes]:
+    """What python-can would send."""
+    fixed = {
+        "is_extended_id": False, "is_remote_frame": False, "is_error_frame": False,
+        "channel": 0, "is_fd": False, "bitrate_switch": False, "error_state_indicator": False,
+    }  # fmt: skip
+    rows = zip(
+        frames.t_us.tolist(), frames.can_id.tolist(), frames.length.tolist(), frames.data,
+        strict=True,
+    )  # fmt: skip
+    return [
+        msgpack.packb(
+            {
+                "timestamp": t_us * 1e-6 + shift_s,
+                "arbitration_id": can_id,
+                "dlc": length,
+                "data": data[:length].tobytes(),
+            }
+            | fixed
+        )
+        for t_us, can_id, length, data in rows
+    ]
+
+
+def main() -> None:
+    """Send."""
+    trace, group, seconds, speed, loops = sys.argv[1:6]
+    frames = open_log(Path(trace))
+    at_s = (frames.t_us - frames.t_us[0]) * 1e-6
+    frames, at_s = frames[at_s < float(seconds)], at_s[at_s < float(seconds)]
+    pieces = [datagrams(frames, k * float(seconds)) for k in range(int(loops))]
+    out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 1)
+    start_s, sent = time.monotonic(), 0
+    for k, piece in enumerate(pieces):
+        n = 0
+        while n < len(piece):
+            now_s = (time.monotonic() - start_s) * float(speed) - k * float(seconds)
+            while n < len(piece) and at_s[n] <= now_s:
+                out.sendto(piece[n], (group, PORT))
+                n += 1
+            time.sleep(PIECE_S)
+        sent += n
+    print(sent)
+
+
+if __name__ == "__main__":
+    main()
