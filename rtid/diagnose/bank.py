@@ -8,9 +8,11 @@ import numpy as np
 
 from rtid.diagnose.candidates import Candidate, Cause, Columns, Shape, Volumes
 from rtid.diagnose.causes import causes
+from rtid.diagnose.causes.common import supply_change
 from rtid.diagnose.commands import change_of
+from rtid.diagnose.pump import demand
 from rtid.diagnose.revision import Revision
-from rtid.diagnose.timing import TIMINGS
+from rtid.diagnose.timing import COMMAND, SUPPLY, TIMINGS
 from rtid.diagnose.timing import lagged as lagged_command
 from rtid.diagnose.view import View
 from rtid.estimator.state import Weights
@@ -37,12 +39,16 @@ def add_timing(
             change[name] = rise / (above - below)
         columns.add(opening_change(view, change))
         n += 1
-    for k, (_, psi) in enumerate(revision.timings):
+    for k, (timing, psi) in enumerate(revision.timings):
         for j in range(len(psi)):
-            change = {
-                name: change_of(u, d, dt_s, revision.timings, k, j) for name, (d, u) in sent.items()
-            }
-            columns.add(opening_change(view, change))
+            if timing.where == SUPPLY:
+                columns.add(supply_change(view, -timing.change(demand(view), 1, dt_s, psi, j)))
+            else:
+                change = {
+                    name: change_of(u, d, dt_s, revision.timings, k, j)
+                    for name, (d, u) in sent.items()
+                }
+                columns.add(opening_change(view, change))
             n += 1
     return n
 
@@ -99,7 +105,7 @@ def _offer_timings(view: View, columns: Columns, revision: Revision) -> None:
     """What each timing of the bank would change, first order in the opening; coefficient 1."""
     names = {e.command: e.direction for e in view.model.edges}
     for timing in TIMINGS:
-        if revision.has((timing.effect, "command")) or timing.own_spools:
+        if revision.has((timing.effect, COMMAND)) or timing.own_spools:
             continue
         for psi in timing.bank:
             change = {
@@ -109,7 +115,7 @@ def _offer_timings(view: View, columns: Columns, revision: Revision) -> None:
             columns.offer(
                 Candidate(
                     timing.effect,
-                    "command",
+                    COMMAND,
                     "share",
                     "1",
                     20.0,

@@ -1,4 +1,4 @@
-"""The commands of a record as they reach the spools.
+"""The commands of a record as they reach the spools, and the supply as the pump holds it.
 
 Edges that open with u > 0 and with u < 0 may be parts of one spool or valves of their own (see
 `timing`), so the machine is given a command for either direction.
@@ -10,7 +10,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from rtid.diagnose.timing import Psi, Timing
+from rtid.diagnose.pump import demand
+from rtid.diagnose.timing import COMMAND, SUPPLY, Psi, Timing
+from rtid.diagnose.view import View
 from rtid.model import FloatArray, Model
 
 Timings = tuple[tuple[Timing, Psi], ...]
@@ -44,13 +46,25 @@ def transformed(model: Model, chunk: FloatArray, timings: Timings) -> FloatArray
     """The record of the split machine: commands as the timings let them reach the spools."""
     dt_s = float(np.median(np.diff(chunk[:, 0])))
     sent = [through(u, d, dt_s, timings) for d, u in commands(model, chunk).values()]
-    return np.column_stack([chunk, *sent])
+    return lowered(split(model), np.column_stack([chunk, *sent]), timings)
+
+
+def lowered(model: Model, chunk: FloatArray, timings: Timings) -> FloatArray:
+    """The record of the split machine, its supply lowered as a timing of the supply says."""
+    for timing, psi in timings:
+        if timing.where == SUPPLY:
+            view = View.without_map(model, chunk)
+            chunk[:, 2 + model.column(view.supply_name)] -= timing.apply(
+                demand(view), view.step_s, psi
+            )
+    return chunk
 
 
 def through(u: FloatArray, direction: int, dt_s: float, timings: Timings) -> FloatArray:
     """What timings let through of a command (n,) to the edges of one direction."""
     for timing, psi in timings:
-        u = timing.on(u, direction, dt_s, psi)
+        if timing.where == COMMAND:
+            u = timing.on(u, direction, dt_s, psi)
     return u
 
 
@@ -62,6 +76,6 @@ def change_of(
     before = through(u, direction, dt_s, timings[:k])
     change = timing.change(before, direction, dt_s, psi, j)
     for behind, held in timings[k + 1 :]:  # linear ones pass it on, play lets it through
-        if behind.is_linear:
+        if behind.where == COMMAND and behind.is_linear:
             change = behind.apply(change, dt_s, held)
     return change

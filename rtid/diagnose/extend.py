@@ -13,9 +13,10 @@ import numpy as np
 
 from rtid.diagnose.diagnosis import LEAST_SHARE, begin
 from rtid.diagnose.fit import Fit, fit, one_pass
-from rtid.diagnose.parts import COMMAND, Part
+from rtid.diagnose.parts import Part
+from rtid.diagnose.pump import PUMP
 from rtid.diagnose.residual import Residual, residual
-from rtid.diagnose.timing import TIMINGS
+from rtid.diagnose.timing import COMMAND, TIMINGS
 from rtid.diagnose.trials import (
     GAIN,
     MATCH_RHO,
@@ -32,6 +33,7 @@ from rtid.diagnose.trials import (
     physical,
     refined,
     scored,
+    with_pump,
 )
 from rtid.diagnose.verdict import MATERIAL
 from rtid.errors import RtidError
@@ -100,6 +102,8 @@ def extend(present: Standing, effect: str, where: str = "") -> Extension:
     """
     state = present.state
     trials = _timings(present, effect, where) or _flows(present, effect, where)
+    if effect == PUMP.effect:
+        trials = with_pump(state, present.fit, trials)
     best = max(trials, key=lambda t: t.gain)
     alike = alike_ones(state, best, trials)
     if alike:

@@ -1,7 +1,7 @@
 """Fit one revision of the model to a record: maps, compliances, effects and timing together.
 
 Timing parameters and the shapes of effects enter as their derivative columns and are moved until
-nothing is left to move (Gauss-Newton); the declared lag of the spools is one of them, held by its
+nothing is left to move (`moving`); the declared lag of the spools is one of them, held by its
 tolerance.
 """
 
@@ -17,6 +17,7 @@ from rtid.diagnose.candidates import Candidate, Cause, Columns, Shape, Volumes
 from rtid.diagnose.causes import add_echoes, total_softness
 from rtid.diagnose.commands import commands, split, transformed
 from rtid.diagnose.evidence import Projected, Rows, project, rows_of
+from rtid.diagnose.moving import halfway, is_worse, moved
 from rtid.diagnose.regression import Estimate, Regression
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.view import FlowMap, View
@@ -27,12 +28,9 @@ from rtid.estimator.state import Weights, variance
 from rtid.kernels.layout import TERMS
 from rtid.model import FloatArray, Model
 
-PASSES = 5  # of Gauss-Newton
-SIZED = 0.05  # share by which compliances and sizes of effects may still change: they weigh
-SETTLED = 0.2  # of a standard deviation: a step as short ends it
-REACH = 0.6  # of a timing parameter: the longest step
-SHAPE_REACH = 0.5  # the same of an effect's nonlinear parameter, in steps of its axis
-RIDGE = 1e-9  # of the square of a shape's column: more than rounding leaves
+PASSES = 10  # of Gauss-Newton
+ENOUGH = 1e-3  # of the misfit: a pass that gains less ends it
+RIDGE = 1e-9  # of the square of a timing's or a shape's column: more than rounding leaves
 HELD = 1e30  # information of a parameter that is held
 NO_COV = np.zeros((0, TERMS, TERMS))  # of maps whose covariance nobody asked for
 
@@ -116,13 +114,19 @@ def fit(
 
     bank: also make the columns of every candidate, to score them.
     """
+    best = one_pass(model, chunk, weights, revision, start, False, thorough=False)
+    step = moved(best)
     for _ in range(PASSES):
-        start = found = one_pass(model, chunk, weights, revision, start, False, thorough=False)
-        moved = _moved(found)
-        if moved is None:
+        if step is None:
             break
-        revision, weights = moved
-    return one_pass(model, chunk, weights, revision, start, bank) if bank else found
+        found = one_pass(model, chunk, step.weights, step.revision, best, False, thorough=False)
+        if is_worse(found, best):
+            step = halfway(best, step)
+        else:
+            misfit = max(1.0, best.estimate.sse - best.regression.dof)
+            is_done = abs(best.estimate.sse - found.estimate.sse) < max(1.0, ENOUGH * misfit)
+            best, step = found, None if is_done else moved(found)
+    return one_pass(model, chunk, best.weights, best.revision, best, bank) if bank else best
 
 
 def one_pass(
@@ -158,8 +162,8 @@ def one_pass(
     cov = rows.factor.covariances if thorough else NO_COV
     dof = rows.n - TERMS * len(rows.cells) + float(np.einsum("bii->", cov)) * PRIOR_SD**-2
     regression = _regression(model, weights, revision, projected, columns, rows.n, dof)
-    weak = slice(first - len(shapes), first)
-    regression.prior[weak] = RIDGE * regression.own[weak]
+    weak = slice(first - len(shapes) - sum(len(psi) for _, psi in revision.timings), first)
+    regression.prior[weak] = RIDGE * regression.own[weak] + (regression.own[weak] == 0.0)
     at = [first + columns.candidates.index(e) for e in revision.effects]
     estimate = regression.fit((*range(1, first), *at))
     found = FlowMap(rows.cells, projected.terms(list(estimate.used), estimate.theta), cov)
@@ -191,7 +195,7 @@ def softened(
 
     The noise of a pressure moves what is stored: sd_P times V / beta and the effects' own share.
     """
-    view = View(model, chunk, weights.compliance, np.zeros((0, 0, 5)), np.zeros(0, bool))
+    view = View.without_map(model, chunk, weights.compliance)
     more = np.zeros((view.n, len(model.chambers)))
     own = total_softness(view, sizes)
     for c, chamber in enumerate(model.chambers):
@@ -238,51 +242,3 @@ def _regression(
         prior[1 + n_c] = tolerance**-2 if tolerance > 0 else HELD
         mean[1 + n_c] = model.lag.nominal_s - weights.lag_s
     return Regression(projected.schur, noise, prior, mean, projected.own, dof, rows)
-
-
-def _moved(found: Fit) -> tuple[Revision, Weights] | None:
-    """Revision and weights with timing parameters moved to where the derivatives point."""
-    settled, weights, lag = True, found.weights, found.model.lag
-    estimate, spread = found.estimate, np.sqrt(max(1.0, found.rho))
-    if not found.revision.replaces_lag and lag.tolerance_s > 0:
-        at = 1 + len(found.model.chambers)
-        moved = found.weights.lag_s + estimate.value(at)
-        moved = float(np.clip(moved, 0.0, lag.nominal_s + 3 * lag.tolerance_s))
-        if abs(moved - found.weights.lag_s) > max(SETTLED * spread * estimate.sd(at), 2e-5):
-            settled, weights = False, replace(weights, lag_s=moved)
-    timings = []
-    for k, (timing, psi) in enumerate(found.revision.timings):
-        new = []
-        for j, (value, at) in enumerate(zip(psi, found.timing_columns(k), strict=True)):
-            reach = REACH * max(abs(value), abs(timing.bank[0][j]) * 0.1)
-            step = float(np.clip(estimate.value(at), -reach, reach))
-            target = float(np.clip(value + step, timing.low[j], timing.high[j]))
-            if abs(target - value) > max(SETTLED * spread * estimate.sd(at), 2e-3 * abs(value)):
-                settled = False
-            new.append(target)
-        timings.append((timing, tuple(new)))
-    effects = tuple(_reshaped(found, effect) for effect in found.revision.effects)
-    sizes = [found.estimate.value(found.column(effect)) for effect in found.revision.effects]
-    known = [size for _, size in found.revision.sizes]
-    settled = settled and effects == found.revision.effects and len(known) == len(sizes)
-    settled = settled and np.allclose(known, sizes, rtol=SIZED, atol=0.0)
-    low, high = sorted(1.0 / bound for bound in found.model.beta_bounds_pa)
-    compliance = np.clip(found.compliance, low, high)
-    if not np.allclose(compliance, found.weights.compliance, rtol=SIZED, atol=0.0):
-        settled, weights = False, replace(weights, compliance=compliance)
-    revision = Revision(effects, tuple(timings), tuple(zip(effects, sizes, strict=True)))
-    return None if settled else (revision, weights)
-
-
-def _reshaped(found: Fit, effect: Candidate) -> Candidate:
-    """An effect with its nonlinear parameters moved by what their derivatives took."""
-    size, shape = found.estimate.value(found.column(effect)), list(effect.shape)
-    cause = cause_of(found.view, effect)
-    if size == 0.0:
-        return effect
-    for k, at in found.shape_columns(effect).items():
-        step, sd = found.estimate.value(at) / size, found.estimate.sd(at) / abs(size)
-        reach = SHAPE_REACH * cause.spacing(k)
-        if abs(step) > max(SETTLED * np.sqrt(max(1.0, found.rho)) * sd, 1e-3 * cause.spacing(k)):
-            shape[k] = float(np.clip(shape[k] + np.clip(step, -reach, reach), *cause.bounds(k)))
-    return replace(effect, shape=tuple(shape))

@@ -13,14 +13,13 @@ from rtid.diagnose.candidates import Candidate, Cause
 from rtid.diagnose.causes import causes
 from rtid.diagnose.commands import split, transformed
 from rtid.diagnose.fit import Fit, first_map
+from rtid.diagnose.pump import PUMP
 from rtid.diagnose.revision import Revision
-from rtid.diagnose.timing import TIMINGS, Psi, Timing
+from rtid.diagnose.timing import COMMAND, TIMINGS, Psi, Timing
 from rtid.diagnose.view import View
 from rtid.errors import RtidError
 from rtid.estimator.state import Weights
 from rtid.model import FloatArray, Model
-
-COMMAND = "command"  # where every timing sits
 
 
 class PartError(RtidError):
@@ -44,7 +43,7 @@ class Part:
 
 def part_of(fit: Fit, key: tuple[str, str], parameters: Mapping[str, float]) -> Part:
     """The part that a cause of a fit becomes."""
-    own = any(t.own_spools for t, _ in fit.revision.timings if (t.effect, COMMAND) == key)
+    own = any(t.own_spools for t, _ in fit.revision.timings if t.effect == key[0])
     return Part(*key, parameters, own)
 
 
@@ -54,7 +53,7 @@ def recall(model: Model, chunk: FloatArray, weights: Weights, parts: tuple[Part,
     Raises PartError where a part fits no effect of this machine and record.
     """
     timings = tuple((t, psi) for p in parts if (found := _timing(p)) for t, psi in [found])
-    fixed = [p for p in parts if p.where != COMMAND]
+    fixed = [p for p in parts if _timing(p) is None]
     if not fixed:
         return Revision((), timings)
     sent, whole = transformed(model, chunk, timings), split(model)
@@ -64,12 +63,12 @@ def recall(model: Model, chunk: FloatArray, weights: Weights, parts: tuple[Part,
 
 
 def _timing(part: Part) -> tuple[Timing, Psi] | None:
-    if part.where != COMMAND:
-        return None
-    for timing in TIMINGS:
+    for timing in (*TIMINGS, PUMP):
         if (timing.effect, timing.own_spools) == (part.effect, part.own_spools):
             return timing, tuple(_value(part, name) for name in timing.parameters)
-    raise _unfit(part, "is no effect on a command")
+    if part.where == COMMAND:
+        raise _unfit(part, "is no effect on a command")
+    return None
 
 
 def _candidate(part: Part, offered: list[Cause]) -> Candidate:

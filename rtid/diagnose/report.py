@@ -165,7 +165,7 @@ def parameters(fit: Fit, key: Key) -> dict[str, Value]:
     found: dict[str, Value] = {}
     spread = np.sqrt(max(1.0, fit.rho))
     for k, (timing, psi) in enumerate(fit.revision.timings):
-        if (timing.effect, "command") == key:
+        if timing.effect == key[0]:
             for name, unit, value, j in zip(
                 timing.parameters, timing.units, psi, fit.timing_columns(k), strict=True
             ):

@@ -8,8 +8,10 @@ closed in on; half the blocks per axis are enough to tell which is best.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from scipy.optimize import minimize
 
 from rtid.diagnose.candidates import Columns
 from rtid.diagnose.commands import Timings, split, transformed
@@ -20,6 +22,8 @@ from rtid.estimator.state import Weights
 from rtid.model import FloatArray, Grid, Model
 
 ROW_S = 20e-3  # long rows are enough
+SIMPLEX, DOWNHILL = 0.25, 80  # first size in logarithms of the parameters; refits
+KEPT = 0.995  # of the rows that must stay on the grids: what is left out cannot misfit
 CLOSING = 5  # refits between the neighbours of the best of the bank
 
 
@@ -44,6 +48,7 @@ class Search:
         self.model, self.chunk = coarse(model), chunk
         self.split = split(self.model)
         self.weights: Weights = prepare(self.model, chunk)
+        self.most_rows = 0
 
     def best(self, timing: Timing, beside: Fit, enough: float) -> tuple[Psi, float]:
         """The parameters of a timing that lower the cost most beside a fit, and by how much.
@@ -73,14 +78,34 @@ class Search:
                 high = trial
         return psi, before - best
 
+    def polished(self, timing: Timing, bank: list[Psi], beside: Fit) -> Psi:
+        """The best of a bank for a timing of several parameters, and from there downhill.
+
+        Where parameters bend each other, a simplex finds the way that derivatives miss.
+        """
+
+        def cost(logs: FloatArray) -> float:
+            psi = tuple(np.clip(np.exp(logs), timing.low, timing.high))
+            return self.cost(((timing, psi),), beside)
+
+        starts = [np.log(np.array(psi)) for psi in bank]
+        start = min(starts, key=cost)
+        simplex = np.vstack([start, start + SIMPLEX * np.eye(len(start))])
+        options: Any = {"maxfev": DOWNHILL, "initial_simplex": simplex}
+        found = minimize(cost, start, method="Nelder-Mead", options=options)
+        return tuple(float(v) for v in np.clip(np.exp(found.x), timing.low, timing.high))
+
     def cost(self, more: Timings, beside: Fit) -> float:
-        """Residual sum of squares of a revision with more timings."""
+        """Residual sum of squares of a revision with more timings; inf where it loses rows."""
         timings = (*beside.revision.timings, *more)
         sent = transformed(self.model, self.chunk, timings)
         weights = self.weights
         if any(t.replaces_lag for t, _ in timings):
             weights = replace(weights, lag_s=0.0)
         rows = rows_of(self.split, sent, weights, ROW_S)
+        self.most_rows = max(self.most_rows, rows.n)
+        if rows.n < KEPT * self.most_rows:
+            return float("inf")
         columns = Columns(rows.condensed)
         for volumes in columns_of_effects(beside):
             columns.add(volumes)

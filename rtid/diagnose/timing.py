@@ -18,6 +18,7 @@ from rtid.kernels.jit import kernel
 from rtid.model import FloatArray
 
 Psi = tuple[float, ...]
+COMMAND, SUPPLY = "command", "supply"  # what a timing transforms
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,8 @@ class Timing:
 
     apply(u (n,), dt_s, psi) -> (n,); low, high: bounds of psi; replaces_lag: it stands for the
     declared lag of the spools instead of coming before it; is_linear: in the command;
-    own_spools: each direction follows its own part of the command.
+    own_spools: each direction follows its own part of the command; where: a command, or the
+    demand on the supply, from which `apply` makes what the supply gives way.
     """
 
     effect: str
@@ -39,6 +41,7 @@ class Timing:
     replaces_lag: bool = False
     is_linear: bool = True
     own_spools: bool = False
+    where: str = COMMAND
 
     def on(self, command: FloatArray, direction: int, dt_s: float, psi: Psi) -> FloatArray:
         """What reaches the spool of the edges of one direction (+1, -1)."""

@@ -15,11 +15,12 @@ from rtid.diagnose.candidates import Candidate
 from rtid.diagnose.causes import causes
 from rtid.diagnose.fit import Fit, fit, one_pass
 from rtid.diagnose.parts import Part
+from rtid.diagnose.pump import PUMP, demand
 from rtid.diagnose.regression import LIMIT_SD, Score
 from rtid.diagnose.residual import Residual, residual
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.search import Search
-from rtid.diagnose.timing import TIMINGS, Psi, Timing
+from rtid.diagnose.timing import COMMAND, TIMINGS, Psi, Timing
 from rtid.model import FloatArray, Model
 
 GAIN = 16.0  # chi2 of the first effect: 60 candidates, 0.4 % for all of them together
@@ -31,6 +32,9 @@ SHARE_OF_BEST = 0.2  # of the best gain that a cause must have for its shape to 
 ROUNDS = 8  # of refinement, each with half the step of the last
 SETTLED = 2e-3  # of the gain: what a round must add for another one
 MATCH_RHO = 1.10  # largest rho of a model that matches
+
+# pumps to begin with: droops as shares of that seen, quantiles of the demand, stiffness in Pa/m3
+DROOPS, PUMP_LIMITS, STIFFNESSES = (0.1, 0.7), (0.8, 0.93, 0.98), (1e9, 1e10, 1e11, 1e12)
 
 Key = tuple[str, str]
 
@@ -108,11 +112,11 @@ def trials_of(state: State, present: Fit) -> list[Trial]:
     best = best_by_key(present, scored(present))
     trials = []
     for key, (candidate, score) in best.items():
-        if key[1] == "command":
+        if key[1] == COMMAND:
             continue
         trials.append(Trial(key, score.gain, _with(present, candidate)))
-    trials = refined(state, present, trials)
-    scores = {key: s.gain for key, (_, s) in best.items() if key[1] == "command"}
+    trials = with_pump(state, present, refined(state, present, trials))
+    scores = {key: s.gain for key, (_, s) in best.items() if key[1] == COMMAND}
     other = max((t.gain for t in trials if t.key not in state.negligible), default=0.0)
     return trials + _timing_trials(state, present, scores, other)
 
@@ -179,13 +183,40 @@ def _with(present: Fit, candidate: Candidate) -> Revision:
     return replace(present.revision, effects=(*present.revision.effects, candidate))
 
 
+def with_pump(state: State, present: Fit, trials: list[Trial]) -> list[Trial]:
+    """A supply that sags is refitted exactly, from where its first-order forms point."""
+    first = [t for t in trials if t.effect.effect == PUMP.effect]
+    rest = [t for t in trials if t.effect.effect != PUMP.effect]
+    if not first or first[0].gain < PROMISING * max((t.gain for t in rest), default=0.0):
+        return rest
+    psi = state.coarse.polished(PUMP, _pumps(present), present)
+    timings = (*present.revision.timings, (PUMP, psi))
+    revision = replace(present.revision, timings=timings)
+    now = fit(state.model, state.chunk, present.weights, revision, None, bank=False)
+    gain = present.estimate.sse - now.estimate.sse
+    return [*rest, Trial(first[0].key, gain, now.revision, now)]
+
+
+def _pumps(present: Fit) -> list[Psi]:
+    """Pumps to begin with: droops about the one that is seen, limits within what is drawn."""
+    drawn = demand(present.view)
+    resistances = [
+        score.value
+        for candidate, score in scored(present)
+        if candidate.effect == PUMP.effect and candidate.parameter == "resistance"
+    ]
+    r = max([*resistances, PUMP.low[0]])
+    limits = [*np.quantile(drawn[drawn > 0], PUMP_LIMITS), 2.0 * drawn.max()]
+    return [(float(r * part), float(q), s) for part in DROOPS for q in limits for s in STIFFNESSES]
+
+
 def _timing_trials(
     state: State, present: Fit, scores: dict[Key, float], other: float
 ) -> list[Trial]:
     """Exact refits with one timing more, of those that may matter."""
-    open_ = [t for t in TIMINGS if not present.revision.has((t.effect, "command"))]
+    open_ = [t for t in TIMINGS if not present.revision.has((t.effect, COMMAND))]
     if present.rho < LARGE:
-        open_ = [t for t in open_ if scores.get((t.effect, "command"), 0.0) > GAIN]
+        open_ = [t for t in open_ if scores.get((t.effect, COMMAND), 0.0) > GAIN]
     if not open_ or not present.view.has_pressures:
         return []
     return exact_trials(state, present, open_, other)
@@ -211,7 +242,7 @@ def exact_trials(
         now = fit(state.model, state.chunk, present.weights, revision, None, bank=False)
         if not _is_inside(now):
             continue
-        exact, key = present.estimate.sse - now.estimate.sse, (timing.effect, "command")
+        exact, key = present.estimate.sse - now.estimate.sse, (timing.effect, COMMAND)
         if key not in trials or exact > trials[key].gain:
             trials[key] = Trial(key, exact, now.revision, now.light())
     return list(trials.values())

@@ -19,6 +19,7 @@ from rtid.model import PRESSURE, FloatArray, Model
 
 TURNS = 0.05  # share of changes that reverse the one before: 2/3 for noise, next to 0 for motion
 UNKNOWN = 10.0  # standard deviation of the flow in a block that was never visited, rated flows
+NONE = np.zeros(0)
 SMOOTH_S = 0.02  # half width of the window for derivatives of pressures, without delay
 
 
@@ -76,6 +77,11 @@ class View:
         return cls(
             model, chunk, weights.compliance, np.nan_to_num(along), np.isfinite(along[:, 0, 0])
         )
+
+    @classmethod
+    def without_map(cls, model: Model, chunk: FloatArray, compliance: FloatArray = NONE) -> View:
+        """The record's signals and volumes alone."""
+        return cls(model, chunk, compliance, np.zeros((0, 0, 5)), np.zeros(0, bool))
 
     @property
     def n(self) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.signal import lfilter
 
+from rtid.diagnose.candidates import Volumes
 from rtid.diagnose.view import View
 from rtid.model import FloatArray
 
@@ -36,3 +37,14 @@ def slope_to(view: View, c: int) -> FloatArray:
         for edge in view.model.edges
     ]
     return view.into_chamber(c, [k * view.slope_dp(i) for i, k in enumerate(toward)])
+
+
+def supply_change(view: View, change_pa: FloatArray) -> Volumes:
+    """Volumes per interval and chamber of a small change of the supply's pressure (n,)."""
+    mean = 0.5 * (change_pa[1:] + change_pa[:-1])
+    flows = [
+        view.slope_dp(i) * mean if edge.source == view.supply_name else np.zeros(view.n - 1)
+        for i, edge in enumerate(view.model.edges)
+    ]
+    n_c = len(view.model.chambers)
+    return {c: view.into_chamber(c, flows) * view.dt_s for c in range(n_c)}

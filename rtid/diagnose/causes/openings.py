@@ -22,6 +22,7 @@ from rtid.diagnose.view import View
 
 OPENINGS = 8  # opening pressures that are tried, over the range
 OWN_TIMES_S = (0.0, 0.02, 0.06)
+MAKEUP_PA = 1.5e6  # a make-up valve feeds from the tank line: it opens at low pressure
 HYSTERESIS = 0.04  # of the highest pressure: where the search begins
 
 
@@ -36,6 +37,9 @@ def _opening(view: View, effect: str, c: int, sign: float) -> Cause:
     """A valve that lets out (sign +1) above its opening pressure, or in (-1) below it."""
     p, smooth = view.pressure(c), view.smooth(view.pressure(c))
     low, high = (float(v) for v in np.quantile(p, [0.002, 0.998]))
+    is_possible = sign > 0 or low < MAKEUP_PA
+    if sign < 0 and is_possible:
+        high = min(high, MAKEUP_PA)
     pressures = tuple(float(v) for v in np.linspace(low, high, OPENINGS + 2)[1:-1])
 
     def make(shape: Shape) -> Volumes:
@@ -51,4 +55,4 @@ def _opening(view: View, effect: str, c: int, sign: float) -> Cause:
         shape_units=("Pa", "s", "Pa"),
     )  # fmt: skip
     times_s = OWN_TIMES_S if sign > 0 else (0.0,)  # a check valve is quick
-    return Cause(candidate, make, (pressures, times_s, (0.0, HYSTERESIS * high)), banked=2)
+    return Cause(candidate, make, (pressures, times_s, (0.0, HYSTERESIS * high)), 2, is_possible)

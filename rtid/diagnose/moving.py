@@ -1,0 +1,136 @@
+"""Gauss-Newton over what is not linear: lag, timings, shapes of effects, and what weighs the rows.
+
+A step follows the derivative columns of a fit, bounded; one that makes the misfit larger is halved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rtid.diagnose.bank import cause_of
+from rtid.diagnose.candidates import Candidate
+from rtid.diagnose.revision import Revision
+from rtid.diagnose.timing import Psi, Timing
+from rtid.estimator.state import Weights
+from rtid.model import FloatArray
+
+if TYPE_CHECKING:
+    from rtid.diagnose.fit import Fit
+
+SETTLED = 0.2  # of a standard deviation: a step as short ends it
+REACH = 0.6  # of a timing parameter: the longest step
+SHAPE_REACH = 0.5  # the same of an effect's nonlinear parameter, in steps of its axis
+SIZED = 0.05  # share by which compliances and sizes of effects may still change: they weigh
+KEPT = 0.995  # of the rows that a step must leave on the grids: what is left out cannot misfit
+LAG_REACH = 3.0  # tolerances of the declared lag
+LEAST_LAG_S, LEAST_SHARE = 2e-5, 2e-3  # steps of a lag and of a timing that are not worth a pass
+LEAST_SPACING = 1e-3  # the same of a shape, of its axis' spacing
+
+
+@dataclass(frozen=True)
+class Step:
+    """What to fit next."""
+
+    revision: Revision
+    weights: Weights
+
+
+def moved(found: Fit) -> Step | None:
+    """Where the derivatives point; None where nothing is left to move."""
+    old = found.revision
+    timings = tuple(
+        (timing, _timed(found, k, timing, psi)) for k, (timing, psi) in enumerate(old.timings)
+    )
+    effects = tuple(_reshaped(found, effect) for effect in old.effects)
+    sizes = tuple(
+        (e, found.estimate.value(found.column(o)))
+        for e, o in zip(effects, old.effects, strict=True)
+    )
+    weights = replace(found.weights, lag_s=_lag_s(found), compliance=_compliance(found))
+    is_same = (timings, effects) == (old.timings, old.effects) and _weigh_alike(sizes, old.sizes)
+    is_same &= weights.lag_s == found.weights.lag_s
+    is_same &= weights.compliance is found.weights.compliance
+    return None if is_same else Step(Revision(effects, timings, sizes), weights)
+
+
+def halfway(best: Fit, step: Step) -> Step:
+    """Half the way from a fit to a step that went too far."""
+    old, new = best.revision, step.revision
+    timings = tuple(
+        (timing, _mean(psi, was))
+        for (timing, psi), (_, was) in zip(new.timings, old.timings, strict=True)
+    )
+    effects = tuple(
+        replace(e, shape=_mean(e.shape, was.shape))
+        for e, was in zip(new.effects, old.effects, strict=True)
+    )
+    sizes = tuple((e, size) for e, (_, size) in zip(effects, new.sizes, strict=True))
+    lag_s = 0.5 * (best.weights.lag_s + step.weights.lag_s)
+    return Step(Revision(effects, timings, sizes), replace(step.weights, lag_s=lag_s))
+
+
+def is_worse(found: Fit, best: Fit) -> bool:
+    """True where a step made the misfit larger, both being weighed alike, or lost rows."""
+    if found.regression.rows < KEPT * best.regression.rows:
+        return True
+    alike = np.array_equal(found.weights.compliance, best.weights.compliance)
+    alike = alike and _weigh_alike(found.revision.sizes, best.revision.sizes)
+    return alike and found.estimate.sse > best.estimate.sse
+
+
+def _mean(a: Psi, b: Psi) -> Psi:
+    return tuple(0.5 * (one + other) for one, other in zip(a, b, strict=True))
+
+
+def _weigh_alike(
+    a: tuple[tuple[Candidate, float], ...], b: tuple[tuple[Candidate, float], ...]
+) -> bool:
+    one, other = [size for _, size in a], [size for _, size in b]
+    return len(one) == len(other) and np.allclose(one, other, rtol=SIZED, atol=0.0)
+
+
+def _least(found: Fit, column: int) -> float:
+    """The step of a column's parameter that is within its uncertainty."""
+    return SETTLED * float(np.sqrt(max(1.0, found.rho))) * found.estimate.sd(column)
+
+
+def _lag_s(found: Fit) -> float:
+    lag, now, at = found.model.lag, found.weights.lag_s, found.first_given
+    if found.revision.replaces_lag or lag.tolerance_s == 0.0:
+        return now
+    most = lag.nominal_s + LAG_REACH * lag.tolerance_s
+    target = float(np.clip(now + found.estimate.value(at), 0.0, most))
+    return target if abs(target - now) > max(_least(found, at), LEAST_LAG_S) else now
+
+
+def _compliance(found: Fit) -> FloatArray:
+    low, high = sorted(1.0 / bound for bound in found.model.beta_bounds_pa)
+    target, now = np.clip(found.compliance, low, high), found.weights.compliance
+    return now if np.allclose(target, now, rtol=SIZED, atol=0.0) else target
+
+
+def _timed(found: Fit, k: int, timing: Timing, psi: Psi) -> Psi:
+    new = []
+    for j, (value, at) in enumerate(zip(psi, found.timing_columns(k), strict=True)):
+        reach = REACH * max(abs(value), abs(timing.bank[0][j]) * 0.1)
+        step = float(np.clip(found.estimate.value(at), -reach, reach))
+        target = float(np.clip(value + step, timing.low[j], timing.high[j]))
+        is_far = abs(target - value) > max(_least(found, at), LEAST_SHARE * abs(value))
+        new.append(target if is_far else value)
+    return tuple(new)
+
+
+def _reshaped(found: Fit, effect: Candidate) -> Candidate:
+    """An effect with its nonlinear parameters moved by what their derivatives took."""
+    size, shape = found.estimate.value(found.column(effect)), list(effect.shape)
+    cause = cause_of(found.view, effect)
+    if size == 0.0:
+        return effect
+    for k, at in found.shape_columns(effect).items():
+        step, reach = found.estimate.value(at) / size, SHAPE_REACH * cause.spacing(k)
+        if abs(step) > max(_least(found, at) / abs(size), LEAST_SPACING * cause.spacing(k)):
+            shape[k] = float(np.clip(shape[k] + np.clip(step, -reach, reach), *cause.bounds(k)))
+    return replace(effect, shape=tuple(shape))
