@@ -48,7 +48,7 @@ def _fill(one: Record, t_us: Integer) -> None:
     """One frame more in the bucket."""
     periods = (t_us - one.last_us) / one.period_us if one.seen else 1.0
     if periods < 0.0 and t_us < one.last_us - HOLD_US:  # the clock was set back
-        one.until_us, periods = t_us, 1.0
+        one.until_us, one.level, periods = t_us, 0.0, 1.0
     periods = max(periods, 0.0)
     one.credit *= max(0.0, 1.0 - periods * one.period_us / CREDIT_US)
     if periods > SILENCE:
