@@ -42,6 +42,7 @@ class Line:
             return t, y
         known = np.isfinite(y)
         chosen = _THIN.downsample(_held(y, known), n_out=points).astype(int)
+        chosen = np.union1d(chosen, [0, len(y) - 1])
         breaks = np.flatnonzero(known[:-1] & ~known[1:])
         if len(breaks) <= MOST_GAPS:
             ends = np.flatnonzero(~known[:-1] & known[1:])

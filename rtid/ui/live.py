@@ -29,6 +29,7 @@ from rtid.ui.fragments import table
 
 STALE_S = 3.0
 MOST_ALARMS = 6
+COUNTED = ("samples", "rows", "block_changes")
 DOTS = {"ok": "ok", "open": "ok", "late": "warn", "reopening": "warn", "suspended": "warn"}
 Clock = Callable[[], float]
 
@@ -102,6 +103,11 @@ def _head(status: Status, age_s: float) -> str:
         f'<span class="{kind}">{text(saved)} {text(store.reason)}</span>. '
         f"{status.rss_anon_mb:.0f} MB.</p>"
     )
+
+
+def _refusals(counts: dict[str, int]) -> str:
+    """Without what is counted and not refused."""
+    return _counts({name: n for name, n in counts.items() if name not in COUNTED})
 
 
 def _counts(counts: dict[str, int]) -> str:
@@ -224,7 +230,7 @@ def _learning(status: Status) -> str:
     rho = (
         "" if found.rho is None else f"<dt>residual variance</dt><dd>{found.rho:.2f} of noise</dd>"
     )
-    refused = _counts(found.refused)
+    refused = _refusals(found.refused)
     bars = "".join(_edge(edge) for edge in found.edges)
     return (
         f"<h2>Learning</h2><p>{_dot('ok' if found.state == 'learning' else 'suspended')}"

@@ -7,6 +7,8 @@ from functools import cache
 from pathlib import Path
 
 from bokeh.core.properties import Dict, String
+from bokeh.core.validation import silence
+from bokeh.core.validation.warnings import EMPTY_LAYOUT
 from bokeh.document import Document
 from bokeh.layouts import column
 from bokeh.model import DataModel
@@ -18,6 +20,7 @@ from rtid.ui.live import Live
 from rtid.ui.session import FAILED, Session
 from rtid.ui.verdict import record_line, strip, work_line
 
+silence(EMPTY_LAYOUT)  # a view that nobody has looked at yet
 PAUSE_MS = 700  # between views that are made ahead
 STATIC = Path(__file__).parent / "static"
 VIEWS = ("compare", "where", "why", "add", "map", "live")

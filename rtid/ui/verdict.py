@@ -46,8 +46,8 @@ def strip(session: Session) -> str:
     found = last.told.diagnosis
     kind, heading = VERDICTS[found.verdict]
     words = sentences(found)
-    start = len(found.added) > 0
-    said = text(" ".join(words[start + 1 :][:1] if found.found else words[:2]))
+    names = tuple(title(e.effect) for e in found.found)
+    said = text(" ".join([s for s in words if s.startswith(names)][:1] if names else words[:2]))
     offer = ""
     if session.named is not None:
         effect, where = session.named

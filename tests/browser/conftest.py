@@ -1,0 +1,112 @@
+"""The system's Chromium with every request to another host blocked and counted."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rtid.sim.hidden import hide_wish
+from rtid.sim.random_plants import draw
+from rtid.sim.recording import write_run
+from rtid.sim.run import simulate
+from rtid.ui.server import Workbench
+from tests.ui.served import served
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page, Route
+
+NAMES = ("chromium", "chromium-browser", "google-chrome")
+FLAGS = [
+    *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync"),
+    *("--disable-background-networking", "--disable-component-update"),
+]
+SIZE = {"width": 1366, "height": 768}
+SEED, DURATION_S = 3, 40.0
+PATIENCE_MS = 90_000  # cold kernels on a loaded machine
+
+
+@dataclass
+class Opened:
+    """A page of the workbench, and what went wrong in it."""
+
+    page: Page
+    bench: Workbench
+    elsewhere: list[str] = field(default_factory=list)
+    errors: list[str] = field(default_factory=list)
+
+    def go(self, view: str = "") -> None:
+        """Open the page and wait until it can be used."""
+        self.page.goto(self.bench.url + (f"#{view}" if view else ""))
+        self.page.wait_for_selector("body[data-ready=yes]")
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Browser]:
+    playwright = pytest.importorskip(
+        "playwright.sync_api", reason="needs playwright: pip install 'rtid[dev]'"
+    )
+    found = next((path for name in NAMES if (path := shutil.which(name))), None)
+    if found is None:
+        pytest.skip("needs Chromium: apt-get install chromium (the page itself is not tested here)")
+    with playwright.sync_playwright() as running:
+        launched = running.chromium.launch(executable_path=found, args=FLAGS)
+        yield launched
+        launched.close()
+
+
+@pytest.fixture(scope="session")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Trace and project of a machine whose piston seal leaks."""
+    folder = tmp_path_factory.mktemp("worn")
+    machine = hide_wish(draw(SEED), "internal_leakage_laminar=strong")
+    run = simulate(machine, "rich", SEED, DURATION_S)
+    trace, _, project = write_run(folder / "worn.parquet", run, SEED, "rich")
+    return trace, project
+
+
+@pytest.fixture(scope="session")
+def bench(recorded: tuple[Path, Path]) -> Iterator[Workbench]:
+    trace, project = recorded
+    with served(project=project, trace=trace) as running:
+        yield running
+
+
+@pytest.fixture
+def opened(browser: Browser, bench: Workbench) -> Iterator[Opened]:
+    yield from open_page(browser, bench)
+
+
+def open_page(browser: Browser, bench: Workbench) -> Iterator[Opened]:
+    """A fresh context; at the end nothing may have been asked of other hosts, nothing failed."""
+    context = browser.new_context(viewport=SIZE, color_scheme="light")  # type: ignore[arg-type]
+    context.set_default_timeout(PATIENCE_MS)
+    own = bench.url.split("?")[0]
+    one = Opened(context.new_page(), bench)
+
+    def judge(route: Route) -> None:
+        if route.request.url.startswith((own, "data:", "blob:")):
+            route.continue_()
+        else:
+            one.elsewhere.append(route.request.url)
+            route.abort()
+
+    context.route("**/*", judge)
+    one.page.on("pageerror", lambda error: one.errors.append(str(error)))
+    one.page.on(
+        "console", lambda line: one.errors.append(line.text) if line.type == "error" else None
+    )
+    one.page.on("websocket", lambda ws: _judge_socket(one, ws.url, own))
+    yield one
+    context.close()
+    assert one.elsewhere == []
+    assert one.errors == []
+
+
+def _judge_socket(one: Opened, url: str, own: str) -> None:
+    if not url.startswith(own.replace("http", "ws", 1)):
+        one.elsewhere.append(url)
