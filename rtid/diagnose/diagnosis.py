@@ -24,6 +24,7 @@ from rtid.diagnose.trials import (
     State,
     Trial,
     alike_ones,
+    carried_on,
     material_share,
     own_share,
     physical,
@@ -150,26 +151,23 @@ def _add_best(state: State, present: Fit, last: Residual) -> tuple[Fit, Residual
         alike = alike_ones(state, best, trials)
         trial = simplest(best, trials, alike)
         alike = tuple(key for key in (best.key, *alike) if key != trial.key)
-        now = _with(state, present, trial)
+        now = carried_on(state, present, trial)
         after = residual(now, state.held_out)
         own = BENT * own_share(now, trial, state.held_out)
         share = min(material_share(last, after), own)
         if share >= MATERIAL:
             state.found.append(Found(trial.key, alike, trial.gain, last, after))
-            return now, after
+            return _with_bank(state, now), after
         state.negligible[trial.key] = share
         if _is_noticed(present, trial) and after.rms_m3s <= WORSE * last.rms_m3s:
             state.negligible |= dict.fromkeys(alike, share)
-            return now, after
+            return _with_bank(state, now), after
     return None
 
 
-def _with(state: State, present: Fit, trial: Trial) -> Fit:
-    """The fit with a trial's revision, every candidate beside it."""
-    now = trial.fit or fit(
-        state.model, state.chunk, present.weights, trial.revision, present, bank=False
-    )
-    return one_pass(state.model, state.chunk, now.weights, now.revision, now, True)
+def _with_bank(state: State, now: Fit) -> Fit:
+    """A fit with every candidate beside it."""
+    return one_pass(state.model, state.chunk, now.weights, now.revision, now, bank=True)
 
 
 def _is_noticed(present: Fit, trial: Trial) -> bool:

@@ -22,7 +22,7 @@ from rtid.diagnose.candidates import Volumes
 from rtid.estimator.factor import PRIOR_SD, one_thread
 from rtid.estimator.state import Weights, build
 from rtid.kernels import evidence as kernel
-from rtid.kernels import products
+from rtid.kernels import products, ringing
 from rtid.kernels.engine import ROW_FLAG
 from rtid.kernels.layout import TERMS
 from rtid.model import FloatArray, Model
@@ -72,7 +72,7 @@ class Rows:
     def maps(self) -> FloatArray:
         """Products of the maps' columns: the lower triangle of an array (6 V, 6 V)."""
         gram = np.zeros((TERMS * len(self.cells),) * 2)
-        products.maps(
+        ringing.map_products(
             self.sign, self.start, self.block, self.terms, self.fresh, self.whiten, self.keep,
             SPAN, QUIET, gram,
         )  # fmt: skip
@@ -91,7 +91,7 @@ class Rows:
             own = flat.T @ flat
         products.adjoint(columns, self.fresh, self.whiten, self.keep)
         cross = np.zeros((TERMS * len(self.cells), columns.shape[2]))
-        products.cross(columns, self.sign, self.start, self.block, self.terms, self.fresh, cross)
+        products.cross(columns, self.sign, self.start, self.block, self.terms, cross)
         return own, cross
 
     def _columns(self, given: list[Volumes]) -> FloatArray:
@@ -158,33 +158,36 @@ def rows_of(
     weights: Weights,
     row_s: float = ROW_S,
     soft: FloatArray | None = None,
+    means: int = 1,
 ) -> Rows:
     """One pass over a record, chunk (n, 2 + signals).
 
     soft (n, chambers): white variance of each measured position's equation, m6, beyond that of the
-    model without effects.
+    model without effects; means: measurements that each sample is a mean of.
     """
     group = rows_per_group(chunk, row_s)
     e = build(model, weights)
-    e.engine[0]["x_var_m2"] /= group
-    e.engine[0]["p_var_pa2"] /= group
+    e.engine[0]["x_var_m2"] /= group * means
+    e.engine[0]["p_var_pa2"] /= group * means
     n, most = len(chunk), _measured(chunk).sum() // group + 1
     counts, noise = np.zeros(4, np.int64), np.zeros((4, 2, 2))
     row_of, share = np.full(max(0, n - 1), kernel.NO_ROW), np.zeros(max(0, n - 1))
     own, fresh = np.zeros((most + 2, 2, 3)), np.zeros(most, np.bool_)
     whiten, keep = np.zeros((most, 3)), np.zeros((most, 2, 2))
-    start, cell, terms = np.zeros(most + 2, np.int64), *_entries(ENTRIES * most)
+    start = np.zeros(most + 2, np.int64)
+    cell, terms, later = _entries(ENTRIES * most + ENTRIES)
     soft = np.zeros((n, len(model.chambers))) if soft is None else soft
     at = 0
     while True:
         at = kernel.integrate(
             e.engine, e.cells, chunk, soft / group, at, group, counts, noise, row_of, share, own,
-            fresh, whiten, keep, start, cell, terms,
+            fresh, whiten, keep, start, cell, terms, later,
         )  # fmt: skip
         if at == n:
             break
-        more, more_terms = _entries(len(cell))
-        cell, terms = np.append(cell, more), np.append(terms, more_terms, axis=0)
+        more = _entries(len(cell))
+        cell, terms = np.append(cell, more[0]), np.append(terms, more[1], axis=0)
+        later = np.append(later, more[2], axis=0)
     rows, n_c = int(counts[kernel.N_ROWS]), len(model.chambers)
     entries = int(start[rows])
     cells, block = _numbered(cell[:entries])
@@ -194,8 +197,8 @@ def rows_of(
     )  # fmt: skip
 
 
-def _entries(count: int) -> tuple[IntArray, FloatArray]:
-    return np.empty(count, np.int64), np.empty((count, 2, TERMS))
+def _entries(count: int) -> tuple[IntArray, FloatArray, FloatArray]:
+    return np.empty(count, np.int64), np.empty((count, TERMS)), np.empty((count, TERMS))
 
 
 def _numbered(cell: IntArray) -> tuple[IntArray, IntArray]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rtid.diagnose.diagnosis import LEAST_SHARE, begin
-from rtid.diagnose.fit import Fit, fit, one_pass
+from rtid.diagnose.fit import Fit, one_pass
 from rtid.diagnose.parts import Part
 from rtid.diagnose.pump import PUMP
 from rtid.diagnose.residual import Residual, residual
@@ -27,6 +27,7 @@ from rtid.diagnose.trials import (
     Trial,
     alike_ones,
     best_by_key,
+    carried_on,
     exact_trials,
     material_share,
     own_share,
@@ -109,10 +110,8 @@ def extend(present: Standing, effect: str, where: str = "") -> Extension:
     if alike:
         choices = " or ".join(f"{effect}:{place}" for _, place in (best.key, *alike))
         raise RefusedError(f"{effect} explains as much at several places", f"name one: {choices}")
-    now = best.fit or fit(
-        state.model, state.chunk, present.fit.weights, best.revision, present.fit, bank=False
-    )
-    now = one_pass(state.model, state.chunk, now.weights, now.revision, now, True)
+    now = carried_on(state, present.fit, best)
+    now = one_pass(state.model, state.chunk, now.weights, now.revision, now, bank=True)
     after = Standing.of(state, now)
     against = tuple(_against(present, after, best))
     return Extension(best.key, best.gain, present, after, against, _better(present, best))

@@ -109,14 +109,15 @@ def fit(
     revision: Revision,
     start: Fit | None = None,
     bank: bool = True,
+    passes: int = PASSES,
 ) -> Fit:
     """Fit a revision to chunk (n, 2 + signals); start: the fit to begin with.
 
-    bank: also make the columns of every candidate, to score them.
+    bank: also make the columns of every candidate, to score them; passes: at most.
     """
     best = one_pass(model, chunk, weights, revision, start, False, thorough=False)
     step = moved(best)
-    for _ in range(PASSES):
+    for _ in range(passes):
         if step is None:
             break
         found = one_pass(model, chunk, step.weights, step.revision, best, False, thorough=False)
@@ -159,16 +160,34 @@ def one_pass(
     slopes = [(cause_of(view, e), e.shape, k) for i, k in shapes for e in [revision.effects[i]]]
     add_echoes(view, columns, n_timing, slopes)
     projected = project(rows, columns.released())
-    cov = rows.factor.covariances if thorough else NO_COV
-    dof = rows.n - TERMS * len(rows.cells) + float(np.einsum("bii->", cov)) * PRIOR_SD**-2
+    dof = float(rows.n - TERMS * len(rows.cells))
     regression = _regression(model, weights, revision, projected, columns, rows.n, dof)
     weak = slice(first - len(shapes) - sum(len(psi) for _, psi in revision.timings), first)
     regression.prior[weak] = RIDGE * regression.own[weak] + (regression.own[weak] == 0.0)
     at = [first + columns.candidates.index(e) for e in revision.effects]
     estimate = regression.fit((*range(1, first), *at))
-    found = FlowMap(rows.cells, projected.terms(list(estimate.used), estimate.theta), cov)
+    flowmap = FlowMap(rows.cells, projected.terms(list(estimate.used), estimate.theta), NO_COV)
     parts = sent, weights, revision, view, columns, regression, estimate
-    return Fit(declared, model, *parts, found, first, shapes, rows)
+    found = Fit(declared, model, *parts, flowmap, first, shapes, rows)
+    return with_covariances(found) if thorough else found
+
+
+def with_covariances(found: Fit) -> Fit:
+    """A fit with the covariances of its maps, and what their priors leave of the freedom."""
+    if found.rows is None:
+        return found
+    cov = found.rows.factor.covariances
+    freed = float(np.einsum("bii->", cov)) * PRIOR_SD**-2
+    dof = found.rows.n - TERMS * len(found.rows.cells) + freed
+    return replace(
+        found, map=replace(found.map, cov=cov), regression=replace(found.regression, dof=dof)
+    )
+
+
+def onward(found: Fit) -> tuple[Revision, Weights]:
+    """Where the next pass would be."""
+    step = moved(found)
+    return (step.revision, step.weights) if step else (found.revision, found.weights)
 
 
 def _same_rows(

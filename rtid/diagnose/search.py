@@ -2,7 +2,7 @@
 
 The cost of a wrong delay is not a parabola: far from the truth the fitted map is bent, and its
 derivatives point nowhere.  So each timing is first tried at the values of its bank, and the best is
-closed in on; half the blocks per axis are enough to tell which is best.
+closed in on; half the blocks per axis, and a thinned record, are enough to tell which is best.
 """
 
 from __future__ import annotations
@@ -13,18 +13,21 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from rtid.diagnose.candidates import Columns
-from rtid.diagnose.commands import Timings, split, transformed
+from rtid.diagnose.candidates import Columns, Volumes
+from rtid.diagnose.commands import Timings, commands, split, through, transformed
 from rtid.diagnose.evidence import project, rows_of
 from rtid.diagnose.fit import Fit, columns_of_effects, prepare
-from rtid.diagnose.timing import Psi, Timing
+from rtid.diagnose.thinned import Thinning
+from rtid.diagnose.timing import SUPPLY, Psi, Timing
 from rtid.estimator.state import Weights
 from rtid.model import FloatArray, Grid, Model
 
 ROW_S = 20e-3  # long rows are enough
 SIMPLEX, DOWNHILL = 0.25, 80  # first size in logarithms of the parameters; refits
 KEPT = 0.995  # of the rows that must stay on the grids: what is left out cannot misfit
-CLOSING = 5  # refits between the neighbours of the best of the bank
+CLOSING = 3  # refits between the neighbours of the best of the bank
+FOUND = 0.02  # share of a parameter within which it is found well enough from afar
+OFF = 0.05  # share of a bracket that a trial stays off its ends
 
 
 def coarse(model: Model) -> Model:
@@ -42,43 +45,83 @@ def _thinned(border: FloatArray) -> FloatArray:
 
 
 class Search:
-    """Costs of revisions on the coarse map of one record."""
+    """Costs of revisions on the coarse map of one record, thinned out."""
 
     def __init__(self, model: Model, chunk: FloatArray) -> None:
-        self.model, self.chunk = coarse(model), chunk
+        self.thinning = Thinning.of(model, chunk)
+        self.model = self.thinning.model(coarse(model))
         self.split = split(self.model)
-        self.weights: Weights = prepare(self.model, chunk)
+        self.declared, self.chunk = model, chunk
+        self.step_s = float(np.median(np.diff(chunk[:, 0])))
+        self.commands = commands(model, chunk)
+        self.record = self.thinning.record(model, chunk)
+        self.weights: Weights = prepare(self.model, self.record)
+
+    def beside(self, fit: Fit) -> Beside:
+        """Costs beside a fit."""
+        return Beside(self, fit)
+
+    def sent(self, timings: Timings) -> FloatArray:
+        """The thinned record of the split machine."""
+        if any(timing.where == SUPPLY for timing, _ in timings):
+            whole = transformed(self.declared, self.chunk, timings)
+            return self.thinning.record(self.split, whole)
+        sent = [
+            self.thinning.command(through(u, d, self.step_s, timings))
+            for d, u in self.commands.values()
+        ]
+        return np.column_stack([self.record, *sent])
+
+
+class Beside:
+    """The search beside one fit: what a timing more would lower the cost by."""
+
+    def __init__(self, search: Search, fit: Fit) -> None:
+        self.search, self.timings = search, fit.revision.timings
+        thinned = search.thinning.over_intervals
+        self.volumes: list[Volumes] = [
+            {c: thinned(series) for c, series in volumes.items()}
+            for volumes in columns_of_effects(fit)
+        ]
         self.most_rows = 0
+        self.before = self.cost(())
 
-    def best(self, timing: Timing, beside: Fit, enough: float) -> tuple[Psi, float]:
-        """The parameters of a timing that lower the cost most beside a fit, and by how much.
+    def cost(self, more: Timings) -> float:
+        """Residual sum of squares with more timings; inf where they lose rows."""
+        search, timings = self.search, (*self.timings, *more)
+        weights = search.weights
+        if any(t.replaces_lag for t, _ in timings):
+            weights = replace(weights, lag_s=0.0)
+        rows = rows_of(search.split, search.sent(timings), weights, ROW_S, means=search.thinning.m)
+        self.most_rows = max(self.most_rows, rows.n)
+        if rows.n < KEPT * self.most_rows:
+            return float("inf")
+        columns = Columns(rows.condensed)
+        for volumes in self.volumes:
+            columns.add(volumes)
+        s = project(rows, columns.released()).schur
+        theta = np.linalg.lstsq(s[1:, 1:], s[1:, 0], rcond=1e-12)[0]
+        return float(s[0, 0] - s[0, 1:] @ theta)
 
-        enough: a bank that lowers it by less is not closed in on.
+    def gain(self, timing: Timing, psi: Psi) -> float:
+        """What a timing lowers the cost by."""
+        return self.before - self.cost(((timing, psi),))
+
+    def bank(self, timing: Timing) -> dict[float, float]:
+        """Gains by strength, from the slightest value of the bank on.
+
+        They rise towards the truth and fall behind it: two falls in a row, or a deep one, end it.
         """
-        bank, before = list(timing.bank), self.cost((), beside)
-        cost = [self.cost(((timing, psi),), beside) for psi in bank]
-        k = int(np.argmin(cost))
-        if before - cost[k] < enough:
-            return bank[k], before - cost[k]
-        ends = [np.log(psi[0]) for psi in bank]
-        ends = [2 * ends[0] - ends[1], *ends, 2 * ends[-1] - ends[-2]]
-        low, middle, high = ends[k : k + 3]
-        psi, best = bank[k], cost[k]
-        for _ in range(CLOSING):
-            below = middle - low > high - middle
-            trial = 0.5 * (low + middle) if below else 0.5 * (middle + high)
-            moved = (float(np.clip(np.exp(trial), timing.low[0] or 0.0, timing.high[0])), *psi[1:])
-            found = self.cost(((timing, moved),), beside)
-            if found < best:
-                low, high = (low, middle) if below else (middle, high)
-                middle, psi, best = trial, moved, found
-            elif below:
-                low = trial
-            else:
-                high = trial
-        return psi, before - best
+        found, falls = {0.0: 0.0}, 0
+        for strength in sorted(timing.strength(psi) for psi in timing.bank):
+            found[strength] = self.gain(timing, timing.at(strength))
+            *_, second, third = found.values()
+            falls = falls + 1 if third < second else 0
+            if falls == 2 or third < -max(found.values()):
+                break
+        return found
 
-    def polished(self, timing: Timing, bank: list[Psi], beside: Fit) -> Psi:
+    def polished(self, timing: Timing, bank: list[Psi]) -> Psi:
         """The best of a bank for a timing of several parameters, and from there downhill.
 
         Where parameters bend each other, a simplex finds the way that derivatives miss.
@@ -86,7 +129,7 @@ class Search:
 
         def cost(logs: FloatArray) -> float:
             psi = tuple(np.clip(np.exp(logs), timing.low, timing.high))
-            return self.cost(((timing, psi),), beside)
+            return self.cost(((timing, psi),))
 
         starts = [np.log(np.array(psi)) for psi in bank]
         start = min(starts, key=cost)
@@ -95,20 +138,30 @@ class Search:
         found = minimize(cost, start, method="Nelder-Mead", options=options)
         return tuple(float(v) for v in np.clip(np.exp(found.x), timing.low, timing.high))
 
-    def cost(self, more: Timings, beside: Fit) -> float:
-        """Residual sum of squares of a revision with more timings; inf where it loses rows."""
-        timings = (*beside.revision.timings, *more)
-        sent = transformed(self.model, self.chunk, timings)
-        weights = self.weights
-        if any(t.replaces_lag for t, _ in timings):
-            weights = replace(weights, lag_s=0.0)
-        rows = rows_of(self.split, sent, weights, ROW_S)
-        self.most_rows = max(self.most_rows, rows.n)
-        if rows.n < KEPT * self.most_rows:
-            return float("inf")
-        columns = Columns(rows.condensed)
-        for volumes in columns_of_effects(beside):
-            columns.add(volumes)
-        s = project(rows, columns.released()).schur
-        theta = np.linalg.lstsq(s[1:, 1:], s[1:, 0], rcond=1e-12)[0]
-        return float(s[0, 0] - s[0, 1:] @ theta)
+    def closed_in(self, timing: Timing, bank: dict[float, float]) -> tuple[Psi, float]:
+        """The parameters of the largest gain, by parabolas about the best of a bank."""
+        known = dict(bank)
+        for _ in range(CLOSING):
+            at = sorted(known)
+            k = at.index(max(at[1:], key=lambda x: known[x]))
+            if k + 1 == len(at):
+                trial = 2.0 * at[k]
+            else:
+                low, middle, high = at[k - 1 : k + 2]
+                trial = _vertex((low, middle, high), [known[x] for x in (low, middle, high)])
+                if abs(trial - middle) < FOUND * middle:
+                    break
+            known[trial] = self.gain(timing, timing.at(trial))
+        best = max(list(known)[1:], key=lambda x: known[x])
+        return timing.at(best), known[best]
+
+
+def _vertex(at: tuple[float, float, float], gain: list[float]) -> float:
+    """Where a parabola through three points is highest, a little off the outer ones."""
+    (low, middle, high), (a, b, c) = at, gain
+    left, right = (b - a) / (middle - low), (c - b) / (high - middle)
+    if left <= right:  # no hill
+        return 0.5 * (low + middle) if a > c else 0.5 * (middle + high)
+    top = 0.5 * (low + middle) + 0.5 * (high - low) * left / (left - right)
+    margin = OFF * (high - low)
+    return float(np.clip(top, low + margin, high - margin))

@@ -28,7 +28,8 @@ class Timing:
     apply(u (n,), dt_s, psi) -> (n,); low, high: bounds of psi; replaces_lag: it stands for the
     declared lag of the spools instead of coming before it; is_linear: in the command;
     own_spools: each direction follows its own part of the command; where: a command, or the
-    demand on the supply, from which `apply` makes what the supply gives way.
+    demand on the supply, from which `apply` makes what the supply gives way; is_rate: psi[0] is a
+    rate, so that a smaller one does more.
     """
 
     effect: str
@@ -42,6 +43,16 @@ class Timing:
     is_linear: bool = True
     own_spools: bool = False
     where: str = COMMAND
+    is_rate: bool = False
+
+    def strength(self, psi: Psi) -> float:
+        """How much a command is changed, 0 for not at all."""
+        return 1.0 / psi[0] if self.is_rate else psi[0]
+
+    def at(self, strength: float) -> Psi:
+        """The parameters of that strength, within their bounds, the others as in the bank."""
+        value = 1.0 / strength if self.is_rate else strength
+        return (float(np.clip(value, self.low[0], self.high[0])), *self.bank[0][1:])
 
     def on(self, command: FloatArray, direction: int, dt_s: float, psi: Psi) -> FloatArray:
         """What reaches the spool of the edges of one direction (+1, -1)."""
@@ -121,7 +132,7 @@ _LAG = Timing(
 _SPOOL = Timing(
     "spool_lag_second_order", ("natural_frequency", "damping"), ("rad/s", "1"),
     tuple((2.0 * zeta / t, zeta) for t in (60e-3, 20e-3, 6e-3, 2e-3) for zeta in (0.8,)),
-    (8.0, 0.3), (2000.0, 2.0), second_order, replaces_lag=True,
+    (8.0, 0.3), (2000.0, 2.0), second_order, replaces_lag=True, is_rate=True,
 )  # fmt: skip
 TIMINGS = (
     Timing("input_delay", ("delay",), ("s",), _log(2e-3, 60e-3, 4), (0.0,), (0.5,), delayed),

@@ -13,13 +13,13 @@ import numpy as np
 
 from rtid.diagnose.candidates import Candidate
 from rtid.diagnose.causes import causes
-from rtid.diagnose.fit import Fit, fit, one_pass
+from rtid.diagnose.fit import Fit, fit, one_pass, onward, with_covariances
 from rtid.diagnose.parts import Part
 from rtid.diagnose.pump import PUMP, demand
 from rtid.diagnose.regression import LIMIT_SD, Score
 from rtid.diagnose.residual import Residual, residual
 from rtid.diagnose.revision import Revision
-from rtid.diagnose.search import Search
+from rtid.diagnose.search import Beside, Search
 from rtid.diagnose.timing import COMMAND, TIMINGS, Psi, Timing
 from rtid.model import FloatArray, Model
 
@@ -31,6 +31,7 @@ PROMISING = 0.3  # share of the best gain that a timing's bank must reach to be 
 SHARE_OF_BEST = 0.2  # of the best gain that a cause must have for its shape to be refined
 ROUNDS = 8  # of refinement, each with half the step of the last
 SETTLED = 2e-3  # of the gain: what a round must add for another one
+TRIAL_PASSES = 1  # of Gauss-Newton behind the first, before one of several timings is chosen
 MATCH_RHO = 1.10  # largest rho of a model that matches
 
 # pumps to begin with: droops as shares of that seen, quantiles of the demand, stiffness in Pa/m3
@@ -189,12 +190,12 @@ def with_pump(state: State, present: Fit, trials: list[Trial]) -> list[Trial]:
     rest = [t for t in trials if t.effect.effect != PUMP.effect]
     if not first or first[0].gain < PROMISING * max((t.gain for t in rest), default=0.0):
         return rest
-    psi = state.coarse.polished(PUMP, _pumps(present), present)
+    psi = state.coarse.beside(present).polished(PUMP, _pumps(present))
     timings = (*present.revision.timings, (PUMP, psi))
     revision = replace(present.revision, timings=timings)
-    now = fit(state.model, state.chunk, present.weights, revision, None, bank=False)
+    now = fit(state.model, state.chunk, present.weights, revision, bank=False)
     gain = present.estimate.sse - now.estimate.sse
-    return [*rest, Trial(first[0].key, gain, now.revision, now)]
+    return [*rest, Trial(first[0].key, gain, now.revision, now.light())]
 
 
 def _pumps(present: Fit) -> list[Psi]:
@@ -229,23 +230,47 @@ def exact_trials(
 
     other: the best gain of any other cause; what cannot come close to it is left out.
     """
-    gains: list[tuple[float, Timing, Psi]] = []
-    for timing in timings:
-        psi, gain = state.coarse.best(timing, present, PROMISING * other)
-        gains.append((gain, timing, psi))
-    most = max(other, *(gain for gain, _, _ in gains))
+    gains = _from_afar(state.coarse.beside(present), timings, other)
+    most = max([other, *(gain for gain, _, _ in gains)])
     trials: dict[Key, Trial] = {}
     for gain, timing, psi in gains:
         if gain < CLOSE * most:
             continue
         revision = replace(present.revision, timings=(*present.revision.timings, (timing, psi)))
-        now = fit(state.model, state.chunk, present.weights, revision, None, bank=False)
+        now = fit(
+            state.model, state.chunk, present.weights, revision, bank=False, passes=TRIAL_PASSES
+        )
         if not _is_inside(now):
             continue
         exact, key = present.estimate.sse - now.estimate.sse, (timing.effect, COMMAND)
         if key not in trials or exact > trials[key].gain:
             trials[key] = Trial(key, exact, now.revision, now.light())
     return list(trials.values())
+
+
+def carried_on(state: State, present: Fit, trial: Trial) -> Fit:
+    """The fit with a trial's revision to the end, with the covariances of its maps."""
+    revision, weights, start = trial.revision, present.weights, present
+    if trial.fit is not None:
+        revision, weights = onward(trial.fit)
+        start = trial.fit
+    return with_covariances(fit(state.model, state.chunk, weights, revision, start, bank=False))
+
+
+def _from_afar(
+    coarse: Beside, timings: list[Timing], other: float
+) -> list[tuple[float, Timing, Psi]]:
+    """Gain and parameters of every promising timing on the coarse map; one of each name."""
+    banks = {timing: coarse.bank(timing) for timing in timings}
+    bar = PROMISING * max([other, *(max(bank.values()) for bank in banks.values())])
+    best: dict[str, tuple[float, Timing, Psi]] = {}
+    for timing, bank in banks.items():
+        if max(bank.values()) < bar or max(bank.values()) <= 0.0:
+            continue
+        psi, gain = coarse.closed_in(timing, bank)
+        if timing.effect not in best or gain > best[timing.effect][0]:
+            best[timing.effect] = gain, timing, psi
+    return list(best.values())
 
 
 def _is_inside(now: Fit) -> bool:

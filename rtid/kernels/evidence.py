@@ -55,21 +55,23 @@ def integrate(
     start: IntArray,
     cell: IntArray,
     terms: FloatArray,
+    later: FloatArray,
 ) -> int:
     """Rows of the samples k >= first of chunk (n, 2 + signals); returns where it stopped.
 
     engine (1,), cells: a freshly built state.  soft (n, chambers): white variance of a row at each
     sample beyond that of the declared model, m6.  row_of, share (n - 1,): row of an interval or -1,
     and its share a.  own (rows + 1, 2, 3): y and theta_beta per chamber; fresh (rows,): the row has
-    none before it; whiten (rows, 3): 1 / L00, S01 / L00, 1 / L11; keep (rows, 2, 2): I - K.  Group
-    r has the entries start[r] to start[r + 1] of cell (most,) and terms (most, 2, 6): what an open
-    block adds to row r and to the next, m3 into a chamber that the edge feeds.  counts (4,),
-    noise (4, 2, 2): see above.  All of these are changed in place.  Stops early when entries run
-    out.
+    none before it; whiten (rows, 3): 1 / L00, S01 / L00, 1 / L11; keep (rows, 2, 2): I - K.  Row r
+    has the entries start[r] to start[r + 1] of cell (most,) and terms (most, 6): what a block adds
+    to it, m3 into a chamber that the edge feeds; later (most, 6) is due in the next row.
+    counts (4,), noise (4, 2, 2): see above.  All of these are changed in place.  Stops early when
+    entries run out.
     """
     e = engine[0]
     for k in range(first, len(chunk)):
-        if counts[N_ENTRIES] + e.n_edges > len(cell):
+        begun = counts[N_ENTRIES] - start[counts[N_ROWS]]
+        if counts[N_ENTRIES] + begun + 2 * e.n_edges > len(cell):
             return k
         whole, joined, dt = take(e, chunk, k)
         sample, flags = e.sample, int(e.sample[1])
@@ -77,7 +79,7 @@ def integrate(
             a, r = (group - counts[IN_GROUP]) / group, counts[N_ROWS]
             row_of[k - 1], share[k - 1] = r, a
             _add_own(e, sample, dt, a, own[r], own[r + 1])
-            _add_blocks(e, cells, dt, a, counts, start[r], cell, terms)
+            _add_blocks(e, cells, dt, a, counts, start[r], cell, terms, later)
             _count_noise(e, a, noise)
             remember(e, sample)
             if (flags & ROW_FLAG) != 0:
@@ -86,7 +88,7 @@ def integrate(
                     _close_row(e, soft[k], noise, whiten[r], keep[r])
                     counts[IN_GROUP], counts[GROUP_AT] = 0, k
                     counts[N_ROWS] += 1
-                    start[r + 1] = counts[N_ENTRIES]
+                    _hand_on(counts, start, r, cell, terms, later)
         else:
             e.running = 0
             if whole and (flags & ROW_FLAG) != 0:
@@ -148,6 +150,7 @@ def _add_blocks(
     first: int,
     cell: IntArray,
     terms: FloatArray,
+    later: FloatArray,
 ) -> None:
     """What the interval adds to the terms of the blocks that the working points are in."""
     for i in range(e.n_edges):
@@ -161,13 +164,31 @@ def _add_blocks(
         if n == counts[N_ENTRIES]:
             cell[n] = at
             terms[n] = 0.0
+            later[n] = 0.0
             counts[N_ENTRIES] += 1
         mean_terms(e, i, e.cell[i, 0], e.cell[i, 1])
         flow = e.scale_m3s[i] * dt
         for j in range(TERMS):
-            terms[n, 0, j] += a * flow * e.phi[j]
-            terms[n, 1, j] += (1.0 - a) * flow * e.phi[j]
+            terms[n, j] += a * flow * e.phi[j]
+            later[n, j] += (1.0 - a) * flow * e.phi[j]
         flow_noise(e, i, cells[at].slope, cells[at].missed, dt)
+
+
+@inlined
+def _hand_on(
+    counts: IntArray, start: IntArray, r: int, cell: IntArray, terms: FloatArray, later: FloatArray
+) -> None:
+    """Begin the entries of the row behind r with what is due in it."""
+    first, n = start[r], counts[N_ENTRIES]
+    start[r + 1] = n
+    to = n
+    for k in range(first, n):
+        if later[k, 0] != 0.0:  # the constant term
+            cell[to] = cell[k]
+            for j in range(TERMS):
+                terms[to, j], later[to, j] = later[k, j], 0.0
+            to += 1
+    counts[N_ENTRIES] = to
 
 
 @inlined

@@ -1,0 +1,242 @@
+"""Products of the maps' columns among themselves.
+
+A block that has been left rings on without anything being added: its state d decays by the
+whitener's I - K alone (`evidence`).  So what it shares with an entry s v of row r (s: signs of the
+edge, v: six terms) and all that follows from it is
+
+    d_r' M_r s v,   M_r = L_r^-T L_r^-1 + A_r' M_r+1 A_r,   A = I - K,
+
+and the many blocks that ring are met once in a span of rows by the few that move in it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtid.kernels.jit import inlined, kernel, part
+from rtid.kernels.layout import TERMS
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+
+@kernel
+def map_products(
+    sign: FloatArray,
+    start: IntArray,
+    block: IntArray,
+    terms: FloatArray,
+    fresh: BoolArray,
+    whiten: FloatArray,
+    keep: FloatArray,
+    span: int,
+    quiet: float,
+    gram: FloatArray,
+) -> None:
+    """Add the products of all columns of the maps to the lower triangle of gram (6 V, 6 V).
+
+    sign (V, 2) of the blocks' edges; start (rows + 1,), block (entries,), terms (entries, 6),
+    fresh, whiten, keep: see `evidence.integrate`.  Rows are taken `span` at a time; a block whose
+    whitened state is below `quiet` is forgotten.
+    """
+    n_v, rows = len(sign), len(whiten)
+    memory = np.empty((rows, 3))
+    _memories(fresh, whiten, keep, memory)
+    # per block: what it left behind before the span, adds in it, and what that meets
+    left, new, felt = np.zeros((n_v, 12)), np.zeros((n_v, 12)), np.zeros((n_v, 12))
+    live, moving = np.empty(n_v, np.int64), np.empty(n_v, np.int64)
+    is_live, moves = np.zeros(n_v, np.bool_), np.zeros(n_v, np.bool_)
+    n_live, r = 0, 0
+    way = np.empty((2, 2))
+    while r < rows:
+        if fresh[r]:
+            for n in range(n_live):
+                left[live[n]] = 0.0
+                is_live[live[n]] = False
+            n_live = 0
+        way[0, 0], way[0, 1], way[1, 0], way[1, 1] = 1.0, 0.0, 0.0, 1.0
+        n_moving, first = 0, r
+        while r < rows and r < first + span and (r == first or not fresh[r]):
+            if r > first:
+                _carry(keep[r - 1], way)
+                for n in range(n_moving):
+                    _fade(keep[r - 1], new[moving[n]])
+            for n in range(start[r], start[r + 1]):
+                v = block[n]
+                if not moves[v]:
+                    moves[v] = True
+                    moving[n_moving] = v
+                    n_moving += 1
+                _meet(v, terms[n], sign[v], memory[r], way, moving[:n_moving], new, felt, gram)
+            r += 1
+        for a in range(n_moving):
+            _ring(moving[a], felt[moving[a]], live[:n_live], left, gram)
+        if r < rows:
+            _carry(keep[r - 1], way)
+            for n in range(n_live):
+                _fade(way, left[live[n]])
+            for n in range(n_moving):
+                v = moving[n]
+                _leave(keep[r - 1], new[v], felt[v], left[v])
+                if not is_live[v]:
+                    is_live[v] = True
+                    live[n_live] = v
+                    n_live += 1
+            n_live = _loud(whiten[r], quiet, moves, live, n_live, is_live, left)
+            for n in range(n_moving):
+                moves[moving[n]] = False
+
+
+@part
+def _memories(fresh: BoolArray, whiten: FloatArray, keep: FloatArray, out: FloatArray) -> None:
+    """M00, M01, M11 of every row, out (rows, 3)."""
+    m00, m01, m11 = 0.0, 0.0, 0.0
+    for r in range(len(out) - 1, -1, -1):
+        i0, half, i1 = whiten[r, 0], whiten[r, 1], whiten[r, 2]
+        if r + 1 == len(out) or fresh[r + 1]:
+            m00, m01, m11 = 0.0, 0.0, 0.0
+        k = keep[r]
+        a00, a01 = m00 * k[0, 0] + m01 * k[1, 0], m00 * k[0, 1] + m01 * k[1, 1]
+        a10, a11 = m01 * k[0, 0] + m11 * k[1, 0], m01 * k[0, 1] + m11 * k[1, 1]
+        l10 = -i1 * half * i0
+        m00 = i0 * i0 + l10 * l10 + k[0, 0] * a00 + k[1, 0] * a10
+        m01 = l10 * i1 + k[0, 0] * a01 + k[1, 0] * a11
+        m11 = i1 * i1 + k[0, 1] * a01 + k[1, 1] * a11
+        out[r, 0], out[r, 1], out[r, 2] = m00, m01, m11
+
+
+@inlined
+def _carry(k: FloatArray, way: FloatArray) -> None:
+    """way <- k way, 2 x 2, in place."""
+    for j in range(2):
+        w0, w1 = way[0, j], way[1, j]
+        way[0, j] = k[0, 0] * w0 + k[0, 1] * w1
+        way[1, j] = k[1, 0] * w0 + k[1, 1] * w1
+
+
+@inlined
+def _fade(k: FloatArray, d: FloatArray) -> None:
+    """A block's state d (12,), six terms per chamber, <- k d, in place."""
+    k00, k01, k10, k11 = k[0, 0], k[0, 1], k[1, 0], k[1, 1]
+    for j in range(TERMS):
+        d0, d1 = d[j], d[TERMS + j]
+        d[j] = k00 * d0 + k01 * d1
+        d[TERMS + j] = k10 * d0 + k11 * d1
+
+
+@inlined
+def _leave(k: FloatArray, new: FloatArray, felt: FloatArray, left: FloatArray) -> None:
+    """What a block added in a span is left behind at the next row."""
+    _fade(k, new)
+    for j in range(2 * TERMS):
+        left[j] += new[j]
+        new[j] = 0.0
+        felt[j] = 0.0
+
+
+@inlined
+def _outer(gram: FloatArray, i: int, j: int, a: FloatArray, b: FloatArray) -> None:
+    """gram[i : i + 6, j : j + 6] += a b'."""
+    b0, b1, b2, b3, b4, b5 = b[0], b[1], b[2], b[3], b[4], b[5]
+    for p in range(TERMS):
+        row, f = gram[i + p], a[p]
+        row[j] += f * b0
+        row[j + 1] += f * b1
+        row[j + 2] += f * b2
+        row[j + 3] += f * b3
+        row[j + 4] += f * b4
+        row[j + 5] += f * b5
+
+
+@part
+def _meet(
+    v: int,
+    t: FloatArray,
+    s: FloatArray,
+    m: FloatArray,
+    way: FloatArray,
+    moving: IntArray,
+    new: FloatArray,
+    felt: FloatArray,
+    gram: FloatArray,
+) -> None:
+    """Products of one entry with what blocks have added since the span began, and with itself."""
+    m0, m1 = m[0] * s[0] + m[1] * s[1], m[1] * s[0] + m[2] * s[1]
+    both = np.empty(TERMS)
+    for n in range(len(moving)):
+        w = moving[n]
+        for p in range(TERMS):
+            both[p] = m0 * new[w, p] + m1 * new[w, TERMS + p]
+        if w < v:
+            _outer(gram, TERMS * v, TERMS * w, t, both)
+        elif w > v:
+            _outer(gram, TERMS * w, TERMS * v, both, t)
+        else:
+            own = 0.5 * (m0 * s[0] + m1 * s[1])
+            for p in range(TERMS):
+                both[p] += own * t[p]
+            _outer(gram, TERMS * v, TERMS * v, t, both)
+            _outer(gram, TERMS * v, TERMS * v, both, t)
+    f0, f1 = way[0, 0] * m0 + way[1, 0] * m1, way[0, 1] * m0 + way[1, 1] * m1
+    for p in range(TERMS):
+        felt[v, p] += f0 * t[p]
+        felt[v, TERMS + p] += f1 * t[p]
+        new[v, p] += s[0] * t[p]
+        new[v, TERMS + p] += s[1] * t[p]
+
+
+@part
+def _ring(v: int, f: FloatArray, live: IntArray, left: FloatArray, gram: FloatArray) -> None:
+    """Products of what block v added in a span with what others had left behind before it."""
+    for n in range(len(live)):
+        w = live[n]
+        d = left[w]
+        if w <= v:
+            _twice(gram, TERMS * v, TERMS * w, f, d)
+        if w >= v:
+            _twice(gram, TERMS * w, TERMS * v, d, f)
+
+
+@inlined
+def _twice(gram: FloatArray, i: int, j: int, a: FloatArray, b: FloatArray) -> None:
+    """gram[i : i + 6, j : j + 6] += a' b of two states (12,)."""
+    b0, b1, b2, b3, b4, b5 = b[0], b[1], b[2], b[3], b[4], b[5]
+    c0, c1, c2, c3, c4, c5 = b[6], b[7], b[8], b[9], b[10], b[11]
+    for p in range(TERMS):
+        row, f, g = gram[i + p], a[p], a[TERMS + p]
+        row[j] += f * b0 + g * c0
+        row[j + 1] += f * b1 + g * c1
+        row[j + 2] += f * b2 + g * c2
+        row[j + 3] += f * b3 + g * c3
+        row[j + 4] += f * b4 + g * c4
+        row[j + 5] += f * b5 + g * c5
+
+
+@part
+def _loud(
+    whiten: FloatArray,
+    quiet: float,
+    moves: BoolArray,
+    live: IntArray,
+    n_live: int,
+    is_live: BoolArray,
+    left: FloatArray,
+) -> int:
+    """Keep the blocks that still ring, in place; their number."""
+    kept = 0
+    for n in range(n_live):
+        v = live[n]
+        loud = moves[v]
+        for j in range(TERMS):
+            first = whiten[0] * left[v, j]
+            second = whiten[2] * (left[v, TERMS + j] - whiten[1] * first)
+            loud = loud or abs(first) > quiet or abs(second) > quiet
+        if loud:
+            live[kept] = v
+            kept += 1
+        else:
+            is_live[v] = False
+            left[v] = 0.0
+    return kept
