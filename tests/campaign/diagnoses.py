@@ -10,6 +10,7 @@ from multiprocessing import get_context
 
 from rtid.diagnose.diagnosis import search
 from rtid.diagnose.report import Diagnosis, diagnosis
+from rtid.diagnose.verdict import MATERIAL
 from rtid.estimator.estimator import to_chunk
 from rtid.sim.declare import declared_model
 from rtid.sim.hidden import HIDDEN, MECHANICAL, OUTSIDE
@@ -19,6 +20,7 @@ from tests.campaign.plants import WORKERS, grid
 
 RECORD_S, LEARN_S, TEST_S = 110.0, 80.0, 83.0
 NONE = "none"
+LARGEST_SET = 3  # causes that an honest set may have
 
 RIGHT, IN_SET, NEGLIGIBLE, SILENT, UNKNOWN, WRONG = (
     "right", "in a set", "negligible", "not seen", "unknown", "wrong name"
@@ -85,16 +87,19 @@ def judge(case: Case, found: Diagnosis) -> str:
     """What the diagnosis is worth."""
     true = truth(case.effect)
     if not found.found:
-        if true and true in {small.effect for small in found.negligible}:
-            return NEGLIGIBLE
-        return UNKNOWN if found.verdict == "unknown" else SILENT
-    names = [effect.effect for effect in found.found]
-    sets = [{n.split(" ")[0] for n in e.cannot_be_told_from} for e in found.found]
-    if true and names[0] == true and not sets[0]:
-        return RIGHT
-    if true and any(true == n or true in s for n, s in zip(names, sets, strict=True)):
-        return IN_SET if all(len(s) <= 2 for s in sets) else WRONG
-    return WRONG
+        if found.verdict == "unknown":
+            return UNKNOWN
+        return NEGLIGIBLE if case.effect != NONE and excess(found) < MATERIAL else SILENT
+    sets = [{e.effect, *(n.split(" ")[0] for n in e.cannot_be_told_from)} for e in found.found]
+    if not all(true in one for one in sets) or any(len(one) > LARGEST_SET for one in sets):
+        return WRONG  # a false name beside the right one is as wrong as alone
+    return RIGHT if all(len(one) == 1 for one in sets) else IN_SET
+
+
+def excess(found: Diagnosis) -> float:
+    """What the model leaves of the held-out part beyond the sensors' noise, of the rms flow."""
+    left = found.heldout_residual_before_m3s**2 - found.noise_floor_m3s**2
+    return sqrt(max(0.0, left)) / max(found.rms_flow_m3s, 1e-12)
 
 
 def wilson(hits: int, n: int, z: float = 1.96) -> tuple[float, float]:
