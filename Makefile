@@ -5,7 +5,7 @@ PYTHON ?= python3
 PIP = .venv/bin/python -m pip --disable-pip-version-check
 READY = .venv/.ready
 
-.PHONY: demo test bench lint campaign pictures lock clean
+.PHONY: demo test bench lint campaign pictures screenshots lock clean
 
 demo: $(READY)
 	.venv/bin/rtid demo
@@ -26,6 +26,10 @@ lint: $(READY)
 campaign: $(READY)
 	.venv/bin/python -m pytest -q -s -p no:benchmark -m campaign tests/campaign; \
 	  status=$$?; .venv/bin/python -m tests.campaign.report && exit $$status
+
+# Every view of the workbench on the demo's worn machine, light and dark, into out/screenshots.
+screenshots: $(READY)
+	.venv/bin/python -m tools.screenshots out/screenshots
 
 pictures: $(READY)
 	.venv/bin/python -m tools.readme_pictures tools/pictures

@@ -23,12 +23,14 @@ from rtid.live import Learner, listen, virtual_bus
 from rtid.model import Edge, FloatArray
 from rtid.project import Project, load
 from rtid.replay import catalog_of, replay
+from rtid.sim.hidden import hide_wish
 from rtid.sim.plant import Plant
 from rtid.sim.random_plants import draw
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 
 MOTION = "rich"
+WORN, WORN_MOTION, WORN_S = "internal_leakage_laminar=middle", "rich_record", 110.0
 STEP_S = 6.0  # machine time between two looks at the estimate
 POINT_STEP = 10  # samples between two working points at which maps are compared
 
@@ -112,6 +114,17 @@ class Demo:
         error = np.abs(learned.flow(w[valid], dp[valid]) - true) / np.abs(true).max(initial=1e-12)
         share = float(valid.sum() / max(1, open_.sum()))
         return MapError(edge.name, share, float(error.mean()), float(error.max(initial=0.0)))
+
+
+def wear(demo: Demo) -> tuple[Path, Path]:
+    """The same machine with a piston seal that has worn out, on a longer record: trace, project.
+
+    Nobody has told the project file of the leak.
+    """
+    worn = hide_wish(demo.plant, WORN)
+    run = simulate(worn, WORN_MOTION, demo.seed, WORN_S)
+    trace, _, project = write_run(demo.trace.with_name("worn.blf"), run, demo.seed, WORN_MOTION)
+    return trace, project
 
 
 def prepare(folder: Path, seed: int = 1, duration_s: float = 60.0) -> Demo:

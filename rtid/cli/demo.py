@@ -28,6 +28,9 @@ def demo(
     pictures: Annotated[
         Path | None, typer.Option(help="Also draw coverage, maps and residual into this folder.")
     ] = None,
+    open_page: Annotated[
+        bool, typer.Option("--ui", help="At the end, open the page on a worn machine.")
+    ] = False,
 ) -> None:
     """Learn the flow maps of a simulated machine from its CAN frames.
 
@@ -36,7 +39,7 @@ def demo(
     """
     from rich.console import Console
 
-    from rtid.demo import prepare
+    from rtid.demo import prepare, wear
 
     console = Console(highlight=False)
     console = console if console.is_terminal else Console(highlight=False, width=WIDTH)
@@ -50,7 +53,11 @@ def demo(
 
         for path in Story(found).draw(pictures, "png"):
             console.print(f"wrote {path}")
-    _print_next(console, machine)
+    with console.status("letting its piston seal wear out ..."):
+        worn = wear(machine)
+    _print_next(console, machine, worn)
+    if open_page:
+        _open_page(*worn)
 
 
 def _print_live(console: Console, machine: Demo, speed: float) -> None:
@@ -118,9 +125,20 @@ def _print_answer(console: Console, found: TraceComparison) -> None:
         console.print(f"   {held.name:12}{cells}")
 
 
-def _print_next(console: Console, machine: Demo) -> None:
+def _print_next(console: Console, machine: Demo, worn: tuple[Path, Path]) -> None:
     trace, project = machine.trace, machine.project.path
     console.print("\n[bold]3  Your turn[/bold]  The trace and its project file are yours to try:")
     console.print(f"   rtid check {project} {trace}")
     console.print(f"   rtid replay {trace} --project {project} --pictures {trace.parent}")
-    console.print(f"   rtid export {trace} {trace.parent / 'map.csv'} --project {project}\n")
+    console.print(f"   rtid export {trace} {trace.parent / 'map.csv'} --project {project}")
+    console.print(
+        "\n[bold]4  What is missing?[/bold]  Years later something in this machine has worn out, "
+        "and the model\n   does not know.  See it in the browser: where it fails, why, and add it:"
+    )
+    console.print(f"   [bold]rtid ui {worn[1]} {worn[0]}[/bold]\n")
+
+
+def _open_page(trace: Path, project: Path) -> None:
+    from rtid.cli.ui import ui
+
+    ui(project, trace, port=0, host="127.0.0.1", state=None, sheet=None, open_page=True)

@@ -15,7 +15,7 @@ from rtid.diagnose.report import Value
 from rtid.diagnosed_text import quantity, title
 from rtid.project.added import AddedSection
 from rtid.report_tables import text
-from rtid.ui.blocks import ML_PER_MIN, Quantity, quantities, round_up
+from rtid.ui.blocks import LARGEST, ML_PER_MIN, Quantity, quantities, round_up
 from rtid.ui.compare_view import EMPTY, NAMES, TimePlots
 from rtid.ui.fragments import button, table
 from rtid.ui.lines import Line
@@ -152,7 +152,8 @@ def _planes(session: Session) -> str:
     part = "validation" if "validation" in looks[0].parts else next(iter(looks[0].parts))
     every = [b for look in looks for b in look.parts[part].blocks]
     values = [b.residual_rms_m3s for b in every if isfinite(b.residual_rms_m3s)]
-    scale = quantities(round_up(ML_PER_MIN * max(values, default=1.0)))["residual"]
+    top = round_up(ML_PER_MIN * float(np.quantile(values, LARGEST))) if values else 1.0
+    scale = quantities(top)["residual"]
     rows = ""
     for word, look in zip(("before", "after"), looks, strict=True):
         planes = "".join(
@@ -191,7 +192,7 @@ def _actions(session: Session) -> str:
             f"Add {title(effect).lower()}", "add", kind="main", effect=effect, where=where
         )
     made += " " + button("Undo", "undo", off=last is None or last.is_saved)
-    label = f"Save {unsaved} to the project" if unsaved else "Saved"
+    label = f"Save {unsaved} to the project" if unsaved else "Nothing to save"
     made += " " + button(label, "save", off=not unsaved)
     made += " " + button("Write the report", "export", what="report")
     return f"<p>{made}</p>"

@@ -34,7 +34,8 @@ STATUS_COLOURS = {
     "valid": "#9ecae1", "learning": "#f6e3b4", "stale": "#d9d9d9", "invalid": "#e6a98c",
 }  # fmt: skip
 ML_PER_MIN = 1e3 * LPM  # per m3/s
-NONE, OTHER = "#f4f4f2", "#eeeeee"
+LARGEST = 0.98  # quantile of the blocks' residuals at which their scale ends
+NONE, OTHER = "rgba(128, 128, 128, 0.10)", "rgba(128, 128, 128, 0.25)"
 DARK_FROM = 0.55  # of a scale: figures are white from here on
 MOST_TICKS = 9
 

@@ -45,7 +45,9 @@ class TimePlots:
         margin = MARGIN * (high - low)
         self.whole = low - margin, high + margin
         self.x = Range1d(*self.whole, bounds=self.whole)
-        self._lines: list[tuple[Line, ColumnDataSource]] = []
+        self._lines: dict[str, list[tuple[Line, ColumnDataSource]]] = {}
+        self._drawn: dict[str, tuple[float, float]] = {}  # what a view's lines were thinned for
+        self.view = ""  # the one that is looked at, or made
         self._lit = ColumnDataSource({"x0": [], "x1": []})
         self._plots: list[figure] = []
         self._on_span = on_span
@@ -76,12 +78,16 @@ class TimePlots:
         drawn.nonselection_glyph = None
         if colour == INK_TAG:
             drawn.glyph.tags = [INK_TAG]
-        self._lines.append((line, source))
+        self._lines.setdefault(self.view, []).append((line, source))
         return source
 
     def change(self, source: ColumnDataSource, line: Line) -> None:
-        """Another line in the same place."""
-        self._lines = [one for one in self._lines if one[1] is not source] + [(line, source)]
+        """Another line in the same place, drawn when its view is refreshed."""
+        for view, lines in self._lines.items():
+            for k, (_, known) in enumerate(lines):
+                if known is source:
+                    lines[k] = line, source
+                    self._drawn.pop(view, None)
 
     @property
     def seen(self) -> tuple[float, float]:
@@ -90,10 +96,12 @@ class TimePlots:
         return float(min(ends)), float(max(ends))
 
     def refresh(self) -> None:
-        """Thin every line for what is seen now."""
-        low, high = self.seen
-        for line, source in self._lines:
-            t, y = line.between(low, high)
+        """Thin the lines of the view that is looked at for what is seen of the record now."""
+        if self._drawn.get(self.view) == self.seen:
+            return
+        self._drawn[self.view] = self.seen
+        for line, source in self._lines.get(self.view, []):
+            t, y = line.between(*self.seen)
             source.data = {"t": t, "y": y}
 
     def _shade(self, made: figure) -> None:

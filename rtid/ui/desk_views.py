@@ -31,7 +31,7 @@ class DeskViews:
         self._where: WhereView | None = None
         self._add: AddView | None = None
         self._map: MapView | None = None
-        self._page = ""
+        self._page, self._view = "", ""
         self._is_due = False
         for end in ("start", "end"):
             self._time.x.on_change(end, lambda _attr, _old, _new: self._zoomed())
@@ -41,7 +41,16 @@ class DeskViews:
         return self.session.revisions[-1].look
 
     def show(self, view: str) -> None:
-        """Make a view that is looked at for the first time."""
+        """Look at a view."""
+        self._view = view
+        self._make(view)
+        self._time.view = view
+        self._time.refresh()
+        self._tell()
+
+    def _make(self, view: str) -> None:
+        """Make a view that nobody has looked at before."""
+        self._time.view = view
         if view == "compare" and self._compare is None:
             self._compare = CompareView(self._look, self._time)
             self._compare.show(self._look)
@@ -60,14 +69,14 @@ class DeskViews:
             self._map = MapView(self._look.flowmap, opened.reference if opened else None)
             self._map.show()
             self._place("map", self._map.root)
-        self._tell()
 
     def prepare(self) -> bool:
         """Make one more view before it is looked at; False where all are made."""
         made = {"where": self._where, "add": self._add, "map": self._map, "compare": self._compare}
         missing = [name for name, view in made.items() if view is None]
         if missing:
-            self.show(missing[0])
+            self._make(missing[0])
+            self._time.view = self._view
         return len(missing) > 1
 
     def refresh(self, what: str) -> None:
@@ -81,6 +90,7 @@ class DeskViews:
                 self._add.show(self.session.revisions)
             if self._map:
                 self._map.show(self._look.flowmap)
+            self._time.refresh()
         self._tell()
 
     def take(self, what: str, asked: dict[str, str]) -> None:

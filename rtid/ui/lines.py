@@ -10,7 +10,7 @@ from tsdownsample import MinMaxDownsampler
 
 from rtid.model import FloatArray
 
-POINTS = 1400  # that a line has at most: two per pixel of a wide plot
+POINTS = 1200  # that a line has at most: two per pixel of a plot
 MOST_GAPS = 400
 _THIN: Any = MinMaxDownsampler()  # type: ignore[no-untyped-call]
 

@@ -21,7 +21,7 @@ from rtid.ui.session import FAILED, Session
 from rtid.ui.verdict import record_line, strip, work_line
 
 silence(EMPTY_LAYOUT)  # a view that nobody has looked at yet
-PAUSE_MS = 700  # between views that are made ahead
+PAUSE_MS = 1500  # between views that are made ahead
 STATIC = Path(__file__).parent / "static"
 VIEWS = ("compare", "where", "why", "add", "map", "live")
 ROOTS = ("compare", "where_maps", "where_time", "add", "map")

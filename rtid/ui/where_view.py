@@ -13,7 +13,7 @@ from rtid.colours import CHAMBERS, GREY, LPM, MARKERS, UNITS
 from rtid.compare import BlockRow, Dependence
 from rtid.compare.tables import CAUSES, cause_of
 from rtid.report_tables import text
-from rtid.ui.blocks import HATCHES, ML_PER_MIN, BlockPlots, Key, quantities, round_up
+from rtid.ui.blocks import HATCHES, LARGEST, ML_PER_MIN, BlockPlots, Key, quantities, round_up
 from rtid.ui.compare_view import EMPTY, NAMES, TimePlots
 from rtid.ui.fragments import button, choice, select
 from rtid.ui.lines import Line
@@ -21,7 +21,6 @@ from rtid.ui.look import Look
 from rtid.ui.theme import plot, styled
 
 Z95 = 1.96
-LARGEST = 0.98  # quantile of the blocks' residuals at which the scale ends
 
 
 class WhereView:

@@ -17,6 +17,7 @@ from rtid.ui.desk import Told
 from rtid.ui.fragments import button, table
 
 MOST = 18  # candidates that are shown
+TENS = 99.5  # standard deviations from which no decimals are told
 WIDEST = 150.0  # pixels of the longest bar
 NAN = float("nan")
 
@@ -107,7 +108,9 @@ def _rank(one: Ranked, most: float, may_add: bool) -> tuple[str, ...]:
     own = one.after is None
     width = WIDEST * _log(before) / max(_log(most), 1e-9)
     bar = f'<span class="clear{" own" if own else ""}" style="width:{width:.0f}px"></span>'
-    sd = f"{before:.3g}" + (f" → {one.after:.2g}" if one.after is not None else "")
+    sd = f"{before:.3g}" if before < TENS else f"{before:.0f}"
+    if one.after is not None and abs(one.after - before) > 0.05 * before:
+        sd += f" → {one.after:.2g}"
     size = quantity(Value(one.value, one.std, one.unit))
     remark = "" if one.is_possible else ", not possible"
     can = may_add and one.is_possible

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from rtid.errors import RtidError
 
 Then = Callable[[Any], None]
 Progress = Callable[[str, float], None]
+POLITE = 5
 ENDED = "the worker has ended", "start `rtid ui` again"
 
 
@@ -36,6 +38,7 @@ class Job:
 
 def serve(pipe: Connection) -> None:
     """Work until the pipe is closed.  Runs in the worker's process."""
+    os.nice(POLITE)  # the page comes first
     from rtid.ui.desk import Desk  # noqa: PLC0415 - only the worker imports the estimator's weight
 
     desk = Desk(lambda text, share: pipe.send(("progress", (text, share))))

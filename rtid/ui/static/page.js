@@ -58,10 +58,24 @@
     if (glyph) set({ line_color: ink, text_color: ink, fill_color: ink });
   }
 
+  // data colours that would be dim on a dark ground have a lighter twin
+  const TWINS = [["#0072b2", "#56b4e9"], ["#d55e00", "#f5995b"]];
+
+  function twin(model) {
+    for (const key of ["line_color", "fill_color"]) {
+      const own = model.properties[key] && model[key], colour = own && (own.value || own);
+      const pair = TWINS.find((two) => two.includes(colour));
+      if (!pair) continue;
+      const now = pair[theme === "dark" ? 1 : 0];
+      if (now !== colour)
+        model.setv({ [key]: own.value ? { value: now } : now }, { sync: false });
+    }
+  }
+
   function paintAll() {
     document.documentElement.classList.toggle("dark", theme === "dark");
     for (const doc of (window.Bokeh ? Bokeh.documents : []))
-      for (const model of doc.all_models) paint(model);
+      for (const model of doc.all_models) { paint(model); twin(model); }
   }
 
   // -- keys
