@@ -65,6 +65,7 @@ class Analyst:
         self._limit_bytes = limit_bytes
         self._chronicle: Chronicle | None = None
         self._judge: Judge | None = None
+        self._segment = ""
         self._told: dict[str, float] = {}
         self._handed: deque[Handover] = deque(maxlen=KEPT)
 
@@ -99,6 +100,9 @@ class Analyst:
         frames = batch.frames
         if frames is not None and self._limit_bytes:
             self._guarded("recording", lambda: self._record().write(frames))
+            if self._recorder is not None and self._recorder.path != self._segment:
+                self._segment = self._recorder.path
+                self._answer(Recording(self._segment))
 
     def _handover(self, job: Handover) -> None:
         if job.store:

@@ -1,4 +1,4 @@
-"""The helper that diagnoses: one process per diagnosis, whose memory goes with it.
+"""The helper that diagnoses and checks: one process per job, whose memory goes with it.
 
 `python -m rtid.daemon.diagnoser FD PROJECT`: one job in, one answer out.
 """
@@ -9,8 +9,12 @@ import os
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 
-from rtid.daemon.jobs import Diagnose, Found
+from firmware_bridge.sources.errors import LogError
+from rtid.check import judge
+from rtid.check.reading import read_trace
+from rtid.daemon.jobs import Answer, Check, Checked, Diagnose, Found, Job
 from rtid.daemon.pipe import Pipe
 from rtid.daemon.status import Verdict
 from rtid.diagnosed_text import sentences
@@ -31,13 +35,26 @@ def diagnose(job: Diagnose, project: Project) -> Found:
     estimator = Estimator(replace(job.model, upkeep=upkeep))
     assert estimator.history is not None
     estimator.history.append(job.chunk)
-    try:
-        found = diagnose_live(estimator, added_parts(project), project.effects)
-    except RtidError as error:
-        return Found(None, str(error))
+    found = diagnose_live(estimator, added_parts(project), project.effects)
     effects = tuple(f"{e.effect} ({e.where})" if e.where else e.effect for e in found.found)
     text = " ".join(sentences(found)[:3])
     return Found(Verdict(now_s, found.verdict, text, effects, (span_s, 0.0), found.as_json()))
+
+
+def check(job: Check, project: Project) -> Checked:
+    """What `rtid check` has against the project file, by the daemon's own recording."""
+    read = read_trace(project, Path(job.recording))
+    report = judge(
+        project.model,
+        project.assembly,
+        read.samples,
+        read.series,
+        read.messages,
+        read.refused,
+        project.sections.geometry.stroke_m,
+    )
+    errors = [finding for finding in report.findings if finding.level == "error"]
+    return Checked(tuple(f"{finding.subject}: {finding.text}" for finding in errors))
 
 
 def main() -> None:
@@ -47,9 +64,19 @@ def main() -> None:
     pipe, project = Pipe(int(fd)), load(path)
     try:
         while (job := pipe.receive()) is not None:
-            pipe.send(diagnose(job, project))
+            pipe.send(_answer(job, project))
     except (EOFError, OSError):
         pass  # the daemon is gone
+
+
+def _answer(job: Job, project: Project) -> Answer:
+    try:
+        if isinstance(job, Check):
+            return check(job, project)
+        assert isinstance(job, Diagnose)
+        return diagnose(job, project)
+    except (RtidError, LogError) as error:
+        return Found(None, str(error))
 
 
 if __name__ == "__main__":

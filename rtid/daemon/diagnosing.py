@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from rtid.daemon.helper import Helper
-from rtid.daemon.jobs import Answer, Diagnose, Found
+from rtid.daemon.jobs import Answer, Check, Checked, Diagnose, Found, Job
 from rtid.daemon.log import logger
 from rtid.daemon.status import Verdict
 from rtid.estimator.estimator import Estimator
@@ -36,6 +36,7 @@ class Diagnosing:
         self._stage = 0
         self.verdict: Verdict | None = None
         self.is_of_change = False
+        self.implausible: tuple[str, ...] = ()
 
     @property
     def is_running(self) -> bool:
@@ -45,6 +46,13 @@ class Diagnosing:
     def begin(self, since_s: float) -> None:
         """The plant has changed at this sample time."""
         self._since_s, self._stage, self.is_of_change = since_s, 0, False
+
+    def check(self, recording: str) -> bool:
+        """Hold the project file against a recording; False while something else is under way."""
+        if self._helper is not None:
+            return False
+        self._start(Check(recording))
+        return True
 
     def end(self) -> None:
         """The plant is as before."""
@@ -69,9 +77,12 @@ class Diagnosing:
             self._next_s = time.monotonic() + self._every_s
             self._begin(estimator, history.span_s)
 
-    def take(self, found: Found) -> None:
+    def take(self, found: Found | Checked) -> None:
         """An answer has come."""
         self._end_helper()
+        if isinstance(found, Checked):
+            self.implausible = found.errors
+            return
         if found.verdict is None:
             logger.info("no diagnosis: %s", found.reason)
             return
@@ -87,9 +98,12 @@ class Diagnosing:
     def _begin(self, estimator: Estimator, span_s: float) -> None:
         assert estimator.history is not None
         chunk = newest(estimator.history, span_s)
+        self._start(Diagnose(self._project.model, chunk))
+
+    def _start(self, job: Job) -> None:
         self._started_s = time.monotonic()
         self._helper = Helper(DIAGNOSER, [str(self._project.path)], self._answer, restarts=False)
-        self._helper.put(Diagnose(self._project.model, chunk))
+        self._helper.put(job)
 
     def _end_helper(self) -> None:
         if self._helper is not None:

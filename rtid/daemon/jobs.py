@@ -56,6 +56,13 @@ class Diagnose:
 
 
 @dataclass(frozen=True)
+class Check:
+    """A recording to hold the project file against: units, signs, swapped signals."""
+
+    recording: str
+
+
+@dataclass(frozen=True)
 class Ready:
     """The helper has compiled everything and takes jobs."""
 
@@ -127,5 +134,12 @@ class Found:
     reason: str = ""
 
 
-Job = Handover | Batch | Note | Recall | Diagnose | Found
-Answer = Ready | Publication | Judgement | Recalled | Saved | NotSaved | Recording | Found
+@dataclass(frozen=True)
+class Checked:
+    """Answer to Check: what would be learnt wrongly, each with the signal's name."""
+
+    errors: tuple[str, ...]
+
+
+Job = Handover | Batch | Note | Recall | Diagnose | Check | Found | Checked
+Answer = Ready | Publication | Judgement | Recalled | Saved | NotSaved | Recording | Found | Checked

@@ -19,6 +19,7 @@ from rtid.daemon.diagnosing import Diagnosing
 from rtid.daemon.helper import Helper
 from rtid.daemon.jobs import (
     Answer,
+    Checked,
     Found,
     Judgement,
     Note,
@@ -38,6 +39,7 @@ from rtid.project import Project
 
 LOOK_S = 0.1
 OVERLOAD = 0.05  # share of ticks lost in a second that is worth an alarm
+CHECK_S = 30.0  # of samples after which the project file is held against them
 GRACE_S = 15.0  # a save may take so long before its absence is an alarm
 
 
@@ -78,8 +80,8 @@ class Keeper:
         self._not_saved: dict[str, str] = {}
         self._saved_s: float | None = None
         self._started_s = time.monotonic()
-        self._recording = ""
-        self._recalling = False
+        self._recording, self._first_s = "", 0.0
+        self._recalling = self._is_checked = False
         self._is_ready = False
         self._frames_before, self._told_s = 0, 0.0
         self._lost = 0
@@ -132,7 +134,7 @@ class Keeper:
                     self.alarms.keep(name, folder)
             elif isinstance(answer, Recalled):
                 self._recalling, self._core.swap = False, answer.estimator
-            elif isinstance(answer, Found):
+            elif isinstance(answer, Found | Checked):
                 self._analyst.put(answer)
                 self._diagnosing.take(answer)
 
@@ -163,7 +165,16 @@ class Keeper:
         self.alarms.put("bus_down", "bus", text if source.is_down else "")
         self.alarms.put("not_saved", "store", self._why_not_saved())
         self.alarms.put("plant_changed", "plant", self._plant_text())
+        self.alarms.put("implausible", "sensor", "; ".join(self._diagnosing.implausible))
+        if not self._is_checked and self._recording and self._has_run_s() > CHECK_S:
+            self._is_checked = self._diagnosing.check(self._recording)
         self._diagnosing.look(self._core.learner.estimator, self._core.newest_s)
+
+    def _has_run_s(self) -> float:
+        """Seconds since the first sample of this run."""
+        if self._core.samples and not self._first_s:
+            self._first_s = time.monotonic()
+        return time.monotonic() - self._first_s if self._first_s else 0.0
 
     def _plant_text(self) -> str:
         if not self.plant.changed:

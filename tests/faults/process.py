@@ -78,12 +78,18 @@ def a_group() -> str:
 
 
 @contextlib.contextmanager
-def daemon(folder: Path, *options: str, settings: str = "", group: str = "") -> Iterator[Daemon]:
+def daemon(
+    folder: Path,
+    *options: str,
+    settings: str = "",
+    group: str = "",
+    edit: Callable[[str], str] = str,
+) -> Iterator[Daemon]:
     """`rtid run` on a multicast group of its own; killed at the end where it still runs."""
     (folder / "notify").unlink(missing_ok=True)
     project = folder / "machine.toml"
     source = machine().trace.with_suffix(".toml").read_text("utf-8")
-    project.write_text(f"{source}\n[daemon]\n{settings}\n", "utf-8")
+    project.write_text(f"{edit(source)}\n[daemon]\n{settings}\n", "utf-8")
     group = group or a_group()
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(folder / "notify"))
