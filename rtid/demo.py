@@ -19,10 +19,10 @@ from rtid.compare.reference import GainTable
 from rtid.comparing import TraceComparison, compare_trace
 from rtid.estimator.flowmap import VALID
 from rtid.estimator.solution import Solution
-from rtid.live import Learner, listen, virtual_bus
+from rtid.live import Learner, catalog_of, listen, virtual_bus
 from rtid.model import Edge, FloatArray
 from rtid.project import Project, load
-from rtid.replay import catalog_of, replay
+from rtid.replay import replay
 from rtid.sim.hidden import hide_wish
 from rtid.sim.plant import Plant
 from rtid.sim.random_plants import draw

@@ -17,7 +17,7 @@ import can
 import numpy as np
 
 from firmware_bridge.assemble import Assembler
-from firmware_bridge.catalog import Catalog
+from firmware_bridge.catalog import Catalog, load
 from firmware_bridge.config import CYCLE, Assembly
 from firmware_bridge.frames import Frames, add_counts, empty, to_messages
 from firmware_bridge.frozen import REASON as FROZEN
@@ -27,10 +27,21 @@ from firmware_bridge.samples import Samples
 from firmware_bridge.senders import Senders
 from firmware_bridge.sources.can_bus import CanBus
 from firmware_bridge.sources.live import LiveSource
+from rtid.errors import RtidError
 from rtid.estimator.estimator import Estimator, to_chunk
 from rtid.model import COMMAND, MODE, FloatArray, Model
+from rtid.project import Project
 
 QUIET_READS = 5  # the bus is over when its sender has ended and so many reads found nothing
+
+
+def catalog_of(project: Project) -> Catalog:
+    """The bit layouts of the project's DBC.  RtidError if it names none."""
+    if project.dbc is None:
+        raise RtidError(
+            f"{project.path}: source.dbc is missing", "name the DBC of the CAN trace", 2
+        )
+    return load(project.dbc)
 
 
 class Learner:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from firmware_bridge.assemble import Assembler
-from firmware_bridge.catalog import Catalog, load
+from firmware_bridge.catalog import Catalog
 from firmware_bridge.config import Assembly
 from firmware_bridge.frames import Frames
 from firmware_bridge.samples import Samples
@@ -23,7 +23,7 @@ from rtid.errors import RtidError
 from rtid.estimator.estimator import Estimator, to_chunk
 from rtid.estimator.noise import estimate_noise
 from rtid.estimator.record import RecordFit, fit_record
-from rtid.live import Learner, listen, virtual_bus
+from rtid.live import Learner, catalog_of, listen, virtual_bus
 from rtid.model import FloatArray, Model, Signal
 from rtid.project import Project
 from rtid.project.table import is_table, open_table
@@ -71,15 +71,6 @@ class Replay:
         """Rows of the chunk with span_s[0] <= t < span_s[1], seconds from the first sample."""
         t_s = self.chunk[:, 0]
         return self.chunk[(t_s >= span_s[0]) & (t_s < span_s[1])]
-
-
-def catalog_of(project: Project) -> Catalog:
-    """The bit layouts of the project's DBC.  RtidError if it names none."""
-    if project.dbc is None:
-        raise RtidError(
-            f"{project.path}: source.dbc is missing", "name the DBC of the CAN trace", 2
-        )
-    return load(project.dbc)
 
 
 def read_trace(project: Project, path: Path) -> Trace:

@@ -149,7 +149,7 @@ class Generations:
 
     def __init__(self, folder: Path, digest: str) -> None:
         self._folder, self._digest = folder, digest
-        self._serial = 0
+        self._serial: int | None = None
 
     def path(self, serial: int) -> Path:
         """Where the snapshot of this number goes."""
@@ -157,6 +157,8 @@ class Generations:
 
     def save(self, estimator: Estimator) -> Path:
         """Replace the older one; OSError where the disk does not take it."""
+        if self._serial is None:
+            self._serial = max((serial for serial, _ in self._whole()[0]), default=0)
         path = self.path(self._serial + 1)
         save(path, estimator, self._digest, self._serial + 1)
         self._serial += 1
@@ -167,8 +169,22 @@ class Generations:
 
         What belongs to another project or schema is kept under another name, never overwritten.
         """
+        found, damaged = self._whole()
+        for path in damaged:
+            os.replace(path, path.with_suffix(".refused.npz"))
+        refused = list(damaged.values())
+        for serial, path in sorted(found, reverse=True):
+            self._serial = max(self._serial or 0, serial)
+            try:
+                return Restored(load(path, model, self._digest), path.name, tuple(refused))
+            except SnapshotError as error:
+                refused.append(str(error))
+        return Restored(None, "fresh", tuple(refused))
+
+    def _whole(self) -> tuple[list[tuple[int, Path]], dict[Path, str]]:
+        """Serials of the snapshots that are whole and ours, and why the others are not."""
         found: list[tuple[int, Path]] = []
-        refused = []
+        refused: dict[Path, str] = {}
         for path in (self.path(0), self.path(1)):
             try:
                 header, _ = _read(path)
@@ -177,12 +193,5 @@ class Generations:
             except FileNotFoundError:
                 continue
             except SnapshotError as error:
-                refused.append(str(error))
-                os.replace(path, path.with_suffix(".refused.npz"))
-        for serial, path in sorted(found, reverse=True):
-            self._serial = max(self._serial, serial)
-            try:
-                return Restored(load(path, model, self._digest), path.name, tuple(refused))
-            except SnapshotError as error:
-                refused.append(str(error))
-        return Restored(None, "fresh", tuple(refused))
+                refused[path] = str(error)
+        return found, refused

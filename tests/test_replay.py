@@ -13,9 +13,9 @@ from firmware_bridge.frames import Frames
 from firmware_bridge.sources import candump, open_log
 from rtid.errors import RtidError
 from rtid.estimator.estimator import Estimator
-from rtid.live import Learner
+from rtid.live import Learner, catalog_of
 from rtid.project import Project, load
-from rtid.replay import catalog_of, read_trace, replay
+from rtid.replay import read_trace, replay
 from rtid.sim.random_plants import draw
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate

@@ -17,9 +17,10 @@ from firmware_bridge.sources.table import to_samples
 from rtid.check.series import Series
 from rtid.check.timing import Timing, timing
 from rtid.errors import RtidError
+from rtid.live import catalog_of
 from rtid.project import Project
 from rtid.project.table import is_table, open_table
-from rtid.replay import assemble, catalog_of
+from rtid.replay import assemble
 
 
 @dataclass(frozen=True)

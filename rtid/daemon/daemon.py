@@ -31,11 +31,10 @@ from rtid.daemon.keeper import Facts, Keeper
 from rtid.daemon.log import logger
 from rtid.daemon.status import Status
 from rtid.errors import RtidError
-from rtid.live import Learner
+from rtid.live import Learner, catalog_of
 from rtid.loop import realtime
 from rtid.loop.loop import Loop
 from rtid.project import Project
-from rtid.replay import catalog_of
 from rtid.store import Generations
 
 ANALYST = "rtid.daemon.analyst"

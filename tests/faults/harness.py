@@ -15,9 +15,8 @@ from firmware_bridge.frames import Frames
 from rtid.estimator.flowmap import VALID, FlowMap
 from rtid.estimator.published import publish
 from rtid.estimator.solution import Solution
-from rtid.live import Learner
+from rtid.live import Learner, catalog_of
 from rtid.project import Project, load
-from rtid.replay import catalog_of
 from rtid.sim.bus import run_frames
 from rtid.sim.log import START_US
 from rtid.sim.plant import Plant

@@ -63,6 +63,15 @@ class Daemon:
         assert self.process.returncode == 0, err
         return from_json(out)
 
+    def cpu_s(self) -> float:
+        """Processor time of the daemon's own process so far, s."""
+        fields = Path(f"/proc/{self.process.pid}/stat").read_text("ascii").rsplit(")", 1)[1].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    def handles(self) -> int:
+        """Files, sockets and pipes that it holds."""
+        return len(os.listdir(f"/proc/{self.process.pid}/fd"))
+
     def analyst(self) -> int:
         """Process id of its helper."""
         found = subprocess.run(
@@ -125,12 +134,17 @@ def _listen(manager: socket.socket, started: Daemon) -> None:
 
 @contextlib.contextmanager
 def sender(
-    group: str, seconds: float, speed: float = 1.0, loops: int = 1, trace: Path | None = None
+    group: str,
+    seconds: float,
+    speed: float = 1.0,
+    loops: int = 1,
+    flood_hz: float = 0.0,
+    trace: Path | None = None,
 ) -> Iterator[subprocess.Popen[str]]:
     """Somebody who sends the machine's frames; ended at the end."""
     command = [
         sys.executable, "-m", "tests.faults.sender", str(trace or machine().trace), group,
-        str(seconds), str(speed), str(loops),
+        str(seconds), str(speed), str(loops), str(flood_hz),
     ]  # fmt: skip
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:

@@ -1,7 +1,8 @@
 """Frames of a trace over udp_multicast, from a process of its own: `python -m tests.faults.sender`.
 
-Arguments: TRACE GROUP SECONDS SPEED LOOPS.  Datagrams are those of python-can, made beforehand;
-stamps are the trace's, and go on in the next loop.  Prints the number of frames sent.
+Arguments: TRACE GROUP SECONDS SPEED LOOPS FLOOD_HZ.  Datagrams are those of python-can, made
+beforehand; stamps are the trace's, and go on in the next loop.  FLOOD_HZ frames per second of other
+identifiers come with them.  Prints the number of the trace's frames that were sent.
 """
 
 from __future__ import annotations
@@ -44,15 +45,22 @@ def datagrams(frames: Frames, shift_s: float) -> list[bytes]:
     ]
 
 
+def _foreign(frames: Frames) -> Frames:
+    """The same frames under identifiers that nobody wants."""
+    frames.can_id[:] = 0x400 + frames.can_id % 0x100
+    return frames
+
+
 def main() -> None:
     """Send."""
-    trace, group, seconds, speed, loops = sys.argv[1:6]
+    trace, group, seconds, speed, loops, flood_hz = sys.argv[1:7]
     frames = open_log(Path(trace))
     at_s = (frames.t_us - frames.t_us[0]) * 1e-6
     frames, at_s = frames[at_s < float(seconds)], at_s[at_s < float(seconds)]
     pieces = [datagrams(frames, k * float(seconds)) for k in range(int(loops))]
     out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 1)
+    foreign, flooded = datagrams(_foreign(frames[:100]), 0.0), 0
     start_s, sent = time.monotonic(), 0
     for k, piece in enumerate(pieces):
         n = 0
@@ -61,6 +69,9 @@ def main() -> None:
             while n < len(piece) and at_s[n] <= now_s:
                 out.sendto(piece[n], (group, PORT))
                 n += 1
+            while flooded < float(flood_hz) * (time.monotonic() - start_s):
+                out.sendto(foreign[flooded % len(foreign)], (group, PORT))
+                flooded += 1
             time.sleep(PIECE_S)
         sent += n
     print(sent)

@@ -1,0 +1,190 @@
+"""The long ones (`make soak`): a full bus, many kills, hours in minutes, a live diagnosis.
+
+RTID_SOAK (share of the full length, 1 by default) shortens them for a quick look.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from rtid.daemon.status import Status
+from rtid.live import Learner, catalog_of
+from rtid.project import load
+from rtid.sim.bus import run_frames
+from rtid.sim.hidden import hide_wish
+from rtid.sim.log import START_US, write_log
+from rtid.sim.random_plants import draw
+from rtid.sim.recording import write_run
+from rtid.sim.run import Change, simulate
+from rtid.store import Generations
+from tests.faults.conftest import Figure
+from tests.faults.harness import SECONDS, drift, machine
+from tests.faults.process import a_group, daemon, sender, stored
+
+pytestmark = pytest.mark.soak
+SHARE = float(os.environ.get("RTID_SOAK", "1"))
+QUICK = "publish_s = 5\nstore_s = 2\n"
+FULL_BUS_HZ = 8000.0
+
+
+def test_row_14_a_full_bus_for_60_s(tmp_path: Path, figure: Figure) -> None:
+    """8,000 frames/s, 3,000 of them wanted, publishing and recording as ever."""
+    seconds = SECONDS * min(1.0, SHARE)
+    with daemon(tmp_path) as running:
+        running.wait(lambda s: s.pid > 0)
+        with sender(running.group, seconds, flood_hz=FULL_BUS_HZ - 3000.0) as sending:
+            running.wait(lambda s: s.bus.frames > 3000)
+            cpu_s, start_s = running.cpu_s(), time.monotonic()
+            before = running.status()
+            sent = int(sending.communicate()[0])
+            share = (running.cpu_s() - cpu_s) / (time.monotonic() - start_s)
+        running.wait(lambda s: s.bus.frames_per_s == 0)
+        last = running.stop()
+    assert before is not None
+    loop = last.loop
+    figure(14, "wanted frames lost on a full bus", sent - last.bus.frames, 0)
+    figure(14, "processor time of the daemon, share of a core", share, 0.5)
+    figure(14, "private memory", last.rss_anon_mb, 150, "MB")
+    figure(14, "memory beyond that of the first second", last.rss_anon_mb - before.rss_anon_mb,
+           unit="MB")  # fmt: skip
+    figure(14, "work per tick p50", loop.work.p50_us, unit="us")
+    figure(14, "work per tick p99.9", loop.work.p999_us, unit="us")
+    figure(14, "overruns by its own work, share of ticks",
+           sum(n for c, n in loop.causes.items() if c not in ("late", "preempted")) / loop.ticks,
+           0.001)  # fmt: skip
+
+
+def test_row_17_killed_50_times(tmp_path: Path, figure: Figure) -> None:
+    """At random moments of a run over the same minute again and again, saved every 2 s."""
+    kills, chance, group = max(3, round(50 * SHARE)), random.Random(50), a_group()
+    restored: list[str] = []
+    with sender(group, SECONDS, loops=100):
+        for k in range(kills + 1):
+            with daemon(tmp_path, settings=QUICK, group=group) as running:
+                running.wait(running.is_its_own)
+                running.wait(lambda s: s.estimate.samples > 0)
+                found = running.status()
+                assert found is not None
+                restored.append(found.store.restored)
+                time.sleep(2.0 + chance.uniform(0.0, 4.0))
+                if k < kills:
+                    running.process.kill()
+                    running.process.wait()
+                else:
+                    running.stop()
+    figure(17, f"of {kills} restarts that began anew", sum(r == "fresh" for r in restored[1:]), 0)
+    whole = machine().learned(machine().frames).estimator.solution()
+    figure(17, f"drift after {kills} kills against one uninterrupted pass",
+           drift(whole, stored(running.folder, machine().project).estimator.solution()),
+           0.01)  # fmt: skip
+
+
+def test_row_28_hours_at_ten_times_the_pace(tmp_path: Path, figure: Figure) -> None:
+    """10 minutes at 10 x: no growth, and the state of one pass over the same frames."""
+    loops = max(2, round(100 * SHARE))
+    with daemon(tmp_path, settings="publish_s = 5\nstore_s = 10\nrecord_mb = 0\n") as running:
+        running.wait(lambda s: s.pid > 0)
+        with sender(running.group, SECONDS, speed=10.0, loops=loops) as sending:
+            seen: list[tuple[float, float, int]] = []
+
+            def look(status: Status) -> bool:
+                hours = status.loop.ticks / status.loop.rate_hz / 3600
+                if not seen or hours > seen[-1][0] + 2 / 3600:
+                    seen.append((hours, status.rss_anon_mb, running.handles()))
+                return sending.poll() is not None
+
+            running.wait(look, limit_s=30.0 + 7.0 * loops)
+            sent = int(sending.communicate()[0])
+        running.wait(lambda s: s.bus.frames >= sent, 20.0)
+        running.wait(lambda s: s.bus.frames_per_s == 0, 20.0)
+        running.stop()
+    half = len(seen) // 2
+    early, late = seen[half], seen[-1]
+    growth = (late[1] - early[1]) / max(late[0] - early[0], 1e-9)
+    figure(28, "handles more than half way", late[2] - early[2], 0)
+    figure(28, "memory, second half", late[1] - early[1], unit="MB")
+    figure(28, "memory growth, second half, in time of the wall", growth, unit="MB/h")
+    learner = machine().learner()
+    for k in range(loops):
+        again = machine().frames[:]
+        again.t_us[:] += round(k * SECONDS * 1e6)
+        learner.push(again)
+    learner.finish()
+    learned = stored(running.folder, machine().project)
+    same = learned.estimator.state.memory.tobytes() == learner.estimator.state.memory.tobytes()
+    figure(28, "states that differ from one-shot replay", 0 if same else 1, 0)
+
+
+@pytest.mark.parametrize(("number", "effect", "name"), [
+    (3, "internal_leakage_laminar=middle", "internal_leakage_laminar"),
+    (2, "input_delay=middle", "input_delay"),
+    (3, "entrained_air=middle", "entrained_air"),
+])  # fmt: skip
+def test_an_effect_that_begins_is_named(
+    number: int, effect: str, name: str, tmp_path: Path, figure: Figure
+) -> None:
+    """Real time, two processes; after 60 s something breaks."""
+    plant = draw(number)
+    run = simulate(plant, "rich", 0, 130.0, change=Change(60.0, hide_wish(plant, effect)))
+    frames = run_frames(run, start_us=START_US)
+    healthy = simulate(plant, "rich", 0, 10.0)
+    trace = tmp_path / "machine.blf"
+    write_run(trace, healthy, 0, "rich")
+    write_log(trace, frames)
+    text = trace.with_suffix(".toml").read_text("utf-8")
+    with daemon(tmp_path, edit=lambda _: text) as running:
+        running.wait(lambda s: s.pid > 0)
+        with sender(running.group, 130.0, trace=trace):
+            running.wait(lambda s: s.estimate.samples > 0)
+            began_s = time.monotonic()
+            running.wait(lambda s: any(a.name == "plant_changed" for a in s.alarms), 120)
+            alarm_s = time.monotonic() - began_s - 60
+            running.wait(lambda s: s.verdict is not None, 120)
+            verdict_s = time.monotonic() - began_s - 60
+            found = running.status()
+        last = running.stop()
+    assert found is not None and found.verdict is not None
+    figure(6, f"{name}: alarm after it begins", alarm_s, 60, "s")
+    figure(6, f"{name}: verdict after it begins", verdict_s, 60, "s")
+    assert found.verdict.verdict in ("missing", "ambiguous"), found.verdict.text
+    assert any(name in effect for effect in found.verdict.effects), found.verdict.effects
+    assert last.estimate.state == "suspended"
+    project = load(running.folder.parent / "machine.toml")
+    learner = Learner(project.model, catalog_of(project), project.assembly)
+    learner.push(frames[: 3 * 60_000])
+    kept = Generations(running.folder, project.digest).restore(project.model).estimator
+    assert kept is not None
+    figure(6, f"{name}: drift of the map against that of the healthy minute",
+           drift(learner.estimator.solution(), kept.solution()), 0.01)  # fmt: skip
+
+
+def test_row_21_overload(tmp_path: Path, figure: Figure) -> None:
+    """Four processes that only compute, for 20 s."""
+    burn = "while True: pass"
+    with daemon(tmp_path, settings=QUICK) as running:
+        running.wait(lambda s: s.pid > 0)
+        with sender(running.group, 40.0) as sending:
+            running.wait(lambda s: s.estimate.samples > 2000)
+            busy = [subprocess.Popen([sys.executable, "-c", burn]) for _ in range(4)]
+            time.sleep(20.0 * min(1.0, SHARE))
+            during = running.status()
+            for process in busy:
+                process.kill()
+                process.wait()
+            calm_s = running.wait(lambda s: s.loop.lateness_1s.p99_us < 2000.0, 20.0)
+            sent = int(sending.communicate()[0])
+        running.wait(lambda s: s.bus.frames >= sent, 10.0)
+        last = running.stop()
+    assert during is not None
+    loop = last.loop
+    figure(21, "frames lost under overload", sent - last.bus.frames, 0)
+    figure(21, "overruns without a cause", loop.overruns - sum(loop.causes.values()), 0)
+    figure(21, "overruns under overload", during.loop.overruns)
+    figure(21, "normal again after (status told each second)", calm_s, 3.0, "s")
