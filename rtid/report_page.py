@@ -30,10 +30,9 @@ from rtid.report_tables import (
     not_found,
     section,
     table,
-    text,
 )
 from rtid.report_template import PAGE
-from rtid.report_verdicts import VERDICTS
+from rtid.report_words import VERDICTS, text
 
 PARTS = "identification part", "held-out part"
 RANKED = 16  # candidates that are shown

@@ -10,11 +10,7 @@ from rtid.diagnose.report import Small, Unseen, Value
 from rtid.diagnosed_text import quantity, title
 from rtid.project.history import UNDO, Change, standing
 from rtid.report_story import Ranked
-
-
-def text(words: str) -> str:
-    """Words as HTML."""
-    return escape(words.replace("+-", "±"))
+from rtid.report_words import text
 
 
 def section(heading: str, *content: str) -> str:

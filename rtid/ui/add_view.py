@@ -14,7 +14,7 @@ from rtid.compare import FREE_RUN, BlockRow
 from rtid.diagnose.report import Value
 from rtid.diagnosed_text import quantity, title
 from rtid.project.added import AddedSection
-from rtid.report_tables import text
+from rtid.report_words import text
 from rtid.ui.blocks import LARGEST, ML_PER_MIN, Quantity, quantities, round_up
 from rtid.ui.compare_view import EMPTY, NAMES, TimePlots
 from rtid.ui.fragments import button, table

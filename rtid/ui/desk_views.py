@@ -8,7 +8,7 @@ from bokeh.models import Column, UIElement
 
 from rtid.compare import NoSuchBlockError
 from rtid.compare.places import blocks_in_span, spans_of_block
-from rtid.report_tables import text
+from rtid.report_words import text
 from rtid.ui import add_view, why_view
 from rtid.ui.add_view import AddView
 from rtid.ui.blocks import Key

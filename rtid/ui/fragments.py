@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 
-from rtid.report_tables import text
+from rtid.report_words import text
 
 
 def button(label: str, do: str, *, kind: str = "", off: bool = False, **data: str) -> str:

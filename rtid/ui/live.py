@@ -23,8 +23,7 @@ from rtid.daemon.status import (
     read,
 )
 from rtid.model import Model
-from rtid.report_tables import text
-from rtid.report_verdicts import VERDICTS
+from rtid.report_words import VERDICTS, text
 from rtid.ui.fragments import table
 
 STALE_S = 3.0

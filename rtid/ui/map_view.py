@@ -22,7 +22,7 @@ from rtid.colours import BLUE, GREY, LPM, MPA, ORANGE
 from rtid.compare import PAPER_DP_PA, PAPER_U_V, LearnedReference, Reference, deviations
 from rtid.estimator.flowmap import VALID, EdgeMap, FlowMap
 from rtid.model import FloatArray
-from rtid.report_tables import text
+from rtid.report_words import text
 from rtid.ui.blocks import YELLOWS
 from rtid.ui.fragments import button, choice, select, table
 from rtid.ui.theme import INK_TAG, plot, styled

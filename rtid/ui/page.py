@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bokeh.core.properties import Dict, String
 from bokeh.core.validation import silence
@@ -14,13 +15,15 @@ from bokeh.layouts import column
 from bokeh.model import DataModel
 from jinja2 import Environment, Template
 
-from rtid.ui.desk_views import DeskViews
 from rtid.ui.fragments import changed, cover, parsed
 from rtid.ui.live import Live
 from rtid.ui.session import FAILED, Session
 from rtid.ui.verdict import record_line, strip, work_line
 
 silence(EMPTY_LAYOUT)  # a view that nobody has looked at yet
+if TYPE_CHECKING:
+    from rtid.ui.desk_views import DeskViews
+
 PAUSE_MS = 1500  # between views that are made ahead
 STATIC = Path(__file__).parent / "static"
 VIEWS = ("compare", "where", "why", "add", "map", "live")
@@ -82,6 +85,8 @@ class Page:
     def _refresh(self, what: str) -> None:
         session = self.session
         if session.revisions and self._desk is None:
+            from rtid.ui.desk_views import DeskViews  # noqa: PLC0415 - the live page needs none
+
             self._desk = DeskViews(session, self._roots, self._put)
             self._soon(self._prepare)
         if self._desk is not None:

@@ -7,6 +7,7 @@ import secrets
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -131,6 +132,8 @@ def start(
     state: folder in which a daemon keeps its state, for the live page; model: its machine.  Raises
     RtidError where the port is taken.
     """
+    if trace is not None:
+        import_module("rtid.ui.desk_views")  # now, not while somebody waits for a picture
     loop = IOLoop.current()
     worker = Worker(loop.add_callback)
     session = Session(project, trace, worker, sheet)

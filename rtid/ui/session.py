@@ -9,12 +9,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rtid.errors import RtidError
 from rtid.project.added import AddedSection
-from rtid.ui.desk import Added, Opened, Saved, Told
-from rtid.ui.look import Look
 from rtid.ui.worker import Worker
+
+if TYPE_CHECKING:
+    from rtid.ui.desk import Added, Opened, Saved, Told
+    from rtid.ui.look import Look
 
 Key = tuple[str, str]
 Listener = Callable[[str], None]

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from rtid.diagnosed_text import sentences, title
 from rtid.project.history import ADD
-from rtid.report_tables import text
-from rtid.report_verdicts import VERDICTS
+from rtid.report_words import VERDICTS, text
 from rtid.ui.fragments import button
 from rtid.ui.session import FAILED, Revision, Session
 
@@ -43,6 +41,8 @@ def strip(session: Session) -> str:
     if last is None or last.told is None:
         heading = "Looking for what is missing" if last else "Opening the record"
         return f"<h1>{heading}</h1><p>{_waiting(session)}</p>"
+    from rtid.diagnosed_text import sentences, title  # noqa: PLC0415 - the live page needs none
+
     found = last.told.diagnosis
     kind, heading = VERDICTS[found.verdict]
     words = sentences(found)
@@ -60,6 +60,8 @@ def strip(session: Session) -> str:
 
 def _just_changed(last: Revision) -> str:
     """The change, before the new model is diagnosed."""
+    from rtid.diagnosed_text import title  # noqa: PLC0415 - the live page needs none
+
     section = last.section
     pair = section.errors.heldout_pct if section else None
     heading = "Added" if last.change == ADD else "Dropped"

@@ -12,7 +12,7 @@ from bokeh.plotting import figure
 from rtid.colours import CHAMBERS, GREY, LPM, MARKERS, UNITS
 from rtid.compare import BlockRow, Dependence
 from rtid.compare.tables import CAUSES, cause_of
-from rtid.report_tables import text
+from rtid.report_words import text
 from rtid.ui.blocks import HATCHES, LARGEST, ML_PER_MIN, BlockPlots, Key, quantities, round_up
 from rtid.ui.compare_view import EMPTY, NAMES, TimePlots
 from rtid.ui.fragments import button, choice, select

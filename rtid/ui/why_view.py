@@ -11,8 +11,8 @@ from rtid.effects import effect as page_of
 from rtid.effects.page import Effect as Page
 from rtid.effects.page import EffectError, readable
 from rtid.report_story import Ranked
-from rtid.report_tables import named, text
-from rtid.report_verdicts import VERDICTS
+from rtid.report_tables import named
+from rtid.report_words import VERDICTS, text
 from rtid.ui.desk import Told
 from rtid.ui.fragments import button, table
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from typing import Any
 
 from rtid.errors import RtidError
@@ -65,11 +66,8 @@ class Worker:
     def __init__(self, on_loop: Callable[[Callable[[], None]], None]) -> None:
         self._on_loop = on_loop
         self._jobs: list[Job] = []
-        self._pipe, theirs = get_context("spawn").Pipe()
-        self._process = get_context("spawn").Process(target=serve, args=(theirs,), daemon=True)
-        self._process.start()
-        theirs.close()
-        threading.Thread(target=self._listen, daemon=True).start()
+        self._pipe: Connection | None = None
+        self._process: BaseProcess | None = None
 
     @property
     def is_busy(self) -> bool:
@@ -91,21 +89,33 @@ class Worker:
 
     def stop(self) -> None:
         """End the process, whatever it does."""
-        self._process.terminate()
-        self._process.join(5.0)
+        if self._process is not None:
+            self._process.terminate()
+            self._process.join(5.0)
+
+    def _start(self) -> Connection:
+        """The process, started with the first job: a page that only looks on needs none."""
+        context = get_context("spawn")
+        ours, theirs = context.Pipe()
+        self._process = context.Process(target=serve, args=(theirs,), daemon=True)
+        self._process.start()
+        theirs.close()
+        threading.Thread(target=self._listen, args=(ours,), daemon=True).start()
+        return ours
 
     def _begin(self) -> None:
         job = self._jobs[0]
         try:
+            self._pipe = self._pipe or self._start()
             self._pipe.send((job.method, job.arguments))
         except OSError:
             self._take("refused", ENDED)
 
-    def _listen(self) -> None:
+    def _listen(self, pipe: Connection) -> None:
         """Pass on what the worker says, from a thread of its own."""
         while True:
             try:
-                kind, content = self._pipe.recv()
+                kind, content = pipe.recv()
             except (EOFError, OSError):
                 self._on_loop(partial(self._take, "refused", ENDED))
                 return

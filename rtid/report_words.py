@@ -1,4 +1,11 @@
-"""The verdicts as headings: a kind for the colour, and words."""
+"""Words of report and page: the verdicts as headings, and what becomes of words in HTML.
+
+VERDICTS: a kind, for the colour, and the heading.
+"""
+
+from __future__ import annotations
+
+from html import escape
 
 VERDICTS = {
     "matches": ("good", "The model matches"),
@@ -7,3 +14,8 @@ VERDICTS = {
     "unknown": ("open", "Something unknown is missing"),
     "insufficient_data": ("open", "Too little motion to tell"),
 }
+
+
+def text(words: str) -> str:
+    """Words as HTML."""
+    return escape(words.replace("+-", "±"))
