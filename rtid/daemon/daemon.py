@@ -85,6 +85,7 @@ class Daemon:
 
         Raises DaemonError, SourceError where the bus cannot be opened or has failed for good.
         """
+        realtime.share_arenas()
         folder = self._folder
         folder.mkdir(parents=True, exist_ok=True)
         with _locked(folder / LOCK_FILE):
@@ -122,6 +123,8 @@ class Daemon:
         self._loop = loop = Loop(rate_hz, _until(core.tick, end_ns, self.stop))
         keeper.loop = loop
         keeper.start()
+        if self._project.sections.daemon.priority:
+            realtime.favour_threads()
         logger.info("running %s on %s %s at %g Hz", self._project.name, self._bus.interface,
                     self._bus.channel, rate_hz)  # fmt: skip
         try:
