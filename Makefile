@@ -5,7 +5,7 @@ PYTHON ?= python3
 PIP = .venv/bin/python -m pip --disable-pip-version-check
 READY = .venv/.ready
 
-.PHONY: demo test bench lint campaign pictures screenshots lock clean
+.PHONY: demo test bench lint campaign faults soak pictures screenshots lock clean
 
 demo: $(READY)
 	.venv/bin/rtid demo
@@ -30,6 +30,20 @@ campaign: $(READY)
 # Every view of the workbench on the demo's worn machine, light and dark, into out/screenshots.
 screenshots: $(READY)
 	.venv/bin/python -m tools.screenshots out/screenshots
+
+# Every fault of the on-board daemon with its figure: a table in out/faults.md.
+faults: $(READY)
+	@mkdir -p out && rm -f out/faults.jsonl
+	RTID_FAULTS=out/faults.jsonl .venv/bin/python -m pytest -q -p no:benchmark tests/faults; \
+	  status=$$?; .venv/bin/python -m tests.faults.table out/faults.jsonl | tee out/faults.md; \
+	  exit $$status
+
+# The long ones (half an hour): a full bus, 50 kills, hours in minutes, live diagnoses.
+soak: $(READY)
+	@mkdir -p out && rm -f out/soak.jsonl
+	RTID_FAULTS=out/soak.jsonl .venv/bin/python -m pytest -q -p no:benchmark -m soak tests/faults; \
+	  status=$$?; .venv/bin/python -m tests.faults.table out/soak.jsonl | tee out/soak.md; \
+	  exit $$status
 
 pictures: $(READY)
 	.venv/bin/python -m tools.readme_pictures tools/pictures
