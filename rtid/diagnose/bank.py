@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from rtid.diagnose.candidates import Candidate, Cause, Columns, Shape, Volumes
-from rtid.diagnose.causes import causes
+from rtid.diagnose.causes import cause_of, causes
 from rtid.diagnose.causes.common import supply_change
 from rtid.diagnose.commands import change_of
 from rtid.diagnose.pump import demand
@@ -65,11 +65,6 @@ def add_shapes(view: View, columns: Columns, revision: Revision) -> Iterator[tup
                 yield e, k
 
 
-def cause_of(view: View, effect: Candidate) -> Cause:
-    """The cause that made a candidate."""
-    return next(cause for cause in causes(view) if cause.makes(effect))
-
-
 def opening_change(view: View, change: dict[str, FloatArray]) -> Volumes:
     """Volumes per interval and chamber of a small change of the commands (n,), in the blocks."""
     flows = [
@@ -88,11 +83,14 @@ def offer(
     more: Iterable[tuple[Cause, Shape]],
 ) -> None:
     """Columns of the revision's effects, and of all that is to be scored."""
-    for cause in causes(view) if bank or revision.effects else ():
+    if not bank:
+        for effect in revision.effects:
+            columns.offer(effect, cause_of(view, effect).column(effect.shape))
+    for cause in causes(view) if bank else ():
         own = [e for e in revision.effects if cause.makes(e)]
         for effect in own:
             columns.offer(effect, cause.column(effect.shape))
-        if bank and not own and cause.offered:
+        if not own and cause.offered:
             for shape in cause.shapes:
                 columns.offer(cause.at(shape), cause.column(shape))
     for cause, shape in more:

@@ -99,9 +99,9 @@ class Rows:
         rows, n_c, first = self.own.shape
         columns = np.zeros((rows, n_c, first + len(given)))
         columns[:, :, :first] = self.own
-        for j, volumes in enumerate(given):
-            for c, values in volumes.items():
-                columns[:, c, first + j] = values
+        nothing = np.zeros(rows)
+        for c in range(n_c if given else 0):
+            columns[:, c, first:] = np.stack([v.get(c, nothing) for v in given]).T
         return columns
 
     @cached_property

@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rtid.diagnose.bank import add_shapes, add_timing, cause_of, offer
+from rtid.diagnose.bank import add_shapes, add_timing, offer
 from rtid.diagnose.candidates import Candidate, Cause, Columns, Shape, Volumes
-from rtid.diagnose.causes import add_echoes, total_softness
+from rtid.diagnose.causes import add_echoes, cause_of, total_softness
 from rtid.diagnose.commands import commands, split, transformed
 from rtid.diagnose.evidence import Projected, Rows, project, rows_of
-from rtid.diagnose.moving import halfway, is_worse, moved
+from rtid.diagnose.moving import halfway, is_as_good, is_worse, moved, reweighed
 from rtid.diagnose.regression import Estimate, Regression
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.view import FlowMap, View
@@ -29,7 +29,7 @@ from rtid.kernels.layout import TERMS
 from rtid.model import FloatArray, Model
 
 PASSES = 10  # of Gauss-Newton
-ENOUGH = 1e-3  # of the misfit: a pass that gains less ends it
+HALVINGS = 2  # of one step, before it is given up
 RIDGE = 1e-9  # of the square of a timing's or a shape's column: more than rounding leaves
 HELD = 1e30  # information of a parameter that is held
 NO_COV = np.zeros((0, TERMS, TERMS))  # of maps whose covariance nobody asked for
@@ -109,24 +109,22 @@ def fit(
     revision: Revision,
     start: Fit | None = None,
     bank: bool = True,
-    passes: int = PASSES,
 ) -> Fit:
     """Fit a revision to chunk (n, 2 + signals); start: the fit to begin with.
 
-    bank: also make the columns of every candidate, to score them; passes: at most.
+    bank: also make the columns of every candidate, to score them.
     """
     best = one_pass(model, chunk, weights, revision, start, False, thorough=False)
-    step = moved(best)
-    for _ in range(passes):
-        if step is None:
+    step, halvings = moved(best), 0
+    for _ in range(PASSES):
+        if step is None or halvings > HALVINGS:
             break
         found = one_pass(model, chunk, step.weights, step.revision, best, False, thorough=False)
         if is_worse(found, best):
-            step = halfway(best, step)
+            step, halvings = halfway(best, step), halvings + 1
         else:
-            misfit = max(1.0, best.estimate.sse - best.regression.dof)
-            is_done = abs(best.estimate.sse - found.estimate.sse) < max(1.0, ENOUGH * misfit)
-            best, step = found, None if is_done else moved(found)
+            halvings = 0
+            best, step = found, None if is_as_good(found, best) else moved(found)
     return one_pass(model, chunk, best.weights, best.revision, best, bank) if bank else best
 
 
@@ -184,10 +182,13 @@ def with_covariances(found: Fit) -> Fit:
     )
 
 
-def onward(found: Fit) -> tuple[Revision, Weights]:
-    """Where the next pass would be."""
-    step = moved(found)
-    return (step.revision, step.weights) if step else (found.revision, found.weights)
+def tried(model: Model, chunk: FloatArray, weights: Weights, revision: Revision) -> Fit:
+    """A revision fitted where it is, its rows weighed by what it finds; derivatives do the rest."""
+    found = one_pass(model, chunk, weights, revision, None, False, thorough=False)
+    better = reweighed(found)
+    if better is not None:
+        found = one_pass(model, chunk, better, revision, found, False, thorough=False)
+    return found.light()
 
 
 def _same_rows(

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rtid.diagnose.bank import cause_of
 from rtid.diagnose.candidates import Candidate
+from rtid.diagnose.causes import cause_of
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.timing import Psi, Timing
 from rtid.estimator.state import Weights
@@ -26,6 +26,9 @@ SHAPE_REACH = 0.5  # the same of an effect's nonlinear parameter, in steps of it
 SIZED = 0.05  # share by which compliances and sizes of effects may still change: they weigh
 KEPT = 0.995  # of the rows that a step must leave on the grids: what is left out cannot misfit
 LAG_REACH = 3.0  # tolerances of the declared lag
+FAR = 10.0  # rho above which lag and weights are left alone: what is missing would pass for them
+NOISE = 4.0  # of chi2: two fits are as good as one another
+ENOUGH = 1e-3  # the same, of the misfit
 LEAST_LAG_S, LEAST_SHARE = 2e-5, 2e-3  # steps of a lag and of a timing that are not worth a pass
 LEAST_SPACING = 1e-3  # the same of a shape, of its axis' spacing
 
@@ -49,11 +52,21 @@ def moved(found: Fit) -> Step | None:
         (e, found.estimate.value(found.column(o)))
         for e, o in zip(effects, old.effects, strict=True)
     )
-    weights = replace(found.weights, lag_s=_lag_s(found), compliance=_compliance(found))
+    weights = found.weights
+    if found.rho < FAR:
+        weights = replace(weights, lag_s=_lag_s(found), compliance=_compliance(found))
     is_same = (timings, effects) == (old.timings, old.effects) and _weigh_alike(sizes, old.sizes)
     is_same &= weights.lag_s == found.weights.lag_s
     is_same &= weights.compliance is found.weights.compliance
     return None if is_same else Step(Revision(effects, timings, sizes), weights)
+
+
+def reweighed(found: Fit) -> Weights | None:
+    """Weights with the compliances that a fit has found; None where they weigh the same."""
+    compliance = _compliance(found)
+    if compliance is found.weights.compliance:
+        return None
+    return replace(found.weights, compliance=compliance)
 
 
 def halfway(best: Fit, step: Step) -> Step:
@@ -72,13 +85,19 @@ def halfway(best: Fit, step: Step) -> Step:
     return Step(Revision(effects, timings, sizes), replace(step.weights, lag_s=lag_s))
 
 
+def is_as_good(found: Fit, best: Fit) -> bool:
+    """True where a step changed the misfit by next to nothing."""
+    misfit = best.estimate.sse - best.regression.dof
+    return abs(best.estimate.sse - found.estimate.sse) < max(NOISE, ENOUGH * misfit)
+
+
 def is_worse(found: Fit, best: Fit) -> bool:
     """True where a step made the misfit larger, both being weighed alike, or lost rows."""
     if found.regression.rows < KEPT * best.regression.rows:
         return True
     alike = np.array_equal(found.weights.compliance, best.weights.compliance)
     alike = alike and _weigh_alike(found.revision.sizes, best.revision.sizes)
-    return alike and found.estimate.sse > best.estimate.sse
+    return alike and found.estimate.sse > best.estimate.sse and not is_as_good(found, best)
 
 
 def _mean(a: Psi, b: Psi) -> Psi:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rtid.diagnose.candidates import Candidate
-from rtid.diagnose.causes import SEED, causes, total_softness
+from rtid.diagnose.causes import SEED, cause_of, total_softness
 from rtid.diagnose.commands import transformed
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.view import View
@@ -65,7 +65,7 @@ def modelled(fit: Fit, view: View, leave_out: Candidate | None = None) -> FloatA
     for effect, value in effect_values(fit):
         if effect == leave_out:
             continue
-        cause = next(k for k in causes(view) if k.makes(effect))
+        cause = cause_of(view, effect)
         for c, volume in cause.column(effect.shape).items():
             flows[:, c] += value * volume / view.dt_s
     return flows

@@ -13,7 +13,7 @@ import numpy as np
 
 from rtid.diagnose.candidates import Candidate
 from rtid.diagnose.causes import causes
-from rtid.diagnose.fit import Fit, fit, one_pass, onward, with_covariances
+from rtid.diagnose.fit import Fit, fit, one_pass, tried, with_covariances
 from rtid.diagnose.parts import Part
 from rtid.diagnose.pump import PUMP, demand
 from rtid.diagnose.regression import LIMIT_SD, Score
@@ -31,7 +31,6 @@ PROMISING = 0.3  # share of the best gain that a timing's bank must reach to be 
 SHARE_OF_BEST = 0.2  # of the best gain that a cause must have for its shape to be refined
 ROUNDS = 8  # of refinement, each with half the step of the last
 SETTLED = 2e-3  # of the gain: what a round must add for another one
-TRIAL_PASSES = 1  # of Gauss-Newton behind the first, before one of several timings is chosen
 MATCH_RHO = 1.10  # largest rho of a model that matches
 
 # pumps to begin with: droops as shares of that seen, quantiles of the demand, stiffness in Pa/m3
@@ -237,14 +236,12 @@ def exact_trials(
         if gain < CLOSE * most:
             continue
         revision = replace(present.revision, timings=(*present.revision.timings, (timing, psi)))
-        now = fit(
-            state.model, state.chunk, present.weights, revision, bank=False, passes=TRIAL_PASSES
-        )
+        now = tried(state.model, state.chunk, present.weights, revision)
         if not _is_inside(now):
             continue
         exact, key = present.estimate.sse - now.estimate.sse, (timing.effect, COMMAND)
         if key not in trials or exact > trials[key].gain:
-            trials[key] = Trial(key, exact, now.revision, now.light())
+            trials[key] = Trial(key, exact, now.revision, now)
     return list(trials.values())
 
 
@@ -252,8 +249,7 @@ def carried_on(state: State, present: Fit, trial: Trial) -> Fit:
     """The fit with a trial's revision to the end, with the covariances of its maps."""
     revision, weights, start = trial.revision, present.weights, present
     if trial.fit is not None:
-        revision, weights = onward(trial.fit)
-        start = trial.fit
+        weights, start = trial.fit.weights, trial.fit
     return with_covariances(fit(state.model, state.chunk, weights, revision, start, bank=False))
 
 

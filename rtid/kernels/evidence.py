@@ -242,14 +242,21 @@ def condense(
     out: FloatArray,
 ) -> None:
     """What a series (n - 1,) per interval adds to each row; out (rows,) is changed in place."""
-    rows = len(out)
+    n, rows, k = len(series), len(out), 0
     out[:] = 0.0
-    for k in range(len(series)):
-        r, a = row_of[k], share[k]
-        if 0 <= r < rows:
-            out[r] += a * series[k]
-            if r + 1 < rows and not fresh[r + 1]:
-                out[r + 1] += (1.0 - a) * series[k]
+    while k < n:
+        r = row_of[k]
+        if r < 0 or r >= rows:
+            k += 1
+            continue
+        now, later = 0.0, 0.0
+        while k < n and row_of[k] == r:
+            now += share[k] * series[k]
+            later += (1.0 - share[k]) * series[k]
+            k += 1
+        out[r] += now
+        if r + 1 < rows and not fresh[r + 1]:
+            out[r + 1] += later
 
 
 @kernel
@@ -265,9 +272,9 @@ def follow_map(
     """Means over each interval of what a map says along a record; outputs changed in place.
 
     engine (1,), cells: a freshly built state; theta (cells, 6) m3/s, cov (cells, 6, 6) its
-    covariance.  along (n - 1, edges, 5): opening command w in V, Q in m3/s, dQ/dw in m3/s/V, dQ/ddp
-    in m3/s/Pa, standard deviation of Q; all but w are 0 where shut, all NaN where the record has a
-    gap or the point is off the grid.  cell (n - 1, edges): grid cell or -1.
+    covariance, or empty.  along (n - 1, edges, 5): opening command w in V, Q in m3/s, dQ/dw in
+    m3/s/V, dQ/ddp in m3/s/Pa, standard deviation of Q; all but w are 0 where shut, all NaN where
+    the record has a gap or the point is off the grid.  cell (n - 1, edges): grid cell or -1.
     """
     e = engine[0]
     for k in range(len(chunk)):
@@ -305,8 +312,9 @@ def _map_at(e: Any, theta: FloatArray, cov: FloatArray, along: FloatArray, cell:
         q, variance = 0.0, 0.0
         for j in range(TERMS):
             q += phi[j] * th[j]
-            for m in range(TERMS):
-                variance += phi[j] * cov[at, j, m] * phi[m]
+            if len(cov) > 0:
+                for m in range(TERMS):
+                    variance += phi[j] * cov[at, j, m] * phi[m]
         along[i, 0] = e.moments[i, 0]
         along[i, 1] = q
         along[i, 2] = hu * (th[1] + 2.0 * th[3] * phi[1] + th[5] * phi[2])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from rtid.diagnose.candidates import Cause
+from collections.abc import Iterator
+
+from rtid.diagnose.candidates import Candidate, Cause
 from rtid.diagnose.causes.leaks import leaks, seats
 from rtid.diagnose.causes.lines import lines
 from rtid.diagnose.causes.openings import openings
@@ -12,13 +14,21 @@ from rtid.diagnose.causes.storage import SEED, add_echoes, storage, total_softne
 from rtid.diagnose.causes.supply import supply
 from rtid.diagnose.view import View
 
-__all__ = ["SEED", "add_echoes", "causes", "total_softness"]
+__all__ = ["SEED", "add_echoes", "cause_of", "causes", "total_softness"]
 
 MAKERS = (leaks, seats, openings, storage, lines, supply, drift, sensors, own)
 
 
 def causes(view: View) -> list[Cause]:
     """The causes that this machine and record have columns for; none without all pressures."""
-    if not view.has_pressures:
-        return []
-    return [cause for make in MAKERS for cause in make(view)]
+    return list(_causes(view))
+
+
+def cause_of(view: View, effect: Candidate) -> Cause:
+    """The cause that made a candidate."""
+    return next(cause for cause in _causes(view) if cause.makes(effect))
+
+
+def _causes(view: View) -> Iterator[Cause]:
+    for make in MAKERS if view.has_pressures else ():
+        yield from make(view)
