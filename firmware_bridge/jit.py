@@ -20,9 +20,17 @@ Integer = int | np.integer[Any]
 
 def kernel(function: Callable[..., Any]) -> Any:
     """Compile an entry point; cached on disk."""
-    return njit(cache=True)(function)
+    return _cached(function)
 
 
 def inlined(function: Callable[..., Any]) -> Any:
     """Compile a part of a kernel; always inlined."""
-    return njit(cache=True, forceinline=True)(function)
+    return _cached(function, forceinline=True)
+
+
+def _cached(function: Callable[..., Any], **options: Any) -> Any:
+    """Keep the result on disk, where numba finds a folder that it may write to."""
+    try:
+        return njit(cache=True, **options)(function)
+    except RuntimeError:  # no such folder: compile at each start
+        return njit(**options)(function)

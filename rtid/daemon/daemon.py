@@ -30,6 +30,7 @@ from rtid.daemon.jobs import Answer
 from rtid.daemon.keeper import Facts, Keeper
 from rtid.daemon.log import logger
 from rtid.daemon.status import Status
+from rtid.daemon.warm import compiled
 from rtid.errors import RtidError
 from rtid.live import Learner, catalog_of
 from rtid.loop import realtime
@@ -89,9 +90,7 @@ class Daemon:
         folder = self._folder
         folder.mkdir(parents=True, exist_ok=True)
         with _locked(folder / LOCK_FILE):
-            learner = Learner(
-                self._project.model, catalog_of(self._project), self._project.assembly
-            )
+            learner = compiled(self._learner)
             restored = self._restore(learner)
             analyst = Helper(ANALYST, [str(self._project.path), str(folder)], self._answers.append)
             diagnosing = Diagnosing(self._project, self._answers.append)
@@ -141,6 +140,9 @@ class Daemon:
             keeper.stop()
             logger.info("stopped")
         return keeper.status
+
+    def _learner(self) -> Learner:
+        return Learner(self._project.model, catalog_of(self._project), self._project.assembly)
 
     def _restore(self, learner: Learner) -> str:
         """Go on with the newest whole snapshot of this project."""
