@@ -23,13 +23,12 @@ from rtid.diagnose.trials import (
     Key,
     State,
     Trial,
-    alike_ones,
     carried_on,
+    contest,
     material_share,
     own_share,
     physical,
     scored,
-    simplest,
     trials_of,
 )
 from rtid.diagnose.verdict import MATERIAL, NAMED, UNKNOWN, can_judge, verdict
@@ -148,9 +147,7 @@ def _add_best(state: State, present: Fit, last: Residual) -> tuple[Fit, Residual
             continue
         if not _explains(state, present, best):
             return None
-        alike = alike_ones(state, best, trials)
-        trial = simplest(best, trials, alike)
-        alike = tuple(key for key in (best.key, *alike) if key != trial.key)
+        trial, alike = contest(state, present, best, trials)
         now = carried_on(state, present, trial)
         after = residual(now, state.held_out)
         own = BENT * own_share(now, trial, state.held_out)

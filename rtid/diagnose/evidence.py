@@ -86,7 +86,7 @@ class Rows:
         given = list(given)
         columns = self._columns(given)
         products.whitened(columns, self.fresh, self.whiten, self.keep)
-        flat = columns.reshape(self.n, -1)
+        flat = columns.reshape(self.n, columns.shape[2])
         with one_thread():
             own = flat.T @ flat
         products.adjoint(columns, self.fresh, self.whiten, self.keep)

@@ -106,7 +106,7 @@ def extend(present: Standing, effect: str, where: str = "") -> Extension:
     if effect == PUMP.effect:
         trials = with_pump(state, present.fit, trials)
     best = max(trials, key=lambda t: t.gain)
-    alike = alike_ones(state, best, trials)
+    alike = alike_ones(state, present.fit, best, trials)
     if alike:
         choices = " or ".join(f"{effect}:{place}" for _, place in (best.key, *alike))
         raise RefusedError(f"{effect} explains as much at several places", f"name one: {choices}")

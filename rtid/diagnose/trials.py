@@ -26,6 +26,7 @@ from rtid.model import FloatArray, Model
 GAIN = 16.0  # chi2 of the first effect: 60 candidates, 0.4 % for all of them together
 LARGE = 1.5  # rho above which timing effects are refitted whatever their score
 TIE, TIE_SHARE = 12.0, 0.03  # causes within so much of the best gain are not told apart
+REFUTED, WITHIN = 3.0, 0.05  # times the best cause's misfit; least misfit, of dof
 CLOSE = 0.9  # timings whose coarse gain is this share of the best are refitted finely
 PROMISING = 0.3  # share of the best gain that a timing's bank must reach to be closed in on
 SHARE_OF_BEST = 0.2  # of the best gain that a cause must have for its shape to be refined
@@ -43,18 +44,19 @@ Key = tuple[str, str]
 class Trial:
     """A cause beside the model so far: what chi2 would fall by, and the revision with it.
 
-    fit: the exact refit of a timing; a cause with a column of its own is fitted when it is chosen.
+    fit: an exact refit, where there is one; is_timing: it transforms a command or the supply.
     """
 
     key: Key
     gain: float
     revision: Revision
     fit: Fit | None = None
+    is_timing: bool = False
 
     @property
     def n_parameters(self) -> int:
         """Parameters that the cause brings."""
-        if self.fit is not None:
+        if self.is_timing:
             return len(self.revision.timings[-1][1])
         return 1 + len(self.effect.shape)
 
@@ -194,7 +196,7 @@ def with_pump(state: State, present: Fit, trials: list[Trial]) -> list[Trial]:
     revision = replace(present.revision, timings=timings)
     now = fit(state.model, state.chunk, present.weights, revision, bank=False)
     gain = present.estimate.sse - now.estimate.sse
-    return [*rest, Trial(first[0].key, gain, now.revision, now.light())]
+    return [*rest, Trial(first[0].key, gain, now.revision, now.light(), True)]
 
 
 def _pumps(present: Fit) -> list[Psi]:
@@ -241,7 +243,7 @@ def exact_trials(
             continue
         exact, key = present.estimate.sse - now.estimate.sse, (timing.effect, COMMAND)
         if key not in trials or exact > trials[key].gain:
-            trials[key] = Trial(key, exact, now.revision, now)
+            trials[key] = Trial(key, exact, now.revision, now, True)
     return list(trials.values())
 
 
@@ -276,27 +278,45 @@ def _is_inside(now: Fit) -> bool:
     return timing.low[0] * 1.01 < psi[0] < timing.high[0] * 0.99 and psi[0] > 3.0 * sd
 
 
-def alike_ones(state: State, best: Trial, trials: list[Trial]) -> tuple[Key, ...]:
+def alike_ones(state: State, present: Fit, best: Trial, trials: list[Trial]) -> tuple[Key, ...]:
     """Causes that this record does not tell from the best one: all but as good.
 
-    Where the best one leaves nothing but noise, one that leaves more is refuted.
+    One that leaves several times the misfit that the best one leaves is refuted.
     """
+    dof = present.regression.dof
+    misfit = present.estimate.sse - dof
     close = best.gain - TIE - TIE_SHARE * best.gain
-    settled = best.fit is not None and best.fit.rho < MATCH_RHO
+    refuted = misfit - REFUTED * max(misfit - best.gain, WITHIN * dof) - TIE
     return tuple(
         t.key
         for t in trials
-        if t.key != best.key
-        and t.gain > close
-        and t.key not in state.negligible
-        and not (settled and t.fit is not None and t.fit.rho > MATCH_RHO)
+        if t.key != best.key and t.gain > max(close, refuted) and t.key not in state.negligible
     )
 
 
-def simplest(best: Trial, trials: list[Trial], alike: tuple[Key, ...]) -> Trial:
-    """Of causes that this record does not tell apart, the one with the fewest parameters."""
-    equals = [best, *(t for t in trials if t.key in alike)]
-    return min(equals, key=lambda t: (t.n_parameters, -t.gain))
+def contest(
+    state: State, present: Fit, best: Trial, trials: list[Trial]
+) -> tuple[Trial, tuple[Key, ...]]:
+    """The cause to add, and those that this record does not tell from it.
+
+    Where several look alike each is refitted to the end, and the best of them is asked again; among
+    equals the one with the fewest parameters is taken.
+    """
+    rivals = [t for t in trials if t.key in alike_ones(state, present, best, trials)]
+    if not rivals:
+        return best, ()
+    refitted = [_finished(state, present, t) for t in (best, *rivals)]
+    best = max(refitted, key=lambda t: t.gain)
+    alike = alike_ones(state, present, best, refitted)
+    equals = [best, *(t for t in refitted if t.key in alike)]
+    chosen = min(equals, key=lambda t: (t.n_parameters, -t.gain))
+    return chosen, tuple(t.key for t in equals if t.key != chosen.key)
+
+
+def _finished(state: State, present: Fit, trial: Trial) -> Trial:
+    now = carried_on(state, present, trial)
+    gain = present.estimate.sse - now.estimate.sse
+    return replace(trial, gain=gain, revision=now.revision, fit=now.light())
 
 
 def material_share(before: Residual, after: Residual) -> float:
@@ -307,7 +327,7 @@ def material_share(before: Residual, after: Residual) -> float:
 
 def own_share(now: Fit, trial: Trial, held_out: FloatArray) -> float:
     """Size of an effect's own flow on the held-out part, of the rms flow; inf for a timing."""
-    if trial.fit is not None:
+    if trial.is_timing:
         return float("inf")
     effect = now.revision.effects[-1]
     whole = residual(now, held_out)

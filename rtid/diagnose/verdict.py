@@ -24,7 +24,8 @@ def can_judge(held: Residual) -> bool:
 
 def verdict(state: State, last: Fit, after: Residual) -> str:
     """The verdict on a search that ended with this fit and what it leaves of the held-out part."""
-    if last.regression.rows < LEAST_EVIDENCE or not can_judge(after):
+    has_moved = last.regression.rows >= LEAST_EVIDENCE and len(last.map.cells) > 0
+    if not has_moved or not can_judge(after):
         return INSUFFICIENT
     if not state.found:
         # what is left may be no noise, and still be too small to matter

@@ -22,6 +22,7 @@ from rtid.diagnose.view import View
 
 OPENINGS = 8  # opening pressures that are tried, over the range
 OWN_TIMES_S = (0.0, 0.02, 0.06)
+SHUT, RARE = 0.1, 0.998  # quantiles of the pressure: one that never shuts is a leak
 MAKEUP_PA = 1.5e6  # a make-up valve feeds from the tank line: it opens at low pressure
 HYSTERESIS = 0.04  # of the highest pressure: where the search begins
 
@@ -36,7 +37,8 @@ def openings(view: View) -> Iterator[Cause]:
 def _opening(view: View, effect: str, c: int, sign: float) -> Cause:
     """A valve that lets out (sign +1) above its opening pressure, or in (-1) below it."""
     p, smooth = view.pressure(c), view.smooth(view.pressure(c))
-    low, high = (float(v) for v in np.quantile(p, [0.002, 0.998]))
+    shares = (SHUT, RARE) if sign > 0 else (1.0 - RARE, 1.0 - SHUT)
+    low, high = (float(v) for v in np.quantile(p, shares))
     is_possible = sign > 0 or low < MAKEUP_PA
     if sign < 0 and is_possible:
         high = min(high, MAKEUP_PA)
