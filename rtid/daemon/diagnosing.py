@@ -20,6 +20,7 @@ AFTER_CHANGE_S = (20.0, 35.0, 55.0)  # of samples since the change
 LEAST_S = 30.0  # of samples for a diagnosis in between
 LIMIT_S = 240.0  # a diagnosis that takes longer is given up
 BEING_WRITTEN = 100  # rows at most that one tick appends
+MATCHES = "matches"
 DIAGNOSER = "rtid.daemon.diagnoser"
 
 
@@ -37,6 +38,11 @@ class Diagnosing:
         self.verdict: Verdict | None = None
         self.is_of_change = False
         self.implausible: tuple[str, ...] = ()
+
+    @property
+    def is_acquitted(self) -> bool:
+        """Whether the last verdict on the present change is that nothing is missing."""
+        return self.is_of_change and self.verdict is not None and self.verdict.verdict == MATCHES
 
     @property
     def is_running(self) -> bool:

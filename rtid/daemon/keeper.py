@@ -137,6 +137,9 @@ class Keeper:
             elif isinstance(answer, Found | Checked):
                 self._analyst.put(answer)
                 self._diagnosing.take(answer)
+                if self._diagnosing.is_acquitted and self.plant.changed:
+                    self.plant.accept()
+                    self._plant_changed()
 
     def _plant_changed(self) -> None:
         """Stop learning and go back to what was learned before, or go on."""

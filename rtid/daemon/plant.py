@@ -1,6 +1,6 @@
 """Has the plant changed?  Judgements of the map held, one per second of motion, in; events out.
 
-The level of a healthy plant is learned: its median surprise, at least 1.  Three of five judgements
+The level of a healthy plant is learned: its median surprise, at least 1.  Five of eight judgements
 beyond FACTOR times that level are a change; ten in a row that are not, and it is over.  A slow
 drift moves the level and the map with it.
 """
@@ -13,10 +13,10 @@ from statistics import median
 from rtid.daemon.jobs import Judgement
 
 FACTOR = 2.0
-RECENT, BAD = 5, 3
+RECENT, BAD = 8, 5
 HEALTHY = 10
 LEVEL = 60  # healthy judgements that the level is the median of
-LEAST_LEVEL = 10  # before so many nothing is judged
+LEAST_LEVEL = 30  # before so many nothing is judged: the first maps are rough
 CLEAN_S = 3.0  # so long a map must have been foretelling well to be trusted
 
 

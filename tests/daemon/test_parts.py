@@ -112,7 +112,7 @@ def watch(surprises: list[float]) -> list[tuple[float, bool]]:
 
 def test_a_plant_that_changes_is_noticed_and_that_it_is_well_again() -> None:
     healthy = [1.5, 1.2, 2.0, 1.7, 1.4] * 6
-    assert watch(healthy + [8.0] * 5 + healthy) == [(32.0, True), (44.0, False)]
+    assert watch(healthy + [8.0] * 6 + healthy) == [(34.0, True), (45.0, False)]
 
 
 def test_single_surprises_and_a_slow_drift_are_no_change() -> None:
@@ -127,7 +127,7 @@ def test_the_last_map_that_foretold_well_is_trusted() -> None:
     for k in range(30):
         plant.push(Judgement(1 + k // 10, 1.5, 1000, float(k)))
     assert plant.trusted == 3
-    for k in range(30, 34):
+    for k in range(30, 35):
         plant.push(Judgement(4, 9.0, 1000, float(k)))
     assert plant.changed and plant.trusted == 3
     assert plant.since_s == pytest.approx(29.0)
