@@ -75,6 +75,19 @@ def _picture(figure: Figure, name: str, caption: str) -> str:
     )
 
 
+def stills(told: Told) -> dict[str, Figure]:
+    """The pictures of the page by name, those that this record has."""
+    drawn: dict[str, Figure] = {}
+    if _can_be_judged(told):
+        drawn["errors"] = _errors_figure(told)
+    drawn["flows"] = _flows_figure(told)
+    if told.depends_before:
+        drawn["dependences"] = _dependences_figure(told)
+    if told.ranking:
+        drawn["ranking"] = _ranking_figure(told)
+    return drawn
+
+
 def _share(told: Told, residual_m3s: float) -> float:
     return 100.0 * residual_m3s / told.diagnosed.diagnosis.rms_flow_m3s
 
@@ -104,7 +117,8 @@ def _key_figures(told: Told) -> str:
     )
 
 
-def _errors(told: Told) -> str:
+def _steps(told: Told) -> list[tuple[str, float]]:
+    """Error behind each addition, in per cent of the rms flow."""
     found = told.diagnosed.diagnosis
     start = BEFORE if not found.added else "model with what was added before"
     steps = [(start, _share(told, found.heldout_residual_before_m3s))]
@@ -115,28 +129,47 @@ def _errors(told: Told) -> str:
     last = _share(told, found.heldout_residual_after_m3s)
     if found.found and found.negligible and not np.isclose(last, steps[-1][1], rtol=0.01):
         steps.append(("+ what is present but negligible", last))
-    floor = _share(told, found.noise_floor_m3s)
-    if not all(np.isfinite([floor, *(v for _, v in steps)])):
+    return steps
+
+
+def _floor(told: Told) -> float:
+    return _share(told, told.diagnosed.diagnosis.noise_floor_m3s)
+
+
+def _can_be_judged(told: Told) -> bool:
+    return all(np.isfinite([_floor(told), *(value for _, value in _steps(told))]))
+
+
+def _errors_figure(told: Told) -> Figure:
+    return errors(_steps(told), _floor(told), PARTS[told.judges])
+
+
+def _errors(told: Told) -> str:
+    if not _can_be_judged(told):
         return section("Error", "<p>No flow of the record could be judged.</p>")
-    part = PARTS[told.judges]
+    found, part, steps = told.diagnosed.diagnosis, PARTS[told.judges], _steps(told)
     caption = (
         f"Root mean square of measured less modelled chamber flow on the {part} of the record, "
         f"in per cent of the rms flow of {LPM * found.rms_flow_m3s:.3g} "
         f"L/min: {steps[0][1]:.2f} % for the model as it is"
     )
     caption += f", {steps[-1][1]:.2f} % with everything that was found." if found.found else "."
-    caption += f" Dashed: what the sensors' noise alone leaves, {floor:.2f} %."
+    caption += f" Dashed: what the sensors' noise alone leaves, {_floor(told):.2f} %."
     if not told.judges:
         caption += (
             " The map is known over too little of the held-out part of this record, so these "
             "errors are of the identification part."
         )
-    picture = _picture(errors(steps, floor, part), "error bars", caption)
+    picture = _picture(_errors_figure(told), "error bars", caption)
     return section(f"Error on the {part}", picture)
 
 
-def _flows(told: Told) -> str:
+def _flows_figure(told: Told) -> Figure:
     models = {BEFORE: told.before} | ({AFTER: told.after} if told.after else {})
+    return flows(told.chambers, models)
+
+
+def _flows(told: Told) -> str:
     caption = (
         "Flow into each chamber as the piston's motion measures it (dark) and as the model gives "
         "it (orange); below, the difference. The blue part taught the model, the yellow part was "
@@ -146,7 +179,7 @@ def _flows(told: Told) -> str:
     )
     if told.after:
         caption += " Left before, right with what was found, on the same scales."
-    picture = _picture(flows(told.chambers, models), "measured and modelled flow", caption)
+    picture = _picture(_flows_figure(told), "measured and modelled flow", caption)
     return section("Measured and modelled flow", picture)
 
 
@@ -154,14 +187,17 @@ def _judged_s(part: Residual) -> float:
     return len(part.t_s) / ROWS_PER_S
 
 
+def _dependences_figure(told: Told) -> Figure:
+    models = {BEFORE: told.depends_before}
+    if told.depends_after:
+        models[AFTER] = told.depends_after
+    return dependences(told.chambers, models, told.diagnosed.diagnosis.noise_floor_m3s)
+
+
 def _dependences(told: Told) -> str:
     heading = "What the residual depends on"
     if not told.depends_before:
         return section(heading, "<p>No flow of this record could be judged.</p>")
-    models = {BEFORE: told.depends_before}
-    if told.depends_after:
-        models[AFTER] = told.depends_after
-    floor = told.diagnosed.diagnosis.noise_floor_m3s
     caption = (
         "Mean residual over bins of position, pressures, the signals that explain most of it and "
         "time, over the whole record, with its 95 % interval; in the corner the share of the "
@@ -169,15 +205,17 @@ def _dependences(told: Told) -> str:
         "A trend says what the model misses; a right model lies on the zero line. The grey band is "
         "the rms of the sensors' noise."
     )
-    picture = _picture(dependences(told.chambers, models, floor), "residual by signal", caption)
-    return section(heading, picture)
+    return section(heading, _picture(_dependences_figure(told), "residual by signal", caption))
+
+
+def _ranking_figure(told: Told) -> Figure:
+    ranks = [Rank(named(r.key), r.before, r.after) for r in told.ranking[:RANKED]]
+    return ranking(ranks, float(np.sqrt(GAIN)))
 
 
 def _ranking(told: Told) -> str:
     if not told.ranking:
         return section("Candidates", "<p>This record holds no candidate.</p>")
-    limit = float(np.sqrt(GAIN))
-    ranks = [Rank(named(r.key), r.before, r.after) for r in told.ranking[:RANKED]]
     caption = (
         "How clearly the record shows each effect when it is added alone to the model: its "
         "coefficient in standard deviations. "
@@ -189,11 +227,11 @@ def _ranking(told: Told) -> str:
         f"{100 * MATERIAL:g} % of the rms flow, explains little of what is left, or has an "
         "impossible sign or size."
         if told.after
-        else f"Nothing beyond {limit:g} counts unless it is also possible and material."
+        else f"Nothing beyond {np.sqrt(GAIN):g} counts unless it is also possible and material."
     )
     return section(
         "Candidates",
-        _picture(ranking(ranks, limit), "ranking of the candidates", caption),
+        _picture(_ranking_figure(told), "ranking of the candidates", caption),
         candidates(told.ranking[:RANKED]),
     )
 

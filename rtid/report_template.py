@@ -39,7 +39,8 @@ table { border-collapse: collapse; width: 100%; font-size: 14px;
   font-variant-numeric: tabular-nums; }
 th { text-align: left; color: var(--quiet); font-weight: 600;
   border-bottom: 2px solid var(--line); }
-th, td { padding: 5px 14px 5px 0; vertical-align: top; overflow-wrap: anywhere; }
+th, td { padding: 5px 14px 5px 0; vertical-align: top; }
+td:first-child { min-width: 15ch; } td:last-child { overflow-wrap: anywhere; }
 td { border-bottom: 1px solid var(--line); }
 @media (max-width: 760px) { .figures { grid-template-columns: repeat(2, 1fr); } }
 @media print {

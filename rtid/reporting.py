@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from rtid.errors import RtidError
+from rtid.pictures import save
 from rtid.project import Project
-from rtid.report_page import page
+from rtid.report_page import page, stills
 from rtid.report_story import Progress, Told, tell
 
 
@@ -20,6 +21,7 @@ class Reported:
     told: Told
     path: Path
     size: int
+    pictures: tuple[Path, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """The diagnosis as of `rtid diagnose --json`, and where it came from and went to."""
@@ -31,6 +33,7 @@ class Reported:
             "project_digest": told.diagnosed.project.digest,
             "report": str(self.path),
             "bytes": self.size,
+            "pictures": [str(path) for path in self.pictures],
         } | told.diagnosed.diagnosis.as_json()
 
 
@@ -38,18 +41,32 @@ def _silent(_what: str, _share: float) -> None:
     pass
 
 
-def report(project: Project, trace: Path, path: Path, progress: Progress = _silent) -> Reported:
+def report(
+    project: Project,
+    trace: Path,
+    path: Path,
+    progress: Progress = _silent,
+    pictures: Path | None = None,
+) -> Reported:
     """Diagnose a trace and write its story to `path`; the file appears whole or not at all.
 
-    Raises RtidError, before the long work, where the file cannot be written.
+    pictures: a folder for the same pictures as PNG files, made if it is not there.  Raises
+    RtidError, before the long work, where the file cannot be written.
     """
     _refuse_unwritable(path, (trace, project.path))
     told = tell(project, trace, lambda what, share: progress(what, 0.8 * share))
     progress("drawing", 0.8)
     data = page(told).encode()
     _put(path, data)
+    drawn = _draw(told, pictures) if pictures else ()
     progress("done", 1.0)
-    return Reported(told, path, len(data))
+    return Reported(told, path, len(data), drawn)
+
+
+def _draw(told: Told, folder: Path) -> tuple[Path, ...]:
+    """Every picture of the page as a file."""
+    folder.mkdir(parents=True, exist_ok=True)
+    return tuple(save(figure, folder / f"{name}.png") for name, figure in stills(told).items())
 
 
 def _refuse_unwritable(path: Path, inputs: tuple[Path, ...]) -> None:

@@ -17,6 +17,9 @@ def report(
     output: Annotated[Path, typer.Option("--output", "-o", help="HTML file to write.")] = Path(
         "report.html"
     ),
+    png: Annotated[
+        Path | None, typer.Option(help="Also write the pictures as PNG files into this folder.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Write one HTML file that tells what the model misses: verdict, errors, pictures, tables.
@@ -30,11 +33,13 @@ def report(
 
     loaded = load(project)
     with progress_bar(hidden=as_json) as progress:
-        written = write_report(loaded, trace, output, progress)
+        written = write_report(loaded, trace, output, progress, png)
     if as_json:
         print(json.dumps(written.as_json()))
     else:
         for sentence in sentences(written.told.diagnosed.diagnosis):
             print(sentence)
         print(f"wrote {output}, {written.size / 1e3:.0f} kB")
+        for path in written.pictures:
+            print(f"wrote {path}")
     refuse_truncated(trace, written.told.diagnosed.trace.counters)

@@ -35,23 +35,48 @@ Spans = list[tuple[float, float]]
 
 
 class TimePlots:
-    """Plots over time that are zoomed together; every zoom thins their lines anew."""
+    """Plots over time that are zoomed together; every zoom thins their lines anew.
+
+    Each view has a range of its own, which takes over what the view before it has seen: what is
+    hidden costs nothing while somebody zooms.
+    """
 
     def __init__(
-        self, parts: dict[str, tuple[float, float]], on_span: Callable[[float, float], None]
+        self,
+        parts: dict[str, tuple[float, float]],
+        on_span: Callable[[float, float], None],
+        on_zoom: Callable[[], None],
     ) -> None:
         self._parts = parts
         low, high = min(a for a, _ in parts.values()), max(b for _, b in parts.values())
         margin = MARGIN * (high - low)
         self.whole = low - margin, high + margin
-        self.x = Range1d(*self.whole, bounds=self.whole)
+        self._ranges: dict[str, Range1d] = {}
         self._lines: dict[str, list[tuple[Line, ColumnDataSource]]] = {}
         self._drawn: dict[str, tuple[float, float]] = {}  # what a view's lines were thinned for
         self.view = ""  # the one that is looked at, or made
         self._lit = ColumnDataSource({"x0": [], "x1": []})
         self._plots: list[figure] = []
-        self._on_span = on_span
+        self._on_span, self._on_zoom = on_span, on_zoom
         self.drag = "zoom"
+
+    @property
+    def x(self) -> Range1d:
+        """The range of the view that is looked at."""
+        if self.view not in self._ranges:
+            made = Range1d(*self.whole, bounds=self.whole)
+            for end in ("start", "end"):
+                made.on_change(end, lambda _attr, _old, _new: self._on_zoom())
+            self._ranges[self.view] = made
+        return self._ranges[self.view]
+
+    def look_at(self, view: str) -> None:
+        """Another view, at the same time of the record."""
+        low, high = self.seen
+        self.view = view
+        if view in self._ranges and self.seen != (low, high):
+            self.x.update(start=low, end=high)
+        self.refresh()
 
     def plot(self, label: str, title: str = "") -> figure:
         """One more plot on the common time."""

@@ -18,6 +18,7 @@ from rtid.ui.map_view import MapView
 from rtid.ui.session import Session
 from rtid.ui.where_view import WhereView
 
+TIMED = ("compare", "where", "add")  # views with plots over time
 Put = Callable[[dict[str, str]], None]
 
 
@@ -26,15 +27,13 @@ class DeskViews:
 
     def __init__(self, session: Session, roots: dict[str, Column], put: Put) -> None:
         self.session, self._roots, self._put = session, roots, put
-        self._time = TimePlots(spans_of(self._look), self._mark_span)
+        self._time = TimePlots(spans_of(self._look), self._mark_span, self._zoomed)
         self._compare: CompareView | None = None
         self._where: WhereView | None = None
         self._add: AddView | None = None
         self._map: MapView | None = None
-        self._page, self._view = "", ""
+        self._page = ""
         self._is_due = False
-        for end in ("start", "end"):
-            self._time.x.on_change(end, lambda _attr, _old, _new: self._zoomed())
 
     @property
     def _look(self) -> Look:
@@ -42,15 +41,14 @@ class DeskViews:
 
     def show(self, view: str) -> None:
         """Look at a view."""
-        self._view = view
         self._make(view)
-        self._time.view = view
-        self._time.refresh()
+        if view in TIMED:
+            self._time.look_at(view)
         self._tell()
 
     def _make(self, view: str) -> None:
         """Make a view that nobody has looked at before."""
-        self._time.view = view
+        at, self._time.view = self._time.view, view
         if view == "compare" and self._compare is None:
             self._compare = CompareView(self._look, self._time)
             self._compare.show(self._look)
@@ -69,6 +67,7 @@ class DeskViews:
             self._map = MapView(self._look.flowmap, opened.reference if opened else None)
             self._map.show()
             self._place("map", self._map.root)
+        self._time.view = at
 
     def prepare(self) -> bool:
         """Make one more view before it is looked at; False where all are made."""
@@ -76,7 +75,6 @@ class DeskViews:
         missing = [name for name, view in made.items() if view is None]
         if missing:
             self._make(missing[0])
-            self._time.view = self._view
         return len(missing) > 1
 
     def refresh(self, what: str) -> None:

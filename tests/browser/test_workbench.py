@@ -9,7 +9,7 @@ import pytest
 
 from rtid.mapfiles import read_map
 from rtid.project import load
-from tests.browser.conftest import Opened
+from tests.browser.conftest import DURATION_S, Opened
 
 pytestmark = pytest.mark.slow
 NAMED = "#verdict button.main[data-do=add]"
@@ -66,17 +66,17 @@ def test_zooming_draws_what_is_seen_anew(opened: Opened) -> None:
     opened.go("compare")
     page = opened.page
     page.wait_for_selector("#compare canvas")
-    spans = (
-        "() => [...Bokeh.documents[0].all_models].filter(m => m.type === 'ColumnDataSource'"
-        " && m.data.t && m.data.t.length > 100).map(m => m.data.t[m.data.t.length-1]-m.data.t[0])"
+    count = (
+        "share => [...Bokeh.documents[0].all_models].filter(m => m.type === 'ColumnDataSource'"
+        " && m.data.t && m.data.t.length > 100 && m.data.t[m.data.t.length - 1] - m.data.t[0]"
+        " < share).length"
     )
-    page.wait_for_function(f"() => ({spans})().length >= 6")
-    whole = max(page.evaluate(spans))
+    page.wait_for_function(f"() => ({count})(1e9) >= 12")
     for _ in range(3):
         page.keyboard.press("+")
-    page.wait_for_function(f"() => Math.max(...({spans})()) < {0.2 * whole}")
+    page.wait_for_function(f"() => ({count})({0.2 * DURATION_S}) >= 12")
     page.keyboard.press("0")
-    page.wait_for_function(f"() => Math.max(...({spans})()) > {0.95 * whole}")
+    page.wait_for_function(f"() => ({count})({0.9 * DURATION_S}) === 0")
 
 
 def test_the_block_with_the_largest_error_lights_its_spans(opened: Opened) -> None:
