@@ -152,4 +152,5 @@ class Columns:
     def released(self) -> list[Volumes]:
         """What all columns add to the rows, chamber -> (rows,); kept no longer."""
         columns, self._columns = self._columns, []
+        self.condense = np.asarray  # which held the rows
         return columns

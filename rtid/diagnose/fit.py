@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -39,19 +40,18 @@ NO_COV = np.zeros((0, TERMS, TERMS))  # of maps whose covariance nobody asked fo
 class Fit:
     """A fitted revision.
 
-    declared: the machine as declared; model: the same with split commands; sent: the record with
-    the commands as they reach the spools.  The columns of the regression are
+    declared: the machine as declared, and chunk the record; before: the map that gave the columns.
+    The columns of the regression are
     y, theta_beta per chamber, timing parameters, shapes up to `first`, candidates, echoes.
     shapes: (effect, nonlinear parameter) of each column of shapes.  rows: of the record, for
     another fit with the same commands and weights; large.
     """
 
     declared: Model
-    model: Model
-    sent: FloatArray
+    chunk: FloatArray
     weights: Weights
     revision: Revision
-    view: View
+    before: FlowMap
     columns: Columns
     regression: Regression
     estimate: Estimate
@@ -59,6 +59,21 @@ class Fit:
     first: int
     shapes: tuple[tuple[int, int], ...] = ()
     rows: Rows | None = None
+
+    @cached_property
+    def model(self) -> Model:
+        """The machine with split commands."""
+        return split(self.declared)
+
+    @cached_property
+    def sent(self) -> FloatArray:
+        """The record with the commands as they reach the spools."""
+        return transformed(self.declared, self.chunk, self.revision.timings)
+
+    @cached_property
+    def view(self) -> View:
+        """The record beside the map that gave the columns."""
+        return View.of(self.model, self.sent, self.weights, self.before)
 
     @property
     def rho(self) -> float:
@@ -77,7 +92,7 @@ class Fit:
         return 1 + len(self.model.chambers)
 
     def light(self) -> Fit:
-        """The same without the rows."""
+        """The same without the rows, and without what can be made again."""
         return replace(self, rows=None)
 
     def column(self, candidate: Candidate) -> int:
@@ -125,6 +140,7 @@ def fit(
         else:
             halvings = 0
             best, step = found, None if is_as_good(found, best) else moved(found)
+        del found  # its rows are large
     return one_pass(model, chunk, best.weights, best.revision, best, bank) if bank else best
 
 
@@ -149,7 +165,8 @@ def one_pass(
     model = split(declared)
     soft = softened(model, sent, weights, revision.sizes)
     rows = _same_rows(start, sent, weights, soft) or rows_of(model, sent, weights, soft=soft)
-    view = View.of(model, sent, weights, start.map if start else _map_alone(model, rows))
+    before = start.map if start else _map_alone(model, rows)
+    view = View.of(model, sent, weights, before)
     columns = Columns(rows.condensed)
     n_timing = add_timing(view, columns, commands(declared, chunk), weights, revision)
     shapes = tuple(add_shapes(view, columns, revision))
@@ -165,8 +182,9 @@ def one_pass(
     at = [first + columns.candidates.index(e) for e in revision.effects]
     estimate = regression.fit((*range(1, first), *at))
     flowmap = FlowMap(rows.cells, projected.terms(list(estimate.used), estimate.theta), NO_COV)
-    parts = sent, weights, revision, view, columns, regression, estimate
-    found = Fit(declared, model, *parts, flowmap, first, shapes, rows)
+    parts = chunk, weights, revision, before, columns, regression, estimate
+    found = Fit(declared, *parts, flowmap, first, shapes, rows)
+    vars(found).update(model=model, sent=sent, view=view)  # what is made when it is missing
     return with_covariances(found) if thorough else found
 
 
@@ -177,9 +195,11 @@ def with_covariances(found: Fit) -> Fit:
     cov = found.rows.factor.covariances
     freed = float(np.einsum("bii->", cov)) * PRIOR_SD**-2
     dof = found.rows.n - TERMS * len(found.rows.cells) + freed
-    return replace(
+    better = replace(
         found, map=replace(found.map, cov=cov), regression=replace(found.regression, dof=dof)
     )
+    vars(better).update(model=found.model, sent=found.sent, view=found.view)
+    return better
 
 
 def tried(model: Model, chunk: FloatArray, weights: Weights, revision: Revision) -> Fit:

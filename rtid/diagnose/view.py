@@ -6,11 +6,11 @@ Values at samples have n entries, means and volumes over intervals n - 1.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import savgol_coeffs, savgol_filter
+from scipy.signal import savgol_coeffs
 
 from rtid.estimator.state import Weights, build
 from rtid.kernels.evidence import follow_map
@@ -32,6 +32,19 @@ def has_noise(values: FloatArray) -> bool:
     change = np.diff(values)
     change = change[change != 0.0]
     return len(change) > 2 and bool(np.mean(change[1:] * change[:-1] < 0.0) > TURNS)
+
+
+@cache
+def _parabolas(
+    half: int, derivative: int, step_s: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Weights (2 half + 1) of a parabola's value: at the first points, the middle, the last."""
+    m = 2 * half + 1
+    at = [
+        savgol_coeffs(m, 2, derivative, step_s, pos=k, use="dot").astype(np.float64)
+        for k in range(m)
+    ]
+    return np.array(at[:half]), at[half], np.array(at[half + 1 :])
 
 
 @dataclass(frozen=True)
@@ -176,14 +189,10 @@ class View:
         half = max(2, round(SMOOTH_S / self.step_s))
         if len(values) <= 2 * half:
             return np.zeros(len(values))
-        window, ends = 2 * half + 1, 4 * half + 1
-        found = np.empty(len(values))
-        for part in (slice(None, ends), slice(-ends, None)):  # a parabola up to either end
-            found[part] = savgol_filter(
-                values[part], window, 2, deriv=derivative, delta=self.step_s
-            )
-        weights = savgol_coeffs(window, 2, derivative, self.step_s, use="dot")
-        correlate(np.ascontiguousarray(values), weights, found[half : len(values) - half])
+        found, m = np.empty(len(values)), 2 * half + 1
+        first, middle, last = _parabolas(half, derivative, self.step_s)
+        found[:half], found[-half:] = first @ values[:m], last @ values[-m:]
+        correlate(np.ascontiguousarray(values), middle, found[half : len(values) - half])
         return found
 
     def into_chamber(self, c: int, per_edge: list[FloatArray]) -> FloatArray:
