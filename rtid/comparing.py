@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rtid.beside import replay_beside
 from rtid.compare import (
     BlockRow,
     Candidate,
@@ -39,7 +40,7 @@ from rtid.estimator.published import publish
 from rtid.mapfiles import read_map
 from rtid.model import FloatArray
 from rtid.project import Project, load
-from rtid.replay import Replay, replay
+from rtid.replay import Replay
 
 IDENTIFICATION, VALIDATION = "identification", "validation"
 LEARNED = "learned"
@@ -147,7 +148,8 @@ def _assembled(
     known = tuple(reference for reference in references if reference is not None)
     candidates = [learned(result.fit, flowmap, name)]
     weights = result.fit.weights
-    candidates += [refitted(result.model, reference, weights, chunk) for reference in known]
+    terms = candidates[0].terms if result.added else None
+    candidates += [refitted(result.model, reference, weights, chunk, terms) for reference in known]
     held = tuple(hold(candidate) for candidate in candidates)
     blocks = {
         title: block_rows(result.fit.solution, part, flowmap)
@@ -177,8 +179,8 @@ def compare_two(
         other, other_trace, names[0] = load(against), trace, project.path.stem
     if names[0] == names[1]:
         names = [f"{name} {k}" for k, name in enumerate(names, 1)]
-    first = study(replay(project, trace), *references, name=names[0])
-    return first, study(replay(other, other_trace), name=names[1])
+    first = study(replay_beside(project, trace), *references, name=names[0])
+    return first, study(replay_beside(other, other_trace), name=names[1])
 
 
 def changes(first: TraceComparison, second: TraceComparison) -> list[Deviation]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -55,9 +55,19 @@ def read_map(path: Path) -> tuple[FlowMap, dict[str, Any]]:
         raise MapFileError(f"{path}: not a flow map of {SCHEMA} ({error})") from error
 
 
-def provenance(solution: Solution, project: str, digest: str, source: str) -> dict[str, Any]:
-    """Where a map comes from, in JSON types: what was learned from, and how well it fits."""
-    return {
+def provenance(
+    solution: Solution,
+    project: str,
+    digest: str,
+    source: str,
+    effects: Sequence[Mapping[str, Any]] | None = None,
+) -> dict[str, Any]:
+    """Where a map comes from, in JSON types: what was learned from, and how well it fits.
+
+    effects: those beside which it was fitted, whose flow is not in the map; None: not known.
+    """
+    known = {} if effects is None else {"effects": list(effects)}
+    return known | {
         "program": f"rtid {rtid.__version__}",
         "project": project,
         "digest": digest,

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,6 +28,9 @@ from rtid.live import Learner, catalog_of, listen, virtual_bus
 from rtid.model import FloatArray, Model, Signal
 from rtid.project import Project
 from rtid.project.table import is_table, open_table
+
+if TYPE_CHECKING:
+    from rtid.compare.beside import KnownEffect
 
 Progress = Callable[[str, float], None]
 
@@ -56,7 +60,11 @@ class Trace:
 
 @dataclass(frozen=True)
 class Replay:
-    """A replayed trace: `live` is what the daemon would have learned, `fit` the record path."""
+    """A replayed trace: `live` is what the daemon would have learned, `fit` the record path.
+
+    added: effects of the model beside which `fit` was learned (`rtid.beside`); then model and chunk
+    are those of the machine with them.
+    """
 
     project: Project
     model: Model
@@ -66,6 +74,7 @@ class Replay:
     chunk: FloatArray
     identification_s: tuple[float, float]
     validation_s: tuple[float, float] | None
+    added: tuple[KnownEffect, ...] = ()
 
     def part(self, span_s: tuple[float, float]) -> FloatArray:
         """Rows of the chunk with span_s[0] <= t < span_s[1], seconds from the first sample."""

@@ -50,11 +50,11 @@ def compare(
 
     Learns from the identification part, then holds every map against both parts: the equation
     residual, the simulated pressure (free run, 1 s and 0.1 s ahead), what the residual depends on,
-    and whether the model begins to fail.
+    and whether the model begins to fail.  Effects that `rtid add` has added are in the model.
     """
+    from rtid.beside import replay_beside
     from rtid.comparing import compare_two, find_reference, study
     from rtid.project import load
-    from rtid.replay import replay
     from rtid.residualfile import refuse_format, write_residuals
 
     if table is not None:
@@ -65,7 +65,7 @@ def compare(
     references = [find_reference(loaded, sheet) for sheet in sheets]
     studies: Sequence[TraceComparison]
     if against is None:
-        studies = [study(replay(loaded, trace), *references)]
+        studies = [study(replay_beside(loaded, trace), *references)]
     else:
         studies = compare_two(loaded, trace, against, *references)
     written = _draw(studies, pictures, picture_format) if pictures else []
@@ -108,13 +108,15 @@ def _span(text: str | None) -> tuple[float, float] | None:
 def _json(
     studies: Sequence[TraceComparison], place: Place | None, when: tuple[float, float] | None
 ) -> dict[str, Any]:
+    from rtid.beside import as_json as added_json
     from rtid.comparing import as_json, blocks_in_span, changes, spans_of_block
     from rtid.comparing_json import deviation
 
     first = studies[0]
-    found = as_json(first)
+    found = as_json(first) | {"added": added_json(first.replay.added)}
     if len(studies) > 1:
-        found["against"] = as_json(studies[1])
+        added = added_json(studies[1].replay.added)
+        found["against"] = as_json(studies[1]) | {"added": added}
         found["changes"] = [deviation(d) for d in changes(first, studies[1])]
     if place is not None:
         found["spans_of_block"] = spans_of_block(first, *place)
@@ -129,6 +131,7 @@ def _print(
     when: tuple[float, float] | None,
     written: list[Path],
 ) -> None:
+    from rtid.beside import sentences
     from rtid.compared_text import make_console, tell, tell_block, tell_span
 
     console = make_console()
@@ -137,6 +140,9 @@ def _print(
     if when is not None:
         tell_span(console, studies[0], *when)
     if place is None and when is None:
+        for found in studies:
+            for sentence in sentences(found.replay.added):
+                console.print(sentence)
         tell(console, studies)
     for path in written:
         console.print(f"wrote {path}")

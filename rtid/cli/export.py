@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -23,7 +23,9 @@ def export(
 ) -> None:
     """Write the learned maps: flow, standard deviation and status over command and pressure drop.
 
-    CSV is a long table at the nodes and centres of the grid; JSON and npz hold everything.
+    CSV is a long table at the nodes and centres of the grid; JSON and npz hold everything.  From a
+    trace the maps are learned beside the effects that `rtid add` has added, whose flow is not in
+    them; a snapshot holds the maps as they were learned on board, without such effects.
     """
     from rtid.errors import RtidError
     from rtid.estimator.published import publish
@@ -34,23 +36,41 @@ def export(
         remedy = f"end its name in {', '.join(FORMATS)}"
         raise RtidError(f"{output}: unknown format", remedy, exit_code=2)
     loaded = load(project)
-    solution = _solution(loaded, source)
+    solution, effects = _solution(loaded, source)
     flowmap = publish(solution)
-    write_map(output, flowmap, provenance(solution, loaded.name, loaded.digest, source.name))
+    origin = provenance(solution, loaded.name, loaded.digest, source.name, effects)
+    write_map(output, flowmap, origin)
     cells = {e.name: int((e.status == "valid").sum()) for e in flowmap.edges}
     if as_json:
-        print(json.dumps({"schema": 1, "written": str(output), "valid_blocks": cells}))
+        told = {"schema": 1, "written": str(output), "valid_blocks": cells, "effects": effects}
+        print(json.dumps(told))
     else:
         text = ", ".join(f"{name} {count}" for name, count in cells.items())
         print(f"wrote {output}; valid blocks: {text}")
+        print(_beside(effects, loaded))
 
 
-def _solution(project: Project, source: Path) -> Solution:
-    """From a snapshot as it is, from a trace by the record path."""
+def _beside(effects: list[dict[str, Any]], project: Project) -> str:
+    """Beside which effects the maps were learned, and which they had to take up."""
+    if effects:
+        names = ", ".join(f"{e['effect']} at {e['where']}" for e in effects)
+        return f"Learned beside {names}: their flow is not in the maps."
+    added = [f"{a.effect} at {a.where}" for a in project.sections.added]
+    if added:
+        return (
+            f"A snapshot is learned without {', '.join(added)}, which the project has added: the "
+            "maps hold what they could of it.  Export from a trace to have it apart."
+        )
+    return "The project has added no effects."
+
+
+def _solution(project: Project, source: Path) -> tuple[Solution, list[dict[str, Any]]]:
+    """From a snapshot as it is, from a trace by the record path; the effects beside it."""
     if source.suffix.lower() == SNAPSHOT:
         from rtid.store import load
 
-        return load(source, project.model, project.digest).solution()
-    from rtid.replay import replay
+        return load(source, project.model, project.digest).solution(), []
+    from rtid.beside import as_json, replay_beside
 
-    return replay(project, source).fit.solution
+    found = replay_beside(project, source)
+    return found.fit.solution, as_json(found.added)

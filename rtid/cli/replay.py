@@ -35,23 +35,29 @@ def replay(
     """Learn flow maps and bulk modulus from a captured trace.
 
     Prints what the trace holds, what the gates refused, the bulk modulus with its interval and the
-    maps; the same frames give the same snapshot, bit for bit, from the file or from a bus.
+    maps; the same frames give the same snapshot, bit for bit, from the file or from a bus.  Effects
+    that `rtid add` has added are in the model: the maps are learned beside them.
     """
+    from rtid.beside import as_json as added_json
+    from rtid.beside import replay_beside, sentences
     from rtid.comparing import compare_trace, find_reference
     from rtid.present import Story, progress_bar
     from rtid.project import load
-    from rtid.replay import replay as run
     from rtid.store import save
 
     loaded = load(project)
     with progress_bar(hidden=as_json) as progress:
-        result = run(loaded, trace, progress, bus_speed=(speed or float("inf")) if bus else None)
+        pace = (speed or float("inf")) if bus else None
+        result = replay_beside(loaded, trace, progress, bus_speed=pace)
     if snapshot is not None:
         save(snapshot, result.live, loaded.digest)
     story = Story(compare_trace(result, find_reference(loaded, reference)))
     written = story.draw(pictures, picture_format) if pictures else []
     if as_json:
-        print(json.dumps(story.as_json() | {"pictures": [str(p) for p in written]}))
+        more = {"added": added_json(result.added), "pictures": [str(p) for p in written]}
+        print(json.dumps(story.as_json() | more))
     else:
+        for sentence in sentences(result.added):
+            print(sentence)
         story.print(snapshot, written)
     refuse_truncated(trace, result.trace.counters)

@@ -87,14 +87,24 @@ class Comparison:
         return self.residual_rms_m3s / self.flow_rms_m3s
 
 
-def refitted(model: Model, reference: Reference, weights: Weights, chunk: FloatArray) -> Candidate:
-    """A reference map with each chamber's compliance fitted to the chunk, all else as it is."""
+def refitted(
+    model: Model,
+    reference: Reference,
+    weights: Weights,
+    chunk: FloatArray,
+    terms: FloatArray | None = None,
+) -> Candidate:
+    """A reference map with each chamber's compliance fitted to the chunk, all else as it is.
+
+    terms: coefficients of the model's shared terms; none of them where not given.
+    """
     theta, none = reference.theta_cells(model), np.zeros(len(model.terms))
+    beside = none if terms is None else terms
     one = np.ones(len(model.chambers))
     unknown = np.full(len(theta), REFERENCE)
-    parts = Candidate(reference.name, theta, 0.0 * one, unknown, weights, none)
+    parts = Candidate(reference.name, theta, 0.0 * one, unknown, weights, beside)
     by_map = _rows(model, _hold(model, parts, chunk))
-    parts = replace(parts, theta=np.zeros_like(theta), compliance=one)
+    parts = replace(parts, theta=np.zeros_like(theta), compliance=one, terms=none)
     by_beta = _rows(model, _hold(model, parts, chunk))
     at = np.intersect1d(by_map.t_s, by_beta.t_s, return_indices=True)
     y = (by_map.measured - by_map.modelled)[at[1]]
@@ -102,7 +112,7 @@ def refitted(model: Model, reference: Reference, weights: Weights, chunk: FloatA
     compliance = (column * y).sum(axis=0) / np.maximum((column**2).sum(axis=0), 1e-300)
     low, high = 1 / model.beta_bounds_pa[1], 1 / model.beta_bounds_pa[0]
     found = np.clip(compliance, low, high)
-    return Candidate(reference.name, theta, found, unknown, weights, none)
+    return Candidate(reference.name, theta, found, unknown, weights, beside)
 
 
 def compare(

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtid.compare.comparison import Comparison
+from rtid.compare.extra import VOLUME
 from rtid.model import POSITION, VELOCITY, FloatArray, Model
 
 BINS, TIME_BINS = 16, 24
@@ -50,7 +51,11 @@ def against_signals(model: Model, part: Comparison, bins: int = BINS) -> list[De
     """Dependence on every signal that varies; on the position's rate where no velocity is there."""
     found = []
     velocity = part.measured_m3s[:, 0] / (model.chambers[0].area_m2 * model.chambers[0].sign)
-    columns = [(s.name, s.unit, part.signals[:, k]) for k, s in enumerate(model.signals)]
+    columns = [
+        (s.name, s.unit, part.signals[:, k])
+        for k, s in enumerate(model.signals)
+        if s.kind != VOLUME
+    ]
     kinds = [s.kind for s in model.signals]
     if VELOCITY not in kinds and POSITION in kinds:
         columns.append((RATE, "m/s", velocity))

@@ -16,17 +16,23 @@ import numpy as np
 from rtid.errors import RtidError
 from rtid.model import FloatArray, Model, Signal, Term
 
+VOLUME = "volume"  # kind of a signal that nobody has measured
+
 
 class ExtraFlowError(RtidError):
     """Extra flows of another shape than the record, or not finite."""
 
 
 def with_extra_flow(
-    model: Model, terms: FloatArray, chunk: FloatArray, extra_flow: FloatArray | None
+    model: Model,
+    terms: FloatArray,
+    chunk: FloatArray,
+    extra_flow: FloatArray | None,
+    name: str = "extra flow",
 ) -> tuple[Model, FloatArray, FloatArray]:
     """Model, coefficients of its shared terms and samples, with extra_flow (n - 1, chambers), m3/s.
 
-    Positive into the chamber.  Raises ExtraFlowError.
+    Positive into the chamber; name: of the flow, where there are several.  Raises ExtraFlowError.
     """
     if extra_flow is None:
         return model, terms, chunk
@@ -34,8 +40,8 @@ def with_extra_flow(
     if flow.shape != wanted or not np.isfinite(flow).all():
         text = f"an extra flow of shape {flow.shape}, finite: {bool(np.isfinite(flow).all())}"
         raise ExtraFlowError(text, f"give finite m3/s of shape {wanted}: intervals, chambers")
-    names = [f"extra flow {chamber.name}" for chamber in model.chambers]
-    signals = tuple(Signal(name, "volume", "m3") for name in names)
+    names = [f"{name} {chamber.name}" for chamber in model.chambers]
+    signals = tuple(Signal(name, VOLUME, "m3") for name in names)
     added = tuple(
         Term(name, ((name, -1.0),), ((chamber.name, 1),), 1.0, rate=True)
         for name, chamber in zip(names, model.chambers, strict=True)

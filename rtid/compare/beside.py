@@ -1,0 +1,190 @@
+"""Learn the maps of a record beside effects that are known: those of a fitted revision.
+
+What the diagnosis' fit says of the compliances and of the effects' coefficients, N(s, S), takes the
+place of what the record's own sums say of them; with the maps m and their products with the shared
+unknowns G_sm,
+
+    G_ss = S^-1 + G_sm G_mm^-1 G_ms,        r_s = S^-1 s + G_sm G_mm^-1 r_m,
+
+so that the joint solution has s and S as they are told, and the maps are fitted beside them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import linalg
+
+from rtid.compare.acting import terms_of
+from rtid.compare.extra import with_extra_flow
+from rtid.diagnose.candidates import Candidate
+from rtid.diagnose.causes import causes
+from rtid.diagnose.fit import Fit
+from rtid.diagnose.report import Value, parameters
+from rtid.diagnose.residual import effect_values, transformed_like
+from rtid.diagnose.view import View
+from rtid.errors import RtidError
+from rtid.estimator.factor import PRIOR_SD, SHARED_PRIOR, misfit, one_thread
+from rtid.estimator.limits import refuse_unfit
+from rtid.estimator.misfit import can_be_explained, count_misfit
+from rtid.estimator.missed import weighed
+from rtid.estimator.record import RecordFit, run
+from rtid.estimator.solution import Solution, solve
+from rtid.estimator.state import State, Weights
+from rtid.estimator.sums import Sums
+from rtid.model import FloatArray, Lag, Model, Signal
+
+ALONE = 1e-4  # share by which the terms of one effect may differ from each other
+
+
+class TooManyEffectsError(RtidError):
+    """More effects than the kernels have room for."""
+
+
+@dataclass(frozen=True)
+class KnownEffect:
+    """An effect of the model as fitted to a record; parameters: SI.
+
+    follows: its flow is that of the simulated pressures where pressures are simulated; else it is
+    taken from the measured ones.
+    """
+
+    effect: str
+    where: str
+    parameters: dict[str, Value]
+    follows: bool
+
+
+@dataclass(frozen=True)
+class Acting:
+    """The machine with the effects of a fitted revision.
+
+    model: with terms of the effects, each for theta = 1, and behind timings with split commands;
+    chunk (n, 2 + signals): the record as it reaches the spools; of (terms,): the effect that each
+    term belongs to.
+    measured: the effects whose flow is taken from the measured pressures, not from simulated ones.
+    """
+
+    model: Model
+    chunk: FloatArray
+    of: tuple[Candidate, ...]
+    measured: tuple[Candidate, ...]
+
+
+def acting(fit: Fit, chunk: FloatArray) -> Acting:
+    """The machine of a fit and its effects on a record, chunk (n, 2 + signals) as declared.
+
+    Raises TooManyEffectsError.
+    """
+    sent = transformed_like(fit, chunk)
+    model = with_positive_pressures(fit.model, sent)
+    view = View.of(model, sent, fit.weights, fit.map)
+    if not fit.revision.timings:  # nothing was done to the commands
+        model, sent = with_positive_pressures(fit.declared, chunk), chunk
+    if fit.revision.replaces_lag:
+        model = replace(model, lag=Lag())
+    of, measured = list[Candidate](), list[Candidate]()
+    for effect, value in effect_values(fit):
+        terms = terms_of(view, effect, value)
+        model = replace(model, terms=(*model.terms, *terms))
+        if not terms:
+            ones, name = np.ones(len(model.terms)), f"{effect.effect} {effect.where}"
+            flow = _flow(view, effect, value)
+            model, _, sent = with_extra_flow(model, ones, sent, flow, name)
+            measured.append(effect)
+        of += [effect] * (len(model.terms) - len(of))
+    try:
+        refuse_unfit(model)
+    except ValueError as error:
+        raise TooManyEffectsError(f"too many effects: {error}", "drop one: rtid drop") from None
+    return Acting(model, sent, tuple(of), tuple(measured))
+
+
+def with_positive_pressures(model: Model, chunk: FloatArray) -> Model:
+    """The model with ranges of the chambers' pressures that end above zero where the record does.
+
+    What is the inverse of a pressure needs that.
+    """
+    chambers = {chamber.pressure for chamber in model.chambers}
+
+    def above_zero(signal: Signal) -> Signal:
+        lowest = float(chunk[:, 2 + model.column(signal.name)].min())
+        return replace(signal, minimum=0.5 * lowest) if signal.minimum <= 0 < lowest else signal
+
+    signals = (above_zero(s) if s.name in chambers else s for s in model.signals)
+    return replace(model, signals=tuple(signals))
+
+
+def _flow(view: View, effect: Candidate, value: float) -> FloatArray:
+    """What an effect adds to every chamber by the measured pressures (n - 1, chambers), m3/s."""
+    flow = np.zeros((view.n - 1, len(view.model.chambers)))
+    cause = next(k for k in causes(view) if k.makes(effect))
+    for c, volume in cause.column(effect.shape).items():
+        flow[:, c] += value * volume / view.dt_s
+    return flow
+
+
+def learn_beside(fit: Fit, found: Acting, chunk: FloatArray) -> RecordFit:
+    """The record path with the shared unknowns of a fit; chunk: a part of the machine's record."""
+    model, weights = found.model, fit.weights
+    theta, cov = _told(fit, found)
+    if can_be_explained(chunk):
+        _, first = _solved(model, chunk, weights, theta, cov)
+        weights = weighed(model, chunk, weights, first)
+    state, solution = _solved(model, chunk, weights, theta, cov)
+    solution = count_misfit(model, chunk, weights, solution)
+    lag_sd_s = 0.0
+    if not fit.revision.replaces_lag and model.lag.tolerance_s > 0:
+        lag_sd_s = fit.estimate.sd(fit.first_given)
+    return RecordFit(solution, state, weights, lag_sd_s, np.zeros(0), np.zeros(0))
+
+
+def known_effects(
+    fit: Fit, found: Acting, keys: Iterable[tuple[str, str]]
+) -> tuple[KnownEffect, ...]:
+    """The effects of a fit by their names and places, effects and timings alike."""
+    apart = {effect.key for effect in found.measured}
+    return tuple(KnownEffect(*key, parameters(fit, key), key not in apart) for key in keys)
+
+
+def _told(fit: Fit, found: Acting) -> tuple[FloatArray, FloatArray]:
+    """Shared unknowns (n,) and their covariance: compliances in weights' units, then the terms."""
+    n_c = len(fit.model.chambers)
+    used = [*range(1, 1 + n_c), *(fit.column(effect) for effect in found.of)]
+    at = [fit.estimate.used.index(column) for column in used]
+    value = fit.estimate.theta[at]
+    unit = np.concatenate([np.ones(n_c), value[n_c:]])
+    cov = fit.estimate.cov[np.ix_(at, at)] / np.outer(unit, unit)
+    cov[np.diag_indices(len(at))] += ALONE**2 * (np.arange(len(at)) >= n_c)
+    return value / unit, cov
+
+
+def _solved(
+    model: Model, chunk: FloatArray, weights: Weights, theta: FloatArray, cov: FloatArray
+) -> tuple[State, Solution]:
+    state = run(model, chunk, weights)
+    return state, solve(model, told(Sums.of(state), theta, cov), counters=state.counters)
+
+
+def told(sums: Sums, theta: FloatArray, cov: FloatArray) -> Sums:
+    """The sums with N(theta, cov) for what they say of the shared unknowns (n_shared,).
+
+    The residual at the solution stays what the rows leave; nothing is left to correct for noise.
+    """
+    normal, ns = sums.normal(), sums.n_shared
+    gram, right = normal.gram, normal.right
+    maps = gram[ns:, ns:] + PRIOR_SD**-2 * np.eye(len(right) - ns)
+    with one_thread():
+        both = np.column_stack([gram[ns:, :ns], right[ns:]])
+        follow = linalg.solve(maps, both, assume_a="pos")
+    information = np.linalg.inv(cov)
+    whole = np.concatenate([theta, follow[:, ns] - follow[:, :ns] @ theta])
+    shared = np.zeros_like(sums.shared)
+    shared[1:, 1:] = information - SHARED_PRIOR * np.eye(ns) + gram[:ns, ns:] @ follow[:, :ns]
+    shared[1:, 0] = information @ theta + gram[:ns, ns:] @ follow[:, ns]
+    shared[0, 1:] = shared[1:, 0]
+    replaced = replace(sums, shared=shared, noise=np.zeros_like(sums.noise))
+    shared[0, 0] = misfit(normal, whole) - misfit(replaced.normal(), whole)
+    return replaced

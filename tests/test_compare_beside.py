@@ -1,0 +1,270 @@
+"""Effects of a project count in compare, replay and export: terms, told unknowns, the whole way."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from rtid.beside import replay_beside
+from rtid.cli.compare import compare
+from rtid.cli.export import export
+from rtid.cli.replay import replay as replay_command
+from rtid.compare import FREE_RUN
+from rtid.compare.acting import MAKERS, SHIFTS_PA, shares, terms_of
+from rtid.compare.beside import acting, learn_beside, told
+from rtid.comparing import TraceComparison, study
+from rtid.diagnose.candidates import Candidate
+from rtid.diagnose.causes import causes
+from rtid.diagnose.causes.storage import ATMOSPHERE_PA, LEAST_PA
+from rtid.diagnose.fit import fit, prepare
+from rtid.diagnose.revision import Revision
+from rtid.diagnose.view import View
+from rtid.estimator.batch import column_rates
+from rtid.estimator.factor import misfit
+from rtid.estimator.flowmap import VALID, FlowMap
+from rtid.estimator.record import run
+from rtid.estimator.solution import solve
+from rtid.estimator.state import nominal_weights
+from rtid.estimator.sums import Sums
+from rtid.estimator.track import follow
+from rtid.mapfiles import read_map
+from rtid.model import FloatArray, Model
+from rtid.project import load
+from rtid.revising import add
+from rtid.sim.hidden import hide_wish
+from rtid.sim.plant import Plant
+from rtid.sim.recording import write_run
+from rtid.sim.run import simulate
+from tests.diagnose.records import record
+
+SEEN_S, ALL_S = 30.0, 40.0
+LEAK, DELAY, RELIEF = "internal_leakage_laminar", "input_delay", "relief_valve"
+APP = typer.Typer()
+APP.command()(compare)
+APP.command()(export)
+APP.command("replay")(replay_command)
+
+
+def call(*arguments: object) -> str:
+    result = CliRunner().invoke(APP, [str(a) for a in arguments], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+@cache
+def part() -> tuple[Model, FloatArray]:
+    """Half a second of motion, with pressures that are all above zero."""
+    model, chunk, _ = record()
+    return model, chunk[4000:4500]
+
+
+def view_of(model: Model, chunk: FloatArray) -> View:
+    low = tuple(replace(s, minimum=1e4) if s.kind == "pressure" else s for s in model.signals)
+    return View.without_map(
+        replace(model, signals=low), chunk, np.full(2, 1.0 / model.beta_nominal_pa)
+    )
+
+
+def flow_of_terms(view: View, effect: Candidate, value: float) -> FloatArray:
+    """Mean flow (n - 1, chambers) of an effect's terms, by the oracle of the recursion."""
+    model = replace(view.model, terms=terms_of(view, effect, value))
+    weights, values = nominal_weights(model), view.chunk[:, 2:]
+    track = follow(model, view.t_s, values, view.chunk[:, 1].astype(np.int64), weights)
+    rates, _ = column_rates(model, view.t_s, values, track, weights)
+    assert len(rates) == view.n - 1
+    columns = rates[:, :, :, 3 : 3 + len(model.terms)]
+    return np.asarray(columns.mean(axis=2).sum(axis=2))
+
+
+@pytest.mark.parametrize("name", sorted(MAKERS))
+def test_terms_are_the_columns_of_the_diagnosis(name: str) -> None:
+    view = view_of(*part())
+    offered = [k for k in causes(view) if k.candidate.effect == name]
+    assert offered
+    for cause in offered:
+        shape = cause.shapes[0]
+        if name in ("relief_valve", "makeup_valve", "cavitation"):
+            c = [chamber.name for chamber in view.model.chambers].index(cause.candidate.where)
+            shape = (float(np.median(view.pressure(c))), *shape[1:])
+        effect, value = cause.at(shape), 3e-12
+        wanted = np.zeros((view.n - 1, 2))
+        for c, volume in cause.column(shape).items():
+            wanted[:, c] = value * volume / view.dt_s
+        found = flow_of_terms(view, effect, value)
+        assert np.abs(wanted).max() > 0
+        np.testing.assert_allclose(found, wanted, atol=2e-3 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize("kappa", [1.0, 1.2, 1.4, 1.6])
+def test_air_is_a_sum_of_inverses(kappa: float) -> None:
+    p, s = np.geomspace(LEAST_PA, 40e6, 500), 1.0 / kappa
+    slope = s / p * (ATMOSPHERE_PA / p) ** s
+    found = (shares(s) / (p[:, None] + np.array(SHIFTS_PA)) ** 2).sum(axis=1)
+    np.testing.assert_allclose(found, slope, rtol=0.007)
+
+
+def test_a_poppet_with_a_state_has_no_terms() -> None:
+    view = view_of(*part())
+    cause = next(k for k in causes(view) if k.candidate.effect == RELIEF)
+    assert terms_of(view, cause.at((2e6, 0.0, 0.0)), 1e-12)
+    assert not terms_of(view, cause.at((2e6, 0.02, 0.0)), 1e-12)
+    assert not terms_of(view, cause.at((2e6, 0.0, 1e5)), 1e-12)
+    drift = next(k for k in causes(view) if k.candidate.effect == "valve_gain_drift")
+    assert not terms_of(view, drift.candidate, 1e-3)
+
+
+def test_shared_unknowns_are_as_told_and_the_maps_follow() -> None:
+    model, chunk, _ = record()
+    sums = Sums.of(run(model, chunk[:8000]))
+    theta, cov = np.array([1.1, 0.9]), np.array([[4e-4, 1e-4], [1e-4, 9e-4]])
+    replaced = told(sums, theta, cov)
+    found = solve(model, replaced)
+    np.testing.assert_allclose(found.unknowns[:2], theta, rtol=1e-6)
+    own = found.compliance_cov / np.outer(found.scale_pa, found.scale_pa)
+    np.testing.assert_allclose(own, cov, rtol=1e-4)
+    normal, prior = sums.normal(), 1e-2
+    maps = np.linalg.solve(
+        normal.gram[2:, 2:] + prior * np.eye(len(normal.right) - 2),
+        normal.right[2:] - normal.gram[2:, :2] @ theta,
+    )
+    np.testing.assert_allclose(found.unknowns[2:], maps, rtol=1e-5, atol=1e-6)
+    left = misfit(normal, found.unknowns)
+    assert misfit(replaced.normal(), found.unknowns) == pytest.approx(left, rel=1e-6)
+
+
+def test_an_effect_that_cannot_follow_is_taken_from_the_measured_pressures() -> None:
+    """The same leak as a term and as a flow: one equation residual, and who can follow is said."""
+    model, chunk, _ = record(LEAK, 2e-12)
+    weights = prepare(model, chunk)
+    drift = Candidate("valve_gain_drift", "all valves", "relative_change", "1", 1.0, sign=0)
+    leak = Candidate(LEAK, "a-b", "coefficient", "m3/s/Pa", 1e-9)
+    fitted = fit(model, chunk, weights, Revision((leak, drift)), bank=False)
+    machine = acting(fitted, chunk)
+    assert machine.measured == (drift,)
+    assert [effect.effect for effect in machine.of] == [LEAK, *2 * ["valve_gain_drift"]]
+    learned = learn_beside(fitted, machine, machine.chunk)
+    terms, leak_value = learned.solution.terms, fitted.estimate.value(fitted.column(leak))
+    np.testing.assert_allclose(terms, [leak_value, 1.0, 1.0], rtol=1e-3)
+    np.testing.assert_allclose(learned.solution.compliance, fitted.compliance, rtol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Records of one machine: clean, with a leak, with a delay; a project file each."""
+    path = tmp_path_factory.mktemp("beside")
+    for name, wish in (("clean", ""), ("leak", f"{LEAK}=middle"), ("delay", f"{DELAY}=middle")):
+        plant = hide_wish(Plant(), wish) if wish else Plant()
+        write_run(path / f"{name}.parquet", simulate(plant, "rich", 1, ALL_S), 1, "rich")
+        project = path / f"{name}.toml"
+        parts = f"[record]\nidentification_s = [0, {SEEN_S}]\nvalidation_s = [{SEEN_S}, {ALL_S}]\n"
+        project.write_text(project.read_text().partition("[record]")[0] + parts)
+        (path / f"{name}_before.toml").write_text(project.read_text())
+    add(path / "leak.toml", path / "leak.parquet", LEAK)
+    add(path / "delay.toml", path / "delay.parquet", DELAY)
+    return path
+
+
+@cache
+def studied(folder: Path, project: str) -> TraceComparison:
+    trace = folder / (project.removesuffix("_before") + ".parquet")
+    return study(replay_beside(load(folder / f"{project}.toml"), trace))
+
+
+def errors(found: TraceComparison) -> tuple[float, float]:
+    """Held-out: residual as a share of the flow, and rms of the free run in Pa."""
+    examined = found.held[0].examinations["validation"]
+    run = examined.simulations[FREE_RUN]
+    return float(np.mean(examined.equation.residual_share)), float(np.mean(run.rms_pa))
+
+
+def map_error(flowmap: FlowMap) -> float:
+    """Rms distance of all valid nodes from the true maps, of the largest flow."""
+    plant, off = Plant(), []
+    for edge in flowmap.edges:
+        w, dp = (a.ravel() for a in np.meshgrid(edge.grid.u_v, edge.grid.dp_pa, indexing="ij"))
+        valid = edge.status_at(w, dp) == VALID
+        away = edge.flow(w, dp) - plant.flow(edge.name, w, dp)
+        off.append(away[valid] / edge.q_max_m3s)
+    return float(np.sqrt(np.mean(np.concatenate(off) ** 2)))
+
+
+@pytest.mark.parametrize("name", ["leak", "delay"])
+def test_held_out_errors_fall_to_those_of_the_clean_machine(folder: Path, name: str) -> None:
+    clean, before, after = (studied(folder, n) for n in ("clean", f"{name}_before", name))
+    (floor, floor_pa), (old, old_pa), (new, new_pa) = errors(clean), errors(before), errors(after)
+    assert old > 2.0 * floor and old_pa > 2.0 * floor_pa
+    assert new < 1.3 * floor
+    assert new_pa < 1.3 * floor_pa
+    assert [k.effect for k in after.replay.added] == [LEAK if name == "leak" else DELAY]
+    assert before.replay.added == ()
+
+
+@pytest.mark.parametrize(("name", "of_clean"), [("leak", 3.0), ("delay", 1.3)])
+def test_the_map_and_beta_come_nearer_to_the_truth(
+    folder: Path, name: str, of_clean: float
+) -> None:
+    """The simulated leak widens with pressure, its column does not: 2.4 times the clean error."""
+    before, after = studied(folder, f"{name}_before"), studied(folder, name)
+    assert map_error(after.flowmap) < 0.6 * map_error(before.flowmap)
+    assert map_error(after.flowmap) < of_clean * map_error(studied(folder, "clean").flowmap)
+    np.testing.assert_allclose(after.held[0].beta_pa, Plant().beta_pa, rtol=0.01)
+
+
+def test_blocks_are_those_of_the_map_beside_the_effect(folder: Path) -> None:
+    before, after = studied(folder, "leak_before"), studied(folder, "leak")
+    rms = [
+        {(b.edge, b.i, b.j): b.residual_rms_m3s for b in found.blocks if b.status == VALID}
+        for found in (before, after)
+    ]
+    shared = sorted(set(rms[0]) & set(rms[1]))
+    assert len(shared) > 30
+    assert np.median([rms[1][k] / rms[0][k] for k in shared]) < 0.5
+
+
+def test_compare_in_words_and_json(folder: Path, tmp_path: Path) -> None:
+    arguments = ("compare", folder / "leak.parquet", "-p", folder / "leak.toml")
+    against = ("--against", folder / "leak_before.toml", "--table", tmp_path / "t.csv")
+    text = " ".join(call(*arguments, *against).split())
+    assert "The model has Internal leakage, laminar at a-b: coefficient 2." in text
+    assert "explains the validation part better than" in text
+    found = json.loads(call(*arguments, "--json"))
+    (known,) = found["added"]
+    assert (known["effect"], known["where"], known["follows"]) == (LEAK, "a-b", True)
+    assert known["parameters"]["coefficient"]["value"] == pytest.approx(2e-12, rel=0.15)
+    assert (tmp_path / "t.csv").stat().st_size > 0
+
+
+def test_replay_learns_beside_and_keeps_the_boards_memory(folder: Path, tmp_path: Path) -> None:
+    told_ = json.loads(
+        call(
+            "replay", folder / "delay.parquet", "-p", folder / "delay.toml", "--json",
+            "--snapshot", tmp_path / "memory.npz",
+        )
+    )  # fmt: skip
+    assert told_["added"][0]["parameters"]["delay"]["value"] == pytest.approx(5e-3, abs=1e-4)
+    assert told_["lag_s"] == pytest.approx(1.3e-3, abs=3e-4)
+    text = call("export", tmp_path / "memory.npz", tmp_path / "m.json", "-p", folder / "delay.toml")
+    assert "A snapshot is learned without input_delay at command" in " ".join(text.split())
+    assert read_map(tmp_path / "m.json")[1]["effects"] == []
+
+
+@pytest.mark.parametrize("suffix", [".json", ".npz", ".csv"])
+def test_the_exported_map_names_its_effects(folder: Path, tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"map{suffix}"
+    text = call("export", folder / "leak.parquet", path, "-p", folder / "leak.toml")
+    assert f"Learned beside {LEAK} at a-b" in text
+    if suffix == ".csv":
+        with path.open() as file:
+            origin = json.loads(next(csv.reader(file, delimiter="\n"))[0].split(" ", 2)[2])
+    else:
+        flowmap, origin = read_map(path)
+        assert map_error(flowmap) < 0.6 * map_error(studied(folder, "leak_before").flowmap)
+    assert [(e["effect"], e["where"]) for e in origin["effects"]] == [(LEAK, "a-b")]
