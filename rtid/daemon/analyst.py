@@ -74,7 +74,10 @@ class Analyst:
         if isinstance(job, Batch):
             self._batch(job)
         elif isinstance(job, Handover):
-            self._handover(job)
+            try:
+                self._handover(job)
+            finally:
+                self._answer(Ready())
         elif isinstance(job, Note):
             self._note(job)
         elif isinstance(job, Recall) and self._handed:

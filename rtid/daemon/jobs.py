@@ -64,7 +64,7 @@ class Check:
 
 @dataclass(frozen=True)
 class Ready:
-    """The helper has compiled everything and takes jobs."""
+    """The helper has compiled everything, or is done with a handover: it takes the next one."""
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ It looks ten times a second and tells once a second; it only reads what the loop
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 import time
@@ -39,7 +40,9 @@ from rtid.project import Project
 
 LOOK_S = 0.1
 OVERLOAD = 0.05  # share of ticks lost in a second that is worth an alarm
+HOLDING = ("sensor_frozen", "second_sender")  # alarms while which nothing is learned
 CHECK_S = 30.0  # of samples after which the project file is held against them
+FALLEN_S = 60.0  # so long a helper that ended is an alarm
 GRACE_S = 15.0  # a save may take so long before its absence is an alarm
 
 
@@ -84,7 +87,8 @@ class Keeper:
         self._recalling = self._is_checked = False
         self._is_ready = False
         self._frames_before, self._told_s = 0, 0.0
-        self._lost = 0
+        self._lost = self._fallen = 0
+        self._fallen_s = -math.inf
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="rtid-keeper", daemon=True)
         self.status = self._make_status(time.monotonic_ns())
@@ -119,7 +123,7 @@ class Keeper:
             if isinstance(answer, Ready):
                 self._core.busy = False
             elif isinstance(answer, Publication):
-                self.publication, self._core.busy = answer, False
+                self.publication = answer
                 self._version += 1
             elif isinstance(answer, Judgement):
                 if self.plant.push(answer):
@@ -166,6 +170,13 @@ class Keeper:
         self.alarms.put("sensor_frozen", "sensor", text if frozen else "")
         text = f"{self._facts.interface} {self._facts.channel}: failed, is being opened again"
         self.alarms.put("bus_down", "bus", text if source.is_down else "")
+        fallen = self._analyst.failures - self._fallen
+        self._fallen = self._analyst.failures
+        if fallen:
+            self._fallen_s = time.monotonic()
+        late = time.monotonic() - self._fallen_s > FALLEN_S
+        text = f"the analyst has ended {self._fallen} times and was started again"
+        self.alarms.put("helper_failed", "loop", "" if late else text)
         self.alarms.put("not_saved", "store", self._why_not_saved())
         self.alarms.put("plant_changed", "plant", self._plant_text())
         self.alarms.put("implausible", "sensor", "; ".join(self._diagnosing.implausible))
@@ -264,8 +275,8 @@ class Keeper:
         reason = ""
         if not core.learner.learns:
             learning, reason = "suspended", "the plant has changed"
-        elif any(a.name in ("sensor_frozen", "second_sender") for a in self.alarms.on):
-            learning, reason = "held", self.alarms.on[0].text
+        elif held := [a.text for a in self.alarms.on if a.name in HOLDING]:
+            learning, reason = "held", held[0]
         shown = st.Estimate(
             state=learning,
             reason=reason,

@@ -164,7 +164,7 @@ class Store:
 
 @dataclass(frozen=True)
 class Verdict:
-    """The last diagnosis; `content` is the JSON of docs/diagnosis.md."""
+    """The last diagnosis; `content` is the JSON of rtid/diagnose/schema.md."""
 
     at_unix_s: float
     verdict: str
