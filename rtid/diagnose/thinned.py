@@ -50,6 +50,7 @@ class Thinning:
             mode = windows[:, :, 2 + model.column(model.mode)]
             broken |= np.ptp(mode, axis=1) > 0
             thin[:, 2 + model.column(model.mode)] = mode[:, 0]
+        broken[1:] |= broken[:-1].copy()  # a mean across a gap is nowhere to begin
         thin[:, 1] = ROW_FLAG | np.where(broken, GAP_FLAG, 0)
         for name in {edge.command for edge in model.edges}:
             column = 2 + model.column(name)

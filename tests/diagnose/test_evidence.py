@@ -14,10 +14,12 @@ import pytest
 from rtid.diagnose import evidence
 from rtid.diagnose.candidates import Volumes
 from rtid.diagnose.evidence import Rows, project, rows_of
+from rtid.estimator.factor import PRIOR_SD
 from rtid.estimator.record import run
 from rtid.estimator.state import build, nominal_weights
 from rtid.estimator.sums import Sums
 from rtid.kernels import evidence as kernel
+from rtid.kernels import products
 from rtid.kernels.layout import TERMS
 from tests.diagnose.records import record
 
@@ -57,6 +59,50 @@ def test_rows_are_those_of_the_estimator(
     assert np.abs((gram[np.ix_(at, at)] - normal.gram) / size).max() < within
     assert gram[0, 0] == pytest.approx(normal.square, rel=1e-9)
     assert found.n == 2 * normal.rows
+
+
+def dense(rows: Rows) -> np.ndarray:
+    """Whitened rows of the maps' columns, (scalar rows, 6 V)."""
+    n, n_c, _ = rows.own.shape
+    columns = np.zeros((n, n_c, TERMS * len(rows.cells)))
+    for r in range(n):
+        for k in range(rows.start[r], rows.start[r + 1]):
+            at = TERMS * rows.block[k]
+            for c in range(n_c):
+                columns[r, c, at : at + TERMS] += rows.sign[rows.block[k], c] * rows.terms[k]
+    products.whitened(columns, rows.fresh, rows.whiten, rows.keep)
+    return columns.reshape(n * n_c, -1)
+
+
+@pytest.mark.parametrize("row_s", [1e-3, 1e-2])
+def test_products_are_those_of_whole_rows(row_s: float) -> None:
+    """What rings is met once in a span, and the head by its adjoint: the same, to rounding."""
+    model, chunk, _ = record()
+    chunk = chunk[:6000].copy()
+    chunk[2500, 1] = 3  # and behind a gap
+    rows = rows_of(model, chunk, nominal_weights(model), row_s=row_s)
+    whole, maps = dense(rows), rows.maps()
+    expected = whole.T @ whole
+    size = np.sqrt(np.outer(np.diag(expected), np.diag(expected))) + 1e-300
+    assert np.abs(np.tril(maps - expected) / size).max() < 1e-9
+    head = rows.own.copy()
+    products.whitened(head, rows.fresh, rows.whiten, rows.keep)
+    flat = head.reshape(rows.n, -1)
+    _, cross = rows.head([])
+    scale = np.sqrt(np.outer(np.diag(expected), (flat**2).sum(axis=0))) + 1e-300
+    assert np.abs((cross - whole.T @ flat) / scale).max() < 1e-9
+
+
+def test_covariances_are_blocks_of_the_inverse() -> None:
+    model, chunk, _ = record()
+    rows = rows_of(model, chunk[:3000], nominal_weights(model))
+    maps = rows.maps()
+    full = np.tril(maps) + np.tril(maps, -1).T + np.eye(len(maps)) * PRIOR_SD**-2
+    inverse = np.linalg.inv(full)
+    for v, cov in enumerate(rows.factor.covariances):
+        at = slice(TERMS * v, TERMS * (v + 1))
+        size = np.sqrt(np.outer(np.diag(inverse[at, at]), np.diag(inverse[at, at])))
+        assert np.abs((cov - inverse[at, at]) / size).max() < 1e-5
 
 
 def test_a_given_column_is_its_own_sum() -> None:

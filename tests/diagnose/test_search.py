@@ -1,0 +1,85 @@
+"""A thinned record says what the whole one says, and finds a timing from afar."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import savgol_filter
+
+from rtid.diagnose.fit import one_pass, prepare
+from rtid.diagnose.revision import Revision
+from rtid.diagnose.search import Search
+from rtid.diagnose.thinned import Thinning
+from rtid.diagnose.timing import TIMINGS, Timing
+from rtid.diagnose.view import View
+from rtid.kernels.engine import GAP_FLAG
+from tests.diagnose.records import record
+
+
+def timing(effect: str) -> Timing:
+    return next(t for t in TIMINGS if t.effect == effect)
+
+
+def test_means_move_by_what_flows_between_them() -> None:
+    """Mean positions differ by the triangle-weighted sum of the changes, to rounding."""
+    model, chunk, _ = record()
+    thinning = Thinning.of(model, chunk)
+    assert thinning.m == 5
+    x = 2 + model.column("x")
+    thin = thinning.record(model, chunk)
+    assert np.diff(thin[:, x]) == pytest.approx(
+        thinning.over_intervals(np.diff(chunk[:, x], append=chunk[-1, x])), abs=1e-12
+    )
+    assert np.diff(thin[:, 0]) == pytest.approx(5e-3)
+
+
+def test_a_steady_command_stays_and_a_gap_is_kept() -> None:
+    """A mean across a gap is nowhere to begin: the next one does."""
+    model, chunk, _ = record()
+    chunk = chunk[:1000].copy()
+    u = 2 + model.column(model.edges[0].command)
+    chunk[:, u] = 1.5
+    chunk[502, 1] = int(chunk[502, 1]) | GAP_FLAG
+    thin = Thinning.of(model, chunk).record(model, chunk)
+    assert thin[:, u] == pytest.approx(1.5)
+    gaps = np.flatnonzero(thin[:, 1].astype(int) & GAP_FLAG)
+    assert list(gaps) == [0, 1, 100, 101]
+
+
+def test_a_record_of_rare_positions_is_not_thinned() -> None:
+    model, chunk, _ = record()
+    chunk = chunk[:1000].copy()
+    chunk[np.arange(1000) % 20 != 0, 1] = 0
+    assert Thinning.of(model, chunk).m == 1
+
+
+def test_a_late_command_is_closed_in_on() -> None:
+    """12 ms to 3 %, in a dozen refits; a play explains clearly less."""
+    model, chunk, _ = record("input_delay", 12e-3)
+    fit = one_pass(model, chunk, prepare(model, chunk), Revision(), None, False, thorough=False)
+    beside = Search(model, chunk).beside(fit)
+    delay, play = timing("input_delay"), timing("valve_hysteresis")
+    psi, gain = beside.closed_in(delay, beside.bank(delay))
+    assert psi[0] == pytest.approx(12e-3, rel=0.03)
+    assert gain > 1.2 * max(beside.bank(play).values())
+
+
+def test_a_bank_ends_where_it_falls() -> None:
+    """Nothing is late: two falls, or a deep one, and stronger values are not tried."""
+    model, chunk, _ = record()
+    fit = one_pass(model, chunk, prepare(model, chunk), Revision(), None, False, thorough=False)
+    bank = Search(model, chunk).beside(fit).bank(timing("input_delay"))
+    assert 2 <= len(bank) <= 3
+    assert max(bank, key=lambda x: bank[x]) == 0.0
+
+
+@pytest.mark.parametrize("derivative", [0, 1])
+def test_smooth_is_savitzky_and_golay_s(derivative: int) -> None:
+    """Parabolas over the window, also at both ends."""
+    model, chunk, _ = record()
+    view = View.without_map(model, chunk)
+    p = view.pressure(0)
+    half = round(0.02 / view.step_s)
+    expected = savgol_filter(p, 2 * half + 1, 2, deriv=derivative, delta=view.step_s)
+    scale = np.abs(expected).max()
+    assert view.smooth(p, derivative) / scale == pytest.approx(expected / scale, abs=1e-9)
