@@ -28,7 +28,7 @@ def work_line(session: Session) -> str:
             f'{text(session.doing)} ...<progress max="1" value="{session.share:.2f}" '
             f'aria-label="progress"></progress>'
         )
-    return text(session.note)
+    return f'<span title="{text(session.note)}">{text(session.note)}</span>'
 
 
 def strip(session: Session) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rtid.ui.lines import POINTS, Line
@@ -15,6 +15,7 @@ def record(n: int = 110_000) -> tuple[np.ndarray, np.ndarray]:
     return t, np.sin(2 * np.pi * 0.3 * t)
 
 
+@settings(deadline=None)
 @given(st.integers(0, 109_999), st.booleans())
 def test_a_spike_of_one_sample_is_drawn_at_the_whole_record(at: int, up: bool) -> None:
     t, y = record()

@@ -1,0 +1,55 @@
+"""The report opens from disk in a browser that has no network, and every picture is drawn."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from PIL import Image
+
+from rtid.project import load
+from rtid.reporting import Reported, report
+from tests.browser.conftest import SIZE
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+MOST_BYTES = 3_000_000
+BROKEN = "() => [...document.images].filter(i => !i.complete || i.naturalWidth < 300).length"
+
+
+@pytest.fixture(scope="module")
+def written(recorded: tuple[Path, Path]) -> Reported:
+    trace, project = recorded
+    folder = trace.parent
+    return report(load(project), trace, folder / "r.html", pictures=folder / "stills")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_it_opens_with_the_network_off(browser: Browser, written: Reported, scheme: str) -> None:
+    assert written.size <= MOST_BYTES
+    context = browser.new_context(viewport=SIZE, color_scheme=scheme)  # type: ignore[arg-type]
+    context.set_offline(True)
+    page, asked, errors = context.new_page(), list[str](), list[str]()
+    page.on("request", lambda r: asked.append(r.url))
+    page.on("pageerror", lambda e: errors.append(str(e)))
+    page.goto(written.path.as_uri())
+    page.wait_for_load_state("networkidle")
+    assert page.locator("img").count() == 4
+    assert page.evaluate(BROKEN) == 0
+    assert page.evaluate("() => document.documentElement.scrollWidth <= innerWidth")
+    assert [url for url in asked if not url.startswith(("file:", "data:"))] == []
+    assert errors == []
+    context.close()
+
+
+@pytest.mark.slow
+def test_its_pictures_are_files_too(written: Reported) -> None:
+    names = [path.name for path in written.pictures]
+    assert names == ["errors.png", "flows.png", "dependences.png", "ranking.png"]
+    for path in written.pictures:
+        image = Image.open(path)
+        assert image.width >= 1200
+        assert len(image.convert("L").getcolors() or []) > 10

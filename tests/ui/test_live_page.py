@@ -1,0 +1,107 @@
+"""The live page from a status: every part says what it knows, stale is said to be stale."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from rtid.daemon.status import (
+    Alarm,
+    BusHealth,
+    Chamber,
+    Distribution,
+    EdgeHealth,
+    Estimate,
+    LoopHealth,
+    MessageHealth,
+    SignalHealth,
+    Status,
+    Store,
+    Verdict,
+    write,
+)
+from rtid.project import load
+from rtid.ui.live import Live
+from tests.ui.served import project_file
+
+NOW = 1_800_000_000.0
+
+
+def status() -> Status:
+    work = Distribution(3, 100.0, 200.0, 400.0, 900.0, (0.0, 100.0, 200.0, 1000.0), (5, 20, 1))
+    timing = {"rate_hz": 998.0, "age_s": 0.001, "gap_s": 0.004}
+    pressure = SignalHealth("p_a", "pressure", "Pa", "Pressures", 2.5e6, 1e6, 3e6, 998.0)
+    position = SignalHealth("x", "position", "m", "Motion", 0.1, 0.1, 0.1, verdict="frozen")
+    message = MessageHealth("Pressures", 0x101, 1000.0, **timing, verdict="ok", refused={"crc": 7})
+    estimate = Estimate(
+        state="learning",
+        stale=False,
+        samples=60_000,
+        rho=1.05,
+        chambers=(Chamber("a", 1.06e9, 1e6),),
+        edges=(EdgeHealth("pa", {"valid": 30, "learning": 12}, {}, 0.7),),
+        refused={"range": 3, "samples": 60_000},
+    )
+    return Status(
+        name="press <1>",
+        pid=1,
+        started_unix_s=NOW - 60,
+        now_unix_s=NOW,
+        loop=LoopHealth(1000.0, 60_000, 3, 0, {"late": 3}, work, work, work, work),
+        bus=BusHealth("socketcan", "can0", "open", 180_000, 3000.0, 0, 0, {"error_frame": 2}),
+        messages=(message,),
+        signals=(replace(pressure, verdict="ok"), position),
+        estimate=estimate,
+        store=Store("NOT SAVED", "disk full", 40.0),
+        verdict=Verdict(NOW - 5, "missing", "Internal leakage at a-b"),
+        alarms=(Alarm("frozen", "x does not move", NOW - 3, None, "sensor"),),
+    )
+
+
+def shown(folder: Path, at: float = NOW + 0.5) -> str:
+    model = load(project_file(folder)).model
+    parts = Live(folder, model, lambda: at).fragments()
+    return parts["live_health"] + parts["live_learning"]
+
+
+def test_everything_that_the_daemon_says_is_there(tmp_path: Path) -> None:
+    write(tmp_path, status())
+    html = shown(tmp_path)
+    for words in (
+        *("press &lt;1&gt;", "can0 is open", "3000 frames/s", "error frame 2", "NOT SAVED"),
+        *("disk full", "1000 Hz", "3 overruns (late 3)", "2.5 MPa", "frozen", "crc 7", "0x101"),
+        *("998 /s", "1060 ± 2.0 MPa", "30 of 42 visited blocks valid", "range 3"),
+        *("Internal leakage at a-b", "x does not move", "To learn more"),
+    ):
+        assert words in html, words
+    assert "samples 60,000" not in html  # counted, not refused
+    assert "stale:" not in html
+
+
+def test_a_status_that_is_not_renewed_is_stale(tmp_path: Path) -> None:
+    write(tmp_path, status())
+    html = shown(tmp_path, NOW + 12.0)
+    assert "stale: 12 s old" in html
+    assert 'class="stale"' in html
+
+
+def test_the_newest_status_is_read_and_an_old_one_kept_where_the_file_is_torn(
+    tmp_path: Path,
+) -> None:
+    live = Live(tmp_path, None, lambda: NOW)
+    assert "No daemon has been heard" in live.fragments()["live_health"]
+    write(tmp_path, status())
+    assert "3000 frames/s" in live.fragments()["live_health"]
+    write(tmp_path, replace(status(), bus=BusHealth("socketcan", "can0", "open", 1, 2500.0)))
+    assert "2500 frames/s" in live.fragments()["live_health"]
+    (tmp_path / "status.json").write_text("{torn")
+    assert "2500 frames/s" in live.fragments()["live_health"]
+
+
+@pytest.mark.parametrize("edges", [(), (0.0, 1.0), (0.0, 100.0, 1000.0)])
+def test_a_histogram_of_nothing_is_no_picture(tmp_path: Path, edges: tuple[float, ...]) -> None:
+    empty = Distribution(0, edges_us=edges, counts=(0,) * max(0, len(edges) - 1))
+    write(tmp_path, replace(status(), loop=LoopHealth(1000.0, work=empty)))
+    assert "<svg" not in shown(tmp_path)

@@ -1,0 +1,159 @@
+"""What all pages show: state and order of the work, undo, refusals; nothing saved by itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from rtid.diagnose.report import Diagnosis, Effect, Value
+from rtid.errors import RtidError
+from rtid.project.added import AddedSection, ParameterSection
+from rtid.ui.session import FAILED, LOADING, READY, Session
+
+KEY = "internal_leakage_laminar", "a-b"
+NAN = float("nan")
+
+
+@dataclass
+class FakeWorker:
+    """Takes jobs; the test answers them."""
+
+    jobs: list[tuple[str, tuple[Any, ...], dict[str, Any]]] = field(default_factory=list)
+
+    @property
+    def is_busy(self) -> bool:
+        return bool(self.jobs)
+
+    def ask(self, method: str, *arguments: Any, **answers: Any) -> None:
+        self.jobs.append((method, arguments, answers))
+
+    def answer(self, result: Any = None) -> str:
+        method, _, answers = self.jobs.pop(0)
+        answers["then"](result)
+        return method
+
+    def refuse(self, message: str) -> None:
+        self.jobs.pop(0)[2]["failed"](RtidError(message, "do something else"))
+
+
+def section() -> AddedSection:
+    parameters = {"coefficient": ParameterSection(value=2e-12, sd=1e-14, unit="m3/s/Pa")}
+    return AddedSection(effect=KEY[0], where=KEY[1], parameters=parameters)
+
+
+def told(*named: tuple[str, str], alike: tuple[str, ...] = ()) -> Any:
+    found = tuple(
+        Effect(e, w, alike, {"coefficient": Value(2e-12, 1e-14, "m3/s/Pa")}, 0.0, 90.0, 2e-6, 2e-7)
+        for e, w in named
+    )
+    said = Diagnosis(
+        "missing" if named else "matches", (), found, 100.0, 1.0, 2e-6, 2e-7, 1e-7, 1e-4, (1e9,),
+        0.0, False, True, (), (), (),
+    )  # fmt: skip
+    return SimpleNamespace(diagnosis=said, ranking=())
+
+
+def opened() -> Any:
+    return SimpleNamespace(look="first look", added=(), project="machine", trace="run.blf")
+
+
+def state(session: Session) -> str:
+    return session.state
+
+
+def named(session: Session) -> object:
+    return session.named
+
+
+def looks(session: Session) -> list[Any]:
+    return [revision.look for revision in session.revisions]
+
+
+def begun() -> tuple[Session, FakeWorker, list[str]]:
+    worker, heard = FakeWorker(), list[str]()
+    session = Session(Path("m.toml"), Path("run.blf"), worker)  # type: ignore[arg-type]
+    session.listeners.append(heard.append)
+    session.open()
+    return session, worker, heard
+
+
+def test_a_record_is_opened_diagnosed_and_the_next_step_is_made_ready() -> None:
+    session, worker, heard = begun()
+    assert state(session) == LOADING
+    assert worker.answer(opened()) == "open"
+    assert state(session) == READY
+    assert "looks" in heard
+    assert worker.answer(told(KEY)) == "diagnose"
+    assert session.named == KEY
+    assert worker.answer() == "prepare"
+    assert session.is_prepared(KEY)
+    assert not worker.is_busy  # nothing is added or saved by itself
+
+
+def test_a_record_that_cannot_be_read_says_why() -> None:
+    session, worker, _ = begun()
+    worker.refuse("run.blf: no complete sample")
+    assert session.state == FAILED
+    assert session.trouble == ("run.blf: no complete sample", "do something else")
+
+
+def test_add_and_undo_leave_the_file_alone() -> None:
+    session, worker, _ = begun()
+    worker.answer(opened())
+    worker.answer(told(KEY))
+    worker.answer()
+    session.add(*KEY)
+    assert named(session) is None  # while it is being added nobody can add it twice
+    added = SimpleNamespace(look="second look", sections=(section(),), section=section(), note="")
+    assert worker.answer(added) == "add"
+    assert looks(session) == ["first look", "second look"]
+    assert worker.answer(told()) == "diagnose"
+    session.undo()
+    assert worker.answer() == "back"
+    assert looks(session) == ["first look"]
+    assert session.named == KEY
+    session.undo()
+    assert not worker.is_busy  # there is nothing more to take back
+
+
+def test_what_was_saved_is_not_taken_back_here() -> None:
+    session, worker, _ = begun()
+    for result in (opened(), told(KEY), None):
+        worker.answer(result)
+    session.add(*KEY)
+    worker.answer(SimpleNamespace(look="l", sections=(section(),), section=section(), note=""))
+    worker.answer(told())
+    session.save()
+    assert worker.answer(SimpleNamespace(note="wrote m.toml")) == "save"
+    assert session.note == "wrote m.toml"
+    session.undo()
+    assert not worker.is_busy
+
+
+def test_a_refusal_is_shown_and_the_work_goes_on() -> None:
+    session, worker, heard = begun()
+    worker.answer(opened())
+    worker.answer(told(KEY))
+    worker.answer()
+    session.add("external_leakage_laminar", "a")
+    worker.refuse("it does not lower the held-out error")
+    assert session.trouble[0] == "it does not lower the held-out error"
+    assert session.named == KEY
+    assert heard[-1] == "state"
+
+
+def test_of_a_set_none_is_offered_as_the_one() -> None:
+    session, worker, _ = begun()
+    worker.answer(opened())
+    worker.answer(told(KEY, alike=("external_leakage_laminar (a)",)))
+    assert session.named is None
+
+
+def test_a_session_without_a_record_waits_for_nothing() -> None:
+    worker = FakeWorker()
+    session = Session(Path("m.toml"), None, worker)  # type: ignore[arg-type]
+    session.open()
+    assert session.state == READY
+    assert not worker.is_busy
