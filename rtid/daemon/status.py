@@ -172,6 +172,7 @@ class Verdict:
     effects: tuple[str, ...] = ()
     over_s: tuple[float, float] = (0.0, 0.0)  # samples it saw, seconds before `at_unix_s`
     content: dict[str, Any] = field(default_factory=dict)
+    of_sensor: bool = False  # all that is missing are effects of sensors, not of the machine
 
 
 @dataclass(frozen=True)

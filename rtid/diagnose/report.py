@@ -1,6 +1,6 @@
 """A diagnosis in plain values: what is missing, how large, how sure, what could not be seen.
 
-`Diagnosis.as_json` follows the schema that docs/diagnosis.schema.json describes.
+`Diagnosis.as_json` follows the schema that `schema.md` describes.
 """
 
 from __future__ import annotations

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from rtid.diagnose import report
 from rtid.diagnose.causes.storage import ATMOSPHERE_PA
 from rtid.diagnose.diagnosis import search
 from rtid.diagnose.report import Diagnosis, Effect, diagnosis
@@ -93,6 +95,12 @@ def test_json_is_plain_and_versioned() -> None:
     for key in ("verdict", "found", "rho_before", "rho_after", "not_found", "negligible", "advice"):
         assert key in plain
     assert np.isfinite(plain["heldout_residual_before_m3s"])
+
+
+def test_every_key_of_the_json_is_described() -> None:
+    described = (Path(report.__file__).parent / "schema.md").read_text()
+    for key in diagnosed().as_json():
+        assert f"`{key}`" in described, key
 
 
 def test_an_effect_of_the_user_s_own_is_offered_and_found() -> None:
