@@ -26,14 +26,14 @@ class Alarms:
         self._over: list[Alarm] = []
 
     def set(self, name: str, kind: Kind, text: str) -> None:
-        """Raise it, or change its text where it is on already."""
+        """Raise it, or change its text and kind where it is on already."""
         self._gone_s.pop(name, None)
         present = self._on.get(name)
         if present is None:
             self._on[name] = Alarm(name, text, self._clock_s(), None, kind)
             self._tell(self._on[name])
-        elif present.text != text:
-            self._on[name] = replace(present, text=text)
+        elif (present.text, present.kind) != (text, kind):
+            self._on[name] = replace(present, text=text, kind=kind)
 
     def clear(self, name: str) -> None:
         """Its cause is gone; it is over when the cause stays away for QUIET_S."""

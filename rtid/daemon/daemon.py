@@ -27,9 +27,10 @@ from rtid.daemon.core import Core
 from rtid.daemon.diagnosing import Diagnosing
 from rtid.daemon.helper import Helper
 from rtid.daemon.jobs import Answer
-from rtid.daemon.keeper import Facts, Keeper
+from rtid.daemon.keeper import Keeper
 from rtid.daemon.log import logger
 from rtid.daemon.status import Status
+from rtid.daemon.teller import Facts
 from rtid.daemon.warm import compiled
 from rtid.errors import RtidError
 from rtid.live import Learner, catalog_of
@@ -120,7 +121,7 @@ class Daemon:
         rate_hz = self._project.sections.daemon.rate_hz
         end_ns = time.monotonic_ns() + round(1e9 * for_s) if for_s is not None else None
         self._loop = loop = Loop(rate_hz, _until(core.tick, end_ns, self.stop))
-        keeper.loop = loop
+        keeper.teller.loop = loop
         keeper.start()
         if self._project.sections.daemon.priority:
             realtime.favour_threads()

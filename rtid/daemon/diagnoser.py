@@ -19,12 +19,13 @@ from rtid.daemon.pipe import Pipe
 from rtid.daemon.status import Verdict
 from rtid.diagnosed_text import sentences
 from rtid.diagnosing import added_parts, diagnose_live
+from rtid.effects import catalogue
 from rtid.errors import RtidError
 from rtid.estimator.estimator import Estimator
 from rtid.model import Upkeep
 from rtid.project import Project, load
 
-NICE = 10
+NICE = 5
 
 
 def diagnose(job: Diagnose, project: Project) -> Found:
@@ -38,7 +39,19 @@ def diagnose(job: Diagnose, project: Project) -> Found:
     found = diagnose_live(estimator, added_parts(project), project.effects)
     effects = tuple(f"{e.effect} ({e.where})" if e.where else e.effect for e in found.found)
     text = " ".join(sentences(found)[:3])
-    return Found(Verdict(now_s, found.verdict, text, effects, (span_s, 0.0), found.as_json()))
+    pages = catalogue()
+    places = [pages[e.effect].places for e in found.found if e.effect in pages]
+    of_sensor = bool(found.found) and all("sensor" in place for place in places)
+    told = Verdict(
+        now_s,
+        found.verdict,
+        text,
+        effects,
+        (span_s, 0.0),
+        found.as_json(),
+        of_sensor and bool(places),
+    )
+    return Found(told)
 
 
 def check(job: Check, project: Project) -> Checked:

@@ -6,12 +6,9 @@ It looks ten times a second and tells once a second; it only reads what the loop
 from __future__ import annotations
 
 import math
-import os
 import threading
 import time
 from collections import deque
-from dataclasses import dataclass, replace
-from pathlib import Path
 
 from rtid.daemon import status as st
 from rtid.daemon.alarms import Alarms
@@ -34,31 +31,13 @@ from rtid.daemon.jobs import (
 )
 from rtid.daemon.log import logger
 from rtid.daemon.plant import PlantWatch
-from rtid.daemon.story import line, loop_health, resident_mb
-from rtid.loop.loop import Loop
-from rtid.project import Project
+from rtid.daemon.story import line
+from rtid.daemon.teller import Facts, Saving, Teller
 
 LOOK_S = 0.1
 OVERLOAD = 0.05  # share of ticks lost in a second that is worth an alarm
-HOLDING = ("sensor_frozen", "second_sender")  # alarms while which nothing is learned
 CHECK_S = 30.0  # of samples after which the project file is held against them
 FALLEN_S = 60.0  # so long a helper that ended is an alarm
-GRACE_S = 15.0  # a save may take so long before its absence is an alarm
-
-
-@dataclass
-class Facts:
-    """What does not change while the daemon runs."""
-
-    project: Project
-    folder: Path
-    interface: str
-    channel: str
-    restored: str
-    scheduling: str
-    memory_locked: bool
-    started_unix_s: float
-    log_every_s: float
 
 
 class Keeper:
@@ -74,24 +53,20 @@ class Keeper:
     ) -> None:
         self._facts, self._core, self._analyst = facts, core, analyst
         self._diagnosing = diagnosing
-        self.loop: Loop | None = None
+        self.teller = Teller(facts, core)
         self.alarms = Alarms(self._told)
         self.plant = PlantWatch()
-        self.publication: Publication | None = None
-        self._version = 0
         self._answers = answers  # of the helpers, appended from their threads
-        self._not_saved: dict[str, str] = {}
-        self._saved_s: float | None = None
-        self._started_s = time.monotonic()
+        self._saving = Saving(facts.project.sections.daemon.store_s)
         self._recording, self._first_s = "", 0.0
         self._recalling = self._is_checked = False
         self._is_ready = False
-        self._frames_before, self._told_s = 0, 0.0
+        self._told_s = 0.0
         self._lost = self._fallen = 0
         self._fallen_s = -math.inf
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="rtid-keeper", daemon=True)
-        self.status = self._make_status(time.monotonic_ns())
+        self.status = self._make_status()
 
     def start(self) -> None:
         """Begin to look."""
@@ -103,7 +78,7 @@ class Keeper:
         if self._thread.is_alive():
             self._thread.join(5.0)
         self._listen()
-        self._tell(time.monotonic_ns())
+        self._tell()
 
     def _run(self) -> None:
         next_s = time.monotonic()
@@ -113,7 +88,7 @@ class Keeper:
                 self._look()
                 if time.monotonic() >= next_s:
                     next_s = time.monotonic() + 1.0
-                    self._tell(time.monotonic_ns())
+                    self._tell()
             except Exception:  # the keeper must not die: without it nobody hears of anything
                 logger.exception("keeper failed")
 
@@ -123,15 +98,12 @@ class Keeper:
             if isinstance(answer, Ready):
                 self._core.busy = False
             elif isinstance(answer, Publication):
-                self.publication = answer
-                self._version += 1
+                self.teller.publish(answer)
             elif isinstance(answer, Judgement):
                 if self.plant.push(answer):
                     self._plant_changed()
-            elif isinstance(answer, Saved):
-                self._saved_s, self._not_saved = time.monotonic(), {}
-            elif isinstance(answer, NotSaved):
-                self._not_saved[answer.what] = answer.reason
+            elif isinstance(answer, Saved | NotSaved):
+                self._saving.hear(answer)
             elif isinstance(answer, Recording):
                 self._recording = answer.path
                 for name, folder in answer.kept.items():
@@ -178,7 +150,9 @@ class Keeper:
         text = f"the analyst has ended {self._fallen} times and was started again"
         self.alarms.put("helper_failed", "loop", "" if late else text)
         self.alarms.put("not_saved", "store", self._why_not_saved())
-        self.alarms.put("plant_changed", "plant", self._plant_text())
+        verdict = self._diagnosing.verdict if self._diagnosing.is_of_change else None
+        of_sensor = verdict is not None and verdict.of_sensor
+        self.alarms.put("plant_changed", "sensor" if of_sensor else "plant", self._plant_text())
         self.alarms.put("implausible", "sensor", "; ".join(self._diagnosing.implausible))
         if not self._is_checked and self._recording and self._has_run_s() > CHECK_S:
             self._is_checked = self._diagnosing.check(self._recording)
@@ -200,14 +174,13 @@ class Keeper:
         return text
 
     def _why_not_saved(self) -> str:
-        if self._not_saved:
-            return "NOT SAVED: " + "; ".join(f"{w}: {r}" for w, r in self._not_saved.items())
-        limit_s = self._facts.project.sections.daemon.store_s + GRACE_S
-        since_s = self._started_s if self._saved_s is None else self._saved_s
-        late = time.monotonic() - since_s > limit_s
-        if late and self._core.samples and self._core.learner.learns:
-            return f"NOT SAVED: no snapshot for {time.monotonic() - since_s:.0f} s"
-        return ""
+        core = self._core
+        return self._saving.why_not(core.samples > 0 and core.learner.learns)
+
+    def _make_status(self) -> st.Status:
+        why, dropped = self._why_not_saved(), self._analyst.dropped
+        store = self._saving.store(why, self._facts.restored, self._recording, dropped)
+        return self.teller.tell(self.alarms, store, self.plant.surprise, self._diagnosing)
 
     def _told(self, alarm: st.Alarm) -> None:
         begins = alarm.until_unix_s is None
@@ -215,9 +188,9 @@ class Keeper:
                    "on" if begins else "over", alarm.name, alarm.kind, alarm.text)  # fmt: skip
         self._analyst.put(Note(alarm, keep=begins and alarm.kind != "loop"))
 
-    def _tell(self, now_ns: int) -> None:
+    def _tell(self) -> None:
         """Status, file, log line."""
-        self.status = self._make_status(now_ns)
+        self.status = self._make_status()
         loop = self.status.loop
         lost, self._lost = loop.overruns + loop.skipped - self._lost, loop.overruns + loop.skipped
         text = f"{lost} of {loop.rate_hz:.0f} ticks lost in a second; since the start {loop.causes}"
@@ -231,79 +204,6 @@ class Keeper:
         try:
             st.write(self._facts.folder, self.status)
         except OSError as error:
-            self._not_saved["status"] = str(error)
+            self._saving.refused["status"] = str(error)
         else:
-            self._not_saved.pop("status", None)
-
-    def _make_status(self, now_ns: int) -> st.Status:
-        facts, core = self._facts, self._core
-        messages, signals = core.health.take(now_ns)
-        frames, self._frames_before = core.frames - self._frames_before, core.frames
-        counters = core.learner.counters
-        bus = st.BusHealth(
-            facts.interface,
-            facts.channel,
-            "reopening" if core.source.is_down else "open",
-            core.frames,
-            float(frames),
-            core.source.queued,
-            counters.get("reopened", 0),
-            core.learner.assembler.source_counters,
-        )
-        return st.Status(
-            name=facts.project.name,
-            pid=os.getpid(),
-            started_unix_s=facts.started_unix_s,
-            now_unix_s=time.time(),
-            loop=loop_health(self.loop, facts.project, facts.scheduling, facts.memory_locked),
-            bus=bus,
-            messages=messages,
-            signals=signals,
-            estimate=self._estimate(now_ns, counters),
-            store=self._store(),
-            verdict=self._diagnosing.verdict,
-            diagnosing=self._diagnosing.is_running,
-            alarms=self.alarms.all,
-            rss_anon_mb=resident_mb(),
-        )
-
-    def _estimate(self, now_ns: int, counters: dict[str, int]) -> st.Estimate:
-        core, daemon = self._core, self._facts.project.sections.daemon
-        age_s = core.lag.age_s(now_ns // 1000)
-        found = self.publication
-        learning: st.Learning = "learning" if core.samples else "waiting"
-        reason = ""
-        if not core.learner.learns:
-            learning, reason = "suspended", "the plant has changed"
-        elif held := [a.text for a in self.alarms.on if a.name in HOLDING]:
-            learning, reason = "held", held[0]
-        shown = st.Estimate(
-            state=learning,
-            reason=reason,
-            version=self._version,
-            age_s=age_s,
-            stale=age_s is None or age_s > daemon.max_age_s,
-            samples=counters.get("samples", 0),
-            rows=counters.get("rows", 0),
-            surprise=self.plant.surprise,
-            refused=counters,
-        )
-        if found is None:
-            return shown
-        names = [chamber.name for chamber in self._facts.project.model.chambers]
-        rows = zip(names, found.beta_pa, found.beta_sd_pa, strict=True)
-        chambers = tuple(st.Chamber(name, float(beta), float(sd)) for name, beta, sd in rows)
-        return replace(shown, rho=found.rho, chambers=chambers, edges=found.edges)
-
-    def _store(self) -> st.Store:
-        age_s = None if self._saved_s is None else time.monotonic() - self._saved_s
-        why = self._why_not_saved()
-        state = "NOT SAVED" if why else ("saved" if self._saved_s is not None else "none")
-        return st.Store(
-            state=state,  # type: ignore[arg-type]
-            reason=why,
-            age_s=age_s,
-            restored=self._facts.restored,
-            recording=self._recording,
-            dropped_frames=self._analyst.dropped,
-        )
+            self._saving.refused.pop("status", None)

@@ -1,0 +1,153 @@
+"""Makes the status once a second: what loop, gates, helpers and disk have come to."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from rtid.daemon import status as st
+from rtid.daemon.alarms import Alarms
+from rtid.daemon.core import Core
+from rtid.daemon.diagnosing import Diagnosing
+from rtid.daemon.jobs import NotSaved, Publication, Saved
+from rtid.daemon.story import loop_health, resident_mb
+from rtid.loop.loop import Loop
+from rtid.project import Project
+
+HOLDING = ("sensor_frozen", "second_sender")  # alarms while which nothing is learned
+GRACE_S = 15.0  # a save may take so long before its absence is an alarm
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What does not change while the daemon runs."""
+
+    project: Project
+    folder: Path
+    interface: str
+    channel: str
+    restored: str
+    scheduling: str
+    memory_locked: bool
+    started_unix_s: float
+    log_every_s: float
+
+
+@dataclass
+class Saving:
+    """What the disk has taken, and what it has refused."""
+
+    interval_s: float
+    started_s: float = field(default_factory=time.monotonic)
+    saved_s: float | None = None
+    refused: dict[str, str] = field(default_factory=dict)
+
+    def hear(self, answer: Saved | NotSaved) -> None:
+        """The analyst has saved, or could not."""
+        if isinstance(answer, Saved):
+            self.saved_s, self.refused = time.monotonic(), {}
+        else:
+            self.refused[answer.what] = answer.reason
+
+    def why_not(self, is_learning: bool) -> str:
+        """Why what was learned would not survive; "" if it would."""
+        if self.refused:
+            return "NOT SAVED: " + "; ".join(f"{w}: {r}" for w, r in self.refused.items())
+        since_s = self.started_s if self.saved_s is None else self.saved_s
+        age_s = time.monotonic() - since_s
+        if is_learning and age_s > self.interval_s + GRACE_S:
+            return f"NOT SAVED: no snapshot for {age_s:.0f} s"
+        return ""
+
+    def store(self, why: str, restored: str, recording: str, dropped: int) -> st.Store:
+        """As the status has it."""
+        age_s = None if self.saved_s is None else time.monotonic() - self.saved_s
+        told = st.Store("none", why, age_s, restored, recording, dropped)
+        if why:
+            return replace(told, state="NOT SAVED")
+        return told if age_s is None else replace(told, state="saved")
+
+
+class Teller:
+    """Makes statuses; asked once a second."""
+
+    def __init__(self, facts: Facts, core: Core) -> None:
+        self._facts, self._core = facts, core
+        self.loop: Loop | None = None
+        self.publication: Publication | None = None
+        self.version = 0
+        self._frames_before = 0
+
+    def publish(self, found: Publication) -> None:
+        """Another map is known."""
+        self.publication = found
+        self.version += 1
+
+    def tell(
+        self, alarms: Alarms, store: st.Store, surprise: float | None, diagnosing: Diagnosing
+    ) -> st.Status:
+        """The status of now."""
+        facts, now_ns = self._facts, time.monotonic_ns()
+        messages, signals = self._core.health.take(now_ns)
+        counters = self._core.learner.counters
+        return st.Status(
+            name=facts.project.name,
+            pid=os.getpid(),
+            started_unix_s=facts.started_unix_s,
+            now_unix_s=time.time(),
+            loop=loop_health(self.loop, facts.project, facts.scheduling, facts.memory_locked),
+            bus=self._bus(counters),
+            messages=messages,
+            signals=signals,
+            estimate=self._estimate(now_ns, counters, alarms, surprise),
+            store=store,
+            verdict=diagnosing.verdict,
+            diagnosing=diagnosing.is_running,
+            alarms=alarms.all,
+            rss_anon_mb=resident_mb(),
+        )
+
+    def _bus(self, counters: dict[str, int]) -> st.BusHealth:
+        facts, core = self._facts, self._core
+        frames, self._frames_before = core.frames - self._frames_before, core.frames
+        return st.BusHealth(
+            facts.interface,
+            facts.channel,
+            "reopening" if core.source.is_down else "open",
+            core.frames,
+            float(frames),
+            core.source.queued,
+            counters.get("reopened", 0),
+            core.learner.assembler.source_counters,
+        )
+
+    def _estimate(
+        self, now_ns: int, counters: dict[str, int], alarms: Alarms, surprise: float | None
+    ) -> st.Estimate:
+        core, found = self._core, self.publication
+        age_s = core.lag.age_s(now_ns // 1000)
+        learning: st.Learning = "learning" if core.samples else "waiting"
+        reason = ""
+        if not core.learner.learns:
+            learning, reason = "suspended", "the plant has changed"
+        elif held := [a.text for a in alarms.on if a.name in HOLDING]:
+            learning, reason = "held", held[0]
+        shown = st.Estimate(
+            state=learning,
+            reason=reason,
+            version=self.version,
+            age_s=age_s,
+            stale=age_s is None or age_s > self._facts.project.sections.daemon.max_age_s,
+            samples=counters.get("samples", 0),
+            rows=counters.get("rows", 0),
+            surprise=surprise,
+            refused=counters,
+        )
+        if found is None:
+            return shown
+        names = [chamber.name for chamber in self._facts.project.model.chambers]
+        rows = zip(names, found.beta_pa, found.beta_sd_pa, strict=True)
+        chambers = tuple(st.Chamber(name, float(beta), float(sd)) for name, beta, sd in rows)
+        return replace(shown, rho=found.rho, chambers=chambers, edges=found.edges)
