@@ -19,7 +19,7 @@ from rtid.daemon.status import Status, StatusError, from_json, read
 from rtid.live import Learner
 from rtid.project import Project
 from rtid.store import Generations
-from tests.faults.harness import machine
+from tests.faults.harness import SECONDS, machine
 
 LIMIT_S = 60.0
 
@@ -123,6 +123,26 @@ def daemon(
                 process.send_signal(signal.SIGCONT)
             process.kill()
             process.wait()
+
+
+@contextlib.contextmanager
+def replayed(folder: Path, settings: str, loops: int) -> Iterator[Daemon]:
+    """A daemon that hears the machine's minute `loops` times at ten times its pace."""
+    project, state = folder / "machine.toml", folder / "state"
+    source = machine().trace.with_suffix(".toml").read_text("utf-8")
+    project.write_text(f"{source}\n[daemon]\n{settings}\n", "utf-8")
+    command = [
+        sys.executable, "-m", "tests.faults.replayed", str(project), str(machine().trace),
+        str(state), str(SECONDS), "10", str(loops),
+    ]  # fmt: skip
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
+    try:
+        yield Daemon(process, state, "", time.monotonic())
+    finally:
+        process.kill()
+        process.wait()
 
 
 def _listen(manager: socket.socket, started: Daemon) -> None:
