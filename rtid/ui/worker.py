@@ -16,6 +16,7 @@ from rtid.errors import RtidError
 
 Then = Callable[[Any], None]
 Progress = Callable[[str, float], None]
+OUR_PACKAGES = ("rtid", "firmware_bridge")  # their errors are meant for the user
 POLITE = 5
 ENDED = "the worker has ended", "start `rtid ui` again"
 
@@ -50,14 +51,19 @@ def serve(pipe: Connection) -> None:
             return
         try:
             pipe.send(("done", getattr(desk, method)(*arguments)))
-        except RtidError as error:
-            pipe.send(("refused", (str(error), error.remedy)))
-        except OSError as error:
-            pipe.send(("refused", (f"{error.filename or method}: {error.strerror}", "")))
         except KeyboardInterrupt:
             return
         except Exception as error:
-            pipe.send(("refused", (f"{method} failed: {type(error).__name__}: {error}", "")))
+            pipe.send(("refused", in_words(method, error)))
+
+
+def in_words(method: str, error: Exception) -> tuple[str, str]:
+    """An error as a user reads it, and the remedy; one that is not meant for users has its kind."""
+    if type(error).__module__.split(".")[0] in OUR_PACKAGES:
+        return str(error), getattr(error, "remedy", "")
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}", ""
+    return f"{method} failed: {type(error).__name__}: {error}", "a defect of rtid: please report it"
 
 
 class Worker:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
@@ -23,7 +24,7 @@ from tests.ui.served import served
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
-CHANNEL = "239.74.163.77"
+CHANNEL = f"239.74.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"  # one for each test worker
 SEED = 3
 SOAK_S, SHORT_S = 60.0, 8.0
 START_S = 90.0  # of a cold daemon on a loaded machine

@@ -1,0 +1,118 @@
+"""The desk: add, drop, undo, save and export, with the commands' own history; other machines."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware_bridge.sources.errors import LogError
+from rtid.errors import RtidError
+from rtid.mapfiles import read_map
+from rtid.project import load
+from rtid.project.history import ADD, read
+from rtid.revising import undo
+from rtid.sim.hidden import hide_wish
+from rtid.sim.random_plants import draw
+from rtid.sim.recording import write_run
+from rtid.sim.run import simulate
+from rtid.ui.desk import Desk
+from rtid.ui.look import Look
+from rtid.ui.worker import in_words
+
+pytestmark = pytest.mark.slow
+SEED, DURATION_S = 3, 40.0
+LEAK = "internal_leakage_laminar", "a-b"
+
+
+def silent(_text: str, _share: float) -> None:
+    pass
+
+
+@pytest.fixture(scope="module")
+def worn(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    folder = tmp_path_factory.mktemp("desk")
+    machine = hide_wish(draw(SEED), "internal_leakage_laminar=strong")
+    run = simulate(machine, "rich", SEED, DURATION_S)
+    trace, _, project = write_run(folder / "worn.parquet", run, SEED, "rich")
+    return trace, project
+
+
+def left(look: Look) -> float:
+    """Root mean square of what a revision leaves of the held-out flow, both chambers."""
+    part = look.parts.get("validation") or look.parts["identification"]
+    return float(np.sqrt(np.mean(part.equation.residual_m3s**2)))
+
+
+def fit(look: Look) -> float:
+    part = look.parts.get("validation") or look.parts["identification"]
+    return float(part.runs["free run"].fit_percent.min())
+
+
+def test_the_whole_way_of_an_effect(worn: tuple[Path, Path]) -> None:
+    trace, project = worn
+    untouched, desk = project.read_bytes(), Desk(silent)
+    first = desk.open(project, trace, None).look
+    named = desk.diagnose().diagnosis.found[0]
+    assert (named.effect, named.where) == LEAK
+    desk.prepare(*LEAK)
+    added = desk.add(*LEAK, "named by the diagnosis")
+    assert left(added.look) < 0.25 * left(first)
+    assert fit(added.look) > fit(first) + 10
+    size = added.section.parameters["coefficient"]
+    assert size.value == pytest.approx(named.parameters["coefficient"].value, rel=1e-3)
+    pair = added.section.errors.heldout_pct
+    assert pair.before is not None
+    assert pair.after is not None
+    assert pair.after < 0.2 * pair.before
+    desk.back()
+    with pytest.raises(RtidError, match="spool_lag_of_the_moon"):
+        desk.add("spool_lag_of_the_moon", "", "")
+    again = desk.add(*LEAK, "once more")
+    assert left(again.look) == pytest.approx(left(added.look))
+    dropped = desk.drop(*LEAK)
+    assert left(dropped.look) == pytest.approx(left(first), rel=1e-9)
+    assert dropped.sections == ()
+    desk.back()
+    assert project.read_bytes() == untouched
+    desk.save()
+    assert [a.key for a in load(project).sections.added] == [LEAK]
+    assert [change.change for change in read(project)] == [ADD]
+    desk.export("npz")
+    flowmap, _ = read_map(trace.with_suffix(".map.npz"))
+    assert np.array_equal(flowmap.edges[0].theta, again.look.flowmap.edges[0].theta)
+    reopened = Desk(silent).open(project, trace, None)
+    assert [a.key for a in reopened.added] == [LEAK]
+    assert left(reopened.look) == pytest.approx(left(again.look), rel=0.02)
+    undo(project)
+    assert project.read_bytes() == untouched
+
+
+def test_a_file_that_was_changed_meanwhile_is_not_overwritten(worn: tuple[Path, Path]) -> None:
+    trace, project = worn
+    copy = project.with_name("copy.toml")
+    copy.write_bytes(project.read_bytes())
+    desk, other = Desk(silent), Desk(silent)
+    for one in (desk, other):
+        one.open(copy, trace, None)
+        one.add(*LEAK, "by name")
+    other.save()
+    saved = copy.read_bytes()
+    with pytest.raises(RtidError, match="other effects"):
+        desk.save()
+    assert copy.read_bytes() == saved
+
+
+def test_a_wrong_format_or_record_is_refused_in_words(
+    worn: tuple[Path, Path], tmp_path: Path
+) -> None:
+    trace, project = worn
+    desk = Desk(silent)
+    with pytest.raises(LogError) as refusal:
+        desk.open(project, tmp_path / "absent.blf", None)
+    assert in_words("open", refusal.value)[0].endswith("absent.blf: no such file")
+    assert in_words("open", ZeroDivisionError("x"))[1].startswith("a defect")
+    desk.open(project, trace, None)
+    with pytest.raises(RtidError, match="no format"):
+        desk.export("../../etc/passwd")
