@@ -50,7 +50,7 @@ def sentences(found: Diagnosis) -> list[str]:
         )
     if found.negligible:
         names = ", ".join(f"{title(s.effect)} ({s.where})" for s in found.negligible)
-        lines.append(f"Present but negligible: {names}.")
+        lines.append(f"Too small to matter, if there at all: {names}.")
     return lines + [f"{text}" for text in found.advice[:4]]
 
 

@@ -17,10 +17,12 @@ from rtid.diagnose.experiment import limits
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.regression import Score
 from rtid.diagnose.trials import Found, Key, detection_limit, physical
+from rtid.diagnose.verdict import INSUFFICIENT, UNKNOWN
 from rtid.effects import catalogue
 
 SCHEMA = 1
 WORTH = 2.0  # times better that an experiment must be to be proposed
+SILENT = (UNKNOWN, INSUFFICIENT)  # verdicts that say nothing of what remains
 VISIBLE = 2e-3  # share of a column that must be left beside the maps
 HYDRAULIC = ("flow", "storage", "timing", "supply", "map")
 
@@ -121,7 +123,7 @@ def diagnosis(result: Result) -> Diagnosis:
     return Diagnosis(
         verdict=result.verdict,
         added=tuple(Added(*p.key, parameters(last, p.key)) for p in result.given),
-        found=found if result.verdict != "unknown" else (),
+        found=found,
         rho_before=result.first.rho,
         rho_after=last.rho,
         heldout_residual_before_m3s=result.before.rms_m3s,
@@ -130,7 +132,7 @@ def diagnosis(result: Result) -> Diagnosis:
         rms_flow_m3s=result.after.flow_m3s,
         beta_pa=tuple(float(b) for b in 1.0 / last.compliance),
         lag_s=last.weights.lag_s,
-        something_remains=bool(found or result.given) and last.rho > result.match_rho,
+        something_remains=result.verdict not in SILENT and last.rho > result.match_rho,
         held_out_judged=result.held_out_judged,
         not_found=unseen,
         negligible=tuple(
