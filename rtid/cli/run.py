@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -43,6 +45,9 @@ def run(
     fresh: Annotated[
         bool, typer.Option("--fresh", help="Do not go on with what the folder holds.")
     ] = False,
+    page: Annotated[
+        bool, typer.Option("--ui", help="Also serve the live page, from a process of its own.")
+    ] = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print the last status as JSON at the end.")
     ] = False,
@@ -68,10 +73,22 @@ def run(
         _set_aside(folder)
     chosen = Bus(interface, channel, _opener(loaded, interface, channel))
     daemon = Daemon(loaded, chosen, folder, 1.0 if sys.stderr.isatty() else LOG_SERVICE_S)
-    with stopped_by_signals(daemon):
+    with _served(project, folder) if page else nullcontext(), stopped_by_signals(daemon):
         last = daemon.run(for_s)
     if as_json:
         print(last.to_json())
+
+
+@contextmanager
+def _served(project: Path, state: Path) -> Iterator[None]:
+    """The page beside the daemon: it reads one small file, and comes after everything else."""
+    command = [sys.executable, "-m", "rtid", "ui", str(project), "--state", str(state), "--no-open"]
+    served = subprocess.Popen(["nice", "-n", "10", *command])
+    try:
+        yield
+    finally:
+        served.terminate()
+        served.wait()
 
 
 def _refuse_untrusted(interface: str, project: Path, test_bus: bool) -> None:
