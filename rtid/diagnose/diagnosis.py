@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 from rtid.diagnose.candidates import Candidate
 from rtid.diagnose.clean import as_measured, usable
-from rtid.diagnose.fit import Fit, fit, one_pass, prepare
+from rtid.diagnose.fit import Fit, fit, one_pass, prepare, with_covariances
 from rtid.diagnose.parts import Part, recall
 from rtid.diagnose.regression import Score
 from rtid.diagnose.residual import Residual, residual
@@ -148,7 +148,7 @@ def _add_best(state: State, present: Fit, last: Residual) -> tuple[Fit, Residual
         if not _explains(state, present, best):
             return None
         trial, alike = contest(state, present, best, trials)
-        now = carried_on(state, present, trial)
+        now = with_covariances(carried_on(state, present, trial), like=present)
         after = residual(now, state.held_out)
         own = BENT * own_share(now, trial, state.held_out)
         share = min(material_share(last, after), own)
@@ -159,6 +159,7 @@ def _add_best(state: State, present: Fit, last: Residual) -> tuple[Fit, Residual
         if _is_noticed(present, trial) and after.rms_m3s <= WORSE * last.rms_m3s:
             state.negligible |= dict.fromkeys(alike, share)
             return _with_bank(state, now), after
+        del now  # its rows are large
     return None
 
 

@@ -15,9 +15,10 @@ import numpy as np
 
 from rtid.diagnose.bank import add_shapes, add_timing, offer
 from rtid.diagnose.candidates import Candidate, Cause, Columns, Shape, Volumes
-from rtid.diagnose.causes import add_echoes, cause_of, total_softness
+from rtid.diagnose.causes import add_echoes, cause_of
 from rtid.diagnose.commands import commands, split, transformed
-from rtid.diagnose.evidence import Projected, Rows, project, rows_of
+from rtid.diagnose.equations import regression_of, softened
+from rtid.diagnose.evidence import Rows, project, rows_of
 from rtid.diagnose.moving import halfway, is_as_good, is_worse, moved, reweighed
 from rtid.diagnose.regression import Estimate, Regression
 from rtid.diagnose.revision import Revision
@@ -25,14 +26,14 @@ from rtid.diagnose.view import FlowMap, View
 from rtid.estimator.factor import PRIOR_SD, SHARED_PRIOR
 from rtid.estimator.record import refined, run
 from rtid.estimator.solution import sketch
-from rtid.estimator.state import Weights, variance
+from rtid.estimator.state import Weights
 from rtid.kernels.layout import TERMS
 from rtid.model import FloatArray, Model
 
 PASSES = 10  # of Gauss-Newton
 HALVINGS = 2  # of one step, before it is given up
 RIDGE = 1e-9  # of the square of a timing's or a shape's column: more than rounding leaves
-HELD = 1e30  # information of a parameter that is held
+WEIGHED = 0.05  # share by which the compliances may differ that weigh the rows alike
 NO_COV = np.zeros((0, TERMS, TERMS))  # of maps whose covariance nobody asked for
 
 
@@ -176,7 +177,7 @@ def one_pass(
     add_echoes(view, columns, n_timing, slopes)
     projected = project(rows, columns.released())
     dof = float(rows.n - TERMS * len(rows.cells))
-    regression = _regression(model, weights, revision, projected, columns, rows.n, dof)
+    regression = regression_of(model, weights, revision, projected, columns, rows.n, dof)
     weak = slice(first - len(shapes) - sum(len(psi) for _, psi in revision.timings), first)
     regression.prior[weak] = RIDGE * regression.own[weak] + (regression.own[weak] == 0.0)
     at = [first + columns.candidates.index(e) for e in revision.effects]
@@ -188,11 +189,17 @@ def one_pass(
     return with_covariances(found) if thorough else found
 
 
-def with_covariances(found: Fit) -> Fit:
-    """A fit with the covariances of its maps, and what their priors leave of the freedom."""
+def with_covariances(found: Fit, like: Fit | None = None) -> Fit:
+    """A fit with the covariances of its maps, and what their priors leave of the freedom.
+
+    like: a fit whose covariances are taken where its rows are weighed alike and meet the same
+    blocks: an effect more changes them by next to nothing.
+    """
     if found.rows is None:
         return found
-    cov = found.rows.factor.covariances
+    cov = _covariances_of(like, found) if like is not None else None
+    if cov is None:
+        cov = found.rows.factor.covariances
     freed = float(np.einsum("bii->", cov)) * PRIOR_SD**-2
     dof = found.rows.n - TERMS * len(found.rows.cells) + freed
     better = replace(
@@ -200,6 +207,18 @@ def with_covariances(found: Fit) -> Fit:
     )
     vars(better).update(model=found.model, sent=found.sent, view=found.view)
     return better
+
+
+def _covariances_of(like: Fit, found: Fit) -> FloatArray | None:
+    """Those of another fit, in the order of this one's blocks; None where they are not the same."""
+    known, cells = like.map, found.map.cells
+    alike = like.revision.timings == found.revision.timings and np.allclose(
+        like.weights.compliance, found.weights.compliance, rtol=WEIGHED, atol=0.0
+    )
+    if not alike or not len(known.cov) or not np.isin(cells, known.cells).all():
+        return None
+    order = np.argsort(known.cells)
+    return np.asarray(known.cov[order[np.searchsorted(known.cells[order], cells)]])
 
 
 def tried(model: Model, chunk: FloatArray, weights: Weights, revision: Revision) -> Fit:
@@ -228,23 +247,6 @@ def _same_rows(
     return start.rows if all(np.array_equal(a, b) for a, b in pairs) else None
 
 
-def softened(
-    model: Model, chunk: FloatArray, weights: Weights, sizes: tuple[tuple[Candidate, float], ...]
-) -> FloatArray:
-    """What storage effects add to the white variance of each row's equation (n, chambers), m6.
-
-    The noise of a pressure moves what is stored: sd_P times V / beta and the effects' own share.
-    """
-    view = View.without_map(model, chunk, weights.compliance)
-    more = np.zeros((view.n, len(model.chambers)))
-    own = total_softness(view, sizes)
-    for c, chamber in enumerate(model.chambers):
-        plain = view.volume(c) * view.compliance[c]
-        noise = variance(model, chamber.pressure) * model.pressure_share
-        more[:, c] = ((plain + own[:, c]) ** 2 - plain**2) * noise
-    return more
-
-
 def columns_of_effects(found: Fit) -> list[Volumes]:
     """Volumes per interval of the effects of a fit, for coefficients of 1."""
     return [cause_of(found.view, e).column(e.shape) for e in found.revision.effects]
@@ -260,25 +262,3 @@ def _map_alone(model: Model, rows: Rows) -> FlowMap:
     s = projected.schur
     theta = np.asarray(np.linalg.solve(s[1:, 1:] + SHARED_PRIOR * np.eye(n_c), s[1:, 0]))
     return FlowMap(rows.cells, projected.terms(list(range(1, 1 + n_c)), theta), NO_COV)
-
-
-def _regression(
-    model: Model,
-    weights: Weights,
-    revision: Revision,
-    projected: Projected,
-    columns: Columns,
-    rows: int,
-    dof: float,
-) -> Regression:
-    n_c, head = len(model.chambers), len(projected.schur)
-    noise, prior, mean = np.zeros((head, head)), np.zeros(head), np.zeros(head)
-    for a, echo_a in columns.echo_of.items():
-        for b, echo_b in columns.echo_of.items():
-            noise[a, b] = projected.schur[echo_a, echo_b]
-    prior[1 : 1 + n_c] = SHARED_PRIOR
-    if not revision.replaces_lag:
-        tolerance = model.lag.tolerance_s
-        prior[1 + n_c] = tolerance**-2 if tolerance > 0 else HELD
-        mean[1 + n_c] = model.lag.nominal_s - weights.lag_s
-    return Regression(projected.schur, noise, prior, mean, projected.own, dof, rows)

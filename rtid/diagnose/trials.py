@@ -13,7 +13,7 @@ import numpy as np
 
 from rtid.diagnose.candidates import Candidate
 from rtid.diagnose.causes import causes
-from rtid.diagnose.fit import Fit, fit, one_pass, tried, with_covariances
+from rtid.diagnose.fit import Fit, fit, one_pass, tried
 from rtid.diagnose.parts import Part
 from rtid.diagnose.pump import PUMP, demand
 from rtid.diagnose.regression import LIMIT_SD, Score
@@ -248,11 +248,11 @@ def exact_trials(
 
 
 def carried_on(state: State, present: Fit, trial: Trial) -> Fit:
-    """The fit with a trial's revision to the end, with the covariances of its maps."""
+    """The fit with a trial's revision, to the end."""
     revision, weights, start = trial.revision, present.weights, present
     if trial.fit is not None:
         weights, start = trial.fit.weights, trial.fit
-    return with_covariances(fit(state.model, state.chunk, weights, revision, start, bank=False))
+    return fit(state.model, state.chunk, weights, revision, start, bank=False)
 
 
 def _from_afar(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.signal import savgol_coeffs
 
 from rtid.estimator.state import Weights, build
-from rtid.kernels.evidence import follow_map
+from rtid.kernels.following import follow_map
 from rtid.kernels.layout import TERMS
 from rtid.kernels.smoothing import correlate
 from rtid.model import PRESSURE, FloatArray, Model

@@ -18,8 +18,8 @@ from rtid.estimator.factor import PRIOR_SD
 from rtid.estimator.record import run
 from rtid.estimator.state import build, nominal_weights
 from rtid.estimator.sums import Sums
-from rtid.kernels import evidence as kernel
 from rtid.kernels import products
+from rtid.kernels.following import follow_map
 from rtid.kernels.layout import TERMS
 from tests.diagnose.records import record
 
@@ -189,7 +189,7 @@ def test_the_map_is_followed_with_its_slopes() -> None:
         along = np.empty((len(samples) - 1, len(model.edges), 5))
         cell = np.empty(along.shape[:2], np.int64)
         cov = np.zeros((model.n_cells, TERMS, TERMS))
-        kernel.follow_map(state.engine, state.cells, theta, cov, samples, along, cell)
+        follow_map(state.engine, state.cells, theta, cov, samples, along, cell)
         return along, cell
 
     along, cell = flows(chunk)

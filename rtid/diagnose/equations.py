@@ -1,0 +1,57 @@
+"""The small regression of one pass: its noise and priors, and what weighs its rows."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rtid.diagnose.candidates import Candidate, Columns
+from rtid.diagnose.causes import total_softness
+from rtid.diagnose.evidence import Projected
+from rtid.diagnose.regression import Regression
+from rtid.diagnose.revision import Revision
+from rtid.diagnose.view import View
+from rtid.estimator.factor import SHARED_PRIOR
+from rtid.estimator.state import Weights, variance
+from rtid.model import FloatArray, Model
+
+HELD = 1e30  # information of a parameter that is held
+
+
+def softened(
+    model: Model, chunk: FloatArray, weights: Weights, sizes: tuple[tuple[Candidate, float], ...]
+) -> FloatArray:
+    """What storage effects add to the white variance of each row's equation (n, chambers), m6.
+
+    The noise of a pressure moves what is stored: sd_P times V / beta and the effects' own share.
+    """
+    view = View.without_map(model, chunk, weights.compliance)
+    more = np.zeros((view.n, len(model.chambers)))
+    own = total_softness(view, sizes)
+    for c, chamber in enumerate(model.chambers):
+        plain = view.volume(c) * view.compliance[c]
+        noise = variance(model, chamber.pressure) * model.pressure_share
+        more[:, c] = ((plain + own[:, c]) ** 2 - plain**2) * noise
+    return more
+
+
+def regression_of(
+    model: Model,
+    weights: Weights,
+    revision: Revision,
+    projected: Projected,
+    columns: Columns,
+    rows: int,
+    dof: float,
+) -> Regression:
+    """What the projection has left, the echoes' products as its noise, and the declared priors."""
+    n_c, head = len(model.chambers), len(projected.schur)
+    noise, prior, mean = np.zeros((head, head)), np.zeros(head), np.zeros(head)
+    for a, echo_a in columns.echo_of.items():
+        for b, echo_b in columns.echo_of.items():
+            noise[a, b] = projected.schur[echo_a, echo_b]
+    prior[1 : 1 + n_c] = SHARED_PRIOR
+    if not revision.replaces_lag:
+        tolerance = model.lag.tolerance_s
+        prior[1 + n_c] = tolerance**-2 if tolerance > 0 else HELD
+        mean[1 + n_c] = model.lag.nominal_s - weights.lag_s
+    return Regression(projected.schur, noise, prior, mean, projected.own, dof, rows)

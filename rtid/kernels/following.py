@@ -1,0 +1,81 @@
+"""What a map says along a record: flow, its slopes and its standard deviation."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtid.kernels.engine import ROW_FLAG, SHUT, remember
+from rtid.kernels.increments import mean_terms
+from rtid.kernels.jit import kernel, part
+from rtid.kernels.layout import TERMS
+from rtid.kernels.taking import begin, take
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+@kernel
+def follow_map(
+    engine: Any,
+    cells: Any,
+    theta: FloatArray,
+    cov: FloatArray,
+    chunk: FloatArray,
+    along: FloatArray,
+    cell: IntArray,
+) -> None:
+    """Means over each interval of what a map says along a record; outputs changed in place.
+
+    engine (1,), cells: a freshly built state; theta (cells, 6) m3/s, cov (cells, 6, 6) its
+    covariance, or empty.  along (n - 1, edges, 5): opening command w in V, Q in m3/s, dQ/dw in
+    m3/s/V, dQ/ddp in m3/s/Pa, standard deviation of Q; all but w are 0 where shut, all NaN where
+    the record has a gap or the point is off the grid.  cell (n - 1, edges): grid cell or -1.
+    """
+    e = engine[0]
+    for k in range(len(chunk)):
+        whole, joined, _ = take(e, chunk, k)
+        sample, flags = e.sample, int(e.sample[1])
+        if joined:
+            _map_at(e, theta, cov, along[k - 1], cell[k - 1])
+            remember(e, sample)
+            continue
+        if k > 0:
+            along[k - 1] = np.nan
+            cell[k - 1] = SHUT
+        e.running = 0
+        if whole and (flags & ROW_FLAG) != 0:
+            begin(e, sample)
+
+
+@part
+def _map_at(e: Any, theta: FloatArray, cov: FloatArray, along: FloatArray, cell: IntArray) -> None:
+    """Q and its slopes at the mean working point of each edge, by the terms of its block."""
+    for i in range(e.n_edges):
+        e.cell[i, 0], e.cell[i, 1] = e.target[i, 0], e.target[i, 1]
+        along[i] = 0.0
+        along[i, 0] = e.direction[i] * e.values[e.command[i]]
+        cell[i] = SHUT
+        if e.cell[i, 0] == SHUT:
+            continue
+        iu, ip = e.cell[i, 0], e.cell[i, 1]
+        at = e.first_cell[i] + iu * e.n_dp[i] + ip
+        cell[i] = at
+        mean_terms(e, i, iu, ip)
+        th, phi = theta[at], e.phi
+        hu = 2.0 / (e.u_border[i, iu + 1] - e.u_border[i, iu])
+        hp = 2.0 / (e.dp_border[i, ip + 1] - e.dp_border[i, ip])
+        q, variance = 0.0, 0.0
+        for j in range(TERMS):
+            q += phi[j] * th[j]
+            if len(cov) > 0:
+                for m in range(TERMS):
+                    variance += phi[j] * cov[at, j, m] * phi[m]
+        along[i, 0] = e.moments[i, 0]
+        along[i, 1] = q
+        along[i, 2] = hu * (th[1] + 2.0 * th[3] * phi[1] + th[5] * phi[2])
+        along[i, 3] = hp * (th[2] + 2.0 * th[4] * phi[2] + th[5] * phi[1])
+        along[i, 4] = math.sqrt(max(0.0, variance))
