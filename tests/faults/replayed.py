@@ -1,7 +1,7 @@
 """A daemon that hears a trace again and again, faster: `python -m tests.faults.replayed`.
 
 Arguments: PROJECT TRACE STATE SECONDS SPEED LOOPS.  The frames come from memory, so that none can
-be lost on a machine that has other work; stamps go on in the next loop.
+be lost on a machine that has other work; the next loop comes a second later.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from firmware_bridge.sources.live import LiveSource
 from rtid.daemon import log
 from rtid.daemon.daemon import Bus, Daemon, stopped_by_signals
 from rtid.project import load
+from tests.faults.sender import PAUSE_S
 
 PIECE = 300  # frames
 
@@ -57,7 +58,7 @@ def _pieces(frames: Frames, seconds: float, loops: int) -> Iterator[Frames]:
         for part in frames.chunks(PIECE):
             again = part[:]
             yield Frames(
-                again.t_us + round(k * seconds * 1e6),
+                again.t_us + round(k * (seconds + PAUSE_S) * 1e6),
                 again.channel, again.can_id, again.length, again.data,
             )  # fmt: skip
 

@@ -1,7 +1,7 @@
 """Frames of a trace over udp_multicast, from a process of its own: `python -m tests.faults.sender`.
 
 Arguments: TRACE GROUP SECONDS SPEED LOOPS FLOOD_HZ.  Datagrams are those of python-can, made
-beforehand; stamps are the trace's, and go on in the next loop.  FLOOD_HZ frames per second of other
+beforehand; stamps are the trace's, and the next loop comes a second later.  FLOOD_HZ frames per second of other
 identifiers come with them.  Prints the number of the trace's frames that were sent.
 """
 
@@ -18,6 +18,7 @@ from firmware_bridge.frames import Frames
 from firmware_bridge.sources import open_log
 from firmware_bridge.sources.udp import PORT
 
+PAUSE_S = 1.0  # between two loops: the machine does not jump back to its start
 PIECE_S = 0.002  # what is due is sent so often
 
 
@@ -57,7 +58,7 @@ def main() -> None:
     frames = open_log(Path(trace))
     at_s = (frames.t_us - frames.t_us[0]) * 1e-6
     frames, at_s = frames[at_s < float(seconds)], at_s[at_s < float(seconds)]
-    pieces = [datagrams(frames, k * float(seconds)) for k in range(int(loops))]
+    pieces = [datagrams(frames, k * (float(seconds) + PAUSE_S)) for k in range(int(loops))]
     out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 1)
     foreign, flooded = datagrams(_foreign(frames[:100]), 0.0), 0
@@ -65,7 +66,7 @@ def main() -> None:
     for k, piece in enumerate(pieces):
         n = 0
         while n < len(piece):
-            now_s = (time.monotonic() - start_s) * float(speed) - k * float(seconds)
+            now_s = (time.monotonic() - start_s) * float(speed) - k * (float(seconds) + PAUSE_S)
             while n < len(piece) and at_s[n] <= now_s:
                 out.sendto(piece[n], (group, PORT))
                 n += 1
