@@ -1,8 +1,8 @@
 """Frames of a trace over udp_multicast, from a process of its own: `python -m tests.faults.sender`.
 
 Arguments: TRACE GROUP SECONDS SPEED LOOPS FLOOD_HZ.  Datagrams are those of python-can, made
-beforehand; stamps are the trace's, and the next loop comes a second later.  FLOOD_HZ frames per second of other
-identifiers come with them.  Prints the number of the trace's frames that were sent.
+beforehand; stamps are the trace's, and the next loop comes a second later.  FLOOD_HZ frames per
+second of other identifiers come with them.  Prints the number of the trace's frames that were sent.
 """
 
 from __future__ import annotations
