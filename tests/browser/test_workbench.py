@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
 from rtid.mapfiles import read_map
 from rtid.project import load
-from tests.browser.conftest import DURATION_S, Opened
+from tests.browser.conftest import DURATION_S, Opened, open_page
+from tests.ui.served import served
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
 
 pytestmark = pytest.mark.slow
 NAMED = "#verdict button.main[data-do=add]"
@@ -100,6 +105,37 @@ def test_the_block_with_the_largest_error_lights_its_spans(opened: Opened) -> No
     page.wait_for_selector("text=Click a block")
 
 
+def test_a_time_span_outlines_its_blocks(opened: Opened) -> None:
+    opened.go("where")
+    page = opened.page
+    page.wait_for_selector("#where_says b")
+    page.keyboard.press("s")
+    page.wait_for_selector("#where_tools [data-mode=span][aria-pressed=true]")
+    box = page.evaluate(STRIP)
+    page.mouse.move(box["x"] + 0.3 * box["width"], box["y"] + 0.5 * box["height"])
+    page.mouse.down()
+    page.mouse.move(box["x"] + 0.35 * box["width"], box["y"] + 0.5 * box["height"], steps=5)
+    page.mouse.up()
+    page.wait_for_selector("#where_says >> text=the valves were in")
+    count = int(re.findall(r"(\d+) blocks", page.locator("#where_says").inner_text())[0])
+    outlined = page.evaluate(
+        "() => [...Bokeh.documents[0].all_models].filter(m => m.type === 'ColumnDataSource' &&"
+        " m.data.x && m.data.y && Object.keys(m.data).length === 2)"
+        ".reduce((sum, m) => sum + m.data.x.length, 0)"
+    )
+    assert 1 <= outlined == count
+    page.keyboard.press("Escape")
+    page.keyboard.press("z")
+
+
+STRIP = """() => {
+  const find = (views) => { for (const v of views) {
+    if (v.model.type === "Figure" && v.model.title.text.startsWith("residual of chamber")) return v;
+    const inner = find(v.child_views || []); if (inner) return inner; } };
+  const view = find(Object.values(Bokeh.index.roots || Bokeh.index));
+  const box = view.canvas_view.el.getBoundingClientRect(), frame = view.frame.bbox;
+  return { x: box.x + frame.x, y: box.y + frame.y, width: frame.width, height: frame.height };
+}"""
 LARGEST = """() => {
   let best = null;
   for (const m of Bokeh.documents[0].all_models) {
@@ -169,6 +205,18 @@ def test_from_the_verdict_to_the_falling_bar_and_back(
     page.keyboard.press("4")
     page.wait_for_function(f"() => document.querySelectorAll('{BARS}').length === 2")
     assert errors(opened)[1] == pytest.approx(second, rel=0.02)
+
+
+def test_a_record_that_cannot_be_read_is_said_in_words(
+    browser: Browser, recorded: tuple[Path, Path], tmp_path: Path
+) -> None:
+    trace = tmp_path / "empty.parquet"
+    trace.write_bytes(b"")
+    with served(project=recorded[1], trace=trace) as bench:
+        for failed in open_page(browser, bench):
+            failed.page.goto(bench.url)
+            failed.page.wait_for_selector("#cover >> text=This record cannot be shown")
+            assert "empty.parquet" in failed.page.locator("#cover").inner_text()
 
 
 def test_keys_and_the_dark_page(opened: Opened) -> None:
