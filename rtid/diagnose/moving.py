@@ -1,10 +1,13 @@
 """Gauss-Newton over what is not linear: lag, timings, shapes of effects, and what weighs the rows.
 
-A step follows the derivative columns of a fit, bounded; one that makes the misfit larger is halved.
+A step follows the derivative columns of a fit, shortened as a whole where one parameter would go
+too far: parameters that do nearly the same move together.  One that makes the misfit larger is
+halved.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -12,6 +15,7 @@ import numpy as np
 
 from rtid.diagnose.candidates import Candidate
 from rtid.diagnose.causes import cause_of
+from rtid.diagnose.regression import Estimate
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.timing import Psi, Timing
 from rtid.estimator.state import Weights
@@ -43,18 +47,18 @@ class Step:
 
 def moved(found: Fit) -> Step | None:
     """Where the derivatives point; None where nothing is left to move."""
-    old = found.revision
+    old, way = found.revision, _Way.of(found)
     timings = tuple(
-        (timing, _timed(found, k, timing, psi)) for k, (timing, psi) in enumerate(old.timings)
+        (timing, way.timed(k, timing, psi)) for k, (timing, psi) in enumerate(old.timings)
     )
-    effects = tuple(_reshaped(found, effect) for effect in old.effects)
+    effects = tuple(way.reshaped(effect) for effect in old.effects)
     sizes = tuple(
         (e, found.estimate.value(found.column(o)))
         for e, o in zip(effects, old.effects, strict=True)
     )
     weights = found.weights
     if found.rho < FAR:
-        weights = replace(weights, lag_s=_lag_s(found), compliance=_compliance(found))
+        weights = replace(weights, lag_s=way.lag_s(), compliance=_compliance(found))
     is_same = (timings, effects) == (old.timings, old.effects) and _weigh_alike(sizes, old.sizes)
     is_same &= weights.lag_s == found.weights.lag_s
     is_same &= weights.compliance is found.weights.compliance
@@ -111,45 +115,82 @@ def _weigh_alike(
     return len(one) == len(other) and np.allclose(one, other, rtol=SIZED, atol=0.0)
 
 
-def _least(found: Fit, column: int) -> float:
-    """The step of a column's parameter that is within its uncertainty."""
-    return SETTLED * float(np.sqrt(max(1.0, found.rho))) * found.estimate.sd(column)
-
-
-def _lag_s(found: Fit) -> float:
-    lag, now, at = found.model.lag, found.weights.lag_s, found.first_given
-    if found.revision.replaces_lag or lag.tolerance_s == 0.0:
-        return now
-    most = lag.nominal_s + LAG_REACH * lag.tolerance_s
-    target = float(np.clip(now + found.estimate.value(at), 0.0, most))
-    return target if abs(target - now) > max(_least(found, at), LEAST_LAG_S) else now
-
-
 def _compliance(found: Fit) -> FloatArray:
     low, high = sorted(1.0 / bound for bound in found.model.beta_bounds_pa)
     target, now = np.clip(found.compliance, low, high), found.weights.compliance
     return now if np.allclose(target, now, rtol=SIZED, atol=0.0) else target
 
 
-def _timed(found: Fit, k: int, timing: Timing, psi: Psi) -> Psi:
-    new = []
-    for j, (value, at) in enumerate(zip(psi, found.timing_columns(k), strict=True)):
-        reach = REACH * max(abs(value), abs(timing.bank[0][j]) * 0.1)
-        step = float(np.clip(found.estimate.value(at), -reach, reach))
-        target = float(np.clip(value + step, timing.low[j], timing.high[j]))
-        is_far = abs(target - value) > max(_least(found, at), LEAST_SHARE * abs(value))
-        new.append(target if is_far else value)
-    return tuple(new)
+@dataclass(frozen=True)
+class _Way:
+    """Where a fit's derivatives point, and the share of it that may be gone at once."""
 
+    found: Fit
+    estimate: Estimate
+    share: float = 1.0
 
-def _reshaped(found: Fit, effect: Candidate) -> Candidate:
-    """An effect with its nonlinear parameters moved by what their derivatives took."""
-    size, shape = found.estimate.value(found.column(effect)), list(effect.shape)
-    cause = cause_of(found.view, effect)
-    if size == 0.0:
-        return effect
-    for k, at in found.shape_columns(effect).items():
-        step, reach = found.estimate.value(at) / size, SHAPE_REACH * cause.spacing(k)
-        if abs(step) > max(_least(found, at) / abs(size), LEAST_SPACING * cause.spacing(k)):
-            shape[k] = float(np.clip(shape[k] + np.clip(step, -reach, reach), *cause.bounds(k)))
-    return replace(effect, shape=tuple(shape))
+    @classmethod
+    def of(cls, found: Fit) -> _Way:
+        """A declared lag that would leave its range stays, and the others go without it."""
+        way = cls(found, found.estimate)
+        if not found.revision.replaces_lag and way._lag_leaves():
+            used = tuple(k for k in found.estimate.used if k != found.first_given)
+            way = cls(found, found.regression.fit(used))
+        return replace(way, share=min([1.0, *way._shares()]))
+
+    def lag_s(self) -> float:
+        """The declared lag to go on with."""
+        now, at = self.found.weights.lag_s, self.found.first_given
+        if self.found.revision.replaces_lag or at not in self.estimate.used:
+            return now
+        if self.found.model.lag.tolerance_s == 0.0:
+            return now
+        step = self.share * self.estimate.value(at)
+        target = float(np.clip(now + step, 0.0, self._most_lag_s))
+        return target if abs(target - now) > max(self._least(at), LEAST_LAG_S) else now
+
+    def timed(self, k: int, timing: Timing, psi: Psi) -> Psi:
+        """The parameters of timing k to go on with."""
+        new = []
+        for j, (value, at) in enumerate(zip(psi, self.found.timing_columns(k), strict=True)):
+            target = value + self.share * self.estimate.value(at)
+            target = float(np.clip(target, timing.low[j], timing.high[j]))
+            is_far = abs(target - value) > max(self._least(at), LEAST_SHARE * abs(value))
+            new.append(target if is_far else value)
+        return tuple(new)
+
+    def reshaped(self, effect: Candidate) -> Candidate:
+        """An effect with its nonlinear parameters moved by what their derivatives took."""
+        size, shape = self.estimate.value(self.found.column(effect)), list(effect.shape)
+        cause = cause_of(self.found.view, effect)
+        for k, at in self.found.shape_columns(effect).items() if size else ():
+            step = self.share * self.estimate.value(at) / size
+            if abs(step) > max(self._least(at) / abs(size), LEAST_SPACING * cause.spacing(k)):
+                shape[k] = float(np.clip(shape[k] + step, *cause.bounds(k)))
+        return replace(effect, shape=tuple(shape))
+
+    @property
+    def _most_lag_s(self) -> float:
+        lag = self.found.model.lag
+        return lag.nominal_s + LAG_REACH * lag.tolerance_s
+
+    def _lag_leaves(self) -> bool:
+        target = self.found.weights.lag_s + self.estimate.value(self.found.first_given)
+        return not 0.0 <= target <= self._most_lag_s
+
+    def _least(self, column: int) -> float:
+        """The step of a column's parameter that is within its uncertainty."""
+        return SETTLED * float(np.sqrt(max(1.0, self.found.rho))) * self.estimate.sd(column)
+
+    def _shares(self) -> Iterator[float]:
+        """What each parameter admits of the step."""
+        for k, (timing, psi) in enumerate(self.found.revision.timings):
+            for j, (value, at) in enumerate(zip(psi, self.found.timing_columns(k), strict=True)):
+                reach = REACH * max(abs(value), abs(timing.bank[0][j]) * 0.1)
+                yield reach / max(abs(self.estimate.value(at)), 1e-300)
+        for effect in self.found.revision.effects:
+            size = abs(self.estimate.value(self.found.column(effect)))
+            cause = cause_of(self.found.view, effect)
+            for k, at in self.found.shape_columns(effect).items():
+                step = abs(self.estimate.value(at)) / max(size, 1e-300)
+                yield SHAPE_REACH * cause.spacing(k) / max(step, 1e-300)
