@@ -70,6 +70,7 @@ class Daemon:
         self._log_every_s = log_every_s
         self._loop: Loop | None = None
         self._keeper: Keeper | None = None
+        self._stopping = False
         self._answers: deque[Answer] = deque()  # of the helpers, for the keeper
 
     @property
@@ -78,7 +79,8 @@ class Daemon:
         return self._keeper.status if self._keeper is not None else None
 
     def stop(self) -> None:
-        """End in good order, from any thread or a signal handler."""
+        """End in good order, from any thread or a signal handler, also before the bus is open."""
+        self._stopping = True
         if self._loop is not None:
             self._loop.stop()
 
@@ -128,7 +130,8 @@ class Daemon:
         logger.info("running %s on %s %s at %g Hz", self._project.name, self._bus.interface,
                     self._bus.channel, rate_hz)  # fmt: skip
         try:
-            loop.run()
+            if not self._stopping:
+                loop.run()
         except BaseException:
             self._dump(core)
             raise

@@ -102,7 +102,12 @@ class Helper:
         """Start the process and feed it until it ends or nothing more is to be done."""
         ours, theirs = pair()
         command = [*self._command, str(theirs), *self._arguments]
-        self.process = subprocess.Popen(command, pass_fds=[theirs], stdin=subprocess.DEVNULL)
+        self.process = subprocess.Popen(
+            command,
+            pass_fds=[theirs],
+            stdin=subprocess.DEVNULL,
+            process_group=0,  # Ctrl-C is for the daemon, which ends its helpers in good order
+        )
         os.close(theirs)
         pipe = Pipe(ours)
         listener = threading.Thread(target=self._listen, args=(pipe,), daemon=True)

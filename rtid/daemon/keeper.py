@@ -197,7 +197,7 @@ class Keeper:
         self.alarms.put("overload", "loop", text if lost > OVERLOAD * loop.rate_hz else "")
         if time.monotonic() - self._told_s >= self._facts.log_every_s - 0.5:
             self._told_s = time.monotonic()
-            logger.info(line(self.status))
+            logger.info("status %s", line(self.status))
         if not self._is_ready and self._core.samples:
             self._is_ready = True
             self._core.notifier.tell("READY=1", "STATUS=learning")

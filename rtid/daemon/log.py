@@ -1,7 +1,7 @@
 """Log lines "time level name key=value ...", and no flood of them.
 
-The same message is written at most BURST times per INTERVAL_S; what was held back is counted in the
-next one that is written.
+The same message, known by its template, is written at most BURST times per INTERVAL_S; what was
+held back is counted in the next one that is written.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import logging
 import sys
 import time
 
-BURST, INTERVAL_S = 5, 10.0
+BURST, INTERVAL_S = 15, 10.0
 logger = logging.getLogger("rtid")
 
 

@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -40,7 +41,13 @@ def test_the_unit_is_sandboxed(tmp_path: Path) -> None:
 
 def test_the_unit_waits_for_samples_and_is_watched() -> None:
     text = UNIT.read_text("utf-8")
-    for line in ("Type=notify", "WatchdogSec=5", "Restart=always", "TimeoutStartSec=infinity"):
+    for line in (
+        "Type=notify",
+        "WatchdogSec=5",
+        "Restart=always",
+        "KillMode=mixed",
+        "TimeoutStartSec=infinity",
+    ):
         assert line in text
 
 
@@ -56,6 +63,21 @@ def test_a_bus_that_cannot_be_opened_is_a_plain_error(tmp_path: Path) -> None:
                     str(tmp_path / "state"))  # fmt: skip
     assert found.returncode == 3, found.stderr
     assert "/dev/no_such_port" in found.stderr and "Traceback" not in found.stderr
+
+
+def test_a_stop_before_the_bus_is_open_is_heard(tmp_path: Path) -> None:
+    """SIGTERM while kernels are being loaded."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "rtid", "run", str(PROJECT), "--bus", "virtual:stop", "--test-bus",
+         "--state", str(tmp_path)],
+        stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    while not (tmp_path / "lock").exists():
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.terminate()
+    _, said = process.communicate(timeout=120)
+    assert process.returncode == 0 and "stopped" in said
 
 
 def test_status_of_no_daemon(tmp_path: Path) -> None:
