@@ -161,8 +161,11 @@ class Desk:
 
     def drop(self, effect: str, where: str) -> Added:
         """The newest revision without one of its effects."""
-        last, present = self._stack[-1], self._standing()
-        gone = next(s for s in last.sections if s.key == (effect, where))
+        last = self._stack[-1]
+        gone = next((s for s in last.sections if s.key == (effect, where)), None)
+        if gone is None:
+            raise RtidError(f"{effect} at {where} is not part of the model")
+        present = self._standing()
         kept = tuple(s for s in last.sections if s is not gone)
         self._progress("fitting without it", 0.2)
         after = stand(self._machine, *self._chunks, _parts(kept))

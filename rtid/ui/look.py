@@ -1,14 +1,11 @@
 """One revision of the model held against a record: plain arrays, from which pictures are made.
 
-A revision with effects is learned like the first one, from the record behind its timings, with the
-flow of its effects as known shared terms (`compare.with_extra_flow`).
+A revision with effects is learned beside them (`compare.beside`), as `rtid compare` does it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-
-import numpy as np
 
 from rtid.compare import (
     HORIZONS_S,
@@ -24,17 +21,14 @@ from rtid.compare import (
     simulate,
     smooth_position,
 )
-from rtid.compare.extra import with_extra_flow
+from rtid.compare.beside import acting, learn_beside
 from rtid.compare.simulation import why_no_free_run
 from rtid.comparing import parts_of
-from rtid.diagnose.causes import causes
+from rtid.diagnose.clean import usable
 from rtid.diagnose.fit import Fit
-from rtid.diagnose.residual import effect_values, transformed_like
-from rtid.diagnose.view import View
 from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.published import publish
-from rtid.estimator.record import fit_record
-from rtid.model import FloatArray, Lag, Model
+from rtid.model import FloatArray, Model
 from rtid.replay import Replay
 
 
@@ -86,22 +80,8 @@ def look(result: Replay) -> Look:
 
 
 def revised(first: Replay, fit: Fit) -> Replay:
-    """The record learned from anew, with the effects and timings of a fitted revision."""
-    sent, model = transformed_like(fit, first.chunk), fit.model
-    if fit.revision.replaces_lag:
-        model = replace(model, lag=Lag())
-    extra = extra_flow(fit, sent) if fit.revision.effects else None
-    model, _, chunk = with_extra_flow(model, np.zeros(len(model.terms)), sent, extra)
-    result = replace(first, model=model, chunk=chunk)
-    return replace(result, fit=fit_record(model, result.part(first.identification_s)))
-
-
-def extra_flow(fit: Fit, sent: FloatArray) -> FloatArray:
-    """What the effects of a revision add to every chamber (n - 1, chambers), m3/s."""
-    view = View.of(fit.model, sent, fit.weights, fit.map)
-    flow = np.zeros((view.n - 1, len(fit.model.chambers)))
-    for effect, value in effect_values(fit):
-        cause = next(k for k in causes(view) if k.makes(effect))
-        for c, volume in cause.column(effect.shape).items():
-            flow[:, c] += value * volume / view.dt_s
-    return flow
+    """The record learned from anew, beside the effects and timings of a fitted revision."""
+    machine = acting(fit, usable(fit.declared, first.chunk))
+    result = replace(first, model=machine.model, chunk=machine.chunk)
+    record = learn_beside(fit, machine, result.part(first.identification_s))
+    return replace(result, fit=record)

@@ -56,7 +56,7 @@ class Page:
         self.doc, self.session, self.live = doc, session, live
         self._sent: dict[str, str] = {}
         self._is_open = False
-        self._seen, self._beats = "", 0
+        self._seen, self._beats, self._moves = "", 0, 0
         self._view = "live" if session.trace is None else "compare"
         self._channel = Channel(name="channel")
         self._roots = {name: column(name=name, sizing_mode="stretch_both") for name in ROOTS}
@@ -137,17 +137,25 @@ class Page:
             self._refresh("view")
         elif what == "seen":
             self._seen = asked.get("number", "")
-        elif what == "add" and "effect" not in asked:
-            self._add_named()
+        elif what == "add":
+            self._add(asked)
         elif what in SESSION_ACTIONS:
             SESSION_ACTIONS[what](self.session, asked)
         elif self._desk is not None:
             self._desk.take(what, asked)
 
-    def _add_named(self) -> None:
-        key = self.session.named
-        if key is not None:
-            self.session.add(*key)
+    def _add(self, asked: dict[str, str]) -> None:
+        """Add what is asked for, or what is named, and show where the error falls."""
+        named = self.session.named
+        if "effect" in asked:
+            self.session.add(asked["effect"], asked.get("where", ""))
+        elif named is not None:
+            self.session.add(*named)
+        else:
+            return
+        self._view, self._moves = "add", self._moves + 1
+        self._channel.show = f"add {self._moves}"
+        self._refresh("view")
 
     def _beat(self) -> None:
         """Five times a second: the live page, where it is looked at.
@@ -163,8 +171,7 @@ class Page:
 
 
 SESSION_ACTIONS: dict[str, Callable[[Session, dict[str, str]], None]] = {
-    "add": lambda s, a: s.add(a["effect"], a.get("where", "")),
-    "drop": lambda s, a: s.drop(a["effect"], a.get("where", "")),
+    "drop": lambda s, a: s.drop(a.get("effect", ""), a.get("where", "")),
     "undo": lambda s, a: s.undo(),
     "save": lambda s, a: s.save(),
     "export": lambda s, a: s.export(a.get("what", "")),

@@ -175,7 +175,9 @@ def test_from_the_verdict_to_the_falling_bar_and_back(
     page.wait_for_selector(BARS)
     before = errors(opened)
     assert len(before) == 1
+    page.keyboard.press("1")
     page.click(NAMED)
+    page.wait_for_selector("#add.shown")  # where the error can be seen to fall
     page.wait_for_function(f"() => document.querySelectorAll('{BARS}').length === 2")
     page.wait_for_timeout(1200)  # the bar's own motion
     first, second = errors(opened)
