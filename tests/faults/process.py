@@ -74,11 +74,13 @@ class Daemon:
 
     def analyst(self) -> int:
         """Process id of its helper."""
-        found = subprocess.run(
-            ["pgrep", "-P", str(self.process.pid), "-f", "rtid.daemon.analyst"],
-            capture_output=True, text=True, check=True,
-        )  # fmt: skip
-        return int(found.stdout.split()[0])
+        for stat in Path("/proc").glob("[0-9]*/stat"):
+            with contextlib.suppress(OSError):
+                parent = int(stat.read_text("ascii").rsplit(")", 1)[1].split()[1])
+                command = stat.with_name("cmdline").read_bytes()
+                if parent == self.process.pid and b"rtid.daemon.analyst" in command:
+                    return int(stat.parent.name)
+        raise AssertionError("the daemon has no analyst")
 
 
 def a_group() -> str:
