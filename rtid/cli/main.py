@@ -36,6 +36,7 @@ COMMANDS = {
     "undo": "Take the last change of the model back.",
     "history": "List what was added to the model and dropped, and what it brought.",
     "export": "Write the learned maps as CSV, JSON or npz.",
+    "paper": "Reproduce the figures and tables of the paper, beside its numbers.",
 }
 
 OUR_PACKAGES = ("rtid", "firmware_bridge")  # their own error classes are meant for the user
