@@ -28,6 +28,7 @@ CHANNEL = f"239.74.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"  # one for each
 SEED = 3
 SOAK_S, SHORT_S = 60.0, 8.0
 START_S = 90.0  # of a cold daemon on a loaded machine
+END_S = 60.0
 UPDATES = "() => Number(document.querySelector('#seen').textContent)"
 MEMORY = "() => performance.memory.usedJSHeapSize / 1e6"
 
@@ -37,6 +38,16 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("live")
     run = simulate(draw(SEED), "rich", SEED, 2.0)
     return write_run(folder / "m.parquet", run, SEED, "rich")[2]
+
+
+def end(process: subprocess.Popen[bytes]) -> None:
+    """Ask it to end, and see to it where a loaded machine takes too long."""
+    process.terminate()
+    try:
+        process.wait(END_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
 
 
 @pytest.fixture(scope="module")
@@ -51,8 +62,7 @@ def machine(project: Path) -> Iterator[Path]:
     with ExitStack() as stack:
         for command in (run, speak):
             process = subprocess.Popen(command, **quiet)  # type: ignore[call-overload]
-            stack.callback(process.wait, 20)
-            stack.callback(process.terminate)
+            stack.callback(end, process)
         yield state
 
 
