@@ -193,7 +193,7 @@ def _white_noise(samples: Samples, signal: Signal) -> float:
     found = estimate_noise(1e-6 * samples.t_us, samples.column(signal.name))
     if not np.isfinite(found.relative_sd):
         raise NoSamplesError(
-            f"{len(samples)} samples are too few to estimate the noise of {signal.name}",
+            f"{len(samples)} samples do not tell the noise of {signal.name}",
             f"give signals.{signal.name}.noise in the project file",
         )
     return float(np.sqrt(max(0.0, found.sd**2 - signal.resolution**2 / 12)))

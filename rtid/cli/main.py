@@ -19,6 +19,7 @@ from rtid.cli.exits import Exit
 
 COMMANDS = {
     "demo": "Learn the maps of a simulated machine from its CAN frames: the whole story.",
+    "quick": "Judge a file without a project file: good enough, and what is missing.",
     "init": "Write a project file from a DBC or a table, with proposed roles.",
     "check": "Judge a project file against a trace: rates, gaps, ranges, signs, units.",
     "run": "Learn on board from a live bus: the daemon.",

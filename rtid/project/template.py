@@ -105,8 +105,8 @@ def _edges(roles: dict[str, Candidate]) -> Iterator[str]:
     unit = (find_unit(u.unit) if u else None) or find_unit("V")
     pressure = (find_unit(p.unit) if p else None) or find_unit("bar")
     assert unit is not None and pressure is not None
-    u_max = _nice(max(abs(u.low), abs(u.high)) if u else 0.0, 10.0)
-    p_max_mpa = _nice(max(p.high, 0.0) * pressure.factor * 1e-6 if p else 0.0, 10.0)
+    u_max = nice(max(abs(u.low), abs(u.high)) if u else 0.0, 10.0)
+    p_max_mpa = nice(max(p.high, 0.0) * pressure.factor * 1e-6 if p else 0.0, 10.0)
     yield from (
         "",
         "[edge_defaults]  # borders of the blocks of each flow map; the spacing may be unequal",
@@ -135,7 +135,7 @@ def _priors() -> Iterator[str]:
     )
 
 
-def _nice(size: float, otherwise: float) -> float:
+def nice(size: float, otherwise: float) -> float:
     """The next round number from `size` on."""
     if not (math.isfinite(size) and size > 0):
         return otherwise

@@ -1,0 +1,59 @@
+"""`rtid quick FILE`: without a project file; is this data good enough, and what is missing."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rtid.cli.exits import Exit, refuse_truncated
+
+
+def quick(
+    file: Annotated[Path, typer.Argument(help="Table (.csv .parquet .mat) or CAN log.")],
+    dbc: Annotated[
+        Path | None, typer.Option(help="DBC of a CAN log; the built-in one without it.")
+    ] = None,
+    bore_mm: Annotated[
+        float | None, typer.Option("--bore", min=1.0, help="Piston diameter, mm.")
+    ] = None,
+    rod_mm: Annotated[float | None, typer.Option("--rod", min=0.0, help="Rod, mm.")] = None,
+    stroke_mm: Annotated[
+        float | None, typer.Option("--stroke", min=1.0, help="Stroke, mm.")
+    ] = None,
+    dead_volume_l: Annotated[
+        float | None,
+        typer.Option("--dead-volume", min=1e-4, help="Volume left at either end, hoses too, L."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Say within a minute whether this data is good enough, and which effect is missing.
+
+    Guesses the roles of the signals by name, unit and range, takes the grids from the data, and
+    states what it assumes of the machine.  Exit code 3: the file cannot be read, or has no signal
+    for a role that is needed; 4: it is read, and too little for a verdict.
+    """
+    from rtid.errors import RtidError
+    from rtid.present import progress_bar
+    from rtid.quick import quick as look
+    from rtid.quick_machine import Given
+    from rtid.quick_text import lines
+
+    if bore_mm is not None and rod_mm is not None and rod_mm >= bore_mm:
+        raise RtidError("--rod is not thinner than --bore", "give diameters in mm", Exit.USAGE)
+    bore_m, rod_m, stroke_m, dead_volume_m3 = (
+        None if value is None else 1e-3 * value
+        for value in (bore_mm, rod_mm, stroke_mm, dead_volume_l)
+    )
+    given = Given(bore_m, rod_m, stroke_m, dead_volume_m3)
+    with progress_bar(hidden=as_json) as progress:
+        found = look(file, dbc, given, progress)
+    if as_json:
+        print(json.dumps(found.as_json()))
+    else:
+        print("\n".join(lines(found)))
+    refuse_truncated(file, {"truncated": int(found.truncated)})
+    if not found.is_enough:
+        raise typer.Exit(Exit.NEGATIVE)

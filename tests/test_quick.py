@@ -1,0 +1,268 @@
+"""`rtid quick`: roles, signs and sizes guessed, data judged, verdicts on simulated records."""
+
+from __future__ import annotations
+
+import io
+import json
+import subprocess
+from contextlib import redirect_stderr, redirect_stdout
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from firmware_bridge.samples import ROW, Samples
+from firmware_bridge.sources.table import read_table
+from rtid.cli.exits import Exit
+from rtid.cli.main import run
+from rtid.project import load
+from rtid.project.proposal import Candidate
+from rtid.quick_machine import (
+    MOST_S,
+    Given,
+    dp_grid,
+    first_machine,
+    fitted_machine,
+    project_text,
+    shut_band,
+)
+from rtid.quick_source import open_source, roles_of
+from rtid.sim.hidden import hide_wish
+from rtid.sim.plant import Plant
+from rtid.sim.recording import write_run
+from rtid.sim.run import simulate
+
+LEAK, TRUTH = "internal_leakage_laminar", 2e-12
+SIZES = ("--bore", 50, "--rod", 36, "--stroke", 500, "--dead-volume", 0.6)
+
+
+def quick(*arguments: object) -> subprocess.CompletedProcess[str]:
+    """The command line in this process: exit code, stdout, stderr; a traceback is an error."""
+    out, err = io.StringIO(), io.StringIO()
+    words = ["quick", *map(str, arguments)]
+    with redirect_stdout(out), redirect_stderr(err), pytest.raises(SystemExit) as ended:
+        run(words)
+    code = ended.value.code
+    return subprocess.CompletedProcess(words, int(code or 0), out.getvalue(), err.getvalue())
+
+
+def told(*arguments: object) -> dict[str, Any]:
+    done = quick(*arguments, "--json")
+    assert done.returncode == Exit.OK, done.stdout + done.stderr
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A leaking machine on the bus and as a table, and a clean one."""
+    path = tmp_path_factory.mktemp("quick")
+    leaking = simulate(hide_wish(Plant(), f"{LEAK}=middle"), "rich", 5, 45.0)
+    write_run(path / "leak.blf", leaking, 5, "rich")
+    write_run(path / "leak.parquet", leaking, 5, "rich")
+    write_run(path / "clean.parquet", simulate(Plant(), "rich", 6, 45.0), 6, "rich")
+    return path
+
+
+@cache
+def columns(table: Path) -> dict[str, np.ndarray]:
+    return read_table(table).columns
+
+
+def as_csv(path: Path, **values: np.ndarray) -> Path:
+    rows = np.column_stack(list(values.values()))
+    header = ",".join(values).replace("_of_", " [").replace("__", "]")
+    np.savetxt(path, rows, fmt="%.9g", delimiter=",", header=header, comments="")
+    return path
+
+
+@pytest.mark.parametrize("name", ["leak.blf", "leak.parquet"])
+def test_a_leak_is_named_from_the_file_alone(folder: Path, name: str) -> None:
+    found = told(folder / name)
+    assert set(found["roles"]) == {"p_supply", "p_tank", "p_a", "p_b", "x", "v", "u"}
+    diagnosis = found["diagnosis"]
+    assert diagnosis["verdict"] == "missing"
+    (effect,) = diagnosis["found"]
+    assert (effect["effect"], effect["where"]) == (LEAK, "a-b")
+    assert effect["parameters"]["coefficient"]["value"] == pytest.approx(TRUTH, rel=0.2)
+    assert found["data"]["level"] in ("good", "fair")
+    assert len(found["cautions"]) == 1 and "--bore" in found["cautions"][0]
+
+
+def test_a_clean_machine_matches_in_plain_sentences(folder: Path) -> None:
+    done = quick(folder / "clean.parquet")
+    assert done.returncode == Exit.OK, done.stdout + done.stderr
+    text = done.stdout
+    assert "Verdict: matches." in text
+    assert "the bore is 50 mm (--bore): else every flow" in text
+    assert "Is this data good enough?" in text
+    assert "s with 1000 positions per second" in text
+    assert f"Next: rtid init {folder / 'clean.parquet'} -o machine.toml" in text
+    volumes = text.partition("Dead volumes, as fitted: ")[2].split()
+    assert [float(volumes[0]), float(volumes[5])] == pytest.approx([0.6, 0.6], rel=0.1)
+
+
+def test_an_area_only_scales(folder: Path) -> None:
+    """Twice the bore: four times the leak, the same verdict."""
+    one, two = (
+        told(folder / "leak.parquet", "--bore", bore, "--rod", rod)
+        for bore, rod in ((50, 36), (100, 72))
+    )
+    sizes = [d["diagnosis"]["found"][0]["parameters"]["coefficient"]["value"] for d in (one, two)]
+    assert sizes[1] / sizes[0] == pytest.approx(4.0, rel=0.01)
+    assert one["diagnosis"]["verdict"] == two["diagnosis"]["verdict"] == "missing"
+
+
+def test_what_is_given_is_not_assumed(folder: Path) -> None:
+    found = told(folder / "clean.parquet", *SIZES)
+    said = " ".join(a["what"] for a in found["assumptions"])
+    assert not any(option in said for option in SIZES if isinstance(option, str))
+    assert found["diagnosis"]["verdict"] == "matches"
+    assert found["diagnosis"]["added"] == []
+    assert found["dead_volume_m3"] == pytest.approx(0.6e-3)
+
+
+@pytest.mark.parametrize("what", ["x", "u", "chambers", "units"])
+def test_signs_and_units_are_found(folder: Path, tmp_path: Path, what: str) -> None:
+    c = columns(folder / "leak.parquet")
+    x, u, a, b = c["x"], c["u"], c["p_a"], c["p_b"]
+    if what == "x":
+        x = 0.5 - x
+    if what == "u":
+        u = -u
+    if what == "chambers":
+        a, b = b, a
+    path = as_csv(tmp_path / "t.csv", t=c["t"], u=u, x=x, p_a=a, p_b=b, p_supply=c["p_supply"])
+    if what == "units":
+        path = as_csv(
+            tmp_path / "t.csv", time=c["t"], valve=10 * u, Pos_of_mm__=1e3 * x, P1=a / 1e5,
+            P2=b / 1e5, Psys=c["p_supply"] / 1e5,
+        )  # fmt: skip
+    found = told(path)
+    assert [e["effect"] for e in found["diagnosis"]["found"]] == [LEAK]
+    turned = [a["what"] for a in found["assumptions"] if "the wiring" in a["if_wrong"]]
+    assert len(turned) == (what != "units")
+    if what == "units":
+        units = {role: one["unit"] for role, one in found["roles"].items()}
+        assert units == {"p_a": "bar", "p_b": "bar", "p_supply": "bar", "u": "%", "x": "mm"}
+
+
+GARBAGE = {
+    "noise.blf": b"\x93\x11" * 900,
+    "noise.parquet": b"\x93\x11" * 900,
+    "noise.csv": bytes(range(256)) * 9,
+    "noise.mat": b"\x93\x11" * 900,
+    "noise.xyz": b"\x93\x11" * 900,
+    "empty.csv": b"",
+    "empty.log": b"",
+    "roles.csv": b"t,foo,bar\n0,1,2\n1,2,3\n",
+    "row.csv": b"t,u,x,p_a,p_b\n0,1,2,3,4\n",
+    "time.csv": b"u,x,p_a,p_b\n0,1,2,3\n",
+    "nan.csv": b"t,u,x,p_a,p_b\n" + 99 * b"nan,nan,nan,nan,nan\n",
+    "angle.csv": b"t,u [V],x [deg],p_a [bar],p_b [bar]\n0,1,2,3,4\n1,2,3,4,5\n",
+    "back.csv": b"t,u,x,p_a,p_b\n" + b"".join(b"%d,1,2,3,4\n" % k for k in range(99, 0, -1)),
+}
+
+
+@pytest.mark.parametrize("name", GARBAGE)
+def test_garbage_is_refused_in_words(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(GARBAGE[name])
+    done = quick(tmp_path / name)
+    assert done.returncode == Exit.INPUT
+    assert done.stderr.lstrip().startswith("rtid: ")
+    assert name in done.stderr
+
+
+def test_what_is_missing_has_a_name(tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_bytes(GARBAGE["roles.csv"])
+    message = quick(tmp_path / "t.csv").stderr
+    for word in ("position of the piston (x)", "command of the valves (u)", "foo [?]"):
+        assert word in message
+
+
+@pytest.mark.parametrize(
+    ("still", "words"),
+    [
+        ("x", "x never changes"),
+        ("u", "u never changes"),
+        ("p_b", "p_b never changes"),
+        ("", "too little"),
+        ("way", "never opens"),
+    ],
+)
+def test_data_that_cannot_bear_a_verdict_end_with_4(
+    folder: Path, tmp_path: Path, still: str, words: str
+) -> None:
+    """A signal that stands still, five seconds of record, motion one way."""
+    c = columns(folder / "clean.parquet")
+    end = 20_000 if still else 5_000
+    values = {k: c[k][:end:4].copy() for k in ("t", "u", "x", "p_a", "p_b")}
+    if still in values:
+        values[still][:] = values[still][0]
+    if still == "way":
+        values["u"] = np.abs(values["u"])
+    done = quick(as_csv(tmp_path / "t.csv", **values))
+    assert done.returncode == Exit.NEGATIVE, done.stderr
+    assert words in done.stdout
+    assert "No verdict" in done.stdout
+
+
+def test_a_foreign_bus_needs_its_dbc(folder: Path, tmp_path: Path) -> None:
+    log = tmp_path / "other.log"
+    log.write_text("".join(f"({k}.0) can0 6AB#0011223344556677\n" for k in range(50)))
+    done = quick(log)
+    assert done.returncode == Exit.INPUT
+    assert "0x6AB" in done.stderr and "--dbc" in done.stderr
+    assert quick(log, "--dbc", folder / "none.dbc").returncode == Exit.INPUT
+    assert quick(folder / "leak.blf", "--bore", 30, "--rod", 40).returncode == Exit.USAGE
+
+
+def test_the_dead_band_is_half_of_where_motion_begins() -> None:
+    u = np.linspace(-10.0, 10.0, 20_001)
+    speed = np.maximum(0.0, np.abs(u) - 1.5) * 0.03
+    assert shut_band(u, speed) == pytest.approx(0.8, abs=0.1)
+    assert shut_band(u, 0.0 * speed) == 0.0
+    assert shut_band(np.abs(u), speed) == 0.0, "of one way nothing is known"
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.0, 6e6), (-3e4, 6e6), (-4e6, 6e6), (2e5, 2e5)])
+def test_the_grid_of_dp_holds_the_data(low: float, high: float) -> None:
+    borders = dp_grid(low, high)
+    assert borders[0] <= low and borders[-1] >= high
+    assert (np.diff(borders) > 0).all()
+
+
+def test_a_long_record_is_cut_to_where_it_moves(tmp_path: Path) -> None:
+    t = np.arange(0.0, 1000.0, 0.1)
+    x = 0.2 + 0.1 * np.sin(t) * ((t > 500) & (t < 620))
+    u = 5.0 * np.sin(t)
+    path = as_csv(tmp_path / "t.csv", t=t, u=u, x=x, p_a=3e6 + 1e5 * u, p_b=3e6 - 1e5 * u)
+    source = open_source(path, None)
+    roles = roles_of(path, source)
+    first = first_machine(roles, Given())
+    values = np.column_stack([u, x, 3e6 + 1e5 * u, 3e6 - 1e5 * u, 0 * t + 7e6, 0 * t + 1e5])
+    names = ("u", "x", "p_a", "p_b", "p_supply", "p_tank")
+    samples = Samples(names, (t * 1e6).astype(np.int64), values, np.full(len(t), ROW, np.uint8))
+    machine = fitted_machine(first, samples)
+    assert machine.span_s == pytest.approx((500.0, 500.0 + MOST_S), abs=3.0)
+    file = tmp_path / "m.toml"
+    file.write_text(project_text("m", source, roles, machine))
+    record = load(file).sections.record
+    assert record.identification_s is not None and record.validation_s is not None
+    assert record.validation_s[1] - record.identification_s[0] == pytest.approx(MOST_S)
+    assert "120 s with the most motion" in " ".join(a.what for a in machine.assumptions)
+
+
+def test_a_position_below_zero_is_moved(tmp_path: Path) -> None:
+    roles = {
+        "u": Candidate("u", "", "V", -8.0, 8.0),
+        "x": Candidate("x", "", "mm", -250.0, 240.0),
+        "p_a": Candidate("a", "", "bar", 1.0, 90.0),
+        "p_b": Candidate("b", "", "bar", 1.0, 90.0),
+    }
+    machine = first_machine(roles, Given())
+    assert machine.x_zero_m == pytest.approx(-0.25)
+    assert machine.stroke_m == pytest.approx(0.5)
+    assert any("fully retracted at x = -250 mm" in a.what for a in machine.assumptions)
