@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rtid.model import BASES, LAPPED, TAYLOR, FloatArray
+from rtid.paper.fig3_picture import draw
 from rtid.paper.function import THETA, grid, record
 from rtid.paper.result import Measure, Part, Table, at_most
 from rtid.paper.surface import errors, excess, jumps, learn, rms
@@ -24,8 +25,6 @@ SPACINGS = (  # name, spacing between u = 1 and 2, elsewhere
 
 def reproduce(seed: int = 0, spacings: Sequence[tuple[str, float, float]] = SPACINGS) -> Part:
     """Fig. 3 with its numbers; spacings: (name, spacing between 1 and 2, elsewhere) to compare."""
-    from rtid.paper.fig3_picture import draw  # noqa: PLC0415 - matplotlib only where it is wanted
-
     chunk = record(seed)
     found = {basis: learn(chunk, grid(FINE), basis) for basis in BASES}
     taylor, lapped = found[TAYLOR], found[LAPPED]

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rtid.errors import RtidError
-from rtid.paper import fig3
+from rtid.paper import fig3, fig4, fig5, table1
 from rtid.paper.result import Part, all_met
 
 PAPER = "IMECE2005-79420"
@@ -17,6 +17,9 @@ Maker = Callable[[int, int], Part]
 
 PARTS: dict[str, Maker] = {  # each is given the seed and the number of random plants
     "fig3": lambda seed, plants: fig3.reproduce(seed),
+    "fig4": lambda seed, plants: fig4.reproduce(seed),
+    "table1": table1.reproduce,
+    "fig5": lambda seed, plants: fig5.reproduce(seed),
 }
 SEED, PLANTS = 0, 30
 

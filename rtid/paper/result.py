@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from matplotlib.figure import Figure
+
+from rtid.pictures.style import save
 
 SUFFIXES = ("png", "svg")
 
@@ -29,8 +30,9 @@ class Measure:
 
     @property
     def text(self) -> str:
-        """Value and unit, three digits."""
-        return f"{self.value:.3g} {self.unit}".rstrip()
+        """Value and unit, three digits, whole numbers as they are."""
+        whole = float(self.value).is_integer()
+        return f"{self.value:{'.0f' if whole else '.3g'}} {self.unit}".rstrip()
 
 
 def at_most(name: str, value: float, limit: float, unit: str = "", paper: str = "") -> Measure:
@@ -41,7 +43,7 @@ def at_most(name: str, value: float, limit: float, unit: str = "", paper: str = 
 
 def at_least(name: str, value: float, limit: float, unit: str = "", paper: str = "") -> Measure:
     """A measure that must reach a limit."""
-    goal = f"at least {limit:g} {unit}".rstrip()
+    goal = f"at least {limit:.3g} {unit}".rstrip()
     return Measure(name, float(value), unit, paper, goal, bool(value >= limit))
 
 
@@ -76,8 +78,6 @@ class Part:
 
     def save(self, folder: Path) -> list[Path]:
         """Write the pictures as PNG and SVG; their paths."""
-        from rtid.pictures.style import save  # noqa: PLC0415 - matplotlib only where it is wanted
-
         return [
             save(figure, folder / f"{name}.{suffix}")
             for name, figure in self.pictures.items()

@@ -9,17 +9,17 @@ also counts what is steep, but continuous.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from rtid.estimator.flowmap import VALID, EdgeMap
-from rtid.estimator.published import publish
 from rtid.estimator.record import fit_record
 from rtid.estimator.solution import Solution
 from rtid.kernels.basis import window_terms_at
 from rtid.kernels.layout import TERMS
-from rtid.model import BASES, NONE, FloatArray, Grid
+from rtid.model import BASES, FloatArray, Grid
+from rtid.paper.alone import alone
 from rtid.paper.function import U_MAX, X_MAX, declared, true_value
 
 STEP = 0.01  # of the narrower block's width, over which a jump is measured
@@ -70,9 +70,7 @@ class Estimate:
 def learn(chunk: FloatArray, blocks: Grid, basis: str) -> Estimate:
     """The record path of the product on one grid with one basis."""
     solution = fit_record(declared(blocks, basis), chunk).solution
-    edge = replace(solution.model.edges[0], source=NONE)  # nothing says that f is an orifice
-    model = replace(solution.model, edges=(edge,))
-    return Estimate(basis, solution, publish(replace(solution, model=model)).edges[0])
+    return Estimate(basis, solution, alone(solution).edges[0])
 
 
 def errors(found: Estimate, known: float = np.inf) -> FloatArray:
