@@ -147,12 +147,14 @@ class Desk:
         """The newest revision with one effect more."""
         last = self._stack[-1]
         extension, result, seen = self._extension(effect, where)
+        against = "; ".join(extension.against)
+        reason = f"forced: {against}" if against else reason
         sections = extended(last.sections, extension, self._replay.trace.path.name, reason)
         solution = result.fit.solution
         self._stack.append(
             _Revision(sections, seen, solution, ADD, sections[-1], standing=extension.after)
         )
-        return Added(sections[-1], sections, seen, "; ".join(extension.against))
+        return Added(sections[-1], sections, seen, against)
 
     def back(self) -> None:
         """Forget the newest revision."""

@@ -33,6 +33,7 @@ class Revision:
     change: str = ""
     section: AddedSection | None = None
     told: Told | None = None
+    note: str = ""  # what speaks against the change
     is_saved: bool = False
 
 
@@ -177,10 +178,11 @@ class Session:
 
     def _added(self, change: str) -> Callable[[Added], None]:
         def added(result: Added) -> None:
-            revision = Revision(result.look, result.sections, change, result.section)
+            revision = Revision(
+                result.look, result.sections, change, result.section, note=result.note
+            )
             self.revisions.append(revision)
             self._is_adding = False
-            self.note = result.note
             self.tell("looks")
             self._diagnose()
 

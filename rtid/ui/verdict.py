@@ -36,8 +36,8 @@ def strip(session: Session) -> str:
     last = session.last
     if session.state == FAILED or session.trace is None:
         return ""
-    if last is not None and last.told is None and last.section is not None:
-        return _just_changed(last)
+    if last is not None and last.section is not None and (last.told is None or last.note):
+        return _changed(last)
     if last is None or last.told is None:
         heading = "Looking for what is missing" if last else "Opening the record"
         return f"<h1>{heading}</h1><p>{_waiting(session)}</p>"
@@ -58,8 +58,8 @@ def strip(session: Session) -> str:
     return f'<h1 class="{kind}">{text(heading)}</h1><p>{said}</p>{offer}'
 
 
-def _just_changed(last: Revision) -> str:
-    """The change, before the new model is diagnosed."""
+def _changed(last: Revision) -> str:
+    """The change, before the new model is diagnosed, and where something speaks against it."""
     from rtid.diagnosed_text import title  # noqa: PLC0415 - the live page needs none
 
     section = last.section
@@ -68,6 +68,11 @@ def _just_changed(last: Revision) -> str:
     words = f"{title(section.effect)} at {section.where}. " if section else ""
     if pair and pair.before is not None and pair.after is not None:
         words += f"The held-out error went from {pair.before:.2f} % to {pair.after:.2f} %. "
+    if last.note:
+        undo = "" if last.is_saved else button("Undo", "undo", kind="main")
+        return (
+            f'<h1 class="open">{heading}, against the evidence</h1><p>{text(last.note)}</p>{undo}'
+        )
     words += "Looking whether anything else is missing ..."
     return f'<h1 class="good">{heading}</h1><p>{text(words)}</p>{button("Undo", "undo")}'
 

@@ -11,6 +11,7 @@ from rtid.diagnose.report import Diagnosis, Effect, Value
 from rtid.errors import RtidError
 from rtid.project.added import AddedSection, ParameterSection
 from rtid.ui.session import FAILED, LOADING, READY, Session
+from rtid.ui.verdict import strip
 
 KEY = "internal_leakage_laminar", "a-b"
 NAN = float("nan")
@@ -157,3 +158,36 @@ def test_a_session_without_a_record_waits_for_nothing() -> None:
     session.open()
     assert session.state == READY
     assert not worker.is_busy
+
+
+def test_what_speaks_against_a_change_stays_in_sight() -> None:
+    session, worker, _ = begun()
+    for result in (opened(), told(), None):
+        if worker.is_busy:
+            worker.answer(result)
+    session.add(*KEY)
+    note = "it does not lower the held-out error: 0.19 % without it, 0.20 % with it"
+    worker.answer(SimpleNamespace(look="l", sections=(section(),), section=section(), note=note))
+    for _ in range(2):  # while the model is diagnosed, and behind it
+        words = strip(session)
+        assert "against the evidence" in words
+        assert note in words
+        assert 'data-do="undo"' in words
+        if worker.is_busy:
+            worker.answer(told())
+
+
+def test_the_strip_says_what_to_do_next() -> None:
+    session, worker, _ = begun()
+    assert "Opening the record" in strip(session)
+    worker.answer(opened())
+    assert "Looking for what is missing" in strip(session)
+    worker.answer(told(KEY))
+    assert 'data-do="add" data-effect="internal_leakage_laminar"' in strip(session)
+    worker.answer()
+    session.add(*KEY)
+    worker.answer(SimpleNamespace(look="l", sections=(section(),), section=section(), note=""))
+    assert "Added" in strip(session)
+    worker.answer(told())
+    assert "The model matches" in strip(session)
+    assert 'data-do="save"' in strip(session)
