@@ -1,4 +1,7 @@
-"""History in SQLite (WAL): estimates, alarms and verdicts over months, readable while it grows."""
+"""History in SQLite (WAL): estimates, alarms and verdicts over months, readable while it grows.
+
+Estimates go after KEPT_S, alarms and verdicts stay: about 3 MB a day at a publication every 10 s.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,8 @@ from rtid.daemon.jobs import Publication
 from rtid.daemon.status import Alarm, Verdict
 
 FILE = "history.sqlite"
+DAY_S = 86_400.0
+KEPT_S = 180 * DAY_S
 TABLES = """
 CREATE TABLE IF NOT EXISTS estimate (unix_s REAL, chamber TEXT, beta_pa REAL, beta_sd_pa REAL);
 CREATE TABLE IF NOT EXISTS map (unix_s REAL, edge TEXT, valid INTEGER, visited INTEGER, rho REAL);
@@ -29,6 +34,7 @@ class Chronicle:
         self._database.execute("PRAGMA journal_mode=WAL")
         self._database.execute("PRAGMA synchronous=NORMAL")
         self._database.executescript(TABLES)
+        self._pruned_s = 0.0
 
     def note_publication(self, found: Publication, chambers: list[str]) -> None:
         """One row per chamber and per edge."""
@@ -45,6 +51,10 @@ class Chronicle:
         self._database.executemany("INSERT INTO estimate VALUES (?, ?, ?, ?)", estimates)
         self._database.executemany("INSERT INTO map VALUES (?, ?, ?, ?, ?)", maps)
         self._database.execute("COMMIT")
+        if now_s - self._pruned_s > DAY_S:
+            self._pruned_s = now_s
+            for table in ("estimate", "map"):
+                self._database.execute(f"DELETE FROM {table} WHERE unix_s < ?", (now_s - KEPT_S,))
 
     def note_alarm(self, alarm: Alarm) -> None:
         """One row when it begins and one when it is over."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import sqlite3
 import time
 from collections import deque
 from collections.abc import Callable
@@ -18,14 +19,16 @@ from firmware_bridge.frames import Frames
 from firmware_bridge.sources import open_log
 from rtid.daemon import log, metrics, status
 from rtid.daemon.alarms import Alarms
+from rtid.daemon.chronicle import Chronicle
 from rtid.daemon.collector import Collector
 from rtid.daemon.diagnosing import newest
 from rtid.daemon.helper import Helper
-from rtid.daemon.jobs import Answer, Batch, Judgement, Ready
+from rtid.daemon.jobs import Answer, Batch, Judgement, Publication, Ready
 from rtid.daemon.lag import Lag
 from rtid.daemon.plant import PlantWatch
 from rtid.daemon.recorder import Recorder
 from rtid.daemon.status import Alarm, BusHealth, Chamber, Estimate, LoopHealth, Status
+from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.history import History
 
 START_US = 1_700_000_000_000_000
@@ -179,6 +182,22 @@ def test_a_flood_of_messages_is_held_back_and_counted(capsys: pytest.CaptureFixt
     assert "985 more" in capsys.readouterr().err
     log.logger.handlers.clear()
     log.logger.setLevel(logging.NOTSET)
+
+
+def test_the_history_forgets_old_estimates_and_keeps_alarms(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = Publication(1, FlowMap(()), np.array([9e8]), np.array([1e6]), 1.0, 5.0, (), 0.1)
+    now_s = time.time()
+    for days in (200, 100, 0):
+        monkeypatch.setattr(time, "time", lambda days=days: now_s - 86_400.0 * days)
+        history = Chronicle(tmp_path)
+        history.note_publication(found, ["a"])
+        history.note_alarm(Alarm(f"{days}", "text", now_s - 86_400.0 * days))
+        history.close()
+    with sqlite3.connect(tmp_path / "history.sqlite") as database:
+        assert database.execute("SELECT count(*) FROM estimate").fetchone()[0] == 2
+        assert database.execute("SELECT count(*) FROM alarm").fetchone()[0] == 3
 
 
 def full_status() -> Status:
