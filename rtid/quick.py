@@ -26,9 +26,8 @@ from rtid.quick_machine import (
     Machine,
     first_machine,
     fitted_machine,
-    of_missing,
-    project_text,
 )
+from rtid.quick_project import of_missing, project_text
 from rtid.quick_source import Source, open_source, roles_of
 from rtid.replay import NoSamplesError, model_for
 
@@ -218,6 +217,11 @@ def _cautions(found: Diagnosis | None, given: Given) -> list[str]:
         return []
     names = [effect.effect for effect in found.found] + [s.effect for s in found.negligible]
     cautions = []
+    if given.dead_volume_m3 is None and "entrained_air" in names:
+        cautions.append(
+            "Air and dead volume share what a chamber takes up: with --dead-volume (and the bore) "
+            "the share of air is known, without it it may be twice too large."
+        )
     both = ("internal_leakage", "external_leakage")
     if given.rod_m is None and any(name.startswith(both) for name in names):
         cautions.append(

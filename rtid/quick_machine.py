@@ -1,36 +1,29 @@
 """A machine of which nobody has said anything: given sizes, stated assumptions, grids of the data.
 
-The text of its project file is made here; what the user does not know is assumed, and every
-assumption is kept with what would change if it is wrong.
+What nobody has said is assumed, and every assumption is kept with what would change if it is wrong.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
-import tomlkit
 
 from firmware_bridge.samples import ROW, Samples
 from rtid.model import FloatArray
 from rtid.project.proposal import Candidate
 from rtid.project.template import EDGES, nice
-from rtid.quick_source import Source
-from rtid.units import Unit, find_unit, units_of
+from rtid.quick_source import unit_of
 
 BORE_M, ROD_SHARE, DEAD_SHARE = 0.05, 0.7, 0.2  # a usual cylinder
-DEAD_VOLUME = "extra_dead_volume"
-TANK_PA, SUPPLY_PA = 1e5, 7e6
+SUPPLY_PA = 7e6
 U_STEPS, DP_STEPS = 16, 12
 WINDOW_S = 0.02  # over which the speed is taken
 MOVES = 0.02  # of the top speed: below, the machine stands
 SPEED_BINS = 80
 LAG_MS, LAG_TOLERANCE_MS = 2.0, 5.0  # of a spool: every real one has some lag
-SLOW_MS, GAP_STEPS = 20.0, 2.5  # a table with longer steps than the usual gate lets through
 MOST_S = 120.0  # of a record: a diagnosis of more takes longer than a minute
-HELD_OUT = 0.25
 
 
 @dataclass(frozen=True)
@@ -78,12 +71,12 @@ def first_machine(roles: dict[str, Candidate], given: Given) -> Machine:
     bore = given.bore_m or BORE_M
     rod = given.rod_m if given.rod_m is not None else ROD_SHARE * bore
     x, u = roles["x"], roles["u"]
-    low, high = (end * _unit(x).factor for end in (x.low, x.high))
+    low, high = (end * unit_of(x).factor for end in (x.low, x.high))
     zero = min(low, 0.0)
     stroke = given.stroke_m or nice(high - zero, 1.0)
     areas = math.pi / 4 * bore**2, math.pi / 4 * (bore**2 - rod**2)
-    u_max = nice(max(abs(u.low), abs(u.high)) * _unit(u).factor, 10.0)
-    highest = max(c.high * _unit(c).factor for r, c in roles.items() if r.startswith("p_"))
+    u_max = nice(max(abs(u.low), abs(u.high)) * unit_of(u).factor, 10.0)
+    highest = max(c.high * unit_of(c).factor for r, c in roles.items() if r.startswith("p_"))
     top = nice(highest, SUPPLY_PA)
     return Machine(
         areas,
@@ -237,101 +230,3 @@ def _span(samples: Samples, x: FloatArray) -> tuple[float, float] | None:
     last = len(way) - int(MOST_S) - 1
     start = float(np.argmax(way[int(MOST_S) :][: last + 1] - way[: last + 1]))
     return start, start + MOST_S
-
-
-def project_text(name: str, source: Source, roles: dict[str, Candidate], machine: Machine) -> str:
-    """TOML of the machine's project file, complete."""
-    u = _unit(roles["u"])
-    key = next(unit.key for unit in units_of(u.dimension) if unit.factor == 1.0)
-    raw: dict[str, Any] = {"project": {"name": name}, "source": dict(source.keys)}
-    raw["messages"] = {
-        message: {"period_ms": period}
-        for message, period in source.periods_ms.items()
-        if any(c.message == message for c in roles.values())
-    }
-    raw["signals"] = _signals(source, roles, machine)
-    raw["geometry"] = {"stroke_m": machine.stroke_m}
-    raw["chambers"] = {
-        chamber: {"pressure": f"p_{chamber}", "sign": sign, "area_m2": area,
-                  "dead_volume_m3": machine.dead_volume_m3}
-        for chamber, sign, area in zip("ab", (1, -1), machine.areas_m2, strict=True)
-    }  # fmt: skip
-    raw["edge_defaults"] = {
-        "command": "u",
-        f"u_grid_{key}": machine.u_grid.tolist(),
-        "dp_grid_pa": machine.dp_grid_pa.tolist(),
-        f"safe_band_{key}": machine.safe_band,
-        "rated_flow_m3s": machine.rated_flow_m3s,
-        "rated_dp_pa": machine.rated_dp_pa,
-    }
-    raw["edges"] = {
-        edge: {"source": start, "sink": sink, "direction": way}
-        for edge, (start, sink, way) in EDGES.items()
-    }
-    if machine.dead_is_fitted:
-        volume = {"volume": {"value": 0.0, "unit": "m3"}}
-        raw["added"] = [
-            {"effect": DEAD_VOLUME, "where": chamber, "parameters": volume} for chamber in "ab"
-        ]
-    raw["dynamics"] = {"spool_lag": {"nominal_ms": LAG_MS, "tolerance_ms": LAG_TOLERANCE_MS}}
-    raw["gates"] = {"max_gap_ms": GAP_STEPS * source.step_ms} if source.step_ms > SLOW_MS else {}
-    if machine.span_s:
-        begin, end = machine.span_s
-        split = end - HELD_OUT * (end - begin)
-        raw["record"] = {"identification_s": [begin, split], "validation_s": [split, end]}
-    return tomlkit.dumps({name: part for name, part in raw.items() if part})
-
-
-def _signals(
-    source: Source, roles: dict[str, Candidate], machine: Machine
-) -> dict[str, dict[str, Any]]:
-    found: dict[str, dict[str, Any]] = {}
-    for role, one in roles.items():
-        if role == "v":
-            continue
-        on_bus = {"message": one.message, "signal": one.name}
-        section: dict[str, Any] = (on_bus if one.message else {"column": one.name}) | {
-            "unit": one.unit
-        }
-        if role != "u":
-            section["noise"] = "estimate" if one.high > one.low else 0.0
-            if one.name in source.steps:
-                section["resolution"] = source.steps[one.name]
-        turned = role in machine.reversed
-        if turned:
-            section["scale"] = -1.0
-        if role == "x" and (turned or machine.x_zero_m):
-            end_m = machine.stroke_m + machine.x_zero_m if turned else -machine.x_zero_m
-            section["offset"] = end_m / _unit(one).factor
-        found[role] = section
-    if "p_supply" not in roles:
-        found["p_supply"] = {"unit": "Pa", "constant": _supply_pa(roles)}
-    if "p_tank" not in roles:
-        found["p_tank"] = {"unit": "Pa", "constant": TANK_PA}
-    return found
-
-
-def of_missing(roles: dict[str, Candidate]) -> list[Assumption]:
-    """What is assumed of pressures that nobody measures."""
-    found = []
-    if "p_supply" not in roles:
-        found.append(Assumption(
-            f"the supply is not measured, and stays at {_supply_pa(roles) / 1e5:.0f} bar",
-            "maps of the supply's valves are off, and a supply that sags cannot be seen apart",
-        ))  # fmt: skip
-    if "p_tank" not in roles:
-        found.append(Assumption(
-            f"the tank is at {TANK_PA / 1e5:.0f} bar", "maps to the tank are off at small drops",
-        ))  # fmt: skip
-    return found
-
-
-def _supply_pa(roles: dict[str, Candidate]) -> float:
-    """A supply that nobody measures: a round pressure above what the chambers reach."""
-    return nice(max(roles[r].high * _unit(roles[r]).factor for r in ("p_a", "p_b")), SUPPLY_PA)
-
-
-def _unit(one: Candidate) -> Unit:
-    unit = find_unit(one.unit)
-    assert unit is not None, "roles have units that are known, or guessed ones"
-    return unit

@@ -17,7 +17,7 @@ from rtid.project import proposal
 from rtid.project.loading import BUILTIN
 from rtid.project.proposal import Candidate
 from rtid.project.table import is_table
-from rtid.units import find_unit
+from rtid.units import Unit, find_unit
 
 NEEDED = {
     "u": "the command of the valves",
@@ -139,3 +139,10 @@ def _alike(roles: dict[str, Candidate]) -> dict[str, Candidate]:
         return roles
     unit = max(guessed.values(), key=lambda c: abs(c.high)).unit
     return roles | {role: replace(c, unit=unit) for role, c in guessed.items()}
+
+
+def unit_of(one: Candidate) -> Unit:
+    """The unit of a role's signal, which is known or guessed."""
+    unit = find_unit(one.unit)
+    assert unit is not None, "roles have units that are known, or guessed ones"
+    return unit

@@ -52,6 +52,7 @@ def test_own_dbc_gives_a_project_that_loads_once_filled_in(tmp_path: Path) -> No
     assert signals["u"] == ("ValveCommand", "U")
     assert signals["x"] == ("Motion", "X")
     assert project.model.edges[0].grid.u_v[-1] == 10.0
+    assert project.model.edges[0].safe_band_v == 0.0, "with none, u < 0 would be off the grid"
 
 
 def test_existing_file_is_not_replaced(tmp_path: Path) -> None:

@@ -25,9 +25,9 @@ from rtid.quick_machine import (
     dp_grid,
     first_machine,
     fitted_machine,
-    project_text,
     shut_band,
 )
+from rtid.quick_project import project_text
 from rtid.quick_source import open_source, roles_of
 from rtid.sim.hidden import hide_wish
 from rtid.sim.plant import Plant

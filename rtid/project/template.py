@@ -113,7 +113,7 @@ def _edges(roles: dict[str, Candidate]) -> Iterator[str]:
         'command = "u"',
         f"u_grid_{unit.key} = [{{start = 0.0, stop = {u_max:g}, step = {u_max / 20:g}}}]",
         f"dp_grid_mpa = [{{start = 0.0, stop = {p_max_mpa:g}, step = {p_max_mpa / 20:g}}}]",
-        f"# safe_band_{unit.key} = {u_max / 10:g}  # TODO if known: shut for sure up to here",
+        f"safe_band_{unit.key} = 0  # TODO if known: shut for sure up to {u_max / 10:g} or so",
         "# rated_flow_lpm = 30  # TODO: data sheet, flow at rated_dp, fully open",
         "rated_dp_mpa = 0.5",
     )
