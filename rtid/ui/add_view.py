@@ -16,12 +16,13 @@ from rtid.diagnosed_text import quantity, title
 from rtid.project.added import AddedSection
 from rtid.report_words import text
 from rtid.ui.blocks import LARGEST, ML_PER_MIN, Quantity, quantities, round_up
-from rtid.ui.compare_view import EMPTY, NAMES, TimePlots
+from rtid.ui.compare_view import NAMES
 from rtid.ui.fragments import button, table
 from rtid.ui.lines import Line
 from rtid.ui.look import Look
 from rtid.ui.session import Revision, Session
 from rtid.ui.theme import INK_TAG
+from rtid.ui.time_plots import EMPTY, TimePlots
 
 INSIDE = 25.0  # % of the track from which a bar has its figure inside
 

@@ -12,10 +12,11 @@ from rtid.report_words import text
 from rtid.ui import add_view, why_view
 from rtid.ui.add_view import AddView
 from rtid.ui.blocks import Key
-from rtid.ui.compare_view import RUNS, CompareView, TimePlots, spans_of
+from rtid.ui.compare_view import RUNS, CompareView
 from rtid.ui.look import Look
 from rtid.ui.map_view import MapView
 from rtid.ui.session import Session
+from rtid.ui.time_plots import TimePlots, spans_of
 from rtid.ui.where_view import WhereView
 
 TIMED = ("compare", "where", "add")  # views with plots over time

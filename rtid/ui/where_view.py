@@ -14,11 +14,12 @@ from rtid.compare import BlockRow, Dependence
 from rtid.compare.tables import CAUSES, cause_of
 from rtid.report_words import text
 from rtid.ui.blocks import HATCHES, LARGEST, ML_PER_MIN, BlockPlots, Key, quantities, round_up
-from rtid.ui.compare_view import EMPTY, NAMES, TimePlots
+from rtid.ui.compare_view import NAMES
 from rtid.ui.fragments import button, choice, select
 from rtid.ui.lines import Line
 from rtid.ui.look import Look
 from rtid.ui.theme import plot, styled
+from rtid.ui.time_plots import EMPTY, TimePlots
 
 Z95 = 1.96
 
