@@ -237,6 +237,9 @@ def test_nothing_is_cut_off_at_1366_by_768(opened: Opened) -> None:
     opened.go()
     page = opened.page
     page.wait_for_selector("#compare canvas")
+    page.evaluate(
+        "() => { document.querySelector('#work').innerHTML = 'wrote /a/b/c '.repeat(40) }"
+    )
     assert page.evaluate("() => document.documentElement.scrollWidth <= innerWidth")
     assert page.evaluate("() => document.documentElement.scrollHeight <= innerHeight")
     inside = page.evaluate(
