@@ -113,7 +113,7 @@ def test_row_11_bus_off(tmp_path: Path, figure: Figure) -> None:
     )  # fmt: skip
     opened = seen[0].started_unix_s - (time.time() - source.now_s())
     figure(11, "recovery after the bus is back, status told each second",
-           back + opened - 10.0, 3.5, "s")  # fmt: skip
+           back + opened - 10.0, 2.5, "s")  # fmt: skip
     assert any(s.bus.state == "reopening" for s in seen)
     assert {"bus_down"} <= {a.name for s in seen for a in s.alarms}
     assert last.bus.reopened == 1

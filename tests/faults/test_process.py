@@ -106,7 +106,7 @@ def test_row_17_kill_9_while_it_runs(tmp_path: Path, figure: Figure) -> None:
                     running.process.kill()
                 else:
                     running.stop()
-    figure(17, "age of the snapshot at a kill (saved every 2 s)", max(lost), 4.0, "s")
+    figure(17, "age of the snapshot at a kill (saved every 2 s)", max(lost), 3.0, "s")
     taken = stored(running.folder, machine().project).estimator.counters["samples"]
     figure(17, "samples that all three runs together have learned from", taken, least=5000)
 
@@ -126,7 +126,7 @@ def test_row_18_disk_full(tmp_path: Path, figure: Figure) -> None:
             well_s = running.wait(lambda s: s.store.state == "saved")
             last = running.stop()
     assert full is not None and "not_saved" in {a.name for a in full.alarms}
-    figure(18, "alarm after the disk is full (save interval 2 s)", alarm_s, 5.0, "s")
+    figure(18, "alarm after the disk is full (save interval 2 s)", alarm_s, 2.0, "s")
     figure(18, "saved again after there is room", well_s, 8.0, "s")
     assert last.bus.refused.get("overrun", 0) == 0
 
