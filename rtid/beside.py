@@ -18,6 +18,7 @@ from rtid.diagnose.fit import fit, prepare
 from rtid.diagnose.parts import recall
 from rtid.diagnosed_text import quantity, title
 from rtid.diagnosing import added_parts
+from rtid.estimator.published import publish
 from rtid.project import Project
 from rtid.replay import Progress, Replay, replay
 
@@ -51,9 +52,12 @@ def beside(found: Replay) -> Replay:
     declared = replace(as_measured(found.model, learned), own_effects=found.project.effects)
     weights = prepare(declared, learned)
     fitted = fit(declared, learned, weights, recall(declared, learned, weights, parts), bank=False)
-    machine = acting(fitted.light(), usable(declared, found.chunk))
+    fitted, chunk = fitted.light(), usable(declared, found.chunk)
+    machine = acting(fitted, chunk)
     result = replace(found, model=machine.model, chunk=machine.chunk)
     record = learn_beside(fitted, machine, result.part(found.identification_s))
+    if machine.measured:  # they may act on flows where the fit has none, and the map now has
+        result = replace(result, chunk=acting(fitted, chunk, publish(record.solution)).chunk)
     offsets = found.fit.offsets_s, found.fit.offsets_sd_s
     record = replace(record, offsets_s=offsets[0], offsets_sd_s=offsets[1])
     known = known_effects(fitted, machine, [part.key for part in parts])

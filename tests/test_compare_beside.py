@@ -13,7 +13,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from rtid.beside import replay_beside
+from rtid.beside import replay_beside, sentences
 from rtid.cli.compare import compare
 from rtid.cli.export import export
 from rtid.cli.replay import replay as replay_command
@@ -47,6 +47,7 @@ from tests.diagnose.records import record
 
 SEEN_S, ALL_S = 30.0, 40.0
 LEAK, DELAY, RELIEF = "internal_leakage_laminar", "input_delay", "relief_valve"
+DRIFT = "valve_gain_drift"
 APP = typer.Typer()
 APP.command()(compare)
 APP.command()(export)
@@ -156,19 +157,22 @@ def test_an_effect_that_cannot_follow_is_taken_from_the_measured_pressures() -> 
     np.testing.assert_allclose(learned.solution.compliance, fitted.compliance, rtol=1e-5)
 
 
+HIDDEN = {"clean": "", "leak": LEAK, "delay": DELAY, "drift": DRIFT}
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Records of one machine: clean, with a leak, with a delay; a project file each."""
+    """Records of one machine, clean and with an effect each; project files before and after."""
     path = tmp_path_factory.mktemp("beside")
-    for name, wish in (("clean", ""), ("leak", f"{LEAK}=middle"), ("delay", f"{DELAY}=middle")):
-        plant = hide_wish(Plant(), wish) if wish else Plant()
+    for name, effect in HIDDEN.items():
+        plant = hide_wish(Plant(), f"{effect}=middle") if effect else Plant()
         write_run(path / f"{name}.parquet", simulate(plant, "rich", 1, ALL_S), 1, "rich")
         project = path / f"{name}.toml"
         parts = f"[record]\nidentification_s = [0, {SEEN_S}]\nvalidation_s = [{SEEN_S}, {ALL_S}]\n"
         project.write_text(project.read_text().partition("[record]")[0] + parts)
         (path / f"{name}_before.toml").write_text(project.read_text())
-    add(path / "leak.toml", path / "leak.parquet", LEAK)
-    add(path / "delay.toml", path / "delay.parquet", DELAY)
+        if effect:
+            add(project, path / f"{name}.parquet", effect)
     return path
 
 
@@ -203,8 +207,17 @@ def test_held_out_errors_fall_to_those_of_the_clean_machine(folder: Path, name: 
     assert old > 2.0 * floor and old_pa > 2.0 * floor_pa
     assert new < 1.3 * floor
     assert new_pa < 1.3 * floor_pa
-    assert [k.effect for k in after.replay.added] == [LEAK if name == "leak" else DELAY]
+    assert [k.effect for k in after.replay.added] == [HIDDEN[name]]
     assert before.replay.added == ()
+
+
+def test_a_drift_acts_on_flows_that_the_fit_has_not_visited(folder: Path) -> None:
+    """Its flow is a share of the valves': on unseen motion that of the published map."""
+    clean, before, after = (studied(folder, n) for n in ("clean", "drift_before", "drift"))
+    assert errors(after)[0] < 0.7 * errors(before)[0]
+    assert errors(after)[0] < 1.3 * errors(clean)[0]
+    assert [(k.effect, k.follows) for k in after.replay.added] == [(DRIFT, False)]
+    assert "taken from the measured pressures" in " ".join(sentences(after.replay.added))
 
 
 @pytest.mark.parametrize(("name", "of_clean"), [("leak", 3.0), ("delay", 1.3)])

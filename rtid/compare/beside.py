@@ -11,6 +11,7 @@ so that the joint solution has s and S as they are told, and the maps are fitted
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
@@ -21,12 +22,14 @@ from rtid.compare.acting import terms_of
 from rtid.compare.extra import with_extra_flow
 from rtid.diagnose.candidates import Candidate
 from rtid.diagnose.causes import causes
-from rtid.diagnose.fit import Fit
+from rtid.diagnose.fit import NO_COV, Fit
 from rtid.diagnose.report import Value, parameters
 from rtid.diagnose.residual import effect_values, transformed_like
+from rtid.diagnose.view import FlowMap as KnownMap
 from rtid.diagnose.view import View
 from rtid.errors import RtidError
 from rtid.estimator.factor import PRIOR_SD, SHARED_PRIOR, misfit, one_thread
+from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.limits import refuse_unfit
 from rtid.estimator.misfit import can_be_explained, count_misfit
 from rtid.estimator.missed import weighed
@@ -73,14 +76,15 @@ class Acting:
     measured: tuple[Candidate, ...]
 
 
-def acting(fit: Fit, chunk: FloatArray) -> Acting:
+def acting(fit: Fit, chunk: FloatArray, published: FlowMap | None = None) -> Acting:
     """The machine of a fit and its effects on a record, chunk (n, 2 + signals) as declared.
 
-    Raises TooManyEffectsError.
+    published: a map that also knows blocks which the fit has not visited, for effects that act on
+    the valves' flows.  Raises TooManyEffectsError.
     """
     sent = transformed_like(fit, chunk)
     model = with_positive_pressures(fit.model, sent)
-    view = View.of(model, sent, fit.weights, fit.map)
+    view = View.of(model, sent, fit.weights, _everywhere(model, published) or fit.map)
     if not fit.revision.timings:  # nothing was done to the commands
         model, sent = with_positive_pressures(fit.declared, chunk), chunk
     if fit.revision.replaces_lag:
@@ -100,6 +104,15 @@ def acting(fit: Fit, chunk: FloatArray) -> Acting:
     except ValueError as error:
         raise TooManyEffectsError(f"too many effects: {error}", "drop one: rtid drop") from None
     return Acting(model, sent, tuple(of), tuple(measured))
+
+
+def _everywhere(model: Model, published: FlowMap | None) -> KnownMap | None:
+    """A published map as the diagnosis takes maps, all blocks known."""
+    if published is None:
+        return None
+    cells = [math.prod(edge.grid.shape) for edge in model.edges]
+    rated = np.repeat([edge.rated_q_m3s for edge in model.edges], cells)
+    return KnownMap(np.arange(model.n_cells), published.theta_cells() / rated[:, None], NO_COV)
 
 
 def with_positive_pressures(model: Model, chunk: FloatArray) -> Model:
