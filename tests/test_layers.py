@@ -27,7 +27,7 @@ LAYER = {
     "rtid.__main__": COMMAND,
 }  # every other part of rtid is a shell: files, clocks and threads are allowed
 NEEDS_NO_OUTSIDE = {"can", "cantools", "serial", "time", "filterpy", "pyarrow", "typer", "rich"}
-MAY_SIMULATE = ("rtid.demo", "rtid.cli.demo", "rtid.cli.simulate", "rtid.sim")
+MAY_SIMULATE = ("rtid.demo", "rtid.cli.demo", "rtid.cli.simulate", "rtid.paper", "rtid.sim")
 MODULES = sorted(p for top in ("rtid", "firmware_bridge") for p in (ROOT / top).rglob("*.py"))
 
 
