@@ -35,6 +35,8 @@ def reproduce(seed: int = 0) -> Part:
         at_most("ratio to equal spacing", errors[0] / errors[1], 1.0),
     )
     picture = coverage(unequal.model, unequal.flowmap, unequal.replay.chunk)
+    for line in (line for axis in picture.axes for line in axis.lines):
+        line.set_rasterized(True)  # thousands of points would fill an SVG
     title = "Fig. 1 and 4: blocks and location of the data"
     return Part("fig4", title, text, measures, (_table(unequal, equal),), {"fig4": picture})
 
