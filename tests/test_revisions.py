@@ -173,16 +173,16 @@ def test_what_this_machine_cannot_have(
 
 
 def test_a_set_of_equals_needs_a_choice(tmp_path: Path) -> None:
-    """20 s do not tell a delay from a spool of second order."""
-    project = recorded(tmp_path, "input_delay=middle", 20.0)
+    """20 s do not tell a spool of second order from one of first order."""
+    project = recorded(tmp_path, "spool_lag_second_order=middle", 20.0)
     old, trace = project.read_bytes(), project.with_name("trace.parquet")
     with pytest.raises(RefusedError, match="apart") as caught:
         add(project, trace)
-    assert "input_delay:command" in caught.value.remedy
+    assert "spool_lag_second_order:command" in caught.value.remedy
     assert project.read_bytes() == old
-    chosen = add(project, trace, "input_delay", force=True)
-    delay = chosen.changes[0].section["parameters"]["delay"]
-    assert delay["value"] == pytest.approx(5e-3, rel=0.1)
+    chosen = add(project, trace, "spool_lag_second_order", force=True)
+    frequency = chosen.changes[0].section["parameters"]["natural_frequency"]
+    assert frequency["value"] == pytest.approx(200.0, rel=0.1)
     assert diagnose_trace(load(project), trace).diagnosis.verdict == "matches"
     undo(project)
     assert project.read_bytes() == old

@@ -153,19 +153,21 @@ def _add_best(state: State, present: Fit, last: Residual) -> tuple[Fit, Residual
         own = BENT * own_share(now, trial, state.held_out)
         share = min(material_share(last, after), own)
         if share >= MATERIAL:
+            kept, after = _with_bank(state, now)
             state.found.append(Found(trial.key, alike, trial.gain, last, after))
-            return _with_bank(state, now), after
+            return kept, after
         state.negligible[trial.key] = share
         if _is_noticed(present, trial) and after.rms_m3s <= WORSE * last.rms_m3s:
             state.negligible |= dict.fromkeys(alike, share)
-            return _with_bank(state, now), after
+            return _with_bank(state, now)
         del now  # its rows are large
     return None
 
 
-def _with_bank(state: State, now: Fit) -> Fit:
-    """A fit with every candidate beside it."""
-    return one_pass(state.model, state.chunk, now.weights, now.revision, now, bank=True)
+def _with_bank(state: State, now: Fit) -> tuple[Fit, Residual]:
+    """A fit with every candidate beside it, and what it leaves of the held-out part."""
+    kept = one_pass(state.model, state.chunk, now.weights, now.revision, now, bank=True)
+    return kept, residual(kept, state.held_out)
 
 
 def _is_noticed(present: Fit, trial: Trial) -> bool:
