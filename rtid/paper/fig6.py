@@ -113,7 +113,8 @@ def reproduce(seed: int = 0, plants: int = 30) -> Part:
         "point-to-point motion under the same controller (Liu and Yao, gains 16, adaptation off) "
         "with three maps: the true one, the one learned before from the frames of the paper's "
         "sweep, and a data sheet with up to 10 % of gain and 0.3 V of dead band wrong per valve. "
-        "The controller knows the machine's other constants. No cross-port valve, no regeneration."
+        "The controller knows the machine's other constants. No cross-port valve, no regeneration; "
+        "the stroke has no ends, so that a boom whose data sheet is too wrong may run away."
     )
     measures = (
         at_least("estimated better than manufacturer's", better, MOST_PLANTS, "%", "1 of 1"),

@@ -8,6 +8,7 @@ import pytest
 from rtid.paper.boom import boom
 from rtid.paper.fig6 import compare, machines, manufacturer, point_to_point
 from rtid.paper.fig6_picture import CALIBRATED, ESTIMATED, MANUFACTURER, Compared
+from rtid.sim.plant import FloatArray
 from rtid.sim.robust import W_V, knowledge, opening, run
 
 NUMBER = 1002
@@ -65,7 +66,25 @@ def test_estimated_is_near_calibrated_and_far_from_the_data_sheet(found: Compare
     assert rms[MANUFACTURER] > 5 * rms[ESTIMATED]
 
 
+@pytest.fixture(scope="module")
+def thirty() -> FloatArray:
+    """Tracking errors (30, 3): calibrated, estimated, manufacturer's."""
+    return np.array([[r.rms_m for r in c.runs.values()] for c in machines(30)])
+
+
 @pytest.mark.campaign
-def test_thirty_booms() -> None:
-    rms = np.array([[r.rms_m for r in c.runs.values()] for c in machines(30)])
-    assert np.mean(rms[:, 1] < rms[:, 2]) >= 0.9
+def test_estimated_beats_the_data_sheet_on_thirty_booms(thirty: FloatArray) -> None:
+    assert np.mean(thirty[:, 1] < thirty[:, 2]) >= 0.9
+
+
+@pytest.mark.campaign
+@pytest.mark.xfail(strict=True, reason="measured 1.14: the moves go where the sweep has not been")
+def test_median_ratio_to_calibrated(thirty: FloatArray) -> None:
+    assert np.median(thirty[:, 1] / thirty[:, 0]) <= 1.05
+
+
+@pytest.mark.campaign
+@pytest.mark.xfail(strict=True, reason="measured 73 %: on the others noise puts estimated first")
+def test_calibrated_is_first(thirty: FloatArray) -> None:
+    in_order = (thirty[:, 0] <= thirty[:, 1]) & (thirty[:, 1] < thirty[:, 2])
+    assert np.mean(in_order) >= 0.9
