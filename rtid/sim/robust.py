@@ -29,7 +29,7 @@ from rtid.sim.plant import AT, BT, EDGES, PA, PB, Constants, FloatArray, Plant, 
 from rtid.sim.sensing import P_A, P_B, P_S, P_T, Sensors, U, V, X
 
 GAIN_1PS = 16.0  # of the paper
-OFF_SIDE_PA = 4e6
+OFF_SIDE_PA = 5e6  # takes A near the pressures that it has in the sweep
 LEAST_FLOW_M3S = 5e-7  # less is not metered: both valves of the chamber stay shut
 SUBSTEPS = 10
 FOUR = EDGES[:4]
