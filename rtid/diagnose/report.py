@@ -130,7 +130,7 @@ def diagnosis(result: Result) -> Diagnosis:
         heldout_residual_after_m3s=result.after.rms_m3s,
         noise_floor_m3s=result.after.floor_m3s,
         rms_flow_m3s=result.after.flow_m3s,
-        beta_pa=tuple(float(b) for b in 1.0 / last.compliance),
+        beta_pa=tuple(1.0 / float(c) if c else float("inf") for c in last.compliance),
         lag_s=last.weights.lag_s,
         something_remains=result.verdict not in SILENT and last.rho > result.match_rho,
         held_out_judged=result.held_out_judged,
