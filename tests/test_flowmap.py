@@ -75,9 +75,9 @@ def monotone_map(seed: int) -> EdgeMap | None:
     edge = edge_map(edge.grid, theta, edge.safe_band_v)
     near = edge.safe_band_v + np.diff(edge.grid.u_v).min() * np.geomspace(1e-6, 0.1, 20)
     w, dp = np.meshgrid(np.append(_fine(edge.grid.u_v), near), _fine(edge.grid.dp_pa))
-    checked = (w > edge.safe_band_v) & (dp > 2e5)
-    rising = edge.gradient(w, dp)[0][checked] > 0
-    return edge if rising.any() and rising.all() else None
+    checked = (w > edge.safe_band_v) & (dp > 1e5)  # nodes below where it is used, too
+    rising, is_used = edge.gradient(w, dp)[0][checked] > 0, edge.grid.dp_pa[-1] > 2e5
+    return edge if is_used and rising.any() and rising.all() else None
 
 
 def _fine(border: FloatArray) -> FloatArray:

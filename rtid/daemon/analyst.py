@@ -196,8 +196,8 @@ def main() -> None:
     loaded = load(project)
     Estimator(loaded.model).solution()  # compiles
     analyst = Analyst(loaded, Path(folder), pipe.send)
-    pipe.send(Ready())
     try:
+        pipe.send(Ready())
         while (job := pipe.receive()) is not None:
             try:
                 analyst.take(job)

@@ -197,7 +197,7 @@ def test_from_the_verdict_to_the_falling_bar_and_back(
     assert [a.effect for a in load(project).sections.added] == ["internal_leakage_laminar"]
     page.keyboard.press("5")
     page.click("#map_tools >> text=export json")
-    page.wait_for_selector("#work >> text=wrote")
+    page.wait_for_selector("#work >> text=.map.json")
     flowmap, provenance = read_map(trace.with_suffix(".map.json"))
     assert len(flowmap.edges) == 4
     assert provenance["source"] == trace.name
