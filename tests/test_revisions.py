@@ -15,7 +15,8 @@ from rtid.cli import main
 from rtid.cli.exits import Exit
 from rtid.diagnose.extend import RefusedError
 from rtid.diagnose.fit import prepare
-from rtid.diagnose.parts import COMMAND, Part, PartError, recall
+from rtid.diagnose.parts import Part, PartError, recall
+from rtid.diagnose.timing import COMMAND
 from rtid.diagnosing import diagnose_trace, parts
 from rtid.effects import EffectError
 from rtid.project import load
