@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 
 from rtid.diagnose.candidates import Candidate
 from rtid.diagnose.clean import as_measured, usable
+from rtid.diagnose.contest import contest, trials_of
+from rtid.diagnose.exact import carried_on
 from rtid.diagnose.fit import Fit, fit, one_pass, prepare, with_covariances
 from rtid.diagnose.parts import Part, recall
 from rtid.diagnose.regression import Score
@@ -23,13 +25,10 @@ from rtid.diagnose.trials import (
     Key,
     State,
     Trial,
-    carried_on,
-    contest,
     material_share,
     own_share,
     physical,
     scored,
-    trials_of,
 )
 from rtid.diagnose.verdict import MATERIAL, NAMED, UNKNOWN, can_judge, verdict
 from rtid.model import FloatArray, Model

@@ -11,7 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rtid.diagnose.contest import alike_ones
 from rtid.diagnose.diagnosis import LEAST_SHARE, begin
+from rtid.diagnose.exact import carried_on, exact_trials, with_pump
 from rtid.diagnose.fit import Fit, one_pass
 from rtid.diagnose.parts import Part
 from rtid.diagnose.pump import PUMP
@@ -25,16 +27,12 @@ from rtid.diagnose.trials import (
     Key,
     State,
     Trial,
-    alike_ones,
     best_by_key,
-    carried_on,
-    exact_trials,
     material_share,
     own_share,
     physical,
     refined,
     scored,
-    with_pump,
 )
 from rtid.diagnose.verdict import MATERIAL
 from rtid.errors import RtidError

@@ -1,0 +1,77 @@
+"""The causes of one round against each other: which is best, and which cannot be told from it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from rtid.diagnose.exact import carried_on, timing_trials, with_pump
+from rtid.diagnose.fit import Fit
+from rtid.diagnose.timing import COMMAND
+from rtid.diagnose.trials import (
+    TIE,
+    TIE_SHARE,
+    Key,
+    State,
+    Trial,
+    best_by_key,
+    refined,
+    scored,
+    with_effect,
+)
+
+REFUTED, WITHIN = 3.0, 0.05  # times the best cause's misfit; least misfit, of dof
+
+
+def trials_of(state: State, present: Fit) -> list[Trial]:
+    """Every possible cause with its best shape: fixed columns, and timings where they matter."""
+    best = best_by_key(present, scored(present))
+    trials = []
+    for key, (candidate, score) in best.items():
+        if key[1] == COMMAND:
+            continue
+        trials.append(Trial(key, score.gain, with_effect(present, candidate)))
+    trials = with_pump(state, present, refined(state, present, trials))
+    scores = {key: s.gain for key, (_, s) in best.items() if key[1] == COMMAND}
+    other = max((t.gain for t in trials if t.key not in state.negligible), default=0.0)
+    return trials + timing_trials(state, present, scores, other)
+
+
+def alike_ones(state: State, present: Fit, best: Trial, trials: list[Trial]) -> tuple[Key, ...]:
+    """Causes that this record does not tell from the best one: all but as good.
+
+    One that leaves several times the misfit that the best one leaves is refuted.
+    """
+    dof = present.regression.dof
+    misfit = present.estimate.sse - dof
+    close = best.gain - TIE - TIE_SHARE * best.gain
+    refuted = misfit - REFUTED * max(misfit - best.gain, WITHIN * dof) - TIE
+    return tuple(
+        t.key
+        for t in trials
+        if t.key != best.key and t.gain > max(close, refuted) and t.key not in state.negligible
+    )
+
+
+def contest(
+    state: State, present: Fit, best: Trial, trials: list[Trial]
+) -> tuple[Trial, tuple[Key, ...]]:
+    """The cause to add, and those that this record does not tell from it.
+
+    Where several look alike each is refitted to the end, and the best of them is asked again; among
+    equals the one with the fewest parameters is taken.
+    """
+    rivals = [t for t in trials if t.key in alike_ones(state, present, best, trials)]
+    if not rivals:
+        return best, ()
+    refitted = [_finished(state, present, t) for t in (best, *rivals)]
+    best = max(refitted, key=lambda t: t.gain)
+    alike = alike_ones(state, present, best, refitted)
+    equals = [best, *(t for t in refitted if t.key in alike)]
+    chosen = min(equals, key=lambda t: (t.n_parameters, -t.gain))
+    return chosen, tuple(t.key for t in equals if t.key != chosen.key)
+
+
+def _finished(state: State, present: Fit, trial: Trial) -> Trial:
+    now = carried_on(state, present, trial)
+    gain = present.estimate.sse - now.estimate.sse
+    return replace(trial, gain=gain, revision=now.revision, fit=now.light())

@@ -1,0 +1,112 @@
+"""Exact refits of what transforms a command or the supply: a bent map misleads derivatives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from rtid.diagnose.fit import Fit, fit, tried
+from rtid.diagnose.pump import PUMP, demand
+from rtid.diagnose.search import Beside
+from rtid.diagnose.timing import COMMAND, TIMINGS, Psi, Timing
+from rtid.diagnose.trials import GAIN, Key, State, Trial, scored
+
+LARGE = 1.5  # rho above which timing effects are refitted whatever their score
+CLOSE = 0.9  # timings whose coarse gain is this share of the best are refitted finely
+PROMISING = 0.3  # share of the best gain that a timing's bank must reach to be closed in on
+# pumps to begin with: droops as shares of that seen, quantiles of the demand, stiffness in Pa/m3
+DROOPS, PUMP_LIMITS, STIFFNESSES = (0.1, 0.7), (0.8, 0.93, 0.98), (1e9, 1e10, 1e11, 1e12)
+
+
+def with_pump(state: State, present: Fit, trials: list[Trial]) -> list[Trial]:
+    """A supply that sags is refitted exactly, from where its first-order forms point."""
+    first = [t for t in trials if t.effect.effect == PUMP.effect]
+    rest = [t for t in trials if t.effect.effect != PUMP.effect]
+    if not first or first[0].gain < PROMISING * max((t.gain for t in rest), default=0.0):
+        return rest
+    psi = state.coarse.beside(present).polished(PUMP, _pumps(present))
+    timings = (*present.revision.timings, (PUMP, psi))
+    revision = replace(present.revision, timings=timings)
+    now = fit(state.model, state.chunk, present.weights, revision, bank=False)
+    gain = present.estimate.sse - now.estimate.sse
+    return [*rest, Trial(first[0].key, gain, now.revision, now.light(), True)]
+
+
+def _pumps(present: Fit) -> list[Psi]:
+    """Pumps to begin with: droops about the one that is seen, limits within what is drawn."""
+    drawn = demand(present.view)
+    resistances = [
+        score.value
+        for candidate, score in scored(present)
+        if candidate.effect == PUMP.effect and candidate.parameter == "resistance"
+    ]
+    r = max([*resistances, PUMP.low[0]])
+    limits = [*np.quantile(drawn[drawn > 0], PUMP_LIMITS), 2.0 * drawn.max()]
+    return [(float(r * part), float(q), s) for part in DROOPS for q in limits for s in STIFFNESSES]
+
+
+def timing_trials(
+    state: State, present: Fit, scores: dict[Key, float], other: float
+) -> list[Trial]:
+    """Exact refits with one timing more, of those that may matter."""
+    open_ = [t for t in TIMINGS if not present.revision.has((t.effect, COMMAND))]
+    if present.rho < LARGE:
+        open_ = [t for t in open_ if scores.get((t.effect, COMMAND), 0.0) > GAIN]
+    if not open_ or not present.view.has_pressures:
+        return []
+    return exact_trials(state, present, open_, other)
+
+
+def exact_trials(
+    state: State, present: Fit, timings: list[Timing], other: float = 0.0
+) -> list[Trial]:
+    """Refits with one of these timings more, the best of each name.
+
+    other: the best gain of any other cause; what cannot come close to it is left out.
+    """
+    gains = _from_afar(state.coarse.beside(present), timings, other)
+    most = max([other, *(gain for gain, _, _ in gains)])
+    trials: dict[Key, Trial] = {}
+    for gain, timing, psi in gains:
+        if gain < CLOSE * most:
+            continue
+        revision = replace(present.revision, timings=(*present.revision.timings, (timing, psi)))
+        now = tried(state.model, state.chunk, present.weights, revision)
+        if not _is_inside(now):
+            continue
+        exact, key = present.estimate.sse - now.estimate.sse, (timing.effect, COMMAND)
+        if key not in trials or exact > trials[key].gain:
+            trials[key] = Trial(key, exact, now.revision, now, True)
+    return list(trials.values())
+
+
+def carried_on(state: State, present: Fit, trial: Trial) -> Fit:
+    """The fit with a trial's revision, to the end."""
+    revision, weights, start = trial.revision, present.weights, present
+    if trial.fit is not None:
+        weights, start = trial.fit.weights, trial.fit
+    return fit(state.model, state.chunk, weights, revision, start, bank=False)
+
+
+def _from_afar(
+    coarse: Beside, timings: list[Timing], other: float
+) -> list[tuple[float, Timing, Psi]]:
+    """Gain and parameters of every promising timing on the coarse map; one of each name."""
+    banks = {timing: coarse.bank(timing) for timing in timings}
+    bar = PROMISING * max([other, *(max(bank.values()) for bank in banks.values())])
+    best: dict[str, tuple[float, Timing, Psi]] = {}
+    for timing, bank in banks.items():
+        if max(bank.values()) < bar or max(bank.values()) <= 0.0:
+            continue
+        psi, gain = coarse.closed_in(timing, bank)
+        if timing.effect not in best or gain > best[timing.effect][0]:
+            best[timing.effect] = gain, timing, psi
+    return list(best.values())
+
+
+def _is_inside(now: Fit) -> bool:
+    """True where the timing that was added last did not end at a bound, nor at nothing."""
+    timing, psi = now.revision.timings[-1]
+    sd = now.estimate.sd(now.timing_columns(len(now.revision.timings) - 1)[0])
+    return timing.low[0] * 1.01 < psi[0] < timing.high[0] * 0.99 and psi[0] > 3.0 * sd
