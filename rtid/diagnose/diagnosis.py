@@ -153,7 +153,7 @@ def _add_best(state: State, present: Fit, last: Residual) -> tuple[Fit, Residual
         share = min(material_share(last, after), own)
         if share >= MATERIAL:
             kept, after = _with_bank(state, now)
-            state.found.append(Found(trial.key, alike, trial.gain, last, after))
+            state.found.append(Found(trial.key, alike, trial.gain, trial.n_parameters, last, after))
             return kept, after
         state.negligible[trial.key] = share
         if _is_noticed(present, trial) and after.rms_m3s <= WORSE * last.rms_m3s:

@@ -24,11 +24,11 @@ Limits = dict[Candidate, tuple[float, float]]
 
 
 def varied_supply(fit: Fit) -> FloatArray | None:
-    """The record of a fit with a wandering supply; None where no edge names one."""
+    """The record of a fit, as declared, with a wandering supply; None where no edge names one."""
     view, declared = fit.view, fit.declared
     if not view.supply_name:
         return None
-    chunk = fit.sent[:, : 2 + len(declared.signals)].copy()
+    chunk = fit.chunk.copy()  # not as sent: a sag that was found lowers it once more in each fit
     supply = 2 + declared.column(view.supply_name)
     t_s = chunk[:, 0] - chunk[0, 0]
     wander = sum(np.sin(2 * np.pi * rate * t_s) for rate in RATES_HZ) / len(RATES_HZ)

@@ -26,7 +26,7 @@ def demand(view: View) -> FloatArray:
         for edge in view.model.edges:
             if edge.source == view.supply_name and edge.sign(chamber) > 0:
                 w_v = edge.direction * view.signal(edge.command)
-                is_fed |= w_v > max(0.0, edge.safe_band_v)
+                is_fed |= view.may_open(edge) & (w_v > max(0.0, edge.safe_band_v))
         swept = chamber.sign * chamber.area_m2 * v_mps
         total += np.where(is_fed, np.maximum(swept, 0.0), 0.0)
     return total
@@ -43,14 +43,32 @@ def drawn_down(drawn: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
 def _draw_down(
     drawn: FloatArray, dt_s: float, r: float, q_p: float, s: float, droop: FloatArray
 ) -> None:
-    """Exact over each interval on either branch, held at the corner between them."""
-    fade, d = math.exp(-dt_s * s / r), 0.0
+    """Exact over each interval for a demand that is held."""
+    d = 0.0
     for k in range(len(drawn)):
         droop[k] = d
-        end = r * drawn[k] + (d - r * drawn[k]) * fade
-        if end > r * q_p:
-            end = d + dt_s * s * (drawn[k] - q_p) if d >= r * q_p else r * q_p
-        d = max(0.0, end)
+        d = max(0.0, _step(d, drawn[k], dt_s, r, q_p, s))
+
+
+@kernel
+def _step(d: float, q: float, dt_s: float, r: float, q_p: float, s: float) -> float:
+    """D after an interval: straight above the corner R Q_p, exponential below, from one to other.
+
+    A pump that is exactly at its corner is on the straight branch where more is drawn than Q_p.
+    """
+    corner = r * q_p
+    if d > corner or (d == corner and q > q_p):
+        left_s = dt_s if q >= q_p else min(dt_s, (d - corner) / (s * (q_p - q)))
+        d += left_s * s * (q - q_p)
+        dt_s -= left_s
+        if dt_s <= 0.0:
+            return d
+        d = corner
+    end = r * q + (d - r * q) * math.exp(-dt_s * s / r)
+    if end <= corner:
+        return end
+    over_s = dt_s - math.log((r * q - d) / (r * q - corner)) * r / s
+    return corner + over_s * s * (q - q_p)
 
 
 PUMP = Timing(

@@ -150,7 +150,7 @@ def _effect(result: Result, found: Found) -> Effect:
         where=found.key[1],
         cannot_be_told_from=tuple(_named(result, found.key, key) for key in found.alike),
         parameters=parameters(result.last, found.key),
-        p_value=float(min(1.0, tests * chi2.sf(found.gain, 1))),
+        p_value=float(min(1.0, tests * chi2.sf(found.gain, found.n_parameters))),
         heldout_gain_pct=100.0 * (1.0 - after / before),
         heldout_residual_before_m3s=before,
         heldout_residual_after_m3s=after,

@@ -59,11 +59,12 @@ class Trial:
 
 @dataclass(frozen=True)
 class Found:
-    """An effect that was added: the fit with it, the residuals before and after."""
+    """An effect that was added: by how much chi2 fell, with how many parameters; residuals."""
 
     key: Key
     alike: tuple[Key, ...]
     gain: float
+    n_parameters: int
     before: Residual
     after: Residual
 

@@ -16,7 +16,7 @@ from rtid.estimator.state import Weights, build
 from rtid.kernels.following import follow_map
 from rtid.kernels.layout import TERMS
 from rtid.kernels.smoothing import correlate
-from rtid.model import PRESSURE, FloatArray, Model
+from rtid.model import PRESSURE, Edge, FloatArray, Model
 
 TURNS = 0.05  # share of changes that reverse the one before: 2/3 for noise, next to 0 for motion
 UNKNOWN = 10.0  # standard deviation of the flow in a block that was never visited, rated flows
@@ -162,6 +162,12 @@ class View:
     def supply_is_measured(self) -> bool:
         """False where the supply's signal has no noise: a nominal value, not a measurement."""
         return bool(self.supply_name) and has_noise(self.signal(self.supply_name))
+
+    def may_open(self, edge: Edge) -> NDArray[np.bool_]:
+        """True (n,) where the working mode lets an edge open."""
+        if not (self.model.mode and edge.modes):
+            return np.ones(self.n, bool)
+        return np.isin(self.signal(self.model.mode), edge.modes)
 
     def over_intervals(self, flow: FloatArray) -> FloatArray:
         """Volume (n - 1,) of a flow at the samples (n,), linear between them."""

@@ -19,8 +19,8 @@ from tests.diagnose.records import record
 pytestmark = pytest.mark.hidden_effect
 
 
-def diagnosed(effect: str = "", strength: float = 0.0) -> Diagnosis:
-    return diagnosis(search(*record(effect, strength)))
+def diagnosed(effect: str = "", strength: float = 0.0, seed: int = 3) -> Diagnosis:
+    return diagnosis(search(*record(effect, strength, seed)))
 
 
 def named(found: Diagnosis, effect: str) -> Effect:
@@ -42,8 +42,9 @@ def size(own: Effect) -> float:
     return float(value / kappa.value * (2.2e6 / ATMOSPHERE_PA) ** (1 - 1 / kappa.value))
 
 
-def test_a_clean_record_matches() -> None:
-    found = diagnosed()
+@pytest.mark.parametrize("seed", [3, 4, 5])
+def test_a_clean_record_matches(seed: int) -> None:
+    found = diagnosed(seed=seed)
     assert found.verdict == "matches"
     assert found.found == ()
     assert 0.9 < found.rho_before < 1.1
@@ -51,17 +52,21 @@ def test_a_clean_record_matches() -> None:
 
 
 @pytest.mark.parametrize(
-    ("effect", "strength", "expected"),
+    ("effect", "strength", "expected", "seed"),
     [
-        ("internal_leakage_laminar", 4e-12, 4e-12),
+        ("internal_leakage_laminar", 4e-12, 4e-12, 3),
+        ("internal_leakage_laminar", 4e-12, 4e-12, 6),
         # warms up with 1.5 records: so much of it in the 30 of 40 s that the fit sees
-        ("valve_gain_drift", 0.06, 0.06 * (1 - np.exp(-0.5)) / (1 - np.exp(-1 / 1.5))),
-        ("entrained_air", 0.05, 0.05),
+        ("valve_gain_drift", 0.06, 0.06 * (1 - np.exp(-0.5)) / (1 - np.exp(-1 / 1.5)), 3),
+        ("entrained_air", 0.05, 0.05, 3),
+        ("entrained_air", 0.05, 0.05, 7),
     ],
 )
-def test_an_effect_is_named_and_sized(effect: str, strength: float, expected: float) -> None:
+def test_an_effect_is_named_and_sized(
+    effect: str, strength: float, expected: float, seed: int
+) -> None:
     """Within 15 % where simulated in another form, and most of the held-out error goes."""
-    found = diagnosed(effect, strength)
+    found = diagnosed(effect, strength, seed)
     assert found.verdict in ("missing", "ambiguous")
     own = named(found, effect)
     assert own.effect == effect

@@ -1,0 +1,85 @@
+"""Which causes a record does not tell apart: ties, refuted ones, and what is taken of equals."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from rtid.diagnose import contest as module
+from rtid.diagnose.candidates import Candidate
+from rtid.diagnose.contest import REFUTED, alike_ones, contest
+from rtid.diagnose.revision import Revision
+from rtid.diagnose.trials import TIE, TIE_SHARE, Trial
+
+DOF = 4000.0
+
+
+def trial(effect: str, gain: float, *shape: float) -> Trial:
+    own = Candidate(effect, "a", "size", "1", 1.0, shape=shape, shape_names=("w",) * len(shape))
+    return Trial((effect, "a"), gain, Revision(effects=(own,)))
+
+
+def present(misfit: float) -> Any:
+    """A fit that leaves so much beyond its degrees of freedom."""
+    return SimpleNamespace(
+        regression=SimpleNamespace(dof=DOF), estimate=SimpleNamespace(sse=DOF + misfit)
+    )
+
+
+def state(*negligible: str) -> Any:
+    return SimpleNamespace(negligible={(name, "a"): 0.0 for name in negligible})
+
+
+def alike(misfit: float, *gains: float, known: Any = None) -> set[str]:
+    trials = [trial(f"cause {k}", gain) for k, gain in enumerate(gains)]
+    return {name for name, _ in alike_ones(known or state(), present(misfit), trials[0], trials)}
+
+
+def test_all_but_as_good_is_alike() -> None:
+    """Where much is left besides, a few per cent of the gain are not told apart, and no more."""
+    bar = 1000 - TIE - TIE_SHARE * 1000
+    assert alike(5000, 1000, bar + 1, bar - 1) == {"cause 1"}
+
+
+def test_one_that_leaves_several_times_the_misfit_is_refuted() -> None:
+    """The best leaves nothing: 1 % of 100,000 left is more than noise, though the gains are near."""
+    left = REFUTED * 0.05 * DOF
+    assert alike(100_000, 100_000, 100_000 - left + 1, 100_000 - left - TIE - 1) == {"cause 1"}
+
+
+def test_what_changes_next_to_nothing_is_no_rival() -> None:
+    assert alike(5000, 1000, 999, 998, known=state("cause 2")) == {"cause 1"}
+
+
+@pytest.fixture
+def refits(monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
+    """Gains that refits to the end give, by cause; others keep theirs."""
+    gains: dict[str, float] = {}
+
+    def finished(state_: Any, present_: Any, t: Trial) -> Trial:
+        return Trial(t.key, gains.get(t.key[0], t.gain), t.revision)
+
+    monkeypatch.setattr(module, "_finished", finished)
+    return gains
+
+
+def test_alone_it_is_taken_without_a_refit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_finished", lambda *_: pytest.fail("refitted"))
+    best, other = trial("leak", 1000), trial("air", 100)
+    assert contest(state(), present(2000), best, [best, other]) == (best, ())
+
+
+def test_a_refit_decides_between_two_that_look_alike(refits: dict[str, float]) -> None:
+    refits.update(leak=1000, air=3000)
+    best, other = trial("leak", 1000), trial("air", 990)
+    chosen, rest = contest(state(), present(5000), best, [best, other])
+    assert (chosen.key, chosen.gain, rest) == (("air", "a"), 3000, ())
+
+
+def test_of_equals_the_one_with_the_fewest_parameters(refits: dict[str, float]) -> None:
+    best, other = trial("relief", 1000, 1.0, 2.0), trial("leak", 995)
+    chosen, rest = contest(state(), present(5000), best, [best, other])
+    assert chosen.key == ("leak", "a")
+    assert rest == (("relief", "a"),)

@@ -1,0 +1,103 @@
+"""Steps of Gauss-Newton: as long as every parameter admits, halved where they make it worse."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from rtid.diagnose.fit import Fit, fit, one_pass, prepare
+from rtid.diagnose.moving import REACH, Step, halfway, is_as_good, is_worse, moved
+from rtid.diagnose.revision import Revision
+from rtid.diagnose.timing import TIMINGS, Timing
+from rtid.estimator.state import Weights
+from rtid.model import Lag
+from tests.diagnose.records import record
+
+DELAY_S = 12e-3
+
+
+def timing(effect: str) -> Timing:
+    return next(t for t in TIMINGS if t.effect == effect)
+
+
+def late(*delays_s: float) -> Revision:
+    """A delay, and a lag of 3 ms beside it where two are given."""
+    parts = [(timing("input_delay"), delays_s[:1])]
+    parts += [(timing("spool_lag_first_order"), delays_s[1:])] if len(delays_s) > 1 else []
+    return Revision(timings=tuple(parts))
+
+
+@cache
+def weights() -> Weights:
+    model, chunk, _ = record("input_delay", DELAY_S)
+    return prepare(model, chunk)
+
+
+def at(*delays_s: float) -> Fit:
+    model, chunk, _ = record("input_delay", DELAY_S)
+    return one_pass(model, chunk, weights(), late(*delays_s), None, False, thorough=False)
+
+
+def psi(step: Step | None) -> list[float]:
+    assert step is not None
+    return [value for _, values in step.revision.timings for value in values]
+
+
+def test_a_step_goes_towards_the_truth_and_no_farther_than_its_reach() -> None:
+    (found,) = psi(moved(at(8e-3)))
+    assert 8e-3 < found <= 8e-3 * (1 + REACH) * (1 + 1e-9)
+    assert abs(found - DELAY_S) < 4e-3
+
+
+def test_parameters_are_shortened_together() -> None:
+    """The direction stays: what one may not go, the other does not go alone."""
+    start = np.array([3e-3, 3e-3])
+    present = at(*start)
+    columns = [present.timing_columns(k)[0] for k in (0, 1)]
+    lagging = present.first_given  # the declared lag would leave its range, and is held
+    used = tuple(k for k in present.estimate.used if k != lagging)
+    held = present.regression.fit(used)
+    whole = np.array([held.value(k) for k in columns])
+    step = psi(moved(present)) - start
+    assert np.abs(whole).max() > REACH * 3e-3, "too long a step for the test to see anything"
+    moving = step != 0
+    assert moving.any()
+    shares = step[moving] / whole[moving]
+    assert shares == pytest.approx(shares[0]) and shares[0] < 1.0
+    assert np.abs(step).max() <= REACH * 3e-3 * (1 + 1e-9)
+
+
+def test_halfway_is_the_middle_of_all_that_moves() -> None:
+    best = at(8e-3, 4e-3)
+    step = Step(late(16e-3, 2e-3), replace(best.weights, lag_s=best.weights.lag_s + 2e-3))
+    half = halfway(best, step)
+    assert psi(half) == pytest.approx([12e-3, 3e-3])
+    assert half.weights.lag_s == pytest.approx(best.weights.lag_s + 1e-3)
+
+
+def test_a_step_too_far_is_worse_and_nothing_is_worse_than_itself() -> None:
+    near, far = at(11e-3), at(40e-3)
+    assert is_worse(far, near) and not is_worse(near, far)
+    assert is_as_good(near, near) and not is_worse(near, near)
+
+
+@pytest.mark.parametrize("start_s", [11e-3, 13e-3])
+def test_a_fit_ends_where_nothing_is_left_to_move(start_s: float) -> None:
+    """From within 8 %, which is farther than the search from afar leaves."""
+    model, chunk, _ = record("input_delay", DELAY_S)
+    done = fit(model, chunk, weights(), late(start_s), bank=False)
+    (found,) = [values[0] for _, values in done.revision.timings]
+    assert found == pytest.approx(DELAY_S, rel=0.03)
+    step = moved(done)
+    assert step is None or psi(step)[0] == pytest.approx(found, rel=0.01)
+
+
+def test_a_lag_that_would_leave_its_range_is_held() -> None:
+    """A machine that is later than declared: the lag's tolerance is no free parameter."""
+    model, chunk, _ = record("input_delay", DELAY_S)
+    model = replace(model, lag=Lag(1e-3, 1e-4))
+    done = fit(model, chunk, replace(weights(), lag_s=1e-3), Revision(), bank=False)
+    assert 0.0 <= done.weights.lag_s <= 1e-3 + 3 * 1e-4 + 1e-12

@@ -1,0 +1,102 @@
+"""A finite pump: its equation, its limits, and what counts as drawn from it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+from rtid.diagnose import pump
+from rtid.diagnose.experiment import varied_supply
+from rtid.diagnose.fit import one_pass, prepare
+from rtid.diagnose.pump import PUMP, demand, drawn_down
+from rtid.diagnose.revision import Revision
+from rtid.diagnose.view import View
+from rtid.model import MODE, FloatArray, Model, Signal
+from tests.diagnose.records import record
+
+DT = 1e-3
+R, Q_P, S = 2e9, 4e-4, 2e10  # 0.8 MPa of droop at the limit, a lag of 0.1 s
+
+
+def moves(seed: int, n: int = 1200) -> FloatArray:
+    """A demand that stands still, crosses the limit of the pump and falls back (n,)."""
+    rng = np.random.default_rng(seed)
+    return np.repeat(rng.uniform(0.0, 3.0 * Q_P, n // 60) * rng.integers(0, 2, n // 60), 60)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_it_solves_the_pump_s_equation(seed: int) -> None:
+    """Each held demand against a solver, also across the limit of the pump in either direction."""
+    drawn, exact = moves(seed), [0.0]
+    for q in drawn[:-1]:
+        done = solve_ivp(
+            lambda _, d, q=q: [S * (q - min(Q_P, max(0.0, d[0]) / R))],
+            (0, DT), [exact[-1]], max_step=DT / 8, rtol=1e-9, atol=1e-3,
+        )  # fmt: skip
+        exact.append(max(0.0, done.y[0, -1]))
+    assert max(exact) > 1.2 * R * Q_P > min(exact) == 0.0
+    assert np.abs(drawn_down(drawn, DT, (R, Q_P, S)) - exact).max() < 1e-5 * R * Q_P
+
+
+def test_a_steady_demand_droops_by_the_resistance() -> None:
+    drawn = np.full(3000, 0.5 * Q_P)
+    assert drawn_down(drawn, DT, (R, Q_P, S))[-1] == pytest.approx(0.5 * R * Q_P, rel=1e-9)
+
+
+def test_beyond_its_limit_the_accumulator_gives_the_rest() -> None:
+    """The supply falls in a straight line of slope s (Q - Q_p)."""
+    d = drawn_down(np.full(3000, 1.5 * Q_P), DT, (R, Q_P, S))
+    assert np.diff(d)[-500:] == pytest.approx(0.5 * Q_P * S * DT, rel=1e-9)
+
+
+@given(st.integers(0, 1000), st.floats(1e6, 1e12), st.floats(1e-6, 1e-1), st.floats(1e7, 1e14))
+def test_it_stays_finite_and_never_rises_above_the_set_pressure(
+    seed: int, r: float, q_p: float, s: float
+) -> None:
+    drawn = moves(seed, 120)
+    d = drawn_down(drawn, DT, (r, q_p, s))
+    assert np.isfinite(d).all() and d.min() >= 0.0
+    assert d.max() <= r * drawn.max() + s * DT * drawn.sum()
+    plain = [0.0]
+    for q in drawn[:-1]:
+        plain.append(max(0.0, pump._step.py_func(plain[-1], q, DT, r, q_p, s)))
+    assert d == pytest.approx(plain, rel=1e-9, abs=1e-6)
+
+
+def with_mode(model: Model, chunk: FloatArray, mode: FloatArray) -> tuple[Model, FloatArray]:
+    """The same machine whose supply edges may open in mode 1 alone."""
+    edges = tuple(
+        replace(e, modes=(1,)) if e.source == "p_supply" else replace(e, modes=(0, 1))
+        for e in model.edges
+    )
+    signals = (*model.signals, Signal("mode", MODE))
+    model = replace(model, edges=edges, signals=signals, mode="mode")
+    return model, np.column_stack([chunk, mode])
+
+
+def test_edges_that_the_mode_keeps_shut_draw_nothing() -> None:
+    model, chunk, _ = record()
+    free = demand(View.without_map(model, chunk))
+    mode = (np.arange(len(chunk)) % 400 < 200).astype(float)
+    held = demand(View.without_map(*with_mode(model, chunk, mode)))
+    assert free.max() > 0
+    assert held == pytest.approx(np.where(mode == 1, free, 0.0))
+
+
+def test_a_record_with_a_sag_is_varied_as_it_was_recorded() -> None:
+    """The sag of a revision is applied by each fit: the record of an experiment must not have it."""
+    model, chunk, _ = record()
+    weights = prepare(model, chunk)
+    plain = one_pass(model, chunk, weights, Revision(), None, False, thorough=False)
+    sagging = Revision(timings=((PUMP, (1e9, 1.0, 1e11)),))
+    sagged = one_pass(model, chunk, weights, sagging, None, False, thorough=False)
+    supply = 2 + model.column("p_supply")
+    assert sagged.sent[:, supply].min() < plain.sent[:, supply].min() - 1e4
+    varied = [varied_supply(f) for f in (plain, sagged)]
+    assert varied[0] is not None and varied[1] is not None
+    assert varied[1][:, supply] == pytest.approx(varied[0][:, supply])
