@@ -48,10 +48,10 @@ class UnconfirmedError(DownloadError):
 class Link(Protocol):
     """The way to a controller and back."""
 
-    def send(self, data: bytes) -> None:
+    def tell(self, data: bytes) -> None:
         """Send one frame of eight bytes."""
 
-    def receive(self, timeout_s: float) -> bytes | None:
+    def hear(self, timeout_s: float) -> bytes | None:
         """The next answer; None after timeout_s without one."""
 
 
@@ -123,7 +123,7 @@ class Session:
 
     def close(self) -> None:
         """End; what was not committed is forgotten."""
-        self._link.send(protocol.frame(self._session, Op.CLOSE))
+        self._link.tell(protocol.frame(self._session, Op.CLOSE))
 
     def _begin(self, slot: int, image: Image, version: int) -> None:
         nu, ns = image.data[2:4]
@@ -145,7 +145,7 @@ class Session:
         while wanted < image.chunks:
             end = min(wanted + window, image.chunks)
             for chunk in range(wanted, end):
-                self._link.send(protocol.data_frame(self._session, chunk, image.data))
+                self._link.tell(protocol.data_frame(self._session, chunk, image.data))
             reason, now = self._reply([poll], slot)
             if reason != Reason.DONE or now > image.chunks:
                 return False
@@ -164,7 +164,7 @@ class Session:
     def _answers(self) -> Iterator[bytes]:
         """What comes in the session until nothing comes in time."""
         for _ in range(IGNORED):
-            data = self._link.receive(TIMEOUT_S)
+            data = self._link.hear(TIMEOUT_S)
             if data is None:
                 return
             if protocol.is_whole(self._session, data):
@@ -180,12 +180,12 @@ class Session:
     def _ask(self, frames: list[bytes], asked: int, wanted: int, slot: int = ANY) -> bytes:
         """Send until the answer `wanted` comes; a REPLY to `asked` in its place is a refusal."""
         for _ in range(IGNORED):  # answers to what was asked before
-            if self._link.receive(0.0) is None:
+            if self._link.hear(0.0) is None:
                 break
         for attempt in range(RETRIES):
             self.repeated += len(frames) if attempt else 0
             for data in frames:
-                self._link.send(data)
+                self._link.tell(data)
             for answer in self._answers():
                 is_reply = answer[0] == Op.REPLY and answer[1] == asked
                 if is_reply and wanted != Op.REPLY and answer[3] in WORDS:

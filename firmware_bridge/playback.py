@@ -1,5 +1,6 @@
-"""Playing frames onto a bus or line at their recorded pace: the one place of the bridge that sends.
+"""The one place of the bridge that sends: recorded frames at their pace, and maps on order.
 
+A bus or line is opened for sending only while its sink is armed.
 Open a virtual bus with `preserve_timestamps=True`: only then does the receiver see the recorded
 stamps; udp_multicast always stamps at reception.
 """
@@ -7,9 +8,10 @@ stamps; udp_multicast always stamps at reception.
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Protocol, Self
+from typing import Any, Protocol, Self
 
 import can
 import serial
@@ -32,7 +34,7 @@ class SendError(RuntimeError):
 
 
 class Sink(Protocol):
-    """What frames can be sent to: a python-can bus, or an armed `SerialSink`."""
+    """What frames can be sent to: a python-can bus, an armed `BusSink` or `SerialSink`."""
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Send one frame; can.CanError if it is not taken within timeout seconds."""
@@ -50,6 +52,8 @@ class SerialSink:
     def __init__(self, port: str, baudrate: int = serial_port.BAUDRATE) -> None:
         self._port, self._baudrate = port, baudrate
         self._line: serial.Serial | None = None
+        self._decoder = serial_port.Decoder()
+        self._heard: deque[can.Message] = deque()
 
     @contextmanager
     def armed(self) -> Iterator[Self]:
@@ -82,6 +86,116 @@ class SerialSink:
             self._line.write(serial_port.encode(frames))
         except (serial.SerialException, OSError) as error:
             raise can.CanOperationError(f"serial port {self._port}: {error}") from error
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        """The next frame on the line; None where none came within timeout seconds."""
+        if self._line is None:
+            raise SendError(f"serial port {self._port} is not armed: use `with sink.armed():`")
+        end_s = time.monotonic() + (timeout or 0.0)
+        try:
+            while not self._heard:
+                self._line.timeout = max(0.0, min(end_s - time.monotonic(), timeout or 0.0))
+                piece = self._line.read(max(1, self._line.in_waiting))
+                self._heard.extend(fr.to_messages(self._decoder.push(piece)))
+                if not self._heard and time.monotonic() >= end_s:
+                    return None
+        except (serial.SerialException, OSError) as error:
+            raise can.CanOperationError(f"serial port {self._port}: {error}") from error
+        return self._heard.popleft()
+
+
+class BusSink:
+    """A CAN bus to send frames to, open only while it is armed; hears only `can_ids`."""
+
+    def __init__(
+        self,
+        interface: str,
+        channel: str | None,
+        can_ids: Iterable[int] = (),
+        bitrate: int | None = None,
+    ) -> None:
+        self._interface, self._channel = interface, channel
+        self._options = {} if bitrate is None else {"bitrate": bitrate}
+        self._filters = [
+            {"can_id": i & 0x1FFF_FFFF, "can_mask": 0x1FFF_FFFF, "extended": bool(i & fr.EXTENDED)}
+            for i in can_ids
+        ]
+        self._bus: can.BusABC | None = None
+
+    @contextmanager
+    def armed(self) -> Iterator[Self]:
+        """Open the bus for sending until the block ends; SendError if it cannot be opened."""
+        options: dict[str, Any] = {"can_filters": self._filters, **self._options}
+        try:
+            self._bus = can.Bus(self._channel, interface=self._interface, **options)
+        except (can.CanError, OSError, ValueError) as error:
+            raise SendError(f"cannot open {self._interface} {self._channel}: {error}", 2) from error
+        try:
+            yield self
+        finally:
+            self._bus.shutdown()
+            self._bus = None
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Send one frame; SendError unless armed, can.CanError if the bus does not take it."""
+        self._open.send(msg, timeout=timeout)
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        """The next frame; None where none came within timeout seconds."""
+        return self._open.recv(timeout)
+
+    @property
+    def _open(self) -> can.BusABC:
+        if self._bus is None:
+            raise SendError(
+                f"{self._interface} {self._channel} is not armed: use `with sink.armed():`"
+            )
+        return self._bus
+
+
+class ArmedLink:
+    """Frames of eight bytes to a controller through an armed sink, and its answers.
+
+    can_id, reply_id: bit 31 set for 29 bit identifiers; frames_per_s: no more than so many.
+    """
+
+    def __init__(
+        self, sink: BusSink | SerialSink, can_id: int, reply_id: int, frames_per_s: float
+    ) -> None:
+        self._sink, self._can_id, self._reply_id = sink, can_id, reply_id
+        self._pause_s, self._next_s = 1.0 / frames_per_s, 0.0
+        self.told = 0
+
+    def tell(self, data: bytes) -> None:
+        """Send one frame, not before its turn; SendError if the bus does not take it."""
+        wait_s = self._next_s - time.monotonic()
+        if wait_s > 0:
+            time.sleep(wait_s)
+        self._next_s = max(self._next_s, time.monotonic() - 0.01) + self._pause_s
+        message = can.Message(
+            arbitration_id=self._can_id & 0x1FFF_FFFF,
+            is_extended_id=bool(self._can_id & fr.EXTENDED),
+            data=data,
+        )
+        try:
+            self._sink.send(message, timeout=SEND_TIMEOUT_S)
+        except can.CanError as error:
+            raise SendError(f"after {self.told} frames: {error}; is the bus up?") from error
+        self.told += 1
+
+    def hear(self, timeout_s: float) -> bytes | None:
+        """The next answer; None after timeout_s."""
+        end_s = time.monotonic() + timeout_s
+        while True:
+            message = self._sink.recv(max(0.0, end_s - time.monotonic()))
+            if message is not None and _id_of(message) == self._reply_id:
+                return bytes(message.data)
+            if time.monotonic() >= end_s:
+                return None
+
+
+def _id_of(message: can.Message) -> int:
+    return message.arbitration_id | (fr.EXTENDED if message.is_extended_id else 0)
 
 
 def send(

@@ -31,6 +31,7 @@ SINGLE: dict[str, type[schema.Section]] = {
     "estimator": schema.EstimatorSection,
     "record": schema.RecordSection,
     "daemon": schema.DaemonSection,
+    "publish": schema.PublishSection,
 }
 NAMED: dict[str, type[schema.Section]] = {
     "messages": schema.MessageSection,
@@ -150,11 +151,35 @@ def _across(parts: dict[str, Any]) -> list[Problem]:
         problems.append(
             Problem("beta", "nominal lies outside bounds", "give bounds around nominal, one unit")
         )
+    problems += _publish(parts.get("publish") or schema.PublishSection(), parts)
     source = parts.get("source")
     unit = find_unit(source.time_unit) if source else None
     if source and (unit is None or unit.dimension != "time"):
         remedy = "use " + " or ".join(u.name for u in units_of("time"))
         problems.append(Problem("source.time_unit", f"{source.time_unit!r} is no time", remedy))
+    return problems
+
+
+def _publish(section: schema.PublishSection, parts: dict[str, Any]) -> list[Problem]:
+    """Identifiers that belong together, and slots enough for all maps."""
+    problems: list[Problem] = []
+    if (section.can_id is None) != (section.reply_id is None):
+        key = "can_id" if section.can_id is None else "reply_id"
+        remedy = "the controller answers: give can_id and reply_id, or neither"
+        problems.append(Problem(f"publish.{key}", "missing", remedy))
+    if section.status and section.status_id is None:
+        remedy = "add status_id = 0x702, or leave status out: then nothing is told"
+        problems.append(Problem("publish.status_id", "missing", remedy))
+    given = [i for i in (section.can_id, section.reply_id, section.status_id) if i is not None]
+    if len(set(given)) < len(given):
+        problems.append(
+            Problem("publish.reply_id", "two identifiers are the same", "give each its own")
+        )
+    last = section.first_slot + len(parts.get("edges", {}))
+    if last > 15:
+        problems.append(
+            Problem("publish.first_slot", f"the last slot would be {last}", "there are 0 to 15")
+        )
     return problems
 
 

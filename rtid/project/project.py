@@ -24,6 +24,7 @@ from rtid.project.schema import (
     GeometrySection,
     MessageSection,
     ProjectSection,
+    PublishSection,
     RecordSection,
     SignalSection,
     SourceSection,
@@ -52,6 +53,7 @@ class Sections:
     estimator: EstimatorSection = field(default_factory=EstimatorSection)
     record: RecordSection = field(default_factory=RecordSection)
     daemon: DaemonSection = field(default_factory=DaemonSection)
+    publish: PublishSection = field(default_factory=PublishSection)
     effects: dict[str, EffectSection] = field(default_factory=dict)
     added: tuple[AddedSection, ...] = ()
 

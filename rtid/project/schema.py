@@ -308,3 +308,25 @@ class DaemonSection(Section):
     priority: int = Field(default=0, ge=0, le=99)
     record_mb: int = Field(default=200, ge=0)
     folder: str | None = None
+
+
+class PublishSection(Section):
+    """[publish]: maps to the controller on `rtid apply`; without can_id nothing can be sent.
+
+    Slots are the edges in the order of the file, then the bulk moduli.  Limits are of one apply:
+    the change of a flow that data stand behind, in per cent of the rated flow.
+    """
+
+    can_id: int | None = Field(default=None, ge=0, lt=1 << 29)
+    reply_id: int | None = Field(default=None, ge=0, lt=1 << 29)
+    status_id: int | None = Field(default=None, ge=0, lt=1 << 29)
+    status: bool = False
+    interface: str | None = None
+    channel: str | None = None
+    first_slot: int = Field(default=0, ge=0, le=15)
+    frames_per_s: float = Field(default=1000.0, gt=0, le=10_000)
+    error_percent: float = Field(default=0.1, gt=0, le=10)
+    max_change_percent: float = Field(default=20.0, gt=0)
+    least_interval_s: Annotated[float, TIME] = Field(default=60.0, ge=0)
+    judge_s: Annotated[float, TIME] = Field(default=30.0, ge=5)
+    gain_percent: float = Field(default=1.0, gt=0, lt=100)

@@ -129,7 +129,6 @@ class Line:
     """A line to a controller in made-up time: what it does to frames is up to `spoil`.
 
     spoil(data, is_answer) gives what arrives in place of one frame: nothing, it, or several.
-    late: the next frame may overtake one that spoil kept back (`swap`).
     """
 
     controller: Controller
@@ -138,8 +137,8 @@ class Line:
     time_s: float = 0.0
     _answers: deque[bytes] = field(default_factory=deque)
 
-    def send(self, data: bytes) -> None:
-        """To the controller, whose answers wait for `receive`."""
+    def tell(self, data: bytes) -> None:
+        """To the controller, whose answers wait for `hear`."""
         self.sent.append(data)
         self.time_s += 250e-6
         self.controller.now_ms = round(1e3 * self.time_s)
@@ -147,7 +146,7 @@ class Line:
             for answer in self.controller.push(arrived):
                 self._answers.extend(self.spoil(answer, True))
 
-    def receive(self, timeout_s: float) -> bytes | None:
+    def hear(self, timeout_s: float) -> bytes | None:
         """An answer; time passes where there is none."""
         if self._answers:
             return self._answers.popleft()
