@@ -42,7 +42,7 @@ def alike_ones(state: State, present: Fit, best: Trial, trials: list[Trial]) -> 
     One that leaves several times the misfit that the best one leaves is refuted.
     """
     dof = present.regression.dof
-    misfit = present.estimate.sse - dof
+    misfit = present.held.sse - dof
     close = best.gain - TIE - TIE_SHARE * best.gain
     refuted = misfit - REFUTED * max(misfit - best.gain, WITHIN * dof) - TIE
     return tuple(
@@ -73,5 +73,5 @@ def contest(
 
 def _finished(state: State, present: Fit, trial: Trial) -> Trial:
     now = carried_on(state, present, trial)
-    gain = present.estimate.sse - now.estimate.sse
+    gain = present.held.sse - now.held.sse
     return replace(trial, gain=gain, revision=now.revision, fit=now.light())

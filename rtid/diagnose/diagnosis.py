@@ -83,7 +83,7 @@ def search(
         state.held_out = state.chunk
         before = residual(first, state.held_out)
     bare = _bare(state, first)
-    state.excess = bare.estimate.sse - bare.regression.dof
+    state.excess = bare.held.sse - bare.regression.dof
     present, first, last = first, first.light(), before
     if can_judge(before):
         present, last = _extended(state, present, before)
@@ -172,7 +172,7 @@ def _with_bank(state: State, now: Fit) -> tuple[Fit, Residual]:
 def _is_noticed(present: Fit, trial: Trial) -> bool:
     """True for an immaterial cause that explains a fair part of the misfit all the same."""
     dof = present.regression.dof
-    return trial.gain > max(NOTICED * dof, LEAST_SHARE * (present.estimate.sse - dof))
+    return trial.gain > max(NOTICED * dof, LEAST_SHARE * (present.held.sse - dof))
 
 
 def _explains(state: State, present: Fit, trial: Trial) -> bool:
@@ -181,7 +181,7 @@ def _explains(state: State, present: Fit, trial: Trial) -> bool:
     Once most of the first misfit is explained, the rest of a form that is nearly right would be
     named as effects of their own.
     """
-    left = present.estimate.sse - present.regression.dof
+    left = present.held.sse - present.regression.dof
     excess = state.excess
     if present.rho < MATCH_RHO or excess <= 0:
         return True

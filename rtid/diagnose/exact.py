@@ -29,7 +29,7 @@ def with_pump(state: State, present: Fit, trials: list[Trial]) -> list[Trial]:
     timings = (*present.revision.timings, (PUMP, psi))
     revision = replace(present.revision, timings=timings)
     now = fit(state.model, state.chunk, present.weights, revision, bank=False)
-    gain = present.estimate.sse - now.estimate.sse
+    gain = present.held.sse - now.held.sse
     return [*rest, Trial(first[0].key, gain, now.revision, now.light(), True)]
 
 
@@ -75,7 +75,7 @@ def exact_trials(
         now = tried(state.model, state.chunk, present.weights, revision)
         if not _is_inside(now):
             continue
-        exact, key = present.estimate.sse - now.estimate.sse, (timing.effect, COMMAND)
+        exact, key = present.held.sse - now.estimate.sse, (timing.effect, COMMAND)
         if key not in trials or exact > trials[key].gain:
             trials[key] = Trial(key, exact, now.revision, now, True)
     return list(trials.values())

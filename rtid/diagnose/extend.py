@@ -191,7 +191,7 @@ def _against(before: Standing, after: Standing, trial: Trial) -> Iterator[str]:
         yield f"its own flow on the held-out part is {100 * own:.2g} % of the rms flow: {figures}"
     if trial.gain <= GAIN:
         yield f"it is not significant: chi2 falls by {max(0.0, trial.gain):.1f}, {GAIN:.0f} needed"
-    left = before.fit.estimate.sse - before.fit.regression.dof
+    left = before.fit.held.sse - before.fit.regression.dof
     if before.fit.rho > MATCH_RHO and trial.gain < LEAST_SHARE * left:
         yield (
             f"it explains {100 * max(0.0, trial.gain) / left:.2g} % of the misfit: "

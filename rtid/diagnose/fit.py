@@ -44,6 +44,8 @@ class Fit:
     declared: the machine as declared, and chunk the record; before: the map that gave the columns.
     The columns of the regression are
     y, theta_beta per chamber, timing parameters, shapes up to `first`, candidates, echoes.
+    estimate: of all of them, which says where timings and shapes should move; held: with these
+    where they are, to which `map` belongs and which everything else is judged by.
     shapes: (effect, nonlinear parameter) of each column of shapes.  rows: of the record, for
     another fit with the same commands and weights; large.
     """
@@ -56,6 +58,7 @@ class Fit:
     columns: Columns
     regression: Regression
     estimate: Estimate
+    held: Estimate
     map: FlowMap
     first: int
     shapes: tuple[tuple[int, int], ...] = ()
@@ -79,13 +82,13 @@ class Fit:
     @property
     def rho(self) -> float:
         """Residual variance in units of the sensors' noise."""
-        return self.regression.rho(self.estimate)
+        return self.regression.rho(self.held)
 
     @property
     def compliance(self) -> FloatArray:
         """1 / beta per chamber, 1/Pa."""
         n_c = len(self.model.chambers)
-        return np.asarray(self.estimate.theta[:n_c] * self.weights.compliance)
+        return np.asarray(self.held.theta[:n_c] * self.weights.compliance)
 
     @property
     def first_given(self) -> int:
@@ -182,8 +185,9 @@ def one_pass(
     regression.prior[weak] = RIDGE * regression.own[weak] + (regression.own[weak] == 0.0)
     at = [first + columns.candidates.index(e) for e in revision.effects]
     estimate = regression.fit((*range(1, first), *at))
-    flowmap = FlowMap(rows.cells, projected.terms(list(estimate.used), estimate.theta), NO_COV)
-    parts = chunk, weights, revision, before, columns, regression, estimate
+    held = regression.fit((*range(1, 1 + len(model.chambers)), *at))
+    flowmap = FlowMap(rows.cells, projected.terms(list(held.used), held.theta), NO_COV)
+    parts = chunk, weights, revision, before, columns, regression, estimate, held
     found = Fit(declared, *parts, flowmap, first, shapes, rows)
     vars(found).update(model=model, sent=sent, view=view)  # what is made when it is missing
     return with_covariances(found) if thorough else found

@@ -91,8 +91,8 @@ def halfway(best: Fit, step: Step) -> Step:
 
 def is_as_good(found: Fit, best: Fit) -> bool:
     """True where a step changed the misfit by next to nothing."""
-    misfit = best.estimate.sse - best.regression.dof
-    return abs(best.estimate.sse - found.estimate.sse) < max(NOISE, ENOUGH * misfit)
+    misfit = best.held.sse - best.regression.dof
+    return abs(best.held.sse - found.held.sse) < max(NOISE, ENOUGH * misfit)
 
 
 def is_worse(found: Fit, best: Fit) -> bool:
@@ -101,7 +101,7 @@ def is_worse(found: Fit, best: Fit) -> bool:
         return True
     alike = np.array_equal(found.weights.compliance, best.weights.compliance)
     alike = alike and _weigh_alike(found.revision.sizes, best.revision.sizes)
-    return alike and found.estimate.sse > best.estimate.sse and not is_as_good(found, best)
+    return alike and found.held.sse > best.held.sse and not is_as_good(found, best)
 
 
 def _mean(a: Psi, b: Psi) -> Psi:

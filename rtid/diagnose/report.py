@@ -175,7 +175,7 @@ def parameters(fit: Fit, key: Key) -> dict[str, Value]:
     for effect in fit.revision.effects:
         if effect.key == key:
             column = fit.column(effect)
-            value, sd = fit.estimate.value(column), fit.estimate.sd(column) * spread
+            value, sd = fit.held.value(column), fit.estimate.sd(column) * spread
             scale = physical(fit, effect, 1.0)
             found[effect.parameter] = Value(scale * value, scale * sd, effect.unit)
             free = fit.shape_columns(effect)

@@ -73,7 +73,7 @@ def modelled(fit: Fit, view: View, leave_out: Candidate | None = None) -> FloatA
 
 def effect_values(fit: Fit) -> list[tuple[Candidate, float]]:
     """The effects of a revision and their coefficients, SI."""
-    return [(e, fit.estimate.value(fit.column(e))) for e in fit.revision.effects]
+    return [(e, fit.held.value(fit.column(e))) for e in fit.revision.effects]
 
 
 def residual(fit: Fit, chunk: FloatArray, leave_out: Candidate | None = None) -> Residual:

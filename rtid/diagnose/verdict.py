@@ -31,7 +31,7 @@ def verdict(state: State, last: Fit, after: Residual) -> str:
         # what is left may be no noise, and still be too small to matter
         is_small = last.rho < MATCH_RHO or remainder(after) < MATERIAL
         return MATCHES if is_small else UNKNOWN
-    left = last.estimate.sse - last.regression.dof
+    left = last.held.sse - last.regression.dof
     explained = 1.0 - left / state.excess if state.excess > 0 else 1.0
     if last.rho >= MATCH_RHO and explained < NAMED:
         return UNKNOWN

@@ -24,7 +24,7 @@ def trial(effect: str, gain: float, *shape: float) -> Trial:
 def present(misfit: float) -> Any:
     """A fit that leaves so much beyond its degrees of freedom."""
     return SimpleNamespace(
-        regression=SimpleNamespace(dof=DOF), estimate=SimpleNamespace(sse=DOF + misfit)
+        regression=SimpleNamespace(dof=DOF), held=SimpleNamespace(sse=DOF + misfit)
     )
 
 
@@ -44,7 +44,7 @@ def test_all_but_as_good_is_alike() -> None:
 
 
 def test_one_that_leaves_several_times_the_misfit_is_refuted() -> None:
-    """The best leaves nothing: 1 % of 100,000 left is more than noise, though the gains are near."""
+    """The best leaves nothing: 1 % of 100,000 is more than noise, though the gains are near."""
     left = REFUTED * 0.05 * DOF
     assert alike(100_000, 100_000, 100_000 - left + 1, 100_000 - left - TIE - 1) == {"cause 1"}
 

@@ -32,12 +32,15 @@ def moves(seed: int, n: int = 1200) -> FloatArray:
 @pytest.mark.parametrize("seed", range(4))
 def test_it_solves_the_pump_s_equation(seed: int) -> None:
     """Each held demand against a solver, also across the limit of the pump in either direction."""
+
+    def rate(_: float, d: FloatArray, q: float) -> list[float]:
+        return [S * (q - min(Q_P, max(0.0, d[0]) / R))]
+
     drawn, exact = moves(seed), [0.0]
     for q in drawn[:-1]:
         done = solve_ivp(
-            lambda _, d, q=q: [S * (q - min(Q_P, max(0.0, d[0]) / R))],
-            (0, DT), [exact[-1]], max_step=DT / 8, rtol=1e-9, atol=1e-3,
-        )  # fmt: skip
+            rate, (0, DT), [exact[-1]], max_step=DT / 8, rtol=1e-9, atol=1e-3, args=(q,)
+        )
         exact.append(max(0.0, done.y[0, -1]))
     assert max(exact) > 1.2 * R * Q_P > min(exact) == 0.0
     assert np.abs(drawn_down(drawn, DT, (R, Q_P, S)) - exact).max() < 1e-5 * R * Q_P
@@ -89,7 +92,7 @@ def test_edges_that_the_mode_keeps_shut_draw_nothing() -> None:
 
 
 def test_a_record_with_a_sag_is_varied_as_it_was_recorded() -> None:
-    """The sag of a revision is applied by each fit: the record of an experiment must not have it."""
+    """Each fit applies the sag of its revision: the record of an experiment must not have it."""
     model, chunk, _ = record()
     weights = prepare(model, chunk)
     plain = one_pass(model, chunk, weights, Revision(), None, False, thorough=False)
