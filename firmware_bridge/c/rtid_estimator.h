@@ -1,0 +1,162 @@
+/* The estimator for a controller with no computer beside it: one chamber and the metering edges of
+ * one valve, the same update and the same equations as rtid/kernels (integral form, Taylor blocks):
+ *
+ *     s A (x_k+1 - x_k) = - V (P_k+1 - P_k) theta_beta + sum over open edges of sigma int Q dt
+ *                         + sum over shared terms                           (eq. 14, integrated)
+ *
+ * C99, no heap, no state but what the caller hands in.  rtid_estimator_tables.h, which holds the
+ * machine and fixes all sizes, is written by `rtid mcu` from the project file.  One double or, with
+ * -DRTID_ESTIMATOR_FLOAT32, one float per number in the update; what is summed up for ever is then
+ * kept in two floats.  The solution is computed in double precision, on demand, outside the tick.
+ * Compile without -ffast-math: NaN means "not available", and compensated sums must stay.
+ *
+ *     static rtid_estimator e;  static rtid_estimator_work w;  rtid_estimator_solution s;
+ *     rtid_estimator_start(&e);
+ *     every tick:      rtid_estimator_update(&e, &sample);
+ *     on demand:       rtid_estimator_freeze(&e, &w);     in the tick's context: a short copy
+ *                      rtid_estimator_solve(&w, &s);      anywhere, while updates go on
+ */
+#ifndef RTID_ESTIMATOR_H
+#define RTID_ESTIMATOR_H
+
+#include <stdint.h>
+
+#include "rtid_estimator_tables.h"
+
+#ifdef RTID_ESTIMATOR_FLOAT32
+typedef float rtid_real;
+typedef struct {
+    float high, low; /* of a sum that goes on for ever */
+} rtid_sum;
+#else
+typedef double rtid_real;
+typedef double rtid_sum;
+#endif
+
+#define RTID_EST_TERMS 6 /* 1, xi, eta, xi^2, eta^2, xi eta of a block, eq. (6) */
+#define RTID_EST_SHARED (1 + RTID_EST_N_TERMS)
+#define RTID_EST_BLOCKS_AT (1 + RTID_EST_SHARED)      /* [y | shared | blocks] in the sums */
+#define RTID_EST_RING (1 + RTID_EST_SHARED)           /* [y | shared | ring | open blocks] in rows */
+#define RTID_EST_OPEN_AT (RTID_EST_RING + 1)
+#define RTID_EST_WIDTH (RTID_EST_OPEN_AT + RTID_EST_TERMS * RTID_EST_MAX_OPEN)
+#define RTID_EST_STRIDE ((RTID_EST_WIDTH + 3) / 4 * 4)
+#define RTID_EST_UNKNOWNS (RTID_EST_SHARED + RTID_EST_TERMS * RTID_EST_MAX_BLOCKS)
+#define RTID_EST_SUMS ((1 + RTID_EST_UNKNOWNS) * (2 + RTID_EST_UNKNOWNS) / 2)
+#define RTID_EST_SPAN 16 /* rows that are added up in one rtid_real */
+
+/* What became of samples; counts by these numbers. */
+enum {
+    RTID_EST_SAMPLES = 0, /* all */
+    RTID_EST_ROWS,        /* measured positions that were learned from */
+    RTID_EST_RESTART_GAP, /* a step back, too long, or announced by the sample */
+    RTID_EST_NOT_FINITE,
+    RTID_EST_OUT_OF_RANGE,
+    RTID_EST_OUTSIDE_GRID,
+    RTID_EST_BLOCK_CHANGES,
+    RTID_EST_RESTART_MEMORY, /* too many blocks rang at once: all began anew */
+    RTID_EST_RECOVERING,
+    RTID_EST_NO_ROOM, /* a new block, and RTID_EST_MAX_BLOCKS are in use */
+    RTID_EST_N_COUNTS,
+    RTID_EST_TAKEN = -1
+};
+
+typedef struct {
+    int64_t t_us; /* clock of the controller, 0 to 2^53 - 1 */
+    uint8_t row;  /* x was measured at this instant */
+    uint8_t gap;  /* samples before this one were lost */
+    rtid_real values[RTID_EST_N_SIGNALS]; /* SI, V or A; in the order of rtid_estimator_tables.h */
+} rtid_estimator_sample;
+
+/* A block that was visited. */
+typedef struct {
+    int16_t edge, u, dp; /* place in the grid of its edge */
+    uint32_t rows;
+    int64_t dwell_us, last_us;
+    rtid_sum phi[RTID_EST_TERMS]; /* integral of its terms over the time spent in it, s */
+} rtid_estimator_block;
+
+/* A block that is open, or left and still rings in the whitener. */
+typedef struct {
+    int16_t slot;
+    uint8_t status;
+    rtid_real size;                    /* of its state when it closed */
+    rtid_real d[RTID_EST_TERMS];       /* its state, referred to the ring's origin */
+    rtid_real through[RTID_EST_TERMS]; /* ring x block while it was open */
+    rtid_sum w_start;                  /* ring x ring when it closed */
+    rtid_sum shared_start[RTID_EST_RING];
+} rtid_estimator_recent;
+
+typedef struct {
+    int16_t edge, slot, recent, u, dp;
+    rtid_real phi[RTID_EST_TERMS]; /* integral since it was last carried to its block */
+} rtid_estimator_open;
+
+/* All that the estimator knows; begin with rtid_estimator_start.  A plain copy saves it. */
+typedef struct {
+    /* local columns, those that move at every sample */
+    rtid_real d[RTID_EST_STRIDE];                     /* whitener's state of each column */
+    rtid_real row[RTID_EST_STRIDE];                   /* the row being made */
+    rtid_real gram[RTID_EST_STRIDE][RTID_EST_STRIDE]; /* products of the last few rows */
+    rtid_sum local[RTID_EST_STRIDE][RTID_EST_STRIDE]; /* and of those since the ring began */
+    uint16_t width, uncarried;
+    /* whitener */
+    rtid_real cov, echo, noise_span;
+    rtid_sum noise;
+    /* the last sample */
+    int64_t t_us, ready_us, dt_us;
+    rtid_real values[RTID_EST_N_SIGNALS + 1]; /* and a quantity that is always zero */
+    rtid_real dt_s, lag_decay;
+    uint8_t running;
+    /* working points: lagged command, its moments over the interval, dp at both ends, block */
+    struct {
+        rtid_real w, m1, m2, mt, dp0, dp1;
+        int16_t u, dp, to_u, to_dp, place;
+    } edge[RTID_EST_N_EDGES];
+    uint16_t n_open, n_recent, n_closed, n_young, n_slots;
+    rtid_estimator_open open[RTID_EST_MAX_OPEN];
+    rtid_estimator_recent recent[RTID_EST_MAX_RECENT];
+    uint16_t young[RTID_EST_MAX_RECENT]; /* closed since the ring began, in their order */
+    int16_t slot[RTID_EST_N_CELLS];      /* of each cell of the grids, -1 before the first visit */
+    rtid_estimator_block block[RTID_EST_MAX_BLOCKS];
+    rtid_sum sums[RTID_EST_SUMS]; /* lower triangle, row by row, of [y | shared | blocks] */
+    uint32_t counts[RTID_EST_N_COUNTS];
+} rtid_estimator;
+
+/* Sums as they were at one instant, and the room in which they are solved. */
+typedef struct {
+    double matrix[RTID_EST_SUMS];
+    double scale[RTID_EST_UNKNOWNS], theta[RTID_EST_UNKNOWNS], basis[RTID_EST_UNKNOWNS];
+    double noise, rows, cov_change;
+    uint16_t n_slots;
+    rtid_estimator_block block[RTID_EST_MAX_BLOCKS];
+} rtid_estimator_work;
+
+typedef struct {
+    double compliance, compliance_sd; /* 1 / beta, 1/Pa */
+    double rho;      /* residual variance in units of the declared noise: 1 when all is explained */
+    double leverage; /* share of the pressure noise that the maps absorb */
+    double terms[RTID_EST_SHARED], terms_sd[RTID_EST_SHARED]; /* from 1 on: of the shared terms, SI */
+    int definite; /* 0: the sums were not, and nothing else holds */
+} rtid_estimator_solution;
+
+typedef struct {
+    double theta[RTID_EST_TERMS]; /* m3/s, of the terms of eq. (6) */
+    double mean_m3s, mean_sd_m3s; /* flow averaged over the data, and its standard deviation */
+} rtid_estimator_map;
+
+/* Begin without knowledge. */
+void rtid_estimator_start(rtid_estimator *e);
+
+/* Take one sample: RTID_EST_TAKEN, or the reason against it, which is counted. */
+int rtid_estimator_update(rtid_estimator *e, const rtid_estimator_sample *sample);
+
+/* Bring the sums up to date and copy them; not while an update runs. */
+void rtid_estimator_freeze(rtid_estimator *e, rtid_estimator_work *w);
+
+/* Solve what was frozen; takes nothing but w. */
+void rtid_estimator_solve(rtid_estimator_work *w, rtid_estimator_solution *s);
+
+/* Block `slot` < w->n_slots of a solved w; 1, or 0 if there is no such block. */
+int rtid_estimator_map_of(const rtid_estimator_work *w, int slot, rtid_estimator_map *map);
+
+#endif

@@ -1,0 +1,341 @@
+/* Sparse information sums of rows that touch many blocks, each with a fading memory: see
+ * rtid/kernels/information.py for the algebra.  Here the state of a column is one number, and what
+ * two blocks share goes straight to the dense triangle of sums. */
+#include "rtid_estimator_sums.h"
+
+#include <string.h>
+
+/* ---- sums that go on for ever ---- */
+
+static rtid_sum *sum_at(rtid_estimator *e, int i, int j)
+{
+    return &e->sums[(uint32_t)i * (uint32_t)(i + 1) / 2 + (uint32_t)j];
+}
+
+static int at_slot(int slot) { return RTID_EST_BLOCKS_AT + T * slot; }
+
+/* The tile that two blocks share += left' right; their own tile is symmetric. */
+static void add_tile(rtid_estimator *e, int slot, int other, const rtid_real *left, const rtid_real *right)
+{
+    const int turned = slot < other, low = at_slot(turned ? slot : other);
+    const int high = at_slot(turned ? other : slot);
+    const rtid_real *a = turned ? right : left, *b = turned ? left : right;
+    for (int i = 0; i < T; i++) {
+        rtid_sum *target = sum_at(e, high + i, low);
+        const int n = slot == other ? i + 1 : T;
+        for (int j = 0; j < n; j++)
+            add(&target[j], a[i] * b[j]);
+    }
+}
+
+/* ---- local columns: those that move at every sample, and their products ---- */
+
+void rtid_est_set_open(rtid_estimator *e, int n)
+{
+    e->n_open = (uint16_t)n;
+    e->width = (uint16_t)first_of(n);
+}
+
+static void clear_columns(rtid_estimator *e, int first, int last)
+{
+    for (int i = 0; i < RTID_EST_WIDTH; i++)
+        for (int j = 0; j <= i; j++)
+            if ((i >= first && i < last) || (j >= first && j < last)) {
+                e->gram[i][j] = 0;
+                e->local[i][j] = no_sum();
+            }
+}
+
+void rtid_est_carry(rtid_estimator *e)
+{
+    for (int i = 0; i < e->width; i++)
+        for (int j = 0; j <= i; j++) {
+            add(&e->local[i][j], e->gram[i][j]);
+            e->gram[i][j] = 0;
+        }
+    for (int k = 0; k < e->n_open; k++)
+        for (int j = 0; j < T; j++) {
+            add(&e->block[e->open[k].slot].phi[j], e->open[k].phi[j]);
+            e->open[k].phi[j] = 0;
+        }
+    add(&e->noise, e->noise_span);
+    e->noise_span = 0;
+    e->uncarried = 0;
+}
+
+static rtid_sum ring_ring(const rtid_estimator *e) { return e->local[RTID_EST_RING][RTID_EST_RING]; }
+
+/* out = sign * ring x open block k */
+static void read_through(const rtid_estimator *e, int k, rtid_real sign, rtid_real *out)
+{
+    for (int i = 0; i < T; i++)
+        out[i] = sign * rounded(e->local[first_of(k) + i][RTID_EST_RING]);
+}
+
+/* ---- products of one block, see rtid/kernels/information.py ---- */
+
+/* Of open block k with itself, y and the shared columns. */
+static void add_own(rtid_estimator *e, int k)
+{
+    const int first = first_of(k), at = at_slot(e->open[k].slot);
+    for (int i = 0; i < T; i++) {
+        for (int j = 0; j < 1 + RTID_EST_SHARED; j++)
+            merge(sum_at(e, at + i, j), e->local[first + i][j]);
+        for (int j = 0; j <= i; j++)
+            merge(sum_at(e, at + i, at + j), e->local[first + i][first + j]);
+    }
+}
+
+/* Of open block k with another open one. */
+static void add_open_pair(rtid_estimator *e, int k, int other)
+{
+#if RTID_EST_MAX_OPEN > 1
+    const int a = k > other ? k : other, b = k + other - a;
+    const int slot_a = at_slot(e->open[a].slot), slot_b = at_slot(e->open[b].slot);
+    for (int i = 0; i < T; i++)
+        for (int j = 0; j < T; j++) {
+            const rtid_sum product = e->local[first_of(a) + i][first_of(b) + j];
+            if (slot_a > slot_b)
+                merge(sum_at(e, slot_a + i, slot_b + j), product);
+            else
+                merge(sum_at(e, slot_b + j, slot_a + i), product);
+        }
+#else
+    (void)e, (void)k, (void)other; /* there is none, and compilers cannot see it */
+#endif
+}
+
+/* left = what the closed block shares with the ring's origin, own = the part since it closed. */
+static void weigh(const rtid_estimator *e, const rtid_estimator_recent *item, rtid_real *own, rtid_real *left)
+{
+    const rtid_real w = since(ring_ring(e), item->w_start);
+    for (int i = 0; i < T; i++) {
+        own[i] = w * item->d[i];
+        left[i] = item->through[i] + own[i];
+    }
+}
+
+/* Of a closed block with y and the shared columns since it closed. */
+static void add_shared(rtid_estimator *e, const rtid_estimator_recent *item)
+{
+    const int at = at_slot(item->slot);
+    for (int j = 0; j < 1 + RTID_EST_SHARED; j++) {
+        const rtid_real value = since(e->local[RTID_EST_RING][j], item->shared_start[j]);
+        for (int i = 0; i < T; i++)
+            add(sum_at(e, at + i, j), item->d[i] * value);
+    }
+}
+
+/* left x all blocks that rang all the time */
+static void spread(rtid_estimator *e, int slot, const rtid_real *left)
+{
+    for (int q = 0; q < e->n_recent; q++)
+        if (e->recent[q].status == RINGING)
+            add_tile(e, slot, e->recent[q].slot, left, e->recent[q].d);
+}
+
+/* ---- recent blocks ---- */
+
+static int admit(rtid_estimator *e, int slot)
+{
+    int p = 0;
+    while (p < e->n_recent && e->recent[p].status != FREE)
+        p++;
+    if (p == e->n_recent)
+        e->n_recent++;
+    e->recent[p].status = OPEN;
+    e->recent[p].slot = (int16_t)slot;
+    return p;
+}
+
+static void release(rtid_estimator *e, int p)
+{
+    e->recent[p].status = FREE;
+    while (e->n_recent > 0 && e->recent[e->n_recent - 1].status == FREE)
+        e->n_recent--;
+}
+
+/* Products of the a-th young block with itself and all that closed before it. */
+static void settle_young(rtid_estimator *e, int a)
+{
+    const rtid_estimator_recent *item = &e->recent[e->young[a]];
+    rtid_real own[T], left[T];
+    weigh(e, item, own, left);
+    add_tile(e, item->slot, item->slot, own, item->d);
+    spread(e, item->slot, left);
+    for (int b = 0; b < a; b++)
+        add_tile(e, item->slot, e->recent[e->young[b]].slot, left, e->recent[e->young[b]].d);
+}
+
+void rtid_est_close(rtid_estimator *e, int k)
+{
+    rtid_estimator_recent *item = &e->recent[e->open[k].recent];
+    rtid_real left[T];
+    rtid_est_carry(e);
+    item->status = YOUNG;
+    item->size = 0;
+    for (int i = 0; i < T; i++) {
+        const rtid_real d = e->d[first_of(k) + i];
+        item->size = ABS(d) > item->size ? ABS(d) : item->size;
+        item->d[i] = d / e->d[RTID_EST_RING];
+        e->d[first_of(k) + i] = 0;
+    }
+    item->w_start = ring_ring(e);
+    memcpy(item->shared_start, e->local[RTID_EST_RING], sizeof item->shared_start);
+    read_through(e, k, R(1), item->through);
+    add_own(e, k);
+    for (int other = 0; other < e->n_open; other++)
+        if (other != k) {
+            add_open_pair(e, k, other);
+            read_through(e, other, R(-1), left); /* `other` will charge it from the beginning */
+            add_tile(e, item->slot, e->open[other].slot, item->d, left);
+        }
+    clear_columns(e, first_of(k), first_of(k + 1));
+    e->young[e->n_young++] = (uint16_t)e->open[k].recent;
+    e->n_closed++;
+}
+
+/* Settle what closed block p shares with all but open block k; a young one is so no more. */
+static void settle_one(rtid_estimator *e, int k, int p)
+{
+    const rtid_estimator_recent *item = &e->recent[p];
+    rtid_real own[T], left[T];
+    int later = 0;
+    if (item->status == YOUNG) {
+        while (e->young[later] != p)
+            later++;
+        settle_young(e, later);
+        e->n_young--;
+        for (int a = later; a < e->n_young; a++)
+            e->young[a] = e->young[a + 1];
+    } else {
+        weigh(e, item, own, left);
+        spread(e, item->slot, left);
+    }
+    for (int a = later; a < e->n_young; a++) {
+        const rtid_estimator_recent *young = &e->recent[e->young[a]];
+        weigh(e, young, own, left);
+        add_tile(e, young->slot, item->slot, left, item->d);
+    }
+    for (int other = 0; other < e->n_open; other++)
+        if (other != k) {
+            read_through(e, other, R(1), left);
+            add_tile(e, item->slot, e->open[other].slot, item->d, left);
+        }
+    add_shared(e, item);
+}
+
+void rtid_est_open(rtid_estimator *e, int k, int edge, int slot)
+{
+    rtid_est_carry(e);
+    if (k == e->n_open)
+        rtid_est_set_open(e, k + 1);
+    e->open[k].edge = (int16_t)edge;
+    e->open[k].slot = (int16_t)slot;
+    e->open[k].u = e->edge[edge].u;
+    e->open[k].dp = e->edge[edge].dp;
+    e->edge[edge].place = (int16_t)k;
+    for (int p = 0; p < e->n_recent; p++) {
+        rtid_estimator_recent *item = &e->recent[p];
+        if (item->slot != slot || item->status < YOUNG)
+            continue;
+        settle_one(e, k, p);
+        for (int i = 0; i < T; i++)
+            e->d[first_of(k) + i] = e->d[RTID_EST_RING] * item->d[i];
+        item->status = OPEN;
+        e->open[k].recent = (int16_t)p;
+        e->n_closed--;
+        return;
+    }
+    e->open[k].recent = (int16_t)admit(e, slot);
+}
+
+void rtid_est_remove_open(rtid_estimator *e, int k)
+{
+    const int last = e->n_open - 1, to = first_of(k), source = first_of(last);
+    e->edge[e->open[k].edge].place = -1;
+    if (k < last) {
+        for (int i = 0; i < T; i++) {
+            e->d[to + i] = e->d[source + i];
+            e->d[source + i] = 0;
+            for (int j = 0; j < to; j++)
+                e->local[to + i][j] = e->local[source + i][j];
+            for (int j = to + T; j < source; j++)
+                e->local[j][to + i] = e->local[source + i][j];
+            for (int j = 0; j <= i; j++)
+                e->local[to + i][to + j] = e->local[source + i][source + j];
+        }
+        e->open[k] = e->open[last];
+        e->edge[e->open[k].edge].place = (int16_t)k;
+    }
+    clear_columns(e, source, source + T);
+    rtid_est_set_open(e, last);
+}
+
+/* ---- the ring begins anew ---- */
+
+void rtid_est_rebase(rtid_estimator *e, int end)
+{
+    rtid_real left[T];
+    rtid_est_carry(e);
+    for (int k = 0; k < e->n_open; k++) {
+        add_own(e, k);
+        for (int other = 0; other < k; other++)
+            add_open_pair(e, k, other);
+        read_through(e, k, R(1), left);
+        spread(e, e->open[k].slot, left);
+        for (int a = 0; a < e->n_young; a++)
+            add_tile(e, e->open[k].slot, e->recent[e->young[a]].slot, left, e->recent[e->young[a]].d);
+    }
+    for (int i = 0; i < 1 + RTID_EST_SHARED; i++)
+        for (int j = 0; j <= i; j++)
+            merge(sum_at(e, i, j), e->local[i][j]);
+    for (int p = 0; p < e->n_recent; p++) {
+        const rtid_estimator_recent *item = &e->recent[p];
+        if (item->status != RINGING)
+            continue;
+        for (int i = 0; i < T; i++)
+            left[i] = rounded(ring_ring(e)) * item->d[i];
+        for (int q = 0; q <= p; q++)
+            if (e->recent[q].status == RINGING)
+                add_tile(e, item->slot, e->recent[q].slot, left, e->recent[q].d);
+        add_shared(e, item);
+    }
+    for (int a = 0; a < e->n_young; a++) {
+        settle_young(e, a);
+        add_shared(e, &e->recent[e->young[a]]);
+    }
+    e->n_young = 0;
+    for (int p = e->n_recent - 1; p >= 0; p--) {
+        rtid_estimator_recent *item = &e->recent[p];
+        rtid_real largest = 0;
+        if (item->status < YOUNG)
+            continue;
+        item->status = RINGING;
+        item->w_start = no_sum();
+        for (int i = 0; i < T; i++) {
+            item->d[i] *= e->d[RTID_EST_RING];
+            item->through[i] = 0;
+            largest = ABS(item->d[i]) > largest ? ABS(item->d[i]) : largest;
+        }
+        for (int j = 0; j < 1 + RTID_EST_SHARED; j++)
+            item->shared_start[j] = no_sum();
+        if (end || !(largest > SILENT * item->size)) {
+            e->n_closed--;
+            release(e, p);
+        }
+    }
+    clear_columns(e, 0, e->width);
+    for (int j = 0; end && j < RTID_EST_WIDTH; j++)
+        e->d[j] = 0;
+    e->d[RTID_EST_RING] = R(1);
+}
+
+void rtid_est_end(rtid_estimator *e)
+{
+    rtid_est_rebase(e, END_ALL);
+    while (e->n_open > 0) {
+        release(e, e->open[e->n_open - 1].recent);
+        rtid_est_remove_open(e, e->n_open - 1);
+    }
+}

@@ -1,0 +1,91 @@
+/* What the estimator's files share among themselves; not for its users. */
+#ifndef RTID_ESTIMATOR_SUMS_H
+#define RTID_ESTIMATOR_SUMS_H
+
+#include <math.h>
+
+#include "rtid_estimator.h"
+
+#ifdef __FAST_MATH__
+#error "-ffast-math drops the checks for NaN and the compensated sums"
+#endif
+
+#define R(x) ((rtid_real)(x))
+enum { T = RTID_EST_TERMS };
+enum { FREE, OPEN, YOUNG, RINGING }; /* status of a recent block; young: closed since the ring began */
+enum { GO_ON, END_ALL };
+
+#ifdef RTID_ESTIMATOR_FLOAT32
+
+#define ROOT sqrtf
+#define EXP expf
+#define ABS fabsf
+/* No quantity in SI units is that large, and its square is still a number. */
+#define INSANE 1e9f
+#define RING_LIMIT 0.1f /* rebase before the ring columns lose digits */
+#define SILENT 1e-6f    /* a closed block whose state decayed to this share is forgotten */
+
+static inline void add(rtid_sum *s, rtid_real x)
+{
+    const rtid_real t = s->high + x, back = t - s->high; /* Knuth: the sum, and what it rounded off */
+    s->low += (s->high - (t - back)) + (x - back);
+    s->high = t;
+}
+
+static inline void merge(rtid_sum *s, rtid_sum x)
+{
+    add(s, x.high);
+    s->low += x.low;
+}
+
+static inline rtid_real since(rtid_sum now, rtid_sum then) { return (now.high - then.high) + (now.low - then.low); }
+static inline rtid_real rounded(rtid_sum s) { return s.high + s.low; }
+static inline double exact(rtid_sum s) { return (double)s.high + (double)s.low; }
+static inline rtid_sum no_sum(void) { return (rtid_sum){0.0f, 0.0f}; }
+
+#else
+
+#define ROOT sqrt
+#define EXP exp
+#define ABS fabs
+#define INSANE 1e30
+#define RING_LIMIT 0.05
+#define SILENT 1e-11
+
+static inline void add(rtid_sum *s, rtid_real x) { *s += x; }
+static inline void merge(rtid_sum *s, rtid_sum x) { *s += x; }
+static inline rtid_real since(rtid_sum now, rtid_sum then) { return now - then; }
+static inline rtid_real rounded(rtid_sum s) { return s; }
+static inline double exact(rtid_sum s) { return s; }
+static inline rtid_sum no_sum(void) { return 0.0; }
+
+#endif
+
+static inline int first_of(int k) { return RTID_EST_OPEN_AT + T * k; }
+
+/* Rated flow of an edge, the unit of its unknowns, m3/s. */
+double rtid_est_rated(int edge);
+
+/* Let n blocks be open; the width of the rows follows. */
+void rtid_est_set_open(rtid_estimator *e, int n);
+
+/* Move the products of the last rows to the sums since the ring began. */
+void rtid_est_carry(rtid_estimator *e);
+
+/* Let open block k ring on, its state referred to the ring's origin; clear its columns. */
+void rtid_est_close(rtid_estimator *e, int k);
+
+/* Make `slot` open block k, a place just closed or n_open; if it still rings, it goes on. */
+void rtid_est_open(rtid_estimator *e, int k, int edge, int slot);
+
+/* Take the closed and cleared block k out of the open ones; the last one takes its place. */
+void rtid_est_remove_open(rtid_estimator *e, int k);
+
+/* Settle all products, forget the blocks that fell silent, start the ring anew; with END_ALL all
+ * memory ends, and all states are zero. */
+void rtid_est_rebase(rtid_estimator *e, int end);
+
+/* END_ALL, and no block stays open. */
+void rtid_est_end(rtid_estimator *e);
+
+#endif

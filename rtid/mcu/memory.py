@@ -1,0 +1,114 @@
+"""The memory of the estimator in C as numpy records: its size, and its contents read back.
+
+The layout is that of rtid_estimator.h on every machine where int64_t and double are aligned to
+eight bytes, as on 64-bit hosts and under the ARM EABI.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rtid.estimator.sums import Normal
+from rtid.kernels.layout import TERMS
+from rtid.mcu.tables import Sizes
+from rtid.model import FloatArray
+
+COUNTS = (
+    "samples",
+    "rows",
+    "restart_gap",
+    "not_finite",
+    "out_of_range",
+    "outside_grid",
+    "block_changes",
+    "restart_memory",
+    "recovering",
+    "no_room",
+)
+_I2, _U1, _U2, _U4, _I8 = np.int16, np.uint8, np.uint16, np.uint32, np.int64
+
+
+def _record(fields: Sequence[tuple[Any, ...]]) -> np.dtype[np.void]:
+    return np.dtype(list(fields), align=True)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Records of rtid_estimator.h for one declaration; single: with RTID_ESTIMATOR_FLOAT32."""
+
+    sizes: Sizes
+    single: bool = False
+
+    @property
+    def _real(self) -> Any:
+        return np.float32 if self.single else np.float64
+
+    @property
+    def _sum(self) -> Any:
+        return _record([("high", np.float32), ("low", np.float32)]) if self.single else np.float64
+
+    @property
+    def sample(self) -> np.dtype[np.void]:
+        """rtid_estimator_sample."""
+        values = ("values", self._real, (self.sizes.signals,))
+        return _record([("t_us", _I8), ("row", _U1), ("gap", _U1), values])
+
+    @property
+    def block(self) -> np.dtype[np.void]:
+        """rtid_estimator_block."""
+        place = [("edge", _I2), ("u", _I2), ("dp", _I2), ("rows", _U4)]
+        times = [("dwell_us", _I8), ("last_us", _I8)]
+        return _record([*place, *times, ("phi", self._sum, (TERMS,))])
+
+    @property
+    def estimator(self) -> np.dtype[np.void]:
+        """rtid_estimator."""
+        real, total, n = self._real, self._sum, self.sizes
+        shared = 1 + n.terms
+        stride = -(-(2 + shared + TERMS * n.open) // 4) * 4
+        kept = [("slot", _I2), ("status", _U1), ("size", real), ("d", real, (TERMS,))]
+        kept += [("through", real, (TERMS,)), ("w_start", total), ("shared_start", total, (1 + shared,))]
+        opened = [(name, _I2) for name in ("edge", "slot", "recent", "u", "dp")]
+        edge = [(name, real) for name in ("w", "m1", "m2", "mt", "dp0", "dp1")]
+        edge += [(name, _I2) for name in ("u", "dp", "to_u", "to_dp", "place")]
+        fields = [("d", real, (stride,)), ("row", real, (stride,))]
+        fields += [("gram", real, (stride, stride)), ("local", total, (stride, stride))]
+        fields += [("width", _U2), ("uncarried", _U2)]
+        fields += [(name, real) for name in ("cov", "echo", "noise_span")] + [("noise", total)]
+        fields += [(name, _I8) for name in ("t_us", "ready_us", "dt_us")]
+        fields += [("values", real, (n.signals + 1,)), ("dt_s", real), ("lag_decay", real)]
+        fields += [("running", _U1), ("edge", _record(edge), (n.edges,))]
+        fields += [(f"n_{name}", _U2) for name in ("open", "recent", "closed", "young", "slots")]
+        fields += [("open", _record([*opened, ("phi", real, (TERMS,))]), (n.open,))]
+        fields += [("recent", _record(kept), (n.recent,)), ("young", _U2, (n.recent,))]
+        fields += [("slot", _I2, (n.cells,)), ("block", self.block, (n.blocks,))]
+        return _record([*fields, ("sums", total, (n.sums,)), ("counts", _U4, (len(COUNTS),))])
+
+    @property
+    def work(self) -> np.dtype[np.void]:
+        """rtid_estimator_work."""
+        n = self.sizes
+        fields: list[tuple[Any, ...]] = [("matrix", np.float64, (n.sums,))]
+        fields += [(name, np.float64, (n.unknowns,)) for name in ("scale", "theta", "basis")]
+        fields += [(name, np.float64) for name in ("noise", "rows", "cov_change")]
+        return _record([*fields, ("n_slots", _U2), ("block", self.block, (n.blocks,))])
+
+    def normal(self, memory: np.void) -> Normal:
+        """The normal equations in a record of `estimator` that was frozen: settled sums."""
+        n = 1 + 1 + self.sizes.terms + TERMS * int(memory["n_slots"])
+        whole = np.zeros((n, n))
+        whole[np.tril_indices(n)] = self._number(memory["sums"][: n * (n + 1) // 2])
+        whole += np.tril(whole, -1).T
+        noise = np.array([float(self._number(memory["noise"]))])
+        rows = float(memory["counts"][COUNTS.index("rows")])
+        return Normal(whole[1:, 1:].copy(), whole[1:, 0].copy(), float(whole[0, 0]), noise, rows)
+
+    def _number(self, total: np.ndarray | np.void) -> FloatArray:
+        """Sums as they were added up: the high part and what it rounded off."""
+        if not self.single:
+            return np.asarray(total, float)
+        return np.asarray(total["high"], float) + np.asarray(total["low"], float)

@@ -1,0 +1,108 @@
+"""The estimator in C, compiled for this machine and run on samples."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import firmware_bridge
+from rtid.kernels.layout import TERMS
+from rtid.mcu.memory import COUNTS, Layout
+from rtid.mcu.tables import sizes_of, tables
+from rtid.model import FloatArray, Model
+
+HERE = Path(__file__).parent
+SOURCES = Path(firmware_bridge.__file__).parent / "c"
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
+OPTIMISED = ("-O2",)
+SANITISED = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+COMPILER = next((name for name in ("cc", "gcc", "clang") if shutil.which(name)), None)
+MAP = np.dtype([("theta", np.float64, (TERMS,)), ("mean_m3s", float), ("mean_sd_m3s", float)])
+TAKEN = -1
+
+
+def files() -> list[Path]:
+    """The estimator's sources."""
+    return sorted(SOURCES.glob("rtid_estimator*.c"))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What the C made of samples: verdict of each, memory after the last, its solution and maps."""
+
+    layout: Layout
+    verdicts: NDArray[np.int8]
+    memory: np.void
+    work: np.void
+    solution: np.void
+    maps: NDArray[np.void]
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Counters by name."""
+        return dict(zip(COUNTS, self.memory["counts"].tolist(), strict=True))
+
+
+class Program:
+    """The estimator for one declaration, compiled as a program of its own."""
+
+    def __init__(
+        self,
+        model: Model,
+        folder: Path,
+        blocks: int = 0,
+        single: bool = False,
+        options: tuple[str, ...] = OPTIMISED,
+    ) -> None:
+        if COMPILER is None:
+            pytest.skip("no cc, gcc or clang on this machine: the estimator in C is not tested")
+        self.model, self.layout = model, Layout(sizes_of(model, blocks), single)
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "rtid_estimator_tables.h").write_text(tables(model, blocks))
+        self.path = folder / "estimator"
+        chosen = [*options, *(["-DRTID_ESTIMATOR_FLOAT32"] if single else [])]
+        sources = [str(HERE / "harness.c"), *map(str, files())]
+        command = [COMPILER, *STRICT, *chosen, f"-I{folder}", f"-I{SOURCES}", *sources]
+        subprocess.run([*command, "-o", str(self.path), "-lm"], check=True)
+
+    def samples(self, t_us: NDArray[np.int64], values: FloatArray, flags: FloatArray) -> bytes:
+        """Records for the harness; values (n, signals) in the model's order, flags (n,)."""
+        out = np.zeros(len(t_us), self.layout.sample)
+        out["t_us"], out["values"] = t_us, values
+        out["row"], out["gap"] = flags.astype(int) & 1, (flags.astype(int) >> 1) & 1
+        return out.tobytes()
+
+    def run(self, samples: bytes) -> Outcome:
+        """Feed samples; the program must end well."""
+        done = subprocess.run([self.path], input=samples, capture_output=True, check=False)
+        assert done.returncode == 0, done.stderr.decode()[-2000:]
+        layout, n = self.layout, len(samples) // self.layout.sample.itemsize
+        rest = memoryview(done.stdout)
+        sizes, rest = np.frombuffer(rest[:40], np.uint64), rest[40:]
+        solution = np.dtype(
+            [(name, float) for name in ("compliance", "compliance_sd", "rho", "leverage")]
+            + [(name, float, (1 + layout.sizes.terms,)) for name in ("terms", "terms_sd")]  # type: ignore[list-item]
+            + [("definite", np.int32)],
+            align=True,
+        )
+        records = [layout.estimator, layout.work, layout.sample, solution, MAP]
+        assert sizes.tolist() == [record.itemsize for record in records]
+        found = []
+        for dtype, count in (
+            (np.dtype(np.int8), n),
+            (layout.estimator, 1),
+            (layout.work, 1),
+            (solution, 1),
+        ):
+            size = dtype.itemsize * count
+            found.append(np.frombuffer(rest[:size], dtype))
+            rest = rest[size:]
+        return Outcome(
+            layout, found[0], found[1][0], found[2][0], found[3][0], np.frombuffer(rest, MAP)
+        )

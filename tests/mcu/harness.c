@@ -1,0 +1,34 @@
+/* Samples from standard input through the estimator; verdicts, memory and solution to standard
+ * output, all as the host's own records. */
+#include <stdio.h>
+#include <string.h>
+
+#include "rtid_estimator.h"
+
+static rtid_estimator e;
+static rtid_estimator_work work;
+
+static void put(const void *bytes, size_t n) { fwrite(bytes, 1, n, stdout); }
+
+int main(void)
+{
+    rtid_estimator_sample sample;
+    rtid_estimator_solution solution;
+    rtid_estimator_map map;
+    const uint64_t sizes[] = {sizeof e, sizeof work, sizeof sample, sizeof solution, sizeof map};
+    rtid_estimator_start(&e);
+    put(sizes, sizeof sizes);
+    while (fread(&sample, sizeof sample, 1, stdin) == 1) {
+        const int8_t verdict = (int8_t)rtid_estimator_update(&e, &sample);
+        put(&verdict, 1);
+    }
+    rtid_estimator_freeze(&e, &work);
+    put(&e, sizeof e);
+    rtid_estimator_solve(&work, &solution);
+    put(&work, sizeof work);
+    put(&solution, sizeof solution);
+    for (int slot = -1; slot <= RTID_EST_MAX_BLOCKS; slot++)
+        if (solution.definite && rtid_estimator_map_of(&work, slot, &map))
+            put(&map, sizeof map);
+    return 0;
+}
