@@ -13,7 +13,8 @@ from rtid.diagnose.report import Diagnosis, diagnosis
 from rtid.diagnose.verdict import MATERIAL
 from rtid.estimator.estimator import to_chunk
 from rtid.sim.declare import declared_model
-from rtid.sim.hidden import HIDDEN, MECHANICAL, OUTSIDE
+from rtid.sim.hidden import HIDDEN, MECHANICAL, OUTSIDE, hide
+from rtid.sim.plant import Plant
 from rtid.sim.random_plants import draw, draw_hidden
 from rtid.sim.run import SimulationError, simulate
 from tests.campaign.plants import WORKERS, grid
@@ -22,24 +23,43 @@ RECORD_S, LEARN_S, TEST_S = 110.0, 80.0, 83.0
 NONE = "none"
 LARGEST_SET = 3  # causes that an honest set may have
 
-RIGHT, IN_SET, NEGLIGIBLE, SILENT, UNKNOWN, WRONG = (
-    "right", "in a set", "negligible", "not seen", "unknown", "wrong name"
+RIGHT, IN_SET, NEGLIGIBLE, SILENT, UNKNOWN, WRONG, HALF = (
+    "right", "in a set", "negligible", "not seen", "unknown", "wrong name", "one of two"
 )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Case:
-    """What is drawn: the machine's number, what is hidden, how much of it, the motion."""
+    """What is drawn: the machine's number, what is hidden, how much of it, the motion.
+
+    second: another effect, hidden beside the first.
+    """
 
     seed: int
     effect: str = NONE
     level: str = "middle"
     motion: str = "rich_record"
+    second: str = ""
+
+    @property
+    def plant(self) -> Plant:
+        """The machine."""
+        if self.effect == NONE:
+            return draw(self.seed)
+        plant = draw_hidden(self.seed, self.effect, self.level)
+        if not self.second:
+            return plant
+        (more,) = draw_hidden(self.seed, self.second, self.level).hidden
+        return hide(plant, more.name, more.strength, more.where)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """A judged diagnosis; named: the first effect that was named, "" where none was."""
+    """A judged diagnosis; named: the first effect that was named, "" where none was.
+
+    size: the first effect's size over the true one, NaN where it is not one number; left_pct: of
+    the rms flow on the held-out part, with everything found.
+    """
 
     case: Case
     judgement: str
@@ -47,6 +67,8 @@ class Outcome:
     verdict: str
     rho_before: float
     rho_after: float
+    size: float
+    left_pct: float
 
 
 def outcomes(cases: Iterable[Case]) -> Iterator[Outcome]:
@@ -59,9 +81,7 @@ def outcomes(cases: Iterable[Case]) -> Iterator[Outcome]:
 
 def outcome(case: Case) -> Outcome | None:
     """One case; None where the drawn machine leaves its stroke or cavitates."""
-    plant = (
-        draw(case.seed) if case.effect == NONE else draw_hidden(case.seed, case.effect, case.level)
-    )
+    plant = case.plant
     try:
         run = simulate(plant, case.motion, case.seed, RECORD_S)
     except SimulationError:
@@ -71,9 +91,21 @@ def outcome(case: Case) -> Outcome | None:
     t_s = chunk[:, 0]
     found = diagnosis(search(model, chunk[t_s < LEARN_S], chunk[t_s >= TEST_S]))
     named = found.found[0].effect if found.found else ""
+    left_pct = 100.0 * found.heldout_residual_after_m3s / max(found.rms_flow_m3s, 1e-12)
     return Outcome(
-        case, judge(case, found), named, found.verdict, found.rho_before, found.rho_after
-    )
+        case, judge(case, found), named, found.verdict, found.rho_before, found.rho_after,
+        _size(plant, found), left_pct,
+    )  # fmt: skip
+
+
+def _size(plant: Plant, found: Diagnosis) -> float:
+    """What was found of the first effect over what was hidden, where one number is its size."""
+    if not found.found or not plant.hidden:
+        return float("nan")
+    own, true = found.found[0], plant.hidden[0]
+    value, *shape = own.parameters.values()
+    alike = not shape and own.effect == truth(true.name) and value.unit == HIDDEN[true.name].unit
+    return abs(value.value / true.strength) if alike else float("nan")
 
 
 def truth(effect: str) -> str:
@@ -86,6 +118,8 @@ def truth(effect: str) -> str:
 def judge(case: Case, found: Diagnosis) -> str:
     """What the diagnosis is worth."""
     true = truth(case.effect)
+    if case.second:
+        return _judge_two({true, truth(case.second)}, found)
     if not found.found:
         if found.verdict == "unknown":
             return UNKNOWN
@@ -94,6 +128,16 @@ def judge(case: Case, found: Diagnosis) -> str:
     if not all(true in one for one in sets) or any(len(one) > LARGEST_SET for one in sets):
         return WRONG  # a false name beside the right one is as wrong as alone
     return RIGHT if all(len(one) == 1 for one in sets) else IN_SET
+
+
+def _judge_two(true: set[str], found: Diagnosis) -> str:
+    """Both named, one of them, or neither; a third name is wrong."""
+    sets = [{e.effect, *(n.split(" ")[0] for n in e.cannot_be_told_from)} for e in found.found]
+    if any(not one & true for one in sets):
+        return WRONG
+    if all(any(name in one for one in sets) for name in true):
+        return RIGHT
+    return HALF if sets else UNKNOWN
 
 
 def excess(found: Diagnosis) -> float:
