@@ -7,30 +7,29 @@ Both keep the plain function as `.py_func`.
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from firmware_bridge.kernel_cache import cache_folder, cached
+
 Record = Any  # one row of a structured array
 Records = NDArray[Any]  # a structured array; its dtype is named in the text
 Integer = int | np.integer[Any]
 
 
+_HERE = Path(__file__).parent
+_FOLDER = cache_folder("bridge", _HERE, _HERE.rglob("*.py"))
+
+
 def kernel(function: Callable[..., Any]) -> Any:
-    """Compile an entry point; cached on disk."""
-    return _cached(function)
+    """Compile an entry point; kept on disk where that is possible."""
+    return cached(_FOLDER, function)
 
 
 def inlined(function: Callable[..., Any]) -> Any:
     """Compile a part of a kernel; always inlined."""
-    return _cached(function, forceinline=True)
-
-
-def _cached(function: Callable[..., Any], **options: Any) -> Any:
-    """Keep the result on disk, where numba finds a folder that it may write to."""
-    try:
-        return njit(cache=True, **options)(function)
-    except RuntimeError:  # no such folder: compile at each start
-        return njit(**options)(function)
+    return njit(forceinline=True, no_cfunc_wrapper=True)(function)

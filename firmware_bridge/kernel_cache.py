@@ -1,0 +1,81 @@
+"""Where compiled kernels are kept, and how a cache that may only be read is used all the same.
+
+numba's cache looks at the file of the function that is called, not at those of its callees: an old
+binary would survive a change of them.  So the cache lies in a folder named by the digest of all
+sources.  And numba wants to write where it reads: kernels that were compiled at installation into a
+folder that is closed by now are taken from a copy.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import hashlib
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+from numba import config, njit
+
+
+def cache_folder(name: str, beside: Path, sources: Iterable[Path]) -> Path | None:
+    """A folder `name-DIGEST` to keep kernels in, None where nothing can be written.
+
+    The first of NUMBA_CACHE_DIR, __pycache__ beside the sources, the user's cache and the system's
+    folder for temporary files that holds them or takes them.
+    """
+    name = f"{name}-{_digest(sources)}"
+    for folder in (place / name for place in _places(beside)):
+        if _is_writable(folder):
+            return folder
+        if next(folder.glob("**/*.nbi"), None) is not None:
+            return _copied(folder)
+    return None
+
+
+def cached(folder: Path | None, function: Callable[..., Any], **options: Any) -> Any:
+    """`njit` of a function, kept in the folder where there is one."""
+    if folder is None:
+        return njit(**options)(function)
+    before, config.CACHE_DIR = config.CACHE_DIR, str(folder)
+    try:
+        return njit(cache=True, **options)(function)
+    finally:
+        config.CACHE_DIR = before
+
+
+def _digest(sources: Iterable[Path]) -> str:
+    total = hashlib.sha256()
+    for source in sorted(sources):
+        total.update(source.read_bytes())
+    return total.hexdigest()[:12]
+
+
+def _places(beside: Path) -> Iterator[Path]:
+    if config.CACHE_DIR:
+        yield Path(config.CACHE_DIR)
+    yield beside / "__pycache__"
+    yield Path.home() / ".cache" / "rtid"
+    own = Path(tempfile.gettempdir()) / f"rtid-{os.getuid()}"  # survives this process: others start
+    with contextlib.suppress(OSError):
+        own.mkdir(mode=0o700, exist_ok=True)
+        if own.stat().st_uid == os.getuid() and not own.is_symlink():
+            yield own
+
+
+def _is_writable(folder: Path) -> bool:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False
+
+
+def _copied(folder: Path) -> Path:
+    copy = Path(tempfile.mkdtemp(prefix="rtid-kernels-"))
+    atexit.register(shutil.rmtree, copy, ignore_errors=True)
+    return Path(shutil.copytree(folder, copy / folder.name))
