@@ -4,6 +4,8 @@ Every refusal has a reason and a counter.  A counter of 2^b values cannot see a 
 of 2^b frames, so it is judged together with the time since the message's last good frame:
 
     step = (counter - last) mod 2^b,  dt <= 1.5 periods:  step 0 repeated, step > 2^(b-1) late
+
+and a frame n > 1 steps on that comes before n / 2 periods is somebody else's.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ REASONS = (
     "crc",
     "counter_repeat",  # a frame seen before
     "counter_jump",  # accepted, but frames before it were lost
-    "out_of_order",  # older than the frame before it
+    "out_of_order",  # older than the frame before it, or too soon for its counter
     "not_available",  # a wanted signal is absent, NaN or out of its declared range
     "other_page",  # a multiplexed message that carries other signals
     "incomplete_cycle",  # cycles of which a message never came
@@ -123,6 +125,8 @@ def check_sequence(
         if dt <= row.late_us and step == 0:
             return COUNTER_REPEAT
         if dt <= row.late_us and 2 * step > np.int64(row.counter_mask) + 1:
+            return OUT_OF_ORDER
+        if step > 1 and 3 * dt < step * row.late_us:
             return OUT_OF_ORDER
         if dt > 0 and step != 1:
             _refuse(last, COUNTER_JUMP, counts)

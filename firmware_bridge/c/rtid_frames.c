@@ -114,6 +114,8 @@ static int check_sequence(rtid_receiver *receiver, int m, int64_t t_us, uint8_t 
         return RTID_COUNTER_REPEAT;
     if (dt <= late && 2 * step > mask + 1)
         return RTID_OUT_OF_ORDER;
+    if (step > 1 && 3 * dt < step * late) /* n steps in less than n / 2 periods: another sender's */
+        return RTID_OUT_OF_ORDER;
     if (dt > 0 && step != 1)
         receiver->counts[RTID_COUNTER_JUMP]++;
     return dt <= 0 ? RTID_OUT_OF_ORDER : RTID_OK;

@@ -104,6 +104,17 @@ def test_row_5_second_sender(figure: Figure) -> None:
     figure(5, "learning again after", alarm_s[-1] - 30, 1.0, "s")
 
 
+def test_row_5_a_second_sender_does_not_keep_the_first_ones_count(figure: Figure) -> None:
+    """Before the alarm its frames are told by their counter: n steps take n periods."""
+    frames = machine().frames[:75_000]
+    learner, clean, taken = machine().learner(), machine().learner(), []
+    for part in two_senders(frames, 20.0).chunks(30):
+        taken.append(learner.push(part))
+    expected = {row[0]: row[2:] for part in frames.chunks(3000) for row in clean.push(part)}
+    wrong = sum((row[2:] != expected[row[0]]).any() for part in taken for row in part)
+    figure(5, "samples with a value of the second sender", wrong, 0)
+
+
 def two_senders(frames: Frames, begin_s: float) -> Frames:
     """For 10 s pressures come twice per cycle: good frames, half of them of another time."""
     t_s = at_s(frames)
