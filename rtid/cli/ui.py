@@ -67,6 +67,5 @@ def ui(
 def _refuse_without_bokeh() -> None:
     from importlib.util import find_spec
 
-    missing = [name for name in ("bokeh", "tsdownsample") if find_spec(name) is None]
-    if missing:
-        raise RtidError(f"the page needs {' and '.join(missing)}", "pip install 'rtid[ui]'", 2)
+    if find_spec("bokeh") is None:
+        raise RtidError("the page needs bokeh", "pip install 'rtid[ui]'", 2)

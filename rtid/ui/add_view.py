@@ -7,22 +7,22 @@ from math import isfinite
 
 import numpy as np
 from bokeh.layouts import column, row
-from bokeh.models import ColumnDataSource, UIElement
+from bokeh.models import UIElement
 
-from rtid.colours import BLUE, LPM, MPA, ORANGE
+from rtid.colours import BLUE, ORANGE
 from rtid.compare import FREE_RUN, BlockRow
 from rtid.diagnose.report import Value
 from rtid.diagnosed_text import quantity, title
 from rtid.project.added import AddedSection
 from rtid.report_words import text
 from rtid.ui.blocks import LARGEST, ML_PER_MIN, Quantity, quantities, round_up
-from rtid.ui.compare_view import NAMES
+from rtid.ui.compare_view import NAMES, flows_of, pressures_of
 from rtid.ui.fragments import button, table
-from rtid.ui.lines import Line
+from rtid.ui.lines import Lines
 from rtid.ui.look import Look
 from rtid.ui.session import Revision, Session
 from rtid.ui.theme import INK_TAG
-from rtid.ui.time_plots import EMPTY, TimePlots
+from rtid.ui.time_plots import TimePlots
 
 INSIDE = 25.0  # % of the track from which a bar has its figure inside
 
@@ -31,55 +31,44 @@ class AddView:
     """Simulated pressure and residual of the newest revision over those of the one before."""
 
     def __init__(self, look: Look, plots: TimePlots) -> None:
-        self._time = plots
         self.has_runs = any(part.runs for part in look.parts.values())
-        self._sources: list[dict[str, ColumnDataSource]] = []
+        self._before, self._after = _Revised(), _Revised()
         rows: list[UIElement] = []
-        for chamber in look.model.chambers:
-            sources, name = {}, chamber.name
+        last = len(look.model.chambers) - 1
+        for c, chamber in enumerate(look.model.chambers):
             if self.has_runs:
-                made = plots.plot("MPa", f"chamber {name}: pressure, free run")
-                sources["measured"] = plots.line(made, EMPTY, INK_TAG, 1.4)
-                sources["before"] = plots.line(made, EMPTY, ORANGE, 1.0)
-                sources["after"] = plots.line(made, EMPTY, BLUE, 1.0)
+                title = f"chamber {chamber.name}: pressure, free run"
+                made = plots.plot("add", "MPa", title, False)
+                self._before.pressures.add(made, f"measured {c}", INK_TAG, 1.4)
+                self._before.pressures.add(made, f"model {c}", ORANGE, 1.0)
+                self._after.pressures.add(made, f"model {c}", BLUE, 1.0)
                 rows.append(row(made, sizing_mode="stretch_both"))
-            left = plots.plot("L/min", f"chamber {name}: residual of the flow")
-            sources["left_before"] = plots.line(left, EMPTY, ORANGE, 0.8)
-            sources["left_after"] = plots.line(left, EMPTY, BLUE, 0.8)
+            title = f"chamber {chamber.name}: residual of the flow"
+            left = plots.plot("add", "L/min", title, c == last)
+            self._before.flows.add(left, f"left {c}", ORANGE, 0.8)
+            self._after.flows.add(left, f"left {c}", BLUE, 0.8)
             rows.append(row(left, sizing_mode="stretch_both"))
-            self._sources.append(sources)
-        left.xaxis.axis_label = "time in s"
         self.root = column(*rows, sizing_mode="stretch_both")
 
     def show(self, revisions: list[Revision]) -> None:
         """The newest revision, and the one before it if there is one."""
         after = revisions[-1].look if len(revisions) > 1 else None
-        before = revisions[-2].look if after else revisions[-1].look
-        for c, sources in enumerate(self._sources):
-            if self.has_runs:
-                self._time.change(sources["measured"], _measured(before, c))
-                self._time.change(sources["before"], _simulated(before, c))
-                self._time.change(sources["after"], _simulated(after, c) if after else EMPTY)
-            self._time.change(sources["left_before"], _left(before, c))
-            self._time.change(sources["left_after"], _left(after, c) if after else EMPTY)
-        self._time.refresh()
+        self._before.show(revisions[-2].look if after else revisions[-1].look)
+        self._after.show(after)
 
 
-def _measured(look: Look, c: int) -> Line:
-    runs = [part.runs[FREE_RUN] for part in look.parts.values() if part.runs]
-    return Line.joined([(r.t_s, r.measured_pa[:, c] * MPA) for r in runs])
+class _Revised:
+    """The lines of one revision."""
 
+    def __init__(self) -> None:
+        self.pressures, self.flows = Lines(), Lines()
 
-def _simulated(look: Look, c: int) -> Line:
-    runs = [part.runs[FREE_RUN] for part in look.parts.values() if part.runs]
-    return Line.joined(
-        [(r.t_s, np.where(r.predicted, r.simulated_pa[:, c], np.nan) * MPA) for r in runs]
-    )
-
-
-def _left(look: Look, c: int) -> Line:
-    parts = [part.equation for part in look.parts.values()]
-    return Line.joined([(e.t_s, e.residual_m3s[:, c] * LPM) for e in parts])
+    def show(self, look: Look | None) -> None:
+        """Those of a look; None: nothing."""
+        parts = list(look.parts.values()) if look else []
+        self.pressures.show(pressures_of(part.runs[FREE_RUN]) for part in parts if part.runs)
+        rows = [part.equation for part in parts]
+        self.flows.show(flows_of(e.t_s, e.measured_m3s, e.residual_m3s) for e in rows)
 
 
 def errors_of(session: Session) -> tuple[list[tuple[str, float, bool]], float]:

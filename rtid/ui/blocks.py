@@ -139,7 +139,9 @@ class BlockPlots:
         """Outline blocks."""
         for edge, source in self._lit.items():
             own = [(i, j) for name, i, j in keys if name == edge]
-            source.data = {"x": [i + 0.5 for i, _ in own], "y": [j + 0.5 for _, j in own]}
+            marked = {"x": [i + 0.5 for i, _ in own], "y": [j + 0.5 for _, j in own]}
+            if marked != dict(source.data):  # a plane that does not change is not painted anew
+                source.data = marked
 
     def _plot(self, edge: Edge, blocks: Sequence[BlockRow]) -> figure:
         used = [(b.i, b.j) for b in blocks] or [(0, 0)]

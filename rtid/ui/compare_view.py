@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from bokeh.layouts import column, row
-from bokeh.models import ColumnDataSource, Title, UIElement
+from bokeh.models import Title, UIElement
 from bokeh.plotting import figure
 
 from rtid.colours import BLUE, KPA, LPM, MPA, ORANGE
-from rtid.compare import FREE_RUN, HORIZONS_S
+from rtid.compare import FREE_RUN, HORIZONS_S, Simulation
+from rtid.model import FloatArray
 from rtid.ui.fragments import button, choice
-from rtid.ui.lines import Line
+from rtid.ui.lines import Columns, Lines
 from rtid.ui.look import Look
-from rtid.ui.theme import INK_TAG, styled
-from rtid.ui.time_plots import EMPTY, TimePlots
+from rtid.ui.theme import INK_TAG
+from rtid.ui.time_plots import TimePlots
 
 NAMES = {"identification": "identification", "validation": "held out"}
 RUNS = list(HORIZONS_S)
@@ -27,64 +26,43 @@ class CompareView:
     def __init__(self, look: Look, plots: TimePlots) -> None:
         self.look, self.run = look, FREE_RUN
         self._time = plots
-        self._sources: list[dict[str, ColumnDataSource]] = []
+        self._pressures, self._flows = Lines(), Lines()
         self._titles: list[Title] = []
         self.has_runs = any(part.runs for part in look.parts.values())
-        self.root = row(*self._columns(), sizing_mode="stretch_both")
+        columns = [self._column(c, chamber.name) for c, chamber in enumerate(look.model.chambers)]
+        self.root = row(*columns, sizing_mode="stretch_both")
+        self.show(look)
 
-    def _columns(self) -> list[UIElement]:
-        columns: list[Any] = []
-        for chamber in self.look.model.chambers:
-            made: dict[str, figure] = {}
-            if self.has_runs:
-                made["p"] = self._time.plot("MPa", " ")
-                made["e"] = self._time.plot("kPa")
-            made["q"] = self._time.plot("L/min", f"chamber {chamber.name}: flow")
-            made["r"] = self._time.plot("L/min")
-            sources = {}
-            if self.has_runs:
-                sources["pm"] = self._time.line(made["p"], EMPTY, INK_TAG, 1.4)
-                sources["ps"] = self._time.line(made["p"], EMPTY, ORANGE, 1.0)
-                sources["pe"] = self._time.line(made["e"], EMPTY, BLUE, 0.8)
-            sources["qm"] = self._time.line(made["q"], EMPTY, INK_TAG, 1.4)
-            sources["qs"] = self._time.line(made["q"], EMPTY, ORANGE, 1.0)
-            sources["qr"] = self._time.line(made["r"], EMPTY, BLUE, 0.8)
-            self._sources.append(sources)
-            self._titles.append(styled(Title(text=" ")))
-            made["p" if self.has_runs else "q"].title = self._titles[-1]
-            list(made.values())[-1].xaxis.axis_label = "time in s"
-            for p in list(made.values())[:-1]:
-                p.xaxis.major_label_text_font_size = "0px"
-                p.min_border_bottom = 0
-            parts = [
-                row(p, sizing_mode="stretch_both", styles={"flex": weight})
-                for p, weight in zip(made.values(), ("1.5", "1", "1.5", "1.15"), strict=False)
-            ]
-            columns.append(column(*parts, sizing_mode="stretch_both"))
-        return columns
+    def _column(self, c: int, name: str) -> UIElement:
+        """Pressure, its difference, flow and its difference of one chamber."""
+        made: list[figure] = []
+        if self.has_runs:
+            made = [self._time.plot("compare", unit, " ", False) for unit in ("MPa", "kPa")]
+            self._pressures.add(made[0], f"measured {c}", INK_TAG, 1.4)
+            self._pressures.add(made[0], f"model {c}", ORANGE, 1.0)
+            self._pressures.add(made[1], f"left {c}", BLUE, 0.8)
+            made[1].title.visible = False
+        made += flow_plots(self._time, "compare", self._flows, c, f"chamber {name}: flow")
+        self._titles.append(made[0].title)
+        weights = ("1.5", "1", "1.5", "1.15")[-len(made) :]
+        parts = [
+            row(p, sizing_mode="stretch_both", styles={"flex": weight})
+            for p, weight in zip(made, weights, strict=True)
+        ]
+        return column(*parts, sizing_mode="stretch_both")
 
     def show(self, look: Look, run: str | None = None) -> None:
         """Another revision, or another horizon of the simulation."""
         self.look, self.run = look, run if run in RUNS else self.run
         parts = list(look.parts.values())
-        for c, sources in enumerate(self._sources):
-            if self.has_runs:
-                runs = [part.runs[self.run] for part in parts if part.runs]
-                lines = {
-                    "pm": [(r.t_s, r.measured_pa[:, c] * MPA) for r in runs],
-                    "ps": [(r.t_s, _where(r.predicted, r.simulated_pa[:, c] * MPA)) for r in runs],
-                    "pe": [(r.t_s, r.error_pa[:, c] * KPA) for r in runs],
-                }
-            else:
-                lines = {}
-            rows = [part.equation for part in parts]
-            lines["qm"] = [(e.t_s, e.measured_m3s[:, c] * LPM) for e in rows]
-            lines["qs"] = [(e.t_s, e.modelled_m3s[:, c] * LPM) for e in rows]
-            lines["qr"] = [(e.t_s, e.residual_m3s[:, c] * LPM) for e in rows]
-            for name, pieces in lines.items():
-                self._time.change(sources[name], Line.joined(pieces))
-            self._titles[c].text = self._title(c)
-        self._time.refresh()
+        if self.has_runs:
+            self._pressures.show(pressures_of(part.runs[self.run]) for part in parts if part.runs)
+        self._flows.show(
+            flows_of(p.equation.t_s, p.equation.measured_m3s, p.equation.residual_m3s)
+            for p in parts
+        )
+        for c, title in enumerate(self._titles):
+            title.text = self._title(c)
 
     def _title(self, c: int) -> str:
         name = self.look.model.chambers[c].name
@@ -123,5 +101,25 @@ class CompareView:
         return text + "Next: <b>Where</b> shows in which part of which valve's map it fails."
 
 
-def _where(known: Any, values: Any) -> Any:
-    return np.where(known, values, np.nan)
+def flow_plots(time: TimePlots, view: str, lines: Lines, c: int, title: str) -> list[figure]:
+    """Measured and modelled flow of a chamber, and what is left below."""
+    made = [time.plot(view, "L/min", title, False), time.plot(view, "L/min")]
+    lines.add(made[0], f"measured {c}", INK_TAG, 1.4)
+    lines.add(made[0], f"model {c}", ORANGE, 1.0)
+    lines.add(made[1], f"left {c}", BLUE, 0.8)
+    return made
+
+
+def flows_of(t_s: FloatArray, measured: FloatArray, left: FloatArray) -> tuple[FloatArray, Columns]:
+    """Times (n,) and, per chamber, measured, modelled and what is left, from (n, chambers) m3/s."""
+    columns = {"measured": measured, "model": measured - left, "left": left}
+    return t_s, {f"{k} {c}": v[:, c] * LPM for k, v in columns.items() for c in range(v.shape[1])}
+
+
+def pressures_of(run: Simulation) -> tuple[FloatArray, Columns]:
+    """The same of simulated pressures; the difference in kPa."""
+    model = np.where(run.predicted[:, None], run.simulated_pa, np.nan)
+    columns = {
+        "measured": run.measured_pa * MPA, "model": model * MPA, "left": run.error_pa * KPA
+    }  # fmt: skip
+    return run.t_s, {f"{k} {c}": v[:, c] for k, v in columns.items() for c in range(v.shape[1])}

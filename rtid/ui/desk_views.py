@@ -19,7 +19,6 @@ from rtid.ui.session import Session
 from rtid.ui.time_plots import TimePlots, spans_of
 from rtid.ui.where_view import WhereView
 
-TIMED = ("compare", "where", "add")  # views with plots over time
 Put = Callable[[dict[str, str]], None]
 
 
@@ -28,13 +27,12 @@ class DeskViews:
 
     def __init__(self, session: Session, roots: dict[str, Column], put: Put) -> None:
         self.session, self._roots, self._put = session, roots, put
-        self._time = TimePlots(spans_of(self._look), self._mark_span, self._zoomed)
+        self._time = TimePlots(spans_of(self._look), self._mark_span)
         self._compare: CompareView | None = None
         self._where: WhereView | None = None
         self._add: AddView | None = None
         self._map: MapView | None = None
         self._page = ""
-        self._is_due = False
 
     @property
     def _look(self) -> Look:
@@ -43,16 +41,12 @@ class DeskViews:
     def show(self, view: str) -> None:
         """Look at a view."""
         self._make(view)
-        if view in TIMED:
-            self._time.look_at(view)
         self._tell()
 
     def _make(self, view: str) -> None:
         """Make a view that nobody has looked at before."""
-        at, self._time.view = self._time.view, view
         if view == "compare" and self._compare is None:
             self._compare = CompareView(self._look, self._time)
-            self._compare.show(self._look)
             self._place("compare", self._compare.root)
         elif view == "where" and self._where is None:
             self._where = WhereView(self._look, self._time, self._mark_block)
@@ -68,7 +62,6 @@ class DeskViews:
             self._map = MapView(self._look.flowmap, opened.reference if opened else None)
             self._map.show()
             self._place("map", self._map.root)
-        self._time.view = at
 
     def prepare(self) -> bool:
         """Make one more view before it is looked at; False where all are made."""
@@ -89,7 +82,6 @@ class DeskViews:
                 self._add.show(self.session.revisions)
             if self._map:
                 self._map.show(self._look.flowmap)
-            self._time.refresh()
         self._tell()
 
     def take(self, what: str, asked: dict[str, str]) -> None:
@@ -112,8 +104,8 @@ class DeskViews:
             self._mark_block((worst.edge, worst.i, worst.j))
         elif what == "forget":
             self._forget()
-        else:
-            self._move(what, asked)
+        elif what == "drag":
+            self._time.set_drag(asked.get("mode", ""))
         self._tell()
 
     def _show_revision(self, number: int) -> None:
@@ -125,17 +117,6 @@ class DeskViews:
         self._where.revisions = names if len(names) > 1 else []
         self._where.revision = names[number]
         self._where.show(revisions[number].look)
-
-    def _move(self, what: str, asked: dict[str, str]) -> None:
-        """Through time."""
-        if what == "drag":
-            self._time.set_drag(asked.get("mode", ""))
-        elif what == "whole":
-            self._time.show_whole()
-        elif what == "zoom":
-            self._time.zoom(_number(asked.get("factor"), 1.0))
-        elif what == "pan":
-            self._time.pan(_number(asked.get("share"), 0.0))
 
     def _tell(self) -> None:
         """The words of all views."""
@@ -149,17 +130,6 @@ class DeskViews:
 
     def _place(self, root: str, made: UIElement) -> None:
         self._roots[root].children = [made]
-
-    def _zoomed(self) -> None:
-        """Thin the lines once per turn of the loop, however many ends have moved."""
-        doc = self._roots["compare"].document
-        if not self._is_due and doc is not None:
-            self._is_due = True
-            doc.add_next_tick_callback(self._thin)
-
-    def _thin(self) -> None:
-        self._is_due = False
-        self._time.refresh()
 
     def _mark_block(self, key: Key) -> None:
         """A block was pointed at: its time spans light up."""
@@ -202,12 +172,3 @@ class DeskViews:
         self._time.light([])
         if self._where:
             self._where.mark(None, "")
-
-
-def _number(word: str | None, default: float) -> float:
-    """A finite number that a page has sent."""
-    try:
-        value = float(word or default)
-    except ValueError:
-        return default
-    return value if abs(value) < 1e6 else default

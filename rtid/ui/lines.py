@@ -1,61 +1,61 @@
-"""Lines of a record at any zoom: the least and the largest value of every bin are always drawn."""
+"""Lines of a record: whole in the page, which draws of them what is seen (`static/plots.js`).
+
+The least and the largest value of every bin are always drawn, at any zoom, without asking the
+server.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterable, Mapping
 
 import numpy as np
-from tsdownsample import MinMaxDownsampler
+from bokeh.models import ColumnDataSource
+from bokeh.plotting import figure
 
+from rtid.colours import INK
 from rtid.model import FloatArray
+from rtid.ui.theme import INK_TAG
 
-POINTS = 1200  # that a line has at most: two per pixel of a plot
-MOST_GAPS = 400
-_THIN: Any = MinMaxDownsampler()  # type: ignore[no-untyped-call]
-
-
-@dataclass(frozen=True)
-class Line:
-    """y (n,) over rising t (n,); NaN where the line is broken."""
-
-    t: FloatArray
-    y: FloatArray
-
-    @classmethod
-    def joined(cls, parts: list[tuple[FloatArray, FloatArray]]) -> Line:
-        """Parts one after the other, the line broken between them and at gaps of their times."""
-        t_all, y_all = [np.empty(0)], [np.empty(0)]
-        for t, y in parts:
-            if len(t):
-                at = _gaps(t)
-                t_all += [np.insert(t, at, t[at - 1]), t[-1:]]
-                y_all += [np.insert(y, at, np.nan), np.array([np.nan])]
-        return cls(np.concatenate(t_all), np.concatenate(y_all))
-
-    def between(self, low: float, high: float, points: int = POINTS) -> tuple[FloatArray, ...]:
-        """What is seen of it from low to high, one sample beyond at either end."""
-        first = max(0, int(np.searchsorted(self.t, low)) - 1)
-        last = min(len(self.t), int(np.searchsorted(self.t, high, side="right")) + 1)
-        t, y = self.t[first:last], self.y[first:last]
-        if len(y) <= points:
-            return t, y
-        known = np.isfinite(y)
-        chosen = _THIN.downsample(_held(y, known), n_out=points).astype(int)
-        chosen = np.union1d(chosen, [0, len(y) - 1])
-        breaks = np.flatnonzero(known[:-1] & ~known[1:])
-        if len(breaks) <= MOST_GAPS:
-            ends = np.flatnonzero(~known[:-1] & known[1:])
-            chosen = np.union1d(chosen, np.concatenate([breaks, breaks + 1, ends, ends + 1]))
-        return t[chosen], y[chosen]
+Columns = Mapping[str, FloatArray]
 
 
-def _held(y: FloatArray, known: np.ndarray) -> FloatArray:
-    """y with the last known value where there is none."""
-    if known.all():
-        return np.ascontiguousarray(y)
-    at = np.maximum.accumulate(np.where(known, np.arange(len(y)), 0))
-    return np.ascontiguousarray(np.nan_to_num(y[at]))
+class Lines:
+    """Lines that share their times."""
+
+    def __init__(self) -> None:
+        self.whole = ColumnDataSource({"t": []})
+        self._names: set[str] = set()
+
+    def add(self, made: figure, name: str, colour: str, width: float) -> None:
+        """Draw the column `name` in a plot."""
+        self._names.add(name)
+        drawn = ColumnDataSource({"t": [], "y": []}, tags=[self.whole, name])
+        line = made.line("t", "y", source=drawn, line_width=width)
+        line.glyph.line_color = INK if colour == INK_TAG else colour
+        line.nonselection_glyph = None
+        if colour == INK_TAG:
+            line.glyph.tags = [INK_TAG]
+
+    def show(self, parts: Iterable[tuple[FloatArray, Columns]]) -> None:
+        """Times (n,) and columns (n,) of every part of the record; none: nothing is drawn."""
+        wanted = ((t, {k: v for k, v in y.items() if k in self._names}) for t, y in parts)
+        self.whole.data = joined(wanted)
+
+
+def joined(parts: Iterable[tuple[FloatArray, Columns]]) -> dict[str, FloatArray]:
+    """Parts one after the other, the lines broken between them and at gaps of their times."""
+    pieces: dict[str, list[FloatArray]] = {"t": [np.empty(0)]}
+    for t, columns in parts:
+        if len(t):
+            at = _gaps(t)
+            pieces["t"] += [np.insert(t, at, t[at - 1]), t[-1:]]
+            for name, y in columns.items():
+                broken = [np.insert(y, at, np.nan), np.array([np.nan])]
+                pieces[name] = pieces.get(name, []) + broken
+    return {
+        name: np.concatenate(piece).astype(np.float64 if name == "t" else np.float32)
+        for name, piece in pieces.items()
+    }
 
 
 def _gaps(t: FloatArray) -> np.ndarray:

@@ -69,7 +69,7 @@ class Page:
         doc.template = _template()
         doc.template_variables.update(
             css=(STATIC / "page.css").read_text("utf-8"),
-            js=(STATIC / "page.js").read_text("utf-8"),
+            js="".join((STATIC / name).read_text("utf-8") for name in ("plots.js", "page.js")),
             views=VIEWS,
             first=self._view,
         )

@@ -13,13 +13,15 @@ from typing import Any
 
 from bokeh.application import Application
 from bokeh.application.handlers.function import FunctionHandler
+from bokeh.resources import Resources
 from bokeh.server.server import BaseServer
 from bokeh.server.tornado import BokehTornado
+from bokeh.server.views.static_handler import StaticHandler
 from tornado.httpserver import HTTPServer
-from tornado.httputil import HTTPMessageDelegate, HTTPServerRequest
+from tornado.httputil import HTTPHeaders, HTTPMessageDelegate, HTTPServerRequest
 from tornado.ioloop import IOLoop
 from tornado.netutil import bind_sockets
-from tornado.web import RequestHandler
+from tornado.web import OutputTransform, RequestHandler
 
 from rtid.errors import RtidError
 from rtid.model import Model
@@ -71,13 +73,26 @@ class Welcome(RequestHandler):
         self.redirect("/")
 
 
+class Policy(OutputTransform):
+    """Tells the browser, with every answer, to load nothing from elsewhere and to frame nothing."""
+
+    def transform_first_chunk(
+        self, status_code: int, headers: HTTPHeaders, chunk: bytes, finishing: bool
+    ) -> tuple[int, HTTPHeaders, bytes]:
+        """Add the headers."""
+        headers["Content-Security-Policy"] = POLICY
+        headers["X-Content-Type-Options"] = "nosniff"
+        headers["Referrer-Policy"] = "no-referrer"
+        return status_code, headers, chunk
+
+
 class Guarded(BokehTornado):  # type: ignore[misc]
     """Bokeh's application, with the door in front of every request, sockets included."""
 
     def __init__(self, door: Door, app: Application, **options: Any) -> None:
         self.door = door
         self.refused = 0
-        super().__init__({"/": app}, **options)
+        super().__init__({"/": app}, transforms=[Policy], **options)
 
     def find_handler(self, request: HTTPServerRequest, **kwargs: Any) -> HTTPMessageDelegate:
         """The handler of a request, or one that refuses it."""
@@ -98,6 +113,11 @@ class Guarded(BokehTornado):  # type: ignore[misc]
         if request.path == "/" and pages >= MOST_PAGES:
             return Refusal(503, f"{pages} pages are open already: close one and wait a moment")
         return None
+
+    def resources(self, absolute_url: str | bool | None = None) -> Resources:
+        """Bokeh's scripts from this server, and of these only the one that our pages need."""
+        version = StaticHandler.append_version
+        return Resources("server", components=["bokeh"], root_url="/", path_versioner=version)
 
     def log_request(self, handler: RequestHandler) -> None:
         """Nothing: a desk is no web shop."""

@@ -6,22 +6,20 @@ from collections.abc import Callable
 
 import numpy as np
 from bokeh.layouts import column, row
-from bokeh.models import ColumnDataSource, Range1d, Title, UIElement, Whisker
+from bokeh.models import UIElement
 from bokeh.plotting import figure
 
-from rtid.colours import CHAMBERS, GREY, LPM, MARKERS, UNITS
+from rtid.colours import CHAMBERS
 from rtid.compare import BlockRow, Dependence
 from rtid.compare.tables import CAUSES, cause_of
 from rtid.report_words import text
 from rtid.ui.blocks import HATCHES, LARGEST, ML_PER_MIN, BlockPlots, Key, quantities, round_up
-from rtid.ui.compare_view import NAMES
+from rtid.ui.compare_view import NAMES, flows_of
+from rtid.ui.dependence_plot import DependencePlot
 from rtid.ui.fragments import button, choice, select
-from rtid.ui.lines import Line
+from rtid.ui.lines import Lines
 from rtid.ui.look import Look
-from rtid.ui.theme import plot, styled
-from rtid.ui.time_plots import EMPTY, TimePlots
-
-Z95 = 1.96
+from rtid.ui.time_plots import TimePlots
 
 
 class WhereView:
@@ -37,9 +35,9 @@ class WhereView:
         top = round_up(float(np.quantile(values, LARGEST))) if values else 1.0
         self._quantities = quantities(top)
         self.planes = BlockPlots(look.model, every, on_block)
-        self._reach, self._heading = Range1d(0, 1), styled(Title(text=" "))
+        self._over = DependencePlot([chamber.name for chamber in look.model.chambers])
         self.signal = self._depends[0].signal if self._depends else ""
-        self._lines: list[ColumnDataSource] = []
+        self._lines = Lines()
         self.side = self._side()
         self.chosen: Key | None = None
         self.words = ""
@@ -64,39 +62,18 @@ class WhereView:
         chambers = self.look.model.chambers
         strips: list[figure] = []
         for c, chamber in enumerate(chambers):
-            strip = self._time.plot("L/min", f"residual of chamber {chamber.name} over time")
-            self._lines.append(self._time.line(strip, EMPTY, CHAMBERS[c], 0.8))
+            title, is_last = f"residual of chamber {chamber.name} over time", c == len(chambers) - 1
+            strip = self._time.plot("where", "L/min", title, is_last)
+            self._lines.add(strip, f"left {c}", CHAMBERS[c], 0.8)
             strips.append(strip)
-        strips[-1].xaxis.axis_label = "time in s"
-        self._over = plot("L/min", x_range=self._reach)
-        self._over.title = self._heading
-        self._over.hspan(0.0, line_color=GREY, line_width=0.6)
-        self._bins: list[ColumnDataSource] = []
-        for c, chamber in enumerate(chambers):
-            source = ColumnDataSource({"x": [], "mean": [], "low": [], "high": []})
-            self._over.scatter(
-                "x", "mean", source=source, marker=("circle", "square")[MARKERS[c] == "s"],
-                color=CHAMBERS[c], size=6, legend_label=f"chamber {chamber.name}, mean ± 95 %",
-            )  # fmt: skip
-            self._over.line("x", "mean", source=source, color=CHAMBERS[c], line_width=0.8)
-            whisker = Whisker(base="x", lower="low", upper="high", source=source)
-            whisker.line_color, whisker.upper_head, whisker.lower_head = CHAMBERS[c], None, None
-            self._over.add_layout(whisker)
-            self._bins.append(source)
-        legend = self._over.legend[0]
-        legend.label_text_font_size, legend.padding, legend.border_line_color = "10px", 3, None
-        legend.background_fill_alpha, legend.orientation = 0.6, "horizontal"
-        parts = [row(s, sizing_mode="stretch_both") for s in (*strips, self._over)]
+        parts = [row(s, sizing_mode="stretch_both") for s in (*strips, self._over.root)]
         return column(*parts, sizing_mode="stretch_both")
 
     def show(self, look: Look | None = None) -> None:
         """Draw what is chosen, of another revision if one is given."""
         self.look = look or self.look
-        for c, source in enumerate(self._lines):
-            parts = [p.equation for p in self.look.parts.values()]
-            pieces = [(e.t_s, e.residual_m3s[:, c] * LPM) for e in parts]
-            self._time.change(source, Line.joined(pieces))
-        self._time.refresh()
+        parts = [p.equation for p in self.look.parts.values()]
+        self._lines.show(flows_of(e.t_s, e.measured_m3s, e.residual_m3s) for e in parts)
         self.planes.show(self.blocks, self._quantities[self.quantity])
         self._show_signal()
 
@@ -123,21 +100,8 @@ class WhereView:
 
     def _show_signal(self) -> None:
         found = next((d for d in self._depends if d.signal == self.signal), None)
-        if found is None:
-            return
-        unit, factor = UNITS.get(found.unit, (found.unit, 1.0))
-        x = found.centre * factor
-        for c, source in enumerate(self._bins):
-            mean, error = found.mean_m3s[:, c] * LPM, Z95 * found.error_m3s[:, c] * LPM
-            source.data = {"x": x, "mean": mean, "low": mean - error, "high": mean + error}
-        margin = 0.03 * float(np.ptp(x)) if len(x) else 1.0
-        self._reach.update(start=float(x.min()) - margin, end=float(x.max()) + margin)
-        shares = ", ".join(
-            f"{chamber.name} {100 * found.explained[c]:.0f} %"
-            for c, chamber in enumerate(self.look.model.chambers)
-        )
-        self._heading.text = f"residual over {found.signal}: it explains {shares}"
-        self._over.xaxis.axis_label = f"{found.signal} in {unit}"
+        if found is not None:
+            self._over.show(found)
 
     def fragments(self) -> dict[str, str]:
         """Tools above, and what the picture says."""

@@ -71,17 +71,22 @@ def test_zooming_draws_what_is_seen_anew(opened: Opened) -> None:
     opened.go("compare")
     page = opened.page
     page.wait_for_selector("#compare canvas")
-    count = (
-        "share => [...Bokeh.documents[0].all_models].filter(m => m.type === 'ColumnDataSource'"
-        " && m.data.t && m.data.t.length > 100 && m.data.t[m.data.t.length - 1] - m.data.t[0]"
-        " < share).length"
+    spans = (
+        "[...Bokeh.documents[0].all_models].filter(m => m.type === 'ColumnDataSource' &&"
+        " m.tags.length && m.data.t.length > 100).map(m => m.data.t[m.data.t.length - 1] -"
+        " m.data.t[0])"
     )
-    page.wait_for_function(f"() => ({count})(1e9) >= 12")
+    whole = f"() => {spans}.filter(s => s > {0.9 * DURATION_S}).length >= 12"
+    page.wait_for_function(whole)
     for _ in range(3):
         page.keyboard.press("+")
-    page.wait_for_function(f"() => ({count})({0.2 * DURATION_S}) >= 12")
+    page.wait_for_function(f"() => {spans}.filter(s => s < {0.2 * DURATION_S}).length >= 12")
+    page.keyboard.press("2")  # the next view shows the same time
+    page.wait_for_selector("#where.shown")
+    page.wait_for_function(f"() => {spans}.filter(s => s < {0.2 * DURATION_S}).length >= 14")
+    page.keyboard.press("1")
     page.keyboard.press("0")
-    page.wait_for_function(f"() => ({count})({0.9 * DURATION_S}) === 0")
+    page.wait_for_function(whole)
 
 
 def test_the_block_with_the_largest_error_lights_its_spans(opened: Opened) -> None:

@@ -83,6 +83,18 @@ def test_a_foreign_name_is_refused(bench: Workbench, host: str, path: str) -> No
     assert ask(bench, path=path, Host=host)[0] in (400, 403)
 
 
+@pytest.mark.parametrize("path", ["/", "/alive", "/static/js/bokeh.min.js", "/nothing"])
+def test_every_answer_tells_the_browser_to_load_nothing_from_elsewhere(
+    bench: Workbench, path: str
+) -> None:
+    headers = ask(bench, path=path)[2]
+    policy = headers["Content-Security-Policy"]
+    assert "default-src 'self'" in policy
+    assert "frame-ancestors 'none'" in policy
+    assert "unsafe-eval" not in policy
+    assert headers["X-Content-Type-Options"] == "nosniff"
+
+
 @pytest.mark.parametrize("origin", EVIL)
 def test_a_foreign_page_is_refused(bench: Workbench, origin: str) -> None:
     assert ask(bench, Origin=origin)[0] == 403
@@ -233,5 +245,5 @@ def test_a_taken_port_is_said_in_words(bench: Workbench, tmp_path: Path) -> None
 def test_the_page_names_no_other_host(bench: Workbench) -> None:
     page = wait_for_room(bench)
     loaded = re.findall(r'(?:src|href)\s*=\s*"([^"]+)"', page)
-    assert loaded
+    assert [uri.split("?")[0] for uri in loaded if "/static/" in uri] == ["/static/js/bokeh.min.js"]
     assert all(not re.match(r"(?:https?:)?//", uri) for uri in loaded)
