@@ -164,6 +164,12 @@ class Generations:
         self._serial += 1
         return path
 
+    def set_aside(self) -> None:
+        """Keep what there is under another name: the next start finds nothing."""
+        for path in (self.path(0), self.path(1)):
+            if path.exists():
+                os.replace(path, path.with_suffix(".before.npz"))
+
     def restore(self, model: Model) -> Restored:
         """The newest whole snapshot of this project; further ones are written behind it.
 

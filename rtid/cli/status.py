@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 
     from rtid.daemon.status import Status
 
-OLD_S = 5.0  # a status of that age is that of a daemon that no longer runs
-
 
 def status(
     where: Annotated[Path, typer.Argument(help="Project file, or the daemon's state folder.")],
@@ -29,10 +27,11 @@ def status(
 
     Exit code 4 if it does not run, or an alarm is on.
     """
+    from rtid.daemon.configure import state_of
     from rtid.daemon.metrics import exposition
-    from rtid.daemon.status import read
+    from rtid.daemon.status import OLD_S, read
 
-    found = read(_folder(where))
+    found = read(state_of(where))
     age_s = time.time() - found.now_unix_s
     on = [alarm for alarm in found.alarms if alarm.until_unix_s is None]
     if as_json:
@@ -45,17 +44,10 @@ def status(
         raise typer.Exit(Exit.NEGATIVE)
 
 
-def _folder(where: Path) -> Path:
-    if where.is_dir():
-        return where
-    from rtid.daemon.configure import state_folder
-    from rtid.project import load
-
-    return state_folder(load(where))
-
-
 def _show(found: Status, age_s: float) -> None:
     from rich.console import Console
+
+    from rtid.daemon.status import OLD_S
 
     console = Console(highlight=False, soft_wrap=True)
     up_s = found.now_unix_s - found.started_unix_s

@@ -30,6 +30,7 @@ from rtid.daemon.jobs import (
     Recall,
     Recalled,
     Recording,
+    Relearn,
     Saved,
 )
 from rtid.daemon.judge import Judge
@@ -83,7 +84,9 @@ class Analyst:
         elif isinstance(job, Recall) and self._handed:
             wanted = [one for one in self._handed if one.number <= job.number]
             found = wanted[-1] if wanted else self._handed[0]
-            self._answer(Recalled(found.number, found.estimator))
+            self._answer(Recalled(found.estimator))
+        elif isinstance(job, Relearn):
+            self._relearn(job)
         elif isinstance(job, Found) and job.verdict is not None:
             verdict = job.verdict
             self._guarded("history", lambda: self._history().note_verdict(verdict))
@@ -115,6 +118,17 @@ class Analyst:
         if job.publish and len(job.estimator.sums.blocks):
             self._handed.append(job)
             self._publish(job)
+
+    def _relearn(self, job: Relearn) -> None:
+        """Begin anew with the machine as it is; what was learned before is kept aside."""
+        estimator = Estimator(self._project.model)
+        estimator.history, estimator.origin_us = None, job.origin_us
+        estimator.advance(job.chunk)
+        self._handed.clear()
+        self._answer(Recalled(estimator, is_accepted=True))
+        self._guarded("snapshot", self._generations.set_aside)
+        self._guarded("snapshot", lambda: self._generations.save(estimator))
+        self._guarded("history", lambda: self._history().note_acceptance(job.acceptance))
 
     def _publish(self, job: Handover) -> None:
         start_s = time.monotonic()

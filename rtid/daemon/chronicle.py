@@ -1,6 +1,6 @@
-"""History in SQLite (WAL): estimates, alarms and verdicts over months, readable while it grows.
+"""History in SQLite (WAL): estimates, alarms, verdicts and decisions, readable while it grows.
 
-Estimates go after KEPT_S, alarms and verdicts stay: about 3 MB a day at a publication every 10 s.
+Estimates go after KEPT_S, the others stay: about 3 MB a day at a publication every 10 s.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import sqlite3
 import time
 from pathlib import Path
 
+from rtid.daemon.acceptance import Acceptance
 from rtid.daemon.jobs import Publication
 from rtid.daemon.status import Alarm, Verdict
 
@@ -21,6 +22,7 @@ CREATE TABLE IF NOT EXISTS estimate (unix_s REAL, chamber TEXT, beta_pa REAL, be
 CREATE TABLE IF NOT EXISTS map (unix_s REAL, edge TEXT, valid INTEGER, visited INTEGER, rho REAL);
 CREATE TABLE IF NOT EXISTS alarm (unix_s REAL, name TEXT, kind TEXT, text TEXT, over INTEGER);
 CREATE TABLE IF NOT EXISTS verdict (unix_s REAL, verdict TEXT, text TEXT, content TEXT);
+CREATE TABLE IF NOT EXISTS decision (unix_s REAL, what TEXT, who TEXT, reason TEXT);
 CREATE INDEX IF NOT EXISTS estimate_time ON estimate (unix_s);
 CREATE INDEX IF NOT EXISTS map_time ON map (unix_s);
 """
@@ -67,6 +69,11 @@ class Chronicle:
         """One row per diagnosis."""
         row = (found.at_unix_s, found.verdict, found.text, json.dumps(found.content))
         self._database.execute("INSERT INTO verdict VALUES (?, ?, ?, ?)", row)
+
+    def note_acceptance(self, found: Acceptance) -> None:
+        """One row: somebody has taken the changed machine for the new normal."""
+        row = (found.at_unix_s, "accepted the changed machine", found.who, found.reason)
+        self._database.execute("INSERT INTO decision VALUES (?, ?, ?, ?)", row)
 
     def close(self) -> None:
         """Write everything back."""

@@ -1,11 +1,11 @@
-"""What the command line changes in a project before the daemon runs."""
+"""What the command line changes in a project before the daemon runs; where it keeps its state."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
 
-from rtid.project import Project
+from rtid.project import Project, load
 
 
 def configured(project: Project, rate_hz: float | None) -> Project:
@@ -20,3 +20,8 @@ def state_folder(project: Project) -> Path:
     """Where the daemon of this project keeps its state: beside the file unless it says where."""
     folder = project.sections.daemon.folder
     return project.path.parent / (folder or f"{project.path.stem}.state")
+
+
+def state_of(where: Path) -> Path:
+    """The state folder that is meant by a project file, or by the folder itself."""
+    return where if where.is_dir() else state_folder(load(where))

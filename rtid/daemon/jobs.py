@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from firmware_bridge.frames import Frames
+from rtid.daemon.acceptance import Acceptance
 from rtid.daemon.status import Alarm, EdgeHealth, Verdict
 from rtid.estimator.estimator import Estimator
 from rtid.estimator.flowmap import FlowMap
@@ -45,6 +46,18 @@ class Recall:
     """Give back the estimator of this handover, one of the last three."""
 
     number: int
+
+
+@dataclass(frozen=True)
+class Relearn:
+    """A change of the plant was accepted: learn from these samples alone, rows as in `to_chunk`.
+
+    The snapshots of before are set aside.
+    """
+
+    chunk: FloatArray
+    origin_us: int | None
+    acceptance: Acceptance
 
 
 @dataclass(frozen=True)
@@ -96,10 +109,10 @@ class Judgement:
 
 @dataclass(frozen=True)
 class Recalled:
-    """Answer to Recall: the oldest one there is where the wanted one is not."""
+    """Answer to Recall, the oldest one there is where the wanted one is not; or to Relearn."""
 
-    number: int
     estimator: Estimator
+    is_accepted: bool = False
 
 
 @dataclass(frozen=True)
@@ -141,5 +154,5 @@ class Checked:
     errors: tuple[str, ...]
 
 
-Job = Handover | Batch | Note | Recall | Diagnose | Check | Found | Checked
+Job = Handover | Batch | Note | Recall | Relearn | Diagnose | Check | Found | Checked
 Answer = Ready | Publication | Judgement | Recalled | Saved | NotSaved | Recording | Found | Checked

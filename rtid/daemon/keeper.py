@@ -8,12 +8,14 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 
 from rtid.daemon import status as st
+from rtid.daemon import wording
+from rtid.daemon.acceptance import Acceptance, taken
 from rtid.daemon.alarms import Alarms
 from rtid.daemon.core import Core
-from rtid.daemon.diagnosing import Diagnosing
+from rtid.daemon.diagnosing import Diagnosing, newest
 from rtid.daemon.helper import Helper
 from rtid.daemon.jobs import (
     Answer,
@@ -27,6 +29,7 @@ from rtid.daemon.jobs import (
     Recall,
     Recalled,
     Recording,
+    Relearn,
     Saved,
 )
 from rtid.daemon.log import logger
@@ -37,6 +40,7 @@ from rtid.daemon.teller import Facts, Saving, Teller
 LOOK_S = 0.1
 OVERLOAD = 0.05  # share of ticks lost in a second that is worth an alarm
 CHECK_S = 30.0  # of samples after which the project file is held against them
+BEGINS_S = 5.0  # so long after the start nobody misses a message
 FALLEN_S = 60.0  # so long a helper that ended is an alarm
 
 
@@ -58,9 +62,9 @@ class Keeper:
         self.plant = PlantWatch()
         self._answers = answers  # of the helpers, appended from their threads
         self._saving = Saving(facts.project.sections.daemon.store_s)
-        self._recording, self._first_s = "", 0.0
-        self._recalling = self._is_checked = False
-        self._is_ready = False
+        self._recording = ""
+        self._first_s: float | None = None  # time of the first sample of this run
+        self._is_checked = self._is_ready = False
         self._told_s = 0.0
         self._lost = self._fallen = 0
         self._fallen_s = -math.inf
@@ -86,6 +90,8 @@ class Keeper:
             try:
                 self._listen()
                 self._look()
+                if (request := taken(self._facts.folder)) is not None:
+                    self._accept(request)
                 if time.monotonic() >= next_s:
                     next_s = time.monotonic() + 1.0
                     self._tell()
@@ -109,7 +115,10 @@ class Keeper:
                 for name, folder in answer.kept.items():
                     self.alarms.keep(name, folder)
             elif isinstance(answer, Recalled):
-                self._recalling, self._core.swap = False, answer.estimator
+                self._core.swap = answer.estimator
+                if answer.is_accepted:
+                    self.plant.accept()
+                    self._plant_changed()
             elif isinstance(answer, Found | Checked):
                 self._analyst.put(answer)
                 self._diagnosing.take(answer)
@@ -134,44 +143,43 @@ class Keeper:
         learner, source, project = self._core.learner, self._core.source, self._facts.project
         names = [message.name for message in project.assembly.messages]
         doubted = [n for n, bad in zip(names, learner.senders.doubted, strict=True) if bad]
-        text = f"{', '.join(doubted)}: faster than declared; a second sender, or a wrong period?"
-        self.alarms.put("second_sender", "bus", text if doubted else "")
+        self.alarms.put("second_sender", "bus", wording.second_sender(doubted))
         signals = [source.name for source in project.assembly.signals]
         frozen = [n for n, bad in zip(signals, learner.frozen.doubted, strict=True) if bad]
-        text = f"{', '.join(frozen)}: does not move as its noise would; learning has stopped"
-        self.alarms.put("sensor_frozen", "sensor", text if frozen else "")
-        text = f"{self._facts.interface} {self._facts.channel}: failed, is being opened again"
-        self.alarms.put("bus_down", "bus", text if source.is_down else "")
-        fallen = self._analyst.failures - self._fallen
-        self._fallen = self._analyst.failures
-        if fallen:
-            self._fallen_s = time.monotonic()
+        self.alarms.put("sensor_frozen", "sensor", wording.frozen(frozen))
+        where = f"{self._facts.interface} {self._facts.channel}"
+        self.alarms.put("bus_down", "bus", wording.bus_down(where) if source.is_down else "")
+        if self._analyst.failures != self._fallen:
+            self._fallen, self._fallen_s = self._analyst.failures, time.monotonic()
         late = time.monotonic() - self._fallen_s > FALLEN_S
-        text = f"the analyst has ended {self._fallen} times and was started again"
-        self.alarms.put("helper_failed", "loop", "" if late else text)
+        self.alarms.put(
+            "helper_failed", "loop", "" if late else wording.helper_failed(self._fallen)
+        )
         self.alarms.put("not_saved", "store", self._why_not_saved())
         verdict = self._diagnosing.verdict if self._diagnosing.is_of_change else None
         of_sensor = verdict is not None and verdict.of_sensor
-        self.alarms.put("plant_changed", "sensor" if of_sensor else "plant", self._plant_text())
+        text = wording.plant_changed(verdict) if self.plant.changed else ""
+        self.alarms.put("plant_changed", "sensor" if of_sensor else "plant", text)
         self.alarms.put("implausible", "sensor", "; ".join(self._diagnosing.implausible))
         if not self._is_checked and self._recording and self._has_run_s() > CHECK_S:
             self._is_checked = self._diagnosing.check(self._recording)
         self._diagnosing.look(self._core.learner.estimator, self._core.newest_s)
 
     def _has_run_s(self) -> float:
-        """Seconds since the first sample of this run."""
-        if self._core.samples and not self._first_s:
-            self._first_s = time.monotonic()
-        return time.monotonic() - self._first_s if self._first_s else 0.0
+        """Seconds of samples in this run."""
+        if self._core.samples and self._first_s is None:
+            self._first_s = self._core.newest_s
+        return abs(self._core.newest_s - self._first_s) if self._first_s is not None else 0.0
 
-    def _plant_text(self) -> str:
-        if not self.plant.changed:
-            return ""
-        text = "the machine no longer does what the map says; learning is suspended"
-        verdict = self._diagnosing.verdict
-        if verdict is not None and self._diagnosing.is_of_change:
-            text += f". {verdict.text}"
-        return text
+    def _accept(self, request: Acceptance) -> None:
+        """The changed machine is the new normal: learn anew from what came since the change."""
+        estimator = self._core.learner.estimator
+        if not self.plant.changed or estimator.history is None:
+            logger.warning("nothing to accept: the machine does what the map says")
+            return
+        logger.info("accepted by=%s reason=%r", request.who, request.reason)
+        chunk = newest(estimator.history, self._core.newest_s - self.plant.since_s)
+        self._analyst.put(Relearn(chunk, estimator.origin_us, request))
 
     def _why_not_saved(self) -> str:
         core = self._core
@@ -182,6 +190,17 @@ class Keeper:
         store = self._saving.store(why, self._facts.restored, self._recording, dropped)
         return self.teller.tell(self.alarms, store, self.plant.surprise, self._diagnosing)
 
+    def _judge_signals(self, before: st.Status) -> None:
+        """Alarms of messages and signals: what holds for two seconds, but not while all begins."""
+        now = self.status
+        if self._core.source.is_over or now.now_unix_s - now.started_unix_s < BEGINS_S:
+            return
+        verdicts = {message.name: message.verdict for message in before.messages}
+        lasting = [m for m in now.messages if verdicts.get(m.name) == m.verdict]
+        for verdict in wording.MESSAGES:
+            self.alarms.put(f"message_{verdict}", "bus", wording.message(verdict, lasting))
+        self.alarms.put("signal_range", "sensor", wording.signals(now.signals))
+
     def _told(self, alarm: st.Alarm) -> None:
         begins = alarm.until_unix_s is None
         logger.log(30 if begins else 20, "alarm %s name=%s kind=%s text=%r",
@@ -190,11 +209,13 @@ class Keeper:
 
     def _tell(self) -> None:
         """Status, file, log line."""
-        self.status = self._make_status()
+        before, self.status = self.status, self._make_status()
         loop = self.status.loop
         lost, self._lost = loop.overruns + loop.skipped - self._lost, loop.overruns + loop.skipped
-        text = f"{lost} of {loop.rate_hz:.0f} ticks lost in a second; since the start {loop.causes}"
+        new = Counter(loop.causes) - Counter(before.loop.causes)
+        text = wording.overload(lost, loop.rate_hz, new)
         self.alarms.put("overload", "loop", text if lost > OVERLOAD * loop.rate_hz else "")
+        self._judge_signals(before)
         if time.monotonic() - self._told_s >= self._facts.log_every_s - 0.5:
             self._told_s = time.monotonic()
             logger.info("status %s", line(self.status))

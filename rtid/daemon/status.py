@@ -21,6 +21,7 @@ from rtid.errors import RtidError
 
 SCHEMA = 1
 STATUS_FILE = "status.json"
+OLD_S = 5.0  # a status of that age is that of a daemon that no longer runs
 
 SignalVerdict = Literal["ok", "silent", "frozen", "out_of_range", "not_available", "implausible"]
 Learning = Literal["waiting", "learning", "held", "suspended", "stopped"]
@@ -206,6 +207,10 @@ class Status:
     alarms: tuple[Alarm, ...] = ()  # those that are on, then the last that are over
     rss_anon_mb: float = 0.0
     schema: int = SCHEMA
+
+    def has(self, alarm: str) -> bool:
+        """Whether an alarm of this name is on."""
+        return any(one.name == alarm and one.until_unix_s is None for one in self.alarms)
 
     def to_json(self) -> str:
         """One line of JSON."""
