@@ -39,6 +39,18 @@ static const rtid_real AREA = R(RTID_EST_AREA), V0 = R(RTID_EST_V0), X_VAR = R(R
 
 double rtid_est_rated(int edge) { return EDGES[edge].scale; }
 
+int rtid_est_has_term(int edge, int term) { return EDGES[edge].mask[term] != 0; }
+
+double rtid_est_shared_scale(int shared)
+{
+#if RTID_EST_N_TERMS > 0
+    if (shared > 0)
+        return TERMS[shared - 1].scale;
+#endif
+    (void)shared;
+    return RTID_EST_COMPLIANCE;
+}
+
 static rtid_real volume(rtid_real x) { return V0 + AREA * x; }
 
 /* ---- one interval ---- */
@@ -85,13 +97,13 @@ static void follow_command(rtid_estimator *e, int i)
     const rtid_real g = e->edge[i].w - held, mean = k * (R(1) - decay);
     e->edge[i].w = held;
     e->edge[i].m1 = held;
-    e->edge[i].m2 = held * held;
+    e->edge[i].var = 0;
     e->edge[i].mt = 0;
     if (!(LAG > 0))
         return;
     e->edge[i].w = held + g * decay;
     e->edge[i].m1 = held + g * mean;
-    e->edge[i].m2 = held * held + R(2) * held * g * mean + g * g * (R(0.5) * k * (R(1) - decay * decay));
+    e->edge[i].var = g * g * (R(0.5) * k * (R(1) - decay * decay) - mean * mean);
     e->edge[i].mt = g * (k * (mean - decay) - R(0.5) * mean);
 }
 
@@ -255,12 +267,11 @@ static void mean_terms(const rtid_estimator *e, const rtid_estimator_open *open,
     const rtid_real *u = &BORDERS[EDGES[i].first_u + open->u], *p = &BORDERS[EDGES[i].first_dp + open->dp];
     const rtid_real hu = R(2) / (u[1] - u[0]), hp = R(2) / (p[1] - p[0]);
     const rtid_real uc = R(0.5) * (u[1] + u[0]), pc = R(0.5) * (p[1] + p[0]);
-    const rtid_real m1 = e->edge[i].m1;
     const rtid_real eta0 = (e->edge[i].dp0 - pc) * hp, eta1 = (e->edge[i].dp1 - pc) * hp;
     phi[0] = R(1);
-    phi[1] = (m1 - uc) * hu;
+    phi[1] = (e->edge[i].m1 - uc) * hu;
     phi[2] = R(0.5) * (eta0 + eta1);
-    phi[3] = (e->edge[i].m2 - R(2) * uc * m1 + uc * uc) * hu * hu;
+    phi[3] = phi[1] * phi[1] + e->edge[i].var * hu * hu; /* local: no digits are lost in float */
     phi[4] = (eta0 * eta0 + eta0 * eta1 + eta1 * eta1) * R(1.0 / 3.0);
     phi[5] = phi[1] * phi[2] + e->edge[i].mt * hu * (eta1 - eta0);
     if (EDGES[i].masked)
@@ -336,8 +347,10 @@ static void integrate(rtid_estimator *e, const rtid_estimator_sample *sample)
     e->cov += Q_FLOOR * e->dt_s;
     if (sample->row)
         make_row(e);
-    if (e->d[RTID_EST_RING] < RING_LIMIT)
-        rtid_est_rebase(e, GO_ON);
+    if (e->faded * e->d[RTID_EST_RING] < R(FORGET_AT))
+        rtid_est_rebase(e, FORGET_SILENT);
+    else if (e->d[RTID_EST_RING] < RING_LIMIT)
+        rtid_est_rebase(e, SETTLE);
 }
 
 /* ---- samples ---- */
@@ -379,6 +392,7 @@ void rtid_estimator_start(rtid_estimator *e)
     memset(e, 0, sizeof *e);
     rtid_est_set_open(e, 0);
     e->d[RTID_EST_RING] = R(1);
+    e->faded = R(1);
     e->ready_us = -1;
     for (int i = 0; i < RTID_EST_N_EDGES; i++) {
         e->edge[i].u = SHUT;

@@ -99,6 +99,7 @@ typedef struct {
     rtid_real gram[RTID_EST_STRIDE][RTID_EST_STRIDE]; /* products of the last few rows */
     rtid_sum local[RTID_EST_STRIDE][RTID_EST_STRIDE]; /* and of those since the ring began */
     uint16_t width, uncarried;
+    rtid_real faded; /* what is left of the state of a block that closed at the last forgetting */
     /* whitener */
     rtid_real cov, echo, noise_span;
     rtid_sum noise;
@@ -107,9 +108,10 @@ typedef struct {
     rtid_real values[RTID_EST_N_SIGNALS + 1]; /* and a quantity that is always zero */
     rtid_real dt_s, lag_decay;
     uint8_t running;
-    /* working points: lagged command, its moments over the interval, dp at both ends, block */
+    /* working points: lagged command, its mean and variance over the interval and its mean with
+     * time, dp at both ends; the block, and the one that it is to be in */
     struct {
-        rtid_real w, m1, m2, mt, dp0, dp1;
+        rtid_real w, m1, var, mt, dp0, dp1;
         int16_t u, dp, to_u, to_dp, place;
     } edge[RTID_EST_N_EDGES];
     uint16_t n_open, n_recent, n_closed, n_young, n_slots;
@@ -122,27 +124,34 @@ typedef struct {
     uint32_t counts[RTID_EST_N_COUNTS];
 } rtid_estimator;
 
+/* What is known of a visited block. */
+enum { RTID_EST_LEARNING, RTID_EST_VALID, RTID_EST_STALE };
+typedef struct {
+    double theta[RTID_EST_TERMS]; /* m3/s, of the terms of eq. (6) */
+    double mean_m3s, mean_sd_m3s; /* flow averaged over the data, and its standard deviation */
+    double condition;             /* of the information on its terms */
+    uint8_t status;
+} rtid_estimator_map;
+
 /* Sums as they were at one instant, and the room in which they are solved. */
 typedef struct {
     double matrix[RTID_EST_SUMS];
     double scale[RTID_EST_UNKNOWNS], theta[RTID_EST_UNKNOWNS], basis[RTID_EST_UNKNOWNS];
     double noise, rows, cov_change;
+    int64_t now_us;
     uint16_t n_slots;
     rtid_estimator_block block[RTID_EST_MAX_BLOCKS];
+    rtid_estimator_map map[RTID_EST_MAX_BLOCKS];
 } rtid_estimator_work;
 
 typedef struct {
-    double compliance, compliance_sd; /* 1 / beta, 1/Pa */
+    /* [0]: 1 / beta in 1/Pa, then the shared terms in units of their scales in SI; 1 sigma */
+    double shared[RTID_EST_SHARED], shared_sd[RTID_EST_SHARED];
     double rho;      /* residual variance in units of the declared noise: 1 when all is explained */
     double leverage; /* share of the pressure noise that the maps absorb */
-    double terms[RTID_EST_SHARED], terms_sd[RTID_EST_SHARED]; /* from 1 on: of the shared terms, SI */
-    int definite; /* 0: the sums were not, and nothing else holds */
+    uint16_t raised; /* directions of which the sums know no more than their rounding */
+    uint8_t finite;  /* 0: an absurd sample was let in, and nothing here holds */
 } rtid_estimator_solution;
-
-typedef struct {
-    double theta[RTID_EST_TERMS]; /* m3/s, of the terms of eq. (6) */
-    double mean_m3s, mean_sd_m3s; /* flow averaged over the data, and its standard deviation */
-} rtid_estimator_map;
 
 /* Begin without knowledge. */
 void rtid_estimator_start(rtid_estimator *e);
@@ -153,10 +162,8 @@ int rtid_estimator_update(rtid_estimator *e, const rtid_estimator_sample *sample
 /* Bring the sums up to date and copy them; not while an update runs. */
 void rtid_estimator_freeze(rtid_estimator *e, rtid_estimator_work *w);
 
-/* Solve what was frozen; takes nothing but w. */
+/* Solve what was frozen: w->map[0 .. w->n_slots - 1], whose place in the grid is in w->block, and
+ * *s.  Takes nothing but w. */
 void rtid_estimator_solve(rtid_estimator_work *w, rtid_estimator_solution *s);
-
-/* Block `slot` < w->n_slots of a solved w; 1, or 0 if there is no such block. */
-int rtid_estimator_map_of(const rtid_estimator_work *w, int slot, rtid_estimator_map *map);
 
 #endif

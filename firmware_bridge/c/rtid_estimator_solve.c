@@ -21,8 +21,9 @@ static double prior(int i) { return i < RTID_EST_SHARED ? SHARED_PRIOR : FLOW_PR
 void rtid_estimator_freeze(rtid_estimator *e, rtid_estimator_work *w)
 {
     if (e->running)
-        rtid_est_rebase(e, GO_ON);
+        rtid_est_rebase(e, SETTLE);
     w->n_slots = e->n_slots;
+    w->now_us = e->t_us;
     w->rows = e->counts[RTID_EST_ROWS];
     w->noise = exact(e->noise);
     memcpy(w->block, e->block, sizeof *w->block * e->n_slots);
@@ -30,23 +31,70 @@ void rtid_estimator_freeze(rtid_estimator *e, rtid_estimator_work *w)
     memcpy(w->matrix, e->sums, (size_t)(row_of(w, unknowns(w) + 1) - w->matrix) * sizeof(rtid_sum));
 }
 
-/* The bytes of the sums become numbers, scaled to a unit diagonal with the prior. */
-static void scale_sums(rtid_estimator_work *w)
+/* The bytes of the sums become numbers. */
+static void read_sums(rtid_estimator_work *w)
 {
-    const int n = unknowns(w);
-    const double *end = row_of(w, n + 1);
+    const double *end = row_of(w, unknowns(w) + 1);
     for (double *p = w->matrix; p < end; p++) {
         rtid_sum sum;
         memcpy(&sum, p, sizeof sum);
         *p = exact(sum);
     }
-    for (int i = 1; i <= n; i++) {
+}
+
+/* Add the prior, scale to a unit diagonal. */
+static void scale_sums(rtid_estimator_work *w)
+{
+    for (int i = 1; i <= unknowns(w); i++) {
         double *row = row_of(w, i);
         row[i] += prior(i - 1);
-        w->scale[i - 1] = 1.0 / sqrt(row[i]);
+        w->scale[i - 1] = 1.0 / sqrt(row[i] > 0.0 ? row[i] : prior(i - 1));
         for (int j = 1; j <= i; j++)
             row[j] *= w->scale[i - 1] * w->scale[j - 1];
     }
+}
+
+/* One Jacobi rotation that clears a[p][q] of a symmetric matrix. */
+static void rotate(double a[T][T], int n, int p, int q)
+{
+    const double half = 0.5 * (a[q][q] - a[p][p]), both = a[p][q];
+    const double t = both / (half + (half < 0.0 ? -1.0 : 1.0) * sqrt(half * half + both * both));
+    const double c = 1.0 / sqrt(1.0 + t * t), s = t * c;
+    if (both == 0.0)
+        return;
+    for (int k = 0; k < n; k++) {
+        const double x = a[k][p], y = a[k][q];
+        a[k][p] = c * x - s * y;
+        a[k][q] = s * x + c * y;
+    }
+    for (int k = 0; k < n; k++) {
+        const double x = a[p][k], y = a[q][k];
+        a[p][k] = c * x - s * y;
+        a[q][k] = s * x + c * y;
+    }
+}
+
+/* Condition number of the information on the terms that a block's map has; HUGE_VAL: singular. */
+static double condition(rtid_estimator_work *w, int slot)
+{
+    double a[T][T], low, high;
+    int used[T], n = 0;
+    for (int i = 0; i < T; i++)
+        if (rtid_est_has_term(w->block[slot].edge, i))
+            used[n++] = RTID_EST_BLOCKS_AT + T * slot + i;
+    for (int i = 0; i < n; i++)
+        for (int j = 0; j <= i; j++)
+            a[i][j] = a[j][i] = row_of(w, used[i])[used[j]];
+    for (int sweep = 0; sweep < 8; sweep++)
+        for (int q = 1; q < n; q++)
+            for (int p = 0; p < q; p++)
+                rotate(a, n, p, q);
+    low = high = a[0][0];
+    for (int i = 1; i < n; i++) {
+        low = fmin(low, a[i][i]);
+        high = fmax(high, a[i][i]);
+    }
+    return low > 0.0 ? high / low : HUGE_VAL;
 }
 
 static double dot(const double *a, const double *b, int first, int last)
@@ -57,20 +105,24 @@ static double dot(const double *a, const double *b, int first, int last)
     return sum;
 }
 
-/* Cholesky factor in place; 0 if the matrix is not definite. */
+/* Cholesky factor in place.  A pivot that the sums' rounding leaves unknown is raised to that
+ * level, so that the factor exists and the covariance says how little is known; their number. */
 static int factorize(rtid_estimator_work *w)
 {
     const int n = unknowns(w);
+    int raised = 0;
     for (int i = 1; i <= n; i++) {
         double *row = row_of(w, i);
         for (int j = 1; j < i; j++)
             row[j] = (row[j] - dot(row, row_of(w, j), 1, j)) / row_of(w, j)[j];
         row[i] -= dot(row, row, 1, i);
-        if (!(row[i] > 0.0))
-            return 0;
+        if (!(row[i] > LEAST_PIVOT)) {
+            row[i] = LEAST_PIVOT;
+            raised++;
+        }
         row[i] = sqrt(row[i]);
     }
-    return 1;
+    return raised;
 }
 
 /* x <- (L L')^-1 x */
@@ -120,9 +172,9 @@ static double covariance(const rtid_estimator_work *w, int i, int j)
 static double limited(double x, double low, double high) { return x < low ? low : x > high ? high : x; }
 
 /* Take the pressure noise out of the information on 1 / beta; returns what it is moved by. */
-static double correct(rtid_estimator_work *w, double information, rtid_estimator_solution *s)
+static double correct(rtid_estimator_work *w, double information, double leverage)
 {
-    const double rows = w->rows > 1.0 ? w->rows : 1.0, noise = w->noise * (1.0 - s->leverage);
+    const double rows = w->rows > 1.0 ? w->rows : 1.0, noise = w->noise * (1.0 - leverage);
     const double least = SHARED_PRIOR + 3.0 * sqrt(2.0 / rows) * w->noise;
     const double told = (information - noise) / least, missing = limited(2.0 - told, 0.0, 1.0);
     const double cov = 1.0 / (told > 1.0 ? told * least : least);
@@ -130,24 +182,11 @@ static double correct(rtid_estimator_work *w, double information, rtid_estimator
     return (cov * information - 1.0) * w->theta[0];
 }
 
-void rtid_estimator_solve(rtid_estimator_work *w, rtid_estimator_solution *s)
+/* Least squares with the prior, then beta without its bias, and the flow terms that follow it. */
+static void estimate(rtid_estimator_work *w, rtid_estimator_solution *s)
 {
     const int n = unknowns(w);
-    double effective = 0.0, terms = 0.0, square, information, shift, dof;
-    memset(s, 0, sizeof *s);
-    scale_sums(w);
-    if (!factorize(w))
-        return;
-    s->definite = 1;
-    for (int i = 0; i < n; i++) {
-        w->theta[i] = row_of(w, i + 1)[0] * w->scale[i];
-        w->basis[i] = 0.0;
-    }
-    w->basis[0] = w->scale[0];
-    substitute(w, w->theta);
-    substitute(w, w->basis);
-    invert(w);
-    square = w->matrix[0];
+    double effective = 0.0, terms = 0.0, square = w->matrix[0], information, shift, dof;
     for (int i = 0; i < n; i++) {
         const double share = 1.0 - prior(i) * covariance(w, i, i);
         w->theta[i] *= w->scale[i];
@@ -158,39 +197,99 @@ void rtid_estimator_solve(rtid_estimator_work *w, rtid_estimator_solution *s)
     }
     s->leverage = limited(terms / (w->rows > 1.0 ? w->rows : 1.0), 0.0, 0.9);
     information = 1.0 / w->basis[0];
-    shift = correct(w, information, s);
+    shift = correct(w, information, s->leverage);
     square += shift * shift * information;
     for (int i = 0; i < n; i++) {
-        double *theta = &w->theta[i];
-        w->basis[i] *= information;
-        square -= prior(i) * (w->basis[i] * shift) * (2.0 * *theta + w->basis[i] * shift);
-        *theta += w->basis[i] * shift;
+        const double follow = (w->basis[i] *= information) * shift;
+        square -= prior(i) * follow * (2.0 * w->theta[i] + follow);
+        w->theta[i] += follow;
     }
     dof = rint(w->rows - effective);
     s->rho = square / (dof > 1.0 ? dof : 1.0);
-    s->compliance = w->theta[0] * RTID_EST_COMPLIANCE;
-    s->compliance_sd = sqrt(1.0 / information + w->cov_change) * RTID_EST_COMPLIANCE;
 }
 
-int rtid_estimator_map_of(const rtid_estimator_work *w, int slot, rtid_estimator_map *map)
+/* Variance of a sum of unknowns from `at` on, the correction included. */
+static double variance_of(const rtid_estimator_work *w, int at, int count, const double *weight)
 {
-    double phi[RTID_EST_TERMS], variance = 0.0, along = 0.0, scale;
+    double variance = 0.0, along = 0.0;
+    for (int i = 0; i < count; i++) {
+        along += weight[i] * w->basis[at + i];
+        for (int j = 0; j < count; j++)
+            variance += weight[i] * weight[j] * covariance(w, at + i, at + j);
+    }
+    variance += along * along * w->cov_change;
+    return variance > 0.0 ? variance : 0.0;
+}
+
+static void read_shared(const rtid_estimator_work *w, rtid_estimator_solution *s)
+{
+    const double one = 1.0;
+    for (int i = 0; i < RTID_EST_SHARED; i++) {
+        const double scale = rtid_est_shared_scale(i);
+        s->shared[i] = scale * w->theta[i];
+        s->shared_sd[i] = fabs(scale) * sqrt(variance_of(w, i, 1, &one));
+    }
+}
+
+/* ---- blocks ---- */
+
+static void read_map(rtid_estimator_work *w, int slot)
+{
+    const rtid_estimator_block *block = &w->block[slot];
+    rtid_estimator_map *map = &w->map[slot];
     const int at = RTID_EST_SHARED + RTID_EST_TERMS * slot;
-    if (slot < 0 || slot >= w->n_slots)
-        return 0;
-    scale = rtid_est_rated(w->block[slot].edge);
+    const double scale = rtid_est_rated(block->edge), dwell_s = (double)block->dwell_us * 1e-6;
+    double phi[RTID_EST_TERMS];
     map->mean_m3s = 0.0;
     for (int i = 0; i < RTID_EST_TERMS; i++) {
-        const double dwell_s = (double)w->block[slot].dwell_us * 1e-6;
-        phi[i] = exact(w->block[slot].phi[i]) / (dwell_s > 1e-12 ? dwell_s : 1e-12);
+        phi[i] = exact(block->phi[i]) / (dwell_s > 1e-12 ? dwell_s : 1e-12);
         map->theta[i] = scale * w->theta[at + i];
         map->mean_m3s += phi[i] * map->theta[i];
-        along += phi[i] * w->basis[at + i];
     }
-    for (int i = 0; i < RTID_EST_TERMS; i++)
-        for (int j = 0; j < RTID_EST_TERMS; j++)
-            variance += phi[i] * phi[j] * covariance(w, at + i, at + j);
-    variance += along * along * w->cov_change;
-    map->mean_sd_m3s = scale * sqrt(variance > 0.0 ? variance : 0.0);
-    return 1;
+    map->mean_sd_m3s = scale * sqrt(variance_of(w, at, RTID_EST_TERMS, phi));
+}
+
+/* Largest block-mean flow of an edge, its rated flow where none is known. */
+static double largest_flow(const rtid_estimator_work *w, int edge)
+{
+    double largest = 0.0;
+    for (int slot = 0; slot < w->n_slots; slot++)
+        if (w->block[slot].edge == edge && w->block[slot].rows >= RTID_EST_MIN_ROWS)
+            largest = fmax(largest, fabs(w->map[slot].mean_m3s));
+    return largest > 0.0 ? largest : rtid_est_rated(edge);
+}
+
+static uint8_t status_of(const rtid_estimator_work *w, int slot)
+{
+    const rtid_estimator_block *block = &w->block[slot];
+    const rtid_estimator_map *map = &w->map[slot];
+    if (block->rows < RTID_EST_MIN_ROWS || !(map->condition <= RTID_EST_CONDITION_LIMIT)
+        || !(map->condition <= CONDITION_MOST)
+        || !(map->mean_sd_m3s <= RTID_EST_MAX_SD_SHARE * largest_flow(w, block->edge)))
+        return RTID_EST_LEARNING;
+    return w->now_us - block->last_us > RTID_EST_STALE_US ? RTID_EST_STALE : RTID_EST_VALID;
+}
+
+void rtid_estimator_solve(rtid_estimator_work *w, rtid_estimator_solution *s)
+{
+    memset(s, 0, sizeof *s);
+    read_sums(w);
+    for (int slot = 0; slot < w->n_slots; slot++)
+        w->map[slot].condition = condition(w, slot);
+    scale_sums(w);
+    s->raised = (uint16_t)factorize(w);
+    for (int i = 0; i < unknowns(w); i++) {
+        w->theta[i] = row_of(w, i + 1)[0] * w->scale[i];
+        w->basis[i] = i == 0 ? w->scale[0] : 0.0;
+    }
+    substitute(w, w->theta);
+    substitute(w, w->basis);
+    invert(w);
+    estimate(w, s);
+    read_shared(w, s);
+    for (int slot = 0; slot < w->n_slots; slot++)
+        read_map(w, slot);
+    for (int slot = 0; slot < w->n_slots; slot++)
+        w->map[slot].status = status_of(w, slot);
+    s->finite = isfinite(s->rho) && isfinite(s->shared[0]);
 }

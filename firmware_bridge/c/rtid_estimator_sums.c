@@ -274,7 +274,7 @@ void rtid_est_remove_open(rtid_estimator *e, int k)
 
 /* ---- the ring begins anew ---- */
 
-void rtid_est_rebase(rtid_estimator *e, int end)
+void rtid_est_rebase(rtid_estimator *e, int how)
 {
     rtid_real left[T];
     rtid_est_carry(e);
@@ -320,14 +320,15 @@ void rtid_est_rebase(rtid_estimator *e, int end)
         }
         for (int j = 0; j < 1 + RTID_EST_SHARED; j++)
             item->shared_start[j] = no_sum();
-        if (end || !(largest > SILENT * item->size)) {
+        if (how == END_ALL || (how == FORGET_SILENT && !(largest > SILENT * item->size))) {
             e->n_closed--;
             release(e, p);
         }
     }
     clear_columns(e, 0, e->width);
-    for (int j = 0; end && j < RTID_EST_WIDTH; j++)
+    for (int j = 0; how == END_ALL && j < RTID_EST_WIDTH; j++)
         e->d[j] = 0;
+    e->faded = how == SETTLE ? e->faded * e->d[RTID_EST_RING] : R(1);
     e->d[RTID_EST_RING] = R(1);
 }
 

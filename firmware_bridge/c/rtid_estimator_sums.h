@@ -13,7 +13,8 @@
 #define R(x) ((rtid_real)(x))
 enum { T = RTID_EST_TERMS };
 enum { FREE, OPEN, YOUNG, RINGING }; /* status of a recent block; young: closed since the ring began */
-enum { GO_ON, END_ALL };
+enum { SETTLE, FORGET_SILENT, END_ALL }; /* what a rebase does to the memory of closed blocks */
+#define FORGET_AT 1e-3 /* forget the silent ones each time that all memory has faded to this share */
 
 #ifdef RTID_ESTIMATOR_FLOAT32
 
@@ -23,7 +24,9 @@ enum { GO_ON, END_ALL };
 /* No quantity in SI units is that large, and its square is still a number. */
 #define INSANE 1e9f
 #define RING_LIMIT 0.1f /* rebase before the ring columns lose digits */
-#define SILENT 1e-6f    /* a closed block whose state decayed to this share is forgotten */
+#define SILENT 1e-7f    /* a closed block whose state decayed to this share is forgotten */
+#define LEAST_PIVOT 1e-6 /* of a unit diagonal: below, the sums hold but their own rounding */
+#define CONDITION_MOST 1e6
 
 static inline void add(rtid_sum *s, rtid_real x)
 {
@@ -51,6 +54,8 @@ static inline rtid_sum no_sum(void) { return (rtid_sum){0.0f, 0.0f}; }
 #define INSANE 1e30
 #define RING_LIMIT 0.05
 #define SILENT 1e-11
+#define LEAST_PIVOT 1e-15
+#define CONDITION_MOST HUGE_VAL
 
 static inline void add(rtid_sum *s, rtid_real x) { *s += x; }
 static inline void merge(rtid_sum *s, rtid_sum x) { *s += x; }
@@ -63,8 +68,10 @@ static inline rtid_sum no_sum(void) { return 0.0; }
 
 static inline int first_of(int k) { return RTID_EST_OPEN_AT + T * k; }
 
-/* Rated flow of an edge, the unit of its unknowns, m3/s. */
+/* Units of the unknowns: rated flow of an edge, m3/s; scale of a shared one; terms that a map has. */
 double rtid_est_rated(int edge);
+double rtid_est_shared_scale(int shared);
+int rtid_est_has_term(int edge, int term);
 
 /* Let n blocks be open; the width of the rows follows. */
 void rtid_est_set_open(rtid_estimator *e, int n);
@@ -81,9 +88,8 @@ void rtid_est_open(rtid_estimator *e, int k, int edge, int slot);
 /* Take the closed and cleared block k out of the open ones; the last one takes its place. */
 void rtid_est_remove_open(rtid_estimator *e, int k);
 
-/* Settle all products, forget the blocks that fell silent, start the ring anew; with END_ALL all
- * memory ends, and all states are zero. */
-void rtid_est_rebase(rtid_estimator *e, int end);
+/* Settle all products, start the ring anew; with END_ALL all states are zero. */
+void rtid_est_rebase(rtid_estimator *e, int how);
 
 /* END_ALL, and no block stays open. */
 void rtid_est_end(rtid_estimator *e);

@@ -32,8 +32,23 @@ COUNTS = (
 _I2, _U1, _U2, _U4, _I8 = np.int16, np.uint8, np.uint16, np.uint32, np.int64
 
 
-def _record(fields: Sequence[tuple[Any, ...]]) -> np.dtype[np.void]:
+Field = tuple[Any, ...]
+
+
+def _record(fields: Sequence[Field]) -> np.dtype[np.void]:
     return np.dtype(list(fields), align=True)
+
+
+# rtid_estimator_map
+MAP = _record(
+    [
+        ("theta", np.float64, (TERMS,)),
+        ("mean_m3s", np.float64),
+        ("mean_sd_m3s", np.float64),
+        ("condition", np.float64),
+        ("status", _U1),
+    ]
+)
 
 
 @dataclass(frozen=True)
@@ -71,13 +86,17 @@ class Layout:
         shared = 1 + n.terms
         stride = -(-(2 + shared + TERMS * n.open) // 4) * 4
         kept = [("slot", _I2), ("status", _U1), ("size", real), ("d", real, (TERMS,))]
-        kept += [("through", real, (TERMS,)), ("w_start", total), ("shared_start", total, (1 + shared,))]
+        kept += [
+            ("through", real, (TERMS,)),
+            ("w_start", total),
+            ("shared_start", total, (1 + shared,)),
+        ]
         opened = [(name, _I2) for name in ("edge", "slot", "recent", "u", "dp")]
-        edge = [(name, real) for name in ("w", "m1", "m2", "mt", "dp0", "dp1")]
+        edge = [(name, real) for name in ("w", "m1", "var", "mt", "dp0", "dp1")]
         edge += [(name, _I2) for name in ("u", "dp", "to_u", "to_dp", "place")]
-        fields = [("d", real, (stride,)), ("row", real, (stride,))]
+        fields: list[Field] = [("d", real, (stride,)), ("row", real, (stride,))]
         fields += [("gram", real, (stride, stride)), ("local", total, (stride, stride))]
-        fields += [("width", _U2), ("uncarried", _U2)]
+        fields += [("width", _U2), ("uncarried", _U2), ("faded", real)]
         fields += [(name, real) for name in ("cov", "echo", "noise_span")] + [("noise", total)]
         fields += [(name, _I8) for name in ("t_us", "ready_us", "dt_us")]
         fields += [("values", real, (n.signals + 1,)), ("dt_s", real), ("lag_decay", real)]
@@ -92,10 +111,19 @@ class Layout:
     def work(self) -> np.dtype[np.void]:
         """rtid_estimator_work."""
         n = self.sizes
-        fields: list[tuple[Any, ...]] = [("matrix", np.float64, (n.sums,))]
+        fields: list[Field] = [("matrix", np.float64, (n.sums,))]
         fields += [(name, np.float64, (n.unknowns,)) for name in ("scale", "theta", "basis")]
         fields += [(name, np.float64) for name in ("noise", "rows", "cov_change")]
-        return _record([*fields, ("n_slots", _U2), ("block", self.block, (n.blocks,))])
+        fields += [("now_us", _I8), ("n_slots", _U2), ("block", self.block, (n.blocks,))]
+        return _record([*fields, ("map", MAP, (n.blocks,))])
+
+    @property
+    def solution(self) -> np.dtype[np.void]:
+        """rtid_estimator_solution."""
+        shared = (1 + self.sizes.terms,)
+        fields = [("shared", np.float64, shared), ("shared_sd", np.float64, shared)]
+        numbers = [(name, np.float64) for name in ("rho", "leverage")]
+        return _record([*fields, *numbers, ("raised", _U2), ("finite", _U1)])
 
     def normal(self, memory: np.void) -> Normal:
         """The normal equations in a record of `estimator` that was frozen: settled sums."""

@@ -14,9 +14,10 @@ from rtid.estimator.limits import most_open
 from rtid.estimator.state import Weights, build
 from rtid.kernels import layout
 from rtid.mcu.errors import ValveError
-from rtid.model import Model
+from rtid.model import Gates, Model
 
 ALWAYS = 1e30  # stands for no limit: nothing that large passes the gate
+FOREVER_S = 1e9
 MOST_CELLS = 32_000  # numbers of cells and blocks are kept in 16 bits
 MOST_BLOCKS = 2_000
 
@@ -130,9 +131,20 @@ def _chamber(e: np.void, model: Model) -> Iterator[str]:
     }
     for name, (value, unit) in numbers.items():
         yield f"#define RTID_EST_{name} {_number(value)} /* {unit} */"
-    for name, seconds in (("MAX_GAP_US", e["max_gap_s"]), ("RECOVERY_US", e["recovery_s"])):
-        yield f"#define RTID_EST_{name} INT64_C({round(float(seconds) * 1e6)})"
+    yield from _gates(model.gates)
     yield ""
+
+
+def _gates(gates: Gates) -> Iterator[str]:
+    for name, seconds in (
+        ("MAX_GAP_US", gates.max_gap_s),
+        ("RECOVERY_US", gates.recovery_s),
+        ("STALE_US", gates.stale_s),
+    ):
+        yield f"#define RTID_EST_{name} INT64_C({round(min(seconds, FOREVER_S) * 1e6)})"
+    yield f"#define RTID_EST_MIN_ROWS {max(0, gates.min_rows)}u"
+    yield f"#define RTID_EST_MAX_SD_SHARE {_number(gates.max_sd_share)}"
+    yield f"#define RTID_EST_CONDITION_LIMIT {_number(gates.condition_limit)}"
 
 
 def _edges(e: np.void, model: Model) -> Iterator[str]:

@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 from rtid.estimator.limits import refuse_unfit
 from rtid.mcu.errors import ValveError
 from rtid.model import NONE, TAYLOR, Chamber, Edge, Model, Term
+
+Part = TypeVar("Part", Chamber, Edge)
 
 
 def one_valve(model: Model, chamber: str, edges: Sequence[str] = ()) -> Model:
@@ -36,9 +39,7 @@ def one_valve(model: Model, chamber: str, edges: Sequence[str] = ()) -> Model:
     return valve
 
 
-def _named(
-    things: tuple[Chamber, ...] | tuple[Edge, ...], names: Sequence[str], what: str
-) -> tuple:
+def _named(things: Sequence[Part], names: Sequence[str], what: str) -> tuple[Part, ...]:
     known = {thing.name: thing for thing in things}
     for name in names:
         if name not in known:

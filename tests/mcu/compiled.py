@@ -12,7 +12,6 @@ import pytest
 from numpy.typing import NDArray
 
 import firmware_bridge
-from rtid.kernels.layout import TERMS
 from rtid.mcu.memory import COUNTS, Layout
 from rtid.mcu.tables import sizes_of, tables
 from rtid.model import FloatArray, Model
@@ -23,7 +22,6 @@ STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
 OPTIMISED = ("-O2",)
 SANITISED = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 COMPILER = next((name for name in ("cc", "gcc", "clang") if shutil.which(name)), None)
-MAP = np.dtype([("theta", np.float64, (TERMS,)), ("mean_m3s", float), ("mean_sd_m3s", float)])
 TAKEN = -1
 
 
@@ -41,7 +39,11 @@ class Outcome:
     memory: np.void
     work: np.void
     solution: np.void
-    maps: NDArray[np.void]
+
+    @property
+    def maps(self) -> NDArray[np.void]:
+        """What is known of each visited block, in the order of their first visits."""
+        return np.asarray(self.work["map"][: self.work["n_slots"]])
 
     @property
     def counts(self) -> dict[str, int]:
@@ -84,25 +86,13 @@ class Program:
         assert done.returncode == 0, done.stderr.decode()[-2000:]
         layout, n = self.layout, len(samples) // self.layout.sample.itemsize
         rest = memoryview(done.stdout)
-        sizes, rest = np.frombuffer(rest[:40], np.uint64), rest[40:]
-        solution = np.dtype(
-            [(name, float) for name in ("compliance", "compliance_sd", "rho", "leverage")]
-            + [(name, float, (1 + layout.sizes.terms,)) for name in ("terms", "terms_sd")]  # type: ignore[list-item]
-            + [("definite", np.int32)],
-            align=True,
-        )
-        records = [layout.estimator, layout.work, layout.sample, solution, MAP]
+        records = [layout.estimator, layout.work, layout.sample, layout.solution]
+        sizes, rest = np.frombuffer(rest[:32], np.uint64), rest[32:]
         assert sizes.tolist() == [record.itemsize for record in records]
+        verdicts, rest = np.frombuffer(rest[:n], np.int8), rest[n:]
         found = []
-        for dtype, count in (
-            (np.dtype(np.int8), n),
-            (layout.estimator, 1),
-            (layout.work, 1),
-            (solution, 1),
-        ):
-            size = dtype.itemsize * count
-            found.append(np.frombuffer(rest[:size], dtype))
-            rest = rest[size:]
-        return Outcome(
-            layout, found[0], found[1][0], found[2][0], found[3][0], np.frombuffer(rest, MAP)
-        )
+        for dtype in (layout.estimator, layout.work, layout.solution):
+            found.append(np.frombuffer(rest[: dtype.itemsize], dtype)[0])
+            rest = rest[dtype.itemsize :]
+        assert not rest
+        return Outcome(layout, verdicts, *found)

@@ -14,8 +14,7 @@ int main(void)
 {
     rtid_estimator_sample sample;
     rtid_estimator_solution solution;
-    rtid_estimator_map map;
-    const uint64_t sizes[] = {sizeof e, sizeof work, sizeof sample, sizeof solution, sizeof map};
+    const uint64_t sizes[] = {sizeof e, sizeof work, sizeof sample, sizeof solution};
     rtid_estimator_start(&e);
     put(sizes, sizeof sizes);
     while (fread(&sample, sizeof sample, 1, stdin) == 1) {
@@ -27,8 +26,5 @@ int main(void)
     rtid_estimator_solve(&work, &solution);
     put(&work, sizeof work);
     put(&solution, sizeof solution);
-    for (int slot = -1; slot <= RTID_EST_MAX_BLOCKS; slot++)
-        if (solution.definite && rtid_estimator_map_of(&work, slot, &map))
-            put(&map, sizeof map);
     return 0;
 }

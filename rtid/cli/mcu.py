@@ -1,0 +1,74 @@
+"""`rtid mcu`: write the estimator in C for a controller with no computer beside it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from rtid.mcu.tables import Sizes
+    from rtid.project import Project
+
+
+def mcu(
+    output: Annotated[Path, typer.Argument(help="Folder for the C sources; created if missing.")],
+    project: Annotated[Path, typer.Option("--project", "-p", help="Project file.")],
+    chamber: Annotated[str, typer.Option("--chamber", "-c", help="The chamber to learn.")] = "",
+    edge: Annotated[
+        list[str] | None, typer.Option("--edge", "-e", help="One of its edges; default: all.")
+    ] = None,
+    blocks: Annotated[
+        int, typer.Option(min=0, help="Blocks that fit in its memory; 0: all of the grids.")
+    ] = 0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print a summary as JSON.")] = False,
+) -> None:
+    """Write the estimator of one chamber in C99, with tables from the project file.
+
+    No heap, no globals; one double or, with -DRTID_ESTIMATOR_FLOAT32, one float per number in the
+    update.  The same samples give the sums of `rtid run`.  It learns what the project declares in
+    the integral form with Taylor blocks, for ever: no forgetting, no gate by a map held, no modes.
+    """
+    from rtid.mcu.memory import Layout
+    from rtid.mcu.tables import sizes_of
+    from rtid.mcu.valve import one_valve
+    from rtid.mcu.write import write_sources
+    from rtid.project import load
+
+    loaded = load(project)
+    _refuse_estimated(loaded)
+    model = one_valve(loaded.model, chamber or loaded.model.chambers[0].name, edge or ())
+    title = f" of project {loaded.digest}"
+    written = write_sources(output, model, blocks, title=title)
+    sizes = sizes_of(model, blocks)
+    ram = {
+        name: [Layout(sizes, single).estimator.itemsize, Layout(sizes, single).work.itemsize]
+        for name, single in (("float64", False), ("float32", True))
+    }
+    added = [f"{a.effect} at {a.where}" for a in loaded.sections.added]
+    if as_json:
+        told = {"schema": 1, "written": [str(path) for path in written], "ram_bytes": ram}
+        told |= {"chamber": model.chambers[0].name, "blocks": sizes.blocks, "without": added}
+        print(json.dumps(told))
+    else:
+        _tell(output, model.chambers[0].name, sizes, ram, added)
+
+
+def _refuse_estimated(project: Project) -> None:
+    """The controller has no trace to take the sensors' noise from."""
+    from rtid.mcu.errors import ValveError
+
+    if project.noise_unknown:
+        names = ", ".join(f"signals.{name}.noise" for name in project.noise_unknown)
+        raise ValveError(f"{project.path}: {names} is to be estimated", "give its value, 1 sigma")
+
+
+def _tell(output: Path, chamber: str, sizes: Sizes, ram: dict[str, Any], added: list[str]) -> None:
+    print(f"wrote {output}: chamber {chamber}, {sizes.edges} edges, {sizes.cells} cells")
+    print(f"room for {sizes.blocks} blocks, {sizes.unknowns} unknowns")
+    for name, (estimator, work) in ram.items():
+        print(f"  {name}: {estimator / 1024:.1f} KiB to learn, {work / 1024:.1f} KiB to solve")
+    if added:
+        print(f"It learns without {', '.join(added)}: the maps take up what they can of it.")

@@ -1,0 +1,38 @@
+"""The estimator in C as a folder to be compiled into a firmware: its sources and its tables."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import firmware_bridge
+from rtid.estimator.state import Weights
+from rtid.mcu.tables import tables
+from rtid.model import Model
+
+SOURCES = Path(firmware_bridge.__file__).parent / "c"
+TABLES = "rtid_estimator_tables.h"
+
+
+def sources() -> list[Path]:
+    """The files of the package, without the tables."""
+    return sorted(SOURCES.glob("rtid_estimator*.[ch]"))
+
+
+def write_sources(
+    folder: Path, model: Model, blocks: int = 0, weights: Weights | None = None, title: str = ""
+) -> list[Path]:
+    """Write tables and sources for a machine of `one_valve`; the files, each whole or not there.
+
+    blocks: how many can be learned, 0: all of the grids.  Raises ValveError, OSError.
+    """
+    texts = {TABLES: tables(model, blocks, weights, title)}
+    texts |= {path.name: path.read_text(encoding="utf-8") for path in sources()}
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    for name, text in texts.items():
+        part, path = folder / f"{name}.part", folder / name
+        part.write_text(text, encoding="utf-8")
+        os.replace(part, path)
+        written.append(path)
+    return written
