@@ -1,0 +1,49 @@
+"""`rtid accept`: the machine has changed, and this is how it is to be."""
+
+from __future__ import annotations
+
+import getpass
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rtid.cli.exits import Exit
+from rtid.errors import RtidError
+
+WAIT_S = 30.0
+
+
+def accept(
+    where: Annotated[Path, typer.Argument(help="Project file, or the daemon's state folder.")],
+    reason: Annotated[str, typer.Option(help="Why, for the history.")] = "",
+) -> None:
+    """Take a changed machine for the new normal: the running daemon learns on from the change.
+
+    Its maps begin anew with the samples since the change; what was learned before is kept beside
+    them as state-*.before.npz.  Who accepted it, when and why stands in history.sqlite.  Exit code
+    4 where no change has been noticed.
+    """
+    from rtid.daemon import acceptance
+    from rtid.daemon.configure import state_of
+    from rtid.daemon.status import OLD_S, read
+
+    folder = state_of(where)
+    found = read(folder)
+    if time.time() - found.now_unix_s > OLD_S:
+        raise RtidError(f"{folder}: no daemon is running here", "start it with `rtid run`")
+    if not found.has("plant_changed"):
+        print(f"{found.name}: nothing to accept, the machine does what the map says")
+        raise typer.Exit(Exit.NEGATIVE)
+    request = acceptance.Acceptance(time.time(), getpass.getuser(), reason)
+    acceptance.ask(folder, request)
+    end_s = time.monotonic() + WAIT_S
+    while read(folder).has("plant_changed"):
+        if time.monotonic() > end_s:
+            acceptance.withdraw(folder)
+            raise RtidError(
+                f"{folder}: the daemon has not answered within {WAIT_S:g} s", "see its log"
+            )
+        time.sleep(0.2)
+    print(f"{found.name}: accepted; it learns on from the change, the former state is kept aside")

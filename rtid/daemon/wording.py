@@ -1,0 +1,100 @@
+"""What each alarm says: one sentence that names the part and what follows, "" where all is well."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from rtid.daemon.status import MessageHealth, SignalHealth, Verdict
+
+CAUSES = {
+    "late": "woken too late",
+    "preempted": "kept from the processor",
+    "work": "long work",
+    "backlog": "catching up after a stall",
+    "handover": "copying the estimate",
+    "upkeep": "upkeep of the estimate",
+    "swap": "taking an earlier estimate up",
+}
+MESSAGES = {  # verdict: what is said of the message, and how to go on
+    "silent": "no good frame comes; is its sender switched off, or the identifier wrong?",
+    "late": "comes more slowly than declared; is the bus overloaded, or the period wrong?",
+    "damaged": "frames arrive damaged (CRC or length); look at cable, termination and DBC",
+}
+
+
+def _have(names: list[str], one: str, many: str) -> str:
+    return f"{', '.join(names)} {one if len(names) == 1 else many}"
+
+
+def second_sender(names: list[str]) -> str:
+    """Messages that come faster than declared."""
+    if not names:
+        return ""
+    return (
+        f"{_have(names, 'comes', 'come')} faster than declared: a second sender, or a wrong "
+        "period? Nothing is learned until that has ended"
+    )
+
+
+def frozen(names: list[str]) -> str:
+    """Signals that repeat as noise never would."""
+    if not names:
+        return ""
+    return (
+        f"{_have(names, 'does', 'do')} not move as sensor noise would: frozen? Nothing is learned "
+        "until the value moves again"
+    )
+
+
+def bus_down(where: str) -> str:
+    """The bus has failed."""
+    return f"{where} has failed and is being opened again; nothing is learned meanwhile"
+
+
+def helper_failed(times: int) -> str:
+    """The analyst had to be started again."""
+    often = "once" if times == 1 else f"{times} times"
+    return (
+        f"the process that solves and saves has ended {often} and was started again; its reason "
+        "stands in the log"
+    )
+
+
+def message(verdict: str, found: Iterable[MessageHealth]) -> str:
+    """Messages of one verdict of `MESSAGES`."""
+    names = [m.name for m in found if m.verdict == verdict]
+    return f"{', '.join(names)}: {MESSAGES[verdict]}" if names else ""
+
+
+def signals(found: Iterable[SignalHealth]) -> str:
+    """Signals outside what the project file declares, or without a value."""
+    said = [_signal(s) for s in found if s.verdict in ("out_of_range", "not_available")]
+    return "; ".join(said)
+
+
+def _signal(one: SignalHealth) -> str:
+    if one.verdict == "not_available":
+        return f"{one.name} has no value: its sender says that it is not available"
+    return (
+        f"{one.name} leaves its declared range, it went from {one.minimum:g} to {one.maximum:g} "
+        f"{one.unit} within a second; such samples are not learned"
+    )
+
+
+def plant_changed(verdict: Verdict | None) -> str:
+    """The map no longer foretells the motion; verdict: of the change, as far as there is one."""
+    text = "the machine no longer does what the map says; learning is suspended"
+    if verdict is None:
+        return f"{text}, a diagnosis follows"
+    return f"{text}. {verdict.text} If the machine is to stay as it is now: rtid accept"
+
+
+def overload(lost: int, rate_hz: float, causes: Mapping[str, int]) -> str:
+    """Ticks that were lost within a second, and what the overruns of that second came from."""
+    why = sorted(causes.items(), key=lambda cause: -cause[1])
+    told = ", ".join(f"{CAUSES.get(cause, cause)} ({n})" for cause, n in why)
+    return (
+        f"{lost} of {rate_hz:.0f} ticks were lost within a second{': ' * bool(told)}{told}; no "
+        "frame is lost, but what is published comes late. Give the daemon more of the processor "
+        "(daemon.priority) or a lower rate (daemon.rate_hz)"
+    )
