@@ -12,8 +12,8 @@ from rtid.compare import BlockRow, Comparison, Deviation, Examination
 from rtid.compare.dependence import DIRECTIONS
 from rtid.compare.tables import CAUSES, cause_of
 from rtid.comparing import Held, TraceComparison, share_on_own_data
+from rtid.units import KPA, LPM, MPA
 
-LPM, MPA, KPA = 6e4, 1e-6, 1e-3
 Z95 = 1.96
 WORST = 12  # blocks in the printed table; --json gives all
 

@@ -8,11 +8,10 @@ from rich.table import Table
 from rtid.diagnose.report import Diagnosis, Effect, Unseen, Value
 from rtid.diagnose.verdict import MATERIAL
 from rtid.effects import catalogue
+from rtid.units import PRACTICAL
 
-LPM = 6e4  # L/min per m3/s
 WIDTH = 110  # where the output is no terminal
-# display units by SI unit: factor and name
-DISPLAY = {"s": (1e3, "ms"), "m3": (1e3, "L"), "Pa": (1e-6, "MPa"), "m3/s": (LPM, "L/min")}
+DISPLAY = {si: PRACTICAL[si] for si in ("s", "m3", "Pa", "m3/s")}  # coefficients stay in SI
 SHOWN = 14  # rows of the table of what was not found
 
 
@@ -105,7 +104,7 @@ def title(name: str) -> str:
 
 def quantity(value: Value) -> str:
     """Value, interval and unit, in display units."""
-    factor, unit = DISPLAY.get(value.unit, (1.0, value.unit))
+    unit, factor = DISPLAY.get(value.unit, (value.unit, 1.0))
     unit = "" if unit == "1" else f" {unit}"
     if value.std != value.std:
         return f"{factor * value.value:.4g}{unit}"

@@ -18,8 +18,7 @@ from rtid.comparing import TraceComparison
 from rtid.comparing import as_json as compared_json
 from rtid.estimator.flowmap import LEARNING, VALID, EdgeMap
 from rtid.replay import Replay
-
-LPM, MPA = 6e4, 1e-6  # display units: L/min per m3/s, MPa per Pa
+from rtid.units import LPM, MPA
 
 SCHEMA = 1
 WIDTH = 110  # where the output is no terminal

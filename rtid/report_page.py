@@ -18,7 +18,7 @@ import rtid
 from rtid.diagnose.residual import ROWS_PER_S, Residual
 from rtid.diagnose.trials import GAIN
 from rtid.diagnose.verdict import MATERIAL
-from rtid.diagnosed_text import LPM, sentences, title
+from rtid.diagnosed_text import sentences, title
 from rtid.pictures.diagnosed import Rank, dependences, errors, flows, ranking
 from rtid.pictures.style import STYLE
 from rtid.report_story import Told
@@ -33,6 +33,7 @@ from rtid.report_tables import (
 )
 from rtid.report_template import PAGE
 from rtid.report_words import VERDICTS, text
+from rtid.units import LPM
 
 PARTS = "identification part", "held-out part"
 RANKED = 16  # candidates that are shown

@@ -10,6 +10,20 @@ import math
 from dataclasses import dataclass
 from difflib import get_close_matches
 
+LPM, MPA, KPA = 6e4, 1e-6, 1e-3  # of all that is shown: L/min per m3/s, MPa and kPa per Pa
+# of sizes of effects, by SI unit: what the workshop says, and factor
+PRACTICAL = {
+    "m3/s/Pa": ("L/min/MPa", 6e10),
+    "m3/s/sqrt(Pa)": ("L/min/sqrt(MPa)", 6e7),
+    "m3/s": ("L/min", LPM),
+    "m3/Pa": ("cm3/MPa", 1e12),
+    "Pa s/m3": ("MPa/(L/min)", MPA / LPM),
+    "Pa/m3": ("MPa/L", 1e-3 * MPA),
+    "m3": ("L", 1e3),
+    "Pa": ("MPa", MPA),
+    "m": ("mm", 1e3),
+    "s": ("ms", 1e3),
+}
 COMMAND_DIMENSIONS = ("voltage", "current", "duty")
 
 

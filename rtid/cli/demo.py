@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rtid.units import LPM, MPA
+
 if TYPE_CHECKING:
     from rich.console import Console
 
     from rtid.comparing import TraceComparison
     from rtid.demo import Demo
 
-MPA, LPM = 1e-6, 6e4
 Z95 = 1.96
 WIDTH = 110  # where the output is no terminal
 

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rtid.units import PRACTICAL
+
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
@@ -130,19 +132,6 @@ NOTATION = {
     "ssqrt": "ssqrt(z) = sign(z) sqrt|z|",
     "delay": "delay(z, T): z at the time t - T",
     "play": "play(z, h): z behind a play of full width h",
-}
-
-
-# Practical units beside SI: unit -> (name, value per SI value).
-PRACTICAL = {
-    "m3/s/Pa": ("L/min/MPa", 6e10),
-    "m3/s/sqrt(Pa)": ("L/min/sqrt(MPa)", 6e7),
-    "m3/s": ("L/min", 6e4),
-    "m3/Pa": ("cm3/MPa", 1e12),
-    "m3": ("L", 1e3),
-    "Pa": ("MPa", 1e-6),
-    "m": ("mm", 1e3),
-    "s": ("ms", 1e3),
 }
 
 

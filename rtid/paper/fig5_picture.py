@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-from rtid.colours import BLUE, INK, LPM, MPA
+from rtid.colours import BLUE, INK
 from rtid.paper.slices import Z95, Slice
 from rtid.pictures.style import STYLE
+from rtid.units import LPM, MPA
 
 EVERY = 12  # points between two circles of the truth
 

@@ -19,8 +19,8 @@ from rtid.paper.boom import Learned, boom, learn
 from rtid.paper.result import Measure, Part, Table, at_least, at_most
 from rtid.sim.plant import FloatArray
 from rtid.sim.run import SimulationError
+from rtid.units import LPM, MPA
 
-LPM, MPA = 6e4, 1e-6
 NOT_GIVEN = np.nan
 # Table 1 of the paper in L/min, rows by pressure drop, columns by command.
 PAPER_ESTIMATED = (

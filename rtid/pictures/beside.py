@@ -10,10 +10,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from rtid.colours import BLUE, GREY, HELD_OUT, INK, KPA, LPM, SEEN
+from rtid.colours import BLUE, GREY, HELD_OUT, INK, SEEN
 from rtid.compare import FREE_RUN, Examination
 from rtid.model import Model
 from rtid.pictures.style import STYLE, thin
+from rtid.units import KPA, LPM
 
 LIMIT = 0.998  # quantile of the errors that the common scale shows
 

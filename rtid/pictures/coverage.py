@@ -8,10 +8,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from rtid.colours import GREY, INK, LINE, MPA
+from rtid.colours import GREY, INK, LINE
 from rtid.estimator.flowmap import EdgeMap, FlowMap
 from rtid.model import Edge, FloatArray, Model
 from rtid.pictures.style import FILL, LABELS, STYLE, label_outer, panels
+from rtid.units import MPA
 
 DOTS = 6000  # samples drawn per edge
 

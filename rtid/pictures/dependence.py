@@ -10,11 +10,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rtid.colours import CHAMBERS, GREY, LPM, MARKERS, UNITS
+from rtid.colours import CHAMBERS, GREY, MARKERS, UNITS
 from rtid.compare import Dependence
 from rtid.compare.dependence import DIRECTIONS
 from rtid.model import Model
 from rtid.pictures.style import STYLE
+from rtid.units import LPM
 
 Z95 = 1.96
 COLUMNS = 3

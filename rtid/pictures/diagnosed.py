@@ -16,10 +16,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from rtid.colours import BLUE, GREY, HELD_OUT, INK, LINE, LPM, ORANGE, PALE, SEEN, UNITS
+from rtid.colours import BLUE, GREY, HELD_OUT, INK, LINE, ORANGE, PALE, SEEN, UNITS
 from rtid.compare import Dependence
 from rtid.diagnose.residual import Residual
 from rtid.pictures.style import STYLE, thin
+from rtid.units import LPM
 
 BEFORE, AFTER = (ORANGE, "o"), (BLUE, "s")  # colour and marker
 POINTS = 500  # pairs of least and largest value that a line shows

@@ -13,11 +13,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
-from rtid.colours import BLUE, INK, LPM, MPA
+from rtid.colours import BLUE, INK
 from rtid.compare.tables import AnyMap
 from rtid.estimator.flowmap import VALID, EdgeMap, FlowMap
 from rtid.model import FloatArray
 from rtid.pictures.style import STYLE, label_outer, panels
+from rtid.units import LPM, MPA
 
 LATTICE = 160  # points per axis of a contour
 SLICES = 5

@@ -12,10 +12,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from rtid.colours import BLUE, GREY, HELD_OUT, INK, KPA, MPA, ORANGE, SEEN
+from rtid.colours import BLUE, GREY, HELD_OUT, INK, ORANGE, SEEN
 from rtid.compare import FREE_RUN, Simulation
 from rtid.model import FloatArray, Model
 from rtid.pictures.style import STYLE, thin
+from rtid.units import KPA, MPA
 
 
 def pressures(

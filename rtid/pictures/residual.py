@@ -7,10 +7,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rtid.colours import BLUE, GREY, INK, LPM, ORANGE
+from rtid.colours import BLUE, GREY, INK, ORANGE
 from rtid.compare.comparison import Comparison
 from rtid.model import FloatArray, Model
 from rtid.pictures.style import STYLE, thin
+from rtid.units import LPM
 
 
 def residual(model: Model, parts: dict[str, Comparison]) -> Figure:

@@ -12,11 +12,12 @@ from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
-from rtid.colours import GREY, INK, LINE, LPM, MPA
+from rtid.colours import GREY, INK, LINE
 from rtid.compare import BlockRow
 from rtid.compare.tables import CAUSES, cause_of
 from rtid.model import Edge, Model
 from rtid.pictures.style import STYLE, label_outer, panels
+from rtid.units import LPM, MPA
 
 HATCHES = dict(zip(CAUSES, ("", "....", "////", "\\\\\\\\", "xxxx", "++++"), strict=True))
 EMPTY = "#f4f4f2"

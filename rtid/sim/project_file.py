@@ -11,6 +11,7 @@ import tomlkit
 
 from rtid.model import Edge, Model
 from rtid.sim.frames import CONTROLLER_ROUTES, messages_of
+from rtid.units import LPM
 
 HEAD = "Written by `rtid simulate`: what the user of this simulated machine would declare.\n"
 
@@ -88,7 +89,7 @@ def _edge(edge: Edge) -> dict[str, Any]:
         "u_grid_v": edge.grid.u_v.tolist(),
         "dp_grid_mpa": (edge.grid.dp_pa * 1e-6).round(9).tolist(),
         "safe_band_v": edge.safe_band_v,
-        "rated_flow_lpm": edge.rated_q_m3s * 6e4,
+        "rated_flow_lpm": edge.rated_q_m3s * LPM,
         "rated_dp_mpa": edge.rated_dp_pa * 1e-6,
     }
 

@@ -22,11 +22,12 @@ from bokeh.models import (
 from bokeh.palettes import Blues9, YlOrBr9, interp_palette
 from bokeh.plotting import figure
 
-from rtid.colours import GREY, LPM, MPA
+from rtid.colours import GREY
 from rtid.compare import BlockRow
 from rtid.compare.tables import CAUSES, cause_of
 from rtid.model import Edge, Model
 from rtid.ui.theme import LIT, plot
+from rtid.units import LPM, MPA
 
 Key = tuple[str, int, int]
 HATCHES = dict(zip(CAUSES, (" ", ".", "/", "\\", "x", "+"), strict=True))

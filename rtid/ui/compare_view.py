@@ -7,7 +7,7 @@ from bokeh.layouts import column, row
 from bokeh.models import Title, UIElement
 from bokeh.plotting import figure
 
-from rtid.colours import BLUE, KPA, LPM, MPA, ORANGE
+from rtid.colours import BLUE, ORANGE
 from rtid.compare import FREE_RUN, HORIZONS_S, Simulation
 from rtid.model import FloatArray
 from rtid.ui.fragments import button, choice
@@ -15,6 +15,7 @@ from rtid.ui.lines import Columns, Lines
 from rtid.ui.look import Look
 from rtid.ui.theme import INK_TAG
 from rtid.ui.time_plots import TimePlots
+from rtid.units import KPA, LPM, MPA
 
 NAMES = {"identification": "identification", "validation": "held out"}
 RUNS = list(HORIZONS_S)

@@ -7,10 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from bokeh.models import ColumnDataSource, Range1d, Whisker
 
-from rtid.colours import CHAMBERS, GREY, LPM, MARKERS, UNITS
+from rtid.colours import CHAMBERS, GREY, MARKERS, UNITS
 from rtid.compare import Dependence
 from rtid.model import FloatArray
 from rtid.ui.theme import plot
+from rtid.units import LPM
 
 Z95 = 1.96
 ROOM = 0.06  # of the span, free at either end

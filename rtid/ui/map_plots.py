@@ -9,11 +9,12 @@ from bokeh.layouts import column
 from bokeh.models import ColorBar, ColumnDataSource, LinearColorMapper, Range1d, Title
 from bokeh.plotting import figure
 
-from rtid.colours import BLUE, GREY, LPM, MPA, ORANGE
+from rtid.colours import BLUE, GREY, ORANGE
 from rtid.compare import Reference
 from rtid.estimator.flowmap import VALID, EdgeMap
 from rtid.model import FloatArray
 from rtid.ui.theme import INK_TAG, plot, styled
+from rtid.units import LPM, MPA
 
 SLICES = 5
 Z95 = 1.96

@@ -10,7 +10,6 @@ from bokeh.layouts import row
 from bokeh.models import UIElement
 from bokeh.palettes import Cividis256, RdBu11
 
-from rtid.colours import LPM, MPA
 from rtid.compare import PAPER_DP_PA, PAPER_U_V, LearnedReference, Reference, deviations
 from rtid.estimator.flowmap import VALID, EdgeMap, FlowMap
 from rtid.model import FloatArray
@@ -18,6 +17,7 @@ from rtid.report_words import text
 from rtid.ui.blocks import YELLOWS
 from rtid.ui.fragments import button, choice, select, table
 from rtid.ui.map_plots import Z95, Plane, Slices
+from rtid.units import LPM, MPA
 
 LATTICE_U, LATTICE_P = 120, 96
 NOTHING = "nothing"
