@@ -30,7 +30,7 @@ SHAPE_REACH = 0.5  # the same of an effect's nonlinear parameter, in steps of it
 SIZED = 0.05  # share by which compliances and sizes of effects may still change: they weigh
 KEPT = 0.995  # of the rows that a step must leave on the grids: what is left out cannot misfit
 LAG_REACH = 3.0  # tolerances of the declared lag
-FAR = 10.0  # rho above which lag and weights are left alone: what is missing would pass for them
+FAR = 10.0  # rho above which what is missing would pass for a modulus, or for a lag far off
 NOISE = 4.0  # of chi2: two fits are as good as one another
 ENOUGH = 1e-3  # the same, of the misfit
 LEAST_LAG_S, LEAST_SHARE = 2e-5, 2e-3  # steps of a lag and of a timing that are not worth a pass
@@ -56,9 +56,10 @@ def moved(found: Fit) -> Step | None:
         (e, found.estimate.value(found.column(o)))
         for e, o in zip(effects, old.effects, strict=True)
     )
-    weights = found.weights
-    if found.rho < FAR:
-        weights = replace(weights, lag_s=way.lag_s(), compliance=_compliance(found))
+    is_near = found.regression.rho(found.estimate) < FAR  # once all that may move has moved
+    weights = replace(found.weights, lag_s=way.lag_s(LAG_REACH if is_near else 1.0))
+    if is_near:
+        weights = replace(weights, compliance=_compliance(found))
     is_same = (timings, effects) == (old.timings, old.effects) and _weigh_alike(sizes, old.sizes)
     is_same &= weights.lag_s == found.weights.lag_s
     is_same &= weights.compliance is found.weights.compliance
@@ -138,15 +139,16 @@ class _Way:
             way = cls(found, found.regression.fit(used))
         return replace(way, share=min([1.0, *way._shares()]))
 
-    def lag_s(self) -> float:
-        """The declared lag to go on with."""
-        now, at = self.found.weights.lag_s, self.found.first_given
-        if self.found.revision.replaces_lag or at not in self.estimate.used:
+    def lag_s(self, reach: float) -> float:
+        """The declared lag to go on with, at most so many tolerances off."""
+        now, at, lag = self.found.weights.lag_s, self.found.first_given, self.found.model.lag
+        is_fixed = self.found.revision.replaces_lag or lag.tolerance_s == 0.0
+        if is_fixed or at not in self.estimate.used:
             return now
-        if self.found.model.lag.tolerance_s == 0.0:
-            return now
-        step = self.share * self.estimate.value(at)
-        target = float(np.clip(now + step, 0.0, self._most_lag_s))
+        low, high = (lag.nominal_s + k * reach * lag.tolerance_s for k in (-1.0, 1.0))
+        target = now + self.share * self.estimate.value(at)
+        # one that is farther off already was let go there when less was missing
+        target = float(np.clip(target, min(max(0.0, low), now), max(high, now)))
         return target if abs(target - now) > max(self._least(at), LEAST_LAG_S) else now
 
     def timed(self, k: int, timing: Timing, psi: Psi) -> Psi:

@@ -14,6 +14,7 @@ from rtid.diagnose.diagnosis import search
 from rtid.diagnose.report import Diagnosis, Effect, diagnosis
 from rtid.diagnosed_text import sentences
 from rtid.effects import from_expression, names_of_model
+from rtid.model import Lag
 from tests.diagnose.records import record
 
 pytestmark = pytest.mark.hidden_effect
@@ -49,6 +50,16 @@ def test_a_clean_record_matches(seed: int) -> None:
     assert found.found == ()
     assert 0.9 < found.rho_before < 1.1
     assert found.heldout_residual_before_m3s < 1.3 * found.noise_floor_m3s
+
+
+@pytest.mark.parametrize("seed", [3, 4, 5])
+def test_a_lag_that_is_declared_as_anything_is_learned(seed: int) -> None:
+    """0 +- 5 ms, as `rtid init` writes it: the spools' 1.3 ms are no missing effect."""
+    model, chunk, held_out = record(seed=seed)
+    found = diagnosis(search(replace(model, lag=Lag(0.0, 5e-3)), chunk, held_out))
+    assert (found.verdict, found.found) == ("matches", ())
+    assert found.lag_s == pytest.approx(model.lag.nominal_s, abs=0.25e-3)
+    assert found.rho_before < 1.1
 
 
 @pytest.mark.parametrize(
