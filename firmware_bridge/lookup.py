@@ -130,6 +130,11 @@ def _locate(
     return cell, share, np.asarray(inside != x)
 
 
+def image_bytes(nu: int, ns: int) -> int:
+    """Length of the image of a map."""
+    return HEAD.size + 4 * (nu + ns) + 2 * nu * ns + (nu - 1) * (ns - 1)
+
+
 def image(table: Table, slot: int) -> bytes:
     """The bytes that are sent.  ImageError for more than 255 nodes per axis or 65,535 bytes."""
     nu, ns = table.counts.shape
@@ -137,10 +142,9 @@ def image(table: Table, slot: int) -> bytes:
         raise ImageError(f"{nu} x {ns} nodes: at most {MOST_NODES} per axis")
     head = HEAD.pack(MAP, slot, nu, ns, table.direction, table.scale, table.safe_band_v)
     parts = (table.w_v.astype("<f4"), table.s.astype("<f4"), table.counts.astype("<i2"))
-    out = head + b"".join(part.tobytes() for part in parts) + table.status.tobytes()
-    if len(out) > MOST_BYTES:
-        raise ImageError(f"{nu} x {ns} nodes are {len(out)} bytes: at most {MOST_BYTES}")
-    return out
+    if image_bytes(nu, ns) > MOST_BYTES:
+        raise ImageError(f"{nu} x {ns} nodes are {image_bytes(nu, ns)} bytes, of {MOST_BYTES}")
+    return head + b"".join(part.tobytes() for part in parts) + table.status.tobytes()
 
 
 def table_of(data: bytes) -> Table:
@@ -150,7 +154,7 @@ def table_of(data: bytes) -> Table:
     kind, _, nu, ns, direction, scale, safe = HEAD.unpack_from(data)
     counts_at = HEAD.size + 4 * (nu + ns)
     status_at = counts_at + 2 * nu * ns
-    if kind != MAP or nu < 2 or ns < 2 or len(data) != status_at + (nu - 1) * (ns - 1):
+    if kind != MAP or nu < 2 or ns < 2 or len(data) != image_bytes(nu, ns):
         raise ImageError(f"an image of kind {kind} with {nu} x {ns} nodes in {len(data)} bytes")
     nodes = np.frombuffer(data, "<f4", nu + ns, HEAD.size).astype(np.float32)
     counts = np.frombuffer(data, "<i2", nu * ns, counts_at).astype(np.int16).reshape(nu, ns)

@@ -1,26 +1,35 @@
 """The published map as a look-up table for the controller, with nodes where they are needed.
 
-The table is bilinear in w and in s = sign(dp) sqrt |dp| (`firmware_bridge.lookup`).  Its nodes begin
+The table is bilinear in w and s = sign(dp) sqrt |dp| (`firmware_bridge.lookup`).  Its nodes begin
 with the borders of the blocks, so that each cell of the table has one status.  On a lattice of
-FINE points per block more are set, so that the error of interpolation along each axis alone stays
+some points per block more are set, so that the error of interpolation along each axis alone stays
 below half of what is allowed; what the whole table is off by is then measured at random points.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge import lookup
-from firmware_bridge.lookup import MOST_COUNT, MOST_NODES, NO_SAFE_BAND, STATUS, Table
+from firmware_bridge.lookup import (
+    MOST_BYTES,
+    MOST_COUNT,
+    MOST_NODES,
+    NO_SAFE_BAND,
+    STATUS,
+    Table,
+    image_bytes,
+)
 from rtid.errors import RtidError
 from rtid.estimator.flowmap import EdgeMap
+from rtid.estimator.inverse import on_lattice
 from rtid.estimator.orifice import root
 from rtid.model import Edge, FloatArray
 
-FINE = 32  # lattice points per block and axis; a node every FINE-th of a block is the finest
+FINE_W, FINE_S = 32, 64  # lattice points per block; the root is steep at dp = 0
 CHECKED = 20_000  # random points at which the table is held against the map
 ERROR_PERCENT = 0.1  # of the rated flow
 Index = NDArray[np.intp]
@@ -40,39 +49,54 @@ class Sampled:
     error_rms_m3s: float
 
 
+def on_wire(nu: int, ns: int) -> bool:
+    """Whether an image can have so many nodes."""
+    return max(nu, ns) <= MOST_NODES and image_bytes(nu, ns) <= MOST_BYTES
+
+
 def sample(
-    edge: Edge, published: EdgeMap, error_percent: float = ERROR_PERCENT, most: int = MOST_NODES
+    edge: Edge,
+    published: EdgeMap,
+    error_percent: float = ERROR_PERCENT,
+    fits: Callable[[int, int], bool] = on_wire,
 ) -> Sampled:
     """The table of an edge; its error in per cent of the rated flow is at most error_percent.
 
-    most: nodes per axis; where they do not suffice the error is larger, and told.  Raises
-    NoTableError for a map that is nowhere a number.
+    fits(nu, ns): whether there is room; where there is not, the error is doubled until there is,
+    and told.  Raises NoTableError for a map without room or that is not a number.
     """
     w_start, s_start = _borders(published)
-    w, s = _lattice(w_start), _lattice(s_start)
-    exact = published.flow(w[:, None], _drop(published, s)[None, :])
+    w, s = _lattice(w_start, FINE_W), _lattice(s_start, FINE_S)
+    grid, theta = published.grid, published.theta
+    exact = on_lattice(grid, published.safe_band_v, theta, w, _drop(published, s))
     if not np.isfinite(exact).all():
         raise NoTableError(f"edge {edge.name}: its map is not a number everywhere on its grid")
-    allowed = 0.5e-2 * error_percent * edge.rated_q_m3s
-    at_w = refined(w, exact, allowed, most)
-    at_s = refined(s, exact.T, allowed, most)
-    return _measured(edge, published, w[at_w], s[at_s], exact[np.ix_(at_w, at_s)])
+    if not fits(len(w_start), len(s_start)):
+        raise NoTableError(
+            f"edge {edge.name}: {len(w_start)} x {len(s_start)} nodes do not fit",
+            "a coarser grid has fewer; or give the controller more room",
+        )
+    rounding = 0.5 * float(np.abs(exact).max()) / MOST_COUNT
+    wanted = 1e-2 * error_percent * edge.rated_q_m3s
+    allowed = 0.5 * max(wanted - rounding, 0.5 * wanted)  # for each axis alone
+    while True:
+        at_w, at_s = refined(w, exact, allowed, FINE_W), refined(s, exact.T, allowed, FINE_S)
+        if fits(len(at_w), len(at_s)):
+            return _measured(edge, published, w[at_w], s[at_s], exact[np.ix_(at_w, at_s)])
+        allowed *= 2.0
 
 
-def refined(x: FloatArray, exact: FloatArray, allowed: float, most: int) -> Index:
+def refined(x: FloatArray, exact: FloatArray, allowed: float, fine: int) -> Index:
     """Indices of nodes among x (n,), so that exact (n, m) between them is linear to `allowed`.
 
-    Every FINE-th is one from the start; between two of these each node is as far from the one
-    before as it can be.  More than `most` are not given: what is allowed is doubled until they do.
+    Every fine-th is one from the start; between two of these each node is as far from the one
+    before as it can be.
     """
-    while True:
-        at = [0]
-        for end in range(FINE, len(x), FINE):
-            while at[-1] < end:
-                at.append(_farthest(x, exact, allowed, at[-1], end))
-        if len(at) <= most or allowed > np.abs(exact).max():
-            return np.array(at)
-        allowed *= 2.0
+    at = [0]
+    for end in range(fine, len(x), fine):
+        while at[-1] < end:
+            at.append(_farthest(x, exact, allowed, at[-1], end))
+    return np.array(at)
 
 
 def _farthest(x: FloatArray, exact: FloatArray, allowed: float, start: int, end: int) -> int:
@@ -97,8 +121,8 @@ def _borders(published: EdgeMap) -> tuple[FloatArray, FloatArray]:
     return np.append(start, w[w > start]), root(published.grid.dp_pa)
 
 
-def _lattice(border: FloatArray) -> FloatArray:
-    steps = np.arange(FINE * (len(border) - 1) + 1) / FINE
+def _lattice(border: FloatArray, fine: int) -> FloatArray:
+    steps = np.arange(fine * (len(border) - 1) + 1) / fine
     return np.interp(steps, np.arange(len(border)), border)
 
 

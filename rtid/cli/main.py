@@ -24,6 +24,7 @@ COMMANDS = {
     "check": "Judge a project file against a trace: rates, gaps, ranges, signs, units.",
     "run": "Learn on board from a live bus: the daemon.",
     "status": "Tell how the daemon on this machine is.",
+    "accept": "Take a changed machine for the new normal, on the running daemon.",
     "simulate": "Record a simulated machine as a trace, with its project file.",
     "replay": "Learn from a recorded trace: gates, blocks, bulk modulus, flow maps.",
     "compare": "Hold models, maps and traces against measurements: where the model fails.",
@@ -36,7 +37,9 @@ COMMANDS = {
     "drop": "Take an effect out of the model again.",
     "undo": "Take the last change of the model back.",
     "history": "List what was added to the model and dropped, and what it brought.",
+    "apply": "Send the learned maps to the controller, all or nothing; and back.",
     "export": "Write the learned maps as CSV, JSON or npz.",
+    "mcu": "Write the estimator in C for a controller with no computer beside it.",
     "paper": "Reproduce the figures and tables of the paper, beside its numbers.",
 }
 

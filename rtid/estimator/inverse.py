@@ -32,6 +32,14 @@ def invert(
     return np.concatenate([*found, np.zeros(0)])
 
 
+def on_lattice(
+    grid: Grid, safe_band_v: float, theta: FloatArray, w_v: FloatArray, dp_pa: FloatArray
+) -> FloatArray:
+    """The map's flows (n, m) at all pairs of commands (n,), above the safe band, and dp (m,)."""
+    sections, windowed = _sections(grid, theta, dp_pa), _windowed(grid.u_v, safe_band_v, w_v)
+    return windowed.reshape(len(w_v), -1) @ sections.reshape(len(dp_pa), -1).T
+
+
 def _invert(
     grid: Grid, safe_band_v: float, theta: FloatArray, q: FloatArray, dp: FloatArray
 ) -> FloatArray:

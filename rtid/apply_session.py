@@ -1,0 +1,290 @@
+"""One `rtid apply` from the wish to the record: what the command does, as one call."""
+
+from __future__ import annotations
+
+import fcntl
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from firmware_bridge.download import Session
+from firmware_bridge.protocol import Accepts, Held
+from rtid import offered, reach
+from rtid.applied import DONE, UNCONFIRMED, Applied, Row
+from rtid.applying import (
+    ApplyError,
+    Prepared,
+    Review,
+    objections,
+    prepare,
+    review,
+    send,
+    slots,
+    stored,
+)
+from rtid.daemon.configure import state_folder
+from rtid.errors import RtidError
+from rtid.estimator.estimator import to_chunk
+from rtid.judging import Judgement, Known, judge
+from rtid.mapfiles import read_map
+from rtid.model import FloatArray
+from rtid.project import Project, load
+from rtid.replay import read_trace
+
+ANY_ROOM = Accepts(1, 16, 2 * 255, 0xFFFF)
+LOCK = "apply.lock"
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What was asked for; see the options of `rtid apply`."""
+
+    undo: bool = False
+    map_file: Path | None = None
+    against: Path | None = None
+    dry_run: bool = False
+    bus: str | None = None
+    state: Path | None = None
+    replace_unknown: bool = False
+    test_bus: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What would be sent, why, and what speaks against it."""
+
+    prepared: Prepared
+    review: Review
+    why: str
+    objections: tuple[str, ...]
+    provenance: dict[str, Any]
+
+    @property
+    def is_same(self) -> bool:
+        """Whether the controller holds exactly this."""
+        return self.review.is_same
+
+    @property
+    def held_text(self) -> str:
+        """What the controller holds, in words."""
+        found = self.review
+        if not found.holds:
+            return "The controller holds no map."
+        if found.held_content is None:
+            return f"The controller holds version {found.held_version}, which is not from here."
+        again = "" if found.held_content == found.held_version else f" (as {found.held_content})"
+        return f"The controller holds version {found.held_version}{again}."
+
+    def as_json(self) -> dict[str, Any]:
+        """For `--json`."""
+        lookup = {
+            one.edge: {
+                "nodes": list(one.table.counts.shape),
+                "error_max_m3s": one.error_max_m3s,
+                "error_rms_m3s": one.error_rms_m3s,
+            }
+            for one in self.prepared.sampled
+        }
+        told = {"schema": 1, "why": self.why, "objections": list(self.objections)}
+        return told | self.review.as_json() | {"lookup": lookup, "is_same": self.is_same}
+
+
+def apply_map(path: Path, wish: Wish, confirmed: Callable[[Plan], bool]) -> tuple[Plan, Row | None]:
+    """Do it, if `confirmed` says so after it has seen the plan; the row that was written, or None.
+
+    Raises ApplyError, NoOfferError, DownloadError, SendError, and the errors of what is read.
+    """
+    project = load(path)
+    reach.check(project)
+    folder = wish.state or state_folder(project)
+    applied = Applied(folder)
+    with _alone(folder):
+        if wish.dry_run:
+            plan = _plan(
+                project, folder, wish, applied, _by_the_records(project, applied), ANY_ROOM
+            )
+            confirmed(plan)
+            return plan, None
+        interface, channel = reach.bus_of(project, wish.bus)
+        if interface in reach.TEST_BUSES and not wish.test_bus:
+            raise ApplyError(
+                f"{interface}: anybody may write to it", "add --test-bus if you want that", 2
+            )
+        return _over_the_bus(project, folder, wish, applied, confirmed, (interface, channel))
+
+
+def _over_the_bus(
+    project: Project,
+    folder: Path,
+    wish: Wish,
+    applied: Applied,
+    confirmed: Callable[[Plan], bool],
+    bus: tuple[str, str],
+) -> tuple[Plan, Row | None]:
+    can_id = project.sections.publish.can_id
+    assert can_id is not None, "checked"
+    with reach.armed(project, *bus, can_id) as link:
+        session = Session(link)
+        with _opened(session) as room:
+            held = {slot: session.held(slot) for slot in slots(project) if slot < room.slots}
+        _settle(folder, applied, held)
+        plan = _plan(project, folder, wish, applied, held, room)
+        if not confirmed(plan) or plan.objections or plan.is_same:
+            return plan, None
+        with _opened(session):
+            if {slot: session.held(slot) for slot in held} != held:
+                raise ApplyError("the controller has got other maps meanwhile", "look again")
+            row = send(session, applied, plan.prepared, plan.review, plan.provenance)
+    offered.withdraw(folder)
+    return plan, row
+
+
+@contextmanager
+def _opened(session: Session) -> Iterator[Accepts]:
+    room = session.open()
+    try:
+        yield room
+    finally:
+        session.close()
+
+
+def _plan(
+    project: Project,
+    folder: Path,
+    wish: Wish,
+    applied: Applied,
+    held: Mapping[int, Held],
+    room: Accepts,
+) -> Plan:
+    content = _content(applied, held)
+    if wish.undo:
+        prepared, why, provenance = _undone(applied, content)
+    else:
+        known, sd_pa, why, provenance = _wished(project, folder, wish, applied, held, content)
+        prepared = prepare(project, known, sd_pa, room)
+    found = review(project, applied, held, prepared)
+    against = () if wish.undo else tuple(objections(project, applied, found))
+    if found.is_unknown and not wish.replace_unknown:
+        text = (
+            "the controller holds maps that were not sent from here: what would change is unknown"
+        )
+        against = (f"{text}; --replace-unknown sends all the same", *against)
+    return Plan(prepared, found, why, against, provenance)
+
+
+def _settle(folder: Path, applied: Applied, held: Mapping[int, Held]) -> None:
+    """Write down that an order which was not confirmed has been followed."""
+    last = applied.newest()
+    if last is None or last.outcome != UNCONFIRMED:
+        return
+    if {slot: Held(last.version, crc) for slot, crc in last.crcs.items()} == dict(held):
+        applied.note(replace(last, outcome=DONE, unix_s=time.time()))
+        offered.withdraw(folder)
+
+
+def _content(applied: Applied, held: Mapping[int, Held]) -> int | None:
+    if not any(one.version for one in held.values()):
+        return None
+    return applied.with_crcs({slot: one.crc for slot, one in held.items()})
+
+
+def _by_the_records(project: Project, applied: Applied) -> dict[int, Held]:
+    """What the controller should hold."""
+    last = applied.newest()
+    if last is None:
+        return dict.fromkeys(slots(project), Held(0, 0))
+    return {slot: Held(last.version, crc) for slot, crc in last.crcs.items()}
+
+
+def _undone(applied: Applied, content: int | None) -> tuple[Prepared, str, dict[str, Any]]:
+    before = applied.before(content) if content is not None else None
+    if content is None or before is None:
+        raise ApplyError(
+            "nothing to go back to: the controller holds the first map that was sent, or none of "
+            "those that were",
+            "`rtid apply` sends another one",
+            4,
+        )
+    why = f"Undo: the map of version {before} in place of that of version {content}."
+    return stored(applied, before), why, {"undo_of": content}
+
+
+Wished = tuple[Known, FloatArray, str, dict[str, Any]]
+
+
+def _wished(
+    project: Project,
+    folder: Path,
+    wish: Wish,
+    applied: Applied,
+    held: Mapping[int, Held],
+    content: int | None,
+) -> Wished:
+    """The map to send, with the reason why it may be."""
+    if wish.map_file is not None:
+        return _from_file(project, wish, applied, content)
+    offer = offered.read(folder)
+    if content is not None and offer.against != content:
+        beaten = offer.against or "none"
+        raise ApplyError(
+            f"the offer has beaten version {beaten}, but the controller holds {content}",
+            "let the daemon judge anew",
+            4,
+        )
+    why = f"Offered: {offer.sentence()}."
+    return offer.known, offer.sd_pa, why, offer.provenance | {"judgement": offer.judgement}
+
+
+def _from_file(project: Project, wish: Wish, applied: Applied, content: int | None) -> Wished:
+    assert wish.map_file is not None
+    flow_map, told = read_map(wish.map_file)
+    new = Known(flow_map, np.asarray(told.get("beta_pa", ()), float))
+    if len(new.beta_pa) != len(project.model.chambers):
+        raise ApplyError(f"{wish.map_file}: no bulk modulus per chamber", "export it anew")
+    held = applied.known(content) if content is not None else None
+    found = judge_on(project, wish.against, told, held, new)
+    if not found.is_better:
+        raise ApplyError(
+            f"{wish.map_file} does not beat the {found.against} on {wish.against}: {found.reason}",
+            "a map goes to the controller only after it has",
+            4,
+        )
+    sd_pa = np.asarray(told.get("beta_sd_pa", np.zeros_like(new.beta_pa)), float)
+    why = f"Judged on {wish.against}, {found.blocks} s of motion: {found.reason}."
+    return new, sd_pa, why, dict(told) | {"judgement": found.as_json()}
+
+
+def judge_on(
+    project: Project, trace: Path | None, told: Mapping[str, Any], held: Known | None, new: Known
+) -> Judgement:
+    """Judge a map on a trace that it has not learned from, or on the trace's validation part."""
+    if trace is None:
+        raise RtidError("a map from a file must be judged first", "name a trace: --against", 2)
+    samples = read_trace(project, trace).samples
+    chunk = to_chunk(project.model, samples, int(samples.t_us[0]))
+    if told.get("source") == trace.name:
+        part = project.sections.record.validation_s
+        if part is None:
+            raise ApplyError(
+                f"the map was learned from {trace.name}: that cannot judge it",
+                "name another trace, or set record.identification_s and validation_s apart",
+            )
+        chunk = chunk[(chunk[:, 0] >= part[0]) & (chunk[:, 0] < part[1])]
+    return judge(project.model, chunk, held, new, project.sections.publish.gain_percent)
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """One apply at a time from this folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / LOCK).open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise ApplyError(f"{folder}: another apply is under way", "wait for its end") from None
+        yield

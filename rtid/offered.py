@@ -1,0 +1,99 @@
+"""A map that the daemon offers for `rtid apply`: it has beaten the one held on unseen samples."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rtid.errors import RtidError
+from rtid.judging import Known
+from rtid.mapfiles import read_map, write_map
+from rtid.model import FloatArray
+
+FILE = "offer.npz"
+PART = "part-offer.npz"  # the suffix names the format
+
+
+class NoOfferError(RtidError):
+    """There is nothing to apply; the text says why."""
+
+
+@dataclass(frozen=True, eq=False)
+class Offer:
+    """A map with its bulk modulus; judgement: JSON of `judging.Judgement`.
+
+    against: the content (see `rtid.applied`) that it has beaten, None: nothing was held.
+    """
+
+    known: Known
+    sd_pa: FloatArray
+    against: int | None
+    judgement: dict[str, Any]
+    provenance: dict[str, Any]
+    unix_s: float
+
+    def sentence(self) -> str:
+        """Why it is offered."""
+        j = self.judgement
+        return (
+            f"on {j['blocks']} s of motion that it has not learned from, the residual is "
+            f"{6e4 * j['new_m3s']:.3f} L/min, with the {j['against']} {6e4 * j['held_m3s']:.3f} "
+            f"({j['gain_percent']:.1f} % less, t = {j['t']:.1f})"
+        )
+
+
+def write(folder: Path, offer: Offer) -> None:
+    """Replace the offer in the state folder, whole or not at all."""
+    told = {
+        "beta_pa": offer.known.beta_pa.tolist(),
+        "sd_pa": offer.sd_pa.tolist(),
+        "against": offer.against,
+        "judgement": offer.judgement,
+        "provenance": offer.provenance,
+        "unix_s": offer.unix_s,
+    }
+    write_map(folder / PART, offer.known.flow_map, told)
+    os.replace(folder / PART, folder / FILE)
+
+
+def read(folder: Path) -> Offer:
+    """The offer of the daemon that keeps its state here.  Raises NoOfferError, MapFileError."""
+    try:
+        flow_map, told = read_map(folder / FILE)
+    except FileNotFoundError:
+        raise NoOfferError(
+            f"{folder}: no map is offered: none has yet beaten the one held on new samples",
+            "let the machine move while `rtid run` runs (publish.judge_s), or --map with --against",
+            4,
+        ) from None
+    return Offer(
+        Known(flow_map, np.asarray(told["beta_pa"], float)),
+        np.asarray(told["sd_pa"], float),
+        told["against"],
+        told["judgement"],
+        told["provenance"],
+        told["unix_s"],
+    )
+
+
+def withdraw(folder: Path) -> None:
+    """It was applied, or no longer holds."""
+    (folder / FILE).unlink(missing_ok=True)
+
+
+def exists(folder: Path) -> bool:
+    """Whether a map is offered."""
+    return (folder / FILE).is_file()
+
+
+def as_text(path: Path) -> str:
+    """One line for `rtid status`; "" without an offer."""
+    try:
+        return read(path).sentence() if exists(path) else ""
+    except (RtidError, KeyError, json.JSONDecodeError):
+        return ""

@@ -1,0 +1,342 @@
+"""`rtid apply` as a whole: asked, shown, limited, sent, written down, taken back."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware_bridge.download import DownloadError, UnconfirmedError
+from firmware_bridge.lookup import crc32
+from firmware_bridge.protocol import Op, Reason
+from rtid import offered
+from rtid.applied import DONE, UNCONFIRMED, Applied, Row
+from rtid.apply_session import Plan, Wish, apply_map
+from rtid.applying import ApplyError
+from rtid.cli import main
+from rtid.cli.exits import Exit
+from rtid.estimator.flowmap import FlowMap
+from rtid.offered import NoOfferError
+from rtid.project import Project, load
+from tests.apply.neighbour import Neighbour, learned, loaded, neighbour, offer, project_file
+from tests.bridge.controller import Controller
+from tests.bridge.test_download import damaging, losing
+
+
+@pytest.fixture(scope="module")
+def maps(tmp_path_factory: pytest.TempPathFactory) -> tuple[FlowMap, FlowMap]:
+    project = loaded(tmp_path_factory.mktemp("project"))
+    return learned(project, 0), learned(project, 0, 1.1)
+
+
+def sent(
+    path: Path, there: Neighbour, folder: Path, undo: bool = False, unknown: bool = False
+) -> tuple[Plan, Row | None]:
+    wish = Wish(
+        undo=undo, bus=f"virtual:{there.channel}", state=folder, test_bus=True,
+        replace_unknown=unknown,
+    )  # fmt: skip
+    return apply_map(path, wish, lambda plan: True)
+
+
+def held_slots(project: Project, controller: Controller) -> dict[int, int]:
+    slots = range(len(project.model.edges) + 1)
+    held = {slot: controller.held(slot) for slot in slots}
+    return {slot: one[1] for slot, one in held.items() if one}
+
+
+def test_the_map_that_arrives_is_the_one_that_was_learned(
+    tmp_path: Path, maps: tuple[FlowMap, FlowMap]
+) -> None:
+    path, folder = project_file(tmp_path, error_percent=0.1), tmp_path / "state"
+    project, controller = load(path), Controller()
+    offer(folder, project, maps[0])
+    with neighbour(controller) as there:
+        plan, row = sent(path, there, folder)
+    assert row is not None and row.outcome == DONE and row.version == 1
+    rng, worst = np.random.default_rng(0), 0.0
+    for slot, edge in enumerate(project.model.edges):
+        grid = edge.grid
+        w = rng.uniform(grid.u_v[0], grid.u_v[-1], 20_000)
+        dp = rng.uniform(grid.dp_pa[0], grid.dp_pa[-1], 20_000)
+        q, _ = controller.flow(slot, edge.direction * w, dp)
+        off = np.abs(q - maps[0][edge.name].flow(w, dp)).max() / edge.rated_q_m3s
+        worst = max(worst, float(off))
+        told = plan.prepared.sampled[slot].error_max_m3s / edge.rated_q_m3s
+        assert off < 1.2 * told + 1e-5
+    print(f"\ncontroller against the published map: {100 * worst:.3f} % of the rated flow")
+    assert worst < 1e-3
+    np.testing.assert_allclose(controller.numbers(4), [8.1e8, 1e6, 8.3e8, 2e6], rtol=1e-6)
+    assert not offered.exists(folder), "an offer is for one apply"
+
+
+def test_nothing_is_sent_before_yes(tmp_path: Path, maps: tuple[FlowMap, FlowMap]) -> None:
+    """Before that only the questions what it has room for, and what it holds."""
+    path, folder = project_file(tmp_path), tmp_path / "state"
+    offer(folder, load(path), maps[0])
+    with neighbour() as there:
+        wish = Wish(bus=f"virtual:{there.channel}", state=folder, test_bus=True)
+        plan, row = apply_map(path, wish, lambda plan: False)
+        asked = {data[0] for data in there.heard}
+    assert row is None and not plan.objections
+    assert asked == {Op.OPEN, Op.QUERY, Op.CLOSE}
+    assert Applied(folder).rows() == [] and Applied(folder).contents() == []
+
+
+def test_a_dry_run_sends_no_frame_at_all(tmp_path: Path, maps: tuple[FlowMap, FlowMap]) -> None:
+    path, folder = project_file(tmp_path), tmp_path / "state"
+    offer(folder, load(path), maps[0])
+    with neighbour() as there:
+        wish = Wish(bus=f"virtual:{there.channel}", state=folder, dry_run=True)
+        plan, row = apply_map(path, wish, lambda plan: True)
+        assert there.all == []
+    assert row is None and len(plan.review.differences) == 4
+
+
+def test_difference_apply_and_undo(tmp_path: Path, maps: tuple[FlowMap, FlowMap]) -> None:
+    path, folder, controller = project_file(tmp_path), tmp_path / "state", Controller()
+    project = load(path)
+    with neighbour(controller) as there:
+        offer(folder, project, maps[0])
+        first = sent(path, there, folder)[0]
+        before = held_slots(project, controller)
+        assert not first.review.holds and np.isnan(first.review.differences[0].largest_m3s)
+        offer(folder, project, maps[1], against=1)
+        second, row = sent(path, there, folder)
+        assert row is not None and (row.version, row.content) == (2, 2)
+        for one, edge in zip(second.review.differences, project.model.edges, strict=True):
+            grid, at_w = edge.grid, edge.direction * one.u_v
+            at_dp = np.clip(one.dp_pa, grid.dp_pa[0], grid.dp_pa[-1])
+            exact = maps[1][edge.name].flow(at_w, at_dp) - maps[0][edge.name].flow(at_w, at_dp)
+            assert one.largest_m3s == pytest.approx(float(exact), abs=0.01 * edge.rated_q_m3s)
+            w, dp = np.meshgrid(
+                np.linspace(grid.u_v[0], grid.u_v[-1], 150),
+                np.linspace(grid.dp_pa[0], grid.dp_pa[-1], 150),
+            )
+            anywhere = np.abs(maps[1][edge.name].flow(w, dp) - maps[0][edge.name].flow(w, dp))
+            assert abs(one.largest_m3s) > anywhere.max() - 0.01 * edge.rated_q_m3s
+            assert 0 < one.rms_m3s < abs(one.largest_m3s)
+            assert abs(one.believed_m3s) <= abs(one.largest_m3s) and 0 < one.valid < 1
+        assert held_slots(project, controller) != before
+
+        back, row = sent(path, there, folder, undo=True)
+        assert row is not None and (row.version, row.content) == (3, 1)
+        assert held_slots(project, controller) == before
+        assert back.review.differences[0].largest_m3s == pytest.approx(
+            -second.review.differences[0].largest_m3s
+        )
+        with pytest.raises(ApplyError, match="nothing to go back to"):
+            sent(path, there, folder, undo=True)
+    with sqlite3.connect(folder / "history.sqlite") as database:
+        rows = database.execute("SELECT version, content, outcome, told FROM applied").fetchall()
+    assert [row[:3] for row in rows] == [(1, 1, DONE), (2, 2, DONE), (3, 1, DONE)]
+    assert json.loads(rows[1][3])["edges"][0]["largest_m3s"] is not None
+
+
+def test_undo_twice_goes_back_twice(tmp_path: Path, maps: tuple[FlowMap, FlowMap]) -> None:
+    path, folder, controller = project_file(tmp_path), tmp_path / "state", Controller()
+    project, seen = load(path), []
+    with neighbour(controller) as there:
+        for k, flow_map in enumerate((maps[0], maps[1], learned(project, 3))):
+            offer(folder, project, flow_map, against=k or None)
+            sent(path, there, folder)
+            seen.append(held_slots(project, controller))
+        for wanted in (seen[1], seen[0]):
+            sent(path, there, folder, undo=True)
+            assert held_slots(project, controller) == wanted
+
+
+def test_limits(tmp_path: Path, maps: tuple[FlowMap, FlowMap]) -> None:
+    folder, controller = tmp_path / "state", Controller()
+    path = project_file(tmp_path)
+    project = load(path)
+    with neighbour(controller) as there:
+        offer(folder, project, maps[0])
+        sent(path, there, folder)
+        before, told = held_slots(project, controller), len(there.heard)
+        path = project_file(tmp_path, max_change_percent=2.0, least_interval_s=300)
+        offer(folder, project, maps[1], against=1)
+        plan, row = sent(path, there, folder)
+        assert row is None and held_slots(project, controller) == before
+        text = " ".join(plan.objections)
+        assert "max_change_percent is 2" in text and "least_interval_s is 300" in text
+        assert {data[0] for data in there.heard[told:]} == {Op.OPEN, Op.QUERY, Op.CLOSE}
+
+
+def test_the_same_map_is_not_sent_again(tmp_path: Path, maps: tuple[FlowMap, FlowMap]) -> None:
+    path, folder = project_file(tmp_path), tmp_path / "state"
+    with neighbour() as there:
+        offer(folder, load(path), maps[0])
+        sent(path, there, folder)
+        offer(folder, load(path), maps[0], against=1)
+        plan, row = sent(path, there, folder)
+    assert plan.is_same and row is None
+
+
+def test_maps_of_somebody_else(tmp_path: Path, maps: tuple[FlowMap, FlowMap]) -> None:
+    """What the controller holds was sent from another folder: nobody knows what would change."""
+    path, controller = project_file(tmp_path), Controller()
+    with neighbour(controller) as there:
+        offer(tmp_path / "theirs", load(path), maps[0])
+        sent(path, there, tmp_path / "theirs")
+        offer(tmp_path / "theirs", load(path), maps[1], against=1)
+        sent(path, there, tmp_path / "theirs")  # their versions are ahead of ours
+        offer(tmp_path / "ours", load(path), maps[0])
+        plan, row = sent(path, there, tmp_path / "ours")
+        assert row is None and "not sent from here" in plan.objections[0]
+        with pytest.raises(ApplyError, match="nothing to go back to"):
+            sent(path, there, tmp_path / "ours", undo=True)
+        plan, row = sent(path, there, tmp_path / "ours", unknown=True)
+        assert row is not None and row.version == 3
+
+
+def test_an_offer_that_was_judged_against_another_map(
+    tmp_path: Path, maps: tuple[FlowMap, FlowMap]
+) -> None:
+    path, folder = project_file(tmp_path), tmp_path / "state"
+    with neighbour() as there:
+        offer(folder, load(path), maps[0])
+        sent(path, there, folder)
+        offer(folder, load(path), maps[1], against=None)
+        with pytest.raises(ApplyError, match="controller holds 1"):
+            sent(path, there, folder)
+
+
+def test_without_an_offer(tmp_path: Path) -> None:
+    path = project_file(tmp_path)
+    with neighbour() as there, pytest.raises(NoOfferError, match="no map is offered"):
+        sent(path, there, tmp_path / "state")
+
+
+def test_over_a_bus_that_loses_and_damages(tmp_path: Path, maps: tuple[FlowMap, FlowMap]) -> None:
+    path, folder, controller = project_file(tmp_path), tmp_path / "state", Controller()
+    spoil, damage = losing(0.02, 1), damaging(0.01, 2)
+
+    def both(data: bytes, is_answer: bool) -> list[bytes]:
+        return [out for kept in spoil(data, is_answer) for out in damage(kept, is_answer)]
+
+    with neighbour(controller, both) as there:
+        offer(folder, load(path), maps[0])
+        plan, row = sent(path, there, folder)
+    assert row is not None
+    wanted = {slot: crc32(data) for slot, data in plan.prepared.images.items()}
+    assert held_slots(load(path), controller) == wanted
+    assert controller.counts[0] > 0, "damaged frames came, and were refused"
+
+
+def test_a_controller_that_dies_in_the_middle(
+    tmp_path: Path, maps: tuple[FlowMap, FlowMap]
+) -> None:
+    path, folder, controller = project_file(tmp_path), tmp_path / "state", Controller()
+    project = load(path)
+    left = [10**6]
+
+    def dies(data: bytes, is_answer: bool) -> list[bytes]:
+        left[0] -= 1
+        return [data] if left[0] > 0 else []
+
+    with neighbour(controller, dies) as there:
+        offer(folder, project, maps[0])
+        sent(path, there, folder)
+        before = held_slots(project, controller)
+        offer(folder, project, maps[1], against=1)
+        left[0] = 400
+        with pytest.raises(DownloadError, match=r"does not answer|has not taken"):
+            sent(path, there, folder)
+        assert held_slots(project, controller) == before
+        assert [row.version for row in Applied(folder).rows()] == [1]
+        assert Applied(folder).contents() == [1] and offered.exists(folder)
+        left[0] = 10**6
+        controller.now_ms += 5000
+        assert sent(path, there, folder)[1] is not None
+
+
+def test_a_confirmation_that_is_lost(tmp_path: Path, maps: tuple[FlowMap, FlowMap]) -> None:
+    path, folder, controller = project_file(tmp_path), tmp_path / "state", Controller()
+
+    def lost(data: bytes, is_answer: bool) -> list[bytes]:
+        return [] if is_answer and data[:2] == bytes([Op.REPLY, Op.COMMIT]) else [data]
+
+    with neighbour(controller, lost) as there:
+        offer(folder, load(path), maps[0])
+        with pytest.raises(UnconfirmedError):
+            sent(path, there, folder)
+        rows = Applied(folder).rows()
+        assert [row.outcome for row in rows] == [UNCONFIRMED]
+        with pytest.raises(NoOfferError):  # the controller has said by then that it holds it
+            sent(path, there, folder)
+        assert [row.outcome for row in Applied(folder).rows()] == [UNCONFIRMED, DONE]
+
+
+def test_not_at_standstill(tmp_path: Path, maps: tuple[FlowMap, FlowMap]) -> None:
+    path, folder, controller = project_file(tmp_path), tmp_path / "state", Controller()
+    controller.hold(True)
+    with neighbour(controller) as there:
+        offer(folder, load(path), maps[0])
+        with pytest.raises(DownloadError) as refused:
+            sent(path, there, folder)
+    assert refused.value.reason == Reason.NOT_NOW and "standstill" in refused.value.remedy
+
+
+def test_two_applies_at_once(tmp_path: Path, maps: tuple[FlowMap, FlowMap]) -> None:
+    path, folder = project_file(tmp_path), tmp_path / "state"
+    offer(folder, load(path), maps[0])
+    with neighbour() as there:
+
+        def meanwhile(plan: Plan) -> bool:
+            with pytest.raises(ApplyError, match="under way"):
+                sent(path, there, folder)
+            return False
+
+        wish = Wish(bus=f"virtual:{there.channel}", state=folder, test_bus=True)
+        apply_map(path, wish, meanwhile)
+
+
+def ends(arguments: list[str]) -> int:
+    with pytest.raises(SystemExit) as end:
+        main.run(arguments)
+    return int(end.value.code or 0)
+
+
+def test_the_command(
+    tmp_path: Path, maps: tuple[FlowMap, FlowMap], capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, folder = project_file(tmp_path), tmp_path / "cylinder.state"
+    offer(folder, load(path), maps[0])
+    with neighbour() as there:
+        call = ["apply", str(path), "--bus", f"virtual:{there.channel}", "--test-bus"]
+        assert ends(call) == Exit.USAGE  # nobody can be asked
+        assert "--yes" in capsys.readouterr().err
+        assert ends([*call, "--yes"]) == Exit.OK
+        out = capsys.readouterr().out
+        assert "holds no map" in out and "active: version 1" in out and "on data" in out
+        offer(folder, load(path), maps[1], against=1)
+        assert ends([*call, "--json", "--yes"]) == Exit.OK
+        told = json.loads(capsys.readouterr().out)
+        assert told["applied"]["version"] == 2 and len(told["edges"]) == 4
+        assert ends([*call, "--undo", "--yes"]) == Exit.OK
+        capsys.readouterr()
+        assert ends([*call, "--yes"]) == Exit.NEGATIVE  # no offer
+        assert "no map is offered" in capsys.readouterr().err
+        assert ends(["apply", str(path), "--bus", f"virtual:{there.channel}"]) == Exit.USAGE
+
+
+def test_the_project_file_must_declare_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = project_file(tmp_path)
+    path.write_text(path.read_text().replace("can_id = 1792\n", ""))
+    assert ends(["apply", str(path)]) == Exit.USAGE
+    assert "publish.can_id" in capsys.readouterr().err
+    path.write_text(path.read_text().replace("reply_id = 1793\n", ""))
+    assert ends(["apply", str(path)]) == Exit.USAGE
+    assert "nothing can be sent" in capsys.readouterr().err
+    assert ends(["apply", str(project_file(tmp_path, can_id=0x120))]) == Exit.USAGE
+    assert "that of ValveCommand" in capsys.readouterr().err
+    assert ends(["apply", str(project_file(tmp_path, status=True))]) == Exit.USAGE
+    assert "publish.status_id" in capsys.readouterr().err
+    assert ends(["apply", str(project_file(tmp_path, first_slot=12))]) == Exit.USAGE
+    assert "publish.first_slot" in capsys.readouterr().err
