@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 import firmware_bridge
+from rtid.estimator.state import Weights
 from rtid.mcu.memory import COUNTS, Layout
 from rtid.mcu.tables import sizes_of, tables
 from rtid.model import FloatArray, Model
@@ -61,12 +62,13 @@ class Program:
         blocks: int = 0,
         single: bool = False,
         options: tuple[str, ...] = OPTIMISED,
+        weights: Weights | None = None,
     ) -> None:
         if COMPILER is None:
             pytest.skip("no cc, gcc or clang on this machine: the estimator in C is not tested")
         self.model, self.layout = model, Layout(sizes_of(model, blocks), single)
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "rtid_estimator_tables.h").write_text(tables(model, blocks))
+        (folder / "rtid_estimator_tables.h").write_text(tables(model, blocks, weights))
         self.path = folder / "estimator"
         chosen = [*options, *(["-DRTID_ESTIMATOR_FLOAT32"] if single else [])]
         sources = [str(HERE / "harness.c"), *map(str, files())]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtid.estimator.solution import Solution, solve
-from rtid.estimator.state import State, build
+from rtid.estimator.state import State, Weights, build
 from rtid.estimator.sums import Normal, normal_equations
 from rtid.mcu.valve import one_valve
 from rtid.model import FloatArray, Grid, Model
@@ -76,9 +76,9 @@ class Reference:
     solution: Solution
 
     @classmethod
-    def of(cls, model: Model, record: Record) -> Reference:
+    def of(cls, model: Model, record: Record, weights: Weights | None = None) -> Reference:
         """All samples in one call."""
-        state = build(model)
+        state = build(model, weights)
         state.advance(record.chunk)
         now_s = float(state.engine[0]["t_s"])
         return cls(state, normal_equations(state), solve(model, state, now_s))
@@ -88,6 +88,14 @@ class Reference:
         """Counters that the C has too."""
         counters = self.state.counters
         return {name: counters[name] for name in counters if name not in ("outlier", "reopened")}
+
+
+@cache
+def rig_reference(shared: Path, run: int) -> tuple[Record, Reference]:
+    """A run of the rig and what Python makes of it, on the small grid."""
+    model = small_valve()
+    record = rig_record(shared, run, model)
+    return record, Reference.of(model, record)
 
 
 def sums_apart(outcome: Outcome, reference: Reference) -> float:
