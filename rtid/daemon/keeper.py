@@ -9,6 +9,7 @@ import math
 import threading
 import time
 from collections import Counter, deque
+from dataclasses import replace
 
 from rtid.daemon import status as st
 from rtid.daemon import wording
@@ -164,6 +165,8 @@ class Keeper:
         if not self._is_checked and self._recording and self._has_run_s() > CHECK_S:
             self._is_checked = self._diagnosing.check(self._recording)
         self._diagnosing.look(self._core.learner.estimator, self._core.newest_s)
+        if self.alarms.on != tuple(a for a in self.status.alarms if a.until_unix_s is None):
+            self._tell_alarms()
 
     def _has_run_s(self) -> float:
         """Seconds of samples in this run."""
@@ -185,10 +188,12 @@ class Keeper:
         core = self._core
         return self._saving.why_not(core.samples > 0 and core.learner.learns)
 
-    def _make_status(self) -> st.Status:
+    def _store(self) -> st.Store:
         why, dropped = self._why_not_saved(), self._analyst.dropped
-        store = self._saving.store(why, self._facts.restored, self._recording, dropped)
-        return self.teller.tell(self.alarms, store, self.plant.surprise, self._diagnosing)
+        return self._saving.store(why, self._facts.restored, self._recording, dropped)
+
+    def _make_status(self) -> st.Status:
+        return self.teller.tell(self.alarms, self._store(), self.plant.surprise, self._diagnosing)
 
     def _judge_signals(self, before: st.Status) -> None:
         """Alarms of messages and signals: what holds for two seconds, but not while all begins."""
@@ -207,6 +212,12 @@ class Keeper:
                    "on" if begins else "over", alarm.name, alarm.kind, alarm.text)  # fmt: skip
         self._analyst.put(Note(alarm, keep=begins and alarm.kind != "loop"))
 
+    def _tell_alarms(self) -> None:
+        """What has just begun or ended is told at once."""
+        now_s, store = time.time(), self._store()
+        self.status = replace(self.status, now_unix_s=now_s, alarms=self.alarms.all, store=store)
+        self._write_status()
+
     def _tell(self) -> None:
         """Status, file, log line."""
         before, self.status = self.status, self._make_status()
@@ -222,6 +233,9 @@ class Keeper:
         if not self._is_ready and self._core.samples:
             self._is_ready = True
             self._core.notifier.tell("READY=1", "STATUS=learning")
+        self._write_status()
+
+    def _write_status(self) -> None:
         try:
             st.write(self._facts.folder, self.status)
         except OSError as error:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from tempfile import mkdtemp
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from firmware_bridge.catalog import Catalog
 from firmware_bridge.frames import Frames
+from rtid.estimator.estimator import Estimator
 from rtid.estimator.flowmap import VALID, EdgeMap, FlowMap
 from rtid.estimator.published import publish
 from rtid.estimator.solution import Solution
@@ -23,6 +24,7 @@ from rtid.sim.log import START_US
 from rtid.sim.plant import Plant
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
+from tests.faults.sender import PAUSE_S
 
 SECONDS = 60.0
 FRAMES_PER_CYCLE = 3
@@ -64,6 +66,22 @@ def machine() -> Machine:
 def fault_free() -> Solution:
     """What is learned without any fault."""
     return machine().learned(machine().frames).estimator.solution()
+
+
+def loop(k: int) -> Frames:
+    """The k-th time that the minute is sent."""
+    again = machine().frames[:]
+    return replace(again, t_us=again.t_us + round(k * (SECONDS + PAUSE_S) * 1e6))
+
+
+def uninterrupted(learned: Estimator) -> Solution:
+    """What was sent up to the newest sample of a daemon's estimate, learned without any break."""
+    newest_us = (learned.origin_us or 0) + round(1e6 * float(learned.state.engine[0]["t_s"]))
+    whole, k = machine().learner(), 0
+    while (again := loop(k)).t_us[0] <= newest_us:
+        whole.push(again[again.t_us <= newest_us])
+        k += 1
+    return whole.estimator.solution()
 
 
 def drift(clean: Solution, faulty: Solution) -> float:

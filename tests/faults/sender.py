@@ -60,7 +60,7 @@ def main() -> None:
     frames, at_s = frames[at_s < float(seconds)], at_s[at_s < float(seconds)]
     pieces = [datagrams(frames, k * (float(seconds) + PAUSE_S)) for k in range(int(loops))]
     out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 1)
+    out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)  # on this machine only
     foreign, flooded = datagrams(_foreign(frames[:100]), 0.0), 0
     start_s, sent = time.monotonic(), 0
     for k, piece in enumerate(pieces):

@@ -26,16 +26,22 @@ CYCLES = 10  # per piece
 
 
 class Scripted(LiveSource[Frames]):
-    """The machine's frames at their pace; between two times every access fails, as after bus-off.
+    """The machine's frames; between two times every access fails, as after bus-off.
 
-    hang_s: `read` stands still for 3 s, once, when so much time has passed.
+    hang_s: `read` stands still for 3 s, once, when so much time has passed; speed: times as fast.
     """
 
-    def __init__(self, frames: Frames, down_s: tuple[float, float], hang_s: float = 1e9) -> None:
+    def __init__(
+        self,
+        frames: Frames,
+        down_s: tuple[float, float],
+        hang_s: float = 1e9,
+        speed: float = 1.0,
+    ) -> None:
         super().__init__(reopen_s=60.0)
         self._pieces = deque(frames.chunks(3 * CYCLES))
         self._first_us = int(frames.t_us[0])
-        self._down_s, self._hang_s = down_s, hang_s
+        self._down_s, self._hang_s, self._speed = down_s, hang_s, speed
         self._start_s = time.monotonic()
         self.hung: tuple[float, float] | None = None
 
@@ -60,7 +66,7 @@ class Scripted(LiveSource[Frames]):
         return self._pieces.popleft()
 
     def _due_s(self) -> float:
-        return float(self._pieces[0].t_us[-1] - self._first_us) * 1e-6
+        return float(self._pieces[0].t_us[-1] - self._first_us) * 1e-6 / self._speed
 
     def _convert(self, items: list[Frames]) -> Frames:
         return fr.concatenate(items)
@@ -104,21 +110,21 @@ def run(source: Scripted, folder: Path, for_s: float) -> tuple[Daemon, list[Stat
 
 
 def test_row_11_bus_off(tmp_path: Path, figure: Figure) -> None:
-    frames = machine().frames[:60_000]
-    source = Scripted(frames, (5.0, 10.0))
-    _, seen, last = run(source, tmp_path, 22.0)
+    frames, speed = machine().frames, 4.0
+    source = Scripted(frames, (4.0, 9.0), speed=speed)
+    _, seen, last = run(source, tmp_path, 16.0)
     back = next(
         s.now_unix_s - s.started_unix_s for s in seen
         if s.bus.reopened and (s.estimate.age_s or 9.0) < 1.0
     )  # fmt: skip
     opened = seen[0].started_unix_s - (time.time() - source.now_s())
     figure(11, "recovery after the bus is back, status told each second",
-           back + opened - 10.0, 2.5, "s")  # fmt: skip
+           back + opened - 9.0, 2.5, "s")  # fmt: skip
     assert any(s.bus.state == "reopening" for s in seen)
     assert {"bus_down"} <= {a.name for s in seen for a in s.alarms}
     assert last.bus.reopened == 1
     t_s = at_s(frames)
-    gone = (t_s >= 5.0) & (t_s < 10.1)
+    gone = (t_s >= 4.0 * speed) & (t_s < 9.0 * speed)
     clean = machine().learned(without(frames, gone)).estimator.solution()
     from rtid.store import Generations
 
