@@ -12,6 +12,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from rtid.check import Report, judge
 from rtid.check.reading import Trace, read_trace
 from rtid.diagnose.report import Diagnosis
@@ -123,7 +125,7 @@ def _diagnosed(project: Project, path: Path, progress: Progress) -> Diagnosis:
     """The diagnosis; RtidError for data that its numerics cannot bear: they are anybody's."""
     try:
         return diagnose_trace(project, path, lambda t, s: progress(t, 0.1 + 0.9 * s)).diagnosis
-    except (ArithmeticError, LookupError, ValueError) as error:
+    except np.linalg.LinAlgError as error:
         raise RtidError(
             f"{path}: the fit fails on this data ({error})",
             "record more motion; if it looks sound to you, please report it with the file",
