@@ -151,6 +151,23 @@ def test_grid_that_misses_the_motion_is_named(folder: Path) -> None:
     assert any("outside the grid" in f.text for f in found)
 
 
+def test_a_command_below_a_grid_without_a_safe_band_is_named(folder: Path) -> None:
+    """Half the record would be learned from in no block; a clean file says nothing of it."""
+
+    def without(raw: dict[str, Any]) -> None:
+        for section in (raw.get("edge_defaults", {}), *raw["edges"].values()):
+            for key in [k for k in section if k.startswith("safe_band")]:
+                del section[key]
+
+    found = [f for f in judged(folder, without).findings if "no safe_band" in f.text]
+    assert {f.subject for f in found} == {"edges.pa", "edges.at", "edges.pb", "edges.bt"}
+    assert all(f.level == "warning" for f in found)
+    share = re.search(r"for (\d+) % of the record", found[0].text)
+    assert share and 20 < float(share[1]) < 80
+    clean = judged(folder, lambda raw: None)
+    assert not any("no safe_band" in f.text for f in clean.findings)
+
+
 def test_noise_is_found_under_motion_and_quantisation() -> None:
     rng = np.random.default_rng(1)
     t = np.arange(20_000) * 1e-3

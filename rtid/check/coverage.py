@@ -16,7 +16,8 @@ class Coverage:
     """Rows per block, float64 (nu, nd), of one edge.
 
     A row is a measured position (integral form) or a filtered row (carry form).  Shares are those
-    of the time the edge was open: outside its grid, and with dp < 0.
+    of the time the edge was open: outside its grid, and with dp < 0.  below: share of the record
+    during which the command is below the grid of an edge that no safe band declares shut there.
     """
 
     edge: str
@@ -25,6 +26,7 @@ class Coverage:
     open_s: float
     outside: float
     reverse: float
+    below: float
     w_v: tuple[float, float]  # extremes of command and pressure difference while open
     dp_pa: tuple[float, float]
 
@@ -52,6 +54,7 @@ def _edge(
 ) -> Coverage:
     w = edge.direction * samples.column(edge.command)
     dp = samples.column(edge.source) - samples.column(edge.sink)
+    below = is_row & (w < edge.grid.u_v[0]) & (w > edge.safe_band_v)
     opened = is_row & (w > max(edge.safe_band_v, 0.0))
     w, dp = w[opened], dp[opened]
     rows, _, _ = np.histogram2d(w, dp, [edge.grid.u_v, edge.grid.dp_pa])
@@ -64,6 +67,7 @@ def _edge(
         open_s=len(w) * period_s,
         outside=(len(w) - float(rows.sum())) / n,
         reverse=float((dp < 0).sum()) / n,
+        below=float(below.sum()) / max(int(is_row.sum()), 1),
         w_v=_span(w),
         dp_pa=_span(dp),
     )

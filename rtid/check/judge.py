@@ -256,6 +256,12 @@ def _coverage(found: tuple[Coverage, ...]) -> Iterator[Finding]:
             text += f" {one.w_v[0]:.3g} to {one.w_v[1]:.3g}, dp {1e-6 * one.dp_pa[0]:.3g} to"
             text += f" {1e-6 * one.dp_pa[1]:.3g} MPa"
             yield _warning(subject, text, f"widen u_grid or dp_grid of {subject}")
+        if one.below > OUTSIDE_GRID_SHARE:
+            text = (
+                f"the command is below its grid for {100 * one.below:.0f} % of the record, and no"
+            )
+            text += " safe_band says that the valve is shut there: nothing is learned meanwhile"
+            yield _warning(subject, text, f"give {subject}.safe_band, or a u_grid down to there")
 
 
 def _ms(seconds: float) -> str:
