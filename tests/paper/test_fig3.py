@@ -52,8 +52,19 @@ def test_windows_leave_a_tenth_of_the_jump(found: dict[str, Estimate]) -> None:
     assert without > 0.001
     assert rms(jumps(taylor.grid, taylor.published.flow)) < 0.1 * without
     assert rms(jumps(lapped.grid, lapped.windowed)) < 0.1 * without
-    steep, eased = (rms(excess(taylor.grid, f)) for f in (taylor.unwindowed, taylor.published.flow))
-    assert eased < 0.1 * steep
+
+
+@pytest.mark.parametrize(
+    "basis",
+    [TAYLOR, pytest.param(LAPPED, marks=pytest.mark.xfail(strict=True, reason="10.3 % here"))],
+)
+def test_windows_leave_a_tenth_of_the_change_over_a_border(
+    found: dict[str, Estimate], basis: str
+) -> None:
+    """The plain count: all change beyond the truth's, that of a steep estimate too."""
+    own, taylor = found[basis], found[TAYLOR]
+    surface = own.published.flow if basis == TAYLOR else own.windowed
+    assert rms(excess(own.grid, surface)) < 0.1 * rms(excess(taylor.grid, taylor.unwindowed))
 
 
 def test_a_corner_is_no_jump_and_a_step_is_one() -> None:
