@@ -40,6 +40,13 @@ class Sink(Protocol):
         """Send one frame; can.CanError if it is not taken within timeout seconds."""
 
 
+class Exchange(Sink, Protocol):
+    """A sink that also hears."""
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        """The next frame; None where none came within timeout seconds."""
+
+
 class SerialSink:
     """A serial line to send frames to, packed as `sources.serial_port` unpacks them.
 
@@ -159,9 +166,7 @@ class ArmedLink:
     can_id, reply_id: bit 31 set for 29 bit identifiers; frames_per_s: no more than so many.
     """
 
-    def __init__(
-        self, sink: BusSink | SerialSink, can_id: int, reply_id: int, frames_per_s: float
-    ) -> None:
+    def __init__(self, sink: Exchange, can_id: int, reply_id: int, frames_per_s: float) -> None:
         self._sink, self._can_id, self._reply_id = sink, can_id, reply_id
         self._pause_s, self._next_s = 1.0 / frames_per_s, 0.0
         self.told = 0

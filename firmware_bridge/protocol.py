@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from math import isfinite
 
 from firmware_bridge.e2e import TABLE
 
@@ -146,7 +147,6 @@ def status_frame(
 
 def beta_frame(chamber: int, beta_pa: float, sd_pa: float) -> bytes:
     """Bulk modulus of a chamber and its standard deviation, each in bar; 0: not known."""
-    words = b"".join(
-        min(max(round(x * 1e-5), 0), 0xFFFF).to_bytes(2, "little") for x in (beta_pa, sd_pa)
-    )
+    known = (x if isfinite(x) else 0.0 for x in (beta_pa, sd_pa))
+    words = b"".join(min(max(round(x * 1e-5), 0), 0xFFFF).to_bytes(2, "little") for x in known)
     return frame(0, Op.BETA, bytes([chamber]) + words)

@@ -128,7 +128,7 @@ def _over_the_bus(
 ) -> tuple[Plan, Row | None]:
     can_id = project.sections.publish.can_id
     assert can_id is not None, "checked"
-    with reach.armed(project, *bus, can_id) as link:
+    with reach.armed(project, *bus, can_id, folder) as link:
         session = Session(link)
         with _opened(session) as room:
             held = {slot: session.held(slot) for slot in slots(project) if slot < room.slots}

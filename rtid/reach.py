@@ -5,17 +5,24 @@ Only `rtid apply` and the notices of a daemon that `publish.status` has armed co
 
 from __future__ import annotations
 
+import fcntl
+import socket
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import can
 
 from firmware_bridge.frames import EXTENDED
-from firmware_bridge.playback import ArmedLink, BusSink, SerialSink
+from firmware_bridge.playback import ArmedLink, BusSink, Exchange, SerialSink
+from firmware_bridge.sources.live_bus import ON_PORTS
+from rtid.daemon.answers import SHORT, heard
 from rtid.errors import RtidError
 from rtid.live import catalog_of
 from rtid.project import Project
 
 TEST_BUSES = ("udp_multicast", "virtual")
-SHORT = 0x7FF  # larger identifiers have 29 bits
+LOCK_FILE = "lock"  # of the daemon
 
 
 def identifier(can_id: int) -> int:
@@ -67,15 +74,67 @@ def check(project: Project) -> None:
 
 
 @contextmanager
-def armed(project: Project, interface: str, channel: str, can_id: int) -> Iterator[ArmedLink]:
-    """Open the bus for sending until the block ends; SendError if it cannot be opened."""
-    section, bitrate = project.sections.publish, project.sections.source.bitrate
+def armed(
+    project: Project, interface: str, channel: str, can_id: int, folder: Path | None = None
+) -> Iterator[ArmedLink]:
+    """Open the bus for sending until the block ends; SendError if it cannot be opened.
+
+    folder: state folder of a daemon that may hold the line, from which then answers come.
+    """
+    section = project.sections.publish
     reply = identifier(section.reply_id or 0)
-    sink: BusSink | SerialSink
+    is_held = folder is not None and interface in ON_PORTS and is_running(folder)
+    if is_held and interface != "serial":
+        raise RtidError(
+            f"{interface} {channel}: the daemon has opened this adapter to listen only",
+            "stop the daemon, apply, start it again",
+        )
+    with ExitStack() as stack:
+        sink = _sink(project, interface, channel, reply)
+        stack.enter_context(sink.armed())
+        end: Exchange = sink
+        if is_held and folder is not None:
+            end = _Overheard(sink, stack.enter_context(heard(folder)), reply)
+        yield ArmedLink(end, identifier(can_id), reply, section.frames_per_s)
+
+
+def _sink(project: Project, interface: str, channel: str, reply: int) -> BusSink | SerialSink:
     if interface == "serial":
-        sink = SerialSink(channel)
-    else:
-        own_speed = interface not in (*TEST_BUSES, "socketcan")
-        sink = BusSink(interface, channel or None, [reply], bitrate if own_speed else None)
-    with sink.armed() as open_sink:
-        yield ArmedLink(open_sink, identifier(can_id), reply, section.frames_per_s)
+        return SerialSink(channel)
+    own_speed = interface not in (*TEST_BUSES, "socketcan")
+    bitrate = project.sections.source.bitrate if own_speed else None
+    return BusSink(interface, channel or None, [reply], bitrate)
+
+
+def is_running(folder: Path) -> bool:
+    """Whether a daemon keeps its state here now."""
+    try:
+        with (folder / LOCK_FILE).open() as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
+    return False
+
+
+class _Overheard:
+    """Writes to a line that the daemon reads, and hears from the daemon what came back."""
+
+    def __init__(self, sink: Exchange, listening: socket.socket, reply_id: int) -> None:
+        self._sink, self._listening, self._reply_id = sink, listening, reply_id
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        self._sink.send(msg, timeout)
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        self._listening.settimeout(max(timeout or 0.0, 1e-4))
+        try:
+            data = self._listening.recv(64)
+        except TimeoutError:
+            return None
+        return can.Message(
+            arbitration_id=self._reply_id & ~EXTENDED,
+            is_extended_id=bool(self._reply_id & EXTENDED),
+            data=data,
+        )

@@ -30,8 +30,10 @@ def status(
     from rtid.daemon.configure import state_of
     from rtid.daemon.metrics import exposition
     from rtid.daemon.status import OLD_S, read
+    from rtid.offered import as_text
 
-    found = read(state_of(where))
+    folder = state_of(where)
+    found = read(folder)
     age_s = time.time() - found.now_unix_s
     on = [alarm for alarm in found.alarms if alarm.until_unix_s is None]
     if as_json:
@@ -40,6 +42,8 @@ def status(
         print(exposition(found, age_s), end="")
     else:
         _show(found, age_s)
+        if text := as_text(folder):
+            print(f"offered `rtid apply`: {text}")
     if on or age_s > OLD_S:
         raise typer.Exit(Exit.NEGATIVE)
 

@@ -34,6 +34,7 @@ from rtid.daemon.jobs import (
     Saved,
 )
 from rtid.daemon.judge import Judge
+from rtid.daemon.offering import Offering
 from rtid.daemon.pipe import Pipe
 from rtid.daemon.recorder import Recorder
 from rtid.daemon.status import EdgeHealth
@@ -69,6 +70,7 @@ class Analyst:
         self._segment = ""
         self._told: dict[str, float] = {}
         self._handed: deque[Handover] = deque(maxlen=KEPT)
+        self._offering = Offering(project, folder)
 
     def take(self, job: Job) -> None:
         """Do one job."""
@@ -103,6 +105,7 @@ class Analyst:
             judgement = self._judge.push(batch.chunk)
             if judgement is not None:
                 self._answer(judgement)
+        self._guarded("offer", lambda: self._offering.push(batch.chunk))
         frames = batch.frames
         if frames is not None and self._limit_bytes:
             self._guarded("recording", lambda: self._record().write(frames))
@@ -148,6 +151,7 @@ class Analyst:
             time.monotonic() - start_s,
         )
         self._answer(found)
+        self._offering.published(found, solution)
         self._guarded("map", lambda: self._write_map(flow_map, solution))
         self._guarded("history", lambda: self._history().note_publication(found, self._chambers))
 

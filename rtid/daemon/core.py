@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from firmware_bridge.frames import Frames
 from firmware_bridge.sources.live import Source
+from rtid.daemon.answers import Answers
 from rtid.daemon.collector import Collector
 from rtid.daemon.health import Health
 from rtid.daemon.helper import Helper
@@ -43,6 +44,7 @@ class Core:
         self.notifier = Notifier()
         self.health = Health(project, learner)
         self.lag = Lag()
+        self.answers: Answers | None = None  # for an apply that cannot read the line itself
         self.number = number  # of the last handover
         self.frames = self.samples = 0
         self.newest_s = 0.0  # time of the newest sample, as in `to_chunk`
@@ -117,6 +119,8 @@ class Core:
         if len(frames):
             self.health.ages.note(now_ns)
             self._keep(frames)
+            if self.answers is not None:
+                self.answers.take(frames)
         self._collector.add(chunk, frames)
         if len(chunk):
             self.samples += len(chunk)

@@ -23,12 +23,14 @@ from types import FrameType
 from firmware_bridge import frames as fr
 from firmware_bridge.sources import candump
 from firmware_bridge.sources.live import Source
+from rtid.daemon.answers import answers_of
 from rtid.daemon.core import Core
 from rtid.daemon.diagnosing import Diagnosing
 from rtid.daemon.helper import Helper
 from rtid.daemon.jobs import Answer
 from rtid.daemon.keeper import Keeper
 from rtid.daemon.log import logger
+from rtid.daemon.notices import telling
 from rtid.daemon.status import Status
 from rtid.daemon.teller import Facts
 from rtid.daemon.warm import compiled
@@ -100,6 +102,7 @@ class Daemon:
             try:
                 with self._bus.open() as source:
                     core = Core(self._project, learner, source, analyst)
+                    core.answers = answers_of(self._project, folder, self._bus.interface)
                     facts = Facts(
                         self._project,
                         folder,
@@ -111,7 +114,9 @@ class Daemon:
                         self._log_every_s,
                     )
                     self._keeper = Keeper(facts, core, analyst, diagnosing, self._answers)
-                    return self._run(core, analyst, for_s)
+                    bus = self._bus.interface, self._bus.channel
+                    with telling(self._project, bus, folder, lambda: self.status):
+                        return self._run(core, analyst, for_s)
             finally:
                 diagnosing.stop()
                 analyst.stop(0.0)

@@ -104,6 +104,25 @@ void controller_counts(const controller *c, uint32_t *out)
     out[2] = c->d.repeated;
 }
 
+/* learning, verdict, alarms, progress, valid, flags, chamber, beta and sd in Pa */
+int controller_notice(const uint8_t *data, uint8_t length, float *out)
+{
+    rtid_notice notice;
+    int op;
+    memset(&notice, 0, sizeof notice);
+    op = rtid_notice_read(data, length, &notice);
+    out[0] = notice.learning;
+    out[1] = notice.verdict;
+    out[2] = notice.alarms;
+    out[3] = notice.progress;
+    out[4] = notice.valid;
+    out[5] = notice.flags;
+    out[6] = notice.chamber;
+    out[7] = notice.beta;
+    out[8] = notice.beta_sd;
+    return op;
+}
+
 #ifdef PROGRAM
 /* After the frames: which maps are held, and a look at each of them. */
 int main(void)

@@ -124,6 +124,13 @@ class Controller:
         return out, status
 
 
+def notice(data: bytes) -> tuple[int, list[float]]:
+    """A notice as the firmware reads it: its operation, and all fields of rtid_notice."""
+    out = np.zeros(9, np.float32)
+    op = library().controller_notice(data, ctypes.c_uint8(len(data)), _pointer(out))
+    return op, out.tolist()
+
+
 @dataclass
 class Line:
     """A line to a controller in made-up time: what it does to frames is up to `spoil`.
