@@ -21,6 +21,7 @@ LAYER = {
     "rtid.compare": ESTIMATOR,
     "rtid.diagnose": ESTIMATOR,
     "rtid.effects": ESTIMATOR,
+    "rtid.excite": ESTIMATOR,
     "rtid.output_error": ESTIMATOR,
     "rtid.units": ESTIMATOR,
     "rtid.cli": COMMAND,

@@ -31,6 +31,7 @@ COMMANDS = {
     "refit": "Fit a plant by its equations to a record, and find what they miss.",
     "effects": "List the physical effects that may be missing in the model, or explain one.",
     "diagnose": "Name the physical effect that is missing in the model, or say what would tell.",
+    "excite": "Design the motion that identifies the machine, and predict what it will tell.",
     "ui": "See a record and its model in the browser: where it fails, why, and add it.",
     "report": "Write the story of a trace as one HTML file with pictures.",
     "add": "Make a missing effect part of the model, and see the error fall.",

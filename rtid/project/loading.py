@@ -31,6 +31,7 @@ SINGLE: dict[str, type[schema.Section]] = {
     "estimator": schema.EstimatorSection,
     "record": schema.RecordSection,
     "daemon": schema.DaemonSection,
+    "excite": schema.ExciteSection,
     "publish": schema.PublishSection,
 }
 NAMED: dict[str, type[schema.Section]] = {

@@ -19,6 +19,7 @@ from rtid.project.schema import (
     EdgeSection,
     EffectSection,
     EstimatorSection,
+    ExciteSection,
     FilterSection,
     GatesSection,
     GeometrySection,
@@ -53,6 +54,7 @@ class Sections:
     estimator: EstimatorSection = field(default_factory=EstimatorSection)
     record: RecordSection = field(default_factory=RecordSection)
     daemon: DaemonSection = field(default_factory=DaemonSection)
+    excite: ExciteSection | None = None
     publish: PublishSection = field(default_factory=PublishSection)
     effects: dict[str, EffectSection] = field(default_factory=dict)
     added: tuple[AddedSection, ...] = ()

@@ -103,6 +103,7 @@ Sign = Literal[1, -1]
 LENGTH, AREA, VOLUME = Dimension("length"), Dimension("area"), Dimension("volume")
 PRESSURE, TIME, FLOW = Dimension("pressure"), Dimension("time"), Dimension("flow")
 COMMAND, FREQUENCY = Dimension("command"), Dimension("frequency")
+VELOCITY = Dimension("velocity")
 
 
 class Section(BaseModel):
@@ -295,6 +296,38 @@ class RecordSection(Section):
 
     identification_s: Annotated[Interval | None, TIME] = None
     validation_s: Annotated[Interval | None, TIME] = None
+
+
+class ExciteSection(Section):
+    """[excite]: what a designed motion may do, the load and the position controller.
+
+    supply: range of its setpoint, None where it cannot be changed; offset: steps that may be added
+    to the controller's command, 0 for none; load: force against growing x in mid-stroke.
+    The controller's u = deadband tanh(demand / blend) + volts_per_mps demand,
+    demand = v_ref + kp (x_ref - x), with steps in the command's unit.
+    """
+
+    duration_s: Annotated[float, TIME] = Field(default=80.0, gt=0)
+    stroke_m: Annotated[Interval, LENGTH] = Field(description="stroke_mm = [75, 425]")
+    speed_mps: Annotated[float, VELOCITY] = Field(gt=0, description="speed_mps = 0.3")
+    command_v: Annotated[float, COMMAND] = Field(gt=0, description="command_v = 9")
+    command_rate_per_s: float = Field(default=50.0, gt=0)
+    offset_v: Annotated[float, COMMAND] = Field(default=0.0, ge=0)
+    pressure_pa: Annotated[Interval, PRESSURE] = Field(description="pressure_mpa = [0.1, 10]")
+    supply_pa: Annotated[Interval | None, PRESSURE] = None
+    usual_supply_pa: Annotated[float, PRESSURE] = Field(gt=0, description="usual_supply_mpa = 7")
+    supply_pa_per_s: float = Field(default=5e6, gt=0)
+    tank_pa: Annotated[float, PRESSURE] = 1e5
+    may_shut: bool = True
+    mass_kg: float = Field(gt=0, description="mass_kg = 400")
+    load_n: float = 0.0
+    load_slope_n_per_m: float = 0.0
+    friction_n: float = Field(default=0.0, ge=0)
+    friction_ns_per_m: float = Field(default=0.0, ge=0)
+    kp_per_s: float = Field(gt=0, description="kp_per_s = 5")
+    volts_per_mps: float = Field(gt=0, description="volts_per_mps = 26")
+    deadband_v: Annotated[float, COMMAND] = Field(default=0.0, ge=0)
+    blend_mps: Annotated[float, VELOCITY] = Field(default=4e-3, gt=0)
 
 
 class DaemonSection(Section):

@@ -71,8 +71,13 @@ def quantise(value: float, step: float) -> float:
 
 @njit(cache=True, error_model="numpy")
 def command(k: Controller, drive: FloatArray, x_m: float) -> float:
-    """The controller's signed command from one row of the drive and the measured position."""
+    """The controller's signed command from one row of the drive and the measured position.
+
+    Without a reference (NaN) the controller is off and the valves are shut.
+    """
     demand: float = drive[V_REF] + k.kp_1ps * (drive[X_REF] - x_m)
+    if math.isnan(demand):
+        return 0.0
     compensation = k.deadband_v * math.tanh(demand / k.blend_mps)
     u: float = compensation + k.volts_per_mps * demand + drive[DITHER]
     return min(max(u, -k.limit_v), k.limit_v)

@@ -1,7 +1,8 @@
 """What the simulated machine is asked to do: references, dither, supply and load over time.
 
 A motion is a function (plant, rng, duration_s) -> drive, float64 (n + 1, 6) at 1 kHz with the
-columns of `rtid.sim.loop`: x_ref, v_ref, dither, supply, tank, load force.
+columns of `rtid.sim.loop`: x_ref, v_ref, dither, supply, tank, load force.  Where x_ref is NaN the
+valves are shut.
 """
 
 from __future__ import annotations

@@ -1,0 +1,62 @@
+"""`rtid excite`: design the motion that identifies the machine, and predict what it will tell."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def excite(
+    project: Annotated[Path, typer.Option("--project", "-p", help="Project file.")],
+    out: Annotated[
+        Path | None, typer.Option(help="CSV for the controller, one row per millisecond.")
+    ] = None,
+    see: Annotated[
+        list[str] | None,
+        typer.Option(help="Effect that is to become visible; may be given several times."),
+    ] = None,
+    after: Annotated[
+        Path | None,
+        typer.Option(help="Snapshot (.npz) or trace: design what is still missing after it."),
+    ] = None,
+    duration_s: Annotated[
+        float | None, typer.Option(min=1, help="Length in s, instead of the project's.")
+    ] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="PNG or SVG of the standard errors over the plane.")
+    ] = None,
+    compare: Annotated[bool, typer.Option(help="Also choose D-optimally, for comparison.")] = True,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Design a motion within the limits of [excite], and say what it will tell before it runs.
+
+    The motion is a row of segments from rest to rest, chosen for what they tell per second on the
+    nominal machine (the data sheet's or the learned maps).  Predicted are the standard error of
+    every block and of beta, and the smallest size of each effect that would be seen, beside the
+    paper's swept sine and a D-optimal choice from the same segments.
+    """
+    from rtid.excited_text import show
+    from rtid.exciting import as_json as plain
+    from rtid.exciting import excite as design
+    from rtid.exciting import write_csv
+    from rtid.present import progress_bar
+    from rtid.project import load
+
+    loaded, changes = load(project), {} if duration_s is None else {"duration_s": duration_s}
+    with progress_bar(hidden=as_json) as progress:
+        found = design(loaded, see or [], after, compare, progress, **changes)
+    if out is not None:
+        write_csv(out, found.design)
+    if picture is not None:
+        from rtid.pictures.excited import predicted
+
+        predicted(found.design.machine.model, found.predictions).savefig(picture, dpi=150)
+    if as_json:
+        print(json.dumps(plain(found) | {"written": str(out) if out else None}))
+    else:
+        show(found, see or [])
+        if out is not None:
+            print(f"wrote {out}")

@@ -1,0 +1,192 @@
+"""Design a motion: candidates within the limits, the best of them in a row, and what it will tell.
+
+Every candidate is run on the nominal machine, which must keep the limits with a margin; the whole
+motion is run again at the end, and refused where it does not keep them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rtid.excite.driving import SHUT, STEP_S, SUPPLY
+from rtid.excite.information import Information, of_blocks, of_effects
+from rtid.excite.library import REST_S, Segment, library
+from rtid.excite.limits import Extremes, LimitError, Limits, extremes, require_kept
+from rtid.excite.machine import Machine, MachineError
+from rtid.excite.prediction import Prediction, assess
+from rtid.excite.selection import BOUNDED, Criterion, Known, Problem, choose
+from rtid.excite.sweep import swept_sine
+from rtid.model import FloatArray
+
+MARGIN, PRESSURE_MARGIN = 0.05, 0.02  # of a range, kept free by each candidate on its own
+ELSEWHERE = 0.02  # weight of a block that the working motion does not visit
+WORTH = 0.1  # share of what a segment tells at first, below which it is not worth running
+ROWS = 20  # that a block needs to be where the machine works
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A feasible segment and what it tells."""
+
+    segment: Segment
+    told: Information
+
+
+@dataclass(frozen=True)
+class Design:
+    """A motion: segments in order, reference (n, 5) as `driving`, expected noise-free samples."""
+
+    machine: Machine
+    limits: Limits
+    segments: tuple[Candidate, ...]
+    reference: FloatArray
+    expected: FloatArray
+    extremes: tuple[Extremes, ...]
+    weights: FloatArray
+
+    @property
+    def duration_s(self) -> float:
+        """Its length."""
+        return len(self.reference) * STEP_S
+
+    def predicted(self, name: str = "designed", effects: bool = True) -> Prediction:
+        """What it will tell, before the machine has moved."""
+        return assess(self.machine.model, self.machine.measured(self.expected), name, effects)
+
+
+def _silent(_what: str, _share: float) -> None:
+    pass
+
+
+def design(
+    machine: Machine,
+    limits: Limits,
+    see: tuple[str, ...] = (),
+    known: Known | None = None,
+    criterion: Criterion = BOUNDED,
+    pool: Sequence[Candidate] | None = None,
+    progress: Progress = _silent,
+) -> Design:
+    """Choose a motion; see: effects to become visible, known: what is learned already.
+
+    pool: `candidates` of the same machine and limits, made if not given.  Raises LimitError,
+    MachineError.
+    """
+    pool = candidates(machine, limits, see, progress) if pool is None else pool
+    weights = working_weights(machine, limits)
+    progress("choosing", 0.9)
+    start = known or Known.nothing(machine.model.n_cells)
+    costs = np.array([c.segment.duration_s + 2 * REST_S for c in pool])
+    problem = Problem([c.told for c in pool], costs, weights, criterion)
+    chosen = choose(problem, start, limits.duration_s)
+    if not chosen:
+        raise LimitError("no segment is worth running", "more time, or wider limits, in [excite]")
+    segments = sorted((pool[k] for k in chosen), key=lambda c: c.segment.reference[0, SUPPLY])
+    segments, reference = stitched(segments, limits)
+    expected = machine.run(reference)
+    found = checked(machine, limits, reference, expected)
+    require_kept(found)
+    progress("done", 1.0)
+    return Design(machine, limits, tuple(segments), reference, expected, found, weights)
+
+
+def candidates(
+    machine: Machine, limits: Limits, see: tuple[str, ...] = (), progress: Progress = _silent
+) -> list[Candidate]:
+    """Segments of the library that the nominal machine can follow, and what each tells."""
+    found, every, tight = list[Candidate](), library(limits), tightened(limits)
+    for k, segment in enumerate(every):
+        progress("trying segments", 0.9 * k / len(every))
+        try:
+            chunk = machine.run(segment.reference)
+        except MachineError:
+            continue
+        if all(e.is_kept for e in checked(machine, tight, segment.reference, chunk)):
+            chunk = machine.measured(chunk, k)
+            told = of_blocks(machine, chunk)
+            if see:
+                told = replace(told, effects=of_effects(machine, chunk, see))
+            found.append(Candidate(segment, told))
+    if not found:
+        raise LimitError(
+            "the nominal machine can follow no segment within the limits",
+            "are load, controller and supply of [excite] right?",
+        )
+    return found
+
+
+def working_weights(machine: Machine, limits: Limits) -> FloatArray:
+    """Weight of every grid cell: 1 where the paper's sweep at the usual supply works."""
+    told = of_blocks(machine, machine.measured(machine.run(swept_sine(machine, limits))))
+    weights = np.full(machine.model.n_cells, ELSEWHERE)
+    weights[told.cells[told.rows >= ROWS]] = 1.0
+    return weights
+
+
+def missing(
+    segments: Sequence[Candidate], known: Known, weights: FloatArray, worth: float = WORTH
+) -> tuple[Candidate, ...]:
+    """Segments that are still worth running, the most telling first, by what is learned.
+
+    One whose gain has fallen below the share `worth` of what it is before anything is known is
+    left out.
+    """
+    nothing = Known.nothing(len(known.rows))
+    shares = [
+        known.gain(c.told, BOUNDED, weights) / max(nothing.gain(c.told, BOUNDED, weights), 1e-12)
+        for c in segments
+    ]
+    order = np.argsort(shares)[::-1]
+    return tuple(segments[k] for k in order if shares[k] >= worth)
+
+
+def stitched(segments: Sequence[Candidate], limits: Limits) -> tuple[list[Candidate], FloatArray]:
+    """One reference from segments in a row, the supply led over at rest; as many as fit."""
+    parts, kept, left = list[FloatArray](), list[Candidate](), round(limits.duration_s / STEP_S)
+    for candidate in segments:
+        row = candidate.segment.reference[:1]
+        lead = row
+        if parts:
+            change = row[0, SUPPLY] - parts[-1][-1, SUPPLY]
+            steps = max(
+                round(REST_S / STEP_S),
+                int(np.ceil(abs(change) / limits.supply_rate_paps / STEP_S)) + 1,
+            )
+            lead = np.repeat(row, steps, axis=0)
+            lead[:, SUPPLY] = row[0, SUPPLY] - change * (1.0 - np.arange(1, steps + 1) / steps)
+            lead[:, SHUT] = 0.0
+        if len(lead) + len(candidate.segment.reference) > left:
+            continue
+        parts += [lead, candidate.segment.reference]
+        kept.append(candidate)
+        left -= len(lead) + len(candidate.segment.reference)
+    return kept, np.concatenate(parts)
+
+
+def checked(
+    machine: Machine, limits: Limits, reference: FloatArray, chunk: FloatArray
+) -> tuple[Extremes, ...]:
+    """The quantities of a run beside their limits."""
+    places = machine.places
+    x, u = machine.signal(chunk, places.x), machine.signal(chunk, places.u)
+    return extremes(limits, reference, chunk[:, 0], x, u, machine.pressures(chunk))
+
+
+def tightened(limits: Limits) -> Limits:
+    """The limits with a margin for what the true machine does otherwise."""
+
+    def inner(span: tuple[float, float], share: float) -> tuple[float, float]:
+        slack = share * (span[1] - span[0])
+        return span[0] + slack, span[1] - slack
+
+    return replace(
+        limits,
+        stroke_m=inner(limits.stroke_m, MARGIN),
+        pressure_pa=inner(limits.pressure_pa, PRESSURE_MARGIN),
+        speed_mps=(1.0 - MARGIN) * limits.speed_mps,
+    )

@@ -1,0 +1,256 @@
+"""Design the motion for a project: its [excite] section, what is learned so far, and the CSV."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rtid.compare.reference import Reference
+from rtid.comparing import find_reference
+from rtid.daemon.beside import load_for
+from rtid.effects import catalogue
+from rtid.errors import RtidError
+from rtid.estimator.published import publish
+from rtid.estimator.solution import Solution
+from rtid.excite.design import Candidate, Design, candidates, design, missing
+from rtid.excite.driving import OFFSET, SHUT, STEP_S, SUPPLY, V_REF, X_REF, Control, Piston
+from rtid.excite.known import known_from
+from rtid.excite.limits import Limits
+from rtid.excite.machine import Machine, rated_map
+from rtid.excite.prediction import Prediction, assess, median_ratio
+from rtid.excite.selection import D_OPTIMAL, Known
+from rtid.excite.sweep import swept_sine
+from rtid.model import FloatArray
+from rtid.project import Project
+from rtid.project.schema import ExciteSection
+from rtid.replay import replay
+from rtid.units import nearest
+
+SCHEMA = 1
+SNAPSHOT = ".npz"
+ADVICE = (
+    "add [excite] to the project file: stroke, speed, command and pressure limits, mass, load, "
+    "controller; `rtid excite --help` names them"
+)
+
+
+@dataclass(frozen=True)
+class Excited:
+    """A design with what it will tell, beside the paper's sweep and a D-optimal choice.
+
+    missing: the segments that are still worth running after what is learned; None: nothing is.
+    """
+
+    project: Project
+    design: Design
+    predictions: tuple[Prediction, ...]
+    missing: tuple[Candidate, ...] | None
+
+    @property
+    def designed(self) -> Prediction:
+        """What the designed motion will tell."""
+        return self.predictions[0]
+
+    @property
+    def sweep(self) -> Prediction:
+        """What the paper's sweep would tell."""
+        return self.predictions[1]
+
+
+def _silent(_what: str, _share: float) -> None:
+    pass
+
+
+def excite(
+    project: Project,
+    see: Sequence[str] = (),
+    after: Path | None = None,
+    compare: bool = True,
+    progress: Callable[[str, float], None] = _silent,
+    **changes: Any,
+) -> Excited:
+    """Design the motion for a project.
+
+    see: effects to become visible; after: snapshot or trace that tells what is learned; compare:
+    also choose D-optimally; changes: of the limits, by the names of `Limits`.  Raises RtidError.
+    """
+    section = section_of(project)
+    for name in see:
+        if name not in catalogue():
+            raise RtidError(f"no effect {name!r}", nearest(name, list(catalogue())), exit_code=2)
+    solution = _learned(project, after) if after else None
+    machine = machine_of(project, section, solution)
+    limits = replace(limits_of(section), **changes)
+    known = known_from(machine.model, solution) if solution else None
+    pool = candidates(machine, limits, tuple(see), lambda w, s: progress(w, 0.6 * s))
+    found = design(machine, limits, tuple(see), known, pool=pool)
+    progress("predicting", 0.7)
+    predictions = [found.predicted(), _swept(machine, limits)]
+    if compare:
+        progress("comparing", 0.9)
+        other = design(machine, limits, tuple(see), known, D_OPTIMAL, pool)
+        predictions.append(other.predicted("D-optimal"))
+    left = None
+    if known is not None:
+        left = missing(found.segments, known, found.weights)
+    progress("done", 1.0)
+    return Excited(project, found, tuple(predictions), left)
+
+
+def _swept(machine: Machine, limits: Limits) -> Prediction:
+    chunk = machine.measured(machine.run(swept_sine(machine, limits)), 1)
+    return assess(machine.model, chunk, "paper's sweep")
+
+
+def section_of(project: Project) -> ExciteSection:
+    """The project's [excite].  Raises RtidError where there is none."""
+    if project.sections.excite is None:
+        raise RtidError(f"{project.path}: no section [excite]", ADVICE, exit_code=2)
+    return project.sections.excite
+
+
+def limits_of(section: ExciteSection) -> Limits:
+    """What the motion may do."""
+    usual = section.usual_supply_pa
+    return Limits(
+        duration_s=section.duration_s,
+        stroke_m=section.stroke_m,
+        speed_mps=section.speed_mps,
+        command_v=section.command_v,
+        pressure_pa=section.pressure_pa,
+        supply_pa=section.supply_pa or (usual, usual),
+        supply_rate_paps=section.supply_pa_per_s,
+        offset_v=section.offset_v,
+        command_rate_vps=section.command_rate_per_s,
+        may_shut=section.may_shut,
+    )
+
+
+def machine_of(
+    project: Project, section: ExciteSection, solution: Solution | None = None
+) -> Machine:
+    """The nominal machine: maps as learned, else of the data sheet, else by the rated flow."""
+    model, stroke_m = project.model, project.sections.geometry.stroke_m
+    compliance = np.full(len(model.chambers), 1.0 / model.beta_nominal_pa)
+    reference: Reference | None = find_reference(project, None)
+    if solution is not None:
+        theta, compliance = publish(solution).theta_cells(), solution.compliance
+    else:
+        theta = reference.theta_cells(model) if reference else rated_map(model)
+    middle_m = 0.5 * stroke_m
+    piston = Piston(
+        section.mass_kg,
+        section.load_n,
+        section.load_slope_n_per_m,
+        middle_m,
+        section.friction_ns_per_m,
+        section.friction_n,
+    )
+    control = Control(
+        section.kp_per_s,
+        section.volts_per_mps,
+        section.deadband_v,
+        section.blend_mps,
+        section.command_v,
+    )
+    usual, tank = section.usual_supply_pa, section.tank_pa
+    return Machine(model, theta, compliance, piston, control, stroke_m, usual, tank)
+
+
+def _learned(project: Project, path: Path) -> Solution:
+    """What a snapshot holds, or a trace teaches."""
+    if path.suffix.lower() == SNAPSHOT:
+        return load_for(path, project)[0].solution()
+    return replay(project, path).fit.solution
+
+
+COLUMNS = (
+    "t_s", "x_ref_m", "v_ref_mps", "command_offset_v", "p_supply_set_pa", "valves_shut",
+    "expected_x_m", "expected_u_v",
+)  # fmt: skip
+
+
+def write_csv(path: Path, found: Design) -> None:
+    """The reference for the controller, one row per millisecond, beside what is expected.
+
+    Where valves_shut is 1 the controller rests and the command is zero.
+    """
+    places, r = found.machine.places, found.reference
+    x, u = (found.machine.signal(found.expected, k) for k in (places.x, places.u))
+    t_s = STEP_S * np.arange(len(r))
+    table = np.column_stack(
+        [t_s, r[:, X_REF], r[:, V_REF], r[:, OFFSET], r[:, SUPPLY], r[:, SHUT], x, u]
+    )
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS)
+        writer.writerows([[f"{value:.7g}" for value in row] for row in table])
+
+
+def read_csv(path: Path) -> FloatArray:
+    """The reference (n, 5) of a file that `write_csv` wrote, columns as `excite.driving`."""
+    table = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
+    reference = np.zeros((len(table), 5))
+    reference[:, [X_REF, V_REF, OFFSET, SUPPLY, SHUT]] = table[:, 1:6]
+    return reference
+
+
+def as_json(found: Excited) -> dict[str, Any]:
+    """Plain JSON types, SI units in the names; numbers that are not finite are null."""
+    names = [edge.name for edge in found.design.machine.model.edges]
+    missing_ = found.missing
+    return {
+        "schema": SCHEMA,
+        "duration_s": found.design.duration_s,
+        "segments": [
+            {"name": c.segment.name, "duration_s": c.segment.duration_s}
+            for c in found.design.segments
+        ],
+        "extremes": [e._asdict() | {"is_kept": e.is_kept} for e in found.design.extremes],
+        "predictions": [_predicted(p, names) for p in found.predictions],
+        "median_sd_ratio_to_sweep": _finite(median_ratio(found.designed, found.sweep)),
+        "still_missing": None if missing_ is None else [c.segment.name for c in missing_],
+    }
+
+
+def _predicted(p: Prediction, names: list[str]) -> dict[str, Any]:
+    return {
+        "motion": p.name,
+        "duration_s": p.duration_s,
+        "valid_blocks": p.valid,
+        "beta_pa": p.beta_pa.tolist(),
+        "beta_sd_pa": p.beta_sd_pa.tolist(),
+        "limits": [
+            {
+                "effect": x.effect,
+                "where": x.where,
+                "detection_limit": _finite(x.value),
+                "unit": x.unit,
+            }
+            for x in p.limits
+        ],
+        "blocks": [
+            {
+                "edge": names[b.edge],
+                "i": b.i,
+                "j": b.j,
+                "rows": b.rows,
+                "sd_share": _finite(b.sd),
+                "mean_sd_share": _finite(b.mean_sd),
+                "valid": b.valid,
+            }
+            for b in p.blocks
+        ],
+    }
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+__all__ = ["Excited", "Known", "as_json", "excite", "read_csv", "write_csv"]
