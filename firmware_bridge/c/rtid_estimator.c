@@ -347,7 +347,7 @@ static void integrate(rtid_estimator *e, const rtid_estimator_sample *sample)
     e->cov += Q_FLOOR * e->dt_s;
     if (sample->row)
         make_row(e);
-    if (e->faded * e->d[RTID_EST_RING] < R(FORGET_AT))
+    if (e->faded * e->d[RTID_EST_RING] < FORGET_AT)
         rtid_est_rebase(e, FORGET_SILENT);
     else if (e->d[RTID_EST_RING] < RING_LIMIT)
         rtid_est_rebase(e, SETTLE);
@@ -407,6 +407,7 @@ int rtid_estimator_update(rtid_estimator *e, const rtid_estimator_sample *sample
     int verdict = acceptable(sample);
     const int whole = verdict == RTID_EST_TAKEN, was_running = e->running;
     e->counts[RTID_EST_SAMPLES]++;
+    rtid_est_pay(e, TILES_PER_TICK);
     if (whole && was_running) {
         const int64_t dt_us = sample->t_us - e->t_us;
         if (sample->gap || dt_us > RTID_EST_MAX_GAP_US || dt_us <= 0)

@@ -86,6 +86,14 @@ typedef struct {
     rtid_sum shared_start[RTID_EST_RING];
 } rtid_estimator_recent;
 
+/* Products of blocks not yet added to the sums, left_p' d_q: of p with the first of those noted. */
+typedef struct {
+    uint16_t n, p, q;
+    int16_t slot[RTID_EST_MAX_RECENT];
+    uint16_t partners[RTID_EST_MAX_RECENT];
+    rtid_real left[RTID_EST_MAX_RECENT][RTID_EST_TERMS], d[RTID_EST_MAX_RECENT][RTID_EST_TERMS];
+} rtid_estimator_debt;
+
 typedef struct {
     int16_t edge, slot, recent, u, dp;
     rtid_real phi[RTID_EST_TERMS]; /* integral since it was last carried to its block */
@@ -118,6 +126,7 @@ typedef struct {
     rtid_estimator_open open[RTID_EST_MAX_OPEN];
     rtid_estimator_recent recent[RTID_EST_MAX_RECENT];
     uint16_t young[RTID_EST_MAX_RECENT]; /* closed since the ring began, in their order */
+    rtid_estimator_debt debt;
     int16_t slot[RTID_EST_N_CELLS];      /* of each cell of the grids, -1 before the first visit */
     rtid_estimator_block block[RTID_EST_MAX_BLOCKS];
     rtid_sum sums[RTID_EST_SUMS]; /* lower triangle, row by row, of [y | shared | blocks] */

@@ -22,6 +22,7 @@ void rtid_estimator_freeze(rtid_estimator *e, rtid_estimator_work *w)
 {
     if (e->running)
         rtid_est_rebase(e, SETTLE);
+    rtid_est_pay(e, ALL_TILES);
     w->n_slots = e->n_slots;
     w->now_us = e->t_us;
     w->rows = e->counts[RTID_EST_ROWS];

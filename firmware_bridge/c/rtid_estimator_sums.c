@@ -274,37 +274,79 @@ void rtid_est_remove_open(rtid_estimator *e, int k)
 
 /* ---- the ring begins anew ---- */
 
-void rtid_est_rebase(rtid_estimator *e, int how)
+/* Note what a block shares with the first `partners` of those noted: too much work for one tick. */
+static void owe(rtid_estimator *e, int slot, const rtid_real *left, const rtid_real *d, int partners)
 {
+    rtid_estimator_debt *debt = &e->debt;
+    debt->slot[debt->n] = (int16_t)slot;
+    debt->partners[debt->n] = (uint16_t)partners;
+    for (int i = 0; i < T; i++) {
+        debt->left[debt->n][i] = left[i];
+        debt->d[debt->n][i] = d[i];
+    }
+    debt->n++;
+}
+
+void rtid_est_pay(rtid_estimator *e, int tiles)
+{
+    rtid_estimator_debt *debt = &e->debt;
+    while (debt->p < debt->n && tiles > 0) {
+        if (debt->q >= debt->partners[debt->p]) {
+            debt->p++;
+            debt->q = 0;
+            continue;
+        }
+        add_tile(e, debt->slot[debt->p], debt->slot[debt->q], debt->left[debt->p], debt->d[debt->q]);
+        debt->q++;
+        tiles--;
+    }
+}
+
+/* Owe what closed blocks share: first those that rang all the time, then the young in their order. */
+static void settle_closed(rtid_estimator *e)
+{
+    rtid_real own[T], left[T];
+    for (int p = 0; p < e->n_recent; p++) {
+        const rtid_estimator_recent *item = &e->recent[p];
+        if (item->status != RINGING)
+            continue;
+        weigh(e, item, own, left);
+        owe(e, item->slot, left, item->d, e->debt.n + 1);
+        add_shared(e, item);
+    }
+    for (int a = 0; a < e->n_young; a++) {
+        const rtid_estimator_recent *item = &e->recent[e->young[a]];
+        weigh(e, item, own, left);
+        add_tile(e, item->slot, item->slot, own, item->d);
+        owe(e, item->slot, left, item->d, e->debt.n);
+        add_shared(e, item);
+    }
+}
+
+/* Add what open blocks share among themselves, owe what they share with the closed ones. */
+static void settle_open(rtid_estimator *e)
+{
+    const int closed = e->debt.n;
     rtid_real left[T];
-    rtid_est_carry(e);
     for (int k = 0; k < e->n_open; k++) {
         add_own(e, k);
         for (int other = 0; other < k; other++)
             add_open_pair(e, k, other);
         read_through(e, k, R(1), left);
-        spread(e, e->open[k].slot, left);
-        for (int a = 0; a < e->n_young; a++)
-            add_tile(e, e->open[k].slot, e->recent[e->young[a]].slot, left, e->recent[e->young[a]].d);
+        owe(e, e->open[k].slot, left, left, closed);
     }
+}
+
+void rtid_est_rebase(rtid_estimator *e, int how)
+{
+    rtid_est_pay(e, ALL_TILES);
+    e->debt.n = e->debt.p = e->debt.q = 0;
+    rtid_est_carry(e);
+    settle_closed(e);
+    settle_open(e);
     for (int i = 0; i < 1 + RTID_EST_SHARED; i++)
         for (int j = 0; j <= i; j++)
             merge(sum_at(e, i, j), e->local[i][j]);
-    for (int p = 0; p < e->n_recent; p++) {
-        const rtid_estimator_recent *item = &e->recent[p];
-        if (item->status != RINGING)
-            continue;
-        for (int i = 0; i < T; i++)
-            left[i] = rounded(ring_ring(e)) * item->d[i];
-        for (int q = 0; q <= p; q++)
-            if (e->recent[q].status == RINGING)
-                add_tile(e, item->slot, e->recent[q].slot, left, e->recent[q].d);
-        add_shared(e, item);
-    }
-    for (int a = 0; a < e->n_young; a++) {
-        settle_young(e, a);
-        add_shared(e, &e->recent[e->young[a]]);
-    }
     e->n_young = 0;
     for (int p = e->n_recent - 1; p >= 0; p--) {
         rtid_estimator_recent *item = &e->recent[p];

@@ -13,8 +13,10 @@
 #define R(x) ((rtid_real)(x))
 enum { T = RTID_EST_TERMS };
 enum { FREE, OPEN, YOUNG, RINGING }; /* status of a recent block; young: closed since the ring began */
+enum { TILES_PER_TICK = 4, ALL_TILES = RTID_EST_MAX_RECENT * RTID_EST_MAX_RECENT };
 enum { SETTLE, FORGET_SILENT, END_ALL }; /* what a rebase does to the memory of closed blocks */
-#define FORGET_AT 1e-3 /* forget the silent ones each time that all memory has faded to this share */
+#define RING_LIMIT R(0.1)  /* rebase before the ring's column loses digits */
+#define FORGET_AT R(1e-3)  /* and forget the silent ones when all memory has faded so far */
 
 #ifdef RTID_ESTIMATOR_FLOAT32
 
@@ -23,7 +25,6 @@ enum { SETTLE, FORGET_SILENT, END_ALL }; /* what a rebase does to the memory of 
 #define ABS fabsf
 /* No quantity in SI units is that large, and its square is still a number. */
 #define INSANE 1e9f
-#define RING_LIMIT 0.1f /* rebase before the ring columns lose digits */
 #define SILENT 1e-7f    /* a closed block whose state decayed to this share is forgotten */
 #define LEAST_PIVOT 1e-6 /* of a unit diagonal: below, the sums hold but their own rounding */
 #define CONDITION_MOST 1e6
@@ -52,7 +53,6 @@ static inline rtid_sum no_sum(void) { return (rtid_sum){0.0f, 0.0f}; }
 #define EXP exp
 #define ABS fabs
 #define INSANE 1e30
-#define RING_LIMIT 0.05
 #define SILENT 1e-11
 #define LEAST_PIVOT 1e-15
 #define CONDITION_MOST HUGE_VAL
@@ -87,6 +87,9 @@ void rtid_est_open(rtid_estimator *e, int k, int edge, int slot);
 
 /* Take the closed and cleared block k out of the open ones; the last one takes its place. */
 void rtid_est_remove_open(rtid_estimator *e, int k);
+
+/* Work off so many tiles of what the last rebase left. */
+void rtid_est_pay(rtid_estimator *e, int tiles);
 
 /* Settle all products, start the ring anew; with END_ALL all states are zero. */
 void rtid_est_rebase(rtid_estimator *e, int how);

@@ -103,7 +103,11 @@ class Layout:
         fields += [("running", _U1), ("edge", _record(edge), (n.edges,))]
         fields += [(f"n_{name}", _U2) for name in ("open", "recent", "closed", "young", "slots")]
         fields += [("open", _record([*opened, ("phi", real, (TERMS,))]), (n.open,))]
+        owed: list[Field] = [(name, _U2) for name in ("n", "p", "q")]
+        owed += [("slot", _I2, (n.recent,)), ("partners", _U2, (n.recent,))]
+        owed += [(name, real, (n.recent, TERMS)) for name in ("left", "d")]
         fields += [("recent", _record(kept), (n.recent,)), ("young", _U2, (n.recent,))]
+        fields += [("debt", _record(owed))]
         fields += [("slot", _I2, (n.cells,)), ("block", self.block, (n.blocks,))]
         return _record([*fields, ("sums", total, (n.sums,)), ("counts", _U4, (len(COUNTS),))])
 
