@@ -28,6 +28,7 @@ MOST_NODES = 255  # per axis
 MOST_BYTES = 0xFFFF
 MOST_COUNT = 32_767
 ROUNDING = 0.01  # counts by which a flow may lie beyond the ends
+RISING = 0x80  # with the first cells' status: flows only rise, or only fall, with the command
 NO_SAFE_BAND = -float(np.finfo(np.float32).max)
 MAP, NUMBERS = 1, 2
 HEAD = struct.Struct("<BBBBbxxxff")
@@ -110,6 +111,14 @@ class Table:
         return np.asarray(s * np.abs(s))
 
     @property
+    def rising(self) -> NDArray[np.bool_]:
+        """Between which nodes of s (ns - 1,) flows only rise, or only fall, with the command."""
+        step = np.diff(self.counts.astype(int), axis=0)
+        rises: NDArray[np.bool_] = np.all(step >= 0, axis=0)
+        falls: NDArray[np.bool_] = np.all(step <= 0, axis=0)
+        return np.asarray((rises[1:] & rises[:-1]) | (falls[1:] & falls[:-1]))
+
+    @property
     def flow_m3s(self) -> FloatArray:
         """Flows at the nodes (nu, ns)."""
         return self.scale * self.counts.astype(float)
@@ -144,7 +153,9 @@ def image(table: Table, slot: int) -> bytes:
     parts = (table.w_v.astype("<f4"), table.s.astype("<f4"), table.counts.astype("<i2"))
     if image_bytes(nu, ns) > MOST_BYTES:
         raise ImageError(f"{nu} x {ns} nodes are {image_bytes(nu, ns)} bytes, of {MOST_BYTES}")
-    return head + b"".join(part.tobytes() for part in parts) + table.status.tobytes()
+    status = table.status.copy()
+    status[0] |= np.where(table.rising, RISING, 0).astype(np.uint8)
+    return head + b"".join(part.tobytes() for part in parts) + status.tobytes()
 
 
 def table_of(data: bytes) -> Table:
@@ -159,7 +170,9 @@ def table_of(data: bytes) -> Table:
     nodes = np.frombuffer(data, "<f4", nu + ns, HEAD.size).astype(np.float32)
     counts = np.frombuffer(data, "<i2", nu * ns, counts_at).astype(np.int16).reshape(nu, ns)
     status = np.frombuffer(data, np.uint8, -1, status_at).reshape(nu - 1, ns - 1).copy()
-    return Table(nodes[:nu], nodes[nu:], counts, status, scale, safe, direction)
+    return Table(
+        nodes[:nu], nodes[nu:], counts, status & np.uint8(RISING - 1), scale, safe, direction
+    )
 
 
 def numbers_image(numbers: ArrayLike, slot: int) -> bytes:

@@ -10,9 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from firmware_bridge.download import Session
+from firmware_bridge.download import Progress, Session
 from firmware_bridge.protocol import Accepts, Held
 from rtid import offered, reach
 from rtid.applied import DONE, UNCONFIRMED, Applied, Row
@@ -28,30 +26,11 @@ from rtid.applying import (
     stored,
 )
 from rtid.daemon.configure import state_folder
-from rtid.errors import RtidError
-from rtid.estimator.estimator import to_chunk
-from rtid.judging import Judgement, Known, judge
-from rtid.mapfiles import read_map
-from rtid.model import FloatArray
 from rtid.project import Project, load
-from rtid.replay import read_trace
+from rtid.wished import Wish, wished
 
 ANY_ROOM = Accepts(1, 16, 2 * 255, 0xFFFF)
 LOCK = "apply.lock"
-
-
-@dataclass(frozen=True)
-class Wish:
-    """What was asked for; see the options of `rtid apply`."""
-
-    undo: bool = False
-    map_file: Path | None = None
-    against: Path | None = None
-    dry_run: bool = False
-    bus: str | None = None
-    state: Path | None = None
-    replace_unknown: bool = False
-    test_bus: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,10 +73,16 @@ class Plan:
         return told | self.review.as_json() | {"lookup": lookup, "is_same": self.is_same}
 
 
-def apply_map(path: Path, wish: Wish, confirmed: Callable[[Plan], bool]) -> tuple[Plan, Row | None]:
+def apply_map(
+    path: Path,
+    wish: Wish,
+    confirmed: Callable[[Plan], bool],
+    progress: Progress = lambda done, total: None,
+) -> tuple[Plan, Row | None]:
     """Do it, if `confirmed` says so after it has seen the plan; the row that was written, or None.
 
-    Raises ApplyError, NoOfferError, DownloadError, SendError, and the errors of what is read.
+    progress hears how many of the chunks have arrived.  Raises ApplyError, NoOfferError,
+    DownloadError, SendError, and the errors of what is read.
     """
     project = load(path)
     reach.check(project)
@@ -115,7 +100,8 @@ def apply_map(path: Path, wish: Wish, confirmed: Callable[[Plan], bool]) -> tupl
             raise ApplyError(
                 f"{interface}: anybody may write to it", "add --test-bus if you want that", 2
             )
-        return _over_the_bus(project, folder, wish, applied, confirmed, (interface, channel))
+        bus = interface, channel
+        return _over_the_bus(project, folder, wish, applied, confirmed, bus, progress)
 
 
 def _over_the_bus(
@@ -125,6 +111,7 @@ def _over_the_bus(
     applied: Applied,
     confirmed: Callable[[Plan], bool],
     bus: tuple[str, str],
+    progress: Progress,
 ) -> tuple[Plan, Row | None]:
     can_id = project.sections.publish.can_id
     assert can_id is not None, "checked"
@@ -139,7 +126,7 @@ def _over_the_bus(
         with _opened(session):
             if {slot: session.held(slot) for slot in held} != held:
                 raise ApplyError("the controller has got other maps meanwhile", "look again")
-            row = send(session, applied, plan.prepared, plan.review, plan.provenance)
+            row = send(session, applied, plan.prepared, plan.review, plan.provenance, progress)
     offered.withdraw(folder)
     return plan, row
 
@@ -165,7 +152,7 @@ def _plan(
     if wish.undo:
         prepared, why, provenance = _undone(applied, content)
     else:
-        known, sd_pa, why, provenance = _wished(project, folder, wish, applied, held, content)
+        known, sd_pa, why, provenance = wished(project, folder, wish, applied, content)
         prepared = prepare(project, known, sd_pa, room)
     found = review(project, applied, held, prepared)
     against = () if wish.undo else tuple(objections(project, applied, found))
@@ -212,70 +199,6 @@ def _undone(applied: Applied, content: int | None) -> tuple[Prepared, str, dict[
         )
     why = f"Undo: the map of version {before} in place of that of version {content}."
     return stored(applied, before), why, {"undo_of": content}
-
-
-Wished = tuple[Known, FloatArray, str, dict[str, Any]]
-
-
-def _wished(
-    project: Project,
-    folder: Path,
-    wish: Wish,
-    applied: Applied,
-    held: Mapping[int, Held],
-    content: int | None,
-) -> Wished:
-    """The map to send, with the reason why it may be."""
-    if wish.map_file is not None:
-        return _from_file(project, wish, applied, content)
-    offer = offered.read(folder)
-    if content is not None and offer.against != content:
-        beaten = offer.against or "none"
-        raise ApplyError(
-            f"the offer has beaten version {beaten}, but the controller holds {content}",
-            "let the daemon judge anew",
-            4,
-        )
-    why = f"Offered: {offer.sentence()}."
-    return offer.known, offer.sd_pa, why, offer.provenance | {"judgement": offer.judgement}
-
-
-def _from_file(project: Project, wish: Wish, applied: Applied, content: int | None) -> Wished:
-    assert wish.map_file is not None
-    flow_map, told = read_map(wish.map_file)
-    new = Known(flow_map, np.asarray(told.get("beta_pa", ()), float))
-    if len(new.beta_pa) != len(project.model.chambers):
-        raise ApplyError(f"{wish.map_file}: no bulk modulus per chamber", "export it anew")
-    held = applied.known(content) if content is not None else None
-    found = judge_on(project, wish.against, told, held, new)
-    if not found.is_better:
-        raise ApplyError(
-            f"{wish.map_file} does not beat the {found.against} on {wish.against}: {found.reason}",
-            "a map goes to the controller only after it has",
-            4,
-        )
-    sd_pa = np.asarray(told.get("beta_sd_pa", np.zeros_like(new.beta_pa)), float)
-    why = f"Judged on {wish.against}, {found.blocks} s of motion: {found.reason}."
-    return new, sd_pa, why, dict(told) | {"judgement": found.as_json()}
-
-
-def judge_on(
-    project: Project, trace: Path | None, told: Mapping[str, Any], held: Known | None, new: Known
-) -> Judgement:
-    """Judge a map on a trace that it has not learned from, or on the trace's validation part."""
-    if trace is None:
-        raise RtidError("a map from a file must be judged first", "name a trace: --against", 2)
-    samples = read_trace(project, trace).samples
-    chunk = to_chunk(project.model, samples, int(samples.t_us[0]))
-    if told.get("source") == trace.name:
-        part = project.sections.record.validation_s
-        if part is None:
-            raise ApplyError(
-                f"the map was learned from {trace.name}: that cannot judge it",
-                "name another trace, or set record.identification_s and validation_s apart",
-            )
-        chunk = chunk[(chunk[:, 0] >= part[0]) & (chunk[:, 0] < part[1])]
-    return judge(project.model, chunk, held, new, project.sections.publish.gain_percent)
 
 
 @contextmanager

@@ -147,7 +147,7 @@ def objections(project: Project, applied: Applied, found: Review) -> list[str]:
                 f"{one.edge}: the flow changes by {LPM * one.believed_m3s:+.2f} L/min "
                 f"({one.believed_percent:.1f} % of the rated flow) at {one.believed_u_v:.2f} V, "
                 f"dp = {1e-6 * one.believed_dp_pa:.2f} MPa; publish.max_change_percent is "
-                f"{section.max_change_percent:g}"
+                f"{section.max_change_percent:g}: raise it for this apply if the change is right"
             )
     last = applied.newest()
     since_s = time.time() - last.unix_s if last is not None else np.inf

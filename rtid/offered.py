@@ -40,9 +40,10 @@ class Offer:
     def sentence(self) -> str:
         """Why it is offered."""
         j = self.judgement
+        other = "without any map" if self.against is None else "with the map held"
         return (
             f"on {j['blocks']} s of motion that it has not learned from, the residual is "
-            f"{6e4 * j['new_m3s']:.3f} L/min, with the {j['against']} {6e4 * j['held_m3s']:.3f} "
+            f"{6e4 * j['new_m3s']:.3f} L/min, {other} {6e4 * j['held_m3s']:.3f} "
             f"({j['gain_percent']:.1f} % less, t = {j['t']:.1f})"
         )
 

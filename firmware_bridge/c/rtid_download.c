@@ -171,7 +171,10 @@ static uint8_t judge_map(const rtid_download *d, const rtid_map *map)
     if (map->direction != 1 && map->direction != -1)
         return RTID_CONTENT;
     for (size_t k = 0; k < cells; k++)
-        if (map->status[k] >= RTID_MAP_N_CELL_STATUS)
+        if ((map->status[k] & ~RTID_MAP_RISING) >= RTID_MAP_N_CELL_STATUS)
+            return RTID_CONTENT;
+    for (unsigned j = 0; j < map->ns - 1u; j++)
+        if (map->status[j] & RTID_MAP_RISING && !rtid_map_is_rising(map, j))
             return RTID_CONTENT;
     if (is_beyond(map->u[0], d->max_command) || is_beyond(map->u[map->nu - 1u], d->max_command) ||
         is_beyond(far_s * far_s, d->max_dp))

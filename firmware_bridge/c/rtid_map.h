@@ -24,12 +24,14 @@ enum {
     RTID_MAP_NONE = 6          /* no map, no number, or no single command gives this flow */
 };
 #define RTID_MAP_N_CELL_STATUS 5 /* those that a cell may have */
+#define RTID_MAP_RISING 0x80 /* with the status of the first cells: flows only rise (or only fall)
+                                with the command at both nodes of s: then Q^-1 need not look at all */
 
 typedef struct {
     const float *u;        /* nu opening commands, rising, V */
     const float *s;        /* ns signed roots of the pressure drop, rising, sqrt(Pa) */
     const int16_t *q;      /* nu x ns flows in counts, those of u[0] first */
-    const uint8_t *status; /* (nu - 1) x (ns - 1) cells, RTID_MAP_VALID, ... */
+    const uint8_t *status; /* (nu - 1) x (ns - 1) cells, RTID_MAP_VALID, ..., and RTID_MAP_RISING */
     float scale;           /* m3/s per count */
     float safe;            /* opening command up to which nothing passes; -FLT_MAX: not declared */
     uint8_t nu, ns;        /* at least 2 */
@@ -44,5 +46,8 @@ int rtid_map_flow(const rtid_map *map, float u, float dp, float *q);
  * one gives it: u is then the shut valve's, or the end of the nodes that comes closest.  For q = 0
  * it is the safe band, the largest command that surely passes nothing. */
 int rtid_map_command(const rtid_map *map, float q, float dp, float *u);
+
+/* Whether RTID_MAP_RISING holds between nodes j and j + 1 of s. */
+int rtid_map_is_rising(const rtid_map *map, unsigned j);
 
 #endif

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -55,7 +57,8 @@ def apply(
     [publish], asks, and sends.  It becomes active at one moment, or not at all.  Exit code 4 if
     nothing is offered, a limit forbids it, or you say no.
     """
-    from rtid.apply_session import Wish, apply_map
+    from rtid.apply_session import apply_map
+    from rtid.wished import Wish
 
     wish = Wish(undo, map_file, against, dry_run, bus, state, replace_unknown, test_bus)
 
@@ -70,8 +73,28 @@ def apply(
             raise RtidError("nobody can be asked here", "add --yes in a script", Exit.USAGE)
         return typer.confirm("Send it?", default=False)
 
-    plan, row = apply_map(project, wish, confirmed)
+    with _bar() as progress:
+        plan, row = apply_map(project, wish, confirmed, progress)
     _end(plan, row, as_json, dry_run)
+
+
+@contextmanager
+def _bar() -> Iterator[Callable[[int, int], None]]:
+    """A progress bar on a terminal, from the first chunk on."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    shown = Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty())
+    task = shown.add_task("sending", start=False)
+
+    def progress(done: int, total: int) -> None:
+        shown.start()  # not before: there may be a question on the screen
+        shown.update(task, completed=done, total=total)
+
+    try:
+        yield progress
+    finally:
+        shown.stop()
 
 
 def _end(plan: Plan, row: Row | None, as_json: bool, dry_run: bool) -> None:

@@ -1,8 +1,15 @@
-"""A controller on a virtual bus: the firmware's C behind a thread that listens and answers."""
+"""A controller on a test bus: the firmware's C behind a thread that listens and answers.
+
+    python -m tests.apply.neighbour udp_multicast:239.74.163.2
+
+plays one for the commands of README.md, and says what it holds, until it is interrupted.
+"""
 
 from __future__ import annotations
 
+import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -28,14 +35,16 @@ Spoil = Callable[[bytes, bool], list[bytes]]
 
 
 class Neighbour:
-    """`heard`: every frame on the bus with the identifier of the download."""
+    """`heard`: all frames with the identifier of the download; `all`: also answers and notices."""
 
-    def __init__(self, channel: str, controller: Controller, spoil: Spoil) -> None:
+    def __init__(
+        self, channel: str, controller: Controller, spoil: Spoil, interface: str = "virtual"
+    ) -> None:
         self.channel, self.controller, self.heard = channel, controller, list[bytes]()
         self._spoil = spoil
         self.all: list[can.Message] = []
         self._stopped = threading.Event()
-        self._bus = can.Bus(channel, interface="virtual")
+        self._bus = can.Bus(channel, interface=interface)
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
@@ -45,7 +54,8 @@ class Neighbour:
             self.controller.now_ms += 1
             if message is None:
                 continue
-            self.all.append(message)
+            if message.arbitration_id >= CAN_ID:
+                self.all.append(message)
             if message.arbitration_id != CAN_ID:
                 continue
             self.heard.append(bytes(message.data))
@@ -115,3 +125,24 @@ def offer(folder: Path, project: Project, flow_map: FlowMap, against: int | None
 def loaded(folder: Path, **publish_keys: object) -> Project:
     """The project of `project_file`."""
     return load(project_file(folder, **publish_keys))
+
+
+def main() -> None:
+    """Play a controller until interrupted."""
+    interface, _, channel = sys.argv[1].partition(":")
+    it = Neighbour(channel, Controller(), lambda data, _: [data], interface)
+    told = None
+    try:
+        while True:
+            held = [it.controller.held(slot) for slot in range(5)]
+            if held != told:
+                told = held
+                versions = [one[0] if one else None for one in held]
+                print(f"versions held: {versions}, {len(it.heard)} frames heard", flush=True)
+            time.sleep(0.2)
+    except KeyboardInterrupt:
+        it.stop()
+
+
+if __name__ == "__main__":
+    main()

@@ -14,13 +14,14 @@ from firmware_bridge.lookup import crc32
 from firmware_bridge.protocol import Op, Reason
 from rtid import offered
 from rtid.applied import DONE, UNCONFIRMED, Applied, Row
-from rtid.apply_session import Plan, Wish, apply_map
+from rtid.apply_session import Plan, apply_map
 from rtid.applying import ApplyError
 from rtid.cli import main
 from rtid.cli.exits import Exit
 from rtid.estimator.flowmap import FlowMap
 from rtid.offered import NoOfferError
 from rtid.project import Project, load
+from rtid.wished import Wish
 from tests.apply.neighbour import Neighbour, learned, loaded, neighbour, offer, project_file
 from tests.bridge.controller import Controller
 from tests.bridge.test_download import damaging, losing

@@ -10,20 +10,26 @@ import numpy as np
 import pytest
 import tomlkit
 
+from firmware_bridge.lookup import crc32
 from rtid import offered
 from rtid.applied import DONE, Applied, Row
+from rtid.apply_session import ANY_ROOM, Plan, apply_map
+from rtid.applying import ApplyError, prepare
 from rtid.daemon.jobs import Publication
 from rtid.daemon.offering import Offering
+from rtid.errors import RtidError
 from rtid.estimator.estimator import to_chunk
 from rtid.estimator.published import publish
 from rtid.estimator.solution import Solution
 from rtid.judging import Known, judge
 from rtid.live import Learner, catalog_of
+from rtid.mapfiles import provenance, write_map
 from rtid.model import FloatArray
 from rtid.project import Project, load
 from rtid.sim.plant import Plant
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
+from rtid.wished import Wish
 
 SECONDS, ROUGH_S, GOOD_S = 56.0, 8.0, 30.0
 
@@ -72,11 +78,13 @@ def publication(solution: Solution) -> Publication:
     )
 
 
-def hold(folder: Path, version: int, solution: Solution) -> None:
+def hold(folder: Path, version: int, project: Project, solution: Solution) -> None:
     """Write down that this is what the controller holds."""
     it, applied = known(solution), Applied(folder)
-    applied.keep(version, {0: b"image"}, it.flow_map, {"beta_pa": it.beta_pa.tolist()})
-    applied.note(Row(time.time(), version, version, "me", {0: 1}, DONE, {}))
+    images = prepare(project, it, solution.beta_sd_pa, ANY_ROOM).images
+    applied.keep(version, images, it.flow_map, {"beta_pa": it.beta_pa.tolist()})
+    crcs = {slot: crc32(data) for slot, data in images.items()}
+    applied.note(Row(time.time(), version, version, "me", crcs, DONE, {}))
 
 
 def pieces(chunk: FloatArray) -> list[FloatArray]:
@@ -141,7 +149,7 @@ def test_the_first_map_is_offered_after_unseen_motion_only(
 @pytest.mark.parametrize("held_is_good", [False, True])
 def test_it_must_beat_the_held_one(machine: Machine, tmp_path: Path, held_is_good: bool) -> None:
     held, new = (machine.good, machine.rough) if held_is_good else (machine.rough, machine.good)
-    hold(tmp_path, 4, held)
+    hold(tmp_path, 4, machine.project, held)
     offering = Offering(machine.project, tmp_path)
     offering.published(publication(new), new)
     for piece in pieces(machine.unseen):
@@ -164,3 +172,37 @@ def test_without_a_way_to_the_controller_nothing_is_judged(
     for piece in pieces(machine.unseen):
         assert offering.push(piece) is None
     assert not offered.exists(tmp_path)
+
+
+def test_a_map_from_a_file_is_judged_on_a_trace(machine: Machine, tmp_path: Path) -> None:
+    """`rtid apply --map FILE --against TRACE`: a dry run, from the records."""
+    trace, path = machine.project.path.with_suffix(".parquet"), machine.project.path
+    files = {}
+    for name, solution, source in (
+        ("rough", machine.rough, "other.blf"),
+        ("good", machine.good, "other.blf"),
+        ("own", machine.good, trace.name),
+    ):
+        files[name] = tmp_path / f"{name}.npz"
+        told = provenance(solution, "m", machine.project.digest, source)
+        write_map(files[name], publish(solution), told)
+    (tmp_path / "state").mkdir()
+    hold(tmp_path / "state", 1, machine.project, machine.rough)
+
+    def plan(name: str, against: Path | None = trace) -> Plan:
+        wish = Wish(map_file=files[name], against=against, dry_run=True, state=tmp_path / "state")
+        return apply_map(path, wish, lambda plan: True)[0]
+
+    assert "Judged on" in plan("good").why
+    with pytest.raises(ApplyError, match="does not beat the held map"):
+        plan("rough")
+    with pytest.raises(RtidError, match="must be judged"):
+        plan("good", None)
+    assert int(plan("own").why.split(", ")[1].split(" ")[0]) <= 14  # its validation part alone
+    document = tomlkit.parse(path.read_text("utf-8"))
+    document.remove("record")
+    whole = path.with_name("whole.toml")
+    whole.write_text(tomlkit.dumps(document), "utf-8")
+    wish = Wish(map_file=files["own"], against=trace, dry_run=True, state=tmp_path / "state")
+    with pytest.raises(ApplyError, match="cannot judge it"):
+        apply_map(whole, wish, lambda plan: True)

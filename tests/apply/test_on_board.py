@@ -21,13 +21,14 @@ from firmware_bridge.protocol import Op
 from firmware_bridge.sources import serial_port
 from firmware_bridge.sources.live_bus import open_live
 from rtid import offered, reach
-from rtid.apply_session import Wish, apply_map
+from rtid.apply_session import apply_map
 from rtid.daemon.answers import Answers, answers_of
 from rtid.daemon.notices import frames_of, telling
 from rtid.daemon.status import Alarm, Chamber, EdgeHealth, Estimate, Verdict
 from rtid.errors import RtidError
 from rtid.estimator.flowmap import FlowMap
 from rtid.project import load
+from rtid.wished import Wish
 from tests.apply.neighbour import (
     REPLY_ID,
     STATUS_ID,

@@ -277,7 +277,7 @@ def broken_images() -> list[bytes]:
         (0, b"\3"), (1, b"\1"), (2, b"\7"), (4, b"\2"), (8, b"\0\0\0\0"), (8, b"\0\0\xc0\x7f"),
         (8, b"\0\0\x80\x7f"), (12, b"\0\0\xc0\x7f"), (16, b"\0\0\xc0\x7f"),
         (20, bytes(good[16:20])), (16, b"\0\0\x80\xff"), (44, bytes(good[40:44])),
-        (len(good) - 1, b"\5"),
+        (len(good) - 1, b"\5"), (len(good) - 20, b"\x85"), (62, b"\xff\x7f"),
     ):  # fmt: skip
         spoilt = bytearray(good)
         spoilt[at : at + len(data)] = data
