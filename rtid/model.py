@@ -118,7 +118,8 @@ class Term:
 
     z = sum of weights * signal + constant, linear between samples; weights: (signal, weight) pairs;
     signs: (chamber, +1 or -1) pairs.  f(z) by `shape`: z, sign(z) sqrt|z|, max(0, z) or -1 / z.
-    volume: the chamber whose V(x) multiplies a rate, NONE for 1.
+    volume: the chamber whose V(x) multiplies a rate, NONE for 1.  sd: theta = 1 +- sd is known
+    beforehand, and counts as one row more.
 
     A laminar internal leakage has weights p_a: 1, p_b: -1, signs a: -1, b: +1, and a scale in
     m3/s/Pa near the coefficient that is expected; a relief valve is a hinge with the constant
@@ -133,6 +134,7 @@ class Term:
     shape: str = "linear"
     rate: bool = False
     volume: str = NONE
+    sd: float = np.inf
 
 
 @dataclass(frozen=True)

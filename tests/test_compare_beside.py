@@ -76,7 +76,7 @@ def view_of(model: Model, chunk: FloatArray) -> View:
 
 def flow_of_terms(view: View, effect: Candidate, value: float) -> FloatArray:
     """Mean flow (n - 1, chambers) of an effect's terms, by the oracle of the recursion."""
-    model = replace(view.model, terms=terms_of(view, effect, value))
+    model = replace(view.model, terms=terms_of(view.model, view.compliance, effect, value))
     weights, values = nominal_weights(model), view.chunk[:, 2:]
     track = follow(model, view.t_s, values, view.chunk[:, 1].astype(np.int64), weights)
     rates, _ = column_rates(model, view.t_s, values, track, weights)
@@ -115,11 +115,11 @@ def test_air_is_a_sum_of_inverses(kappa: float) -> None:
 def test_a_poppet_with_a_state_has_no_terms() -> None:
     view = view_of(*part())
     cause = next(k for k in causes(view) if k.candidate.effect == RELIEF)
-    assert terms_of(view, cause.at((2e6, 0.0, 0.0)), 1e-12)
-    assert not terms_of(view, cause.at((2e6, 0.02, 0.0)), 1e-12)
-    assert not terms_of(view, cause.at((2e6, 0.0, 1e5)), 1e-12)
+    assert terms_of(view.model, view.compliance, cause.at((2e6, 0.0, 0.0)), 1e-12)
+    assert not terms_of(view.model, view.compliance, cause.at((2e6, 0.02, 0.0)), 1e-12)
+    assert not terms_of(view.model, view.compliance, cause.at((2e6, 0.0, 1e5)), 1e-12)
     drift = next(k for k in causes(view) if k.candidate.effect == "valve_gain_drift")
-    assert not terms_of(view, drift.candidate, 1e-3)
+    assert not terms_of(view.model, view.compliance, drift.candidate, 1e-3)
 
 
 def test_shared_unknowns_are_as_told_and_the_maps_follow() -> None:
@@ -265,7 +265,7 @@ def test_replay_learns_beside_and_keeps_the_boards_memory(folder: Path, tmp_path
     assert told_["added"][0]["parameters"]["delay"]["value"] == pytest.approx(5e-3, abs=1e-4)
     assert told_["lag_s"] == pytest.approx(1.3e-3, abs=3e-4)
     text = call("export", tmp_path / "memory.npz", tmp_path / "m.json", "-p", folder / "delay.toml")
-    assert "A snapshot is learned without input_delay at command" in " ".join(text.split())
+    assert "This snapshot was learned without input_delay at command" in " ".join(text.split())
     assert read_map(tmp_path / "m.json")[1]["effects"] == []
 
 

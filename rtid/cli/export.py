@@ -25,7 +25,7 @@ def export(
 
     CSV is a long table at the nodes and centres of the grid; JSON and npz hold everything.  From a
     trace the maps are learned beside the effects that `rtid add` has added, whose flow is not in
-    them; a snapshot holds the maps as they were learned on board, without such effects.
+    them; a snapshot holds the maps as they were learned, on board beside those that can run live.
     """
     from rtid.errors import RtidError
     from rtid.estimator.published import publish
@@ -58,8 +58,8 @@ def _beside(effects: list[dict[str, Any]], project: Project) -> str:
     added = [f"{a.effect} at {a.where}" for a in project.sections.added]
     if added:
         return (
-            f"A snapshot is learned without {', '.join(added)}, which the project has added: the "
-            "maps hold what they could of it.  Export from a trace to have it apart."
+            f"This snapshot was learned without {', '.join(added)}, which the project has added: "
+            "the maps hold what they could of it.  Export from a trace to have it apart."
         )
     return "The project has added no effects."
 
@@ -67,9 +67,10 @@ def _beside(effects: list[dict[str, Any]], project: Project) -> str:
 def _solution(project: Project, source: Path) -> tuple[Solution, list[dict[str, Any]]]:
     """From a snapshot as it is, from a trace by the record path; the effects beside it."""
     if source.suffix.lower() == SNAPSHOT:
-        from rtid.store import load
+        from rtid.daemon.beside import load_for
 
-        return load(source, project.model, project.digest).solution(), []
+        estimator, live = load_for(source, project)
+        return estimator.solution(), [{"effect": a.effect, "where": a.where} for a in live]
     from rtid.beside import as_json, replay_beside
 
     found = replay_beside(project, source)

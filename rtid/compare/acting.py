@@ -17,8 +17,7 @@ from scipy.optimize import nnls
 
 from rtid.diagnose.candidates import Candidate
 from rtid.diagnose.causes.storage import ATMOSPHERE_PA, LEAST_PA
-from rtid.diagnose.view import View
-from rtid.model import Chamber, FloatArray, Term
+from rtid.model import Chamber, FloatArray, Model, Term
 
 MOST_PA = 60e6  # up to which air is described
 SHIFTS_PA = (0.0, 5e4, 2.5e5, 1.2e6, 6e6, 3e7, 3e8)  # c_k: the slope within 0.6 % from 0.5 bar on
@@ -28,7 +27,8 @@ SHIFTS_PA = (0.0, 5e4, 2.5e5, 1.2e6, 6e6, 3e7, 3e8)  # c_k: the slope within 0.6
 class _Made:
     """An effect with its coefficient, at chambers with their pressures; name: of its terms."""
 
-    view: View
+    model: Model
+    compliance: FloatArray
     effect: Candidate
     value: float
 
@@ -38,32 +38,34 @@ class _Made:
 
     @property
     def chambers(self) -> list[Chamber]:
-        found = self.view.model.chambers
-        return [c for c in found if self.effect.where in (c.name, "both")]
+        return [c for c in self.model.chambers if self.effect.where in (c.name, "both")]
 
     @property
     def law(self) -> str:
         return "linear" if self.effect.effect.endswith("laminar") else "root"
 
 
-def terms_of(view: View, effect: Candidate, value: float) -> tuple[Term, ...]:
+def terms_of(
+    model: Model, compliance: FloatArray, effect: Candidate, value: float
+) -> tuple[Term, ...]:
     """The terms of an effect with the coefficient `value`, each for theta = 1.
 
+    compliance (chambers,): 1/Pa, that a dead volume's column was made with.
     Empty for an effect that is more than a function of the signals at one instant: its flow can
     only be taken from the measured pressures.
     """
     make = MAKERS.get(effect.effect)
-    return tuple(make(_Made(view, effect, value))) if make else ()
+    return tuple(make(_Made(model, compliance, effect, value))) if make else ()
 
 
 def _between(made: _Made) -> Iterator[Term]:
-    one, two = made.view.model.chambers
+    one, two = made.model.chambers
     drop, into = _drop(one.pressure, two.pressure), ((one.name, -1), (two.name, 1))
     yield Term(made.name, drop, into, made.value, shape=made.law)
 
 
 def _out(made: _Made) -> Iterator[Term]:
-    model = made.view.model
+    model = made.model
     chambers = {chamber.pressure for chamber in model.chambers}
     # the signal that `View.tank` reads
     tank = min((e.sink for e in model.edges if e.sink not in chambers), default="")
@@ -73,7 +75,7 @@ def _out(made: _Made) -> Iterator[Term]:
 
 
 def _seat(made: _Made) -> Iterator[Term]:
-    model = made.view.model
+    model = made.model
     edge = next(e for e in model.edges if e.name == made.effect.where)
     into = tuple((c.name, edge.sign(c)) for c in model.chambers if edge.sign(c))
     yield Term(made.name, _drop(edge.source, edge.sink), into, made.value, shape="root")
@@ -95,10 +97,10 @@ def _opening(made: _Made) -> Iterator[Term]:
 
 def _soft(made: _Made) -> Iterator[Term]:
     """Dead volume, by the compliance that its column was made with, or a hose."""
-    size, names = made.value, [c.name for c in made.view.model.chambers]
+    size, names = made.value, [c.name for c in made.model.chambers]
     if made.effect.effect == "extra_dead_volume":
         at = [names.index(c.name) for c in made.chambers]
-        size *= float(np.mean(made.view.compliance[at]))
+        size *= float(np.mean(made.compliance[at]))
     for c in made.chambers:
         yield Term(made.name, ((c.pressure, 1.0),), ((c.name, 1),), size, rate=True)
 
@@ -113,7 +115,7 @@ def _vapour(made: _Made) -> Iterator[Term]:
 
 def _gas(made: _Made) -> Iterator[Term]:
     """Air; nothing where a declared range lets a pressure reach zero."""
-    model, gains = made.view.model, shares(1.0 / made.effect.shape[0])
+    model, gains = made.model, shares(1.0 / made.effect.shape[0])
     lowest = {s.name: s.minimum for s in model.signals}
     for c in made.chambers if all(lowest[c.pressure] > 0.0 for c in made.chambers) else []:
         for shift, gain in zip(SHIFTS_PA, gains, strict=True):

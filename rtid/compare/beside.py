@@ -91,7 +91,7 @@ def acting(fit: Fit, chunk: FloatArray, published: FlowMap | None = None) -> Act
         model = replace(model, lag=Lag())
     of, measured = list[Candidate](), list[Candidate]()
     for effect, value in effect_values(fit):
-        terms = terms_of(view, effect, value)
+        terms = terms_of(view.model, view.compliance, effect, value)
         model = replace(model, terms=(*model.terms, *terms))
         if not terms:
             ones, name = np.ones(len(model.terms)), f"{effect.effect} {effect.where}"

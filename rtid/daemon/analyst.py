@@ -17,6 +17,7 @@ from typing import TypeVar
 import numpy as np
 
 from rtid.daemon.chronicle import Chronicle
+from rtid.daemon.configure import boarded
 from rtid.daemon.jobs import (
     Answer,
     Batch,
@@ -211,7 +212,7 @@ def main() -> None:
     fd, project, folder = sys.argv[1:]
     pipe = Pipe(int(fd))
     os.nice(NICE)
-    loaded = load(project)
+    loaded = boarded(load(project), lambda _: None)
     Estimator(loaded.model).solution()  # compiles
     analyst = Analyst(loaded, Path(folder), pipe.send)
     try:

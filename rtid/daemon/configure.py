@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,3 +26,12 @@ def state_folder(project: Project) -> Path:
 def state_of(where: Path) -> Path:
     """The state folder that is meant by a project file, or by the folder itself."""
     return where if where.is_dir() else state_folder(load(where))
+
+
+def boarded(project: Project, tell: Callable[[str], None]) -> Project:
+    """The project with its added effects in the model, see `rtid.daemon.beside.on_board`."""
+    if not project.sections.added:
+        return project
+    from rtid.daemon.beside import on_board  # noqa: PLC0415 (scipy: a second of the start)
+
+    return on_board(project, tell)

@@ -24,6 +24,7 @@ from firmware_bridge import frames as fr
 from firmware_bridge.sources import candump
 from firmware_bridge.sources.live import Source
 from rtid.daemon.answers import answers_of
+from rtid.daemon.configure import boarded
 from rtid.daemon.core import Core
 from rtid.daemon.diagnosing import Diagnosing
 from rtid.daemon.helper import Helper
@@ -69,6 +70,7 @@ class Daemon:
                 "record a trace, let `rtid check` tell the noise, and write it into the file",
             )
         self._project, self._bus, self._folder = project, bus, folder
+        self._board = boarded(project, logger.warning)  # with the added effects that can run live
         self._log_every_s = log_every_s
         self._loop: Loop | None = None
         self._keeper: Keeper | None = None
@@ -151,11 +153,12 @@ class Daemon:
         return keeper.status
 
     def _learner(self) -> Learner:
-        return Learner(self._project.model, catalog_of(self._project), self._project.assembly)
+        board = self._board
+        return Learner(board.model, catalog_of(board), board.assembly)
 
     def _restore(self, learner: Learner) -> str:
         """Go on with the newest whole snapshot of this project."""
-        found = Generations(self._folder, self._project.digest).restore(learner.estimator.model)
+        found = Generations(self._folder, self._board.digest).restore(learner.estimator.model)
         for text in found.refused:
             logger.warning("refused %s", text)
         if found.estimator is not None:

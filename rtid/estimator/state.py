@@ -177,6 +177,7 @@ def build(model: Model, weights: Weights | None = None) -> State:
     engine[0]["compliance"][: len(model.chambers)] = weights.compliance
     engine[0]["lag_s"] = weights.lag_s
     tables.clear(engine, cells)
+    _know_terms(engine[0], model)
     return State(
         engine,
         cells,
@@ -276,6 +277,13 @@ def _configure_terms(e: np.void, model: Model) -> None:
             e["term_weight"][k, model.column(name)] = weight
         for name, sign in term.signs:
             e["term_sign"][k, names.index(name)] = sign
+
+
+def _know_terms(e: np.void, model: Model) -> None:
+    """What is known of the terms beforehand: a row (theta - 1) / sd for each."""
+    shared, first = e["shared"], 1 + len(model.chambers)
+    for k, term in enumerate(model.terms, first):
+        shared[np.ix_((0, k), (0, k))] += term.sd**-2
 
 
 def _column(model: Model, name: str) -> int:
