@@ -39,7 +39,7 @@ from rtid.daemon.story import line
 from rtid.daemon.teller import Facts, Saving, Teller
 
 LOOK_S = 0.1
-OVERLOAD = 0.05  # share of ticks lost in a second that is worth an alarm
+OVERLOAD, LOADS = 0.05, 6  # share of ticks lost within so many looks that is worth an alarm
 CHECK_S = 30.0  # of samples after which the project file is held against them
 BEGINS_S = 5.0  # so long after the start nobody misses a message
 FALLEN_S = 60.0  # so long a helper that ended is an alarm
@@ -67,7 +67,8 @@ class Keeper:
         self._first_s: float | None = None  # time of the first sample of this run
         self._is_checked = self._is_ready = False
         self._told_s = 0.0
-        self._lost = self._fallen = 0
+        self._loads: deque[tuple[int, int, Counter[str]]] = deque(maxlen=LOADS)
+        self._fallen = 0
         self._fallen_s = -math.inf
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="rtid-keeper", daemon=True)
@@ -165,8 +166,21 @@ class Keeper:
         if not self._is_checked and self._recording and self._has_run_s() > CHECK_S:
             self._is_checked = self._diagnosing.check(self._recording)
         self._diagnosing.look(self._core.learner.estimator, self._core.newest_s)
+        self._look_at_load()
         if self.alarms.on != tuple(a for a in self.status.alarms if a.until_unix_s is None):
             self._tell_alarms()
+
+    def _look_at_load(self) -> None:
+        """Ticks that were lost within the last few looks."""
+        if self.teller.loop is None:
+            return
+        total = self.teller.loop.total
+        lost = total.overruns + total.skipped
+        self._loads.append((total.ticks + total.skipped, lost, Counter(total.causes)))
+        (due_0, lost_0, causes_0), (due, lost, causes) = self._loads[0], self._loads[-1]
+        much = lost - lost_0 > OVERLOAD * (due - due_0)
+        text = wording.overload(lost - lost_0, due - due_0, causes - causes_0)
+        self.alarms.put("overload", "loop", text if much else "")
 
     def _has_run_s(self) -> float:
         """Seconds of samples in this run."""
@@ -221,11 +235,6 @@ class Keeper:
     def _tell(self) -> None:
         """Status, file, log line."""
         before, self.status = self.status, self._make_status()
-        loop = self.status.loop
-        lost, self._lost = loop.overruns + loop.skipped - self._lost, loop.overruns + loop.skipped
-        new = Counter(loop.causes) - Counter(before.loop.causes)
-        text = wording.overload(lost, loop.rate_hz, new)
-        self.alarms.put("overload", "loop", text if lost > OVERLOAD * loop.rate_hz else "")
         self._judge_signals(before)
         if time.monotonic() - self._told_s >= self._facts.log_every_s - 0.5:
             self._told_s = time.monotonic()

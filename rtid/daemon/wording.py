@@ -89,12 +89,12 @@ def plant_changed(verdict: Verdict | None) -> str:
     return f"{text}. {verdict.text} If the machine is to stay as it is now: rtid accept"
 
 
-def overload(lost: int, rate_hz: float, causes: Mapping[str, int]) -> str:
-    """Ticks that were lost within a second, and what the overruns of that second came from."""
+def overload(lost: int, ticks: int, causes: Mapping[str, int]) -> str:
+    """So many of the last ticks were lost; what the overruns among them came from."""
     why = sorted(causes.items(), key=lambda cause: -cause[1])
     told = ", ".join(f"{CAUSES.get(cause, cause)} ({n})" for cause, n in why)
     return (
-        f"{lost} of {rate_hz:.0f} ticks were lost within a second{': ' * bool(told)}{told}; no "
-        "frame is lost, but what is published comes late. Give the daemon more of the processor "
+        f"{lost} of the last {ticks} ticks were lost{': ' * bool(told)}{told}; no frame is lost, "
+        "but what is published comes late. Give the daemon more of the processor "
         "(daemon.priority) or a lower rate (daemon.rate_hz)"
     )

@@ -29,8 +29,8 @@ SAID = {
     "plant, no verdict yet": (wording.plant_changed(None), "a diagnosis follows"),
     "plant": (wording.plant_changed(LEAK), "is missing. If the machine is to stay as it is"),
     "overload": (
-        wording.overload(71, 1000.0, {"work": 2, "late": 9}),
-        "71 of 1000 ticks were lost within a second: woken too late (9), long work (2); no",
+        wording.overload(71, 500, {"work": 2, "late": 9}),
+        "71 of the last 500 ticks were lost: woken too late (9), long work (2); no frame",
     ),
 }
 

@@ -32,6 +32,7 @@ pytestmark = pytest.mark.soak
 SHARE = float(os.environ.get("RTID_SOAK", "1"))
 QUICK = "publish_s = 5\nstore_s = 2\n"
 FULL_BUS_HZ = 8000.0
+WARM_S = 120.0  # the ring of samples is full, all blocks of the minute have been visited
 
 
 def test_row_14_a_full_bus_for_60_s(tmp_path: Path, figure: Figure) -> None:
@@ -94,18 +95,21 @@ def test_row_28_hours_at_ten_times_the_pace(tmp_path: Path, figure: Figure) -> N
         frames, seen = loops * len(machine().frames), list[tuple[float, float, int]]()
 
         def look(status: Status) -> bool:
-            if not seen or status.now_unix_s > seen[-1][0] + 2:
-                seen.append((status.now_unix_s, status.rss_anon_mb, running.handles()))
+            of_machine_s = status.estimate.samples * 1e-3
+            if not seen or of_machine_s > seen[-1][0] + 20.0:
+                seen.append((of_machine_s, status.rss_anon_mb, running.handles()))
             return status.bus.frames >= frames
 
         running.wait(look, limit_s=60.0 + 7.0 * loops)
         running.stop()
-    early, late = seen[2 * len(seen) // 3], seen[-1]  # tables and rings have grown by then
-    growth = (late[1] - early[1]) / ((late[0] - early[0]) / 3600)
-    figure(28, "handles, last third", late[2] - early[2], 0)
-    figure(28, "memory, last third", late[1] - early[1], unit="MB")
-    figure(28, "memory growth, last third, per hour of the machine", growth / 10, 5.0, "MB/h")
-    figure(28, "memory growth, last third, per hour of the wall", growth, unit="MB/h")
+    warm = next(entry for entry in seen if entry[0] > WARM_S)
+    last = seen[-1]
+    hours = (last[0] - warm[0]) / 3600
+    figure(28, "handles since the ring of samples is full", last[2] - warm[2], 0)
+    figure(28, "private memory at the end", last[1], unit="MB")
+    figure(28, f"hours of the machine, from {warm[0]:.0f} s on", hours, unit="h")
+    figure(28, "memory growth per hour of the machine, from there to the end",
+           (last[1] - warm[1]) / hours, 5.0, "MB/h")  # fmt: skip
     learner = machine().learner()
     for k in range(loops):
         learner.push(loop(k))
@@ -165,16 +169,14 @@ def test_row_21_overload(tmp_path: Path, figure: Figure) -> None:
         running.wait(lambda s: s.pid > 0)
         with sender(running.group, 40.0) as sending:
             running.wait(lambda s: s.estimate.samples > 2000)
-            before = running.status()
-            assert before is not None
             busy = [subprocess.Popen([sys.executable, "-c", burn]) for _ in range(4)]
             time.sleep(20.0 * min(1.0, SHARE))
             during = running.status()
             for process in busy:
                 process.kill()
                 process.wait()
-            usual_us = max(2000.0, 2.0 * before.loop.lateness_1s.p99_us)
-            calm_s = running.wait(lambda s: s.loop.lateness_1s.p99_us < usual_us, 20.0)
+            end_s = time.time()
+            running.wait(lambda s: s.now_unix_s > end_s + 3.0 and not s.has("overload"), 20.0)
             sent = int(sending.communicate()[0])
         running.wait(lambda s: s.bus.frames >= sent, 10.0)
         last = running.stop()
@@ -183,7 +185,6 @@ def test_row_21_overload(tmp_path: Path, figure: Figure) -> None:
     figure(21, "frames lost under overload", sent - last.bus.frames, 0)
     figure(21, "overruns without a cause", loop.overruns - sum(loop.causes.values()), 0)
     figure(21, "overruns under overload", during.loop.overruns)
-    try:
-        figure(21, "normal again after (status told each second)", calm_s, 1.0, "s")
-    except AssertionError as error:  # 3.2 s at load 8: the machine itself was not calm
-        pytest.xfail(str(error))
+    over = [a.until_unix_s for a in last.alarms if a.name == "overload" and a.until_unix_s]
+    assert over, "nobody was told of the overload"
+    figure(21, "normal again after", max(0.0, max(over) - end_s), 1.0, "s")
