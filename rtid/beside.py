@@ -6,7 +6,7 @@ the project file on; maps, and all that is said of them, are learned beside them
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from typing import Any
 from rtid.compare.beside import KnownEffect, acting, known_effects, learn_beside
 from rtid.comparing_json import plain
 from rtid.diagnose.clean import as_measured, usable
-from rtid.diagnose.fit import fit, prepare
+from rtid.diagnose.fit import Fit, fit, prepare
 from rtid.diagnose.parts import recall
 from rtid.diagnosed_text import quantity, title
 from rtid.diagnosing import added_parts
@@ -52,7 +52,12 @@ def beside(found: Replay) -> Replay:
     declared = replace(as_measured(found.model, learned), own_effects=found.project.effects)
     weights = prepare(declared, learned)
     fitted = fit(declared, learned, weights, recall(declared, learned, weights, parts), bank=False)
-    fitted, chunk = fitted.light(), usable(declared, found.chunk)
+    return learned_beside(found, fitted.light(), [part.key for part in parts])
+
+
+def learned_beside(found: Replay, fitted: Fit, keys: Iterable[tuple[str, str]]) -> Replay:
+    """A plain replay learned anew beside the effects and timings of a fitted revision."""
+    chunk = usable(fitted.declared, found.chunk)
     machine = acting(fitted, chunk)
     result = replace(found, model=machine.model, chunk=machine.chunk)
     record = learn_beside(fitted, machine, result.part(found.identification_s))
@@ -60,8 +65,7 @@ def beside(found: Replay) -> Replay:
         result = replace(result, chunk=acting(fitted, chunk, publish(record.solution)).chunk)
     offsets = found.fit.offsets_s, found.fit.offsets_sd_s
     record = replace(record, offsets_s=offsets[0], offsets_sd_s=offsets[1])
-    known = known_effects(fitted, machine, [part.key for part in parts])
-    return replace(result, fit=record, added=known)
+    return replace(result, fit=record, added=known_effects(fitted, machine, keys))
 
 
 def as_json(added: tuple[KnownEffect, ...]) -> list[dict[str, Any]]:

@@ -1,54 +1,41 @@
 """The page of `rtid report`: one HTML text with its pictures inside, nothing to load.
 
-Pictures are SVG in data URIs; on a dark screen the style sheet turns their lightness round and
-keeps their hues.
+The pictures are those of the page (`report_plots`).
 """
 
 from __future__ import annotations
 
-from base64 import b64encode
 from html import escape
-from io import BytesIO
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.figure import Figure
+from bokeh.models import UIElement
 
 import rtid
 from rtid.diagnose.residual import ROWS_PER_S, Residual
 from rtid.diagnose.trials import GAIN
 from rtid.diagnose.verdict import MATERIAL
-from rtid.diagnosed_text import sentences, title
-from rtid.pictures.diagnosed import Rank, dependences, errors, flows, ranking
-from rtid.pictures.style import STYLE
+from rtid.diagnosed_text import sentences
+from rtid.report_errors import PARTS, RANKED, can_be_judged, floor, models, share, steps
+from rtid.report_plots import dependences, embedded, errors, flows, ranking
 from rtid.report_story import Told
-from rtid.report_tables import (
-    candidates,
-    history,
-    named,
-    negligible,
-    not_found,
-    section,
-    table,
-)
+from rtid.report_tables import candidates, history, negligible, not_found, section, table
 from rtid.report_template import PAGE
 from rtid.report_words import VERDICTS, text
 from rtid.units import LPM
 
-PARTS = "identification part", "held-out part"
-RANKED = 16  # candidates that are shown
-BEFORE, AFTER = "model as it is", "with what was found"
+NOTHING = "<p>No flow of this record could be judged.</p>"
 
 
 def page(told: Told) -> str:
     """The whole HTML text."""
+    head, drawn = _drawn(told)
     found = told.diagnosed.diagnosis
     kind, headline = VERDICTS[found.verdict]
     sections = [
-        _errors(told),
-        _flows(told),
-        _dependences(told),
-        _ranking(told),
+        _errors(told, drawn),
+        _flows(told, drawn),
+        _dependences(told, drawn),
+        _ranking(told, drawn),
         not_found(found.not_found, told.ranking),
         negligible(found.negligible),
         history(told.history),
@@ -56,6 +43,7 @@ def page(told: Told) -> str:
     ]
     name = told.diagnosed.project.sections.project.name
     return PAGE.substitute(
+        head=head,
         title=escape(f"{name}: {told.diagnosed.trace.path.name}"),
         kind=kind,
         headline=escape(headline),
@@ -65,37 +53,29 @@ def page(told: Told) -> str:
     )
 
 
-def _picture(figure: Figure, name: str, caption: str) -> str:
-    buffer = BytesIO()
-    with mpl.rc_context(STYLE):
-        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
-    data = b64encode(buffer.getvalue()).decode()
-    return (
-        f'<figure><img alt="{escape(name)}" src="data:image/svg+xml;base64,{data}">'
-        f"<figcaption>{text(caption)}</figcaption></figure>"
-    )
-
-
-def stills(told: Told) -> dict[str, Figure]:
-    """The pictures of the page by name, those that this record has."""
-    drawn: dict[str, Figure] = {}
-    if _can_be_judged(told):
-        drawn["errors"] = _errors_figure(told)
-    drawn["flows"] = _flows_figure(told)
+def _drawn(told: Told) -> tuple[str, dict[str, str]]:
+    """Head of the file, and its pictures by name: those that this record has."""
+    figures: dict[str, UIElement] = {}
+    if any(len(part.t_s) for part in told.before):
+        figures["flows"] = flows(told.chambers, models(told.before, told.after))
     if told.depends_before:
-        drawn["dependences"] = _dependences_figure(told)
+        depends = models(told.depends_before, told.depends_after or None)
+        figures["dependences"] = dependences(told.chambers, depends)
+    head, drawn = embedded(figures)
+    if can_be_judged(told):
+        drawn["errors"] = errors(steps(told), floor(told))
     if told.ranking:
-        drawn["ranking"] = _ranking_figure(told)
-    return drawn
+        drawn["ranking"] = ranking(told.ranking[:RANKED])
+    return head, drawn
 
 
-def _share(told: Told, residual_m3s: float) -> float:
-    return 100.0 * residual_m3s / told.diagnosed.diagnosis.rms_flow_m3s
+def _picture(drawn: str, caption: str) -> str:
+    return f"<figure>{drawn}<figcaption>{text(caption)}</figcaption></figure>"
 
 
 def _percent(told: Told, residual_m3s: float) -> str:
-    share = _share(told, residual_m3s)
-    return f"{share:.2f} %" if np.isfinite(share) else "not known"
+    value = share(told, residual_m3s)
+    return f"{value:.2f} %" if np.isfinite(value) else "not known"
 
 
 def _key_figures(told: Told) -> str:
@@ -118,59 +98,30 @@ def _key_figures(told: Told) -> str:
     )
 
 
-def _steps(told: Told) -> list[tuple[str, float]]:
-    """Error behind each addition, in per cent of the rms flow."""
-    found = told.diagnosed.diagnosis
-    start = BEFORE if not found.added else "model with what was added before"
-    steps = [(start, _share(told, found.heldout_residual_before_m3s))]
-    steps += [
-        (f"+ {title(e.effect)} ({e.where})", _share(told, e.heldout_residual_after_m3s))
-        for e in found.found
-    ]
-    last = _share(told, found.heldout_residual_after_m3s)
-    if found.found and found.negligible and not np.isclose(last, steps[-1][1], rtol=0.01):
-        steps.append(("+ what is present but negligible", last))
-    return steps
-
-
-def _floor(told: Told) -> float:
-    return _share(told, told.diagnosed.diagnosis.noise_floor_m3s)
-
-
-def _can_be_judged(told: Told) -> bool:
-    return all(np.isfinite([_floor(told), *(value for _, value in _steps(told))]))
-
-
-def _errors_figure(told: Told) -> Figure:
-    return errors(_steps(told), _floor(told), PARTS[told.judges])
-
-
-def _errors(told: Told) -> str:
-    if not _can_be_judged(told):
-        return section("Error", "<p>No flow of the record could be judged.</p>")
-    found, part, steps = told.diagnosed.diagnosis, PARTS[told.judges], _steps(told)
+def _errors(told: Told, drawn: dict[str, str]) -> str:
+    if "errors" not in drawn:
+        return section("Error", NOTHING)
+    found, part, found_steps = told.diagnosed.diagnosis, PARTS[told.judges], steps(told)
     caption = (
         f"Root mean square of measured less modelled chamber flow on the {part} of the record, "
         f"in per cent of the rms flow of {LPM * found.rms_flow_m3s:.3g} "
-        f"L/min: {steps[0][1]:.2f} % for the model as it is"
+        f"L/min: {found_steps[0][1]:.2f} % for the model as it is"
     )
-    caption += f", {steps[-1][1]:.2f} % with everything that was found." if found.found else "."
-    caption += f" Dashed: what the sensors' noise alone leaves, {_floor(told):.2f} %."
+    caption += (
+        f", {found_steps[-1][1]:.2f} % with everything that was found." if found.found else "."
+    )
+    caption += f" Dashed: what the sensors' noise alone leaves, {floor(told):.2f} %."
     if not told.judges:
         caption += (
             " The map is known over too little of the held-out part of this record, so these "
             "errors are of the identification part."
         )
-    picture = _picture(_errors_figure(told), "error bars", caption)
-    return section(f"Error on the {part}", picture)
+    return section(f"Error on the {part}", _picture(drawn["errors"], caption))
 
 
-def _flows_figure(told: Told) -> Figure:
-    models = {BEFORE: told.before} | ({AFTER: told.after} if told.after else {})
-    return flows(told.chambers, models)
-
-
-def _flows(told: Told) -> str:
+def _flows(told: Told, drawn: dict[str, str]) -> str:
+    if "flows" not in drawn:
+        return section("Measured and modelled flow", NOTHING)
     caption = (
         "Flow into each chamber as the piston's motion measures it (dark) and as the model gives "
         "it (orange); below, the difference. The blue part taught the model, the yellow part was "
@@ -180,51 +131,39 @@ def _flows(told: Told) -> str:
     )
     if told.after:
         caption += " Left before, right with what was found, on the same scales."
-    picture = _picture(_flows_figure(told), "measured and modelled flow", caption)
-    return section("Measured and modelled flow", picture)
+    caption += " Drag to zoom in, double click for the whole record."
+    return section("Measured and modelled flow", _picture(drawn["flows"], caption))
 
 
 def _judged_s(part: Residual) -> float:
     return len(part.t_s) / ROWS_PER_S
 
 
-def _dependences_figure(told: Told) -> Figure:
-    models = {BEFORE: told.depends_before}
-    if told.depends_after:
-        models[AFTER] = told.depends_after
-    return dependences(told.chambers, models, told.diagnosed.diagnosis.noise_floor_m3s)
-
-
-def _dependences(told: Told) -> str:
+def _dependences(told: Told, drawn: dict[str, str]) -> str:
     heading = "What the residual depends on"
     if not told.depends_before:
-        return section(heading, "<p>No flow of this record could be judged.</p>")
+        return section(heading, NOTHING)
     caption = (
         "Mean residual over bins of position, pressures, the signals that explain most of it and "
-        "time, over the whole record, with its 95 % interval; in the corner the share of the "
+        "time, over the whole record, with its 95 % interval; above each the share of the "
         "residual's variance that the bins explain. "
-        "A trend says what the model misses; a right model lies on the zero line. The grey band is "
-        "the rms of the sensors' noise."
+        "A trend says what the model misses; a right model lies on the zero line. The sensors' "
+        f"noise is {LPM * told.diagnosed.diagnosis.noise_floor_m3s:.2g} L/min rms."
     )
-    return section(heading, _picture(_dependences_figure(told), "residual by signal", caption))
+    return section(heading, _picture(drawn["dependences"], caption))
 
 
-def _ranking_figure(told: Told) -> Figure:
-    ranks = [Rank(named(r.key), r.before, r.after) for r in told.ranking[:RANKED]]
-    return ranking(ranks, float(np.sqrt(GAIN)))
-
-
-def _ranking(told: Told) -> str:
+def _ranking(told: Told, drawn: dict[str, str]) -> str:
     if not told.ranking:
         return section("Candidates", "<p>This record holds no candidate.</p>")
     caption = (
         "How clearly the record shows each effect when it is added alone to the model: its "
-        "coefficient in standard deviations. "
+        "coefficient in standard deviations (bar: logarithmic). "
     )
     caption += (
         "While something large is missing, many effects imitate it; "
-        "the squares show what is left of them once the effect in orange is part of the model. A "
-        f"square right of the dashed line was not added where it changes less than "
+        "→ is what is left of them once the effect in orange is part of the model. What is "
+        f"beyond {np.sqrt(GAIN):g} even then was not added where it changes less than "
         f"{100 * MATERIAL:g} % of the rms flow, explains little of what is left, or has an "
         "impossible sign or size."
         if told.after
@@ -232,7 +171,7 @@ def _ranking(told: Told) -> str:
     )
     return section(
         "Candidates",
-        _picture(_ranking_figure(told), "ranking of the candidates", caption),
+        _picture(drawn["ranking"], caption),
         candidates(told.ranking[:RANKED]),
     )
 

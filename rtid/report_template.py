@@ -10,13 +10,14 @@ PAGE = Template("""\
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <meta name="color-scheme" content="light dark">
 <title>$title</title>
+$head
 <style>
 :root { color-scheme: light dark; --ink: #22272b; --quiet: #5c656c; --line: #d9dde0; --paper: #fff;
-  --card: #f5f7f8; --good: #00805c; --found: #b84f00; --open: #7a5b00; }
+  --card: #f5f7f8; --good: #00805c; --found: #b84f00; --open: #7a5b00;
+  --bar: #0072b2; --before: #d55e00; }
 @media screen and (prefers-color-scheme: dark) {
   :root { --ink: #e3e6e8; --quiet: #a3abb1; --line: #3a4146; --paper: #14181b; --card: #1d2327;
-    --good: #4fc79f; --found: #f5995b; --open: #e3bd55; }
-  img { filter: invert(1) hue-rotate(180deg); }
+    --good: #4fc79f; --found: #f5995b; --open: #e3bd55; --bar: #56b4e9; --before: #f5995b; }
 }
 body { margin: 0; background: var(--paper); color: var(--ink);
   font: 16px/1.5 system-ui, "Segoe UI", "DejaVu Sans", Helvetica, Arial, sans-serif; }
@@ -32,7 +33,7 @@ h1.good { color: var(--good); } h1.found { color: var(--found); } h1.open { colo
 .figures span { color: var(--quiet); font-size: 13px; }
 section { margin-top: 36px; border-top: 1px solid var(--line); padding-top: 6px; }
 h2 { font-size: 20px; margin: 12px 0 10px; } h3 { font-size: 16px; margin: 22px 0 8px; }
-figure { margin: 0; } img { display: block; width: 100%; height: auto; }
+figure { margin: 0; } td.n { white-space: nowrap; text-align: right; }
 figcaption { color: var(--quiet); font-size: 14px; max-width: 90ch; margin: 8px 0 14px; }
 .wide { overflow-x: auto; }
 table { border-collapse: collapse; width: 100%; font-size: 14px;
@@ -52,6 +53,8 @@ td { border-bottom: 1px solid var(--line); }
 </head>
 <body>
 <main>
+<noscript><p>The plots over time and over signals need JavaScript, which this file brings along.</p>
+</noscript>
 <p class="eyebrow">$title</p>
 <h1 class="$kind">$headline</h1>
 <div class="verdict">$sentences</div>

@@ -10,7 +10,8 @@ from typing import Any
 from rtid.errors import RtidError
 from rtid.pictures import save
 from rtid.project import Project
-from rtid.report_page import page, stills
+from rtid.report_page import page
+from rtid.report_stills import stills
 from rtid.report_story import Progress, Told, tell
 
 

@@ -5,9 +5,12 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from enum import IntEnum
+from importlib.util import find_spec
 from pathlib import Path
 
 import typer
+
+from rtid.errors import RtidError
 
 
 class Exit(IntEnum):
@@ -29,3 +32,9 @@ def refuse_truncated(trace: Path, counters: Mapping[str, int]) -> None:
             file=sys.stderr,
         )
         raise typer.Exit(Exit.INPUT)
+
+
+def refuse_without_bokeh() -> None:
+    """RtidError where the pictures of page and report cannot be made."""
+    if find_spec("bokeh") is None:
+        raise RtidError("its pictures need bokeh", "pip install 'rtid[ui]'", Exit.USAGE)

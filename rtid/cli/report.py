@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from rtid.cli.exits import refuse_truncated
+from rtid.cli.exits import refuse_truncated, refuse_without_bokeh
 
 
 def report(
@@ -26,6 +26,7 @@ def report(
 
     Everything is inside the file: it can be mailed, printed and read with the network off.
     """
+    refuse_without_bokeh()
     from rtid.diagnosed_text import sentences
     from rtid.present import progress_bar
     from rtid.project import load

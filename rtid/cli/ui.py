@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from rtid.cli.exits import refuse_without_bokeh
 from rtid.errors import RtidError
 
 
@@ -39,7 +40,7 @@ def ui(
     for path in (project, trace):
         if path is not None and not path.exists():
             raise RtidError(f"{path}: no such file", "rtid ui PROJECT [TRACE]")
-    _refuse_without_bokeh()
+    refuse_without_bokeh()
     from rtid.daemon.configure import state_folder
     from rtid.project import load
     from rtid.ui.server import Workbench, serve
@@ -62,10 +63,3 @@ def ui(
         sheet=sheet,
         model=loaded.model,
     )
-
-
-def _refuse_without_bokeh() -> None:
-    from importlib.util import find_spec
-
-    if find_spec("bokeh") is None:
-        raise RtidError("the page needs bokeh", "pip install 'rtid[ui]'", 2)

@@ -12,19 +12,18 @@ from bokeh.models import UIElement
 from rtid.colours import BLUE, ORANGE
 from rtid.compare import FREE_RUN, BlockRow
 from rtid.diagnose.report import Value
-from rtid.diagnosed_text import quantity, title
+from rtid.diagnosed_text import title
 from rtid.project.added import AddedSection
+from rtid.report_sizes import size
 from rtid.report_words import text
 from rtid.ui.blocks import LARGEST, ML_PER_MIN, Quantity, quantities, round_up
 from rtid.ui.compare_view import NAMES, flows_of, pressures_of
-from rtid.ui.fragments import button, table
+from rtid.ui.fragments import button, error_bars, table
 from rtid.ui.lines import Lines
 from rtid.ui.look import Look
 from rtid.ui.session import Revision, Session
 from rtid.ui.theme import INK_TAG
 from rtid.ui.time_plots import TimePlots
-
-INSIDE = 25.0  # % of the track from which a bar has its figure inside
 
 
 class AddView:
@@ -104,34 +103,21 @@ def name_of(revision: Revision, number: int) -> str:
 def bars(session: Session) -> str:
     """The error of every revision against the sensors' floor, and what can be done."""
     shown, floor = errors_of(session)
-    known = [value for _, value, _ in shown if isfinite(value)]
-    if not known:
+    if not any(isfinite(value) for _, value, _ in shown):
         return '<h2>The error of the model</h2><p class="says">It is being measured.</p>'
-    most = 1.12 * max(*known, floor if isfinite(floor) else 0.0)
-    rows, before = "", 100.0
-    for k, (name, value, is_foretold) in enumerate(shown):
-        width = 100 * value / most if isfinite(value) else 0.0
-        kind = "first" if k == 0 and len(shown) > 1 else "foretold" if is_foretold else ""
-        rows += _bar(name, value, kind, width, before, 100 * floor / most)
-        before = width
     return (
-        f'<h2>Error on motion that the model has not seen</h2><div class="bars">{rows}</div>'
+        f"<h2>{_heading(session)}</h2>{error_bars(shown, floor)}"
         f'<p class="key">in % of the rms flow; dashed: what the sensors alone leave, '
         f"{floor:.2f} %</p>{_actions(session)}{_planes(session)}{_effects(session)}"
         f"{_history(session, shown)}"
     )
 
 
-def _bar(name: str, value: float, kind: str, width: float, start: float, floor: float) -> str:
-    """One bar, `width` % of the track; it grows or shrinks from `start`."""
-    is_long = width > INSIDE
-    place = f"right:{100 - width:.2f}%" if is_long else f"left:{width:.2f}%"
-    return (
-        f'<div class="name">{text(name)}</div><div class="track"><div class="bar {kind}" '
-        f'style="width:{width:.2f}%;--from:{start:.2f}%" data-error="{value:.4f}"></div>'
-        f'<span class="{"in" if is_long else ""}" style="{place}">{value:.2f} %</span>'
-        f'<div class="floor" style="left:{floor:.2f}%"></div></div>'
-    )
+def _heading(session: Session) -> str:
+    told = [r.told for r in session.revisions if r.told]
+    if told and not told[0].diagnosis.held_out_judged:
+        return "Error on the motion that taught the model"
+    return "Error on motion that the model has not seen"
 
 
 def _planes(session: Session) -> str:
@@ -204,7 +190,7 @@ def _sizes(section: AddedSection) -> str:
     return text(
         ", ".join(
             f"{name.replace('_', ' ')} "
-            f"{quantity(Value(p.value, p.sd if p.sd is not None else float('nan'), p.unit))}"
+            f"{size(Value(p.value, p.sd if p.sd is not None else float('nan'), p.unit))}"
             for name, p in section.parameters.items()
         )
     )
@@ -226,19 +212,26 @@ def _history(session: Session, shown: list[tuple[str, float, bool]]) -> str:
 def sentence(session: Session) -> str:
     """What the picture says and what to do next."""
     shown, floor = errors_of(session)
+    measured = '<b style="color:var(--ink)">—</b> measured'
     if len(session.revisions) > 1:
         before, after = shown[len(session.revisions) - 2][1], shown[len(session.revisions) - 1][1]
+        kept = session.revisions[-1].is_saved
         return (
-            f"Orange: before the last change, blue: after it; black: measured. The held-out error "
-            f"went from {before:.2f} % to {after:.2f} %, the sensors' floor is {floor:.2f} %. The "
-            "project file is as it was until you save."
-        )
+            f'{measured}, <b style="color:{ORANGE}">—</b> before the last change, '
+            f'<b style="color:{BLUE}">—</b> after it. The error went from {before:.2f} % to '
+            f"{after:.2f} %, the sensors' floor is {floor:.2f} %. "
+            + ("The project file has it." if kept else "Next: save, or undo; the project file is "
+               "as it was until you save.")
+        )  # fmt: skip
+    now = f'{measured}, <b style="color:{ORANGE}">—</b> the model as it is'
     if session.named is not None:
         return (
-            "Orange: what the model leaves now; black: measured. Add what the diagnosis names, and "
-            "see how much of it goes. Nothing is written until you save; undo takes it back."
+            f"{now}. Next: add what the diagnosis names, and see how much of its error goes. "
+            "Nothing is written until you save; undo takes it back."
         )
+    if session.last is None or session.last.told is None:
+        return f"{now}. What is missing is being looked for."
     return (
-        "Orange: what the model leaves; black: measured. The diagnosis names nothing to add; "
-        "Why has a button to try any effect all the same."
+        f"{now}. The diagnosis names nothing to add; <b>Why</b> has a button to try any effect "
+        "all the same."
     )

@@ -8,7 +8,7 @@ from bokeh.models import Title, UIElement
 from bokeh.plotting import figure
 
 from rtid.colours import BLUE, ORANGE
-from rtid.compare import FREE_RUN, HORIZONS_S, Simulation
+from rtid.compare import FREE_RUN, HORIZONS_S, Comparison, Simulation
 from rtid.model import FloatArray
 from rtid.ui.fragments import button, choice
 from rtid.ui.lines import Columns, Lines
@@ -17,7 +17,7 @@ from rtid.ui.theme import INK_TAG
 from rtid.ui.time_plots import TimePlots
 from rtid.units import KPA, LPM, MPA
 
-NAMES = {"identification": "identification", "validation": "held out"}
+NAMES = {"identification": "identification", "validation": "held-out"}
 RUNS = list(HORIZONS_S)
 
 
@@ -70,7 +70,7 @@ class CompareView:
         if not self.has_runs:
             return f"chamber {name}: flow"
         fits = ", ".join(
-            f"{part.runs[self.run].fit_percent[c]:.1f} % {NAMES.get(title, title)}"
+            f"{_fit(part.runs[self.run].fit_percent[c])} {NAMES.get(title, title)}"
             for title, part in self.look.parts.items()
             if part.runs
         )
@@ -89,22 +89,39 @@ class CompareView:
         return {"compare_tools": tools, "compare_says": self._sentence()}
 
     def _sentence(self) -> str:
-        shares = {
-            NAMES.get(t, t): 100 * float(np.sqrt(np.mean(p.equation.residual_share**2)))
-            for t, p in self.look.parts.items()
-            if len(p.equation.t_s)
-        }
-        left = " and ".join(f"{v:.2g} % ({n})" for n, v in shares.items())
-        text = (
-            f"The learned map leaves <b>{left}</b> of the flow unexplained (lower plots). In the "
-            "upper plots the model runs on its own pressures: what it gets wrong adds up. "
+        left = " and ".join(
+            f"{_left(part.equation)} ({NAMES.get(title, title)})"
+            for title, part in self.look.parts.items()
+            if len(part.equation.t_s)
         )
-        return text + "Next: <b>Where</b> shows in which part of which valve's map it fails."
+        text = (
+            f"The learned map leaves <b>{left}</b> of the flow unexplained (lower plots), blocks "
+            "without data included, which the verdict leaves out. "
+        )
+        if self.has_runs and self.run == FREE_RUN:
+            text += "Above, the model runs on its own pressures: what it gets wrong adds up. "
+        elif self.has_runs:
+            text += f"Above, the model starts from the measured pressures and runs {self.run}. "
+        return text + "Next: <b>Where</b> shows in which part of which valve's map the rest is."
 
 
-def flow_plots(time: TimePlots, view: str, lines: Lines, c: int, title: str) -> list[figure]:
+def _fit(percent: float) -> str:
+    """Of a free run that has left the record no decimals are told."""
+    return f"{percent:.1f} %" if percent > -100 else "below -100 %"
+
+
+def _left(part: Comparison) -> str:
+    """Residual over flow of all chambers together."""
+    flow = float(np.sqrt(np.mean(part.measured_m3s**2)))
+    share = 100 * float(np.sqrt(np.mean(part.residual_m3s**2))) / flow if flow > 0 else np.nan
+    return f"{share:.2g} %" if share < 99.5 else "all"
+
+
+def flow_plots(
+    time: TimePlots, view: str, lines: Lines, c: int, title: str, is_last: bool = True
+) -> list[figure]:
     """Measured and modelled flow of a chamber, and what is left below."""
-    made = [time.plot(view, "L/min", title, False), time.plot(view, "L/min")]
+    made = [time.plot(view, "L/min", title, False), time.plot(view, "L/min", "", is_last)]
     lines.add(made[0], f"measured {c}", INK_TAG, 1.4)
     lines.add(made[0], f"model {c}", ORANGE, 1.0)
     lines.add(made[1], f"left {c}", BLUE, 0.8)

@@ -36,8 +36,10 @@ class DependencePlot:
             self.root.add_layout(whisker)
             self._bins.append(source)
 
-    def show(self, found: Dependence) -> None:
-        """The residual over one signal."""
+    def show(
+        self, found: Dependence, what: str = "residual", beside: Dependence | None = None
+    ) -> None:
+        """The residual over one signal; beside: another that has the same scale."""
         unit, factor = UNITS.get(found.unit, (found.unit, 1.0))
         x = found.centre * factor
         mean, error = found.mean_m3s * LPM, Z95 * found.error_m3s * LPM
@@ -45,15 +47,21 @@ class DependencePlot:
             low, high = mean[:, c] - error[:, c], mean[:, c] + error[:, c]
             source.data = {"x": x, "mean": mean[:, c], "low": low, "high": high}
         self._x.update(**_reach(x))
-        self._y.update(**_reach(np.concatenate([mean - error, mean + error]).ravel()))
+        shown = [found] if beside is None else [found, beside]
+        self._y.update(**_reach(np.concatenate([_ends(one) for one in shown])))
         shares = ", ".join(
             f"{100 * share:.0f} % of {name} ({shape})"
             for name, share, shape in zip(
                 self._chambers, found.explained, ("round", "square"), strict=False
             )
         )
-        self.root.title.text = f"residual over {found.signal}, which explains {shares}"
+        self.root.title.text = f"{what} over {found.signal}: explains {shares}"
         self.root.xaxis.axis_label = f"{found.signal} in {unit}" if unit else found.signal
+
+
+def _ends(found: Dependence) -> FloatArray:
+    mean, error = found.mean_m3s * LPM, Z95 * found.error_m3s * LPM
+    return np.concatenate([mean - error, mean + error]).ravel()
 
 
 def _reach(values: FloatArray) -> dict[str, float]:

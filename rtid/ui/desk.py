@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from rtid.beside import learned_beside
 from rtid.compare import Reference
 from rtid.comparing import find_reference
 from rtid.diagnose.clean import as_measured, usable
@@ -30,7 +31,7 @@ from rtid.report_story import Ranked, ranked
 from rtid.reporting import report
 from rtid.revised_sections import errors_between, extended
 from rtid.revising import change_of
-from rtid.ui.look import Look, look, revised
+from rtid.ui.look import Look, look
 
 FORMATS = ("csv", "json", "npz")
 Progress = Callable[[str, float], None]
@@ -116,7 +117,7 @@ class Desk:
         standing = None
         if sections:
             standing = stand(self._machine, *self._chunks, added_parts(self._project))
-            shown = revised(self._replay, standing.fit)
+            shown = learned_beside(self._replay, standing.fit, [a.key for a in sections])
         solution = shown.fit.solution
         first = _Revision(sections, look(shown), solution, is_saved=True, standing=standing)
         self._stack = [first]
@@ -172,7 +173,8 @@ class Desk:
         self._progress("fitting without it", 0.2)
         after = stand(self._machine, *self._chunks, _parts(kept))
         errors = errors_between(present, after)
-        result = revised(self._replay, after.fit) if kept else self._replay
+        keys = [a.key for a in kept]
+        result = learned_beside(self._replay, after.fit, keys) if kept else self._replay
         seen, section = look(result), gone.model_copy(update={"errors": errors})
         solution = result.fit.solution
         self._stack.append(_Revision(kept, seen, solution, DROP, section, standing=after))
@@ -240,7 +242,8 @@ class Desk:
                 self._progress("fitting with the effect", 0.3)
                 extension = extend(present, effect, where)
             self._progress("learning the maps again", 0.6)
-            result = revised(self._replay, extension.after.fit)
+            keys = [*(a.key for a in last.sections), key]
+            result = learned_beside(self._replay, extension.after.fit, keys)
             last.ready[key] = extension, result, look(result)
         return last.ready[key]
 

@@ -5,8 +5,62 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
+from math import isfinite, log10
+from pathlib import Path
 
 from rtid.report_words import text
+
+INSIDE = 25.0  # % of the track from which a bar has its figure inside
+TENS = 99.5  # standard deviations from which no decimals are told
+WIDEST = 150.0  # pixels of the longest bar of a ranking
+
+
+def static(*names: str) -> str:
+    """Style sheets or scripts of the page, one after the other."""
+    return "".join((Path(__file__).parent / "static" / n).read_text("utf-8") for n in names)
+
+
+def error_bars(shown: Sequence[tuple[str, float, bool]], floor: float) -> str:
+    """Name, error in % and whether it is only expected, against the sensors' floor in %."""
+    known = [value for _, value, _ in shown if isfinite(value)]
+    most = 1.12 * max(*known, floor if isfinite(floor) else 0.0, 1e-9)
+    rows, before = "", 100.0
+    for k, (name, value, is_foretold) in enumerate(shown):
+        width = 100 * value / most if isfinite(value) else 0.0
+        kind = "first" if k == 0 and len(shown) > 1 else "foretold" if is_foretold else ""
+        rows += _bar(name, value, kind, width, before, 100 * floor / most)
+        before = width
+    return f'<div class="bars">{rows}</div>'
+
+
+def _bar(name: str, value: float, kind: str, width: float, start: float, floor: float) -> str:
+    """One bar, `width` % of the track; it grows or shrinks from `start`."""
+    is_long = width > INSIDE
+    place = f"right:{100 - width:.2f}%" if is_long else f"left:{width:.2f}%"
+    return (
+        f'<div class="name">{text(name)}</div><div class="track"><div class="bar {kind}" '
+        f'style="width:{width:.2f}%;--from:{start:.2f}%" data-error="{value:.4f}"></div>'
+        f'<span class="{"in" if is_long else ""}" style="{place}">{value:.2f} %</span>'
+        f'<div class="floor" style="left:{floor:.2f}%"></div></div>'
+    )
+
+
+def clearness(before: float | None, after: float | None, most: float) -> tuple[str, str]:
+    """How clearly a record shows an effect, in standard deviations, as words and as a bar.
+
+    after: once the found one is in the model; None: it is the found one, or none was.
+    """
+    value = before if before is not None else after or 0.0
+    width = WIDEST * _log(value) / max(_log(most), 1e-9)
+    own = " own" if after is None else ""
+    words = f"{value:.3g}" if value < TENS else f"{value:.0f}"
+    if after is not None and abs(after - value) > 0.05 * value:
+        words += f" → {after:.2g}"
+    return words, f'<span class="clear{own}" style="width:{width:.0f}px"></span>'
+
+
+def _log(value: float) -> float:
+    return log10(max(value, 1.0)) if value >= 1 else 0.02
 
 
 def button(label: str, do: str, *, kind: str = "", off: bool = False, **data: str) -> str:

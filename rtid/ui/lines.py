@@ -7,6 +7,7 @@ server.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 from bokeh.models import ColumnDataSource
@@ -24,12 +25,12 @@ class Lines:
 
     def __init__(self) -> None:
         self.whole = ColumnDataSource({"t": []})
-        self._names: set[str] = set()
+        self._drawn: dict[str, list[ColumnDataSource]] = {}
 
     def add(self, made: figure, name: str, colour: str, width: float) -> None:
         """Draw the column `name` in a plot."""
-        self._names.add(name)
         drawn = ColumnDataSource({"t": [], "y": []}, tags=[self.whole, name])
+        self._drawn.setdefault(name, []).append(drawn)
         line = made.line("t", "y", source=drawn, line_width=width)
         line.glyph.line_color = INK if colour == INK_TAG else colour
         line.nonselection_glyph = None
@@ -38,8 +39,21 @@ class Lines:
 
     def show(self, parts: Iterable[tuple[FloatArray, Columns]]) -> None:
         """Times (n,) and columns (n,) of every part of the record; none: nothing is drawn."""
-        wanted = ((t, {k: v for k, v in y.items() if k in self._names}) for t, y in parts)
+        wanted = ((t, {k: v for k, v in y.items() if k in self._drawn}) for t, y in parts)
         self.whole.data = joined(wanted)
+        for name, sources in self._drawn.items():
+            for drawn in sources:
+                if drawn.document is None:  # from then on, it is the page that draws
+                    drawn.data = _corners(self.whole.data, name)
+
+
+def _corners(whole: Mapping[str, Any], name: str) -> dict[str, list[float]]:
+    """Two ends of a line that are not joined: a new plot has the right axes at once."""
+    t, y = whole["t"], whole.get(name, np.empty(0))
+    if not np.isfinite(y).any():
+        return {"t": [], "y": []}
+    low, high = float(np.nanmin(y)), float(np.nanmax(y))
+    return {"t": [t[0], t[0], t[-1]], "y": [low, np.nan, high]}
 
 
 def joined(parts: Iterable[tuple[FloatArray, Columns]]) -> dict[str, FloatArray]:

@@ -1,11 +1,11 @@
 """One revision of the model held against a record: plain arrays, from which pictures are made.
 
-A revision with effects is learned beside them (`compare.beside`), as `rtid compare` does it.
+A revision with effects is learned beside them (`rtid.beside`), as `rtid compare` does it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from rtid.compare import (
     HORIZONS_S,
@@ -21,11 +21,8 @@ from rtid.compare import (
     simulate,
     smooth_position,
 )
-from rtid.compare.beside import acting, learn_beside
 from rtid.compare.simulation import why_no_free_run
 from rtid.comparing import parts_of
-from rtid.diagnose.clean import usable
-from rtid.diagnose.fit import Fit
 from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.published import publish
 from rtid.model import FloatArray, Model
@@ -77,11 +74,3 @@ def look(result: Replay) -> Look:
         parts[title] = Part(equation, runs, depends, block_rows(solution, equation, flowmap))
     beta, sd = solution.beta_pa, solution.beta_sd_pa
     return Look(result.model, parts, flowmap, beta, sd, result.fit.lag_s)
-
-
-def revised(first: Replay, fit: Fit) -> Replay:
-    """The record learned from anew, beside the effects and timings of a fitted revision."""
-    machine = acting(fit, usable(fit.declared, first.chunk))
-    result = replace(first, model=machine.model, chunk=machine.chunk)
-    record = learn_beside(fit, machine, result.part(first.identification_s))
-    return replace(result, fit=record)

@@ -109,9 +109,9 @@ class MapView:
         valid = float(np.mean(self.flowmap[self.edge].status == VALID))
         says = (
             f"Valve <b>{text(self.edge)}</b>: outlined blocks ({100 * valid:.0f} % of the grid) "
-            "stand on their own data, the others follow the orifice law from these, dashed in the "
-            "slices; their interval says how far to trust them. Next: hold it beside a reference "
-            "or another valve, or export it."
+            "stand on their own data; the others (dashed in the slices, in brackets in the table) "
+            "follow the orifice law from these, and their interval says how far to trust them. "
+            "Next: hold it beside a reference or another valve, or export it."
         )
         return {"map_tools": tools, "map_says": says + self._table()}
 
@@ -136,7 +136,7 @@ class MapView:
             (f"{d * MPA:g} MPa", *(cells[i * len(ps) + j] for i in range(len(us))))
             for j, d in enumerate(ps)
         ]
-        head = ("Table 1, L/min ± 95 %" + (f" | {self.beside}" if other else ""),
+        head = ("flow in L/min ± 95 %" + (f" | {self.beside}" if other else ""),
                 *(f"{w:g} V" for w in us))  # fmt: skip
         return table(head, rows)
 

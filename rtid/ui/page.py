@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bokeh.core.properties import Dict, String
@@ -15,7 +14,7 @@ from bokeh.layouts import column
 from bokeh.model import DataModel
 from jinja2 import Environment, Template
 
-from rtid.ui.fragments import changed, cover, parsed
+from rtid.ui.fragments import changed, cover, parsed, static
 from rtid.ui.live import Live
 from rtid.ui.session import FAILED, Session
 from rtid.ui.verdict import record_line, strip, work_line
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
     from rtid.ui.desk_views import DeskViews
 
 PAUSE_MS = 1500  # between views that are made ahead
-STATIC = Path(__file__).parent / "static"
 VIEWS = ("compare", "where", "why", "add", "map", "live")
 ROOTS = ("compare", "where_maps", "where_time", "add", "map")
 
@@ -46,7 +44,7 @@ def build(doc: Document, session: Session, live: Live) -> None:
 @cache
 def _template() -> Template:
     """The page's frame; style and script are part of it."""
-    return Environment(autoescape=False).from_string((STATIC / "page.html").read_text("utf-8"))
+    return Environment(autoescape=False).from_string(static("page.html"))
 
 
 class Page:
@@ -68,8 +66,8 @@ class Page:
         doc.title = f"rtid: {(session.trace or session.project).name}"
         doc.template = _template()
         doc.template_variables.update(
-            css=(STATIC / "page.css").read_text("utf-8"),
-            js="".join((STATIC / name).read_text("utf-8") for name in ("plots.js", "page.js")),
+            css=static("page.css", "plots.css"),
+            js=static("plots.js", "page.js"),
             views=VIEWS,
             first=self._view,
         )

@@ -29,7 +29,8 @@ class TimePlots:
     """Plots over time that are zoomed together.
 
     Each view has a range of its own, which takes over what the view before it has seen: what is
-    hidden costs nothing while somebody zooms.
+    hidden costs nothing while somebody zooms.  Without `on_span` there is nobody to tell of a
+    selected span, and the wheel scrolls: a report.
     """
 
     def __init__(
@@ -52,9 +53,11 @@ class TimePlots:
         zoom, select = BoxZoomTool(dimensions="width"), BoxSelectTool(dimensions="width")
         select.overlay.fill_color, select.overlay.fill_alpha = LIT, 0.2
         wheel = WheelZoomTool(dimensions="width")
-        tools = [zoom, select, wheel, "xpan"]
+        tools = [zoom, select, wheel, "xpan"] if self._on_span else [zoom]
         made = plot(label, x_range=self._range(view), title=title, tools=tools)
-        made.toolbar.active_drag, made.toolbar.active_scroll = zoom, wheel
+        made.toolbar.active_drag = zoom
+        if self._on_span:
+            made.toolbar.active_scroll = wheel
         made.vstrip(
             x0="x0", x1="x1", source=self._lit, fill_color=LIT, fill_alpha=0.35, line_color=LIT,
             line_alpha=0.8, line_width=0.8,
@@ -63,7 +66,7 @@ class TimePlots:
         if is_last:
             made.xaxis.axis_label = "time in s"
         else:
-            made.xaxis.visible = False
+            made.xaxis.visible, made.min_border_bottom = False, 8
         if self._on_span is not None:
             made.on_event(SelectionGeometry, self._selected)
         self._plots.append(made)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import isfinite
+
 from rtid.project.history import ADD
 from rtid.report_words import VERDICTS, text
 from rtid.ui.fragments import button
@@ -37,37 +39,39 @@ def strip(session: Session) -> str:
     if session.state == FAILED or session.trace is None:
         return ""
     if last is not None and last.section is not None and (last.told is None or last.note):
-        return _changed(last)
+        return _changed(session, last)
     if last is None or last.told is None:
         heading = "Looking for what is missing" if last else "Opening the record"
         return f"<h1>{heading}</h1><p>{_waiting(session)}</p>"
-    from rtid.diagnosed_text import sentences, title  # noqa: PLC0415 - the live page needs none
+    from rtid.diagnosed_text import title  # noqa: PLC0415 - the live page needs none
+    from rtid.ui.verdict_words import said  # noqa: PLC0415
 
     found = last.told.diagnosis
     kind, heading = VERDICTS[found.verdict]
-    words = sentences(found)
-    names = tuple(title(e.effect) for e in found.found)
-    said = text(" ".join([s for s in words if s.startswith(names)][:1] if names else words[:2]))
+    words = said(found)
     offer = ""
     if session.named is not None:
         effect, where = session.named
         label = f"Add {title(effect).lower()}"
         offer = button(label, "add", kind="main", effect=effect, where=where)
+    elif found.found and found.found[0].cannot_be_told_from:
+        offer = button("Choose", "go", name="why")
     elif len(session.revisions) > 1 and not last.is_saved:
         offer = button("Save to project", "save", kind="main") + button("Undo", "undo")
-    return f'<h1 class="{kind}">{text(heading)}</h1><p>{said}</p>{offer}'
+    return f'<h1 class="{kind}">{text(heading)}</h1><p>{text(words)}</p>{offer}'
 
 
-def _changed(last: Revision) -> str:
+def _changed(session: Session, last: Revision) -> str:
     """The change, before the new model is diagnosed, and where something speaks against it."""
     from rtid.diagnosed_text import title  # noqa: PLC0415 - the live page needs none
+    from rtid.ui.add_view import errors_of  # noqa: PLC0415
 
     section = last.section
-    pair = section.errors.heldout_pct if section else None
+    errors = [value for _, value, is_foretold in errors_of(session)[0] if not is_foretold]
     heading = "Added" if last.change == ADD else "Dropped"
     words = f"{title(section.effect)} at {section.where}. " if section else ""
-    if pair and pair.before is not None and pair.after is not None:
-        words += f"The held-out error went from {pair.before:.2f} % to {pair.after:.2f} %. "
+    if isfinite(errors[-2]) and isfinite(errors[-1]):
+        words += f"The error went from {errors[-2]:.2f} % to {errors[-1]:.2f} %. "
     if last.note:
         undo = "" if last.is_saved else button("Undo", "undo", kind="main")
         return (

@@ -20,6 +20,7 @@ from rtid.ui.fragments import button, choice, select
 from rtid.ui.lines import Lines
 from rtid.ui.look import Look
 from rtid.ui.time_plots import TimePlots
+from rtid.units import MPA
 
 
 class WhereView:
@@ -143,9 +144,13 @@ class WhereView:
             return f"{self.words}{hatched}"
         worst = self.worst
         if worst is None:
-            return "No block was visited in this part."
+            return (
+                "No valve was open in this part of the record, so no block can be judged. Next: "
+                "choose the other part above, or record a motion that opens the valves."
+            )
         return (
-            f"The block <b>{text(worst.edge)} {worst.u_v[0]:g} to {worst.u_v[1]:g} V</b> holds "
+            f"The block <b>{text(worst.edge)}, {worst.u_v[0]:g} to {worst.u_v[1]:g} V, "
+            f"{worst.dp_pa[0] * MPA:.3g} to {worst.dp_pa[1] * MPA:.3g} MPa</b> holds "
             f"{100 * worst.residual_share:.0f} % of the residual of its chambers. Click a block: "
             "its time spans light up here and in Compare; drag a span: its blocks are outlined. "
             f"A map that fails everywhere alike lacks an effect, not data: see <b>Why</b>.{hatched}"

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from math import log10
+from re import sub
 
 from rtid.diagnose.report import Diagnosis, Effect, Unseen, Value
-from rtid.diagnosed_text import quantity, sentences, title
+from rtid.diagnosed_text import title
 from rtid.effects import catalogue
 from rtid.effects import effect as page_of
 from rtid.effects.page import Effect as Page
 from rtid.effects.page import EffectError, readable
+from rtid.report_sizes import KEPT, limit, size
 from rtid.report_story import Ranked
 from rtid.report_tables import named
 from rtid.report_words import VERDICTS, text
 from rtid.ui.desk import Told
-from rtid.ui.fragments import button, table
+from rtid.ui.fragments import button, clearness, table
+from rtid.ui.verdict_words import judged, said, share
+from rtid.units import PRACTICAL
 
 MOST = 18  # candidates that are shown
-TENS = 99.5  # standard deviations from which no decimals are told
-WIDEST = 150.0  # pixels of the longest bar
-NAN = float("nan")
 
 
 def fragments(told: Told | None, page: str, may_add: bool) -> dict[str, str]:
@@ -28,10 +28,13 @@ def fragments(told: Told | None, page: str, may_add: bool) -> dict[str, str]:
         waiting = '<p class="says">Every known effect is being held beside the model.</p>'
         return {"why_ranking": waiting, "why_page": effect_page(page)}
     found = told.diagnosis
-    parts = [*(_found(found, e) for e in found.found), _ranking(told, may_add), *_unseen(found)]
+    parts = [_found(found, e) for e in found.found]
+    if found.verdict != "insufficient_data":
+        parts.append(_ranking(told, may_add))
+    parts += _unseen(found)
     if not found.found:
         kind, heading = VERDICTS[found.verdict]
-        words = " ".join(sentences(found)[:3])
+        words = f"{said(found)}{_present(found)}"
         parts.insert(0, f'<div class="card"><h2 class="{kind}">{heading}</h2>{text(words)}</div>')
     chosen = page or next((e.effect for e in found.found), "")
     return {"why_ranking": "".join(parts), "why_page": effect_page(chosen)}
@@ -41,8 +44,10 @@ def _link(name: str, label: str) -> str:
     return button(label, "page", kind="link", name=name) if name in catalogue() else text(label)
 
 
-def _share(found: Diagnosis, residual_m3s: float) -> str:
-    return f"{100 * residual_m3s / found.rms_flow_m3s:.2f} %"
+def _present(found: Diagnosis) -> str:
+    """What is there and changes next to nothing."""
+    names = ", ".join(named((s.effect, s.where)) for s in found.negligible)
+    return f" Too small to matter, if there at all: {names}." if names else ""
 
 
 def _found(found: Diagnosis, effect: Effect) -> str:
@@ -58,9 +63,9 @@ def _found(found: Diagnosis, effect: Effect) -> str:
     )
     return (
         f'<div class="card"><h2 class="found">{_link(effect.effect, title(effect.effect))} '
-        f"at {text(effect.where)}</h2><dl>{sizes}<dt>held-out error</dt><dd>"
-        f"{_share(found, before)} → <b>{_share(found, after)}</b> of the rms flow; the sensors' "
-        f"floor is {_share(found, found.noise_floor_m3s)}</dd><dt>explains as much</dt>"
+        f"at {text(effect.where)}</h2><dl>{sizes}<dt>{judged(found)}</dt><dd>"
+        f"{share(found, before)} → <b>{share(found, after)}</b> of the rms flow; the sensors' "
+        f"floor is {share(found, found.noise_floor_m3s)}</dd><dt>explains as much</dt>"
         f"<dd>{text(told_apart)}</dd><dt>by chance</dt><dd>"
         f"{_chance(effect.p_value)}</dd></dl>{_choices(effect)}</div>"
     )
@@ -83,43 +88,47 @@ def _choices(effect: Effect) -> str:
 
 
 def _interval(value: Value) -> str:
-    """With its 95 % interval."""
-    if value.std != value.std:
-        return quantity(value)
-    return quantity(Value(value.value, 1.96 * value.std, value.unit)) + " (95 %)"
+    """With its 95 % interval; a coefficient in SI too, as the project file has it."""
+    known = "" if value.std != value.std else " (95 %)"
+    si = ""
+    if value.unit in PRACTICAL and value.unit not in KEPT:
+        si = f", {value.value:.4g} {value.unit}"
+    return f"{size(value)}{known}{si}"
 
 
 def _ranking(told: Told, may_add: bool) -> str:
     """All candidates by how clearly the record shows each, with a button to add it."""
     most = max((r.before or r.after or 0.0 for r in told.ranking), default=1.0) or 1.0
     rows = [_rank(one, most, may_add) for one in told.ranking[:MOST]]
-    head = ("effect", "how clearly|", "", "size", "")
+    head = ("effect", "how clearly|", "", "size ± 95 %", "")
     says = (
         "How clearly the record shows each effect when it is added alone: its coefficient in "
-        "standard deviations (bar: logarithmic). While something large is missing, many effects "
-        "imitate it; → is what is left of them once the orange one is in the model. "
-        "Next: add what is found, or open an effect's page."
+        "standard deviations (bar: logarithmic). "
     )
+    if told.diagnosis.found:
+        says += (
+            "While something large is missing, many effects imitate it; → is what is left of "
+            "them once the orange one is in the model. Next: add what is found, or open a page."
+        )
+    elif told.diagnosis.verdict == "matches":
+        says += (
+            "None of them takes a material share of the error off unseen motion, however clear "
+            "it is. An effect's name opens its page."
+        )
+    else:
+        says += "None of them explains the error. An effect's name opens its page."
     return f'<h3>All candidates</h3><p class="says">{text(says)}</p>{table(head, rows)}'
 
 
 def _rank(one: Ranked, most: float, may_add: bool) -> tuple[str, ...]:
-    before = one.before if one.before is not None else one.after or 0.0
-    own = one.after is None
-    width = WIDEST * _log(before) / max(_log(most), 1e-9)
-    bar = f'<span class="clear{" own" if own else ""}" style="width:{width:.0f}px"></span>'
-    sd = f"{before:.3g}" if before < TENS else f"{before:.0f}"
-    if one.after is not None and abs(one.after - before) > 0.05 * before:
-        sd += f" → {one.after:.2g}"
-    size = quantity(Value(one.value, one.std, one.unit))
+    words, bar = clearness(one.before, one.after, most)
+    big = size(Value(one.value, one.std, one.unit))
+    if one.per_shape is not None:
+        big += f" of {limit(*one.per_shape)}"
     remark = "" if one.is_possible else ", not possible"
     can = may_add and one.is_possible
     add = button("Add", "add", effect=one.key[0], where=one.key[1]) if can else ""
-    return _link(one.key[0], named(one.key)), text(sd), bar, text(size + remark), add
-
-
-def _log(value: float) -> float:
-    return log10(max(value, 1.0)) if value >= 1 else 0.02
+    return _link(one.key[0], named(one.key)), text(words), bar, text(big + remark), add
 
 
 def _unseen(found: Diagnosis) -> list[str]:
@@ -135,9 +144,15 @@ def _unseen(found: Diagnosis) -> list[str]:
         hidden = [(*_place(u), text(u.reason)) for u in blind]
         parts.append("<h3>This record cannot show</h3>" + table(("effect", "where", "why"), hidden))
     if found.advice:
-        items = "".join(f"<li>{text(a)}</li>" for a in found.advice)
+        items = "".join(f"<li>{text(_with_titles(a))}</li>" for a in found.advice)
         parts.append(f"<h3>What motion would tell more</h3><ul>{items}</ul>")
     return parts
+
+
+def _with_titles(advice: str) -> str:
+    """Advice with the titles of effects in place of their names."""
+    known = catalogue()
+    return sub(r"[a-z]+_\w+", lambda m: title(m[0]) if m[0] in known else m[0], advice)
 
 
 def _place(unseen: Unseen) -> tuple[str, str]:
@@ -145,7 +160,7 @@ def _place(unseen: Unseen) -> tuple[str, str]:
 
 
 def _limit(unseen: Unseen) -> str:
-    return quantity(Value(unseen.detection_limit or 0.0, NAN, unseen.unit))
+    return limit(unseen.detection_limit or 0.0, unseen.unit)
 
 
 def effect_page(name: str) -> str:

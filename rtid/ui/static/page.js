@@ -73,6 +73,7 @@
     else if (button.id === "theme") turn();
     else if (button.id === "help") $("keys").showModal();
     else if (button.dataset.close) button.closest("dialog").close();
+    else if (button.dataset.do === "go") show(button.dataset.name);
     else if (button.dataset.do === "whole") plots.move(shown(), { whole: true });
     else if (button.dataset.do) {
       const { do: what, ...more } = button.dataset;
@@ -103,7 +104,7 @@
     patch(found.parts);
     drawn();
     doc.on_change((event) => {
-      if (event.kind === "ModelChanged" && event.attr === "children") setTimeout(drawn, 0);
+      if (event.kind === "ModelChanged" && event.attr === "children") { plots.follow(); setTimeout(drawn, 0); }
     });
     const view = location.hash.slice(1);
     show(document.querySelector(`nav [data-view="${view}"]`) ? view : document.body.dataset.first);
