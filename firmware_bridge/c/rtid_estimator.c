@@ -281,7 +281,7 @@ static void mean_terms(const rtid_estimator *e, const rtid_estimator_open *open,
 
 static void block_increments(rtid_estimator *e, int k, int64_t t_us, int row)
 {
-    rtid_estimator_open *open = &e->open[k];
+    const rtid_estimator_open *open = &e->open[k];
     rtid_estimator_block *block = &e->block[open->slot];
     const edge_row *edge = &EDGES[open->edge];
     const cell_row *cell = &CELLS[cell_of(open->edge, open->u, open->dp)];
@@ -292,7 +292,7 @@ static void block_increments(rtid_estimator *e, int k, int64_t t_us, int row)
     block->last_us = t_us;
     block->rows += row != 0;
     for (int j = 0; j < T; j++) {
-        open->phi[j] += phi[j] * e->dt_s;
+        add(&block->phi[j], phi[j] * e->dt_s);
         e->d[first_of(k) + j] += scale * phi[j];
     }
     /* random walk of the integral: pressure noise through dQ/ddp and missed flow */
@@ -302,15 +302,9 @@ static void block_increments(rtid_estimator *e, int k, int64_t t_us, int row)
 
 static void add_products(rtid_estimator *e)
 {
-    const int n = e->width;
-    for (int i = 0; i < n; i++) {
-        rtid_real *target = e->gram[i];
-        const rtid_real a = e->row[i];
+    for (int i = 0; i < e->width; i++)
         for (int j = 0; j <= i; j++)
-            target[j] += a * e->row[j];
-    }
-    if (++e->uncarried >= RTID_EST_SPAN)
-        rtid_est_carry(e);
+            add_product(&e->local[i][j], e->row[i], e->row[j]);
 }
 
 /* A row of all columns and their decay, by the Kalman whitener; see rtid/kernels/rows.py. */
@@ -322,7 +316,7 @@ static void make_row(rtid_estimator *e)
         e->row[j] = scale * e->d[j];
         e->d[j] *= keep;
     }
-    e->noise_span += (v + e->echo) / s;
+    add(&e->noise, (v + e->echo) / s);
     e->echo = keep * keep * e->echo + lost * lost * v;
     e->cov *= keep;
     e->counts[RTID_EST_ROWS]++;

@@ -39,10 +39,8 @@ typedef double rtid_sum;
 #define RTID_EST_RING (1 + RTID_EST_SHARED)           /* [y | shared | ring | open blocks] in rows */
 #define RTID_EST_OPEN_AT (RTID_EST_RING + 1)
 #define RTID_EST_WIDTH (RTID_EST_OPEN_AT + RTID_EST_TERMS * RTID_EST_MAX_OPEN)
-#define RTID_EST_STRIDE ((RTID_EST_WIDTH + 3) / 4 * 4)
 #define RTID_EST_UNKNOWNS (RTID_EST_SHARED + RTID_EST_TERMS * RTID_EST_MAX_BLOCKS)
 #define RTID_EST_SUMS ((1 + RTID_EST_UNKNOWNS) * (2 + RTID_EST_UNKNOWNS) / 2)
-#define RTID_EST_SPAN 16 /* rows that are added up in one rtid_real */
 
 /* What became of samples; counts by these numbers. */
 enum {
@@ -96,20 +94,18 @@ typedef struct {
 
 typedef struct {
     int16_t edge, slot, recent, u, dp;
-    rtid_real phi[RTID_EST_TERMS]; /* integral since it was last carried to its block */
 } rtid_estimator_open;
 
 /* All that the estimator knows; begin with rtid_estimator_start.  A plain copy saves it. */
 typedef struct {
     /* local columns, those that move at every sample */
-    rtid_real d[RTID_EST_STRIDE];                     /* whitener's state of each column */
-    rtid_real row[RTID_EST_STRIDE];                   /* the row being made */
-    rtid_real gram[RTID_EST_STRIDE][RTID_EST_STRIDE]; /* products of the last few rows */
-    rtid_sum local[RTID_EST_STRIDE][RTID_EST_STRIDE]; /* and of those since the ring began */
-    uint16_t width, uncarried;
+    rtid_real d[RTID_EST_WIDTH];                    /* whitener's state of each column */
+    rtid_real row[RTID_EST_WIDTH];                  /* the row being made */
+    rtid_sum local[RTID_EST_WIDTH][RTID_EST_WIDTH]; /* products of the rows since the ring began */
+    uint16_t width;
     rtid_real faded; /* what is left of the state of a block that closed at the last forgetting */
     /* whitener */
-    rtid_real cov, echo, noise_span;
+    rtid_real cov, echo;
     rtid_sum noise;
     /* the last sample */
     int64_t t_us, ready_us, dt_us;

@@ -14,17 +14,28 @@ static rtid_sum *sum_at(rtid_estimator *e, int i, int j)
 
 static int at_slot(int slot) { return RTID_EST_BLOCKS_AT + T * slot; }
 
-/* The tile that two blocks share += left' right; their own tile is symmetric. */
+/* What a block shares with itself += left' right, which is symmetric: its lower triangle. */
+static void add_own_tile(rtid_estimator *e, int slot, const rtid_real *left, const rtid_real *right)
+{
+    for (int i = 0; i < T; i++)
+        for (int j = 0; j <= i; j++)
+            add_product(sum_at(e, at_slot(slot) + i, at_slot(slot) + j), left[i], right[j]);
+}
+
+/* What two blocks share += left' right. */
 static void add_tile(rtid_estimator *e, int slot, int other, const rtid_real *left, const rtid_real *right)
 {
     const int turned = slot < other, low = at_slot(turned ? slot : other);
     const int high = at_slot(turned ? other : slot);
     const rtid_real *a = turned ? right : left, *b = turned ? left : right;
+    if (slot == other) {
+        add_own_tile(e, slot, left, right);
+        return;
+    }
     for (int i = 0; i < T; i++) {
         rtid_sum *target = sum_at(e, high + i, low);
-        const int n = slot == other ? i + 1 : T;
-        for (int j = 0; j < n; j++)
-            add(&target[j], a[i] * b[j]);
+        for (int j = 0; j < T; j++)
+            add_product(&target[j], a[i], b[j]);
     }
 }
 
@@ -40,27 +51,8 @@ static void clear_columns(rtid_estimator *e, int first, int last)
 {
     for (int i = 0; i < RTID_EST_WIDTH; i++)
         for (int j = 0; j <= i; j++)
-            if ((i >= first && i < last) || (j >= first && j < last)) {
-                e->gram[i][j] = 0;
+            if ((i >= first && i < last) || (j >= first && j < last))
                 e->local[i][j] = no_sum();
-            }
-}
-
-void rtid_est_carry(rtid_estimator *e)
-{
-    for (int i = 0; i < e->width; i++)
-        for (int j = 0; j <= i; j++) {
-            add(&e->local[i][j], e->gram[i][j]);
-            e->gram[i][j] = 0;
-        }
-    for (int k = 0; k < e->n_open; k++)
-        for (int j = 0; j < T; j++) {
-            add(&e->block[e->open[k].slot].phi[j], e->open[k].phi[j]);
-            e->open[k].phi[j] = 0;
-        }
-    add(&e->noise, e->noise_span);
-    e->noise_span = 0;
-    e->uncarried = 0;
 }
 
 static rtid_sum ring_ring(const rtid_estimator *e) { return e->local[RTID_EST_RING][RTID_EST_RING]; }
@@ -122,7 +114,7 @@ static void add_shared(rtid_estimator *e, const rtid_estimator_recent *item)
     for (int j = 0; j < 1 + RTID_EST_SHARED; j++) {
         const rtid_real value = since(e->local[RTID_EST_RING][j], item->shared_start[j]);
         for (int i = 0; i < T; i++)
-            add(sum_at(e, at + i, j), item->d[i] * value);
+            add_product(sum_at(e, at + i, j), item->d[i], value);
     }
 }
 
@@ -171,7 +163,6 @@ void rtid_est_close(rtid_estimator *e, int k)
 {
     rtid_estimator_recent *item = &e->recent[e->open[k].recent];
     rtid_real left[T];
-    rtid_est_carry(e);
     item->status = YOUNG;
     item->size = 0;
     for (int i = 0; i < T; i++) {
@@ -227,7 +218,6 @@ static void settle_one(rtid_estimator *e, int k, int p)
 
 void rtid_est_open(rtid_estimator *e, int k, int edge, int slot)
 {
-    rtid_est_carry(e);
     if (k == e->n_open)
         rtid_est_set_open(e, k + 1);
     e->open[k].edge = (int16_t)edge;
@@ -341,7 +331,6 @@ void rtid_est_rebase(rtid_estimator *e, int how)
 {
     rtid_est_pay(e, ALL_TILES);
     e->debt.n = e->debt.p = e->debt.q = 0;
-    rtid_est_carry(e);
     settle_closed(e);
     settle_open(e);
     for (int i = 0; i < 1 + RTID_EST_SHARED; i++)

@@ -2,6 +2,7 @@
 #ifndef RTID_ESTIMATOR_SUMS_H
 #define RTID_ESTIMATOR_SUMS_H
 
+#include <float.h>
 #include <math.h>
 
 #include "rtid_estimator.h"
@@ -15,8 +16,7 @@ enum { T = RTID_EST_TERMS };
 enum { FREE, OPEN, YOUNG, RINGING }; /* status of a recent block; young: closed since the ring began */
 enum { TILES_PER_TICK = 4, ALL_TILES = RTID_EST_MAX_RECENT * RTID_EST_MAX_RECENT };
 enum { SETTLE, FORGET_SILENT, END_ALL }; /* what a rebase does to the memory of closed blocks */
-#define RING_LIMIT R(0.1)  /* rebase before the ring's column loses digits */
-#define FORGET_AT R(1e-3)  /* and forget the silent ones when all memory has faded so far */
+#define FORGET_AT R(1e-3) /* look for silent blocks each time that all memory has faded so far */
 
 #ifdef RTID_ESTIMATOR_FLOAT32
 
@@ -26,21 +26,32 @@ enum { SETTLE, FORGET_SILENT, END_ALL }; /* what a rebase does to the memory of 
 /* No quantity in SI units is that large, and its square is still a number. */
 #define INSANE 1e9f
 #define SILENT 1e-7f    /* a closed block whose state decayed to this share is forgotten */
-#define LEAST_PIVOT 1e-6 /* of a unit diagonal: below, the sums hold but their own rounding */
+#define LEAST_PIVOT FLT_EPSILON /* of a unit diagonal: below, sums hold but their own rounding */
+#define RING_LIMIT 0.3f /* rebase before the ring's column loses digits */
 #define CONDITION_MOST 1e6
 
-static inline void add(rtid_sum *s, rtid_real x)
+/* s += x + rest, rest far below x; Knuth: the sum, and what it rounded off. */
+static inline void add_pair(rtid_sum *s, rtid_real x, rtid_real rest)
 {
-    const rtid_real t = s->high + x, back = t - s->high; /* Knuth: the sum, and what it rounded off */
-    s->low += (s->high - (t - back)) + (x - back);
+    const rtid_real t = s->high + x, back = t - s->high;
+    s->low += ((s->high - (t - back)) + (x - back)) + rest;
     s->high = t;
 }
 
-static inline void merge(rtid_sum *s, rtid_sum x)
+/* Products are exact: rounded to one float each, they would not be those of any rows, and lose the
+ * directions that few rows tell. */
+static inline void add_product(rtid_sum *s, rtid_real a, rtid_real b)
 {
-    add(s, x.high);
-    s->low += x.low;
+    const rtid_real p = a * b;
+#ifdef __FP_FAST_FMAF
+    add_pair(s, p, fmaf(a, b, -p));
+#else
+    add_pair(s, p, (rtid_real)((double)a * b - p)); /* the same number */
+#endif
 }
+
+static inline void add(rtid_sum *s, rtid_real x) { add_pair(s, x, 0); }
+static inline void merge(rtid_sum *s, rtid_sum x) { add_pair(s, x.high, x.low); }
 
 static inline rtid_real since(rtid_sum now, rtid_sum then) { return (now.high - then.high) + (now.low - then.low); }
 static inline rtid_real rounded(rtid_sum s) { return s.high + s.low; }
@@ -54,10 +65,12 @@ static inline rtid_sum no_sum(void) { return (rtid_sum){0.0f, 0.0f}; }
 #define ABS fabs
 #define INSANE 1e30
 #define SILENT 1e-11
-#define LEAST_PIVOT 1e-15
+#define LEAST_PIVOT DBL_EPSILON
+#define RING_LIMIT 0.1
 #define CONDITION_MOST HUGE_VAL
 
 static inline void add(rtid_sum *s, rtid_real x) { *s += x; }
+static inline void add_product(rtid_sum *s, rtid_real a, rtid_real b) { *s += a * b; }
 static inline void merge(rtid_sum *s, rtid_sum x) { *s += x; }
 static inline rtid_real since(rtid_sum now, rtid_sum then) { return now - then; }
 static inline rtid_real rounded(rtid_sum s) { return s; }
@@ -75,9 +88,6 @@ int rtid_est_has_term(int edge, int term);
 
 /* Let n blocks be open; the width of the rows follows. */
 void rtid_est_set_open(rtid_estimator *e, int n);
-
-/* Move the products of the last rows to the sums since the ring began. */
-void rtid_est_carry(rtid_estimator *e);
 
 /* Let open block k ring on, its state referred to the ring's origin; clear its columns. */
 void rtid_est_close(rtid_estimator *e, int k);

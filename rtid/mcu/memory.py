@@ -84,7 +84,7 @@ class Layout:
         """rtid_estimator."""
         real, total, n = self._real, self._sum, self.sizes
         shared = 1 + n.terms
-        stride = -(-(2 + shared + TERMS * n.open) // 4) * 4
+        width = 2 + shared + TERMS * n.open
         kept = [("slot", _I2), ("status", _U1), ("size", real), ("d", real, (TERMS,))]
         kept += [
             ("through", real, (TERMS,)),
@@ -94,15 +94,15 @@ class Layout:
         opened = [(name, _I2) for name in ("edge", "slot", "recent", "u", "dp")]
         edge = [(name, real) for name in ("w", "m1", "var", "mt", "dp0", "dp1")]
         edge += [(name, _I2) for name in ("u", "dp", "to_u", "to_dp", "place")]
-        fields: list[Field] = [("d", real, (stride,)), ("row", real, (stride,))]
-        fields += [("gram", real, (stride, stride)), ("local", total, (stride, stride))]
-        fields += [("width", _U2), ("uncarried", _U2), ("faded", real)]
-        fields += [(name, real) for name in ("cov", "echo", "noise_span")] + [("noise", total)]
+        fields: list[Field] = [("d", real, (width,)), ("row", real, (width,))]
+        fields += [("local", total, (width, width))]
+        fields += [("width", _U2), ("faded", real)]
+        fields += [(name, real) for name in ("cov", "echo")] + [("noise", total)]
         fields += [(name, _I8) for name in ("t_us", "ready_us", "dt_us")]
         fields += [("values", real, (n.signals + 1,)), ("dt_s", real), ("lag_decay", real)]
         fields += [("running", _U1), ("edge", _record(edge), (n.edges,))]
         fields += [(f"n_{name}", _U2) for name in ("open", "recent", "closed", "young", "slots")]
-        fields += [("open", _record([*opened, ("phi", real, (TERMS,))]), (n.open,))]
+        fields += [("open", _record(opened), (n.open,))]
         owed: list[Field] = [(name, _U2) for name in ("n", "p", "q")]
         owed += [("slot", _I2, (n.recent,)), ("partners", _U2, (n.recent,))]
         owed += [(name, real, (n.recent, TERMS)) for name in ("left", "d")]
