@@ -17,29 +17,35 @@ SNAPSHOT = ".npz"
 
 def export(
     source: Annotated[Path, typer.Argument(help="Snapshot (.npz) of `rtid replay`, or a trace.")],
-    output: Annotated[Path, typer.Argument(help="File to write: .csv, .json or .npz.")],
+    output: Annotated[Path, typer.Argument(help="File to write: .csv, .json, .npz or .h (C).")],
     project: Annotated[Path, typer.Option("--project", "-p", help="Project file.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print a summary as JSON.")] = False,
 ) -> None:
     """Write the learned maps: flow, standard deviation and status over command and pressure drop.
 
-    CSV is a long table at the nodes and centres of the grid; JSON and npz hold everything.  From a
+    CSV is a long table at the nodes and centres of the grid; JSON and npz hold everything; a C99
+    header holds look-up tables, float and fixed point, with their functions beside it.  From a
     trace the maps are learned beside the effects that `rtid add` has added, whose flow is not in
     them; a snapshot holds the maps as they were learned, on board beside those that can run live.
     """
+    from rtid.cfile import SUFFIX, write_header
     from rtid.errors import RtidError
     from rtid.estimator.published import publish
     from rtid.mapfiles import FORMATS, provenance, write_map
     from rtid.project import load
 
-    if output.suffix.lower() not in FORMATS:
-        remedy = f"end its name in {', '.join(FORMATS)}"
+    if output.suffix.lower() not in (*FORMATS, SUFFIX):
+        remedy = f"end its name in {', '.join((*FORMATS, SUFFIX))}"
         raise RtidError(f"{output}: unknown format", remedy, exit_code=2)
     loaded = load(project)
     solution, effects = _solution(loaded, source)
     flowmap = publish(solution)
     origin = provenance(solution, loaded.name, loaded.digest, source.name, effects)
-    write_map(output, flowmap, origin)
+    if output.suffix.lower() == SUFFIX:
+        percent = loaded.sections.publish.error_percent
+        write_header(output, loaded.model, flowmap, origin, percent)
+    else:
+        write_map(output, flowmap, origin)
     cells = {e.name: int((e.status == "valid").sum()) for e in flowmap.edges}
     if as_json:
         told = {"schema": 1, "written": str(output), "valid_blocks": cells, "effects": effects}

@@ -39,7 +39,7 @@ COMMANDS = {
     "undo": "Take the last change of the model back.",
     "history": "List what was added to the model and dropped, and what it brought.",
     "apply": "Send the learned maps to the controller, all or nothing; and back.",
-    "export": "Write the learned maps as CSV, JSON or npz.",
+    "export": "Write the learned maps as CSV, JSON, npz or a C header.",
     "mcu": "Write the estimator in C for a controller with no computer beside it.",
     "paper": "Reproduce the figures and tables of the paper, beside its numbers.",
 }
