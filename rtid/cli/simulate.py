@@ -16,6 +16,7 @@ from rtid.sim.bus import open_test_bus, run_frames
 from rtid.sim.hidden import hide_wish, known
 from rtid.sim.log import START_US, SUFFIXES
 from rtid.sim.motion import MOTIONS
+from rtid.sim.other_plants import write_example
 from rtid.sim.plant import Plant
 from rtid.sim.random_plants import draw
 from rtid.sim.recording import TABLE_SUFFIX, write_run
@@ -49,6 +50,10 @@ def simulate(
         float | None, typer.Option("--duration", min=0.01, help="Seconds; 80, a record 110.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of noise and motion.")] = 0,
+    example: Annotated[
+        str | None,
+        typer.Option(help="Another plant, as .csv for `rtid refit`: electric_drive | heated_room."),
+    ] = None,
     bus: Annotated[
         str | None, typer.Option(help="Send live: udp_multicast, virtual, or socketcan with vcan.")
     ] = None,
@@ -59,8 +64,12 @@ def simulate(
     """Record a simulated machine: the trace, the truth (.truth.json), a project file (.toml).
 
     The trace then replays with `rtid replay TRACE --project TRACE.toml`.  With --bus the machine
-    speaks live instead of, or after, writing.
+    speaks live instead of, or after, writing.  With --example another plant is recorded, with an
+    effect in it that its equations miss; --hide none leaves it out.
     """
+    if example is not None:
+        _example(example, trace, seed, hide, as_json)
+        return
     _check_arguments(trace, bus, motion, plant, cross_port)
     if hide_at_s is not None and not hide:
         raise _usage("--hide-at: nothing is hidden", "add --hide EFFECT")
@@ -87,6 +96,25 @@ def simulate(
         print(f"wrote {path}")
     if sent:
         print(f"sent {sent} frames on {bus} {channel}")
+
+
+def _example(
+    name: str, table: Path | None, seed: int, hide: list[str] | None, as_json: bool
+) -> None:
+    if table is None:
+        raise _usage("--example: nothing to write to", "name a .csv file")
+    if hide not in (None, ["none"]):
+        raise _usage("--example has one effect of its own", "--hide none leaves it out")
+    found, written = write_example(name, table, seed, hide is None)
+    hidden = (
+        [{"effect": found.hidden, "size": found.size, "unit": found.unit}] if found.size else []
+    )
+    if as_json:
+        print(json.dumps({"hidden": hidden, "files": [str(p) for p in written]}))
+        return
+    print(f"hidden: {found.hidden}, {found.size:.3g} {found.unit}" if hidden else "hidden: nothing")
+    for path in written:
+        print(f"wrote {path}")
 
 
 def _check_arguments(
