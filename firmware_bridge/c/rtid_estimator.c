@@ -292,7 +292,7 @@ static void block_increments(rtid_estimator *e, int k, int64_t t_us, int row)
     block->last_us = t_us;
     block->rows += row != 0;
     for (int j = 0; j < T; j++) {
-        add(&block->phi[j], phi[j] * e->dt_s);
+        merge(&block->phi[j], as_sum(phi[j] * e->dt_s));
         e->d[first_of(k) + j] += scale * phi[j];
     }
     /* random walk of the integral: pressure noise through dQ/ddp and missed flow */
@@ -304,7 +304,7 @@ static void add_products(rtid_estimator *e)
 {
     for (int i = 0; i < e->width; i++)
         for (int j = 0; j <= i; j++)
-            add_product(&e->local[i][j], e->row[i], e->row[j]);
+            merge(&e->local[i][j], product(e->row[i], e->row[j]));
 }
 
 /* A row of all columns and their decay, by the Kalman whitener; see rtid/kernels/rows.py. */
@@ -316,7 +316,7 @@ static void make_row(rtid_estimator *e)
         e->row[j] = scale * e->d[j];
         e->d[j] *= keep;
     }
-    add(&e->noise, (v + e->echo) / s);
+    merge(&e->noise, as_sum((v + e->echo) / s));
     e->echo = keep * keep * e->echo + lost * lost * v;
     e->cov *= keep;
     e->counts[RTID_EST_ROWS]++;

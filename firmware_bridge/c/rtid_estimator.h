@@ -68,7 +68,7 @@ typedef struct {
 /* A block that was visited. */
 typedef struct {
     int16_t edge, u, dp; /* place in the grid of its edge */
-    uint32_t rows;
+    uint64_t rows;
     int64_t dwell_us, last_us;
     rtid_sum phi[RTID_EST_TERMS]; /* integral of its terms over the time spent in it, s */
 } rtid_estimator_block;
@@ -77,10 +77,10 @@ typedef struct {
 typedef struct {
     int16_t slot;
     uint8_t status;
-    rtid_real size;                    /* of its state when it closed */
-    rtid_real d[RTID_EST_TERMS];       /* its state, referred to the ring's origin */
-    rtid_real through[RTID_EST_TERMS]; /* ring x block while it was open */
-    rtid_sum w_start;                  /* ring x ring when it closed */
+    rtid_real size;                   /* of its state when it closed */
+    rtid_real d[RTID_EST_TERMS];      /* its state, referred to the ring's origin */
+    rtid_sum through[RTID_EST_TERMS]; /* ring x block while it was open */
+    rtid_sum w_start;                 /* ring x ring when it closed */
     rtid_sum shared_start[RTID_EST_RING];
 } rtid_estimator_recent;
 
@@ -89,7 +89,8 @@ typedef struct {
     uint16_t n, p, q;
     int16_t slot[RTID_EST_MAX_RECENT];
     uint16_t partners[RTID_EST_MAX_RECENT];
-    rtid_real left[RTID_EST_MAX_RECENT][RTID_EST_TERMS], d[RTID_EST_MAX_RECENT][RTID_EST_TERMS];
+    rtid_sum left[RTID_EST_MAX_RECENT][RTID_EST_TERMS];
+    rtid_real d[RTID_EST_MAX_RECENT][RTID_EST_TERMS];
 } rtid_estimator_debt;
 
 typedef struct {
@@ -126,7 +127,7 @@ typedef struct {
     int16_t slot[RTID_EST_N_CELLS];      /* of each cell of the grids, -1 before the first visit */
     rtid_estimator_block block[RTID_EST_MAX_BLOCKS];
     rtid_sum sums[RTID_EST_SUMS]; /* lower triangle, row by row, of [y | shared | blocks] */
-    uint32_t counts[RTID_EST_N_COUNTS];
+    uint64_t counts[RTID_EST_N_COUNTS];
 } rtid_estimator;
 
 /* What is known of a visited block. */
@@ -154,7 +155,7 @@ typedef struct {
     double shared[RTID_EST_SHARED], shared_sd[RTID_EST_SHARED];
     double rho;      /* residual variance in units of the declared noise: 1 when all is explained */
     double leverage; /* share of the pressure noise that the maps absorb */
-    uint16_t raised; /* directions of which the sums know no more than their rounding */
+    uint16_t raised; /* 0, or directions in which the sums were not definite */
     uint8_t finite;  /* 0: an absurd sample was let in, and nothing here holds */
 } rtid_estimator_solution;
 

@@ -5,6 +5,7 @@
 
 static const double FLOW_PRIOR = 1e-2;   /* ten times the rated flow, 1 sigma */
 static const double SHARED_PRIOR = 1e-2; /* beta is known to a factor of ten */
+static const double LEAST_PIVOT = 1e-14; /* of a unit diagonal: sums of rows and prior are above */
 
 /* Lower triangle by rows; row and column 0 are y, so that row i is unknown i - 1. */
 static double *row_of(rtid_estimator_work *w, int i) { return &w->matrix[(uint32_t)i * (uint32_t)(i + 1) / 2]; }
@@ -25,7 +26,7 @@ void rtid_estimator_freeze(rtid_estimator *e, rtid_estimator_work *w)
     rtid_est_pay(e, ALL_TILES);
     w->n_slots = e->n_slots;
     w->now_us = e->t_us;
-    w->rows = e->counts[RTID_EST_ROWS];
+    w->rows = (double)e->counts[RTID_EST_ROWS];
     w->noise = exact(e->noise);
     memcpy(w->block, e->block, sizeof *w->block * e->n_slots);
     /* as they are: the numbers are made of them by rtid_estimator_solve */
@@ -106,8 +107,8 @@ static double dot(const double *a, const double *b, int first, int last)
     return sum;
 }
 
-/* Cholesky factor in place.  A pivot that the sums' rounding leaves unknown is raised to that
- * level, so that the factor exists and the covariance says how little is known; their number. */
+/* Cholesky factor in place.  A pivot that is not above rounding is raised to that level, so that
+ * the factor always exists; their number. */
 static int factorize(rtid_estimator_work *w)
 {
     const int n = unknowns(w);
@@ -265,7 +266,6 @@ static uint8_t status_of(const rtid_estimator_work *w, int slot)
     const rtid_estimator_block *block = &w->block[slot];
     const rtid_estimator_map *map = &w->map[slot];
     if (block->rows < RTID_EST_MIN_ROWS || !(map->condition <= RTID_EST_CONDITION_LIMIT)
-        || !(map->condition <= CONDITION_MOST)
         || !(map->mean_sd_m3s <= RTID_EST_MAX_SD_SHARE * largest_flow(w, block->edge)))
         return RTID_EST_LEARNING;
     return w->now_us - block->last_us > RTID_EST_STALE_US ? RTID_EST_STALE : RTID_EST_VALID;

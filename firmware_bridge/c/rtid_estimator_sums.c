@@ -15,27 +15,28 @@ static rtid_sum *sum_at(rtid_estimator *e, int i, int j)
 static int at_slot(int slot) { return RTID_EST_BLOCKS_AT + T * slot; }
 
 /* What a block shares with itself += left' right, which is symmetric: its lower triangle. */
-static void add_own_tile(rtid_estimator *e, int slot, const rtid_real *left, const rtid_real *right)
+static void add_own_tile(rtid_estimator *e, int slot, const rtid_sum *left, const rtid_real *right)
 {
     for (int i = 0; i < T; i++)
         for (int j = 0; j <= i; j++)
-            add_product(sum_at(e, at_slot(slot) + i, at_slot(slot) + j), left[i], right[j]);
+            merge(sum_at(e, at_slot(slot) + i, at_slot(slot) + j), times(left[i], right[j]));
 }
 
 /* What two blocks share += left' right. */
-static void add_tile(rtid_estimator *e, int slot, int other, const rtid_real *left, const rtid_real *right)
+static void add_tile(rtid_estimator *e, int slot, int other, const rtid_sum *left, const rtid_real *right)
 {
-    const int turned = slot < other, low = at_slot(turned ? slot : other);
-    const int high = at_slot(turned ? other : slot);
-    const rtid_real *a = turned ? right : left, *b = turned ? left : right;
-    if (slot == other) {
+    const int mine = at_slot(slot), its = at_slot(other);
+    if (slot == other)
         add_own_tile(e, slot, left, right);
-        return;
-    }
-    for (int i = 0; i < T; i++) {
-        rtid_sum *target = sum_at(e, high + i, low);
+    for (int i = 0; i < T && mine > its; i++) {
+        rtid_sum *target = sum_at(e, mine + i, its);
         for (int j = 0; j < T; j++)
-            add_product(&target[j], a[i], b[j]);
+            merge(&target[j], times(left[i], right[j]));
+    }
+    for (int j = 0; j < T && mine < its; j++) {
+        rtid_sum *target = sum_at(e, its + j, mine);
+        for (int i = 0; i < T; i++)
+            merge(&target[i], times(left[i], right[j]));
     }
 }
 
@@ -52,16 +53,16 @@ static void clear_columns(rtid_estimator *e, int first, int last)
     for (int i = 0; i < RTID_EST_WIDTH; i++)
         for (int j = 0; j <= i; j++)
             if ((i >= first && i < last) || (j >= first && j < last))
-                e->local[i][j] = no_sum();
+                e->local[i][j] = as_sum(0);
 }
 
 static rtid_sum ring_ring(const rtid_estimator *e) { return e->local[RTID_EST_RING][RTID_EST_RING]; }
 
-/* out = sign * ring x open block k */
-static void read_through(const rtid_estimator *e, int k, rtid_real sign, rtid_real *out)
+/* Ring x open block k. */
+static void read_through(const rtid_estimator *e, int k, rtid_sum *out)
 {
     for (int i = 0; i < T; i++)
-        out[i] = sign * rounded(e->local[first_of(k) + i][RTID_EST_RING]);
+        out[i] = e->local[first_of(k) + i][RTID_EST_RING];
 }
 
 /* ---- products of one block, see rtid/kernels/information.py ---- */
@@ -98,12 +99,12 @@ static void add_open_pair(rtid_estimator *e, int k, int other)
 }
 
 /* left = what the closed block shares with the ring's origin, own = the part since it closed. */
-static void weigh(const rtid_estimator *e, const rtid_estimator_recent *item, rtid_real *own, rtid_real *left)
+static void weigh(const rtid_estimator *e, const rtid_estimator_recent *item, rtid_sum *own, rtid_sum *left)
 {
-    const rtid_real w = since(ring_ring(e), item->w_start);
+    const rtid_sum w = sum_of(ring_ring(e), minus(item->w_start));
     for (int i = 0; i < T; i++) {
-        own[i] = w * item->d[i];
-        left[i] = item->through[i] + own[i];
+        own[i] = times(w, item->d[i]);
+        left[i] = sum_of(item->through[i], own[i]);
     }
 }
 
@@ -112,14 +113,14 @@ static void add_shared(rtid_estimator *e, const rtid_estimator_recent *item)
 {
     const int at = at_slot(item->slot);
     for (int j = 0; j < 1 + RTID_EST_SHARED; j++) {
-        const rtid_real value = since(e->local[RTID_EST_RING][j], item->shared_start[j]);
+        const rtid_sum since = sum_of(e->local[RTID_EST_RING][j], minus(item->shared_start[j]));
         for (int i = 0; i < T; i++)
-            add_product(sum_at(e, at + i, j), item->d[i], value);
+            merge(sum_at(e, at + i, j), times(since, item->d[i]));
     }
 }
 
 /* left x all blocks that rang all the time */
-static void spread(rtid_estimator *e, int slot, const rtid_real *left)
+static void spread(rtid_estimator *e, int slot, const rtid_sum *left)
 {
     for (int q = 0; q < e->n_recent; q++)
         if (e->recent[q].status == RINGING)
@@ -151,7 +152,7 @@ static void release(rtid_estimator *e, int p)
 static void settle_young(rtid_estimator *e, int a)
 {
     const rtid_estimator_recent *item = &e->recent[e->young[a]];
-    rtid_real own[T], left[T];
+    rtid_sum own[T], left[T];
     weigh(e, item, own, left);
     add_tile(e, item->slot, item->slot, own, item->d);
     spread(e, item->slot, left);
@@ -162,7 +163,7 @@ static void settle_young(rtid_estimator *e, int a)
 void rtid_est_close(rtid_estimator *e, int k)
 {
     rtid_estimator_recent *item = &e->recent[e->open[k].recent];
-    rtid_real left[T];
+    rtid_sum left[T];
     item->status = YOUNG;
     item->size = 0;
     for (int i = 0; i < T; i++) {
@@ -173,13 +174,15 @@ void rtid_est_close(rtid_estimator *e, int k)
     }
     item->w_start = ring_ring(e);
     memcpy(item->shared_start, e->local[RTID_EST_RING], sizeof item->shared_start);
-    read_through(e, k, R(1), item->through);
+    read_through(e, k, item->through);
     add_own(e, k);
     for (int other = 0; other < e->n_open; other++)
         if (other != k) {
             add_open_pair(e, k, other);
-            read_through(e, other, R(-1), left); /* `other` will charge it from the beginning */
-            add_tile(e, item->slot, e->open[other].slot, item->d, left);
+            read_through(e, other, left);
+            for (int i = 0; i < T; i++)
+                left[i] = minus(left[i]); /* `other` will charge it from the beginning */
+            add_tile(e, e->open[other].slot, item->slot, left, item->d);
         }
     clear_columns(e, first_of(k), first_of(k + 1));
     e->young[e->n_young++] = (uint16_t)e->open[k].recent;
@@ -190,7 +193,7 @@ void rtid_est_close(rtid_estimator *e, int k)
 static void settle_one(rtid_estimator *e, int k, int p)
 {
     const rtid_estimator_recent *item = &e->recent[p];
-    rtid_real own[T], left[T];
+    rtid_sum own[T], left[T];
     int later = 0;
     if (item->status == YOUNG) {
         while (e->young[later] != p)
@@ -210,8 +213,8 @@ static void settle_one(rtid_estimator *e, int k, int p)
     }
     for (int other = 0; other < e->n_open; other++)
         if (other != k) {
-            read_through(e, other, R(1), left);
-            add_tile(e, item->slot, e->open[other].slot, item->d, left);
+            read_through(e, other, left);
+            add_tile(e, e->open[other].slot, item->slot, left, item->d);
         }
     add_shared(e, item);
 }
@@ -265,7 +268,7 @@ void rtid_est_remove_open(rtid_estimator *e, int k)
 /* ---- the ring begins anew ---- */
 
 /* Note what a block shares with the first `partners` of those noted: too much work for one tick. */
-static void owe(rtid_estimator *e, int slot, const rtid_real *left, const rtid_real *d, int partners)
+static void owe(rtid_estimator *e, int slot, const rtid_sum *left, const rtid_real *d, int partners)
 {
     rtid_estimator_debt *debt = &e->debt;
     debt->slot[debt->n] = (int16_t)slot;
@@ -295,7 +298,7 @@ void rtid_est_pay(rtid_estimator *e, int tiles)
 /* Owe what closed blocks share: first those that rang all the time, then the young in their order. */
 static void settle_closed(rtid_estimator *e)
 {
-    rtid_real own[T], left[T];
+    rtid_sum own[T], left[T];
     for (int p = 0; p < e->n_recent; p++) {
         const rtid_estimator_recent *item = &e->recent[p];
         if (item->status != RINGING)
@@ -317,13 +320,13 @@ static void settle_closed(rtid_estimator *e)
 static void settle_open(rtid_estimator *e)
 {
     const int closed = e->debt.n;
-    rtid_real left[T];
+    rtid_sum left[T];
     for (int k = 0; k < e->n_open; k++) {
         add_own(e, k);
         for (int other = 0; other < k; other++)
             add_open_pair(e, k, other);
-        read_through(e, k, R(1), left);
-        owe(e, e->open[k].slot, left, left, closed);
+        read_through(e, k, left);
+        owe(e, e->open[k].slot, left, e->recent[e->open[k].recent].d, closed);
     }
 }
 
@@ -343,14 +346,14 @@ void rtid_est_rebase(rtid_estimator *e, int how)
         if (item->status < YOUNG)
             continue;
         item->status = RINGING;
-        item->w_start = no_sum();
+        item->w_start = as_sum(0);
         for (int i = 0; i < T; i++) {
             item->d[i] *= e->d[RTID_EST_RING];
-            item->through[i] = 0;
+            item->through[i] = as_sum(0);
             largest = ABS(item->d[i]) > largest ? ABS(item->d[i]) : largest;
         }
         for (int j = 0; j < 1 + RTID_EST_SHARED; j++)
-            item->shared_start[j] = no_sum();
+            item->shared_start[j] = as_sum(0);
         if (how == END_ALL || (how == FORGET_SILENT && !(largest > SILENT * item->size))) {
             e->n_closed--;
             release(e, p);

@@ -2,7 +2,6 @@
 #ifndef RTID_ESTIMATOR_SUMS_H
 #define RTID_ESTIMATOR_SUMS_H
 
-#include <float.h>
 #include <math.h>
 
 #include "rtid_estimator.h"
@@ -16,6 +15,7 @@ enum { T = RTID_EST_TERMS };
 enum { FREE, OPEN, YOUNG, RINGING }; /* status of a recent block; young: closed since the ring began */
 enum { TILES_PER_TICK = 4, ALL_TILES = RTID_EST_MAX_RECENT * RTID_EST_MAX_RECENT };
 enum { SETTLE, FORGET_SILENT, END_ALL }; /* what a rebase does to the memory of closed blocks */
+#define RING_LIMIT R(0.1) /* rebase before the ring's column loses digits */
 #define FORGET_AT R(1e-3) /* look for silent blocks each time that all memory has faded so far */
 
 #ifdef RTID_ESTIMATOR_FLOAT32
@@ -26,37 +26,37 @@ enum { SETTLE, FORGET_SILENT, END_ALL }; /* what a rebase does to the memory of 
 /* No quantity in SI units is that large, and its square is still a number. */
 #define INSANE 1e9f
 #define SILENT 1e-7f    /* a closed block whose state decayed to this share is forgotten */
-#define LEAST_PIVOT FLT_EPSILON /* of a unit diagonal: below, sums hold but their own rounding */
-#define RING_LIMIT 0.3f /* rebase before the ring's column loses digits */
-#define CONDITION_MOST 1e6
 
-/* s += x + rest, rest far below x; Knuth: the sum, and what it rounded off. */
-static inline void add_pair(rtid_sum *s, rtid_real x, rtid_real rest)
+/* s += x: Knuth's sum of two numbers, and what it rounded off */
+static inline void merge(rtid_sum *s, rtid_sum x)
 {
-    const rtid_real t = s->high + x, back = t - s->high;
-    s->low += ((s->high - (t - back)) + (x - back)) + rest;
+    const rtid_real t = s->high + x.high, back = t - s->high;
+    s->low += ((s->high - (t - back)) + (x.high - back)) + x.low;
     s->high = t;
 }
 
-/* Products are exact: rounded to one float each, they would not be those of any rows, and lose the
- * directions that few rows tell. */
-static inline void add_product(rtid_sum *s, rtid_real a, rtid_real b)
+/* a b without rounding: products of rounded numbers would not be those of any rows, and the
+ * directions that few rows tell would be lost. */
+static inline rtid_sum product(rtid_real a, rtid_real b)
 {
     const rtid_real p = a * b;
 #ifdef __FP_FAST_FMAF
-    add_pair(s, p, fmaf(a, b, -p));
+    return (rtid_sum){p, fmaf(a, b, -p)};
 #else
-    add_pair(s, p, (rtid_real)((double)a * b - p)); /* the same number */
+    return (rtid_sum){p, (rtid_real)((double)a * b - p)}; /* the same numbers */
 #endif
 }
 
-static inline void add(rtid_sum *s, rtid_real x) { add_pair(s, x, 0); }
-static inline void merge(rtid_sum *s, rtid_sum x) { add_pair(s, x.high, x.low); }
+static inline rtid_sum times(rtid_sum a, rtid_real b)
+{
+    rtid_sum p = product(a.high, b);
+    p.low += a.low * b;
+    return p;
+}
 
-static inline rtid_real since(rtid_sum now, rtid_sum then) { return (now.high - then.high) + (now.low - then.low); }
-static inline rtid_real rounded(rtid_sum s) { return s.high + s.low; }
+static inline rtid_sum as_sum(rtid_real x) { return (rtid_sum){x, 0.0f}; }
+static inline rtid_sum minus(rtid_sum a) { return (rtid_sum){-a.high, -a.low}; }
 static inline double exact(rtid_sum s) { return (double)s.high + (double)s.low; }
-static inline rtid_sum no_sum(void) { return (rtid_sum){0.0f, 0.0f}; }
 
 #else
 
@@ -65,19 +65,21 @@ static inline rtid_sum no_sum(void) { return (rtid_sum){0.0f, 0.0f}; }
 #define ABS fabs
 #define INSANE 1e30
 #define SILENT 1e-11
-#define LEAST_PIVOT DBL_EPSILON
-#define RING_LIMIT 0.1
-#define CONDITION_MOST HUGE_VAL
 
-static inline void add(rtid_sum *s, rtid_real x) { *s += x; }
-static inline void add_product(rtid_sum *s, rtid_real a, rtid_real b) { *s += a * b; }
 static inline void merge(rtid_sum *s, rtid_sum x) { *s += x; }
-static inline rtid_real since(rtid_sum now, rtid_sum then) { return now - then; }
-static inline rtid_real rounded(rtid_sum s) { return s; }
+static inline rtid_sum product(rtid_real a, rtid_real b) { return a * b; }
+static inline rtid_sum times(rtid_sum a, rtid_real b) { return a * b; }
+static inline rtid_sum as_sum(rtid_real x) { return x; }
+static inline rtid_sum minus(rtid_sum a) { return -a; }
 static inline double exact(rtid_sum s) { return s; }
-static inline rtid_sum no_sum(void) { return 0.0; }
 
 #endif
+
+static inline rtid_sum sum_of(rtid_sum a, rtid_sum b)
+{
+    merge(&a, b);
+    return a;
+}
 
 static inline int first_of(int k) { return RTID_EST_OPEN_AT + T * k; }
 

@@ -29,7 +29,7 @@ COUNTS = (
     "recovering",
     "no_room",
 )
-_I2, _U1, _U2, _U4, _I8 = np.int16, np.uint8, np.uint16, np.uint32, np.int64
+_I2, _U1, _U2, _U8, _I8 = np.int16, np.uint8, np.uint16, np.uint64, np.int64
 
 
 Field = tuple[Any, ...]
@@ -75,7 +75,7 @@ class Layout:
     @property
     def block(self) -> np.dtype[np.void]:
         """rtid_estimator_block."""
-        place = [("edge", _I2), ("u", _I2), ("dp", _I2), ("rows", _U4)]
+        place = [("edge", _I2), ("u", _I2), ("dp", _I2), ("rows", _U8)]
         times = [("dwell_us", _I8), ("last_us", _I8)]
         return _record([*place, *times, ("phi", self._sum, (TERMS,))])
 
@@ -87,7 +87,7 @@ class Layout:
         width = 2 + shared + TERMS * n.open
         kept = [("slot", _I2), ("status", _U1), ("size", real), ("d", real, (TERMS,))]
         kept += [
-            ("through", real, (TERMS,)),
+            ("through", total, (TERMS,)),
             ("w_start", total),
             ("shared_start", total, (1 + shared,)),
         ]
@@ -105,11 +105,11 @@ class Layout:
         fields += [("open", _record(opened), (n.open,))]
         owed: list[Field] = [(name, _U2) for name in ("n", "p", "q")]
         owed += [("slot", _I2, (n.recent,)), ("partners", _U2, (n.recent,))]
-        owed += [(name, real, (n.recent, TERMS)) for name in ("left", "d")]
+        owed += [("left", total, (n.recent, TERMS)), ("d", real, (n.recent, TERMS))]
         fields += [("recent", _record(kept), (n.recent,)), ("young", _U2, (n.recent,))]
         fields += [("debt", _record(owed))]
         fields += [("slot", _I2, (n.cells,)), ("block", self.block, (n.blocks,))]
-        return _record([*fields, ("sums", total, (n.sums,)), ("counts", _U4, (len(COUNTS),))])
+        return _record([*fields, ("sums", total, (n.sums,)), ("counts", _U8, (len(COUNTS),))])
 
     @property
     def work(self) -> np.dtype[np.void]:
