@@ -1,6 +1,7 @@
 """Learned flow maps as files: a long CSV table, or JSON and npz that hold everything.
 
 The CSV has one line per node and centre of the grids; JSON and npz come back with `read_map`.
+Tables for calibration tools and MATLAB are in `rtid.calibration` and `rtid.matlabfile`.
 """
 
 from __future__ import annotations
@@ -16,15 +17,16 @@ from zipfile import BadZipFile
 import numpy as np
 
 import rtid
+from rtid.calibration import write_cdfx, write_dcm
 from rtid.errors import RtidError
 from rtid.estimator.flowmap import VALID, EdgeMap, FlowMap
 from rtid.estimator.solution import Solution
+from rtid.matlabfile import write_m, write_mat
 from rtid.model import FloatArray, Grid
 
 SCHEMA = "rtid-flowmap/1"
 UNITS = {"u_v": "V", "dp_pa": "Pa", "theta_m3s": "m3/s", "cov_m6s2": "m6/s2"}
 BASIS = "Taylor: 1, xi, eta, xi^2, eta^2, xi eta; xi and eta run from -1 to 1 over each block"
-FORMATS = (".csv", ".json", ".npz")
 
 
 class MapFileError(RtidError):
@@ -33,9 +35,9 @@ class MapFileError(RtidError):
 
 def write_map(path: Path, flowmap: FlowMap, provenance: Mapping[str, Any]) -> None:
     """Write the map in the format that the file's suffix names; whole or not at all."""
-    write = {".csv": _write_csv, ".json": _write_json, ".npz": _write_npz}.get(path.suffix.lower())
+    write = WRITERS.get(path.suffix.lower())
     if write is None:
-        raise MapFileError(f"{path}: unknown format", f"end the name in {', '.join(FORMATS)}")
+        raise MapFileError(f"{path}: unknown format", f"end the name in {', '.join(WRITERS)}")
     temporary = path.with_name(path.name + ".part")
     write(temporary, flowmap, provenance)
     os.replace(temporary, path)
@@ -181,3 +183,15 @@ def _read_npz(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
             for k, words in enumerate(header["edges"])
         ]
     return header, parts
+
+
+WRITERS = {
+    ".csv": _write_csv,
+    ".json": _write_json,
+    ".npz": _write_npz,
+    ".mat": write_mat,
+    ".m": write_m,
+    ".dcm": write_dcm,
+    ".cdfx": write_cdfx,
+}
+FORMATS = tuple(WRITERS)

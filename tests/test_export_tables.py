@@ -1,0 +1,132 @@
+"""Maps for calibration tools and MATLAB: read back, they are the published map."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pytest
+from scipy.interpolate import RegularGridInterpolator
+from scipy.io import loadmat
+
+from rtid.estimator.flowmap import FlowMap
+from rtid.estimator.published import publish
+from rtid.gridded import CODES, ERROR_SHARE, Gridded, gridded
+from rtid.mapfiles import write_map
+from tests.flow_maps import machine, orifice, solved
+
+PROVENANCE = {"trace": "run.blf", "digest": "abc", "beta_pa": [7.1e8, 6.9e8]}
+LPM, MPA = 6e4, 1e-6
+
+
+@pytest.fixture(scope="module")
+def flowmap() -> FlowMap:
+    model = machine(edges=2)
+    return publish(solved(model, orifice, np.random.default_rng(0), rows=80))
+
+
+@pytest.fixture(scope="module")
+def grids(flowmap: FlowMap) -> tuple[Gridded, ...]:
+    return gridded(flowmap)
+
+
+def test_straight_lines_between_the_nodes_are_the_map(
+    flowmap: FlowMap, grids: tuple[Gridded, ...]
+) -> None:
+    """To 0.1 % of the largest flow, at random points, near no pressure drop too."""
+    rng = np.random.default_rng(1)
+    for edge, g in zip(flowmap.edges, grids, strict=True):
+        assert np.all(np.diff(g.u_v) > 0) and np.all(np.diff(g.dp_pa) > 0)
+        assert np.isin(edge.grid.dp_pa, g.dp_pa).all() and np.isin(edge.grid.u_v, g.u_v).all()
+        u = rng.uniform(g.u_v[0], g.u_v[-1], 4000)
+        dp = np.concatenate([rng.uniform(g.dp_pa[0], g.dp_pa[-1], 3000), rng.uniform(0, 1e5, 1000)])
+        lines = RegularGridInterpolator((g.u_v, g.dp_pa), g.flow_m3s)(np.column_stack([u, dp]))
+        largest = np.abs(g.flow_m3s).max()
+        assert np.abs(lines - edge.flow(u, dp)).max() < 1.1 * ERROR_SHARE * largest
+
+
+def test_an_independent_reader_takes_the_dcm_file(
+    flowmap: FlowMap, grids: tuple[Gridded, ...], tmp_path: Path
+) -> None:
+    reader = pytest.importorskip("dcmReader.dcm_reader", reason="pip install 'rtid[dev]'")
+    write_map(tmp_path / "maps.dcm", flowmap, PROVENANCE)
+    read = reader.DcmReader()
+    read.read(str(tmp_path / "maps.dcm"))
+    assert '* digest: "abc"' in (tmp_path / "maps.dcm").read_text()
+    values = {p.name: p for p in read.get_parameters()}
+    assert values["beta_0"].value == 710 and values["beta_0"].unit == "MPa"
+    maps = {m.name: m for m in read.get_characteristic_maps()}
+    assert set(maps) == {f"{g.name}_{x}" for g in grids for x in ("flow", "flow_sd", "flow_status")}
+    for g in grids:
+        found = maps[f"{g.name}_flow"]
+        assert (found.x_dimension, found.y_dimension) == (len(g.dp_pa), len(g.u_v))
+        assert (found.unit_x, found.unit_y, found.unit_values) == ("MPa", "V", "L/min")
+        at = np.array([[found.values[y][x] for x in sorted(found.values[y])]
+                       for y in sorted(found.values)])  # fmt: skip
+        np.testing.assert_allclose(at, LPM * g.flow_m3s, rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(sorted(found.values), g.u_v, rtol=1e-6)
+        codes = maps[f"{g.name}_flow_status"].values
+        assert {c for row in codes.values() for c in row.values()} <= set(range(len(CODES)))
+
+
+def numbers(parent: ET.Element | None) -> list[float]:
+    assert parent is not None
+    return [float(v.text or "nan") for v in parent.iter("V")]
+
+
+def test_cdfx_holds_the_same_and_its_elements_are_in_order(
+    flowmap: FlowMap, grids: tuple[Gridded, ...], tmp_path: Path
+) -> None:
+    write_map(tmp_path / "maps.cdfx", flowmap, PROVENANCE)
+    root = ET.parse(tmp_path / "maps.cdfx").getroot()
+    assert [e.tag for e in root] == ["SHORT-NAME", "INTRODUCTION", "CATEGORY", "SW-SYSTEMS"]
+    assert root.findtext("CATEGORY") == "CDF20"
+    path = "SW-SYSTEMS/SW-SYSTEM/SW-INSTANCE-SPEC/SW-INSTANCE-TREE/SW-INSTANCE"
+    found = {str(e.findtext("SHORT-NAME")): e for e in root.findall(path)}
+    assert numbers(found["beta_1"].find("SW-VALUE-CONT/SW-VALUES-PHYS")) == [690.0]
+    order = ["SHORT-NAME", "LONG-NAME", "CATEGORY", "SW-VALUE-CONT", "SW-AXIS-CONTS"]
+    for g in grids:
+        own = found[f"{g.name}_flow"]
+        assert [e.tag for e in own] == order and own.findtext("CATEGORY") == "MAP"
+        rows = own.findall("SW-VALUE-CONT/SW-VALUES-PHYS/VG")
+        values = np.array([numbers(row) for row in rows])
+        np.testing.assert_allclose(values, LPM * g.flow_m3s, rtol=1e-6, atol=1e-9)
+        x, y = own.findall("SW-AXIS-CONTS/SW-AXIS-CONT/SW-VALUES-PHYS")
+        np.testing.assert_allclose(numbers(x), MPA * g.dp_pa, rtol=1e-6)
+        np.testing.assert_allclose(numbers(y), g.u_v, rtol=1e-6)
+
+
+def test_a_mat_file_round_trips_to_the_last_digit(
+    flowmap: FlowMap, grids: tuple[Gridded, ...], tmp_path: Path
+) -> None:
+    write_map(tmp_path / "maps.mat", flowmap, PROVENANCE)
+    maps = loadmat(tmp_path / "maps.mat", squeeze_me=True, struct_as_record=False)["maps"]
+    assert '"digest": "abc"' in str(maps.provenance)
+    for g in grids:
+        own = getattr(maps, g.name)
+        np.testing.assert_array_equal(own.flow_m3s, g.flow_m3s)
+        np.testing.assert_array_equal(own.sd_m3s, g.sd_m3s)
+        np.testing.assert_array_equal(own.u_v, g.u_v)
+        np.testing.assert_array_equal(own.dp_pa, g.dp_pa)
+        np.testing.assert_array_equal(own.status, g.code)
+
+
+def test_the_matlab_script_holds_tables_of_the_right_shape(
+    flowmap: FlowMap, grids: tuple[Gridded, ...], tmp_path: Path
+) -> None:
+    write_map(tmp_path / "maps.m", flowmap, PROVENANCE)
+    text = (tmp_path / "maps.m").read_text()
+    joined = re.sub(r" \.\.\.\n", " ", text)  # what MATLAB makes of continued lines
+    for g in grids:
+        assert f"{g.name}_flow = Simulink.LookupTable;" in joined
+        tables = {f"{g.name}_flow.Table.Value": g.flow_m3s, f"{g.name}_flow_sd": g.sd_m3s}
+        for name, expected in tables.items():
+            (body,) = re.findall(rf"^{re.escape(name)} = \[(.*?)\];", joined, re.M | re.S)
+            rows = [r.split() for r in body.split(";") if r.strip()]
+            np.testing.assert_allclose(np.array(rows, float), expected, rtol=1e-8, atol=1e-15)
+        for k, axis in ((1, g.u_v), (2, g.dp_pa)):
+            (body,) = re.findall(rf"^{g.name}_flow.Breakpoints\({k}\).Value = \[(.*?)\];", joined,
+                                 re.M | re.S)  # fmt: skip
+            np.testing.assert_allclose(np.array(body.split(), float), axis, rtol=1e-8)
