@@ -38,10 +38,10 @@ faults: $(READY)
 	  status=$$?; .venv/bin/python -m tests.faults.table out/faults.jsonl | tee out/faults.md; \
 	  exit $$status
 
-# The long ones (half an hour): a full bus, 50 kills, hours in minutes, live diagnoses.
+# The long ones (an hour): a full bus, 50 kills, hours in minutes, live diagnoses, an open page.
 soak: $(READY)
 	@mkdir -p out && rm -f out/soak.jsonl
-	RTID_FAULTS=out/soak.jsonl .venv/bin/python -m pytest -q -p no:benchmark -m soak tests/faults; \
+	RTID_FAULTS=out/soak.jsonl .venv/bin/python -m pytest -q -p no:benchmark -m soak tests/faults tests/browser; \
 	  status=$$?; .venv/bin/python -m tests.faults.table out/soak.jsonl | tee out/soak.md; \
 	  exit $$status
 

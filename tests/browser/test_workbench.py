@@ -46,7 +46,7 @@ def test_a_record_opens_and_every_view_is_drawn(opened: Opened) -> None:
     )
     fits = [t for t in titles if "fit" in t]
     assert len(fits) == 2
-    wanted = re.compile(r"free run - fit -?[\d.]+ % identification, -?[\d.]+ % held out")
+    wanted = re.compile(r"free run - fit -?[\d.]+ % identification, -?[\d.]+ % held-out")
     assert all(wanted.search(title) for title in fits)
     for key, view in (("2", "where"), ("3", "why"), ("4", "add"), ("5", "map"), ("6", "live")):
         page.keyboard.press(key)

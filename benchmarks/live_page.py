@@ -1,0 +1,190 @@
+"""What the live page costs: the daemon's loop with and without it, and the memory of its tab.
+
+`python -m benchmarks.live_page [--slice 10] [--pairs 12] [--minutes 10] [--priority 60]`
+
+Daemon, machine (on the test bus) and page server are processes of their own, the page is open in
+Chromium.  Slices with the page closed and open alternate, because the host steals time at random;
+of each second the daemon tells the p99 of its work and of its lateness; the ratio of the medians of
+two neighbouring slices is taken, its interval by resampling pairs.  Then the page stays open: the
+script heap after a collection and the private memory of its process, sampled every ten seconds; the
+growth is the slope after the first fifth.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtid.daemon.status import StatusError, read
+from rtid.sim.random_plants import draw
+from rtid.sim.recording import write_run
+from rtid.sim.run import simulate
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
+
+FLAGS = ["--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"]
+CHANNEL = f"239.74.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"
+SEED, SETTLE_S, SAMPLE_S, WARM = 3, 2.0, 10.0, 0.2
+PATIENCE_S = 120.0
+UPDATES = "() => Number(document.querySelector('#seen').textContent)"
+FloatArray = NDArray[np.float64]
+
+
+def begin(stack: ExitStack, *arguments: str, heard: bool = False) -> subprocess.Popen[str]:
+    """A command of rtid in a process of its own, ended with the stack."""
+    command = [sys.executable, "-u", "-m", "rtid", *arguments]
+    out = subprocess.PIPE if heard else subprocess.DEVNULL
+    process = subprocess.Popen(command, stdout=out, stderr=subprocess.DEVNULL, text=True)
+    stack.callback(process.wait, 30)
+    stack.callback(process.terminate)
+    return process
+
+
+def machine(stack: ExitStack, folder: Path, seconds: float, priority: int) -> tuple[Path, str]:
+    """A daemon that learns, and the page's server: state folder and address."""
+    run = simulate(draw(SEED), "rich", SEED, 2.0)
+    project = write_run(folder / "m.parquet", run, SEED, "rich")[2]
+    if priority:
+        text = project.read_text("utf-8")
+        head = "" if "[daemon]" in text else "\n[daemon]\n"
+        project.write_text(text + f"{head}priority = {priority}\n", "utf-8")
+    state = folder / "state"
+    bus = ["--bus", f"udp_multicast:{CHANNEL}", "--test-bus"]
+    begin(stack, "run", str(project), *bus, "--state", str(state))
+    begin(stack, "simulate", "--plant", str(SEED), "--motion", "rich", "--duration", f"{seconds:g}",
+          "--bus", "udp_multicast", "--channel", CHANNEL)  # fmt: skip
+    page = begin(stack, "ui", str(project), "--state", str(state), "--port", "0", heard=True)
+    assert page.stdout is not None
+    url = next(m[0] for line in page.stdout if (m := re.search(r"http://\S+", line)))
+    end = time.monotonic() + PATIENCE_S
+    while time.monotonic() < end:
+        try:
+            if read(state).estimate.samples > 5000:
+                return state, url
+        except StatusError:
+            pass
+        time.sleep(0.5)
+    raise SystemExit("the daemon has not learned anything")
+
+
+def seconds_of(state: Path, seconds: float) -> FloatArray:
+    """p99 of work and lateness (n, 2), us, of every second that the daemon tells of."""
+    told, last, end = [], 0, time.monotonic() + seconds
+    while time.monotonic() < end:
+        loop = read(state).loop
+        if loop.ticks != last:
+            last = loop.ticks
+            told.append((loop.work_1s.p99_us, loop.lateness_1s.p99_us))
+        time.sleep(0.25)
+    return np.array(told)
+
+
+def cost(state: Path, page: Page, url: str, slice_s: float, pairs: int) -> FloatArray:
+    """Medians of both p99 (pairs, closed or open, 2)."""
+    found = np.empty((pairs, 2, 2))
+    for k in range(pairs):
+        for is_open in (k % 2, 1 - k % 2):  # neither comes first always
+            page.goto(f"{url}#live" if is_open else "about:blank")
+            if is_open:
+                page.wait_for_selector("#live_learning progress")
+            time.sleep(SETTLE_S)
+            found[k, is_open] = np.median(seconds_of(state, slice_s), axis=0)
+        print(f"pair {k + 1}: closed {found[k, 0]}, open {found[k, 1]} us, load "
+              f"{os.getloadavg()[0]:.1f}", flush=True)  # fmt: skip
+    return found
+
+
+def report_cost(found: FloatArray) -> None:
+    """Ratios open / closed with their intervals."""
+    ratios = found[:, 1] / found[:, 0]
+    rng = np.random.default_rng(0)
+    again = np.median(ratios[rng.integers(0, len(ratios), (1000, len(ratios)))], axis=1)
+    low, high = np.quantile(again, [0.025, 0.975], axis=0)
+    for k, name in enumerate(("work", "lateness")):
+        print(f"loop p99, {name}: closed {np.median(found[:, 0, k]):.0f} us, open "
+              f"{np.median(found[:, 1, k]):.0f} us, ratio {np.median(ratios[:, k]):.3f} "
+              f"({low[k]:.3f} .. {high[k]:.3f})")  # fmt: skip
+
+
+def private_mb(browser: Browser) -> float:
+    """Memory that the largest tab has for itself."""
+    told = browser.new_browser_cdp_session().send("SystemInfo.getProcessInfo")
+    sizes = [0.0]
+    for process in told["processInfo"]:
+        if process["type"] == "renderer":
+            lines = Path(f"/proc/{process['id']}/smaps_rollup").read_text().splitlines()
+            sizes.append(sum(int(x.split()[1]) for x in lines if x.startswith("Private")) / 1e3)
+    return max(sizes)
+
+
+def memory(browser: Browser, page: Page, url: str, minutes: float) -> tuple[float, FloatArray]:
+    """Updates per second, and minutes, script heap and private memory (n, 3), MB."""
+    page.goto(f"{url}#live")
+    page.wait_for_selector("#live_learning progress")
+    cdp = page.context.new_cdp_session(page)
+    cdp.send("Performance.enable")
+    begun, first, rows = time.monotonic(), page.evaluate(UPDATES), []
+    while (now_s := time.monotonic() - begun) < 60 * minutes:
+        cdp.send("HeapProfiler.collectGarbage")
+        metrics = {m["name"]: m["value"] for m in cdp.send("Performance.getMetrics")["metrics"]}
+        rows.append((now_s / 60, metrics["JSHeapUsedSize"] / 1e6, private_mb(browser)))
+        page.wait_for_timeout(1e3 * SAMPLE_S)
+    rate = (page.evaluate(UPDATES) - first) / (time.monotonic() - begun)
+    return rate, np.array(rows)
+
+
+def growth(found: FloatArray) -> tuple[float, float]:
+    """Of script heap and private memory in 30 minutes, MB, after the first fifth."""
+    kept = found[found[:, 0] >= WARM * found[-1, 0]]
+    slopes = np.polyfit(kept[:, 0], kept[:, 1:], 1)[0]
+    return float(30 * slopes[0]), float(30 * slopes[1])
+
+
+def report_memory(rate: float, found: FloatArray) -> None:
+    """In words."""
+    heap, private = growth(found)
+    print(f"tab, {found[-1, 0]:.0f} minutes at {rate:.1f} updates a second: script heap "
+          f"{found[0, 1]:.1f} -> {found[-1, 1]:.1f} MB, private {found[0, 2]:.0f} -> "
+          f"{found[-1, 2]:.0f} MB; after warm-up {heap:+.2f}, {private:+.1f} MB "
+          "in 30 minutes")  # fmt: skip
+
+
+def main() -> None:
+    """Measure and report."""
+    from playwright.sync_api import sync_playwright
+
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--slice", type=float, default=10.0)
+    parser.add_argument("--pairs", type=int, default=12)
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--priority", type=int, default=60)
+    wanted = parser.parse_args()
+    seconds = 2.5 * wanted.pairs * (wanted.slice + 10) + 60 * wanted.minutes + PATIENCE_S
+    with ExitStack() as stack, sync_playwright() as running:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        state, url = machine(stack, folder, seconds, wanted.priority)
+        browser = running.chromium.launch(executable_path="/usr/bin/chromium", args=FLAGS)
+        page = browser.new_page()
+        page.set_default_timeout(1e3 * PATIENCE_S)
+        print(f"loop: {read(state).loop.rate_hz:g} Hz, {read(state).loop.scheduling}")
+        if wanted.pairs:
+            report_cost(cost(state, page, url, wanted.slice, wanted.pairs))
+        if wanted.minutes:
+            report_memory(*memory(browser, page, url, wanted.minutes))
+        browser.close()
+
+
+if __name__ == "__main__":
+    main()
