@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import getpass
 import time
-from pathlib import Path
-from typing import Annotated
 
 import typer
 
 from rtid.cli.exits import Exit
+from rtid.cli.options import Reason, Where
 from rtid.errors import RtidError
 
 WAIT_S = 30.0
 
 
 def accept(
-    where: Annotated[Path, typer.Argument(help="Project file, or the daemon's state folder.")],
-    reason: Annotated[str, typer.Option(help="Why, for the history.")] = "",
+    where: Where,
+    reason: Reason = "",
 ) -> None:
     """Take a changed machine for the new normal: the running daemon learns on from the change.
 

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from rtid.cli.exits import Exit, refuse_truncated
+from rtid.cli.options import AsJson, DryRun, ProjectOption, Reason
 from rtid.errors import RtidError
 
 
@@ -20,15 +21,13 @@ def add(
             help="The effect (what `rtid diagnose` names, without it), and a CAN log or table.",
         ),
     ],
-    project: Annotated[Path, typer.Option("--project", "-p", help="Project file.")],
+    project: ProjectOption,
     force: Annotated[
         bool, typer.Option("--force", help="Add it even if the held-out error does not fall.")
     ] = False,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Say what would be; write nothing.")
-    ] = False,
-    reason: Annotated[str, typer.Option(help="Why, for the history.")] = "",
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    dry_run: DryRun = False,
+    reason: Reason = "",
+    as_json: AsJson = False,
 ) -> None:
     """Refit with one effect more, show both errors before and after, and write it to the project.
 

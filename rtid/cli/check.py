@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rtid.cli.exits import Exit, refuse_truncated
+from rtid.cli.options import AsJson
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -32,7 +33,7 @@ def check(
         bool, typer.Option("--bus-only", help="No project: judge a raw capture, id by id.")
     ] = False,
     dbc: Annotated[Path | None, typer.Option(help="Names of messages, for --bus-only.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Judge a project file, alone or against a trace.
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rtid.cli.exits import refuse_truncated
+from rtid.cli.options import AsJson, ProjectOption
 
 if TYPE_CHECKING:
     from rtid.comparing import TraceComparison
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 def compare(
     trace: Annotated[Path, typer.Argument(help="CAN log or table.")],
-    project: Annotated[Path, typer.Option("--project", "-p", help="Project file.")],
+    project: ProjectOption,
     maps: Annotated[
         list[Path] | None,
         typer.Option(
@@ -44,7 +45,7 @@ def compare(
     ] = None,
     pictures: Annotated[Path | None, typer.Option(help="Folder for pictures.")] = None,
     picture_format: Annotated[str, typer.Option(help="png or svg.")] = "png",
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Say how well the learned map, or a data sheet, explains this trace, where and when it fails.
 

@@ -9,12 +9,13 @@ from typing import Annotated
 import typer
 
 from rtid.cli.exits import refuse_truncated
+from rtid.cli.options import AsJson, ProjectOption
 
 
 def diagnose(
     trace: Annotated[Path, typer.Argument(help="CAN log or table.")],
-    project: Annotated[Path, typer.Option("--project", "-p", help="Project file.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    project: ProjectOption,
+    as_json: AsJson = False,
 ) -> None:
     """Say which physical effect is missing, how large it is, and what could not be seen.
 

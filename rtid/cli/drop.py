@@ -9,19 +9,18 @@ from typing import Annotated
 import typer
 
 from rtid.cli.exits import refuse_truncated
+from rtid.cli.options import AsJson, DryRun, ProjectOption, Reason
 
 
 def drop(
     effect: Annotated[str, typer.Argument(metavar="EFFECT[:WHERE]", help="An added effect.")],
-    project: Annotated[Path, typer.Option("--project", "-p", help="Project file.")],
+    project: ProjectOption,
     trace: Annotated[
         Path | None, typer.Argument(help="CAN log or table: also say what it costs.")
     ] = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Say what would be; write nothing.")
-    ] = False,
-    reason: Annotated[str, typer.Option(help="Why, for the history.")] = "",
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    dry_run: DryRun = False,
+    reason: Reason = "",
+    as_json: AsJson = False,
 ) -> None:
     """Take an effect out of the project's model; with a trace, show errors before and after."""
     from rtid.present import progress_bar

@@ -8,9 +8,11 @@ from typing import Annotated
 
 import typer
 
+from rtid.cli.options import AsJson, ProjectOption
+
 
 def excite(
-    project: Annotated[Path, typer.Option("--project", "-p", help="Project file.")],
+    project: ProjectOption,
     out: Annotated[
         Path | None, typer.Option(help="CSV for the controller, one row per millisecond.")
     ] = None,
@@ -29,7 +31,7 @@ def excite(
         Path | None, typer.Option(help="PNG or SVG of the standard errors over the plane.")
     ] = None,
     compare: Annotated[bool, typer.Option(help="Also choose D-optimally, for comparison.")] = True,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Design a motion within the limits of [excite], and say what it will tell before it runs.
 

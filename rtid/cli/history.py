@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
-from typing import Annotated
 
-import typer
+from rtid.cli.options import AsJson, ProjectOption
 
 
 def history(
-    project: Annotated[Path, typer.Option("--project", "-p", help="Project file.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    project: ProjectOption,
+    as_json: AsJson = False,
 ) -> None:
     """List the changes of the model: date, effect, errors before and after, noise floor, reason."""
     from rtid.revised_text import SCHEMA, plain, show_history

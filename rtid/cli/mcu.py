@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rtid.cli.options import ProjectOption
+
 if TYPE_CHECKING:
     from rtid.mcu.tables import Sizes
     from rtid.project import Project
@@ -15,7 +17,7 @@ if TYPE_CHECKING:
 
 def mcu(
     output: Annotated[Path, typer.Argument(help="Folder for the C sources; created if missing.")],
-    project: Annotated[Path, typer.Option("--project", "-p", help="Project file.")],
+    project: ProjectOption,
     chamber: Annotated[str, typer.Option("--chamber", "-c", help="The chamber to learn.")] = "",
     edge: Annotated[
         list[str] | None, typer.Option("--edge", "-e", help="One of its edges; default: all.")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rtid.cli.exits import Exit
+from rtid.cli.options import AsJson
 
 if TYPE_CHECKING:
     from rtid.paper.result import Part
@@ -25,7 +26,7 @@ def paper(
         int, typer.Option(min=1, help="Random machines, where a part takes several.")
     ] = 30,
     seed: Annotated[int, typer.Option(min=0, help="Of noise and motion.")] = 0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Reproduce the figures and tables of the paper that rtid implements, IMECE2005-79420.
 

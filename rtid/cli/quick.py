@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from rtid.cli.exits import Exit, refuse_truncated
+from rtid.cli.options import AsJson
 
 
 def quick(
@@ -27,7 +28,7 @@ def quick(
         float | None,
         typer.Option("--dead-volume", min=1e-4, help="Volume left at either end, hoses too, L."),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Say within a minute whether this data is good enough, and which effect is missing.
 

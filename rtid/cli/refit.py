@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from rtid.cli.options import AsJson
+
 
 def refit(
     plant: Annotated[Path, typer.Argument(help="Plant file (TOML) with the equations.")],
@@ -21,7 +23,7 @@ def refit(
             "--add", help="EFFECT:WHERE, e.g. overflow:x1; may be given twice (see `rtid effects`)."
         ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Fit parameters and initial states of a plant so that its free run follows the record.
 

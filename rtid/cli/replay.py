@@ -9,13 +9,14 @@ from typing import Annotated
 import typer
 
 from rtid.cli.exits import refuse_truncated
+from rtid.cli.options import AsJson, ProjectOption
 
 
 def replay(
     trace: Annotated[
         Path, typer.Argument(help="CAN log (.blf .log .asc .trc .csv .mf4) or table.")
     ],
-    project: Annotated[Path, typer.Option("--project", "-p", help="Project file.")],
+    project: ProjectOption,
     bus: Annotated[
         bool, typer.Option("--bus", help="Through python-can's virtual bus instead of the file.")
     ] = False,
@@ -30,7 +31,7 @@ def replay(
         Path | None, typer.Option(help="Folder for pictures: coverage, maps, model and residual.")
     ] = None,
     picture_format: Annotated[str, typer.Option(help="png or svg.")] = "png",
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Learn flow maps and bulk modulus from a captured trace.
 

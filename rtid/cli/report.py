@@ -9,18 +9,19 @@ from typing import Annotated
 import typer
 
 from rtid.cli.exits import refuse_truncated, refuse_without_bokeh
+from rtid.cli.options import AsJson, ProjectOption
 
 
 def report(
     trace: Annotated[Path, typer.Argument(help="CAN log or table.")],
-    project: Annotated[Path, typer.Option("--project", "-p", help="Project file.")],
+    project: ProjectOption,
     output: Annotated[Path, typer.Option("--output", "-o", help="HTML file to write.")] = Path(
         "report.html"
     ),
     png: Annotated[
         Path | None, typer.Option(help="Also write the pictures as PNG files into this folder.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Write one HTML file that tells what the model misses: verdict, errors, pictures, tables.
 

@@ -11,6 +11,7 @@ import typer
 
 from firmware_bridge.playback import AS_FAST_AS_POSSIBLE, send
 from rtid.cli.exits import Exit
+from rtid.cli.options import AsJson
 from rtid.errors import RtidError
 from rtid.sim.bus import open_test_bus, run_frames
 from rtid.sim.hidden import hide_wish, known
@@ -59,7 +60,7 @@ def simulate(
     ] = None,
     channel: Annotated[str, typer.Option(help="Channel of the bus.")] = "239.74.163.2",
     speed: Annotated[float, typer.Option(help="Pace on the bus; 0: as fast as possible.")] = 1.0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Record a simulated machine: the trace, the truth (.truth.json), a project file (.toml).
 

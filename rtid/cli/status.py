@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from rtid.cli.exits import Exit
+from rtid.cli.options import Where
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def status(
-    where: Annotated[Path, typer.Argument(help="Project file, or the daemon's state folder.")],
+    where: Where,
     as_json: Annotated[bool, typer.Option("--json", help="Print it as JSON.")] = False,
     metrics: Annotated[
         bool, typer.Option("--metrics", help="Print it as Prometheus metrics.")

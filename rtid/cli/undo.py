@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
-from typing import Annotated
 
-import typer
+from rtid.cli.options import AsJson, ProjectOption
 
 
 def undo(
-    project: Annotated[Path, typer.Option("--project", "-p", help="Project file.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    project: ProjectOption,
+    as_json: AsJson = False,
 ) -> None:
     """Restore the project file as it was before the last change, byte for byte; repeatable."""
     from rtid.revised_text import as_json as plain

@@ -16,24 +16,9 @@ from typing import TypeVar
 
 import numpy as np
 
+from rtid.daemon import jobs
 from rtid.daemon.chronicle import Chronicle
 from rtid.daemon.configure import boarded
-from rtid.daemon.jobs import (
-    Answer,
-    Batch,
-    Found,
-    Handover,
-    Job,
-    Note,
-    NotSaved,
-    Publication,
-    Ready,
-    Recall,
-    Recalled,
-    Recording,
-    Relearn,
-    Saved,
-)
 from rtid.daemon.judge import Judge
 from rtid.daemon.offering import Offering
 from rtid.daemon.pipe import Pipe
@@ -58,7 +43,9 @@ FLOOD_S = 10.0  # the same refusal of the disk is told at most this often
 class Analyst:
     """Takes jobs, answers through `answer`."""
 
-    def __init__(self, project: Project, folder: Path, answer: Callable[[Answer], None]) -> None:
+    def __init__(
+        self, project: Project, folder: Path, answer: Callable[[jobs.Answer], None]
+    ) -> None:
         self._answer, self._project = answer, project
         self._chambers = [chamber.name for chamber in project.model.chambers]
         self._generations = Generations(folder, project.digest)
@@ -70,27 +57,27 @@ class Analyst:
         self._judge: Judge | None = None
         self._segment = ""
         self._told: dict[str, float] = {}
-        self._handed: deque[Handover] = deque(maxlen=KEPT)
+        self._handed: deque[jobs.Handover] = deque(maxlen=KEPT)
         self._offering = Offering(project, folder)
 
-    def take(self, job: Job) -> None:
+    def take(self, job: jobs.Job) -> None:
         """Do one job."""
-        if isinstance(job, Batch):
+        if isinstance(job, jobs.Batch):
             self._batch(job)
-        elif isinstance(job, Handover):
+        elif isinstance(job, jobs.Handover):
             try:
                 self._handover(job)
             finally:
-                self._answer(Ready())
-        elif isinstance(job, Note):
+                self._answer(jobs.Ready())
+        elif isinstance(job, jobs.Note):
             self._note(job)
-        elif isinstance(job, Recall) and self._handed:
+        elif isinstance(job, jobs.Recall) and self._handed:
             wanted = [one for one in self._handed if one.number <= job.number]
             found = wanted[-1] if wanted else self._handed[0]
-            self._answer(Recalled(found.estimator))
-        elif isinstance(job, Relearn):
+            self._answer(jobs.Recalled(found.estimator))
+        elif isinstance(job, jobs.Relearn):
             self._relearn(job)
-        elif isinstance(job, Found) and job.verdict is not None:
+        elif isinstance(job, jobs.Found) and job.verdict is not None:
             verdict = job.verdict
             self._guarded("history", lambda: self._history().note_verdict(verdict))
 
@@ -101,7 +88,7 @@ class Analyst:
         if self._chronicle is not None:
             self._chronicle.close()
 
-    def _batch(self, batch: Batch) -> None:
+    def _batch(self, batch: jobs.Batch) -> None:
         if self._judge is not None:
             judgement = self._judge.push(batch.chunk)
             if judgement is not None:
@@ -112,36 +99,36 @@ class Analyst:
             self._guarded("recording", lambda: self._record().write(frames))
             if self._recorder is not None and self._recorder.path != self._segment:
                 self._segment = self._recorder.path
-                self._answer(Recording(self._segment))
+                self._answer(jobs.Recording(self._segment))
 
-    def _handover(self, job: Handover) -> None:
+    def _handover(self, job: jobs.Handover) -> None:
         if job.store:
             path = self._guarded("snapshot", lambda: self._generations.save(job.estimator))
             if path is not None:
-                self._answer(Saved(job.number, str(path)))
+                self._answer(jobs.Saved(job.number, str(path)))
         if job.publish and len(job.estimator.sums.blocks):
             self._handed.append(job)
             self._publish(job)
 
-    def _relearn(self, job: Relearn) -> None:
+    def _relearn(self, job: jobs.Relearn) -> None:
         """Begin anew with the machine as it is; what was learned before is kept aside."""
         estimator = Estimator(self._project.model)
         estimator.history, estimator.origin_us = None, job.origin_us
         estimator.advance(job.chunk)
         self._handed.clear()
-        self._answer(Recalled(estimator, is_accepted=True))
+        self._answer(jobs.Recalled(estimator, is_accepted=True))
         self._guarded("snapshot", self._generations.set_aside)
         self._guarded("snapshot", lambda: self._generations.save(estimator))
         self._guarded("history", lambda: self._history().note_acceptance(job.acceptance))
 
-    def _publish(self, job: Handover) -> None:
+    def _publish(self, job: jobs.Handover) -> None:
         start_s = time.monotonic()
         with np.errstate(divide="ignore"):  # compliance 0: the motion has not shown it yet
             solution = job.estimator.solution()
             self._judge = Judge(job, solution)
             flow_map = publish(solution)
             beta_pa, beta_sd_pa = solution.beta_pa, solution.beta_sd_pa
-        found = Publication(
+        found = jobs.Publication(
             job.number,
             flow_map,
             beta_pa,
@@ -163,7 +150,7 @@ class Analyst:
         write_map(temporary, flow_map, told)
         os.replace(temporary, self._folder / MAP_FILE)
 
-    def _note(self, note: Note) -> None:
+    def _note(self, note: jobs.Note) -> None:
         self._guarded("history", lambda: self._history().note_alarm(note.alarm))
         if note.keep and self._limit_bytes:
             alarm = note.alarm
@@ -171,7 +158,7 @@ class Analyst:
                 "recording", lambda: self._record().keep(alarm.name, alarm.since_unix_s)
             )
             kept = {alarm.name: keep} if keep else {}
-            self._answer(Recording(self._recorder.path if self._recorder else "", kept))
+            self._answer(jobs.Recording(self._recorder.path if self._recorder else "", kept))
 
     def _record(self) -> Recorder:
         if self._recorder is None:
@@ -191,7 +178,7 @@ class Analyst:
             now_s = time.monotonic()
             if now_s >= self._told.get(what, 0.0):
                 self._told[what] = now_s + FLOOD_S
-                self._answer(NotSaved(what, str(error)))
+                self._answer(jobs.NotSaved(what, str(error)))
         return None
 
 
@@ -216,12 +203,12 @@ def main() -> None:
     Estimator(loaded.model).solution()  # compiles
     analyst = Analyst(loaded, Path(folder), pipe.send)
     try:
-        pipe.send(Ready())
+        pipe.send(jobs.Ready())
         while (job := pipe.receive()) is not None:
             try:
                 analyst.take(job)
             except RtidError as error:
-                pipe.send(NotSaved("analysis", str(error)))
+                pipe.send(jobs.NotSaved("analysis", str(error)))
     except (EOFError, OSError):
         pass  # the daemon is gone; what it had was stored by the last job
     analyst.close()

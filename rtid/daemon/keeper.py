@@ -11,28 +11,13 @@ import time
 from collections import Counter, deque
 from dataclasses import replace
 
+from rtid.daemon import jobs, wording
 from rtid.daemon import status as st
-from rtid.daemon import wording
 from rtid.daemon.acceptance import Acceptance, taken
 from rtid.daemon.alarms import Alarms
 from rtid.daemon.core import Core
 from rtid.daemon.diagnosing import Diagnosing, newest
 from rtid.daemon.helper import Helper
-from rtid.daemon.jobs import (
-    Answer,
-    Checked,
-    Found,
-    Judgement,
-    Note,
-    NotSaved,
-    Publication,
-    Ready,
-    Recall,
-    Recalled,
-    Recording,
-    Relearn,
-    Saved,
-)
 from rtid.daemon.log import logger
 from rtid.daemon.plant import PlantWatch
 from rtid.daemon.story import line
@@ -54,7 +39,7 @@ class Keeper:
         core: Core,
         analyst: Helper,
         diagnosing: Diagnosing,
-        answers: deque[Answer],
+        answers: deque[jobs.Answer],
     ) -> None:
         self._facts, self._core, self._analyst = facts, core, analyst
         self._diagnosing = diagnosing
@@ -103,25 +88,25 @@ class Keeper:
     def _listen(self) -> None:
         while self._answers:
             answer = self._answers.popleft()
-            if isinstance(answer, Ready):
+            if isinstance(answer, jobs.Ready):
                 self._core.busy = False
-            elif isinstance(answer, Publication):
+            elif isinstance(answer, jobs.Publication):
                 self.teller.publish(answer)
-            elif isinstance(answer, Judgement):
+            elif isinstance(answer, jobs.Judgement):
                 if self.plant.push(answer):
                     self._plant_changed()
-            elif isinstance(answer, Saved | NotSaved):
+            elif isinstance(answer, jobs.Saved | jobs.NotSaved):
                 self._saving.hear(answer)
-            elif isinstance(answer, Recording):
+            elif isinstance(answer, jobs.Recording):
                 self._recording = answer.path
                 for name, folder in answer.kept.items():
                     self.alarms.keep(name, folder)
-            elif isinstance(answer, Recalled):
+            elif isinstance(answer, jobs.Recalled):
                 self._core.swap = answer.estimator
                 if answer.is_accepted:
                     self.plant.accept()
                     self._plant_changed()
-            elif isinstance(answer, Found | Checked):
+            elif isinstance(answer, jobs.Found | jobs.Checked):
                 self._analyst.put(answer)
                 self._diagnosing.take(answer)
                 if self._diagnosing.is_acquitted and self.plant.changed:
@@ -134,7 +119,7 @@ class Keeper:
         if self.plant.changed:
             logger.warning("plant changed: learning is suspended, surprise=%.1f level=%.1f",
                            self.plant.surprise or 0.0, self.plant.level)  # fmt: skip
-            self._analyst.put(Recall(self.plant.trusted))
+            self._analyst.put(jobs.Recall(self.plant.trusted))
             self._diagnosing.begin(self.plant.since_s)
         else:
             logger.info("plant as before: learning goes on")
@@ -196,7 +181,7 @@ class Keeper:
             return
         logger.info("accepted by=%s reason=%r", request.who, request.reason)
         chunk = newest(estimator.history, self._core.newest_s - self.plant.since_s)
-        self._analyst.put(Relearn(chunk, estimator.origin_us, request))
+        self._analyst.put(jobs.Relearn(chunk, estimator.origin_us, request))
 
     def _why_not_saved(self) -> str:
         core = self._core
@@ -224,7 +209,7 @@ class Keeper:
         begins = alarm.until_unix_s is None
         logger.log(30 if begins else 20, "alarm %s name=%s kind=%s text=%r",
                    "on" if begins else "over", alarm.name, alarm.kind, alarm.text)  # fmt: skip
-        self._analyst.put(Note(alarm, keep=begins and alarm.kind != "loop"))
+        self._analyst.put(jobs.Note(alarm, keep=begins and alarm.kind != "loop"))
 
     def _tell_alarms(self) -> None:
         """What has just begun or ended is told at once."""

@@ -39,10 +39,15 @@ class PlantWatch:
         """Surprise of the healthy plant."""
         return max(1.0, median(self._levels)) if self._levels else 1.0
 
+    @property
+    def is_ready(self) -> bool:
+        """Whether the level is known well enough to judge."""
+        return len(self._levels) >= LEAST_LEVEL
+
     def push(self, one: Judgement) -> bool:
         """Take a judgement; whether `changed` has changed."""
         self.surprise = one.surprise
-        bad = len(self._levels) >= LEAST_LEVEL and one.surprise > FACTOR * self.level
+        bad = self.is_ready and one.surprise > FACTOR * self.level
         if self.changed:
             return self._await_health(bad)
         self._follow(one)

@@ -1,0 +1,14 @@
+"""Options that several commands have in common, in the same words."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+ProjectOption = Annotated[Path, typer.Option("--project", "-p", help="Project file.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Say what would be; write nothing.")]
+Reason = Annotated[str, typer.Option(help="Why, for the history.")]
+Where = Annotated[Path, typer.Argument(help="Project file, or the daemon's state folder.")]
