@@ -151,11 +151,14 @@ def _plan(
     content = _content(applied, held)
     if wish.undo:
         prepared, why, provenance = _undone(applied, content)
+    elif wish.again:
+        prepared, why, provenance = _repeated(applied)
     else:
         known, sd_pa, why, provenance = wished(project, folder, wish, applied, content)
         prepared = prepare(project, known, sd_pa, room)
     found = review(project, applied, held, prepared)
-    against = () if wish.undo else tuple(objections(project, applied, found))
+    is_free = wish.undo or (wish.again and not found.holds)  # the way back is never barred
+    against = () if is_free else tuple(objections(project, applied, found))
     if found.is_unknown and not wish.replace_unknown:
         text = (
             "the controller holds maps that were not sent from here: what would change is unknown"
@@ -186,6 +189,15 @@ def _by_the_records(project: Project, applied: Applied) -> dict[int, Held]:
     if last is None:
         return dict.fromkeys(slots(project), Held(0, 0))
     return {slot: Held(last.version, crc) for slot, crc in last.crcs.items()}
+
+
+def _repeated(applied: Applied) -> tuple[Prepared, str, dict[str, Any]]:
+    """What was last made active, for a controller that was switched off."""
+    done = [row for row in applied.rows() if row.outcome == DONE]
+    if not done:
+        raise ApplyError("nothing was ever sent from here", "`rtid apply` sends a map", 4)
+    content = done[-1].content
+    return stored(applied, content), f"Once more: the map of version {content}.", {"again": content}
 
 
 def _undone(applied: Applied, content: int | None) -> tuple[Prepared, str, dict[str, Any]]:

@@ -26,6 +26,7 @@ class Wish:
     """What was asked for; see the options of `rtid apply`."""
 
     undo: bool = False
+    again: bool = False
     map_file: Path | None = None
     against: Path | None = None
     dry_run: bool = False

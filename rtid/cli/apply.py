@@ -6,6 +6,8 @@ import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,6 +25,10 @@ def apply(
     project: Annotated[Path, typer.Argument(help="Project file, with [publish].")],
     undo: Annotated[
         bool, typer.Option("--undo", help="Send back what was active before the last apply.")
+    ] = False,
+    again: Annotated[
+        bool,
+        typer.Option("--again", help="Send the last map to a controller that has forgotten it."),
     ] = False,
     map_file: Annotated[
         Path | None,
@@ -42,6 +48,9 @@ def apply(
     state: Annotated[
         Path | None, typer.Option(help="State folder of the daemon; else the file's.")
     ] = None,
+    log: Annotated[
+        bool, typer.Option("--log", help="List what was sent, when and by whom; send nothing.")
+    ] = False,
     replace_unknown: Annotated[
         bool,
         typer.Option("--replace-unknown", help="Even where the controller's map is not known."),
@@ -60,7 +69,10 @@ def apply(
     from rtid.apply_session import apply_map
     from rtid.wished import Wish
 
-    wish = Wish(undo, map_file, against, dry_run, bus, state, replace_unknown, test_bus)
+    if log:
+        _list(project, state, as_json)
+        return
+    wish = Wish(undo, again, map_file, against, dry_run, bus, state, replace_unknown, test_bus)
 
     def confirmed(plan: Plan) -> bool:
         if not as_json:
@@ -76,6 +88,23 @@ def apply(
     with _bar() as progress:
         plan, row = apply_map(project, wish, confirmed, progress)
     _end(plan, row, as_json, dry_run)
+
+
+def _list(project: Path, state: Path | None, as_json: bool) -> None:
+    """All applies, the oldest first."""
+    from rtid.applied import Applied
+    from rtid.daemon.configure import state_of
+
+    rows = Applied(state or state_of(project)).rows()
+    if as_json:
+        print(json.dumps([asdict(row) for row in rows]))
+        return
+    for row in rows:
+        when = datetime.fromtimestamp(row.unix_s, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+        changes = [abs(e["largest_m3s"]) for e in row.told.get("edges", ()) if e["largest_m3s"]]
+        largest = f"largest change {6e4 * max(changes):.2f} L/min" if changes else "the first"
+        again = "" if row.content == row.version else f", the maps of version {row.content}"
+        print(f"{when}  version {row.version}{again}: {row.outcome}, by {row.who}, {largest}")
 
 
 @contextmanager

@@ -15,6 +15,7 @@ import numpy as np
 from rtid import offered
 from rtid.applied import DONE, Applied
 from rtid.daemon.jobs import Publication
+from rtid.daemon.log import logger
 from rtid.errors import RtidError
 from rtid.estimator.solution import Solution
 from rtid.judging import Judgement, Known, judge
@@ -55,9 +56,13 @@ class Offering:
         section = self._project.sections.publish
         content, held = self._held()
         samples = np.concatenate(self._chunks)
-        found = judge(
-            self._project.model, samples, held, known, section.gain_percent, solution.terms_theta
-        )
+        terms, gain_percent = solution.terms_theta, section.gain_percent
+        try:
+            found = judge(self._project.model, samples, held, known, gain_percent, terms)
+        except ValueError as error:  # the analyst has more to do than to offer maps
+            logger.warning("map not judged: %s", error)
+            self._candidate, self._chunks = None, []
+            return None
         if found.t == 0.0 and self._span_s < PATIENCE * section.judge_s:  # too little motion
             self._wait_s += section.judge_s
             return None

@@ -150,6 +150,26 @@ def test_undo_twice_goes_back_twice(tmp_path: Path, maps: tuple[FlowMap, FlowMap
             assert held_slots(project, controller) == wanted
 
 
+def test_a_controller_that_was_switched_off_gets_its_map_again(
+    tmp_path: Path, maps: tuple[FlowMap, FlowMap]
+) -> None:
+    path, folder, controller = project_file(tmp_path), tmp_path / "state", Controller()
+    with neighbour(controller) as there:
+        wish = Wish(again=True, bus=f"virtual:{there.channel}", state=folder, test_bus=True)
+        offer(folder, load(path), maps[0])
+        with pytest.raises(ApplyError, match="nothing was ever sent"):
+            apply_map(path, wish, lambda plan: True)
+        sent(path, there, folder)
+        assert apply_map(path, wish, lambda plan: True)[0].is_same
+        held = held_slots(load(path), controller)
+        there.controller = Controller()
+        row = apply_map(path, wish, lambda plan: True)[1]
+        assert row is not None and (row.version, row.content) == (2, 1)
+        assert held_slots(load(path), there.controller) == held
+        with pytest.raises(ApplyError, match="nothing to go back to"):
+            sent(path, there, folder, undo=True)
+
+
 def test_limits(tmp_path: Path, maps: tuple[FlowMap, FlowMap]) -> None:
     folder, controller = tmp_path / "state", Controller()
     path = project_file(tmp_path)
@@ -320,6 +340,11 @@ def test_the_command(
         assert told["applied"]["version"] == 2 and len(told["edges"]) == 4
         assert ends([*call, "--undo", "--yes"]) == Exit.OK
         capsys.readouterr()
+        assert ends(["apply", str(path), "--log"]) == Exit.OK
+        listed = capsys.readouterr().out.splitlines()
+        assert len(listed) == 3 and "version 3, the maps of version 1: done, by " in listed[2]
+        assert ends(["apply", str(path), "--log", "--json"]) == Exit.OK
+        assert [row["version"] for row in json.loads(capsys.readouterr().out)] == [1, 2, 3]
         assert ends([*call, "--yes"]) == Exit.NEGATIVE  # no offer
         assert "no map is offered" in capsys.readouterr().err
         assert ends(["apply", str(path), "--bus", f"virtual:{there.channel}"]) == Exit.USAGE

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import re
 import threading
 import time
 from collections.abc import Iterator
@@ -183,3 +184,25 @@ def test_an_adapter_that_the_daemon_only_listens_with(tmp_path: Path, flow_map: 
         wish = Wish(bus="slcan:/dev/ttyACM7", state=folder)
         with pytest.raises(RtidError, match="listen only"):
             apply_map(path, wish, lambda plan: True)
+
+
+RTID = Path(reach.__file__).parent
+
+
+def test_only_one_module_of_rtid_arms_a_bus() -> None:
+    """Whoever could send is named here: `reach` for the controller, the rest for test buses."""
+    arming, opening = set(), set()
+    for path in RTID.rglob("*.py"):
+        text, name = path.read_text("utf-8"), path.relative_to(RTID).as_posix()
+        if re.search(r"\b(BusSink|SerialSink|ArmedLink)\b", text):
+            arming.add(name)
+        if re.search(r"\bcan\.(Bus|interface\.Bus|ThreadSafeBus)\(", text):
+            opening.add(name)
+    assert arming == {"reach.py"}
+    assert opening <= {"live.py", "sim/bus.py"}  # `virtual_bus` and `open_test_bus`
+    users = {
+        path.relative_to(RTID).as_posix()
+        for path in RTID.rglob("*.py")
+        if "reach.armed(" in path.read_text("utf-8")
+    }
+    assert users == {"apply_session.py", "daemon/notices.py"}

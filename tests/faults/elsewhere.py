@@ -30,6 +30,11 @@ ELSEWHERE: dict[int, tuple[str, tuple[str, ...]]] = {
     26: ("attacks on the page", ("tests/browser",)),
     27: (
         "sending lives in one module, refuses unless armed; no test sends on a real bus",
-        ("tests/bridge/test_serial_sink.py", "tests/test_layers.py"),
+        (
+            "tests/bridge/test_serial_sink.py",
+            "tests/test_layers.py",
+            "tests/apply/test_on_board.py",
+            "tests/apply/test_live.py",
+        ),
     ),
 }
