@@ -23,16 +23,13 @@ from rtid.model import FloatArray
 
 REST_S = 0.1  # at both ends of a segment
 REACH, RANGE = 0.9, 0.96  # of stroke and supply: the true machine differs
-PACES = (0.06, 0.15, 0.3, 0.45, 0.6, 0.75, 0.9)  # of the highest speed
+PACES = (0.06, 0.15, 0.3, 0.5, 0.75)  # of the highest speed
 SWING_PACES = (0.35, 0.65, 0.9)
 LONGEST_S = 9.0  # of one segment
 TURN_S = 0.08  # between speeds
-ZIGZAGS, BRISK = (0.2, 0.5, 1.0), 0.8  # shares of the supply's range; of its rate
-STEPS = (
-    (1.0, 0.1),
-    (0.5, 0.07),
-    (0.25, 0.05),
-)  # of the command: share of the largest offset, hold in s
+ZIGZAGS, BRISK = (0.3, 1.0), 0.8  # shares of the supply's range; of its rate
+# Steps of the command: share of the largest offset, hold in s.
+STEPS = ((1.0, 0.05), (0.25, 0.03))
 SHUT_PACES, SHUT_S = (0.4, 0.9), 3.0
 
 
@@ -134,7 +131,8 @@ def _at_levels(
             continue
         for share, hold_s in STEPS:
             stepped = _with_steps(reference, limits, share, hold_s, rng)
-            yield Segment(f"{name_}, steps of {share * limits.offset_v:.2g} V", stepped)
+            step = f"steps of {share * limits.offset_v:.2g} V, {hold_s:g} s"
+            yield Segment(f"{name_}, {step}", stepped)
 
 
 def _supplied(name: str, v: FloatArray, limits: Limits) -> Iterator[tuple[str, FloatArray]]:
@@ -173,8 +171,8 @@ def _with_steps(
 
 def rate_limited(values: FloatArray, most: float) -> FloatArray:
     """Values (n,) that follow the given ones by at most so much per sample."""
-    found, now = np.empty_like(values), float(values[0])
-    for k, value in enumerate(values):
-        now += float(np.clip(value - now, -most, most))
-        found[k] = now
-    return found
+    found, now = list[float](), float(values[0])
+    for value in values.tolist():
+        now += min(max(value - now, -most), most)
+        found.append(now)
+    return np.array(found)

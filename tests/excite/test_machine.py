@@ -1,0 +1,126 @@
+"""The nominal machine beside the simulated one, and a short design from file to true machine."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rtid.cli.main import run
+from rtid.compare.reference import theta_cells
+from rtid.errors import RtidError
+from rtid.estimator.estimator import to_chunk
+from rtid.excite import library
+from rtid.excite.driving import SHUT, STEP_S, Control, Piston
+from rtid.excite.limits import LimitError
+from rtid.excite.machine import Machine
+from rtid.excite.prediction import assess
+from rtid.exciting import excite, limits_of, machine_of, section_of
+from rtid.model import Grid, Lag
+from rtid.project import load
+from rtid.sim.declare import declared_model
+from rtid.sim.plant import Plant
+from rtid.sim.run import EXACT, P_A, P_B, U, X, simulate
+from tests.excite.machines import machine, motion, motion_of, write_project
+
+NUMBER = 7
+EXCITE = "external_leakage_laminar"
+
+
+def exact_machine(plant: Plant) -> Machine:
+    """Everything known: the true maps on a fine grid, load, friction, controller."""
+    fine = Grid(np.linspace(1.0, 9.6, 120), np.linspace(-1e6, 1e7, 45))
+    model = declared_model(plant, grid=fine, lag=Lag(plant.lag_s, 0.0))
+    c, k = plant.constants, plant.controller
+    piston = Piston(
+        c.mass_kg, c.gravity_n, c.gravity_slope_npm, 0.5 * c.stroke_m, c.viscous_nspm, c.coulomb_n
+    )
+    control = Control(*k)
+    compliance = np.full(2, 1.0 / c.beta_pa)
+    theta = theta_cells(model, plant.flow)
+    return Machine(model, theta, compliance, piston, control, c.stroke_m, plant.p_supply_pa)
+
+
+def few_segments(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A library of a few segments: a test has not the time for all."""
+    monkeypatch.setattr(library, "PACES", (0.15, 0.4))
+    monkeypatch.setattr(library, "SWING_PACES", (0.65,))
+    monkeypatch.setattr(library, "STEPS", ((0.5, 0.07),))
+    monkeypatch.setattr(library, "ZIGZAGS", (0.3,))
+
+
+def test_the_nominal_machine_moves_as_the_simulated_one(tmp_path: Path) -> None:
+    plant = machine(NUMBER)
+    project = load(write_project(tmp_path, plant, NUMBER))
+    limits = limits_of(section_of(project))
+    segments = [s for s in library.library(limits) if "at 8.43" in s.name]
+    moves = [next(s for s in segments if s.name.startswith(n)) for n in ("swing 0.65", "shut 0.4")]
+    reference = np.concatenate([s.reference for s in moves])
+    true = simulate(plant, motion(reference), 0, len(reference) * STEP_S, EXACT).truth.signals
+    found = exact_machine(plant).run(reference)[:, 2:]
+    late = np.arange(len(found)) > 500  # they begin with other pressures at rest
+    assert np.abs(found - true)[late, X].max() < 1e-3
+    for column in (P_A, P_B):
+        error = np.sqrt(np.mean((found - true)[late, column] ** 2))
+        assert error < 0.15 * np.std(true[late, column])
+    shut = reference[:, SHUT] > 0
+    assert shut.any()
+    assert not found[shut, U].any()
+
+
+def test_a_design_from_the_file_to_the_true_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Limits are kept, and the predicted detection limit is what a simulation then finds."""
+    few_segments(monkeypatch)
+    plant = machine(NUMBER)
+    project, table = write_project(tmp_path, plant, NUMBER), tmp_path / "motion.csv"
+    asked = ["excite", "-p", str(project), "--duration-s", "25", "--see", EXCITE, "--no-compare"]
+    picture = tmp_path / "motion.svg"
+    with pytest.raises(SystemExit) as done:
+        run([*asked, "--out", str(table), "--picture", str(picture), "--json"])
+    assert done.value.code == 0
+    told = json.loads(capsys.readouterr().out)
+    assert all(e["is_kept"] for e in told["extremes"])
+    assert picture.stat().st_size > 10_000
+    true = simulate(plant, motion_of(table), 1, told["duration_s"])
+    limits = limits_of(section_of(load(project)))
+    signals = true.truth.signals
+    assert limits.stroke_m[0] <= signals[:, X].min() <= signals[:, X].max() <= limits.stroke_m[1]
+    assert np.abs(signals[:, U]).max() <= limits.command_v + 1e-3
+    model = load(project).model
+    found = assess(model, to_chunk(model, true.samples, int(true.samples.t_us[0])))
+    designed, sweep = told["predictions"]
+    assert found.valid == pytest.approx(designed["valid_blocks"], rel=0.3)
+    assert sweep["valid_blocks"] > 50
+    for limit in designed["limits"]:
+        if limit["effect"] == EXCITE:
+            measured = found.limit(EXCITE, limit["where"])
+            assert 1 / 1.5 < measured / limit["detection_limit"] < 1.5
+
+
+def test_what_cannot_be_designed_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    few_segments(monkeypatch)
+    path = write_project(tmp_path, machine(NUMBER), NUMBER)
+    project = load(path)
+    with pytest.raises(RtidError, match="no effect 'leak'"):
+        excite(project, ["leak"])
+    with pytest.raises(LimitError, match="can follow no segment"):
+        excite(project, pressure_pa=(9.0e6, 9.9e6))
+    text = path.read_text("utf-8")
+    path.write_text(text[: text.index("[excite]")], "utf-8")
+    with pytest.raises(RtidError, match=r"no section \[excite\]"):
+        excite(load(path))
+
+
+def test_the_rated_flow_stands_in_for_a_data_sheet(tmp_path: Path) -> None:
+    path = write_project(tmp_path, machine(NUMBER), NUMBER)
+    path.write_text(path.read_text("utf-8").replace('reference_map = "sheet.csv"\n', ""), "utf-8")
+    project = load(path)
+    found = machine_of(project, section_of(project))
+    edge = project.model.edges[0]
+    assert np.abs(found.theta[:, 0]).max() == pytest.approx(
+        edge.rated_q_m3s * np.sqrt(9e6 / edge.rated_dp_pa), rel=0.1
+    )
