@@ -347,6 +347,131 @@ def test_not_now() -> None:
     assert state(controller) == IS_NEW
 
 
+def asked(controller: Controller, data: bytes) -> bytes:
+    """The answer to one frame."""
+    (answer,) = controller.push(data)
+    return answer
+
+
+def put(controller: Controller, slot: int, image: Image, version: int, chunks: int) -> None:
+    """Open session 3, announce an image, and send so many of its chunks."""
+    controller.push(protocol.open_frame(3))
+    nu, ns = image.data[2:4]
+    for data in protocol.begin_frames(3, slot, nu, ns, len(image.data), version, image.crc):
+        controller.push(data)
+    for k in range(chunks):
+        controller.push(protocol.data_frame(3, k, image.data))
+
+
+def is_active(controller: Controller, image: Image) -> bool:
+    """Whether slot 0 gives the flows of this image, everywhere."""
+    table = lookup.table_of(image.data)
+    u = table.direction * table.w_v[1:, None].astype(float)
+    q = controller.flow(0, u, table.dp_pa)[0]
+    return bool(np.abs(q - table.flow(u, table.dp_pa)[0]).max() < 1e-5 * np.abs(q).max())
+
+
+def test_damage_behind_a_good_crc_8_is_found_at_the_end() -> None:
+    controller, spoilt = begun(), list[bytes]()
+
+    def spoil(data: bytes, is_answer: bool) -> list[bytes]:
+        if not is_answer and data[0] == 0x80 + 70 and len(spoilt) < 2:
+            spoilt.append(data)
+            frame = bytearray(data)
+            frame[3] ^= 0x10
+            session = next(s for s in range(1 << 16) if protocol.crc8(s, data) == data[7])
+            frame[7] = protocol.crc8(session, bytes(frame))
+            return [bytes(frame)]
+        return [data]
+
+    line = Line(controller, spoil)
+    session = Session(line, 5)
+    session.open()
+    session.put(0, NEW[0], 6, lambda done, total: None)
+    assert len(spoilt) == 2 and session.repeated >= NEW[0].chunks
+    assert is_active(controller, OLD[0])
+    session.commit([0], 6)
+    assert is_active(controller, NEW[0])
+
+
+def test_a_session_has_a_number() -> None:
+    assert asked(begun(), protocol.open_frame(0))[3] == Reason.FORMAT
+
+
+def test_room_counts_for_nodes_and_for_flows() -> None:
+    image = Image(lookup.image(a_table(20, 15), 0))
+    for nodes, counts, fits in ((35, 300, True), (34, 300, False), (35, 299, False)):
+        session = Session(Line(Controller(1, nodes, counts)))
+        room = session.open()
+        assert (room.nodes, room.counts, room.slots) == (nodes, counts, 1)
+        if fits:
+            download(session, {0: image}, 1)
+            continue
+        with pytest.raises(DownloadError) as refused:
+            download(session, {0: image}, 1)
+        assert refused.value.reason == Reason.SIZE
+
+
+def test_a_size_that_contradicts_the_nodes() -> None:
+    controller = begun()
+    controller.push(protocol.open_frame(3))
+    for size in (len(NEW[0].data) - 1, len(NEW[0].data) + 1, 0, 0xFFFF):
+        *_, last = protocol.begin_frames(3, 0, 25, 18, size, 6, NEW[0].crc)
+        for data in protocol.begin_frames(3, 0, 25, 18, size, 6, NEW[0].crc)[:2]:
+            controller.push(data)
+        assert asked(controller, last)[3] == Reason.SIZE
+
+
+def test_only_the_version_that_has_arrived_is_committed() -> None:
+    controller = begun()
+    put(controller, 0, NEW[0], 6, NEW[0].chunks)
+    assert asked(controller, protocol.frame(3, Op.END, b"\0"))[3] == Reason.DONE
+    assert asked(controller, protocol.commit_frame(3, [0], 7))[3] == Reason.VERSION
+    assert asked(controller, protocol.commit_frame(3, [0, 1], 6))[3] == Reason.ORDER
+    assert asked(controller, protocol.commit_frame(3, [], 6))[3] == Reason.ORDER
+    assert asked(controller, protocol.commit_frame(3, [0, 9], 6))[3] == Reason.SLOT
+    assert is_active(controller, OLD[0])
+    assert asked(controller, protocol.commit_frame(3, [0], 6))[3] == Reason.DONE
+    assert is_active(controller, NEW[0])
+
+
+@pytest.mark.parametrize("chunks", [0, 1, 100, 249])
+def test_what_was_whole_and_is_begun_again_is_not_whole(chunks: int) -> None:
+    controller = begun()
+    put(controller, 0, NEW[0], 6, NEW[0].chunks)
+    assert asked(controller, protocol.frame(3, Op.END, b"\0"))[3] == Reason.DONE
+    put(controller, 0, NEW[0], 6, chunks)
+    assert asked(controller, protocol.commit_frame(3, [0], 6))[3] == Reason.ORDER
+    assert asked(controller, protocol.frame(3, Op.END, b"\0"))[3] == Reason.INCOMPLETE
+    assert state(controller) == IS_OLD and is_active(controller, OLD[0])
+
+
+def test_a_session_that_was_closed_or_lost_leaves_nothing_behind() -> None:
+    for new in (3, 4):
+        controller = begun()
+        put(controller, 0, NEW[0], 6, NEW[0].chunks)
+        assert asked(controller, protocol.frame(3, Op.END, b"\0"))[3] == Reason.DONE
+        if new == 3:
+            controller.push(protocol.frame(3, Op.CLOSE))
+        controller.now_ms += 5000
+        controller.push(protocol.open_frame(new))
+        assert asked(controller, protocol.commit_frame(new, [0], 6))[3] == Reason.ORDER
+        assert is_active(controller, OLD[0])
+
+
+def test_data_without_a_beginning() -> None:
+    controller = begun()
+    controller.push(protocol.open_frame(3))
+    for k in range(NEW[0].chunks):
+        controller.push(protocol.data_frame(3, k, NEW[0].data))
+    assert asked(controller, protocol.frame(3, Op.END, b"\0"))[3] == Reason.ORDER
+    *_, last = protocol.begin_frames(3, 0, 25, 18, len(NEW[0].data), 6, NEW[0].crc)
+    assert asked(controller, last)[3] == Reason.ORDER
+    first, *_ = protocol.begin_frames(3, 0, 25, 18, len(NEW[0].data), 6, NEW[0].crc)
+    controller.push(first)
+    assert asked(controller, last)[3] == Reason.ORDER, "the version is missing"
+
+
 def broken_images() -> list[bytes]:
     """Whole images, with a good CRC, that are no plausible map."""
     good = bytearray(lookup.image(a_table(6, 5), 0))
@@ -432,6 +557,8 @@ def test_no_soup_of_bytes_activates_a_wrong_map(frames: list[bytes]) -> None:
         if held != before[slot]:
             assert held is not None and held[0] > 5
             assert held[1] in known, "a map that nobody sent is active"
+            if slot == 0:
+                assert is_active(controller, NEW[0] if held[1] == NEW[0].crc else OLD[0])
     q, status = controller.flow(0, [3.0, 7.0], [1e6, 2e6])
     assert (abs(q) < 1e-2).all() and (status < 7).all()
 
