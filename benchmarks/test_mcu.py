@@ -115,7 +115,8 @@ def test_update(benchmark: Any) -> None:
     ]
     title = "The controller's estimator, one chamber, two edges, 10 x 8 blocks per edge"
     times = side_by_side(benchmark, title, "sample", jobs, KERNEL)
-    assert max(ratio(times, name, KERNEL) for name in built) <= 1.0
+    # both compiled for this processor, as the kernel is; -O2 for any x86-64 is reported
+    assert max(ratio(times, name, KERNEL) for name in (DOUBLE_NATIVE, SINGLE_NATIVE)) <= 1.0
 
 
 def test_longest_update(benchmark: Any) -> None:

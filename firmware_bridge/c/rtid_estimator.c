@@ -81,7 +81,10 @@ static int relocate(const rtid_real *border, int n, rtid_real value, int current
     return locate(border, n, value);
 }
 
-static rtid_real commanded(const rtid_estimator *e, int i) { return EDGES[i].direction * e->values[EDGES[i].command]; }
+static rtid_real commanded(const rtid_estimator *e, int i)
+{
+    return EDGES[i].direction * e->values[EDGES[i].command];
+}
 
 static void set_step(rtid_estimator *e, int64_t dt_us)
 {
@@ -109,7 +112,8 @@ static void follow_command(rtid_estimator *e, int i)
 
 static int moved(const rtid_estimator *e, int i)
 {
-    return e->edge[i].to_u != e->edge[i].u || (e->edge[i].to_u != SHUT && e->edge[i].to_dp != e->edge[i].dp);
+    return e->edge[i].to_u != e->edge[i].u
+           || (e->edge[i].to_u != SHUT && e->edge[i].to_dp != e->edge[i].dp);
 }
 
 /* Find the block that each edge asks for; 0 where one is off its grid. */
@@ -119,6 +123,7 @@ static int working_points(rtid_estimator *e, const rtid_real *now)
     for (int i = 0; i < RTID_EST_N_EDGES; i++) {
         const edge_row *row = &EDGES[i];
         const int before = e->edge[i].u != SHUT ? e->edge[i].dp : SHUT;
+        rtid_real mid;
         int u, dp;
         follow_command(e, i);
         e->edge[i].to_u = SHUT;
@@ -129,7 +134,8 @@ static int working_points(rtid_estimator *e, const rtid_real *now)
         e->edge[i].dp1 = (row->source < RTID_EST_N_SIGNALS ? now[row->source] : 0)
                          - (row->sink < RTID_EST_N_SIGNALS ? now[row->sink] : 0);
         u = relocate(&BORDERS[row->first_u], row->n_u, e->edge[i].m1, e->edge[i].u);
-        dp = relocate(&BORDERS[row->first_dp], row->n_dp, R(0.5) * (e->edge[i].dp0 + e->edge[i].dp1), before);
+        mid = R(0.5) * (e->edge[i].dp0 + e->edge[i].dp1);
+        dp = relocate(&BORDERS[row->first_dp], row->n_dp, mid, before);
         e->edge[i].to_u = (int16_t)u;
         e->edge[i].to_dp = (int16_t)dp;
         inside = inside && u >= 0 && dp >= 0;
@@ -182,7 +188,10 @@ static rtid_real column_variance(const rtid_estimator *e)
     return w * w * P_VAR;
 }
 
-static rtid_real position_noise(const rtid_estimator *e) { return AREA * AREA * X_VAR + column_variance(e); }
+static rtid_real position_noise(const rtid_estimator *e)
+{
+    return AREA * AREA * X_VAR + column_variance(e);
+}
 
 static void start_whitener(rtid_estimator *e)
 {
@@ -226,7 +235,8 @@ static void shared_increments(rtid_estimator *e, const rtid_real *now)
     const rtid_real x0 = e->values[RTID_EST_X], x1 = now[RTID_EST_X];
     e->d[0] += AREA * (x1 - x0);
 #ifdef RTID_EST_P
-    e->d[1] -= R(0.5) * (volume(x0) + volume(x1)) * (COMPLIANCE * (now[RTID_EST_P] - e->values[RTID_EST_P]));
+    e->d[1] -= R(0.5) * (volume(x0) + volume(x1))
+               * (COMPLIANCE * (now[RTID_EST_P] - e->values[RTID_EST_P]));
 #endif
 }
 
@@ -260,11 +270,12 @@ static void term_increments(rtid_estimator *e, const rtid_real *now)
 }
 #endif
 
-/* Means over the interval of the six terms of an open block, exact for a lagged command and linear dp. */
+/* Means over the interval of the six terms of an open block, exact for the lag and linear dp. */
 static void mean_terms(const rtid_estimator *e, const rtid_estimator_open *open, rtid_real *phi)
 {
     const int i = open->edge;
-    const rtid_real *u = &BORDERS[EDGES[i].first_u + open->u], *p = &BORDERS[EDGES[i].first_dp + open->dp];
+    const rtid_real *u = &BORDERS[EDGES[i].first_u + open->u];
+    const rtid_real *p = &BORDERS[EDGES[i].first_dp + open->dp];
     const rtid_real hu = R(2) / (u[1] - u[0]), hp = R(2) / (p[1] - p[0]);
     const rtid_real uc = R(0.5) * (u[1] + u[0]), pc = R(0.5) * (p[1] + p[0]);
     const rtid_real eta0 = (e->edge[i].dp0 - pc) * hp, eta1 = (e->edge[i].dp1 - pc) * hp;
@@ -286,6 +297,7 @@ static void block_increments(rtid_estimator *e, int k, int64_t t_us, int row)
     const edge_row *edge = &EDGES[open->edge];
     const cell_row *cell = &CELLS[cell_of(open->edge, open->u, open->dp)];
     const rtid_real scale = edge->sign * edge->scale * e->dt_s;
+    const rtid_real period = P_PERIOD > 0 ? P_PERIOD : e->dt_s;
     rtid_real phi[T];
     mean_terms(e, open, phi);
     block->dwell_us += e->dt_us;
@@ -296,8 +308,7 @@ static void block_increments(rtid_estimator *e, int k, int64_t t_us, int row)
         e->d[first_of(k) + j] += scale * phi[j];
     }
     /* random walk of the integral: pressure noise through dQ/ddp and missed flow */
-    e->cov += (cell->slope * cell->slope * edge->dp_var * (P_PERIOD > 0 ? P_PERIOD : e->dt_s) + cell->missed)
-              * e->dt_s * edge->sign * edge->sign;
+    e->cov += (cell->slope * cell->slope * edge->dp_var * period + cell->missed) * e->dt_s;
 }
 
 static void add_products(rtid_estimator *e)
@@ -349,9 +360,11 @@ static void integrate(rtid_estimator *e, const rtid_estimator_sample *sample)
 
 /* ---- samples ---- */
 
+static int on_clock(int64_t t_us) { return t_us >= 0 && t_us >> 53 == 0; }
+
 static int acceptable(const rtid_estimator_sample *sample)
 {
-    if (sample->t_us < 0 || sample->t_us >> 53 != 0)
+    if (!on_clock(sample->t_us))
         return RTID_EST_OUT_OF_RANGE;
     for (int j = 0; j < RTID_EST_N_SIGNALS; j++)
         if (!(ABS(sample->values[j]) < INSANE))
@@ -412,7 +425,7 @@ int rtid_estimator_update(rtid_estimator *e, const rtid_estimator_sample *sample
     if (verdict != RTID_EST_TAKEN)
         e->counts[verdict]++;
     if (!whole || verdict == RTID_EST_RESTART_GAP)
-        e->ready_us = RTID_EST_RECOVERY_US + (sample->t_us < 0 || sample->t_us >> 53 != 0 ? e->t_us : sample->t_us);
+        e->ready_us = RTID_EST_RECOVERY_US + (on_clock(sample->t_us) ? sample->t_us : e->t_us);
     if (was_running && verdict == RTID_EST_TAKEN)
         integrate(e, sample);
     else if (was_running)

@@ -9,11 +9,12 @@
  * -DRTID_ESTIMATOR_FLOAT32, one float per number in the update; what is summed up for ever is then
  * kept in two floats.  The solution is computed in double precision, on demand, outside the tick.
  * Compile without -ffast-math: NaN means "not available", and compensated sums must stay.
+ * The work of an update is bounded, whatever was learned; no function recurs or allocates.
  *
  *     static rtid_estimator e;  static rtid_estimator_work w;  rtid_estimator_solution s;
  *     rtid_estimator_start(&e);
  *     every tick:      rtid_estimator_update(&e, &sample);
- *     on demand:       rtid_estimator_freeze(&e, &w);     in the tick's context: a short copy
+ *     on demand:       rtid_estimator_freeze(&e, &w);     while no update runs: settles, copies
  *                      rtid_estimator_solve(&w, &s);      anywhere, while updates go on
  */
 #ifndef RTID_ESTIMATOR_H
@@ -35,8 +36,8 @@ typedef double rtid_sum;
 
 #define RTID_EST_TERMS 6 /* 1, xi, eta, xi^2, eta^2, xi eta of a block, eq. (6) */
 #define RTID_EST_SHARED (1 + RTID_EST_N_TERMS)
-#define RTID_EST_BLOCKS_AT (1 + RTID_EST_SHARED)      /* [y | shared | blocks] in the sums */
-#define RTID_EST_RING (1 + RTID_EST_SHARED)           /* [y | shared | ring | open blocks] in rows */
+#define RTID_EST_BLOCKS_AT (1 + RTID_EST_SHARED) /* [y | shared | blocks] in the sums */
+#define RTID_EST_RING (1 + RTID_EST_SHARED)      /* [y | shared | ring | open blocks] in rows */
 #define RTID_EST_OPEN_AT (RTID_EST_RING + 1)
 #define RTID_EST_WIDTH (RTID_EST_OPEN_AT + RTID_EST_TERMS * RTID_EST_MAX_OPEN)
 #define RTID_EST_UNKNOWNS (RTID_EST_SHARED + RTID_EST_TERMS * RTID_EST_MAX_BLOCKS)

@@ -8,14 +8,20 @@ static const double SHARED_PRIOR = 1e-2; /* beta is known to a factor of ten */
 static const double LEAST_PIVOT = 1e-14; /* of a unit diagonal: sums of rows and prior are above */
 
 /* Lower triangle by rows; row and column 0 are y, so that row i is unknown i - 1. */
-static double *row_of(rtid_estimator_work *w, int i) { return &w->matrix[(uint32_t)i * (uint32_t)(i + 1) / 2]; }
+static double *row_of(rtid_estimator_work *w, int i)
+{
+    return &w->matrix[(uint32_t)i * (uint32_t)(i + 1) / 2];
+}
 
 static const double *row_in(const rtid_estimator_work *w, int i)
 {
     return &w->matrix[(uint32_t)i * (uint32_t)(i + 1) / 2];
 }
 
-static int unknowns(const rtid_estimator_work *w) { return RTID_EST_SHARED + RTID_EST_TERMS * w->n_slots; }
+static int unknowns(const rtid_estimator_work *w)
+{
+    return RTID_EST_SHARED + RTID_EST_TERMS * w->n_slots;
+}
 
 static double prior(int i) { return i < RTID_EST_SHARED ? SHARED_PRIOR : FLOW_PRIOR; }
 
@@ -171,7 +177,7 @@ static double covariance(const rtid_estimator_work *w, int i, int j)
     return sum * w->scale[i] * w->scale[j];
 }
 
-static double limited(double x, double low, double high) { return x < low ? low : x > high ? high : x; }
+static double limited(double x, double low, double high) { return fmin(fmax(x, low), high); }
 
 /* Take the pressure noise out of the information on 1 / beta; returns what it is moved by. */
 static double correct(rtid_estimator_work *w, double information, double leverage)
@@ -180,7 +186,8 @@ static double correct(rtid_estimator_work *w, double information, double leverag
     const double least = SHARED_PRIOR + 3.0 * sqrt(2.0 / rows) * w->noise;
     const double told = (information - noise) / least, missing = limited(2.0 - told, 0.0, 1.0);
     const double cov = 1.0 / (told > 1.0 ? told * least : least);
-    w->cov_change = cov + cov * noise * (1.0 + w->noise / rows) * cov - 1.0 / information + missing * missing;
+    w->cov_change = cov + cov * noise * (1.0 + w->noise / rows) * cov;
+    w->cov_change += missing * missing - 1.0 / information;
     return (cov * information - 1.0) * w->theta[0];
 }
 

@@ -23,7 +23,8 @@ static void add_own_tile(rtid_estimator *e, int slot, const rtid_sum *left, cons
 }
 
 /* What two blocks share += left' right. */
-static void add_tile(rtid_estimator *e, int slot, int other, const rtid_sum *left, const rtid_real *right)
+static void add_tile(rtid_estimator *e, int slot, int other, const rtid_sum *left,
+                     const rtid_real *right)
 {
     const int mine = at_slot(slot), its = at_slot(other);
     if (slot == other)
@@ -56,7 +57,10 @@ static void clear_columns(rtid_estimator *e, int first, int last)
                 e->local[i][j] = as_sum(0);
 }
 
-static rtid_sum ring_ring(const rtid_estimator *e) { return e->local[RTID_EST_RING][RTID_EST_RING]; }
+static rtid_sum ring_ring(const rtid_estimator *e)
+{
+    return e->local[RTID_EST_RING][RTID_EST_RING];
+}
 
 /* Ring x open block k. */
 static void read_through(const rtid_estimator *e, int k, rtid_sum *out)
@@ -99,7 +103,8 @@ static void add_open_pair(rtid_estimator *e, int k, int other)
 }
 
 /* left = what the closed block shares with the ring's origin, own = the part since it closed. */
-static void weigh(const rtid_estimator *e, const rtid_estimator_recent *item, rtid_sum *own, rtid_sum *left)
+static void weigh(const rtid_estimator *e, const rtid_estimator_recent *item, rtid_sum *own,
+                  rtid_sum *left)
 {
     const rtid_sum w = sum_of(ring_ring(e), minus(item->w_start));
     for (int i = 0; i < T; i++) {
@@ -289,13 +294,14 @@ void rtid_est_pay(rtid_estimator *e, int tiles)
             debt->q = 0;
             continue;
         }
-        add_tile(e, debt->slot[debt->p], debt->slot[debt->q], debt->left[debt->p], debt->d[debt->q]);
+        add_tile(e, debt->slot[debt->p], debt->slot[debt->q], debt->left[debt->p],
+                 debt->d[debt->q]);
         debt->q++;
         tiles--;
     }
 }
 
-/* Owe what closed blocks share: first those that rang all the time, then the young in their order. */
+/* Owe what closed blocks share: those that rang all the time, then the young in their order. */
 static void settle_closed(rtid_estimator *e)
 {
     rtid_sum own[T], left[T];

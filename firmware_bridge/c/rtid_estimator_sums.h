@@ -12,7 +12,7 @@
 
 #define R(x) ((rtid_real)(x))
 enum { T = RTID_EST_TERMS };
-enum { FREE, OPEN, YOUNG, RINGING }; /* status of a recent block; young: closed since the ring began */
+enum { FREE, OPEN, YOUNG, RINGING }; /* a recent block; young: closed since the ring began */
 enum { TILES_PER_TICK = 4, ALL_TILES = RTID_EST_MAX_RECENT * RTID_EST_MAX_RECENT };
 enum { SETTLE, FORGET_SILENT, END_ALL }; /* what a rebase does to the memory of closed blocks */
 #define RING_LIMIT R(0.1) /* rebase before the ring's column loses digits */
@@ -25,14 +25,15 @@ enum { SETTLE, FORGET_SILENT, END_ALL }; /* what a rebase does to the memory of 
 #define ABS fabsf
 /* No quantity in SI units is that large, and its square is still a number. */
 #define INSANE 1e9f
-#define SILENT 1e-7f    /* a closed block whose state decayed to this share is forgotten */
+#define SILENT 1e-7f /* a closed block whose state decayed to this share is forgotten */
 
-/* s += x: Knuth's sum of two numbers, and what it rounded off */
+/* s += x to 48 bits: Knuth's sum of two numbers with what it rounded off, then brought in order */
 static inline void merge(rtid_sum *s, rtid_sum x)
 {
     const rtid_real t = s->high + x.high, back = t - s->high;
-    s->low += ((s->high - (t - back)) + (x.high - back)) + x.low;
-    s->high = t;
+    const rtid_real rest = s->low + (((s->high - (t - back)) + (x.high - back)) + x.low);
+    s->high = t + rest;
+    s->low = rest - (s->high - t);
 }
 
 /* a b without rounding: products of rounded numbers would not be those of any rows, and the
@@ -83,7 +84,7 @@ static inline rtid_sum sum_of(rtid_sum a, rtid_sum b)
 
 static inline int first_of(int k) { return RTID_EST_OPEN_AT + T * k; }
 
-/* Units of the unknowns: rated flow of an edge, m3/s; scale of a shared one; terms that a map has. */
+/* Units of the unknowns: rated flow of an edge, m3/s; scale of a shared one; terms of a map. */
 double rtid_est_rated(int edge);
 double rtid_est_shared_scale(int shared);
 int rtid_est_has_term(int edge, int term);
