@@ -3,9 +3,8 @@
 Every refusal has a reason and a counter.  A counter of 2^b values cannot see a loss of a multiple
 of 2^b frames, so it is judged together with the time since the message's last good frame:
 
-    step = (counter - last) mod 2^b,  dt <= 1.5 periods:  step 0 repeated, step > 2^(b-1) late
-
-and a frame n > 1 steps on that comes before n / 2 periods is somebody else's.
+    step = (counter - last) mod 2^b:  step 0 within 1.5 periods is repeated; n > 1 steps need n / 2
+    periods, else the frame is a late one (n near 2^b) or somebody else's
 """
 
 from __future__ import annotations
@@ -124,8 +123,6 @@ def check_sequence(
         step = (counter - last.counter) & np.int64(row.counter_mask)
         if dt <= row.late_us and step == 0:
             return COUNTER_REPEAT
-        if dt <= row.late_us and 2 * step > np.int64(row.counter_mask) + 1:
-            return OUT_OF_ORDER
         if step > 1 and 3 * dt < step * row.late_us:
             return OUT_OF_ORDER
         if dt > 0 and step != 1:

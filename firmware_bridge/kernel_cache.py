@@ -14,6 +14,7 @@ import hashlib
 import os
 import shutil
 import tempfile
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,11 @@ def cache_folder(name: str, beside: Path, sources: Iterable[Path]) -> Path | Non
             return folder
         if next(folder.glob("**/*.nbi"), None) is not None:
             return _copied(folder)
+    warnings.warn(
+        "no folder for compiled kernels can be written: each start compiles for half a minute; "
+        "set NUMBA_CACHE_DIR",
+        stacklevel=2,
+    )
     return None
 
 

@@ -112,9 +112,7 @@ static int check_sequence(rtid_receiver *receiver, int m, int64_t t_us, uint8_t 
         return RTID_OK;
     if (dt <= late && step == 0)
         return RTID_COUNTER_REPEAT;
-    if (dt <= late && 2 * step > mask + 1)
-        return RTID_OUT_OF_ORDER;
-    if (step > 1 && 3 * dt < step * late) /* n steps in less than n / 2 periods: another sender's */
+    if (step > 1 && 3 * dt < step * late) /* late, or another sender's */
         return RTID_OUT_OF_ORDER;
     if (dt > 0 && step != 1)
         receiver->counts[RTID_COUNTER_JUMP]++;

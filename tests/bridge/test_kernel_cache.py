@@ -1,0 +1,74 @@
+"""Where kernels are kept: the first place that takes or has them; a change makes a new one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from numba import config
+
+from firmware_bridge import kernel_cache
+from firmware_bridge.kernel_cache import cache_folder
+
+
+@pytest.fixture
+def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """Three places, all of which can be written."""
+    found = [tmp_path / name for name in ("first", "second", "third")]
+    monkeypatch.setattr(kernel_cache, "_places", lambda _: iter(found))
+    return found
+
+
+def closed(monkeypatch: pytest.MonkeyPatch, *shut: Path) -> None:
+    open_ = kernel_cache._is_writable
+    monkeypatch.setattr(kernel_cache, "_is_writable", lambda f: f.parent not in shut and open_(f))
+
+
+def source(folder: Path, text: str) -> Path:
+    path = folder / "source.py"
+    path.write_text(text)
+    return path
+
+
+def test_a_change_of_any_source_is_another_folder(tmp_path: Path, places: list[Path]) -> None:
+    before = cache_folder("k", tmp_path, [source(tmp_path, "a = 1")])
+    after = cache_folder("k", tmp_path, [source(tmp_path, "a = 2")])
+    assert before != after and before is not None and before.parent == places[0]
+
+
+def test_the_next_place_where_one_is_closed(
+    tmp_path: Path, places: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed(monkeypatch, places[0])
+    found = cache_folder("k", tmp_path, [source(tmp_path, "")])
+    assert found is not None and found.parent == places[1]
+
+
+def test_a_full_one_that_is_closed_is_copied(
+    tmp_path: Path, places: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sources = [source(tmp_path, "")]
+    full = cache_folder("k", tmp_path, sources)
+    assert full is not None
+    (full / "engine").mkdir()
+    (full / "engine" / "advance.nbi").write_text("index")
+    closed(monkeypatch, *places)
+    copy = cache_folder("k", tmp_path, sources)
+    assert copy is not None and copy != full
+    assert (copy / "engine" / "advance.nbi").read_text() == "index"
+
+
+def test_nowhere_is_told(
+    tmp_path: Path, places: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed(monkeypatch, *places)
+    with pytest.warns(UserWarning, match="NUMBA_CACHE_DIR"):
+        assert cache_folder("k", tmp_path, [source(tmp_path, "")]) is None
+    kernel = kernel_cache.cached(None, lambda x: x + 1)
+    assert kernel(1) == 2
+
+
+def test_the_setting_comes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "set"))
+    found = cache_folder("k", tmp_path, [source(tmp_path, "")])
+    assert found is not None and found.parent == tmp_path / "set"
