@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import subprocess
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from random import Random
 
@@ -470,6 +471,29 @@ def test_data_without_a_beginning() -> None:
     first, *_ = protocol.begin_frames(3, 0, 25, 18, len(NEW[0].data), 6, NEW[0].crc)
     controller.push(first)
     assert asked(controller, last)[3] == Reason.ORDER, "the version is missing"
+
+
+def test_data_before_the_size_is_judged_are_not_stored() -> None:
+    """Else an absurd size would write beyond the room; under sanitisers as well."""
+    head, *_ = protocol.begin_frames(3, 0, 255, 255, 0xFFFF, 6, 1)
+    chunks = [protocol.data_frame(3, k, bytes(0xFFFF)) for k in range(3000)]
+    controller = begun()
+    for data in (protocol.open_frame(3), head, *chunks):
+        controller.push(data)
+    assert controller.counts[2] == len(chunks) and state(controller) == IS_OLD
+    run([protocol.open_frame(3), head, *chunks])
+
+
+def test_limits_hold_at_both_ends() -> None:
+    table = a_table(10, 8)
+    below = replace(table, w_v=table.w_v - np.float32(11.0), safe_band_v=-11.0)
+    controller = Controller(1)
+    controller.limit(5.0, 0, 0)
+    session = Session(Line(controller))
+    session.open()
+    with pytest.raises(DownloadError) as refused:
+        download(session, {0: Image(lookup.image(below, 0))}, 1)
+    assert refused.value.reason == Reason.LIMITS
 
 
 def broken_images() -> list[bytes]:
