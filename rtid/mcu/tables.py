@@ -103,8 +103,11 @@ def _sizes(sizes: Sizes) -> Iterator[str]:
 def _signals(model: Model) -> Iterator[str]:
     """Columns of a sample under the user's names, and the range of each."""
     yield "/* columns of rtid_estimator_sample.values, SI, V or A */"
-    names = ", ".join(f"RTID_EST_COLUMN_{_c_name(s.name)}" for s in model.signals)
-    yield f"enum {{ {names} }};"
+    names = [f"RTID_EST_COLUMN_{_c_name(signal.name)}" for signal in model.signals]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValveError(f"two signals would be {name} in C", "rename one of them")
+    yield f"enum {{ {', '.join(names)} }};"
     ranges = (_row([s.minimum, s.maximum]) for s in model.signals)
     yield from _rows("RANGES", "values outside are refused", ranges)
 

@@ -82,9 +82,10 @@ class Program:
         out["row"], out["gap"] = flags.astype(int) & 1, (flags.astype(int) >> 1) & 1
         return out.tobytes()
 
-    def run(self, samples: bytes) -> Outcome:
-        """Feed samples; the program must end well."""
-        done = subprocess.run([self.path], input=samples, capture_output=True, check=False)
+    def run(self, samples: bytes, ask_every: int = 0) -> Outcome:
+        """Feed samples, ask for a solution every so many; the program must end well."""
+        command = [str(self.path), str(ask_every)]
+        done = subprocess.run(command, input=samples, capture_output=True, check=False)
         assert done.returncode == 0, done.stderr.decode()[-2000:]
         layout, n = self.layout, len(samples) // self.layout.sample.itemsize
         rest = memoryview(done.stdout)

@@ -1,7 +1,7 @@
 /* Samples from standard input through the estimator; verdicts, memory and solution to standard
- * output, all as the host's own records. */
+ * output, all as the host's own records.  With a number N it is also asked every N samples. */
 #include <stdio.h>
-#include <string.h>
+#include <stdlib.h>
 
 #include "rtid_estimator.h"
 
@@ -10,8 +10,10 @@ static rtid_estimator_work work;
 
 static void put(const void *bytes, size_t n) { fwrite(bytes, 1, n, stdout); }
 
-int main(void)
+int main(int argc, char **argv)
 {
+    const long every = argc > 1 ? atol(argv[1]) : 0;
+    long taken = 0;
     rtid_estimator_sample sample;
     rtid_estimator_solution solution;
     const uint64_t sizes[] = {sizeof e, sizeof work, sizeof sample, sizeof solution};
@@ -20,6 +22,10 @@ int main(void)
     while (fread(&sample, sizeof sample, 1, stdin) == 1) {
         const int8_t verdict = (int8_t)rtid_estimator_update(&e, &sample);
         put(&verdict, 1);
+        if (every > 0 && ++taken % every == 0) {
+            rtid_estimator_freeze(&e, &work);
+            rtid_estimator_solve(&work, &solution);
+        }
     }
     rtid_estimator_freeze(&e, &work);
     put(&e, sizeof e);

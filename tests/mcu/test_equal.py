@@ -79,6 +79,15 @@ def test_single_precision_on_the_rig(single: Program, shared: Path, run: int) ->
     assert outcome.maps["status"].tolist() == statuses
 
 
+def test_asking_changes_nothing(double: Program, shared: Path) -> None:
+    """Frozen and solved 146 times on the way, at rebases and between them."""
+    record, reference = rig_reference(shared, 1)
+    samples = double.samples(record.t_us, record.values, record.flags)
+    outcome = double.run(samples, ask_every=750)
+    assert outcome.counts == reference.counts | {"no_room": 0}
+    assert sums_apart(outcome, reference) <= EQUAL
+
+
 def test_on_a_fine_grid_whose_memory_overflows(tmp_path: Path, shared: Path) -> None:
     """143 blocks of the packaged example; more of them ring at once than there is room for."""
     model = full_valve()

@@ -116,6 +116,18 @@ def test_names_that_are_no_c_are_made_so(tmp_path: Path) -> None:
     assert re.sub(r"/\*.*?\*/", "", text).count("*/") == 0
 
 
+def test_names_that_are_one_in_c_are_refused() -> None:
+    model = small_valve()
+    signals = tuple(
+        replace(s, name={"p_a": "P A", "p_supply": "p-a"}.get(s.name, s.name))
+        for s in model.signals
+    )
+    edges = tuple(replace(e, source="p-a", sink="P A", signs=(("a", 1),)) for e in model.edges[:1])
+    chambers = (replace(model.chambers[0], pressure="P A"),)
+    with pytest.raises(ValveError, match="RTID_EST_COLUMN_P_A"):
+        tables(replace(model, signals=signals, edges=edges, chambers=chambers))
+
+
 def test_learned_weights(tmp_path: Path) -> None:
     """Slopes and missed flow of a first pass weigh the rows as in Python."""
     model, rng = small_valve(), np.random.default_rng(3)
