@@ -139,6 +139,8 @@ def memory(browser: Browser, page: Page, url: str, minutes: float) -> tuple[floa
     while (now_s := time.monotonic() - begun) < 60 * minutes:
         cdp.send("HeapProfiler.collectGarbage")
         metrics = {m["name"]: m["value"] for m in cdp.send("Performance.getMetrics")["metrics"]}
+        if len(rows) % 6 == 0 and rows:
+            print(f"minute {rows[-1][0]:.0f}: {rows[-1][1]:.1f}, {rows[-1][2]:.0f} MB", flush=True)
         rows.append((now_s / 60, metrics["JSHeapUsedSize"] / 1e6, private_mb(browser)))
         page.wait_for_timeout(1e3 * SAMPLE_S)
     rate = (page.evaluate(UPDATES) - first) / (time.monotonic() - begun)

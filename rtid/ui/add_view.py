@@ -217,13 +217,13 @@ def sentence(session: Session) -> str:
         before, after = shown[len(session.revisions) - 2][1], shown[len(session.revisions) - 1][1]
         kept = session.revisions[-1].is_saved
         return (
-            f'{measured}, <b style="color:{ORANGE}">—</b> before the last change, '
-            f'<b style="color:{BLUE}">—</b> after it. The error went from {before:.2f} % to '
+            f'{measured}, <b style="color:var(--before)">—</b> before the last change, '
+            f'<b style="color:var(--bar)">—</b> after it. The error went from {before:.2f} % to '
             f"{after:.2f} %, the sensors' floor is {floor:.2f} %. "
             + ("The project file has it." if kept else "Next: save, or undo; the project file is "
                "as it was until you save.")
         )  # fmt: skip
-    now = f'{measured}, <b style="color:{ORANGE}">—</b> the model as it is'
+    now = f'{measured}, <b style="color:var(--before)">—</b> the model as it is'
     if session.named is not None:
         return (
             f"{now}. Next: add what the diagnosis names, and see how much of its error goes. "

@@ -150,7 +150,7 @@ class BlockPlots:
         source = ColumnDataSource(_columns([], next(iter(quantities(1.0).values()))))
         made = plot(
             x_range=Range1d(i0 - 0.1, i1 + 1.1), y_range=Range1d(j0 - 0.1, j1 + 1.1),
-            title=f"{edge.name}: {edge.source} → {edge.sink}",
+            title=f"{edge.name}: {edge.source} → {edge.sink}{'' if blocks else ', never open'}",
         )  # fmt: skip
         _ticks(made.xaxis[0], edge.grid.u_v, int(i0), int(i1) + 1)
         _ticks(made.yaxis[0], edge.grid.dp_pa * MPA, int(j0), int(j1) + 1)

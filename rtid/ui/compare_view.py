@@ -83,8 +83,9 @@ class CompareView:
             f"<span><label>drag </label>{choice('drag', ['zoom', 'span'], self._time.drag, 'mode')}"
             f"</span>{button('whole record', 'whole')}"
             '<span class="key"><b style="color:var(--ink)">—</b> measured '
-            f'<b style="color:{ORANGE}">—</b> model <b style="color:{BLUE}">—</b> difference '
-            "&nbsp; blue ground: taught the model, yellow: held out</span>"
+            '<b style="color:var(--before)">—</b> model '
+            '<b style="color:var(--bar)">—</b> difference &nbsp; '
+            "blue ground: taught the model, yellow: held out</span>"
         )
         return {"compare_tools": tools, "compare_says": self._sentence()}
 

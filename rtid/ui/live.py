@@ -54,7 +54,7 @@ class Live:
         learning = _learning(status) + _coach(status, self._model) + _verdict(status)
         css = "stale" if age_s > STALE_S else ""
         return {
-            "live_health": f'<div class="{css}" data-age="{age_s:.1f}">{health}</div>',
+            "live_health": f'<div class="{css}">{health}</div>',
             "live_learning": f'<div class="{css}">{learning}</div>',
         }
 
@@ -66,8 +66,10 @@ class Live:
             stamp = (self._folder / "status.json").stat().st_mtime_ns
             if stamp != self._stamp:
                 self._status, self._stamp = read(self._folder), stamp
-        except (StatusError, OSError) as error:
+        except StatusError as error:
             self._trouble = str(error)
+        except OSError as error:
+            self._trouble = f"{self._folder / 'status.json'}: {error.strerror}"
 
 
 def _nothing(trouble: str) -> str:

@@ -32,6 +32,7 @@ from rtid.ui.session import Session
 from rtid.ui.worker import Worker
 
 MOST_PAGES = 8  # that are open at once
+MOST_SOCKETS = 2 * MOST_PAGES  # a page that comes back after a break has two for a moment
 MOST_MESSAGE = 2**20  # bytes that a page may send at once
 PATHS = ("/", "/ws", "/alive")
 POLICY = (
@@ -109,9 +110,13 @@ class Guarded(BokehTornado):  # type: ignore[misc]
         return None if known else Refusal(404, "there is nothing here")
 
     def _full(self, request: HTTPServerRequest) -> Refusal | None:
-        pages = len(list(self.get_sessions("/")))
-        if request.path == "/" and pages >= MOST_PAGES:
-            return Refusal(503, f"{pages} pages are open already: close one and wait a moment")
+        sessions = list(self.get_sessions("/"))
+        sockets = sum(session.connection_count for session in sessions)
+        if request.path == "/" and len(sessions) >= MOST_PAGES:
+            said = f"{len(sessions)} pages are open already: close one and wait a moment"
+            return Refusal(503, said)
+        if request.path == "/ws" and sockets >= MOST_SOCKETS:
+            return Refusal(503, "too many sockets are open already")
         return None
 
     def resources(self, absolute_url: str | bool | None = None) -> Resources:

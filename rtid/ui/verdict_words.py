@@ -19,7 +19,7 @@ def judged(found: Diagnosis) -> str:
 
 def said(found: Diagnosis) -> str:
     """The verdict and the next step."""
-    error = f"{judged(found)} {share(found, found.heldout_residual_before_m3s)} of the rms flow"
+    left = share(found, found.heldout_residual_before_m3s)
     floor = f"the sensors' floor is {share(found, found.noise_floor_m3s)}"
     match found.verdict:
         case "insufficient_data":
@@ -29,14 +29,15 @@ def said(found: Diagnosis) -> str:
                 "says which motion would tell more."
             )
         case "matches":
-            here = "With what was added, its" if found.added else "Its"
-            more = "it cannot be much better" if not found.something_remains else (
-                "what remains beyond it is immaterial")  # fmt: skip
-            return f"{here} {error}; {floor}: {more}. Next: Map, to take the valves' maps along."
+            here = "With what was added, the" if found.added else "The"
+            more = "what remains beyond it is immaterial" if found.something_remains else (
+                "no model could be much better")  # fmt: skip
+            return f"{here} {judged(found)} is {left} of the rms flow; {floor}: {more}."
         case "unknown":
             return (
-                f"No known effect explains it: {error}, {floor}. Next: Where shows which signals "
-                "it follows; an effect of your own goes into the project file as a formula."
+                f"No known effect explains the {judged(found)} of {left}; {floor}. Next: Where "
+                "shows which signals it follows; an effect of your own goes into the project file "
+                "as a formula."
             )
     return _found(found, found.found[0], floor)
 

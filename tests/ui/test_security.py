@@ -20,7 +20,7 @@ from tornado.websocket import websocket_connect
 
 from rtid.errors import RtidError
 from rtid.ui.security import Door
-from rtid.ui.server import MOST_PAGES, Workbench
+from rtid.ui.server import MOST_PAGES, MOST_SOCKETS, Workbench
 from tests.ui.served import project_file, served
 
 EVIL = ("http://evil.example", "http://localhost:1", "null", "https://127.0.0.1.evil.example")
@@ -193,6 +193,31 @@ def test_many_sockets_and_pages_are_bounded(bench: Workbench) -> None:
     assert rss_mb() - before < MOST_MB
     for one in idle:
         one.close()
+    assert wait_for_room(bench)
+
+
+def test_the_sockets_of_one_page_are_bounded(bench: Workbench) -> None:
+    """200 sockets with the token of one page of ours: a few are served, memory stays."""
+    own, before = f"http://127.0.0.1:{port_of(bench)}", rss_mb()
+    token = token_of(wait_for_room(bench))
+
+    async def connect() -> list[int]:
+        answers, kept = [], []
+        for _ in range(200):
+            request = HTTPRequest(own.replace("http", "ws") + "/ws", headers={"Origin": own})
+            try:
+                kept.append(await websocket_connect(request, subprotocols=["bokeh", token]))
+                answers.append(101)
+            except HTTPClientError as refusal:
+                answers.append(refusal.code)
+        for one in kept:
+            one.close()
+        return answers
+
+    answers = done(connect())
+    assert set(answers) == {101, 503}
+    assert answers.count(101) <= MOST_SOCKETS + 1
+    assert rss_mb() - before < MOST_MB
     assert wait_for_room(bench)
 
 
