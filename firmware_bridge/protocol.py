@@ -138,11 +138,11 @@ def commit_frame(session: int, slots: list[int], version: int) -> bytes:
 
 
 def status_frame(
-    learning: int, verdict: int, alarms: int, progress: int, valid: int, flags: int
+    learning: int, verdict: int, alarms: int, progress: int, valid: int, flags: int, counter: int
 ) -> bytes:
-    """How rtid is; see rtid_notice in c/rtid_download.h."""
-    numbers = (alarms, progress, valid, flags)
-    return frame(0, Op.STATUS, bytes([learning | verdict << 4, *(min(n, 255) for n in numbers)]))
+    """How rtid is; see rtid_notice in c/rtid_download.h.  counter: taken modulo 256."""
+    numbers = (learning | verdict << 4, alarms, progress, valid, flags)
+    return frame(0, Op.STATUS, bytes([*(min(n, 255) for n in numbers), counter & 0xFF]))
 
 
 def beta_frame(chamber: int, beta_pa: float, sd_pa: float) -> bytes:

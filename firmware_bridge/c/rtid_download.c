@@ -473,6 +473,7 @@ int rtid_notice_read(const uint8_t *data, uint8_t length, rtid_notice *notice)
         notice->progress = data[3];
         notice->valid = data[4];
         notice->flags = data[5];
+        notice->counter = data[6];
         return RTID_OP_STATUS;
     }
     if (data[0] == RTID_OP_BETA) {

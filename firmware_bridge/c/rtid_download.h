@@ -121,6 +121,7 @@ typedef struct {
     uint8_t learning; /* 0 waiting, 1 learning, 2 held, 3 suspended, 4 stopped */
     uint8_t alarms, progress, valid; /* alarms that are on; percent; percent of the blocks */
     uint8_t flags;                   /* bit 0: estimate is stale; 1: a map is offered */
+    uint8_t counter;                 /* one more with every STATUS: rtid is alive */
     uint8_t verdict; /* 0 none, 1 matches, 2 missing, 3 ambiguous, 4 unknown, 5 too little data */
     uint8_t chamber; /* of a RTID_OP_BETA frame */
     float beta, beta_sd; /* Pa; 0: not known */

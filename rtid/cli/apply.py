@@ -113,7 +113,10 @@ def _bar() -> Iterator[Callable[[int, int], None]]:
     from rich.console import Console
     from rich.progress import Progress
 
-    shown = Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty())
+    if not sys.stderr.isatty():
+        yield lambda done, total: None
+        return
+    shown = Progress(console=Console(stderr=True), transient=True)
     task = shown.add_task("sending", start=False)
 
     def progress(done: int, total: int) -> None:

@@ -52,7 +52,9 @@ def run(
         bool, typer.Option("--json", help="Print the last status as JSON at the end.")
     ] = False,
 ) -> None:
-    """Learn on board: listen to the bus (never send), keep state, raise alarms, diagnose.
+    """Learn on board: listen to the bus, keep state, raise alarms, offer maps, diagnose.
+
+    It sends nothing, but for its status where the project file says publish.status = true.
 
     One line of statistics each second on a terminal, each minute in a log; `rtid status` tells more
     from another shell.  SIGTERM and Ctrl-C end it in good order, with what was learned stored.

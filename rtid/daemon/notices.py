@@ -24,7 +24,7 @@ VERDICTS = ("", "matches", "missing", "ambiguous", "unknown", "insufficient_data
 STALE, IS_OFFERED = 1, 2
 
 
-def frames_of(status: Status, is_offered: bool) -> list[bytes]:
+def frames_of(status: Status, is_offered: bool, counter: int) -> list[bytes]:
     """STATUS, then BETA of each chamber whose bulk modulus is known."""
     estimate = status.estimate
     verdict = status.verdict.verdict if status.verdict is not None else ""
@@ -39,6 +39,7 @@ def frames_of(status: Status, is_offered: bool) -> list[bytes]:
         round(100 * progress),
         round(100 * valid / max(1, blocks)),
         STALE * estimate.stale + IS_OFFERED * is_offered,
+        counter,
     )
     return [told] + [
         protocol.beta_frame(k, chamber.beta_pa, chamber.beta_sd_pa or 0.0)
@@ -76,15 +77,16 @@ def _tell(
     status: Callable[[], Status | None],
     stopped: threading.Event,
 ) -> None:
-    can_id = project.sections.publish.status_id or 0
+    can_id, counter = project.sections.publish.status_id or 0, 0
     while not stopped.is_set():
         try:
             with reach.armed(project, *bus, can_id) as link:
                 logger.info("telling status on %s %s as 0x%X", *bus, can_id)
                 while not stopped.wait(EVERY_S):
-                    now = status()
-                    for data in frames_of(now, offered.exists(folder)) if now is not None else ():
-                        link.tell(data)
+                    now, counter = status(), counter + 1
+                    if now is not None:
+                        for data in frames_of(now, offered.exists(folder), counter):
+                            link.tell(data)
         except SendError as error:
             logger.warning("status not told: %s", error)
             stopped.wait(RETRY_S)

@@ -59,11 +59,11 @@ def test_notices_as_the_firmware_reads_them() -> None:
     status = replace(
         full_status(), estimate=estimate, alarms=(on, over), verdict=Verdict(1.0, "missing", "")
     )
-    told, a, c = (notice(data) for data in frames_of(status, True))
+    told, a, c = (notice(data) for data in frames_of(status, True, 259))
     assert told[0] == Op.STATUS
-    assert told[1][:6] == [2, 2, 1, 75, 70, 2]
-    assert a[0] == Op.BETA and a[1][6:] == [0.0, pytest.approx(8.123e8), pytest.approx(2.6e6)]
-    assert c[1][6:] == [2.0, 0.0, 0.0]
+    assert told[1][:7] == [2, 2, 1, 75, 70, 2, 3]
+    assert a[0] == Op.BETA and a[1][7:] == [0.0, pytest.approx(8.123e8), pytest.approx(2.6e6)]
+    assert c[1][7:] == [2.0, 0.0, 0.0]
     assert notice(b"\x61" + bytes(7))[0] == 0 and notice(protocol.open_frame(5))[0] == 0
 
 

@@ -104,7 +104,7 @@ void controller_counts(const controller *c, uint32_t *out)
     out[2] = c->d.repeated;
 }
 
-/* learning, verdict, alarms, progress, valid, flags, chamber, beta and sd in Pa */
+/* learning, verdict, alarms, progress, valid, flags, counter, chamber, beta and sd in Pa */
 int controller_notice(const uint8_t *data, uint8_t length, float *out)
 {
     rtid_notice notice;
@@ -117,9 +117,10 @@ int controller_notice(const uint8_t *data, uint8_t length, float *out)
     out[3] = notice.progress;
     out[4] = notice.valid;
     out[5] = notice.flags;
-    out[6] = notice.chamber;
-    out[7] = notice.beta;
-    out[8] = notice.beta_sd;
+    out[6] = notice.counter;
+    out[7] = notice.chamber;
+    out[8] = notice.beta;
+    out[9] = notice.beta_sd;
     return op;
 }
 

@@ -126,7 +126,7 @@ class Controller:
 
 def notice(data: bytes) -> tuple[int, list[float]]:
     """A notice as the firmware reads it: its operation, and all fields of rtid_notice."""
-    out = np.zeros(9, np.float32)
+    out = np.zeros(10, np.float32)
     op = library().controller_notice(data, ctypes.c_uint8(len(data)), _pointer(out))
     return op, out.tolist()
 
