@@ -49,8 +49,10 @@ soak: $(READY)
 paper: $(READY)
 	.venv/bin/rtid paper --out out/paper
 
+# The pictures of README; the first one is the page's, as `make screenshots` takes it.
 pictures: $(READY)
 	.venv/bin/python -m tools.readme_pictures tools/pictures
+	.venv/bin/python -m tools.screenshots out/screenshots tools/pictures
 
 $(READY): requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
