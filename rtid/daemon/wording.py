@@ -94,7 +94,7 @@ def overload(lost: int, ticks: int, causes: Mapping[str, int]) -> str:
     why = sorted(causes.items(), key=lambda cause: -cause[1])
     told = ", ".join(f"{CAUSES.get(cause, cause)} ({n})" for cause, n in why)
     return (
-        f"{lost} of the last {ticks} ticks were lost{': ' * bool(told)}{told}; no frame is lost, "
-        "but what is published comes late. Give the daemon more of the processor "
-        "(daemon.priority) or a lower rate (daemon.rate_hz)"
+        f"{lost} of the last {ticks} ticks were lost{': ' * bool(told)}{told}; frames wait, and "
+        "what is published comes late. Give the daemon more of the processor (daemon.priority) "
+        "or a lower rate (daemon.rate_hz)"
     )

@@ -30,7 +30,7 @@ SAID = {
     "plant": (wording.plant_changed(LEAK), "is missing. If the machine is to stay as it is"),
     "overload": (
         wording.overload(71, 500, {"work": 2, "late": 9}),
-        "71 of the last 500 ticks were lost: woken too late (9), long work (2); no frame",
+        "71 of the last 500 ticks were lost: woken too late (9), long work (2); frames wait",
     ),
 }
 

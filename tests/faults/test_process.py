@@ -6,6 +6,8 @@ import os
 import resource
 import signal
 import sqlite3
+import subprocess
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +15,11 @@ from pathlib import Path
 import pytest
 
 from rtid.daemon.status import Status
+from rtid.sim.bus import run_frames
+from rtid.sim.hidden import hide_wish
+from rtid.sim.log import START_US, write_log
+from rtid.sim.plant import Plant
+from rtid.sim.run import Change, simulate
 from tests.faults.conftest import Figure
 from tests.faults.harness import FRAMES_PER_CYCLE, SECONDS, drift, machine, uninterrupted
 from tests.faults.process import LIMIT_S, Daemon, a_group, daemon, recorded, sender, stored
@@ -201,3 +208,29 @@ def test_row_17_kill_9_while_it_runs(tmp_path: Path, figure: Figure) -> None:
     learned = stored(running.folder, machine().project).estimator
     figure(17, "drift after 2 kills against no kill",
            drift(uninterrupted(learned), learned.solution()), 0.01)  # fmt: skip
+
+
+@pytest.mark.soak
+def test_a_changed_machine_is_accepted(tmp_path: Path) -> None:
+    """A leak begins; learning stops, until the engineer says that this is how it is to be."""
+    worn, trace = hide_wish(Plant(), "internal_leakage_laminar=strong"), tmp_path / "worn.blf"
+    run = simulate(Plant(), "rich", 1, SECONDS, change=Change(40.0, worn))
+    write_log(trace, run_frames(run, start_us=START_US))
+    accept = [sys.executable, "-m", "rtid", "accept", str(tmp_path / "state"), "--reason", "test"]
+    with daemon(tmp_path, settings=QUICK) as running:
+        running.wait(lambda s: s.pid > 0)
+        with sender(running.group, SECONDS, speed=SPEED, trace=trace):
+            running.wait(lambda s: s.has("plant_changed"))
+            alarmed = running.status()
+            said = subprocess.run(accept, capture_output=True, text=True, check=False)
+            running.wait(lambda s: s.estimate.state == "learning")
+            again = subprocess.run(accept, capture_output=True, text=True, check=False)
+        running.stop()
+    assert alarmed is not None and alarmed.estimate.state == "suspended"
+    assert said.returncode == 0 and "accepted" in said.stdout, said.stderr
+    assert again.returncode == 4 and "nothing to accept" in again.stdout
+    assert list(running.folder.glob("state-?.before.npz"))
+    with sqlite3.connect(running.folder / "history.sqlite") as history:
+        assert history.execute("SELECT reason FROM decision").fetchall() == [("test",)]
+    taken = stored(running.folder, machine().project).estimator.counters["samples"]
+    assert 0 < taken < 25_000, "the healthy 40 s are still in it"
