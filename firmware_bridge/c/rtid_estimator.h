@@ -9,7 +9,7 @@
  * -DRTID_ESTIMATOR_FLOAT32, one float per number in the update; what is summed up for ever is then
  * kept in two floats.  The solution is computed in double precision, on demand, outside the tick.
  * Compile without -ffast-math: NaN means "not available", and compensated sums must stay.
- * The work of an update is bounded, whatever was learned; no function recurs or allocates.
+ * The work of an update is bounded, whatever was learned; no function is recursive.
  *
  *     static rtid_estimator e;  static rtid_estimator_work w;  rtid_estimator_solution s;
  *     rtid_estimator_start(&e);

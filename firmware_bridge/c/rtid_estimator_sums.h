@@ -11,7 +11,7 @@
 #endif
 
 #define R(x) ((rtid_real)(x))
-enum { T = RTID_EST_TERMS };
+enum { T = RTID_EST_TERMS, SHUT = -1 };
 enum { FREE, OPEN, YOUNG, RINGING }; /* a recent block; young: closed since the ring began */
 enum { TILES_PER_TICK = 4, ALL_TILES = RTID_EST_MAX_RECENT * RTID_EST_MAX_RECENT };
 enum { SETTLE, FORGET_SILENT, END_ALL }; /* what a rebase does to the memory of closed blocks */
@@ -88,6 +88,18 @@ static inline int first_of(int k) { return RTID_EST_OPEN_AT + T * k; }
 double rtid_est_rated(int edge);
 double rtid_est_shared_scale(int shared);
 int rtid_est_has_term(int edge, int term);
+
+/* Keep the sample: it is the start of the next interval. */
+void rtid_est_remember(rtid_estimator *e, const rtid_estimator_sample *sample);
+
+/* Begin at the measured position that was remembered: spools at rest, whitener at R. */
+void rtid_est_begin(rtid_estimator *e);
+
+/* Find the block of every edge over the interval; RTID_EST_TAKEN or the reason against it. */
+int rtid_est_place(rtid_estimator *e, const rtid_real *now, int64_t dt_us);
+
+/* Integrate the columns over the interval; make a row where the position was measured. */
+void rtid_est_integrate(rtid_estimator *e, const rtid_estimator_sample *sample);
 
 /* Let n blocks be open; the width of the rows follows. */
 void rtid_est_set_open(rtid_estimator *e, int n);
