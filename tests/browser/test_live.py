@@ -106,7 +106,7 @@ def test_the_page_follows_a_daemon(opened: Opened) -> None:
 def test_half_an_hour_of_updates_leaves_the_tab_as_it_was(browser: Browser, opened: Opened) -> None:
     rate, found = memory(browser, opened.page, opened.bench.url, SOAK_MINUTES)
     heap_mb, private_mb = growth(found)
-    assert rate > 2.0  # five a second are offered; a page that is slow takes fewer
+    assert rate > 0.8  # the page looks five times a second, the daemon tells once
     assert heap_mb <= MOST_MB
     assert private_mb <= MOST_MB
 
