@@ -14,15 +14,16 @@ KEPT = ("s", "m3", "Pa", "m3/s")  # quantity() turns these round itself
 
 def size(value: Value) -> str:
     """With its 95 % interval, where it has one."""
-    unit, factor = (value.unit, 1.0) if value.unit in KEPT else _workshop(value.unit)
+    unit, factor = _workshop(value.unit)
     std = Z95 * value.std if isfinite(value.std) else nan
     return quantity(Value(factor * value.value, factor * std, unit))
 
 
 def limit(value: float, unit: str) -> str:
     """Without an interval, in two digits."""
-    return size(Value(float(f"{value:.2g}"), nan, unit))
+    name, factor = _workshop(unit)
+    return quantity(Value(float(f"{factor * value:.2g}"), nan, name))
 
 
 def _workshop(unit: str) -> tuple[str, float]:
-    return PRACTICAL.get(unit, (unit, 1.0))
+    return (unit, 1.0) if unit in KEPT else PRACTICAL.get(unit, (unit, 1.0))

@@ -58,7 +58,7 @@ def strip(session: Session) -> str:
         offer = button("Choose", "go", name="why")
     elif len(session.revisions) > 1 and not last.is_saved:
         offer = button("Save to project", "save", kind="main") + button("Undo", "undo")
-        words += " Next: save it, or undo."
+        words += " Next: save it, or undo." if found.verdict == "matches" else ""
     elif found.verdict == "matches":
         words += " Next: Map, to take the valves' maps along."
     return f'<h1 class="{kind}">{text(heading)}</h1><p>{text(words)}</p>{offer}'
