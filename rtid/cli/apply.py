@@ -121,6 +121,7 @@ def _bar() -> Iterator[Callable[[int, int], None]]:
 
     def progress(done: int, total: int) -> None:
         shown.start()  # not before: there may be a question on the screen
+        shown.start_task(task)
         shown.update(task, completed=done, total=total)
 
     try:
