@@ -38,23 +38,16 @@ def _story(found: Excited) -> Iterator[str]:
         f"valid blocks instead of {sweep.valid}, and the median standard error of the map, over "
         f"the blocks of both, is {ratio:.2f} of the sweep's."
     )
-    if found.missing is not None:
-        yield _still(found)
+    if found.worth < found.tried:
+        yield (
+            f"By what is learned already, {found.worth} of {found.tried} possible segments are "
+            "still worth running."
+        )
     names = Counter(c.segment.name for c in design.segments)
     for name, count in list(names.items())[:MOST_SEGMENTS]:
         yield f"  {count} x {name}" if count > 1 else f"  {name}"
     if len(names) > MOST_SEGMENTS:
         yield f"  and {len(names) - MOST_SEGMENTS} more"
-
-
-def _still(found: Excited) -> str:
-    assert found.missing is not None, "asked for"
-    if not found.missing:
-        return "By what is learned already, nothing is missing that this motion would tell."
-    return (
-        f"By what is learned already, {len(found.missing)} of its segments are still worth "
-        f"running, first: {found.missing[0].segment.name}."
-    )
 
 
 def _motions(found: Excited) -> Table:

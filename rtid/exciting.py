@@ -17,8 +17,9 @@ from rtid.effects import catalogue
 from rtid.errors import RtidError
 from rtid.estimator.published import publish
 from rtid.estimator.solution import Solution
-from rtid.excite.design import Candidate, Design, candidates, design, missing
+from rtid.excite.design import Candidate, Design, candidates, design, missing, working_weights
 from rtid.excite.driving import OFFSET, SHUT, STEP_S, SUPPLY, V_REF, X_REF, Control, Piston
+from rtid.excite.information import of_effects
 from rtid.excite.known import known_from
 from rtid.excite.limits import Limits
 from rtid.excite.machine import Machine, rated_map
@@ -39,17 +40,24 @@ ADVICE = (
 )
 
 
+class NothingMissingError(RtidError):
+    """What is learned already leaves nothing that a designed motion would tell."""
+
+    exit_code = 4
+
+
 @dataclass(frozen=True)
 class Excited:
     """A design with what it will tell, beside the paper's sweep and a D-optimal choice.
 
-    missing: the segments that are still worth running after what is learned; None: nothing is.
+    worth, tried: how many segments are worth running by what is learned, of how many.
     """
 
     project: Project
     design: Design
     predictions: tuple[Prediction, ...]
-    missing: tuple[Candidate, ...] | None
+    worth: int
+    tried: int
 
     @property
     def designed(self) -> Prediction:
@@ -79,27 +87,47 @@ def excite(
     see: effects to become visible; after: snapshot or trace that tells what is learned; compare:
     also choose D-optimally; changes: of the limits, by the names of `Limits`.  Raises RtidError.
     """
-    section = section_of(project)
     for name in see:
         if name not in catalogue():
             raise RtidError(f"no effect {name!r}", nearest(name, list(catalogue())), exit_code=2)
-    solution = _learned(project, after) if after else None
-    machine = machine_of(project, section, solution)
+    section = section_of(project)
+    machine, known = _nominal(project, section, tuple(see), after)
     limits = replace(limits_of(section), **changes)
-    known = known_from(machine.model, solution) if solution else None
-    pool = candidates(machine, limits, tuple(see), lambda w, s: progress(w, 0.6 * s))
-    found = design(machine, limits, tuple(see), known, pool=pool)
-    progress("predicting", 0.7)
+    pool: Sequence[Candidate] = candidates(
+        machine, limits, tuple(see), lambda what, share: progress(what, 0.6 * share)
+    )
+    tried = len(pool)
+    if known is not None:
+        pool = missing(pool, known, working_weights(machine, limits))
+        if not pool:
+            raise NothingMissingError(f"by what {after} has taught, no segment tells much more")
+    progress("choosing", 0.6)
+    found = design(machine, limits, known, pool)
+    progress("predicting", 0.75)
     predictions = [found.predicted(), _swept(machine, limits)]
     if compare:
         progress("comparing", 0.9)
-        other = design(machine, limits, tuple(see), known, D_OPTIMAL, pool)
+        other = design(machine, limits, known, pool, D_OPTIMAL)
         predictions.append(other.predicted("D-optimal"))
-    left = None
-    if known is not None:
-        left = missing(found.segments, known, found.weights)
     progress("done", 1.0)
-    return Excited(project, found, tuple(predictions), left)
+    return Excited(project, found, tuple(predictions), len(pool), tried)
+
+
+def _nominal(
+    project: Project, section: ExciteSection, see: tuple[str, ...], after: Path | None
+) -> tuple[Machine, Known | None]:
+    """The nominal machine, and what a snapshot or a trace has taught of it."""
+    if after is None:
+        return machine_of(project, section), None
+    if after.suffix.lower() == SNAPSHOT:
+        solution = load_for(after, project)[0].solution()
+        return machine_of(project, section, solution), known_from(project.model, solution)
+    trace = replay(project, after)
+    machine = machine_of(project, section, trace.fit.solution)
+    known = known_from(project.model, trace.fit.solution)
+    if see:
+        known.effects.update(of_effects(machine, trace.part(trace.identification_s), see))
+    return machine, known
 
 
 def _swept(machine: Machine, limits: Limits) -> Prediction:
@@ -162,13 +190,6 @@ def machine_of(
     return Machine(model, theta, compliance, piston, control, stroke_m, usual, tank)
 
 
-def _learned(project: Project, path: Path) -> Solution:
-    """What a snapshot holds, or a trace teaches."""
-    if path.suffix.lower() == SNAPSHOT:
-        return load_for(path, project)[0].solution()
-    return replay(project, path).fit.solution
-
-
 COLUMNS = (
     "t_s", "x_ref_m", "v_ref_mps", "command_offset_v", "p_supply_set_pa", "valves_shut",
     "expected_x_m", "expected_u_v",
@@ -203,7 +224,6 @@ def read_csv(path: Path) -> FloatArray:
 def as_json(found: Excited) -> dict[str, Any]:
     """Plain JSON types, SI units in the names; numbers that are not finite are null."""
     names = [edge.name for edge in found.design.machine.model.edges]
-    missing_ = found.missing
     return {
         "schema": SCHEMA,
         "duration_s": found.design.duration_s,
@@ -214,7 +234,8 @@ def as_json(found: Excited) -> dict[str, Any]:
         "extremes": [e._asdict() | {"is_kept": e.is_kept} for e in found.design.extremes],
         "predictions": [_predicted(p, names) for p in found.predictions],
         "median_sd_ratio_to_sweep": _finite(median_ratio(found.designed, found.sweep)),
-        "still_missing": None if missing_ is None else [c.segment.name for c in missing_],
+        "segments_worth_running": found.worth,
+        "segments_tried": found.tried,
     }
 
 
@@ -251,6 +272,3 @@ def _predicted(p: Prediction, names: list[str]) -> dict[str, Any]:
 
 def _finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
-
-
-__all__ = ["Excited", "Known", "as_json", "excite", "read_csv", "write_csv"]

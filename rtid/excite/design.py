@@ -17,13 +17,21 @@ from rtid.excite.library import REST_S, Segment, library
 from rtid.excite.limits import Extremes, LimitError, Limits, extremes, require_kept
 from rtid.excite.machine import Machine, MachineError
 from rtid.excite.prediction import Prediction, assess
-from rtid.excite.selection import BOUNDED, Criterion, Known, Problem, choose
+from rtid.excite.selection import (
+    BOUNDED,
+    EFFECT_WEIGHT,
+    Criterion,
+    Known,
+    Problem,
+    choose,
+    standard_errors,
+)
 from rtid.excite.sweep import swept_sine
 from rtid.model import FloatArray
 
 MARGIN, PRESSURE_MARGIN = 0.05, 0.02  # of a range, kept free by each candidate on its own
 ELSEWHERE = 0.02  # weight of a block that the working motion does not visit
-WORTH = 0.1  # share of what a segment tells at first, below which it is not worth running
+GOAL, IMPROVED, WORTH = 5e-3, 0.2, 0.25  # see `missing`; the goal is a share of the rated flow
 ROWS = 20  # that a block needs to be where the machine works
 
 Progress = Callable[[str, float], None]
@@ -66,20 +74,15 @@ def _silent(_what: str, _share: float) -> None:
 def design(
     machine: Machine,
     limits: Limits,
-    see: tuple[str, ...] = (),
-    known: Known | None = None,
+    known: Known | None,
+    pool: Sequence[Candidate],
     criterion: Criterion = BOUNDED,
-    pool: Sequence[Candidate] | None = None,
-    progress: Progress = _silent,
 ) -> Design:
-    """Choose a motion; see: effects to become visible, known: what is learned already.
+    """Choose a motion from `candidates` of the same machine and limits.
 
-    pool: `candidates` of the same machine and limits, made if not given.  Raises LimitError,
-    MachineError.
+    known: what is learned already.  Raises LimitError, MachineError.
     """
-    pool = candidates(machine, limits, see, progress) if pool is None else pool
     weights = working_weights(machine, limits)
-    progress("choosing", 0.9)
     start = known or Known.nothing(machine.model.n_cells)
     costs = np.array([c.segment.duration_s + 2 * REST_S for c in pool])
     problem = Problem([c.told for c in pool], costs, weights, criterion)
@@ -91,7 +94,6 @@ def design(
     expected = machine.run(reference)
     found = checked(machine, limits, reference, expected)
     require_kept(found)
-    progress("done", 1.0)
     return Design(machine, limits, tuple(segments), reference, expected, found, weights)
 
 
@@ -101,7 +103,7 @@ def candidates(
     """Segments of the library that the nominal machine can follow, and what each tells."""
     found, every, tight = list[Candidate](), library(limits), tightened(limits)
     for k, segment in enumerate(every):
-        progress("trying segments", 0.9 * k / len(every))
+        progress("trying segments", k / len(every))
         try:
             chunk = machine.run(segment.reference)
         except MachineError:
@@ -129,20 +131,30 @@ def working_weights(machine: Machine, limits: Limits) -> FloatArray:
 
 
 def missing(
-    segments: Sequence[Candidate], known: Known, weights: FloatArray, worth: float = WORTH
+    segments: Sequence[Candidate], known: Known, weights: FloatArray
 ) -> tuple[Candidate, ...]:
-    """Segments that are still worth running, the most telling first, by what is learned.
+    """Segments that are still worth running by what is learned, the most telling first.
 
-    One whose gain has fallen below the share `worth` of what it is before anything is known is
-    left out.
+    Worth running is what improves blocks that are not known to GOAL, or named effects, by a share
+    IMPROVED of their standard error, as long as these are a share WORTH of what it visits.
     """
-    nothing = Known.nothing(len(known.rows))
-    shares = [
-        known.gain(c.told, BOUNDED, weights) / max(nothing.gain(c.told, BOUNDED, weights), 1e-12)
-        for c in segments
-    ]
-    order = np.argsort(shares)[::-1]
-    return tuple(segments[k] for k in order if shares[k] >= worth)
+    shares = np.array([_share(c.told, known, weights) for c in segments])
+    order = np.argsort(-shares, kind="stable")
+    return tuple(segments[k] for k in order if shares[k] >= WORTH)
+
+
+def _share(told: Information, known: Known, weights: FloatArray) -> float:
+    """Share of what a segment visits, by weight, that it would still improve."""
+    own, visited = known.blocks[told.cells], weights[told.cells]
+    before = standard_errors(own)
+    after = standard_errors(own + told.blocks)
+    open_ = (before > GOAL) & (after < (1.0 - IMPROVED) * before)
+    total, better = float(visited.sum()), float(visited[open_].sum())
+    for key, value in told.effects.items():
+        total += EFFECT_WEIGHT
+        past = known.effects.get(key, 0.0)
+        better += EFFECT_WEIGHT * ((past + value) * (1.0 - IMPROVED) ** 2 > past)
+    return better / max(total, 1e-12)
 
 
 def stitched(segments: Sequence[Candidate], limits: Limits) -> tuple[list[Candidate], FloatArray]:

@@ -26,7 +26,7 @@ USEFUL, BEFORE = 0.02, 0.15  # s_1, from which on it counts whole, and its share
 TARGET = 2e-4  # share of the rated flow below which a block is known well enough
 ENOUGH_ROWS = 60.0
 EXCHANGES = 2  # rounds at most
-EFFECT_WEIGHT = 25.0  # blocks that halving the limit of one effect is worth
+EFFECT_WEIGHT = 10.0  # blocks that halving the limit of one effect is worth
 
 
 def _moments() -> FloatArray:

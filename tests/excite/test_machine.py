@@ -11,7 +11,7 @@ import pytest
 from rtid.cli.main import run
 from rtid.compare.reference import theta_cells
 from rtid.errors import RtidError
-from rtid.estimator.estimator import to_chunk
+from rtid.estimator.estimator import Estimator, to_chunk
 from rtid.excite import library
 from rtid.excite.driving import SHUT, STEP_S, Control, Piston
 from rtid.excite.limits import LimitError
@@ -23,6 +23,7 @@ from rtid.project import load
 from rtid.sim.declare import declared_model
 from rtid.sim.plant import Plant
 from rtid.sim.run import EXACT, P_A, P_B, U, X, simulate
+from rtid.store import save
 from tests.excite.machines import machine, motion, motion_of, write_project
 
 NUMBER = 7
@@ -93,12 +94,20 @@ def test_a_design_from_the_file_to_the_true_machine(
     model = load(project).model
     found = assess(model, to_chunk(model, true.samples, int(true.samples.t_us[0])))
     designed, sweep = told["predictions"]
+    assert told["segments_worth_running"] == told["segments_tried"]
     assert found.valid == pytest.approx(designed["valid_blocks"], rel=0.3)
     assert sweep["valid_blocks"] > 50
     for limit in designed["limits"]:
         if limit["effect"] == EXCITE:
             measured = found.limit(EXCITE, limit["where"])
             assert 1 / 1.5 < measured / limit["detection_limit"] < 1.5
+    learned, snapshot = Estimator(model), tmp_path / "state.npz"
+    learned.update(true.samples)
+    save(snapshot, learned, load(project).digest)
+    with pytest.raises(SystemExit):
+        run([*asked, "--after", str(snapshot), "--json"])
+    again = json.loads(capsys.readouterr().out)
+    assert 0 < again["segments_worth_running"] <= again["segments_tried"]
 
 
 def test_what_cannot_be_designed_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -106,7 +106,7 @@ def test_what_is_learned_is_not_missing() -> None:
 def test_every_broken_limit_is_named_with_its_place() -> None:
     reference = np.zeros((100, 5))
     reference[:, SUPPLY] = 9e6
-    t = STEP_S * np.arange(100)
+    t = STEP_S * np.arange(100, dtype=np.float64)
     found = extremes(LIMITS, reference, t, 0.25 + 4.0 * t, np.full(100, 9.5), np.full((100, 2), 0))
     with pytest.raises(LimitError) as error:
         require_kept(found)
