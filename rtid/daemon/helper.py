@@ -19,7 +19,8 @@ from collections.abc import Callable
 from rtid.daemon.jobs import Answer, Batch, Found, Job
 from rtid.daemon.pipe import Pipe, pair
 
-QUEUED = 500  # batches that may wait: a slow disk or a long solve
+QUEUED = 500  # jobs that may wait: a slow disk or a long solve
+QUEUED_BYTES = 16 << 20  # ... and what their batches may hold
 RESTART_S = (1.0, 60.0)  # first and longest pause before a helper is started again
 
 
@@ -41,6 +42,7 @@ class Helper:
         self._command = [sys.executable, "-m", module]
         self._arguments, self._answer = arguments, answer
         self._jobs: deque[Job] = deque()
+        self._bytes = 0  # of the batches among them
         self._wake = threading.Condition()
         self._stopping = False
         self.dropped = self.failures = 0
@@ -51,9 +53,12 @@ class Helper:
     def put(self, job: Job) -> None:
         """Queue a job; never waits."""
         with self._wake:
-            if len(self._jobs) >= QUEUED:
-                self._drop_one()
             self._jobs.append(job)
+            if isinstance(job, Batch):
+                self._bytes += job.size_bytes
+            while len(self._jobs) > QUEUED or self._bytes > QUEUED_BYTES:
+                if not self._drop_one():
+                    break
             self._wake.notify()
 
     @property
@@ -74,12 +79,14 @@ class Helper:
             return False
         return not self._feeder.is_alive()
 
-    def _drop_one(self) -> None:
+    def _drop_one(self) -> bool:
         for k, job in enumerate(self._jobs):
             if isinstance(job, Batch):
                 del self._jobs[k]
+                self._bytes -= job.size_bytes
                 self.dropped += len(job.frames) if job.frames is not None else 0
-                return
+                return True
+        return False
 
     def _run(self) -> None:
         pause_s = RESTART_S[0]
@@ -128,7 +135,9 @@ class Helper:
                 self._wake.wait(0.5)
                 if self.process is not None and self.process.poll() is not None:
                     raise BrokenPipeError("the helper has ended")
-            return self._jobs.popleft() if self._jobs else None
+            job = self._jobs.popleft() if self._jobs else None
+            self._bytes -= job.size_bytes if isinstance(job, Batch) else 0
+            return job
 
     def _listen(self, pipe: Pipe) -> None:
         with contextlib.suppress(EOFError, OSError):

@@ -32,6 +32,11 @@ class Batch:
     chunk: FloatArray
     frames: Frames | None
 
+    @property
+    def size_bytes(self) -> int:
+        """What it holds in memory, about."""
+        return self.chunk.nbytes + (24 * len(self.frames) if self.frames is not None else 0)
+
 
 @dataclass(frozen=True)
 class Note:

@@ -281,4 +281,5 @@ def test_a_helper_that_is_slow_loses_the_oldest_batches_and_says_how_much(echo: 
     for _ in range(700):
         helper.put(Batch(np.zeros((1000, 9)), one))
     assert 0 < helper.dropped <= 7000 and helper.queued <= 500
+    assert helper.queued * 72_000 <= 17 << 20  # and no more memory than that
     helper.stop(0.0)

@@ -5,6 +5,8 @@ One chamber or two, one block per edge, 10 ms per sample.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -56,15 +58,17 @@ def record(n: int, first: int = 0) -> FloatArray:
     return rows
 
 
-def held(chambers: int = 1, rows: int = 3) -> State:
-    """A state that has begun, and judges by the true map; its block has no error of its own."""
+def held(chambers: int = 1, rows: int = 3, sd: float = 0.0) -> State:
+    """A state that has begun, and judges by the true map; sd: of its flow, shares of the rated."""
     state = build(model(chambers))
     state.advance(record(3))
     n = chambers
     theta = np.zeros((n, 6))
     theta[:, 0] = 1.0  # in units of the rated flow
     cells = np.arange(n)
-    state.hold(cells, theta, np.zeros((n, 6, 6)), np.ones(n), np.zeros(0))
+    cov = np.zeros((n, 6, 6))
+    cov[:, 0, 0] = sd**2
+    state.hold(cells, theta, cov, np.ones(n), np.zeros(0))
     state.engine[0]["gate_sd"], state.engine[0]["gate_rows"] = SD, rows
     return state
 
@@ -141,6 +145,49 @@ def test_refusals_are_counted_anew_after_a_good_row() -> None:
     assert counted(state)["outlier"] == 4 and "reopened" not in counted(state)
 
 
+@pytest.mark.parametrize("chambers", [1, 2])
+def test_the_maps_own_error_widens_the_gate(chambers: int) -> None:
+    """It adds up from row to row and fades as the gap does: soon it stays."""
+    sure, unsure, rows = held(chambers), held(chambers, sd=0.5), record(40, 3)
+    for state in (sure, unsure):  # flow noise as large as that of the position: it fades soon
+        state.engine[0]["q_floor"][:] = (AREA * 1e-5) ** 2 / DT
+    e, sds = unsure.engine[0], list[float]()
+    for k in range(40):
+        unsure.advance(rows[k : k + 1])
+        sds.append(float(e["gap_sd"][chambers - 1]))
+    assert 0 < 1.2 * sds[0] < sds[20] and sds[39] == pytest.approx(sds[20], rel=0.05)
+    sure.advance(rows)
+    more = record(1, 43)
+    more[0, 7] += 2e-5
+    seen = [surprised(state)[0] for state in (sure, unsure)]
+    for state in (sure, unsure):
+        state.advance(more)
+    told, less = (surprised(s)[0] - b for s, b in zip((sure, unsure), seen, strict=True))
+    assert 0 < less < told
+
+
+def test_windows_that_share_a_point_answer_once() -> None:
+    """Of up to four windows the one of the cell that holds the point is judged."""
+    fine = Grid(np.array([1.0, 2.0, 3.0, 4.0]), np.array([0.0, 4.9e6, 9e6, 10e6]))
+    plain = model()
+    edges = tuple(replace(e, grid=fine, basis="blended") for e in plain.edges)
+    state = build(replace(plain, edges=edges))
+    state.advance(record(3))
+    e, n = state.engine[0], len(state.cells)
+    theta = np.zeros((n, 6))
+    theta[:, 0] = 1.0
+    slots = int(e["n_slots"])
+    assert slots > 1 and e["n_open"] > 1, "the point lies in one window alone"
+    used = np.flatnonzero(state.cells["slot"] >= 0)
+    state.hold(used, theta[used], np.zeros((slots, 6, 6)), np.ones(1), np.zeros(0))
+    e["gate_sd"], e["gate_rows"] = 1e6, 100
+    state.advance(record(10, 3))
+    judged = state.blocks["judged"][:slots]
+    assert sorted(judged)[-1] == judged.sum() == 10
+    i, j = e["home"][0]
+    assert state.blocks["cell"][int(np.argmax(judged))] == i * 3 + j
+
+
 def test_without_a_limit_nothing_is_judged() -> None:
     state, rows = held(), record(6, 3)
     state.engine[0]["gate_sd"] = 0.0
@@ -156,7 +203,7 @@ def test_an_unknown_block_is_not_judged() -> None:
     rows[:, 7] = rows[0, 7]
     state.advance(rows)
     assert "outlier" not in counted(state) and surprised(state) == (0.0, 0)
-    assert state.engine[0]["gap"][0] == 0.0
+    assert counted(state)["rows"] == 2 + 8 and state.engine[0]["gap"][0] == 0.0
     state.cells["known"][:] = 1
     more = record(3, 11)
     more[:, 7] = rows[0, 7] + Q / AREA * DT * np.arange(1, 4)
