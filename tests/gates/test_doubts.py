@@ -139,3 +139,8 @@ def test_either_signal_holds_the_sample() -> None:
     assert taken.values[:, 0].tolist() == [1, 2, 4, 4, 5]
     assert taken.flags.tolist() == [ROW, ROW, ROW | GAP, ROW, ROW | GAP]
     assert taken.t_us.tolist() == [0, 1, 3, 4, 6] and gate.refused == 2
+
+
+def test_one_repeat_is_enough_where_that_is_the_limit() -> None:
+    gate = Frozen([1, 0])
+    assert len(gate.push(of((1, 1), (1, 2)))) == 1 and gate.doubted.tolist() == [True, False]

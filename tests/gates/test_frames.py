@@ -6,13 +6,17 @@ Small on purpose: `tools/mutate.py` runs these with each operator of the gates c
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from tempfile import NamedTemporaryFile
 
 import numpy as np
 import pytest
 
 from firmware_bridge import frames as fr
 from firmware_bridge.assemble import Assembler
-from firmware_bridge.config import Assembly, SignalSource
+from firmware_bridge.catalog import load
+from firmware_bridge.config import Assembly, MessageSource, SignalSource
+from firmware_bridge.e2e import crc8_bulk
 from firmware_bridge.encode import encode_message
 from firmware_bridge.frames import Frames
 from firmware_bridge.samples import GAP, ROW, Samples
@@ -193,6 +197,51 @@ def test_older_cycles_can_no_longer_be_completed() -> None:
     samples, counted = run([a[:2], b, cycle(2)])
     assert counted["incomplete_cycle"] == 1
     assert (samples.t_us - START_US).tolist() == [1200, 2200]
+
+
+def test_older_cycles_end_when_a_newer_one_is_complete() -> None:
+    assembler = Assembler(CATALOG, assembly())
+    assembler.push(fr.concatenate([cycle(0)[:2], cycle(1)[:1], cycle(2)]))
+    before = assembler.counters["incomplete_cycle"]
+    assembler.finish()
+    assert before == assembler.counters["incomplete_cycle"] == 2
+
+
+def test_crc_and_counter_wherever_they_are() -> None:
+    """The counter in the first bits, the CRC in the last byte."""
+    with NamedTemporaryFile("w", suffix=".dbc") as file:
+        file.write(OTHER_DBC)
+        file.flush()
+        catalog = load(Path(file.name))
+    sources = (MessageSource("M", 1e-3, counter="Counter", crc="Crc", data_id=0x33),)
+    declared = Assembly("cycle", (SignalSource("x_m", "M", "X"),), sources, "x_m")
+    frames, layouts = fr.empty(4), catalog.layouts("M")
+    columns = np.zeros((4, len(layouts.names)))
+    columns[:, layouts.names.index("Counter")] = [0, 1, 1, 3]
+    columns[:, layouts.names.index("X")] = 7.0
+    frames.t_us[:] = START_US + PERIOD_US * np.arange(4)
+    frames.can_id[:], frames.length[:] = catalog.can_id("M"), 8
+    frames.data[:] = layouts.encode(columns)
+    frames.data[:, 7] = crc8_bulk(frames.data, 8, 7, 0x33)
+    assembler = Assembler(catalog, declared)
+    samples = assembler.push(frames)
+    assert assembler.counters == {"counter_repeat": 1, "counter_jump": 1, "gap": 1}
+    assert samples.values[:, 0].tolist() == [7.0] * 3
+    frames.data[:, 7] ^= 1
+    assembler = Assembler(catalog, declared)
+    assembler.push(frames)
+    assert assembler.counters == {"crc": 4}
+
+
+OTHER_DBC = """VERSION ""
+NS_ :
+BS_:
+BU_: A
+BO_ 291 M: 8 A
+ SG_ Counter : 0|4@1+ (1,0) [0|15] "" A
+ SG_ X : 8|16@1+ (1,0) [0|65535] "m" A
+ SG_ Crc : 56|8@1+ (1,0) [0|255] "" A
+"""
 
 
 def test_a_cycle_that_comes_twice_is_no_second_sample() -> None:
