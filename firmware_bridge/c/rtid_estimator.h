@@ -102,7 +102,6 @@ typedef struct {
 typedef struct {
     /* local columns, those that move at every sample */
     rtid_real d[RTID_EST_WIDTH];                    /* whitener's state of each column */
-    rtid_real row[RTID_EST_WIDTH];                  /* the row being made */
     rtid_sum local[RTID_EST_WIDTH][RTID_EST_WIDTH]; /* products of the rows since the ring began */
     uint16_t width;
     rtid_real faded; /* what is left of the state of a block that closed at the last forgetting */

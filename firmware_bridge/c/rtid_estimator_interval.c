@@ -307,27 +307,24 @@ static void block_increments(rtid_estimator *e, int k, int64_t t_us, int row)
     e->cov += (cell->slope * cell->slope * edge->dp_var * period + cell->missed) * e->dt_s;
 }
 
-static void add_products(rtid_estimator *e)
-{
-    for (int i = 0; i < e->width; i++)
-        for (int j = 0; j <= i; j++)
-            merge(&e->local[i][j], product(e->row[i], e->row[j]));
-}
-
 /* A row of all columns and their decay, by the Kalman whitener; see rtid/kernels/rows.py. */
 static void make_row(rtid_estimator *e)
 {
     const rtid_real r = position_noise(e), s = e->cov + r, v = column_variance(e);
     const rtid_real scale = R(1) / ROOT(s), keep = r / s, lost = R(1) - keep;
-    for (int j = 0; j < e->width; j++) {
-        e->row[j] = scale * e->d[j];
+    const int n = e->width;
+    rtid_real row[RTID_EST_WIDTH];
+    for (int j = 0; j < n; j++) {
+        row[j] = scale * e->d[j];
         e->d[j] *= keep;
     }
+    for (int i = 0; i < n; i++)
+        for (int j = 0; j <= i; j++)
+            merge(&e->local[i][j], product(row[i], row[j]));
     merge(&e->noise, as_sum((v + e->echo) / s));
     e->echo = keep * keep * e->echo + lost * lost * v;
     e->cov *= keep;
     e->counts[RTID_EST_ROWS]++;
-    add_products(e);
 }
 
 void rtid_est_integrate(rtid_estimator *e, const rtid_estimator_sample *sample)

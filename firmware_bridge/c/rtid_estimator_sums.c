@@ -23,19 +23,19 @@ static void add_own_tile(rtid_estimator *e, int slot, const rtid_sum *left, cons
 }
 
 /* What two blocks share += left' right. */
-static void add_tile(rtid_estimator *e, int slot, int other, const rtid_sum *left,
-                     const rtid_real *right)
+static void add_tile(rtid_estimator *e, int slot, int other, const rtid_sum *restrict left,
+                     const rtid_real *restrict right)
 {
     const int mine = at_slot(slot), its = at_slot(other);
     if (slot == other)
         add_own_tile(e, slot, left, right);
     for (int i = 0; i < T && mine > its; i++) {
-        rtid_sum *target = sum_at(e, mine + i, its);
+        rtid_sum *restrict target = sum_at(e, mine + i, its);
         for (int j = 0; j < T; j++)
             merge(&target[j], times(left[i], right[j]));
     }
     for (int j = 0; j < T && mine < its; j++) {
-        rtid_sum *target = sum_at(e, its + j, mine);
+        rtid_sum *restrict target = sum_at(e, its + j, mine);
         for (int i = 0; i < T; i++)
             merge(&target[i], times(left[i], right[j]));
     }

@@ -94,7 +94,7 @@ class Layout:
         opened = [(name, _I2) for name in ("edge", "slot", "recent", "u", "dp")]
         edge = [(name, real) for name in ("w", "m1", "var", "mt", "dp0", "dp1")]
         edge += [(name, _I2) for name in ("u", "dp", "to_u", "to_dp", "place")]
-        fields: list[Field] = [("d", real, (width,)), ("row", real, (width,))]
+        fields: list[Field] = [("d", real, (width,))]
         fields += [("local", total, (width, width))]
         fields += [("width", _U2), ("faded", real)]
         fields += [(name, real) for name in ("cov", "echo")] + [("noise", total)]
