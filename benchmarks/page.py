@@ -54,7 +54,7 @@ CLICK = f"""(k) => new Promise((done) => {{
   lit.properties.data.change.connect(heard);
   plane.selected.indices = [Math.floor((0.37 * k % 1) * plane.data.residual.length)];
 }})"""
-Times = dict[str, list[float]]
+Spent = tuple[float, dict[int, float]]
 
 
 def spent_s(pid: int) -> float:
@@ -68,8 +68,8 @@ def spent_s(pid: int) -> float:
     return total / 1e9
 
 
-def browser_s() -> float:
-    """Processor time of all processes of the browser that this one has started."""
+def browser_s() -> dict[int, float]:
+    """Processor time of every process of the browser that this one has started."""
     parents = {}
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -80,7 +80,7 @@ def browser_s() -> float:
     while grown:
         more = {pid for pid, parent in parents.items() if parent in own}
         grown, own = not more <= own, own | more
-    return sum(spent_s(pid) for pid in own if "chrom" in _name(pid))
+    return {pid: spent_s(pid) for pid in own if "chrom" in _name(pid)}
 
 
 def _name(pid: int) -> str:
@@ -96,15 +96,16 @@ class Stopwatch:
     def __init__(self, server: int) -> None:
         self._server, self.times = server, defaultdict[str, list[float]](list)
 
-    def note(self, name: str, wall_ms: float, since: tuple[float, float]) -> None:
+    def note(self, name: str, wall_ms: float, since: Spent) -> None:
         """One more of a kind."""
-        now = self.now()
+        server, browser = self.now()
+        spent = sum(s - since[1].get(pid, 0.0) for pid, s in browser.items())
         self.times[f"{name}, wall"].append(wall_ms)
-        self.times[f"{name}, server"].append(1e3 * (now[0] - since[0]))
-        self.times[f"{name}, browser"].append(1e3 * (now[1] - since[1]))
+        self.times[f"{name}, server"].append(1e3 * (server - since[0]))
+        self.times[f"{name}, browser"].append(1e3 * spent)
 
-    def now(self) -> tuple[float, float]:
-        """Processor seconds of server and browser."""
+    def now(self) -> Spent:
+        """Processor seconds of the server and of every process of the browser."""
         return spent_s(self._server), browser_s()
 
 

@@ -113,8 +113,11 @@ def _ranking(told: Told, may_add: bool) -> str:
     elif told.diagnosis.verdict == "matches":
         says += (
             "None of them takes a material share of the error off unseen motion, however clear "
-            "it is. An effect's name opens its page."
+            "it is. "
         )
+        if told.diagnosis.negligible:
+            says += "→ is what is left of them beside those that are too small to matter. "
+        says += "An effect's name opens its page."
     else:
         says += "None of them explains the error. An effect's name opens its page."
     return f'<h3>All candidates</h3><p class="says">{text(says)}</p>{table(head, rows)}'
@@ -133,7 +136,8 @@ def _rank(one: Ranked, most: float, may_add: bool) -> tuple[str, ...]:
 
 def _unseen(found: Diagnosis) -> list[str]:
     """Detection limits, and what the record cannot show."""
-    seen = [u for u in found.not_found if u.visible and u.detection_limit is not None]
+    listed = () if found.verdict == "insufficient_data" else found.not_found
+    seen = [u for u in listed if u.visible and u.detection_limit is not None]
     blind = [u for u in found.not_found if not u.visible]
     head = ("effect", "where", "smallest size that would have shown", "remark")
     parts = []
