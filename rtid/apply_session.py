@@ -119,11 +119,11 @@ def _over_the_bus(
         session = Session(link)
         with _opened(session) as room:
             held = {slot: session.held(slot) for slot in slots(project) if slot < room.slots}
-        _settle(folder, applied, held)
-        plan = _plan(project, folder, wish, applied, held, room)
-        if not confirmed(plan) or plan.objections or plan.is_same:
-            return plan, None
-        with _opened(session):
+            _settle(folder, applied, held)
+            plan = _plan(project, folder, wish, applied, held, room)
+            if not confirmed(plan) or plan.objections or plan.is_same:
+                return plan, None
+            session.open()  # that took its time: somebody else may have come
             if {slot: session.held(slot) for slot in held} != held:
                 raise ApplyError("the controller has got other maps meanwhile", "look again")
             row = send(session, applied, plan.prepared, plan.review, plan.provenance, progress)

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from firmware_bridge.download import DownloadError, UnconfirmedError
+from firmware_bridge import lookup
+from firmware_bridge.download import DownloadError, Image, Session, UnconfirmedError, download
 from firmware_bridge.lookup import crc32
 from firmware_bridge.protocol import Op, Reason
 from rtid import offered
@@ -23,8 +24,9 @@ from rtid.offered import NoOfferError
 from rtid.project import Project, load
 from rtid.wished import Wish
 from tests.apply.neighbour import Neighbour, learned, loaded, neighbour, offer, project_file
-from tests.bridge.controller import Controller
-from tests.bridge.test_download import damaging, losing
+from tests.bridge.controller import Controller, Line
+from tests.bridge.tables import a_table
+from tests.bridge.test_download import SPOILS, damaging, losing
 
 
 @pytest.fixture(scope="module")
@@ -232,6 +234,28 @@ def test_without_an_offer(tmp_path: Path) -> None:
         sent(path, there, tmp_path / "state")
 
 
+@pytest.mark.parametrize("name", SPOILS)
+def test_over_a_bad_bus(tmp_path: Path, maps: tuple[FlowMap, FlowMap], name: str) -> None:
+    """The lines of tests/bridge/test_download.py, on a virtual bus and in real time."""
+    path, folder, controller = project_file(tmp_path, error_percent=5), tmp_path / "s", Controller()
+    make, share = SPOILS[name]
+    offer(folder, load(path), maps[0])
+    with neighbour(controller, make(share, 1)) as there:
+        plan, row = sent(path, there, folder)
+        chunks = sum(-(-len(data) // 6) for data in plan.prepared.images.values())
+        print(f"\n{name}: {len(there.heard) / chunks:.2f} frames heard per chunk")
+    assert row is not None and held_slots(load(path), controller) == row.crcs
+
+
+def test_nobody_on_the_bus(tmp_path: Path, maps: tuple[FlowMap, FlowMap]) -> None:
+    path, folder = project_file(tmp_path), tmp_path / "state"
+    offer(folder, load(path), maps[0])
+    wish = Wish(bus="virtual:nobody-here", state=folder, test_bus=True)
+    with pytest.raises(DownloadError, match="does not answer"):
+        apply_map(path, wish, lambda plan: True)
+    assert Applied(folder).rows() == [] and offered.exists(folder)
+
+
 def test_over_a_bus_that_loses_and_damages(tmp_path: Path, maps: tuple[FlowMap, FlowMap]) -> None:
     path, folder, controller = project_file(tmp_path), tmp_path / "state", Controller()
     spoil, damage = losing(0.02, 1), damaging(0.01, 2)
@@ -314,6 +338,25 @@ def test_two_applies_at_once(tmp_path: Path, maps: tuple[FlowMap, FlowMap]) -> N
 
         wish = Wish(bus=f"virtual:{there.channel}", state=folder, test_bus=True)
         apply_map(path, wish, meanwhile)
+
+
+def test_somebody_else_comes_while_you_think(tmp_path: Path, maps: tuple[FlowMap, FlowMap]) -> None:
+    path, folder, controller = project_file(tmp_path), tmp_path / "state", Controller()
+    offer(folder, load(path), maps[0])
+    theirs = Image(lookup.image(a_table(), 2))
+
+    def meanwhile(plan: Plan) -> bool:
+        other = Session(Line(controller, time_s=1e3))
+        other.open()
+        download(other, {2: theirs}, 1)
+        other.close()
+        return True
+
+    with neighbour(controller) as there:
+        wish = Wish(bus=f"virtual:{there.channel}", state=folder, test_bus=True)
+        with pytest.raises(ApplyError, match="meanwhile"):
+            apply_map(path, wish, meanwhile)
+    assert controller.held(2) == (1, theirs.crc) and controller.held(0) is None
 
 
 def ends(arguments: list[str]) -> int:

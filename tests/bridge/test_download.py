@@ -287,6 +287,17 @@ def test_two_applies_at_once() -> None:
         first.held(0)
 
 
+def test_the_same_session_may_be_opened_again() -> None:
+    controller = begun()
+    session = Session(Line(controller))
+    session.open()
+    session.put(0, NEW[0], 6, lambda done, total: None)
+    session.open()
+    session.put(1, NEW[1], 6, lambda done, total: None)
+    session.commit([0, 1], 6)
+    assert state(controller) == IS_NEW
+
+
 @pytest.mark.parametrize("version", [0, 4, 5])
 def test_a_version_that_is_not_newer_is_refused(version: int) -> None:
     controller = begun(5)
