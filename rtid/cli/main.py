@@ -41,6 +41,7 @@ COMMANDS = {
     "apply": "Send the learned maps to the controller, all or nothing; and back.",
     "export": "Write the learned maps as CSV, JSON, npz or a C header.",
     "mcu": "Write the estimator in C for a controller with no computer beside it.",
+    "fleet": "Learn and diagnose thousands of traces, and rank the machines.",
     "paper": "Reproduce the figures and tables of the paper, beside its numbers.",
 }
 

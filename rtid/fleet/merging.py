@@ -1,0 +1,189 @@
+"""What the traces of a fleet add up to: a map per machine, and what is typical of its type.
+
+Machines of one type have the same declaration (the project's digest).  A machine's map comes from
+the sums of all its traces; the typical map is the median over machines, its spread the scaled
+median deviation; a machine is an outlier by the rms of its deviations in units of that spread.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from operator import add
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rtid.estimator.flowmap import VALID, FlowMap
+from rtid.estimator.published import publish
+from rtid.estimator.solution import Solution, solve
+from rtid.fleet.archive import Archive
+from rtid.mapfiles import provenance, write_map
+from rtid.model import FloatArray, Model
+
+FEWEST = 3  # machines that a typical value takes
+MAD = 1.4826  # of a normal distribution
+FLOOR = 1e-3  # least spread, of the largest flow: maps are not known better
+WORST = ("unknown", "missing", "ambiguous", "insufficient_data", "", "matches")
+
+Row = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Machine:
+    """All traces of a machine of one declaration: its rows, and the joint estimate."""
+
+    name: str
+    digest: str
+    rows: tuple[Row, ...]
+    solution: Solution
+    flowmap: FlowMap
+
+    @property
+    def verdict(self) -> str:
+        """The worst of its newest three traces that have one: what there is now."""
+        newest = [row["verdict"] for row in self.rows if row["verdict"]][-3:]
+        return min(newest, key=WORST.index, default="")
+
+    @property
+    def effects(self) -> list[str]:
+        """Effects that were named, the most frequent first."""
+        return [e for e, _ in Counter(e for r in self.rows for e in r["effects"]).most_common()]
+
+
+@dataclass(frozen=True, eq=False)
+class Typical:
+    """Typical flows (points,) of a type at the nodes of its grids, and their spread, m3/s."""
+
+    digest: str
+    edge: list[str]
+    u_v: FloatArray
+    dp_pa: FloatArray
+    flow_m3s: FloatArray
+    spread_m3s: FloatArray
+    machines: int
+
+
+def machines(archive: Archive, models: Mapping[str, Model]) -> list[Machine]:
+    """Every machine with at least one trace that was learned from; models by digest."""
+    rows: dict[tuple[str, str], list[Row]] = defaultdict(list)
+    for row in archive.rows():
+        if not row["error"] and row["digest"] in models:
+            rows[row["machine"], row["digest"]].append(row)
+    return [_machine(archive, models[d], name, d, own) for (name, d), own in rows.items()]
+
+
+def _machine(
+    archive: Archive, model: Model, name: str, digest: str, rows: Sequence[Row]
+) -> Machine:
+    solution = solve(model, reduce(add, archive.sums([row["key"] for row in rows])))
+    return Machine(name, digest, tuple(rows), solution, publish(solution))
+
+
+def typical(found: Iterable[Machine]) -> list[Typical]:
+    """One typical map per declaration with at least three machines."""
+    types: dict[str, list[Machine]] = defaultdict(list)
+    for machine in found:
+        types[machine.digest].append(machine)
+    return [_typical(digest, own) for digest, own in types.items() if len(own) >= FEWEST]
+
+
+def _typical(digest: str, own: Sequence[Machine]) -> Typical:
+    edge, u, dp = _nodes(own[0].flowmap)
+    flows = np.array([_known(machine.flowmap) for machine in own])
+    enough = np.isfinite(flows).sum(axis=0) >= FEWEST
+    flows = flows[:, enough]
+    middle = np.nanmedian(flows, axis=0)
+    spread = MAD * np.nanmedian(np.abs(flows - middle), axis=0)
+    least = FLOOR * float(np.abs(middle).max(initial=0.0))
+    names = [name for name, is_known in zip(edge, enough, strict=True) if is_known]
+    return Typical(
+        digest, names, u[enough], dp[enough], middle, np.maximum(spread, least), len(own)
+    )
+
+
+def deviation(machine: Machine, of: Typical) -> float:
+    """Rms of what a machine's map deviates from the typical one, in units of the spread."""
+    own = dict(
+        zip(zip(*_nodes(machine.flowmap), strict=True), _known(machine.flowmap), strict=True)
+    )
+    at = zip(of.edge, of.u_v, of.dp_pa, strict=True)
+    off = (np.array([own[node] for node in at]) - of.flow_m3s) / of.spread_m3s
+    off = off[np.isfinite(off)]
+    return float(np.sqrt(np.mean(off**2))) if len(off) else float("nan")
+
+
+def _nodes(flowmap: FlowMap) -> tuple[list[str], FloatArray, FloatArray]:
+    """Edge, command and pressure drop of all centres of blocks."""
+    names: list[str] = []
+    u, dp = [], []
+    for edge in flowmap.edges:
+        centres = [0.5 * (b[1:] + b[:-1]) for b in (edge.grid.u_v, edge.grid.dp_pa)]
+        w, d = (a.ravel() for a in np.meshgrid(*centres, indexing="ij"))
+        names += [edge.name] * len(w)
+        u.append(w)
+        dp.append(d)
+    return names, np.concatenate(u), np.concatenate(dp)
+
+
+def _known(flowmap: FlowMap) -> FloatArray:
+    """Flow at these centres, NaN in blocks that do not stand on their own data."""
+    found = []
+    for edge in flowmap.edges:
+        centres = [0.5 * (b[1:] + b[:-1]) for b in (edge.grid.u_v, edge.grid.dp_pa)]
+        w, d = np.meshgrid(*centres, indexing="ij")
+        found.append(np.where(edge.status == VALID, edge.flow(w, d), np.nan).ravel())
+    return np.concatenate(found)
+
+
+def write(archive: Archive, found: Sequence[Machine], types: Sequence[Typical]) -> None:
+    """Maps, typical maps and the table of machines, the most remarkable first."""
+    for machine in found:
+        traces = f"{len(machine.rows)} traces of {machine.name}"
+        origin = provenance(machine.solution, machine.name, machine.digest, traces)
+        path = archive.folder / "maps" / f"{_plain(machine.name)}-{machine.digest[:8]}.npz"
+        write_map(path, machine.flowmap, origin)
+    for one in types:
+        _write_typical(archive.folder / f"typical-{one.digest[:8]}.csv", one)
+    archive.keep_machines(ranked(found, types))
+
+
+def ranked(found: Sequence[Machine], types: Sequence[Typical]) -> list[dict[str, Any]]:
+    """One row per machine: the worst verdict first, then the largest deviation from its type."""
+    of = {one.digest: one for one in types}
+    rows = [
+        {
+            "machine": machine.name,
+            "digest": machine.digest,
+            "traces": len(machine.rows),
+            "verdict": machine.verdict,
+            "effects": machine.effects,
+            "deviation": deviation(machine, of[machine.digest])
+            if machine.digest in of
+            else float("nan"),
+            "beta_pa": machine.solution.beta_pa.tolist(),
+            "beta_sd_pa": machine.solution.beta_sd_pa.tolist(),
+            "valid_blocks": int(sum((e.status == VALID).sum() for e in machine.flowmap.edges)),
+            "rho": float(machine.solution.rho),
+        }
+        for machine in found
+    ]
+    return sorted(rows, key=lambda r: (WORST.index(r["verdict"]), -np.nan_to_num(r["deviation"])))
+
+
+def _plain(name: str) -> str:
+    return "".join(c if c.isalnum() or c in "-_" else "_" for c in name)
+
+
+def _write_typical(path: Path, one: Typical) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        file.write(f"# typical of {one.machines} machines; sd: spread over them\n")
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["edge", "u_V", "dp_Pa", "Q_m3/s", "sd_m3/s", "status"])
+        columns = one.edge, one.u_v, one.dp_pa, one.flow_m3s, one.spread_m3s
+        for name, u, dp, q, sd in zip(*columns, strict=True):
+            writer.writerow([name, f"{u:.9g}", f"{dp:.9g}", f"{q:.9g}", f"{sd:.3g}", "prior"])
