@@ -5,7 +5,7 @@ PYTHON ?= python3
 PIP = .venv/bin/python -m pip --disable-pip-version-check
 READY = .venv/.ready
 
-.PHONY: demo test bench lint campaign faults soak paper pictures screenshots lock clean
+.PHONY: demo test bench lint campaign faults soak mutants paper pictures screenshots lock clean
 
 demo: $(READY)
 	.venv/bin/rtid demo
@@ -44,6 +44,10 @@ soak: $(READY)
 	RTID_FAULTS=out/soak.jsonl .venv/bin/python -m pytest -q -p no:benchmark -m soak tests/faults tests/browser; \
 	  status=$$?; .venv/bin/python -m tests.faults.table out/soak.jsonl | tee out/soak.md; \
 	  exit $$status
+
+# Change one operator of the gates at a time: some test must fail (by hand; tests/gates/mutants.txt).
+mutants: $(READY)
+	.venv/bin/python -m tools.mutate
 
 # Every figure and table of the paper, into out/paper (a few minutes).
 paper: $(READY)
