@@ -25,7 +25,6 @@ STATUS = ("valid", "shut", "learning", "extrapolated", "prior", "outside", "none
 SHUT, OUTSIDE, NONE = STATUS.index("shut"), STATUS.index("outside"), STATUS.index("none")
 CELL_STATUS = 5  # codes below can be a cell's
 MOST_NODES = 255  # per axis
-MOST_BYTES = 0xFFFF
 MOST_COUNT = 32_767
 ROUNDING = 0.01  # counts by which a flow may lie beyond the ends
 RISING = 0x80  # with the first cells' status: flows only rise, or only fall, with the command
@@ -145,14 +144,12 @@ def image_bytes(nu: int, ns: int) -> int:
 
 
 def image(table: Table, slot: int) -> bytes:
-    """The bytes that are sent.  ImageError for more than 255 nodes per axis or 65,535 bytes."""
+    """The bytes that are sent.  ImageError for more than 255 nodes per axis."""
     nu, ns = table.counts.shape
     if nu > MOST_NODES or ns > MOST_NODES:
         raise ImageError(f"{nu} x {ns} nodes: at most {MOST_NODES} per axis")
     head = HEAD.pack(MAP, slot, nu, ns, table.direction, table.scale, table.safe_band_v)
     parts = (table.w_v.astype("<f4"), table.s.astype("<f4"), table.counts.astype("<i2"))
-    if image_bytes(nu, ns) > MOST_BYTES:
-        raise ImageError(f"{nu} x {ns} nodes are {image_bytes(nu, ns)} bytes, of {MOST_BYTES}")
     status = table.status.copy()
     status[0] |= np.where(table.rising, RISING, 0).astype(np.uint8)
     return head + b"".join(part.tobytes() for part in parts) + status.tobytes()

@@ -118,7 +118,7 @@ def begin_frames(
     session: int, slot: int, nu: int, ns: int, size: int, version: int, crc: int
 ) -> list[bytes]:
     """Announce an image of nu x ns nodes, size bytes."""
-    head = bytes([slot, nu, ns]) + size.to_bytes(2, "little")
+    head = bytes([slot, nu, ns]) + size.to_bytes(3, "little")
     return [
         frame(session, Op.BEGIN_SIZE, head),
         frame(session, Op.BEGIN_VERSION, bytes([slot]) + version.to_bytes(4, "little")),

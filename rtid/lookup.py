@@ -15,13 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.lookup import (
-    MOST_BYTES,
     MOST_COUNT,
     MOST_NODES,
     NO_SAFE_BAND,
     STATUS,
     Table,
-    image_bytes,
 )
 from rtid.errors import RtidError
 from rtid.estimator.flowmap import EdgeMap
@@ -51,7 +49,7 @@ class Sampled:
 
 def on_wire(nu: int, ns: int) -> bool:
     """Whether an image can have so many nodes."""
-    return max(nu, ns) <= MOST_NODES and image_bytes(nu, ns) <= MOST_BYTES
+    return max(nu, ns) <= MOST_NODES
 
 
 def sample(

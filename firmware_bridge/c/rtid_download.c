@@ -314,7 +314,7 @@ static void on_begin(exchange *x)
         d->rx.id = id;
         d->rx.nu = x->data[2];
         d->rx.ns = x->data[3];
-        d->rx.total = u16_of(x->data + 4);
+        d->rx.total = u16_of(x->data + 4) | (uint32_t)x->data[6] << 16;
         d->rx.next = 0;
         d->rx.got = 0xFFFFFFFFu;
         d->staged &= (uint16_t)~bit(id);

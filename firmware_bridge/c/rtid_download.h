@@ -98,7 +98,8 @@ typedef struct {
     uint32_t heard_ms;      /* last frame of the session */
     struct {
         uint32_t version, crc, got; /* got: CRC-32 so far, inverted */
-        uint16_t total, next;       /* bytes; chunk that is wanted next */
+        uint32_t total;             /* bytes */
+        uint16_t next;              /* chunk that is wanted next */
         uint8_t id, nu, ns, begun;  /* begun: bits 0..2 for the three BEGIN frames, 3: running */
         uint8_t head[RTID_DOWNLOAD_HEAD];
     } rx;

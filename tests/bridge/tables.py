@@ -14,7 +14,7 @@ def a_table(
     """A valve that opens above safe_v, with flow along sqrt(dp), and cells of every status."""
     rng = np.random.default_rng(seed)
     w = np.concatenate([[safe_v], np.sort(rng.uniform(safe_v + 0.1, 10.0, nu - 1))])
-    s = np.linspace(-500.0, 2600.0, ns) + rng.uniform(-10.0, 10.0, ns)
+    s = np.linspace(-500.0, 2600.0, ns) + 1000.0 / ns * rng.uniform(-1.0, 1.0, ns)
     gain = np.concatenate([[0.0], np.cumsum(rng.uniform(0.0, 1.0, nu - 1))])
     counts = np.round(32_000 * gain[:, None] / gain[-1] * s / np.abs(s).max())
     return Table(

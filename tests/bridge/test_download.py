@@ -424,10 +424,19 @@ def test_room_counts_for_nodes_and_for_flows() -> None:
         assert refused.value.reason == Reason.SIZE
 
 
+def test_the_largest_map() -> None:
+    image = Image(lookup.image(a_table(255, 255), 0))
+    controller = Controller(1, 510, 0xFFFF)
+    session = Session(Line(controller))
+    session.open()
+    download(session, {0: image}, 1)
+    assert len(image.data) > 190_000 and is_active(controller, image)
+
+
 def test_a_size_that_contradicts_the_nodes() -> None:
     controller = begun()
     controller.push(protocol.open_frame(3))
-    for size in (len(NEW[0].data) - 1, len(NEW[0].data) + 1, 0, 0xFFFF):
+    for size in (len(NEW[0].data) - 1, len(NEW[0].data) + 1, 0, 0xFFFFFF):
         *_, last = protocol.begin_frames(3, 0, 25, 18, size, 6, NEW[0].crc)
         for data in protocol.begin_frames(3, 0, 25, 18, size, 6, NEW[0].crc)[:2]:
             controller.push(data)
@@ -486,7 +495,7 @@ def test_data_without_a_beginning() -> None:
 
 def test_data_before_the_size_is_judged_are_not_stored() -> None:
     """Else an absurd size would write beyond the room; under sanitisers as well."""
-    head, *_ = protocol.begin_frames(3, 0, 255, 255, 0xFFFF, 6, 1)
+    head, *_ = protocol.begin_frames(3, 0, 255, 255, 0xFFFFFF, 6, 1)
     chunks = [protocol.data_frame(3, k, bytes(0xFFFF)) for k in range(3000)]
     controller = begun()
     for data in (protocol.open_frame(3), head, *chunks):
