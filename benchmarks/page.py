@@ -49,9 +49,12 @@ ZOOM = f"""(factor) => new Promise((done) => {{
 CLICK = f"""(k) => new Promise((done) => {{
   const begun = performance.now();
   const plane = {SOURCES} && m.data.residual && m.data.residual.length)[k % 4];
-  const lit = {SOURCES} && m.data.x0 && !m.data.y0)[0];
-  const heard = () => {{ lit.properties.data.change.disconnect(heard); {AFTER}; }};
-  lit.properties.data.change.connect(heard);
+  const all = {SOURCES} && m.data.x0 && !m.data.y0);  // one of each view
+  const heard = () => {{
+    for (const lit of all) lit.properties.data.change.disconnect(heard);
+    {AFTER};
+  }};
+  for (const lit of all) lit.properties.data.change.connect(heard);
   plane.selected.indices = [Math.floor((0.37 * k % 1) * plane.data.residual.length)];
 }})"""
 Spent = tuple[float, dict[int, float]]

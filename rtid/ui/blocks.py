@@ -39,6 +39,7 @@ LARGEST = 0.98  # quantile of the blocks' residuals at which their scale ends
 NONE, OTHER = "rgba(128, 128, 128, 0.10)", "rgba(128, 128, 128, 0.25)"
 DARK_FROM = 0.55  # of a scale: figures are white from here on
 MOST_TICKS = 9
+MOST_ACROSS = 19  # columns of blocks that are as wide as a figure; in more, figures stand upright
 
 
 @dataclass(frozen=True)
@@ -166,6 +167,7 @@ class BlockPlots:
         made.text(
             "x", "y", "text", source=source, text_color="ink", text_align="center",
             text_baseline="middle", text_font_size="9px", nonselection_text_alpha=1.0,
+            angle=np.pi / 2 if i1 - i0 >= MOST_ACROSS else 0.0,
         )  # fmt: skip
         lit = ColumnDataSource({"x": [], "y": []})
         made.rect(

@@ -41,6 +41,7 @@ class DeskViews:
     def show(self, view: str) -> None:
         """Look at a view."""
         self._make(view)
+        self._time.look_at(view)
         self._tell()
 
     def _make(self, view: str) -> None:

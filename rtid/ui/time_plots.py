@@ -43,7 +43,9 @@ class TimePlots:
         margin = MARGIN * (high - low)
         self._whole = low - margin, high + margin
         self._ranges: dict[str, Range1d] = {}
-        self._lit = ColumnDataSource({"x0": [], "x1": []})
+        self._lit: dict[str, ColumnDataSource] = {}
+        self._spans: Spans = []
+        self._view = ""
         self._plots: list[figure] = []
         self._on_span = on_span
         self.drag = "zoom"
@@ -59,8 +61,8 @@ class TimePlots:
         if self._on_span:
             made.toolbar.active_scroll = wheel
         made.vstrip(
-            x0="x0", x1="x1", source=self._lit, fill_color=LIT, fill_alpha=0.35, line_color=LIT,
-            line_alpha=0.8, line_width=0.8,
+            x0="x0", x1="x1", source=self._lit_of(view), fill_color=LIT, fill_alpha=0.35,
+            line_color=LIT, line_alpha=0.8, line_width=0.8,
         )  # fmt: skip
         self._shade(made)
         if is_last:
@@ -87,9 +89,21 @@ class TimePlots:
             box.tags = [{"light": colour, "dark": DARK[colour]}]
             made.add_layout(box)
 
+    def _lit_of(self, view: str) -> ColumnDataSource:
+        return self._lit.setdefault(view, ColumnDataSource({"x0": [], "x1": []}))
+
     def light(self, spans: Spans) -> None:
         """Mark time spans."""
-        self._lit.data = {"x0": [a for a, _ in spans], "x1": [b for _, b in spans]}
+        self._spans = spans
+        self.look_at(self._view)
+
+    def look_at(self, view: str) -> None:
+        """Another view: what is marked is marked there too, not before it is seen."""
+        self._view = view
+        marked = {"x0": [a for a, _ in self._spans], "x1": [b for _, b in self._spans]}
+        lit = self._lit.get(view)
+        if lit is not None and dict(lit.data) != marked:
+            lit.data = marked
 
     def set_drag(self, mode: str) -> None:
         """Dragging zooms or selects a span."""
