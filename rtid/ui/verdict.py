@@ -40,6 +40,10 @@ def strip(session: Session) -> str:
         return ""
     if last is not None and last.section is not None and (last.told is None or last.note):
         return _changed(session, last)
+    if last is not None and last.told is None and session.trouble[0] and not session.doing:
+        message, remedy = session.trouble
+        words = f"{message}. {remedy}" if remedy else message
+        return f'<h1 class="bad">Not diagnosed</h1><p>{text(words)}</p>'
     if last is None or last.told is None:
         heading = "Looking for what is missing" if last else "Opening the record"
         return f"<h1>{heading}</h1><p>{_waiting(session)}</p>"

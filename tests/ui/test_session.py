@@ -177,6 +177,16 @@ def test_what_speaks_against_a_change_stays_in_sight() -> None:
             worker.answer(told())
 
 
+def test_a_diagnosis_that_failed_is_not_waited_for() -> None:
+    session, worker, _ = begun()
+    worker.answer(opened())
+    worker.refuse("diagnose failed: KeyError")
+    words = strip(session)
+    assert "Not diagnosed" in words
+    assert "diagnose failed: KeyError. do something else" in words
+    assert "Looking" not in words
+
+
 def test_the_strip_says_what_to_do_next() -> None:
     session, worker, _ = begun()
     assert "Opening the record" in strip(session)
