@@ -54,7 +54,7 @@ def test_a_leak_is_learned_beside_the_maps() -> None:
     worn = hide_wish(Plant(), f"{LEAK}=strong")
     (leak,) = (h.strength for h in worn.hidden)
     board = on_board(with_added(added(LEAK, "a-b", coefficient=1.2 * leak)), lambda _: None)
-    clean = machine().learned(machine().frames[:90_000]).estimator.solution()
+    clean = learned(machine().project, Plant()).solution()
     plain, beside = (learned(p, worn).solution() for p in (machine().project, board))
     found = beside.terms[0]
     print(f"leak {found / leak:.3f} of the true one; drift {drift(clean, beside):.4f} beside, "
