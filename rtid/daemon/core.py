@@ -8,11 +8,6 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable
-from weakref import ref
-
-import numpy as np
-from numpy.typing import NDArray
 
 from firmware_bridge.frames import Frames
 from firmware_bridge.sources.live import Source
@@ -52,8 +47,6 @@ class Core:
         self.swap: Estimator | None = None
         self.busy = True  # the analyst solves, or is not ready yet
         self._kept = 0
-        self._handed: Callable[[], Handover | None] = lambda: None
-        self._memory: NDArray[np.uint8] | None = None
         self._collector = Collector(2 + len(project.model.signals), daemon.record_mb > 0)
         self._publish_ns, self._store_ns = (
             round(1e9 * s) for s in (daemon.publish_s, daemon.store_s)
@@ -88,10 +81,7 @@ class Core:
         self._send_batch()  # what the copy knows must not be judged by it
         self.number += 1
         self.busy = publish
-        job = Handover(self.number, twin(self.learner.estimator, self._room()), publish, store)
-        self._handed = ref(job)
-        self._analyst.put(job)
-        self._memory = job.estimator.state.memory
+        self._analyst.put(Handover(self.number, twin(self.learner.estimator), publish, store))
 
     def finish(self, publish: bool) -> None:
         """Take what has arrived and the last sample, and hand everything over to be stored."""
@@ -102,10 +92,6 @@ class Core:
         self._send_batch()
         if self.samples:
             self.hand_over(publish=publish and self.learner.learns, store=True)
-
-    def _room(self) -> NDArray[np.uint8] | None:
-        """The memory of the last copy, once that has been sent: new pages would cost 10 ms."""
-        return self._memory if self._handed() is None else None
 
     def _send_batch(self) -> None:
         batch = self._collector.take()
@@ -154,10 +140,10 @@ class Core:
         self.learner.estimator, self.swap = estimator, None
 
 
-def twin(estimator: Estimator, room: NDArray[np.uint8] | None = None) -> Estimator:
-    """An independent copy without the ring of samples; room: memory for it."""
+def twin(estimator: Estimator) -> Estimator:
+    """An independent copy without the ring of samples."""
     history, estimator.history = estimator.history, None
     try:
-        return estimator.copy(room)
+        return estimator.copy()
     finally:
         estimator.history = history

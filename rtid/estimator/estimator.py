@@ -10,7 +10,6 @@ from __future__ import annotations
 from copy import deepcopy
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_bridge.samples import Samples
 from rtid.estimator.blocks import VALID
@@ -152,14 +151,11 @@ class Estimator:
         """The joint estimate from everything seen so far; nothing is changed by asking."""
         return solve(self.model, self.sums, float(self.state.engine[0]["t_s"]), self.counters)
 
-    def copy(self, room: NDArray[np.uint8] | None = None) -> Estimator:
-        """An independent estimator that continues bit for bit like this one.
-
-        room: memory for its state, see `State.copy`.
-        """
+    def copy(self) -> Estimator:
+        """An independent estimator that continues bit for bit like this one."""
         twin = Estimator.__new__(Estimator)
         twin.model, twin.weights = self.model, self.weights
-        twin.state, twin.origin_us = self.state.copy(room), self.origin_us
+        twin.state, twin.origin_us = self.state.copy(), self.origin_us
         twin.folds, twin.turns, twin.due_s = list(self.folds), self.turns, self.due_s
         twin.history = deepcopy(self.history)
         return twin

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import InitVar, dataclass, field
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,17 +36,11 @@ class State:
     blocks: RecordArray
     pairs: RecordArray
     memory: NDArray[np.uint8] = field(init=False)
-    room: InitVar[NDArray[np.uint8] | None] = None
 
-    def __post_init__(self, room: NDArray[np.uint8] | None) -> None:
-        """Copy the arrays into one block of memory, which `kernel.advance` takes; keep views.
-
-        room: memory to use for that where it has the right size.
-        """
+    def __post_init__(self) -> None:
+        """Copy the arrays into one block of memory, which `kernel.advance` takes; keep views."""
         arrays = self.arrays
-        if room is not None and len(room) != sum(array.nbytes for array in arrays):
-            room = None
-        self.memory = np.concatenate([array.view(np.uint8) for array in arrays], out=room)
+        self.memory = np.concatenate([array.view(np.uint8) for array in arrays])
         ends = np.cumsum([array.nbytes for array in arrays]).tolist()
         parts = zip(arrays, [0, *ends], ends, strict=False)
         views = [self.memory[start:end].view(array.dtype) for array, start, end in parts]
@@ -85,7 +79,7 @@ class State:
             self.blocks = np.concatenate([self.blocks, extra])
         else:
             self.pairs = _rehash(self.engine, self.pairs)
-        self.__post_init__(None)
+        self.__post_init__()
 
     def settle(self) -> None:
         """Bring all sums up to date, in place."""
@@ -122,12 +116,9 @@ class State:
         """Empty the sums of a settled state; it goes on with its memory of recent columns."""
         tables.clear_sums(self.engine, self.blocks, self.pairs)
 
-    def copy(self, room: NDArray[np.uint8] | None = None) -> State:
-        """An independent copy that continues bit for bit like this one.
-
-        room: the memory of a copy that nobody needs any more; used again where it fits.
-        """
-        return State(*self.arrays, room)
+    def copy(self) -> State:
+        """An independent copy that continues bit for bit like this one."""
+        return State(*self.arrays)
 
 
 def _rehash(engine: RecordArray, pairs: RecordArray) -> RecordArray:
