@@ -31,9 +31,9 @@ def trials_of(state: State, present: Fit) -> list[Trial]:
             continue
         trials.append(Trial(key, score.gain, with_effect(present, candidate)))
     trials = with_pump(state, present, refined(state, present, trials))
-    scores = {key: s.gain for key, (_, s) in best.items() if key[1] == COMMAND}
+    scored_timings = {key[0]: found for key, found in best.items() if key[1] == COMMAND}
     other = max((t.gain for t in trials if t.key not in state.negligible), default=0.0)
-    return trials + timing_trials(state, present, scores, other)
+    return trials + timing_trials(state, present, scored_timings, other)
 
 
 def alike_ones(state: State, present: Fit, best: Trial, trials: list[Trial]) -> tuple[Key, ...]:

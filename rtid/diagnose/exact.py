@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 
+from rtid.diagnose.candidates import Candidate
 from rtid.diagnose.fit import Fit, fit, tried
 from rtid.diagnose.pump import PUMP, demand
+from rtid.diagnose.regression import Score
 from rtid.diagnose.search import Beside
 from rtid.diagnose.timing import COMMAND, TIMINGS, Psi, Timing
 from rtid.diagnose.trials import GAIN, Key, State, Trial, scored
 
 LARGE = 1.5  # rho above which timing effects are refitted whatever their score
 CLOSE = 0.9  # timings whose coarse gain is this share of the best are refitted finely
+NO_HINTS: Mapping[str, float] = MappingProxyType({})
 PROMISING = 0.3  # share of the best gain that a timing's bank must reach to be closed in on
 # pumps to begin with: droops as shares of that seen, quantiles of the demand, stiffness in Pa/m3
 DROOPS, PUMP_LIMITS, STIFFNESSES = (0.1, 0.7), (0.8, 0.93, 0.98), (1e9, 1e10, 1e11, 1e12)
@@ -47,25 +52,36 @@ def _pumps(present: Fit) -> list[Psi]:
 
 
 def timing_trials(
-    state: State, present: Fit, scores: dict[Key, float], other: float
+    state: State, present: Fit, scores: dict[str, tuple[Candidate, Score]], other: float
 ) -> list[Trial]:
-    """Exact refits with one timing more, of those that may matter."""
+    """Exact refits with one timing more, of those that may matter; scores: of the first order."""
     open_ = [t for t in TIMINGS if not present.revision.has((t.effect, COMMAND))]
     if present.rho < LARGE:
-        open_ = [t for t in open_ if scores.get((t.effect, COMMAND), 0.0) > GAIN]
+        open_ = [t for t in open_ if t.effect in scores and scores[t.effect][1].gain > GAIN]
     if not open_ or not present.view.has_pressures:
         return []
-    return exact_trials(state, present, open_, other)
+    hints = {t.effect: _strength(t, *scores[t.effect]) for t in open_ if t.effect in scores}
+    return exact_trials(state, present, open_, other, hints)
+
+
+def _strength(timing: Timing, candidate: Candidate, score: Score) -> float:
+    """How strong the first order takes a timing to be: so many times that of its column."""
+    return score.value * timing.strength(candidate.shape)
 
 
 def exact_trials(
-    state: State, present: Fit, timings: list[Timing], other: float = 0.0
+    state: State,
+    present: Fit,
+    timings: list[Timing],
+    other: float = 0.0,
+    hints: Mapping[str, float] = NO_HINTS,
 ) -> list[Trial]:
     """Refits with one of these timings more, the best of each name.
 
-    other: the best gain of any other cause; what cannot come close to it is left out.
+    other: the best gain of any other cause; what cannot come close to it is left out.  hints:
+    strengths by name to try as well, where they are below those of the bank.
     """
-    gains = _from_afar(state.coarse.beside(present), timings, other)
+    gains = _from_afar(state.coarse.beside(present), timings, other, hints)
     most = max([other, *(gain for gain, _, _ in gains)])
     trials: dict[Key, Trial] = {}
     for gain, timing, psi in gains:
@@ -90,10 +106,10 @@ def carried_on(state: State, present: Fit, trial: Trial) -> Fit:
 
 
 def _from_afar(
-    coarse: Beside, timings: list[Timing], other: float
+    coarse: Beside, timings: list[Timing], other: float, hints: Mapping[str, float]
 ) -> list[tuple[float, Timing, Psi]]:
     """Gain and parameters of every promising timing on the coarse map; one of each name."""
-    banks = {timing: coarse.bank(timing) for timing in timings}
+    banks = {timing: coarse.bank(timing, hints.get(timing.effect, 0.0)) for timing in timings}
     bar = PROMISING * max([other, *(max(bank.values()) for bank in banks.values())])
     best: dict[str, tuple[float, Timing, Psi]] = {}
     for timing, bank in banks.items():

@@ -107,13 +107,16 @@ class Beside:
         """What a timing lowers the cost by."""
         return self.before - self.cost(((timing, psi),))
 
-    def bank(self, timing: Timing) -> dict[float, float]:
-        """Gains by strength, from the slightest value of the bank on.
+    def bank(self, timing: Timing, hint: float = 0.0) -> dict[float, float]:
+        """Gains by strength, from the slightest value of the bank on, or from a hint below it.
 
         They rise towards the truth and fall behind it: two falls in a row, or a deep one, end it.
         """
         found, falls = {0.0: 0.0}, 0
-        for strength in sorted(timing.strength(psi) for psi in timing.bank):
+        strengths = sorted(timing.strength(psi) for psi in timing.bank)
+        if 0.0 < hint < strengths[0] and not timing.replaces_lag:  # whose zero is no lag at all
+            strengths.insert(0, hint)
+        for strength in strengths:
             found[strength] = self.gain(timing, timing.at(strength))
             *_, second, third = found.values()
             falls = falls + 1 if third < second else 0

@@ -95,6 +95,15 @@ def test_a_late_command_is_found_from_afar() -> None:
     assert found.rho_before > 10 * found.rho_after
 
 
+def test_a_play_below_the_bank_is_found_from_its_first_order() -> None:
+    """22 mV, where the search begins at 50: at 50 it explains nothing."""
+    found = diagnosed("valve_hysteresis", 0.022)
+    own = named(found, "valve_hysteresis")
+    assert own.effect == "valve_hysteresis"
+    assert own.parameters["width"].value == pytest.approx(0.022, rel=0.1)
+    assert found.rho_before > 5 > 4 * found.rho_after
+
+
 def test_what_was_not_found_has_a_limit() -> None:
     """Every hydraulic effect of the catalogue is found, bounded, or declared invisible."""
     found = diagnosed()
