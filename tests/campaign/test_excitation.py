@@ -67,7 +67,7 @@ def test_smallest_external_leak() -> None:
             FREE,
             "free maps",
             marks=pytest.mark.xfail(
-                strict=True, reason="3, 5, 8, 9 within 1.31; machines 7, 11 found 8 to 33 times larger"
+                strict=True, reason="four of six within 1.31, 7 and 11 found 8 to 33 times larger"
             ),
         ),
     ],
