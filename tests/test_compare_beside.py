@@ -152,7 +152,7 @@ def test_an_effect_that_cannot_follow_is_taken_from_the_measured_pressures() -> 
     assert machine.measured == (drift,)
     assert [effect.effect for effect in machine.of] == [LEAK, *2 * ["valve_gain_drift"]]
     learned = learn_beside(fitted, machine, machine.chunk)
-    terms, leak_value = learned.solution.terms, fitted.estimate.value(fitted.column(leak))
+    terms, leak_value = learned.solution.terms, fitted.held.value(fitted.column(leak))
     np.testing.assert_allclose(terms, [leak_value, 1.0, 1.0], rtol=1e-3)
     np.testing.assert_allclose(learned.solution.compliance, fitted.compliance, rtol=1e-5)
 

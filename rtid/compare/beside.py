@@ -167,7 +167,7 @@ def _told(fit: Fit, found: Acting) -> tuple[FloatArray, FloatArray]:
     n_c = len(fit.model.chambers)
     used = [*range(1, 1 + n_c), *(fit.column(effect) for effect in found.of)]
     at = [fit.estimate.used.index(column) for column in used]
-    value = fit.estimate.theta[at]
+    value = np.array([fit.held.value(column) for column in used])
     unit = np.concatenate([np.ones(n_c), value[n_c:]])
     cov = fit.estimate.cov[np.ix_(at, at)] / np.outer(unit, unit)
     cov[np.diag_indices(len(at))] += ALONE**2 * (np.arange(len(at)) >= n_c)
