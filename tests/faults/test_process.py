@@ -98,7 +98,7 @@ def day(tmp_path_factory: pytest.TempPathFactory) -> Day:
     after = [at_s for at_s in beats if at_s > to_s]
     return Day(
         caught_up_s, full_s, full, well_s, learned, stale_s,
-        sum(from_s + 0.2 < at_s < to_s for at_s in beats), len(after) / (max(beats) - to_s),
+        sum(from_s < at_s < to_s for at_s in beats), len(after) / (max(beats) - to_s),
         sent, last, running.folder,
     )  # fmt: skip
 
@@ -137,12 +137,18 @@ def slowed(running: Daemon, helper: int) -> int:
 
 
 def hung(running: Daemon) -> tuple[float, float]:
-    """The process stands still for 3 s: from when to when, s since its start."""
+    """The process stands still for 3 s: from when to when, s since its start.
+
+    The span begins when it has stopped and what it told before is read, and ends before it is told
+    to go on: this process may be kept from the processor at any of these points.
+    """
     running.process.send_signal(signal.SIGSTOP)
+    os.waitid(os.P_PID, running.process.pid, os.WSTOPPED | os.WNOWAIT)
+    time.sleep(0.2)
     from_s = time.monotonic() - running.started_s
-    time.sleep(3.0)
-    running.process.send_signal(signal.SIGCONT)
+    time.sleep(2.8)
     to_s = time.monotonic() - running.started_s
+    running.process.send_signal(signal.SIGCONT)
     time.sleep(1.5)
     return from_s, to_s
 
