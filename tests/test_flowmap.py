@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, reject, settings
+from hypothesis import assume, given, reject, settings
 from hypothesis import strategies as st
 
 from rtid.estimator.flowmap import EXTRAPOLATED, LEARNING, PRIOR, SHUT, VALID, EdgeMap, FlowMap
@@ -130,6 +130,9 @@ def test_inverse_gives_back_the_command(seed: int) -> None:
     inner = rng.uniform(edge.safe_band_v, u[-1], 60)
     w = np.concatenate([foot, inner, u[1:], [edge.safe_band_v]])
     dp = rng.uniform(2e5, p[-1], len(w))
+    # at these very drops the map must rise: between those that the generator looks at it may fall
+    fine = np.linspace(edge.safe_band_v, u[-1], 1001)[1:, None]
+    assume(bool((edge.gradient(fine, dp[None, :])[0] > 0).all()))
     tolerance = 1e-9 * (u[-1] - u[0])
     np.testing.assert_allclose(edge.inverse(edge.flow(w, dp), dp), w, rtol=0, atol=tolerance)
     beyond = edge.flow(u[-1], dp) * 1.0001
