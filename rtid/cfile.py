@@ -25,7 +25,13 @@ from rtid.lookup import ERROR_PERCENT, Sampled, sample
 from rtid.model import Model
 
 SUFFIX = ".h"
-BESIDE = ("rtid_map.h", "rtid_map.c", "rtid_map_fixed.h", "rtid_map_fixed.c")
+BESIDE = (
+    "rtid_map.h",
+    "rtid_map.c",
+    "rtid_map_fixed.h",
+    "rtid_map_fixed.c",
+    "rtid_map_search.h",
+)
 MICROVOLT, ROOT, FLOW = 1e6, 64.0, 1e9 * 65_536  # units of the fixed tables
 INT32_MIN, INT32_MAX = -(2**31), 2**31 - 1
 WIDTH, PREFIX = 100, "rtid_edge_"

@@ -2,15 +2,13 @@
 
 #include <stddef.h>
 
-#define ONE 65536        /* shares and counts have 16 bits behind the point */
-#define ROUNDING 655     /* 0.01 counts by which a flow may lie beyond the map's ends */
+#define ONE 65536 /* shares and counts have 16 bits behind the point */
 #define MOST_FLOW (1 << 30)
 
-typedef struct {
-    unsigned cell;
-    int64_t share; /* of ONE */
-    int outside;
-} place;
+typedef rtid_map_fixed table;
+typedef int64_t number;
+#define ROUNDING 655 /* 0.01 counts */
+#include "rtid_map_search.h"
 
 static place locate(const int32_t *node, unsigned n, int32_t x)
 {
@@ -47,18 +45,11 @@ static int32_t root(int32_t dp)
     return dp < 0 ? -(int32_t)found : (int32_t)found;
 }
 
-/* The flow at node k of u, between two nodes of s, in counts times ONE. */
-static int64_t along_s(const rtid_map_fixed *map, unsigned k, const place *s)
+/* In counts times ONE. */
+static int64_t along_s(const table *map, unsigned k, const place *s)
 {
     const int16_t *row = map->q + (size_t)k * map->ns + s->cell;
     return (int64_t)row[0] * ONE + s->share * ((int64_t)row[1] - row[0]);
-}
-
-static int status_of(const rtid_map_fixed *map, const place *u, const place *s)
-{
-    if (u->outside || s->outside)
-        return RTID_MAP_OUTSIDE;
-    return map->status[(size_t)u->cell * (map->ns - 1u) + s->cell] & ~RTID_MAP_RISING;
 }
 
 int rtid_map_fixed_flow(const rtid_map_fixed *map, int32_t u, int32_t dp, int32_t *q)
@@ -80,67 +71,18 @@ int rtid_map_fixed_flow(const rtid_map_fixed *map, int32_t u, int32_t dp, int32_
     return status_of(map, &at_u, &at_s);
 }
 
-typedef struct {
-    const rtid_map_fixed *map;
-    const place *s;
-    int64_t sign, count;
-} wanted;
-
-static int64_t flow_at(const wanted *q, unsigned k) { return q->sign * along_s(q->map, k, q->s); }
-
-static unsigned bisect(const wanted *q)
-{
-    unsigned low = 0, high = q->map->nu - 1u;
-    while (high - low > 1) {
-        const unsigned middle = (low + high) / 2;
-        if (flow_at(q, middle) < q->count)
-            low = middle;
-        else
-            high = middle;
-    }
-    return low;
-}
-
-static int scan(const wanted *q, unsigned *cell)
-{
-    unsigned crossings = 0;
-    int was_below = 1;
-    for (unsigned k = 1; k < q->map->nu; k++) {
-        const int is_below = k < q->map->nu - 1u && flow_at(q, k) < q->count;
-        if (was_below && !is_below)
-            *cell = k - 1;
-        crossings += was_below != is_below;
-        was_below = is_below;
-    }
-    return crossings == 1;
-}
-
 int rtid_map_fixed_command(const rtid_map_fixed *map, int32_t q, int32_t dp, int32_t *u)
 {
     place at_u = {0, 0, 0}, at_s;
     wanted flow = {map, &at_s, 1, 0};
-    int64_t first, last, low, high, w;
+    int64_t low, high, w;
     *u = 0;
     if (map == NULL || q >= MOST_FLOW || q <= -MOST_FLOW)
         return RTID_MAP_NONE;
     at_s = locate(map->s, map->ns, root(dp));
-    first = flow_at(&flow, 0);
-    last = flow_at(&flow, map->nu - 1u);
-    if (last < first) {
-        flow.sign = -1;
-        first = -first;
-        last = -last;
-    }
-    flow.count = flow.sign * q * ((int64_t)ONE * ONE) / map->scale;
-    if (flow.count < first - ROUNDING || flow.count > last + ROUNDING) {
-        *u = map->direction * map->u[flow.count > last ? map->nu - 1u : 0];
-        return RTID_MAP_NONE;
-    }
-    flow.count = flow.count < first ? first : flow.count > last ? last : flow.count;
-    if (map->status[at_s.cell] & RTID_MAP_RISING)
-        at_u.cell = bisect(&flow);
-    else if (!scan(&flow, &at_u.cell)) {
-        *u = map->direction * map->u[0];
+    flow.count = q * ((int64_t)ONE * ONE) / map->scale;
+    if (!search(&flow, &at_u.cell)) {
+        *u = map->direction * map->u[at_u.cell];
         return RTID_MAP_NONE;
     }
     low = flow_at(&flow, at_u.cell);
