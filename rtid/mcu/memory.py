@@ -13,22 +13,11 @@ from typing import Any
 import numpy as np
 
 from rtid.estimator.sums import Normal
-from rtid.kernels.layout import TERMS
+from rtid.kernels.layout import COUNTERS, OUTLIER, TERMS
 from rtid.mcu.tables import Sizes
 from rtid.model import FloatArray
 
-COUNTS = (
-    "samples",
-    "rows",
-    "restart_gap",
-    "not_finite",
-    "out_of_range",
-    "outside_grid",
-    "block_changes",
-    "restart_memory",
-    "recovering",
-    "no_room",
-)
+COUNTS = (*COUNTERS[:OUTLIER], "no_room")  # as far as no row is judged by a map held
 _I2, _U1, _U2, _U8, _I8 = np.int16, np.uint8, np.uint16, np.uint64, np.int64
 
 
