@@ -15,8 +15,9 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 import rtid
+from firmware_bridge.lookup import STATUS
 from rtid.estimator.flowmap import FlowMap
-from rtid.gridded import CODES, gridded
+from rtid.gridded import gridded
 from rtid.model import FloatArray
 from rtid.units import LPM, MPA
 
@@ -65,7 +66,7 @@ def write_cdfx(path: Path, flowmap: FlowMap, provenance: Mapping[str, Any]) -> N
 
 
 def _maps(flowmap: FlowMap) -> Iterator[_Map]:
-    codes = ", ".join(f"{k} {word}" for k, word in enumerate(CODES))
+    codes = ", ".join(f"{k} {word}" for k, word in enumerate(STATUS))
     for g in gridded(flowmap):
         axes = MPA * g.dp_pa, g.u_v
         yield _Map(f"{g.name}_flow", f"flow of {g.name}", "L/min", LPM * g.flow_m3s, *axes)

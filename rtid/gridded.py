@@ -10,21 +10,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from firmware_bridge.lookup import STATUS
 from rtid.estimator.flowmap import EdgeMap, FlowMap
 from rtid.estimator.orifice import root
-from rtid.lookup import refined
+from rtid.lookup import drops, lattice, refined
 from rtid.model import FloatArray
 
 ERROR_SHARE = 1e-3
 FINE_U, FINE_DP = 8, 32  # points per block at which a line is held against the map
-CODES = ("valid", "shut", "learning", "extrapolated", "prior", "outside", "none")
 
 
 @dataclass(frozen=True, eq=False)
 class Gridded:
     """One edge: u (nu,) in V along the opening, dp (nd,) Pa, flow and sd (nu, nd) m3/s, code.
 
-    code (nu, nd): index into CODES of what each node stands on.
+    code (nu, nd): index into STATUS of what each node stands on.
     """
 
     name: str
@@ -41,24 +41,18 @@ def gridded(flowmap: FlowMap, share: float = ERROR_SHARE) -> tuple[Gridded, ...]
 
 
 def _edge(edge: EdgeMap, share: float) -> Gridded:
-    u, dp = _between(edge.grid.u_v, FINE_U), _drops(edge.grid.dp_pa)
+    u, dp = lattice(edge.grid.u_v, FINE_U), _drops(edge.grid.dp_pa)
     flow = edge.flow(u[:, None], dp[None, :])
     allowed = 0.5 * share * max(float(np.abs(flow).max()), 1e-12)  # for either axis
     at = np.ix_(refined(u, flow, allowed, FINE_U), refined(dp, flow.T, allowed, FINE_DP))
     u, dp, flow = u[at[0].ravel()], dp[at[1].ravel()], flow[at]
     words = edge.status_at(u[:, None], dp[None, :])
-    code = np.vectorize(CODES.index, otypes=[float])(words)
+    code = np.vectorize(STATUS.index, otypes=[float])(words)
     return Gridded(edge.name, u, dp, flow, edge.sd(u[:, None], dp[None, :]), code)
 
 
 def _drops(border: FloatArray) -> FloatArray:
-    """Pressure drops evenly spaced in their roots, as flows are, none off the grid by rounding."""
-    s = _between(root(border), FINE_DP)
-    dp = np.clip(s * np.abs(s), border[0], border[-1])
+    """Pressure drops evenly spaced in their roots, as flows are; borders to the last bit."""
+    dp = drops(border, lattice(root(border), FINE_DP))
     dp[::FINE_DP] = border
-    return np.asarray(dp)
-
-
-def _between(border: FloatArray, fine: int) -> FloatArray:
-    steps = np.arange(fine * (len(border) - 1) + 1) / fine
-    return np.interp(steps, np.arange(len(border)), border)
+    return dp

@@ -64,9 +64,9 @@ def sample(
     and told.  Raises NoTableError for a map without room or that is not a number.
     """
     w_start, s_start = _borders(published)
-    w, s = _lattice(w_start, FINE_W), _lattice(s_start, FINE_S)
+    w, s = lattice(w_start, FINE_W), lattice(s_start, FINE_S)
     grid, theta = published.grid, published.theta
-    exact = on_lattice(grid, published.safe_band_v, theta, w, _drop(published, s))
+    exact = on_lattice(grid, published.safe_band_v, theta, w, drops(grid.dp_pa, s))
     if not np.isfinite(exact).all():
         raise NoTableError(f"edge {edge.name}: its map is not a number everywhere on its grid")
     if not fits(len(w_start), len(s_start)):
@@ -119,15 +119,15 @@ def _borders(published: EdgeMap) -> tuple[FloatArray, FloatArray]:
     return np.append(start, w[w > start]), root(published.grid.dp_pa)
 
 
-def _lattice(border: FloatArray, fine: int) -> FloatArray:
+def lattice(border: FloatArray, fine: int) -> FloatArray:
+    """The borders of blocks (n,) and between two of them fine - 1 points, evenly spaced."""
     steps = np.arange(fine * (len(border) - 1) + 1) / fine
     return np.interp(steps, np.arange(len(border)), border)
 
 
-def _drop(published: EdgeMap, s: FloatArray) -> FloatArray:
+def drops(border_pa: FloatArray, s: FloatArray) -> FloatArray:
     """Pressure drops of signed roots, none of them off the grid by rounding."""
-    dp = published.grid.dp_pa
-    return np.asarray(np.clip(s * np.abs(s), dp[0], dp[-1]))
+    return np.asarray(np.clip(s * np.abs(s), border_pa[0], border_pa[-1]))
 
 
 def _measured(
@@ -137,7 +137,8 @@ def _measured(
     scale = max(float(np.abs(flow).max()) / MOST_COUNT, 1e-12)
     safe = published.safe_band_v
     centre_w, centre_s = 0.5 * (w[1:] + w[:-1]), 0.5 * (s[1:] + s[:-1])
-    words = published.status_at(centre_w[:, None], _drop(published, centre_s)[None, :])
+    border_pa = published.grid.dp_pa
+    words = published.status_at(centre_w[:, None], drops(border_pa, centre_s)[None, :])
     codes = np.vectorize(STATUS.index, otypes=[np.uint8])(words)
     table = Table(
         w.astype(np.float32),
@@ -150,6 +151,6 @@ def _measured(
     )
     rng = np.random.default_rng(0)
     at_w, at_s = (rng.uniform(x[0], x[-1], CHECKED) for x in (w, s))
-    dp = _drop(published, at_s)
+    dp = drops(border_pa, at_s)
     off = table.flow(edge.direction * at_w, dp)[0] - published.flow(at_w, dp)
     return Sampled(edge.name, table, float(np.abs(off).max()), float(np.sqrt(np.mean(off**2))))

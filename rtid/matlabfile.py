@@ -12,8 +12,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from firmware_bridge.lookup import STATUS
 from rtid.estimator.flowmap import FlowMap
-from rtid.gridded import CODES, Gridded, gridded
+from rtid.gridded import Gridded, gridded
 from rtid.model import FloatArray
 
 PER_LINE = 8
@@ -24,7 +25,7 @@ def write_mat(path: Path, flowmap: FlowMap, provenance: Mapping[str, Any]) -> No
     from scipy.io import savemat  # noqa: PLC0415 - only where a .mat file is wanted
 
     edges = {_name(g.name): _arrays(g) for g in gridded(flowmap)}
-    told = {"provenance": json.dumps(dict(provenance)), "status_codes": list(CODES)}
+    told = {"provenance": json.dumps(dict(provenance)), "status_codes": list(STATUS)}
     savemat(str(path), {"maps": edges | told}, appendmat=False, oned_as="column")
 
 

@@ -11,9 +11,10 @@ import pytest
 from scipy.interpolate import RegularGridInterpolator
 from scipy.io import loadmat
 
+from firmware_bridge.lookup import STATUS
 from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.published import publish
-from rtid.gridded import CODES, ERROR_SHARE, Gridded, gridded
+from rtid.gridded import ERROR_SHARE, Gridded, gridded
 from rtid.mapfiles import write_map
 from tests.flow_maps import machine, orifice, solved
 
@@ -68,7 +69,7 @@ def test_an_independent_reader_takes_the_dcm_file(
         np.testing.assert_allclose(at, LPM * g.flow_m3s, rtol=1e-6, atol=1e-9)
         np.testing.assert_allclose(sorted(found.values), g.u_v, rtol=1e-6)
         codes = maps[f"{g.name}_flow_status"].values
-        assert {c for row in codes.values() for c in row.values()} <= set(range(len(CODES)))
+        assert {c for row in codes.values() for c in row.values()} <= set(range(len(STATUS)))
 
 
 def numbers(parent: ET.Element | None) -> list[float]:
