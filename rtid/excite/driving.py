@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtid.kernels.engine import remember, set_step
-from rtid.kernels.free_run import BEYOND, OFF_GRID, _interval, _spools
+from rtid.kernels.free_run import BEYOND, OFF_GRID, interval, spools
 from rtid.kernels.jit import kernel
 from rtid.kernels.layout import MAX_EDGES, MAX_SIGNALS
 from rtid.kernels.published import foot_width
@@ -113,10 +113,10 @@ def drive(
         sample[2 + places.supply] = reference[k + 1, SUPPLY]
         for j in range(2 + e.n_signals):
             e.sample[j] = sample[j]
-        if not _spools(e, STEP_S):
+        if not spools(e, STEP_S):
             return k
         x1 = x + STEP_S * v
-        code, h = _interval(e, theta, compliance, overlap, foot, x, x1, STEP_S, p, now, slopes, h)
+        code, h = interval(e, theta, compliance, overlap, foot, x, x1, STEP_S, p, now, slopes, h)
         if code > BEYOND or code == OFF_GRID:
             return k
         x = x1

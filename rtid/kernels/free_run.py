@@ -103,9 +103,9 @@ def free_run(
             if dt != e.dt_s:
                 set_step(e, dt)
             code = OFF_GRID
-            if _spools(e, dt):
+            if spools(e, dt):
                 x0, x1 = position[k - 1], position[k]
-                code, h = _interval(
+                code, h = interval(
                     e, theta, compliance, overlap, foot, x0, x1, dt, p, now, slopes, h
                 )
         pressure[k], status[k] = np.nan, code
@@ -129,7 +129,7 @@ def free_run(
 
 
 @part
-def _spools(e: Any, dt: float) -> bool:
+def spools(e: Any, dt: float) -> bool:
     """Move the spools over the interval; False where an open one is off its grid."""
     inside = True
     for i in range(e.n_edges):
@@ -142,7 +142,7 @@ def _spools(e: Any, dt: float) -> bool:
 
 
 @part
-def _interval(
+def interval(
     e: Any,
     theta: FloatArray,
     compliance: FloatArray,
