@@ -36,14 +36,14 @@ def drive(rng: np.random.Generator, hide: bool) -> Recorded:
     """An electric drive behind an amplifier that saturates softly; friction that sticks."""
     n, dt_s = 800, 0.01
     a, b, c = rng.uniform(2, 5), rng.uniform(200, 320), rng.uniform(0.2, 0.35)
-    u = _steps(rng, -6, 6, 40, n) * np.where(_steps(rng, 0, 1, 40, n) < 0.3, 0.25, 1.0)
+    u = steps(rng, -6, 6, 40, n) * np.where(steps(rng, 0, 1, 40, n) < 0.3, 0.25, 1.0)
     friction = float(rng.uniform(15, 40)) if hide else 0.0
 
     def step(w: FloatArray, k: int, h: float) -> FloatArray:
         w = w + h * (b * np.tanh(c * u[k]) - a * w)
         return np.asarray(w - np.sign(w) * np.minimum(np.abs(w), h * friction))
 
-    w = _run(step, np.zeros(1), n, dt_s)[:, 0]
+    w = moved(step, np.zeros(1), n, dt_s)[:, 0]
     y = w + 0.1 * rng.standard_normal(n)
     columns = {"t_s": np.asarray(dt_s * np.arange(n)), "u_v": u, "w_rad_s": y}
     return Recorded(columns, "coulomb_friction:w", friction, "rad/s2")
@@ -53,7 +53,7 @@ def room(rng: np.random.Generator, hide: bool) -> Recorded:
     """A heated room and its wall, which nobody measures; the weather is known."""
     n, dt_s = 900, 120.0
     p, c, g = rng.uniform(2e-3, 4e-3), rng.uniform(2e-4, 4e-4), rng.uniform(3e-5, 6e-5)
-    t_s, u = dt_s * np.arange(n), _steps(rng, 0, 1, 60, n)
+    t_s, u = dt_s * np.arange(n), steps(rng, 0, 1, 60, n)
     outside = 5 + 6 * np.sin(2 * np.pi * t_s / 86_400) + 2 * np.sin(2 * np.pi * t_s / 30_000)
     loss = float(rng.uniform(2e-5, 6e-5)) if hide else 0.0
 
@@ -63,7 +63,7 @@ def room(rng: np.random.Generator, hide: bool) -> Recorded:
         warmer = p * u[k] - c * (air - wall) - loss * (air - out)
         return np.array([air + h * warmer, wall + h * (0.1 * c * (air - wall) - g * (wall - out))])
 
-    air = _run(step, np.array([18.0, 15.0]), n, dt_s)[:, 0]
+    air = moved(step, np.array([18.0, 15.0]), n, dt_s)[:, 0]
     y = air + 0.02 * rng.standard_normal(n)
     columns = {"t_s": t_s, "heating": u, "outside_c": outside, "inside_c": y}
     return Recorded(columns, "heat_loss:T", loss, "1/s")
@@ -90,17 +90,22 @@ def write_example(name: str, table: Path, seed: int, hide: bool) -> tuple[Record
     return found, [table, plant]
 
 
-def _steps(rng: np.random.Generator, low: float, high: float, each: int, n: int) -> FloatArray:
+def steps(rng: np.random.Generator, low: float, high: float, each: int, n: int) -> FloatArray:
+    """An input (n,) that is drawn anew between low and high every so many samples."""
     return np.repeat(rng.uniform(low, high, n // each + 1), each)[:n]
 
 
-def _run(
-    step: Callable[[FloatArray, int, float], FloatArray], start: FloatArray, n: int, dt_s: float
+def moved(
+    step: Callable[[FloatArray, int, float], FloatArray],
+    start: FloatArray,
+    n: int,
+    dt_s: float,
+    fine: int = FINE,
 ) -> FloatArray:
-    """States (n, states); step(x, k, h) makes one fine step in interval k."""
+    """States (n, states); step(x, k, h) makes one of the `fine` steps in interval k."""
     x, found = start, np.empty((n, len(start)))
     for k in range(n):
         found[k] = x
-        for _ in range(FINE):
-            x = step(x, k, dt_s / FINE)
+        for _ in range(fine):
+            x = step(x, k, dt_s / fine)
     return found
