@@ -53,21 +53,27 @@ def _parameter(value: Value) -> ParameterSection:
 
 
 def errors_between(before: Standing, after: Standing) -> ErrorsSection:
-    """The errors of both parts without and with a change."""
+    """The errors of both parts without and with a change.
+
+    In per cent all are shares of the flow that the fuller model is judged on, as in a diagnosis:
+    the map that is bent by what is missing is known in other places.
+    """
+    fuller = max(before, after, key=lambda s: s.fit.revision.n_causes)
+    learned, held = fuller.identification.flow_m3s, fuller.held_out.flow_m3s
     return ErrorsSection(
         rho=_pair(before.fit.rho, after.fit.rho),
         identification_m3s=_pair(before.identification.rms_m3s, after.identification.rms_m3s),
-        identification_pct=_pair(*(_share(s.identification) for s in (before, after))),
+        identification_pct=_percents(before.identification, after.identification, learned),
         heldout_m3s=_pair(before.held_out.rms_m3s, after.held_out.rms_m3s),
-        heldout_pct=_pair(*(_share(s.held_out) for s in (before, after))),
+        heldout_pct=_percents(before.held_out, after.held_out, held),
         noise_floor_m3s=_finite(after.held_out.floor_m3s),
-        noise_floor_pct=_finite(100 * after.held_out.floor_m3s / after.held_out.flow_m3s),
+        noise_floor_pct=_finite(100 * after.held_out.floor_m3s / held),
         judged_s=len(after.held_out.t_s) / ROWS_PER_S,
     )
 
 
-def _share(held: Residual) -> float:
-    return 100 * held.rms_m3s / held.flow_m3s
+def _percents(before: Residual, after: Residual, flow_m3s: float) -> ChangeSection:
+    return _pair(*(100 * left.rms_m3s / flow_m3s for left in (before, after)))
 
 
 def _pair(before: float, after: float) -> ChangeSection:

@@ -95,6 +95,11 @@ def test_diagnose_add_matches_undo_and_named_again(
     assert project.read_bytes() == old
     again = diagnose_trace(load(project), trace).diagnosis
     assert [(f.effect, f.where) for f in again.found] == [(LEAK, "a-b")]
+    assert not again.held_out_judged, "so short a record is judged itself"
+    told = again.found[0].heldout_residual_before_m3s, again.found[0].heldout_residual_after_m3s
+    shares = [100 * m3s / again.rms_flow_m3s for m3s in told]
+    pair = errors.identification_pct
+    assert shares == pytest.approx([pair.before, pair.after], rel=1e-6)
 
     capsys.readouterr()
     assert ends("history", "--project", project, "--json") == Exit.OK

@@ -179,7 +179,8 @@ def _already(effect: str, where: str) -> RefusedError:
 def _against(before: Standing, after: Standing, trial: Trial) -> Iterator[str]:
     """What speaks against an effect, with figures."""
     old, new = before.held_out, after.held_out
-    figures = f"held-out error {_percent(old)} without it, {_percent(new)} with it"
+    without, having = (100 * held.rms_m3s / new.flow_m3s for held in (old, new))
+    figures = f"held-out error {without:.2f} % without it, {having:.2f} % with it"
     if not np.isfinite(new.rms_m3s + old.rms_m3s):
         yield UNJUDGED
         return
@@ -209,7 +210,3 @@ def _better(present: Standing, trial: Trial) -> str:
     return (
         f"{key[0]} at {key[1]} would explain {gains[key] / max(trial.gain, 1.0):.1f} times as much"
     )
-
-
-def _percent(held: Residual) -> str:
-    return f"{100 * held.rms_m3s / held.flow_m3s:.2f} %"

@@ -24,6 +24,11 @@ class Revision:
         """True where a timing stands for the declared lag of the spools."""
         return any(timing.replaces_lag for timing, _ in self.timings)
 
+    @property
+    def n_causes(self) -> int:
+        """Number of effects and timings."""
+        return len(self.effects) + len(self.timings)
+
     def has(self, key: tuple[str, str]) -> bool:
         """True where a cause is part of it."""
         names = [t.effect for t, _ in self.timings]
