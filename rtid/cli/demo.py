@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 from pathlib import Path
+from shutil import which
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -127,16 +130,32 @@ def _print_answer(console: Console, found: TraceComparison) -> None:
 
 
 def _print_next(console: Console, machine: Demo, worn: tuple[Path, Path]) -> None:
+    """Commands to go on with, each on a line that can be pasted."""
     trace, project = machine.trace, machine.project.path
     console.print("\n[bold]3  Your turn[/bold]  The trace and its project file are yours to try:")
-    console.print(f"   rtid check {project} {trace}")
-    console.print(f"   rtid replay {trace} --project {project} --pictures {trace.parent}")
-    console.print(f"   rtid export {trace} {trace.parent / 'map.csv'} --project {project}")
+    _print_command(console, "check", project, trace)
+    _print_command(console, "replay", trace, "--project", project, "--pictures", trace.parent)
+    _print_command(console, "export", trace, trace.parent / "map.csv", "--project", project)
     console.print(
         "\n[bold]4  What is missing?[/bold]  Years later something in this machine has worn out, "
         "and the model\n   does not know.  See it in the browser: where it fails, why, and add it:"
     )
-    console.print(f"   [bold]rtid ui {worn[1]} {worn[0]}[/bold]\n")
+    _print_command(console, "ui", worn[1], worn[0])
+    console.print()
+
+
+def _print_command(console: Console, *words: str | Path) -> None:
+    """One line however long: what a terminal breaks by itself is still pasted as one."""
+    line = shlex.join([*program(), *map(str, words)])
+    console.print(f"   {line}", style="bold", markup=False, soft_wrap=True)
+
+
+def program() -> list[str]:
+    """The words that call rtid from this shell: as it was called where `rtid` is not found."""
+    if which("rtid"):
+        return ["rtid"]
+    called = Path(sys.argv[0])
+    return [sys.executable, "-m", "rtid"] if called.name == "__main__.py" else [str(called)]
 
 
 def _open_page(trace: Path, project: Path) -> None:
