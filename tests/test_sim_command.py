@@ -117,6 +117,27 @@ def test_hidden_effects_are_told_in_the_truth_alone(tmp_path: Path) -> None:
     assert_same_machine(written.model, declared_model(Plant(), seed=0))
 
 
+def test_as_json_the_same_is_told(tmp_path: Path) -> None:
+    trace = tmp_path / "run.parquet"
+    found = json.loads(call(trace, "--duration", 1, "--hide", "input_delay=0.004", "--json"))
+    assert (found["samples"], found["frames_sent"]) == (1000, 0)
+    assert [h["strength"] for h in found["hidden"]] == [0.004]
+    assert [Path(f).name for f in found["files"]] == ["run.parquet", "run.truth.json", "run.toml"]
+
+
+def test_what_begins_later_is_not_there_before(tmp_path: Path) -> None:
+    wish = ["--hide", "internal_leakage_laminar=strong", "--duration", 2]
+    tables = []
+    for name, more in (("healthy", wish[2:]), ("later", [*wish, "--hide-at", 1]), ("leak", wish)):
+        call(tmp_path / f"{name}.parquet", *more)
+        table = pyarrow.parquet.read_table(tmp_path / f"{name}.parquet")
+        tables.append(np.column_stack([column.to_numpy() for column in table.columns]))
+    healthy, later, leak = tables
+    assert np.array_equal(later[:1000], healthy[:1000], equal_nan=True)
+    assert not np.array_equal(leak[:1000], healthy[:1000], equal_nan=True)
+    assert not np.array_equal(later[1001:], healthy[1001:], equal_nan=True)
+
+
 def test_a_record_declares_its_parts(tmp_path: Path) -> None:
     call(tmp_path / "run.parquet", "--motion", "sweep_record", "--duration", 11)
     record = tomllib.loads((tmp_path / "run.toml").read_text())["record"]
@@ -140,6 +161,7 @@ def test_live_on_a_bus() -> None:
         (["no/such/run.blf"], "no such folder"),
         (["run.blf", "--motion", "dance"], "--motion dance"),
         (["run.blf", "--cross-port"], "--cross-port"),
+        (["run.blf", "--hide-at", "5"], "nothing is hidden"),
         (["run.blf", "--hide", "leak"], "leak: no such effect"),
         (["run.blf", "--hide", "supply_sag=huge"], "supply_sag=huge"),
         (["run.blf", "--hide", "relief_valve:c"], "cannot sit at 'c'"),

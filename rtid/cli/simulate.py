@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import sys
+from functools import reduce
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -72,23 +73,29 @@ def simulate(
         _example(example, trace, seed, hide, as_json)
         return
     _check_arguments(trace, bus, motion, plant, cross_port)
-    if hide_at_s is not None and not hide:
-        raise _usage("--hide-at: nothing is hidden", "add --hide EFFECT")
-    machine = Plant() if plant is None else draw(plant, cross_port=cross_port)
-    for wish in hide or ():
-        machine = hide_wish(machine, wish)
-    if hide_at_s is None:
-        run = run_machine(machine, motion, seed, duration_s)
-    else:
-        healthy = Plant() if plant is None else draw(plant, cross_port=cross_port)
-        run = run_machine(healthy, motion, seed, duration_s, change=Change(hide_at_s, machine))
-    hidden = [planted._asdict() for planted in machine.hidden]
-    result = {"samples": len(run.samples), "beta_pa": machine.beta_pa, "hidden": hidden}
+    _check_hidden(hide, hide_at_s)
+    healthy = Plant() if plant is None else draw(plant, cross_port=cross_port)
+    machine = reduce(hide_wish, hide or (), healthy)
+    later = None if hide_at_s is None else Change(hide_at_s, machine)
+    run = run_machine(healthy if later else machine, motion, seed, duration_s, change=later)
     written = write_run(trace, run, seed, motion) if trace else []
     sent = _send(run, bus, channel, speed or AS_FAST_AS_POSSIBLE) if bus else 0
     if as_json:
-        print(json.dumps(result | {"files": [str(p) for p in written], "frames_sent": sent}))
-        return
+        print(json.dumps(_plain(machine, run) | _files(written) | {"frames_sent": sent}))
+    else:
+        _tell(machine, run, written, f"sent {sent} frames on {bus} {channel}" if sent else "")
+
+
+def _plain(machine: Plant, run: Run) -> dict[str, Any]:
+    hidden = [planted._asdict() for planted in machine.hidden]
+    return {"samples": len(run.samples), "beta_pa": machine.beta_pa, "hidden": hidden}
+
+
+def _files(written: list[Path]) -> dict[str, Any]:
+    return {"files": [str(path) for path in written]}
+
+
+def _tell(machine: Plant, run: Run, written: list[Path], sent: str) -> None:
     print(f"{len(run.samples)} samples, bulk modulus {machine.beta_pa / 1e6:.0f} MPa")
     for name, where, strength in machine.hidden:
         place = f" at {where}" if where else ""
@@ -96,7 +103,7 @@ def simulate(
     for path in written:
         print(f"wrote {path}")
     if sent:
-        print(f"sent {sent} frames on {bus} {channel}")
+        print(sent)
 
 
 def _example(
@@ -111,7 +118,7 @@ def _example(
         [{"effect": found.hidden, "size": found.size, "unit": found.unit}] if found.size else []
     )
     if as_json:
-        print(json.dumps({"hidden": hidden, "files": [str(p) for p in written]}))
+        print(json.dumps({"hidden": hidden} | _files(written)))
         return
     print(f"hidden: {found.hidden}, {found.size:.3g} {found.unit}" if hidden else "hidden: nothing")
     for path in written:
@@ -133,6 +140,11 @@ def _check_arguments(
         raise _usage(f"--motion {motion}: unknown", f"use one of {', '.join(MOTIONS)}")
     if cross_port and plant is None:
         raise _usage("--cross-port: the default machine has four valves", "add --plant NUMBER")
+
+
+def _check_hidden(hide: list[str] | None, hide_at_s: float | None) -> None:
+    if hide_at_s is not None and not hide:
+        raise _usage("--hide-at: nothing is hidden", "add --hide EFFECT")
 
 
 def _usage(message: str, remedy: str) -> RtidError:
