@@ -26,8 +26,8 @@ from rtid.project import Project, load
 from rtid.wished import Wish
 from tests.apply.neighbour import Neighbour, learned, loaded, neighbour, offer, project_file
 from tests.bridge.controller import Controller, Line
+from tests.bridge.downloads import SPOILS, damaging, losing
 from tests.bridge.tables import a_table
-from tests.bridge.test_download import SPOILS, damaging, losing
 
 
 @pytest.fixture(scope="module")
@@ -239,7 +239,7 @@ def test_without_an_offer(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", SPOILS)
 def test_over_a_bad_bus(tmp_path: Path, maps: tuple[FlowMap, FlowMap], name: str) -> None:
-    """The lines of tests/bridge/test_download.py, on a virtual bus and in real time."""
+    """The lines of tests/bridge/downloads.py, on a virtual bus and in real time."""
     path, folder, controller = project_file(tmp_path, error_percent=5), tmp_path / "s", Controller()
     make, share = SPOILS[name]
     offer(folder, load(path), maps[0])
