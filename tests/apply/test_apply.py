@@ -46,6 +46,15 @@ def sent(
     return apply_map(path, wish, lambda plan: True)
 
 
+def until_closed(there: Neighbour, since: int = 0) -> set[int]:
+    """What the controller was asked; CLOSE has no answer, and may be on its way still."""
+    last_s = time.monotonic() + 5.0
+    while Op.CLOSE not in (asked := {data[0] for data in there.heard[since:]}):
+        assert time.monotonic() < last_s
+        time.sleep(0.01)
+    return asked
+
+
 def held_slots(project: Project, controller: Controller) -> dict[int, int]:
     slots = range(len(project.model.edges) + 1)
     held = {slot: controller.held(slot) for slot in slots}
@@ -84,9 +93,7 @@ def test_nothing_is_sent_before_yes(tmp_path: Path, maps: tuple[FlowMap, FlowMap
     with neighbour() as there:
         wish = Wish(bus=f"virtual:{there.channel}", state=folder, test_bus=True)
         plan, row = apply_map(path, wish, lambda plan: False)
-        last_s = time.monotonic() + 5.0  # CLOSE has no answer: it may be on its way still
-        while Op.CLOSE not in (asked := {data[0] for data in there.heard}):
-            assert time.monotonic() < last_s
+        asked = until_closed(there)
     assert row is None and not plan.objections
     assert asked == {Op.OPEN, Op.QUERY, Op.CLOSE}
     assert Applied(folder).rows() == [] and Applied(folder).contents() == []
@@ -182,6 +189,7 @@ def test_limits(tmp_path: Path, maps: tuple[FlowMap, FlowMap]) -> None:
     with neighbour(controller) as there:
         offer(folder, project, maps[0])
         sent(path, there, folder)
+        until_closed(there)
         before, told = held_slots(project, controller), len(there.heard)
         path = project_file(tmp_path, max_change_percent=2.0, least_interval_s=300)
         offer(folder, project, maps[1], against=1)
@@ -189,7 +197,7 @@ def test_limits(tmp_path: Path, maps: tuple[FlowMap, FlowMap]) -> None:
         assert row is None and held_slots(project, controller) == before
         text = " ".join(plan.objections)
         assert "max_change_percent is 2" in text and "least_interval_s is 300" in text
-        assert {data[0] for data in there.heard[told:]} == {Op.OPEN, Op.QUERY, Op.CLOSE}
+        assert until_closed(there, told) == {Op.OPEN, Op.QUERY, Op.CLOSE}
 
 
 def test_the_same_map_is_not_sent_again(tmp_path: Path, maps: tuple[FlowMap, FlowMap]) -> None:
