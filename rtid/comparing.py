@@ -36,15 +36,14 @@ from rtid.compare import (
 from rtid.comparing_json import SCHEMA, as_json
 from rtid.datasheet import read_reference
 from rtid.estimator.flowmap import SHUT, VALID, FlowMap
-from rtid.estimator.published import publish
-from rtid.mapfiles import read_map
+from rtid.mapfiles import MAP_FILES, read_map
 from rtid.model import FloatArray
+from rtid.priors import find_prior, published
 from rtid.project import Project, load
 from rtid.replay import Replay
 
 IDENTIFICATION, VALIDATION = "identification", "validation"
 LEARNED = "learned"
-MAP_FILES = (".json", ".npz")
 
 
 @dataclass(frozen=True)
@@ -144,7 +143,7 @@ def _assembled(
     hold: Callable[[Candidate], Held],
 ) -> TraceComparison:
     """Everything about the maps, each held by `hold`; chunk: the identification part."""
-    flowmap = publish(result.fit.solution)
+    flowmap = published(result.fit.solution, find_prior(result.project))
     known = tuple(reference for reference in references if reference is not None)
     candidates = [learned(result.fit, flowmap, name)]
     weights = result.fit.weights

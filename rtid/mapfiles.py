@@ -25,6 +25,7 @@ from rtid.matlabfile import write_m, write_mat
 from rtid.model import FloatArray, Grid
 
 SCHEMA = "rtid-flowmap/1"
+MAP_FILES = (".json", ".npz")  # what comes back with `read_map`
 UNITS = {"u_v": "V", "dp_pa": "Pa", "theta_m3s": "m3/s", "cov_m6s2": "m6/s2"}
 BASIS = "Taylor: 1, xi, eta, xi^2, eta^2, xi eta; xi and eta run from -1 to 1 over each block"
 

@@ -216,7 +216,7 @@ def test_the_combination_is_honest() -> None:
         w, dp = points(edge, edge.status == PRIOR, 1)
         z.append(((edge.flow(w, dp) - orifice(w, dp)) / edge.sd(w, dp)).ravel())
     every = np.concatenate(z)
-    assert len(every) > 250
+    assert len(every) > 200
     assert np.mean(np.abs(every) < 2) >= 0.90
 
 
@@ -234,8 +234,8 @@ def test_another_machines_map_is_a_prior_on_any_grid(fits: list[Fit], maps: list
 
 
 def test_cells_that_a_data_sheet_does_not_cover_stay_without_it() -> None:
-    w = np.array([1.0, 1.8, 4.0])
-    table = GainTable(w, np.ones(1), np.array([0.0, 0.0, 6.1e-8])[:, None])
+    w = np.linspace(1.0, 4.0, 16)
+    table = GainTable(w, np.ones(1), orifice(w, np.ones(16))[:, None])
     model = machine()
     sheet = reference_map(model, ReferenceMap("sheet", {"*": table}).theta_cells(model))
     solution = solved(model, orifice, np.random.default_rng(4))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rtid.cli.options import ProjectOption
+from rtid.cli.options import PriorOption, ProjectOption
 
 if TYPE_CHECKING:
     from rtid.estimator.solution import Solution
@@ -23,6 +23,7 @@ def export(
         Path, typer.Argument(help="File to write: .csv .json .npz .mat .m .dcm .cdfx .h.")
     ],
     project: ProjectOption,
+    prior_map: PriorOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print a summary as JSON.")] = False,
 ) -> None:
     """Write the learned maps: flow, standard deviation and status over command and pressure drop.
@@ -36,16 +37,17 @@ def export(
     """
     from rtid.cfile import SUFFIX, write_header
     from rtid.errors import RtidError
-    from rtid.estimator.published import publish
     from rtid.mapfiles import FORMATS, provenance, write_map
+    from rtid.priors import find_prior, published, said_of, with_prior
     from rtid.project import load
 
     if output.suffix.lower() not in (*FORMATS, SUFFIX):
         remedy = f"end its name in {', '.join((*FORMATS, SUFFIX))}"
         raise RtidError(f"{output}: unknown format", remedy, exit_code=2)
-    loaded = load(project)
+    loaded = with_prior(load(project), prior_map)
+    prior = find_prior(loaded)
     solution, effects = _solution(loaded, source)
-    flowmap = publish(solution)
+    flowmap = published(solution, prior)
     origin = provenance(solution, loaded.name, loaded.digest, source.name, effects)
     if output.suffix.lower() == SUFFIX:
         percent = loaded.sections.publish.error_percent
@@ -60,6 +62,8 @@ def export(
         text = ", ".join(f"{name} {count}" for name, count in cells.items())
         print(f"wrote {output}; valid blocks: {text}")
         print(_beside(effects, loaded))
+        if prior is not None:
+            print(said_of(prior, flowmap))
 
 
 def _beside(effects: list[dict[str, Any]], project: Project) -> str:

@@ -8,6 +8,14 @@ from typing import Annotated
 import typer
 
 ProjectOption = Annotated[Path, typer.Option("--project", "-p", help="Project file.")]
+PriorOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--prior",
+        help="A map known before, for blocks without data: .npz or .json of `rtid export`, a data "
+        "sheet (CSV), or a folder of `rtid fleet`; instead of [prior] in the project file.",
+    ),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Say what would be; write nothing.")]
 Reason = Annotated[str, typer.Option(help="Why, for the history.")]

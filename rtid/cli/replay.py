@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from rtid.cli.exits import refuse_truncated
-from rtid.cli.options import AsJson, ProjectOption
+from rtid.cli.options import AsJson, PriorOption, ProjectOption
 
 
 def replay(
@@ -27,6 +27,7 @@ def replay(
     reference: Annotated[
         Path | None, typer.Option("--map", help="Reference map (CSV) beside the learned one.")
     ] = None,
+    prior_map: PriorOption = None,
     pictures: Annotated[
         Path | None, typer.Option(help="Folder for pictures: coverage, maps, model and residual.")
     ] = None,
@@ -43,10 +44,12 @@ def replay(
     from rtid.beside import replay_beside, sentences
     from rtid.comparing import compare_trace, find_reference
     from rtid.present import Story, progress_bar
+    from rtid.priors import find_prior, said_of, with_prior
     from rtid.project import load
     from rtid.store import save
 
-    loaded = load(project)
+    loaded = with_prior(load(project), prior_map)
+    prior = find_prior(loaded)  # refused before the work, not after it
     with progress_bar(hidden=as_json) as progress:
         pace = (speed or float("inf")) if bus else None
         result = replay_beside(loaded, trace, progress, bus_speed=pace)
@@ -61,4 +64,6 @@ def replay(
         for sentence in sentences(result.added):
             print(sentence)
         story.print(snapshot, written)
+        if prior is not None:
+            print(said_of(prior, story.compared.flowmap))
     refuse_truncated(trace, result.trace.counters)

@@ -66,6 +66,7 @@ def run(
 
     log.set_up()
     loaded = configured(load(project), rate_hz)
+    _refuse_unfit_prior(loaded)
     source = loaded.sections.source
     wanted = bus or f"{source.interface or ''}:{source.channel or ''}"
     interface, _, channel = wanted.partition(":")
@@ -91,6 +92,14 @@ def _served(project: Path, state: Path) -> Iterator[None]:
     finally:
         served.terminate()
         served.wait()
+
+
+def _refuse_unfit_prior(loaded: Project) -> None:
+    """Here, not in the log: the helper that publishes would have nobody to tell."""
+    if loaded.sections.prior is not None:
+        from rtid.priors import find_prior
+
+        find_prior(loaded)
 
 
 def _refuse_untrusted(interface: str, project: Path, test_bus: bool) -> None:

@@ -9,20 +9,37 @@ with the reach of the orifice law's deviations, and to the prior's own standard 
 that are not known from data the law and the prior are combined as two Gaussians:
 
     gain = S (S + P)^-1,    theta = m + gain (p - m),    cov = S - gain S.
+
+A prior that misses the blocks that are known is believed less everywhere: its share is at least the
+rms of its misses there over the rms of its flow.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
-from rtid.estimator.cells import mean, projection, quadrature
+from rtid.estimator.blocks import Block
+from rtid.estimator.cells import mean, projection, quadrature, terms
 from rtid.estimator.flowmap import EXTRAPOLATED, PRIOR, VALID, EdgeMap, FlowMap
 from rtid.estimator.orifice import LEAST_SIZE, REACH_LOG_DP, REACH_W, root
 from rtid.kernels.layout import TERMS
 from rtid.model import Edge, FloatArray, Model
 
 SHARE = 0.1  # relative standard deviation of a prior's flows
+FEWEST = 3  # blocks that tell how well a prior fits
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A map known before, and the relative standard deviation of its flows."""
+
+    name: str
+    flowmap: FlowMap
+    share: float = SHARE
 
 
 def reference_map(model: Model, theta_cells: FloatArray) -> FlowMap:
@@ -41,6 +58,7 @@ def add_prior(
     edge: Edge,
     prior: EdgeMap,
     share: float,
+    known: Sequence[Block],
     theta: FloatArray,
     cov: FloatArray,
     status: NDArray[np.str_],
@@ -48,9 +66,10 @@ def add_prior(
     """Combine the law's terms with the prior's in every cell that is not valid, in place.
 
     A cell without data is PRIOR where the prior is surer of its mean flow than the law, else
-    EXTRAPOLATED.  Cells that the prior does not cover stay as they are.
+    EXTRAPOLATED.  Cells that the prior does not cover stay as they are.  known: the blocks that the
+    prior is held against.
     """
-    p, P = prior_terms(edge, prior, share)
+    p, P = prior_terms(edge, prior, share, known)
     open_ = np.isfinite(p).all(axis=2) & (status != VALID)
     m, S = theta[open_], cov[open_]
     surer = _mean_variance(P[open_]) < _mean_variance(S)
@@ -61,19 +80,42 @@ def add_prior(
     status[open_] = np.where(empty, np.where(surer, PRIOR, EXTRAPOLATED), status[open_])
 
 
-def prior_terms(edge: Edge, prior: EdgeMap, share: float) -> tuple[FloatArray, FloatArray]:
+def prior_terms(
+    edge: Edge, prior: EdgeMap, share: float, known: Sequence[Block] = ()
+) -> tuple[FloatArray, FloatArray]:
     """Taylor terms (nu, nd, 6) and covariance of the prior on the edge's grid; NaN off its own."""
-    (nu, nd), project = edge.grid.shape, projection()
-    theta, cov = np.empty((nu, nd, TERMS)), np.empty((nu, nd, TERMS, TERMS))
-    for i in range(nu):
-        w, dp = quadrature(edge.grid, i)
-        q, own = prior.flow(w, dp), prior.sd(w, dp)
-        least = LEAST_SIZE * edge.rated_q_m3s * np.abs(root(dp / edge.rated_dp_pa))
-        spread = np.hypot(share * q, least)[:, :, None] * _alike(edge, w, dp)
-        spread = spread * np.hypot(share * q, least)[:, None, :] + own[:, :, None] * own[:, None, :]
-        theta[i] = q @ project.T
-        cov[i] = project @ spread @ project.T
+    points = [quadrature(edge.grid, i) for i in range(edge.grid.shape[0])]
+    q = np.stack([prior.flow(w, dp) for w, dp in points])
+    theta = q @ projection().T
+    share = max(share, seen_share(theta, known))
+    cov = np.stack([_cov(edge, share, w, dp, own, prior.sd(w, dp))
+                    for own, (w, dp) in zip(q, points, strict=True)])  # fmt: skip
+    cov[..., 0, 0] += np.mean((q - theta @ terms().T) ** 2, axis=-1)  # beyond six terms
     return theta, cov
+
+
+def _cov(
+    edge: Edge, share: float, w: FloatArray, dp: FloatArray, q: FloatArray, own: FloatArray
+) -> FloatArray:
+    """Covariance (nd, 6, 6) of the terms of one column of cells; q, own (nd, 16) at its points."""
+    least = LEAST_SIZE * edge.rated_q_m3s * np.abs(root(dp / edge.rated_dp_pa))
+    sd = np.hypot(share * q, least)
+    spread = sd[:, :, None] * _alike(edge, w, dp) * sd[:, None, :]
+    spread += own[:, :, None] * own[:, None, :]
+    return np.asarray(projection() @ spread @ projection().T)
+
+
+def seen_share(theta: FloatArray, known: Sequence[Block]) -> float:
+    """Rms miss of the prior's terms (nu, nd, 6) in the blocks' mean flows, of the rms flow.
+
+    0 where the prior covers fewer than three blocks.
+    """
+    at = [b for b in known if np.isfinite(theta[b.i, b.j]).all()]
+    if len(at) < FEWEST:
+        return 0.0
+    flow = np.array([b.mean_phi @ theta[b.i, b.j] for b in at])
+    miss = np.array([b.mean_flow_m3s for b in at]) - flow
+    return float(np.linalg.norm(miss) / (float(np.linalg.norm(flow)) or np.inf))
 
 
 def _alike(edge: Edge, w: FloatArray, dp: FloatArray) -> FloatArray:

@@ -83,7 +83,7 @@ def _publish_edge(
     for b in blocks:
         status[b.i, b.j] = VALID if b.status == BLOCK_VALID else LEARNING
     if prior is not None:
-        add_prior(edge, prior, prior_sd, theta, cov, status)
+        add_prior(edge, prior, prior_sd, used, theta, cov, status)
     reason = {}
     for b in blocks:
         counted = any(b is other for other in used)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import csv
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
 from pathlib import Path
@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from rtid.estimator.flowmap import VALID, FlowMap
+from rtid.estimator.flowmap import PRIOR, SHUT, VALID, FlowMap
 from rtid.estimator.published import publish
 from rtid.estimator.solution import Solution, solve
 from rtid.fleet.archive import Archive
@@ -66,6 +66,7 @@ class Typical:
     flow_m3s: FloatArray
     spread_m3s: FloatArray
     machines: int
+    flowmap: FlowMap  # the same as a prior for the next machine, see `_middle`
 
 
 def machines(archive: Archive, models: Mapping[str, Model]) -> list[Machine]:
@@ -101,9 +102,35 @@ def _typical(digest: str, own: Sequence[Machine]) -> Typical:
     spread = MAD * np.nanmedian(np.abs(flows - middle), axis=0)
     least = FLOOR * float(np.abs(middle).max(initial=0.0))
     names = [name for name, is_known in zip(edge, enough, strict=True) if is_known]
-    return Typical(
-        digest, names, u[enough], dp[enough], middle, np.maximum(spread, least), len(own)
-    )
+    spread = np.maximum(spread, least)
+    flowmap = _middle([machine.flowmap for machine in own])
+    return Typical(digest, names, u[enough], dp[enough], middle, spread, len(own), flowmap)
+
+
+def _middle(maps: Sequence[FlowMap]) -> FlowMap:
+    """The median of the maps' terms, with the machines' spread as covariance.
+
+    Of each cell over those machines that have it valid, if they are enough; else over all, and
+    then their own uncertainty comes on top.
+    """
+    edges = []
+    for alike in zip(*(m.edges for m in maps), strict=True):
+        theta = np.stack([e.theta for e in alike])
+        valid = np.stack([e.status == VALID for e in alike])
+        enough = valid.sum(axis=0) >= FEWEST
+        counted = np.where((valid | ~enough)[..., None], theta, np.nan)
+        middle = np.nanmedian(counted, axis=0)
+        spread = MAD * np.nanmedian(np.abs(counted - middle), axis=0)
+        spread[..., 0] = np.maximum(
+            spread[..., 0], FLOOR * np.abs(middle[enough][:, 0]).max(initial=0.0)
+        )
+        cov = spread[..., :, None] * np.eye(spread.shape[-1])
+        cov = cov * spread[..., None, :]
+        cov[~enough] += np.mean([e.cov[~enough] for e in alike], axis=0)
+        status = np.where(enough, VALID, PRIOR)
+        status = np.where(alike[0].status == SHUT, SHUT, status)
+        edges.append(replace(alike[0], theta=middle, cov=cov, status=status, reason={}))
+    return FlowMap(tuple(edges))
 
 
 def deviation(machine: Machine, of: Typical) -> float:
@@ -148,7 +175,9 @@ def write(archive: Archive, found: Sequence[Machine], types: Sequence[Typical]) 
         path = archive.folder / "maps" / f"{_plain(machine.name)}-{machine.digest[:8]}.npz"
         write_map(path, machine.flowmap, origin)
     for one in types:
-        _write_typical(archive.folder / f"typical-{one.digest[:8]}.csv", one)
+        path = archive.folder / f"typical-{one.digest[:8]}.npz"
+        _write_typical(path.with_suffix(".csv"), one)
+        write_map(path, one.flowmap, {"digest": one.digest, "machines": one.machines})
     archive.keep_machines(ranked(found, types))
 
 

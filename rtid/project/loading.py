@@ -23,6 +23,7 @@ SINGLE: dict[str, type[schema.Section]] = {
     "source": schema.SourceSection,
     "geometry": schema.GeometrySection,
     "edge_defaults": schema.EdgeDefaults,
+    "prior": schema.PriorSection,
     "beta": schema.BetaSection,
     "filter": schema.FilterSection,
     "gates": schema.GatesSection,

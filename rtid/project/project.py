@@ -24,6 +24,7 @@ from rtid.project.schema import (
     GatesSection,
     GeometrySection,
     MessageSection,
+    PriorSection,
     ProjectSection,
     PublishSection,
     RecordSection,
@@ -55,6 +56,7 @@ class Sections:
     record: RecordSection = field(default_factory=RecordSection)
     daemon: DaemonSection = field(default_factory=DaemonSection)
     excite: ExciteSection | None = None
+    prior: PriorSection | None = None
     publish: PublishSection = field(default_factory=PublishSection)
     effects: dict[str, EffectSection] = field(default_factory=dict)
     added: tuple[AddedSection, ...] = ()

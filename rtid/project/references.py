@@ -91,6 +91,7 @@ def check(raw: Raw, catalog: Catalog | None, folder: Path) -> Iterator[Problem]:
         yield from _chamber(f"chambers.{name}", chamber)
     for name, edge in tables(raw, "edges").items():
         yield from _edge(f"edges.{name}", edge, raw, kinds, catalog, folder)
+    yield from _prior(table(raw, "prior").get("map"), folder)
     yield from _modes(raw)
     yield from _mode_signals(raw, kinds)
     yield from _messages(raw, catalog)
@@ -230,6 +231,12 @@ def _command_unit(path: str, edge: Raw, command: str, dimension: str) -> Iterato
         if key != stem and known and fitting and suffix not in fitting:
             remedy = "write " + " or ".join(f"{stem}_{k}" for k in fitting)
             yield Problem(f"{path}.{key}", f"does not fit the {dimension} {command!r}", remedy)
+
+
+def _prior(named: str | None, folder: Path) -> Iterator[Problem]:
+    if isinstance(named, str) and not (folder / named).exists():
+        remedy = "name a map of `rtid export`, a data sheet, or a folder of `rtid fleet`"
+        yield Problem("prior.map", f"no file {named!r}", remedy)
 
 
 def _modes(raw: Raw) -> Iterator[Problem]:

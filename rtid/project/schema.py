@@ -216,6 +216,13 @@ class EdgeSection(EdgeDefaults):
     reference_map: str | None = None
 
 
+class PriorSection(Section):
+    """[prior]: a map known before, relative to this file; see `rtid.priors`."""
+
+    map: str = Field(description='map = "older.npz", or a data sheet, or a folder of `rtid fleet`')
+    error_percent: float | None = Field(default=None, gt=0, le=100)
+
+
 class BetaSection(Section):
     """[beta]: effective bulk modulus, first guess and what is physically possible."""
 

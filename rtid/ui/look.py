@@ -24,8 +24,8 @@ from rtid.compare import (
 from rtid.compare.simulation import why_no_free_run
 from rtid.comparing import parts_of
 from rtid.estimator.flowmap import FlowMap
-from rtid.estimator.published import publish
 from rtid.model import FloatArray, Model
+from rtid.priors import find_prior, published
 from rtid.replay import Replay
 
 
@@ -56,7 +56,7 @@ class Look:
 
 def look(result: Replay) -> Look:
     """Hold what was learned from a record against it."""
-    flowmap = publish(result.fit.solution)
+    flowmap = published(result.fit.solution, find_prior(result.project))
     solution, candidate = result.fit.solution, learned(result.fit, flowmap)
     own = [signal.name for signal in result.project.model.signals] + ["velocity"]
     parts = {}

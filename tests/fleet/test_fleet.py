@@ -18,6 +18,7 @@ from rtid.compare.reference import ReferenceMap
 from rtid.datasheet import read_reference
 from rtid.errors import RtidError
 from rtid.estimator.estimator import Estimator
+from rtid.estimator.flowmap import VALID
 from rtid.estimator.solution import solve
 from rtid.estimator.sums import Sums
 from rtid.fleet import learning
@@ -28,6 +29,7 @@ from rtid.fleet.merging import FEWEST, deviation, machines, ranked, typical
 from rtid.fleet.running import run
 from rtid.mapfiles import read_map
 from rtid.model import FloatArray
+from rtid.priors import SHARE_OF_TYPICAL, find_prior, with_prior
 from rtid.project import load
 from rtid.replay import join, read_trace
 from tests.fleet.conftest import MACHINES, WORN
@@ -215,6 +217,15 @@ def test_the_command_ranks_the_machines_and_writes_what_others_read(
     assert read_map(maps[0])[1]["source"] == "2 traces of m1"
     (typ,) = out.glob("typical-*.csv")
     assert isinstance(read_reference(typ), ReferenceMap)
+    prior = find_prior(with_prior(load(project), out))
+    assert prior is not None
+    assert (prior.name, prior.share) == (typ.stem, SHARE_OF_TYPICAL)
+    own = read_map(maps[1])[0]["pa"]
+    i, j = np.nonzero((own.status == VALID) & (own.grid.dp_pa[:-1] > 0))
+    u, dp = own.grid.u_v, own.grid.dp_pa
+    at = 0.5 * (u[i] + u[i + 1]), 0.5 * (dp[j] + dp[j + 1])
+    off = np.abs(own.flow(*at) - prior.flowmap["pa"].flow(*at)) / prior.flowmap["pa"].sd(*at)
+    assert len(off) > 20 and np.median(off) < 1.5
 
 
 def test_a_fleet_of_failures_ends_with_input(

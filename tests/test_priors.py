@@ -1,0 +1,179 @@
+"""A prior map for a machine: it fills what a short record leaves empty, and data overrule it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rtid.cli import main
+from rtid.errors import RtidError
+from rtid.estimator.flowmap import PRIOR, VALID, EdgeMap, FlowMap
+from rtid.mapfiles import read_map, write_map
+from rtid.model import FloatArray, Grid
+from rtid.priors import find_prior, of_flow, published, with_prior
+from rtid.project import Project, ProjectError, load
+from rtid.replay import Replay, replay
+from rtid.sim.plant import EDGES, Plant, flow_points
+from rtid.sim.recording import write_run
+from rtid.sim.run import simulate
+
+PLANT = Plant()
+
+
+def true_flow(edge: str, w_v: FloatArray, dp_pa: FloatArray) -> FloatArray:
+    w, dp = np.broadcast_arrays(w_v, dp_pa)
+    q = np.empty(w.size)
+    valve = PLANT.valve_table()[EDGES.index(edge)]
+    flow_points(valve, w.ravel().copy(), dp.ravel().copy(), PLANT.constants.dp_laminar_pa, q)
+    return q.reshape(w.shape)
+
+
+def true_map(project: Project, scale: float = 1.0) -> FlowMap:
+    """What the valves do, all gains off by a factor."""
+    return of_flow(project.model, lambda name, w, dp: scale * true_flow(name, w, dp))
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
+    """A machine, its record of 12 s, and as prior its own map, one off by 20 %, and bad ones."""
+    folder = tmp_path_factory.mktemp("prior")
+    write_run(folder / "run.parquet", simulate(PLANT, "rich", 1, 12.0), 1, "rich")
+    loaded = load(folder / "run.toml")
+    exact = true_map(loaded)
+    write_map(folder / "exact.npz", exact, {})
+    write_map(folder / "off.json", true_map(loaded, 0.8), {})
+    other = replace(exact.edges[0], name="p_to_a")
+    write_map(folder / "names.npz", FlowMap((other, *exact.edges[1:])), {})
+    write_map(folder / "part.npz", FlowMap(exact.edges[:3]), {})
+    write_map(folder / "ampere.npz", FlowMap(tuple(map(in_ampere, exact.edges))), {})
+    lines = [f"{u},{dp},{60.0 * u * dp**0.5}" for u in (1, 5, 9) for dp in (1, 4)]
+    (folder / "litres.csv").write_text("\n".join(["u_V,dp_MPa,Q_m3/s", *lines]))
+    (folder / "fleet").mkdir()
+    return loaded
+
+
+def in_ampere(edge: EdgeMap) -> EdgeMap:
+    return replace(edge, grid=Grid(0.08 * edge.grid.u_v, edge.grid.dp_pa))
+
+
+@pytest.fixture(scope="module")
+def found(project: Project) -> Replay:
+    return replay(project, project.path.with_name("run.parquet"))
+
+
+def maps(project: Project, found: Replay, file: str) -> tuple[FlowMap, FlowMap]:
+    """Without the prior and with it."""
+    prior = find_prior(with_prior(project, project.path.with_name(file)))
+    return published(found.fit.solution, None), published(found.fit.solution, prior)
+
+
+def centres(edge: EdgeMap, chosen: np.ndarray) -> tuple[FloatArray, FloatArray]:
+    i, j = np.nonzero(chosen)
+    u, dp = edge.grid.u_v, edge.grid.dp_pa
+    return 0.5 * (u[i] + u[i + 1]), 0.5 * (dp[j] + dp[j + 1])
+
+
+def misses(flowmap: FlowMap, status: str) -> tuple[FloatArray, FloatArray]:
+    """Error at the centres of all blocks of a status, and its standard deviation.
+
+    Not in the two beside dp = 0: law and prior miss the root's corner alike there, which their
+    combination takes for chance (up to 3.8 standard deviations).
+    """
+    errors, sds = [], []
+    for edge in flowmap.edges:
+        clear = edge.grid.dp_pa[1:] * edge.grid.dp_pa[:-1] > 0
+        w, dp = centres(edge, (edge.status == status) & clear)
+        errors.append(edge.flow(w, dp) - true_flow(edge.name, w, dp))
+        sds.append(edge.sd(w, dp))
+    return np.concatenate(errors), np.concatenate(sds)
+
+
+@pytest.mark.parametrize("file", ["exact.npz", "off.json"])
+def test_data_overrule_a_prior_where_there_are_any(
+    project: Project, found: Replay, file: str
+) -> None:
+    """Valid blocks stay what they are without it, to a fifth of their standard deviation."""
+    alone, both = maps(project, found, file)
+    valid = 0
+    for before, after in zip(alone.edges, both.edges, strict=True):
+        kept = before.status == VALID
+        np.testing.assert_array_equal(after.status == VALID, kept)
+        w, dp = centres(before, kept)
+        change = np.abs(after.flow(w, dp) - before.flow(w, dp)) / before.sd(w, dp)
+        assert np.quantile(change, 0.95) < 0.2
+        valid += int(kept.sum())
+    assert valid > 60
+
+
+def test_a_good_prior_fills_what_was_not_visited(project: Project, found: Replay) -> None:
+    alone, both = maps(project, found, "exact.npz")
+    error, sd = misses(both, PRIOR)
+    assert len(error) > 250
+    assert np.mean(np.abs(error) < 2 * sd) > 0.95
+    assert not misses(alone, PRIOR)[0].size
+    bare, there = [], []
+    for before, after in zip(alone.edges, both.edges, strict=True):
+        w, dp = centres(after, (after.status == PRIOR) & (after.grid.dp_pa[:-1] > 0))
+        bare.append(before.flow(w, dp) - true_flow(before.name, w, dp))
+        there.append(after.flow(w, dp) - true_flow(after.name, w, dp))
+    assert rms(there) < 0.5 * rms(bare)
+
+
+def rms(parts: list[FloatArray]) -> float:
+    return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
+
+
+def test_a_wrong_prior_is_believed_less_everywhere(project: Project, found: Replay) -> None:
+    """Gains off by 20 %, declared to 5 %: its misses beside the data widen what it fills."""
+    prior = find_prior(with_prior(project, project.path.with_name("off.json")))
+    assert prior is not None
+    sure = replace(prior, share=0.05)
+    error, sd = misses(published(found.fit.solution, sure), PRIOR)
+    assert len(error) > 100
+    assert np.mean(np.abs(error) < 2 * sd) > 0.9
+
+
+@pytest.mark.parametrize(
+    ("file", "text"),
+    [
+        ("names.npz", "a map for p_to_a, which this machine does not have"),
+        ("ampere.npz", "largest command 0.8 V where this machine has 10"),
+        ("litres.csv", "largest flow"),
+        ("fleet", "no typical map of this machine's declaration"),
+    ],
+)
+def test_a_prior_that_does_not_fit_is_refused(project: Project, file: str, text: str) -> None:
+    with pytest.raises(RtidError, match=text) as refused:
+        find_prior(with_prior(project, project.path.with_name(file)))
+    assert refused.value.remedy
+    assert file in str(refused.value)
+
+
+def test_the_project_file_names_the_prior(project: Project, tmp_path: Path) -> None:
+    text = project.path.read_text()
+    path = project.path.with_name("with_prior.toml")
+    path.write_text(text + '\n[prior]\nmap = "part.npz"\nerror_percent = 4\n')
+    prior = find_prior(load(path))
+    assert prior is not None
+    assert (prior.name, prior.share) == ("part", 0.04)
+    assert load(path).digest == project.digest  # what was learned stays of use
+    path.write_text(text + '\n[prior]\nmap = "none.npz"\n')
+    with pytest.raises(ProjectError, match=r"prior\.map: no file 'none\.npz'"):
+        load(path)
+
+
+def test_export_takes_a_prior_and_says_what_it_fills(
+    project: Project, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trace, out = (project.path.with_name(name) for name in ("run.parquet", "out.npz"))
+    words = ["export", trace, out, "-p", project.path, "--prior", trace.with_name("part.npz")]
+    with pytest.raises(SystemExit) as end:
+        main.run([str(word) for word in words])
+    assert end.value.code == 0
+    assert "Prior map part: blocks that are its own: pa " in (told := capsys.readouterr().out)
+    assert "it has no map for bt" in told
+    by_edge = {edge.name: (edge.status == PRIOR).sum() for edge in read_map(out)[0].edges}
+    assert by_edge["pa"] > 50 and by_edge["bt"] == 0
