@@ -1,6 +1,7 @@
 """The helper that solves, publishes, judges, records and saves: `python -m rtid.daemon.analyst`.
 
-It has time: its disk may be slow, a solve may take seconds.  What it cannot do it says.
+It has time: its disk may be slow, a solve may take seconds.  What it cannot do it says.  Snapshots
+are written as they come, beside the job in work: a kill must not cost what a solve takes.
 """
 
 from __future__ import annotations
@@ -8,10 +9,12 @@ from __future__ import annotations
 import os
 import sqlite3
 import sys
+import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
 from pathlib import Path
+from queue import Queue
 from typing import TypeVar
 
 import numpy as np
@@ -37,6 +40,7 @@ T = TypeVar("T")
 NICE = 5
 MAP_FILE = "map.npz"
 KEPT = 3  # handovers that can be recalled
+QUEUED = 100  # jobs taken from the pipe while one is in work
 FLOOD_S = 10.0  # the same refusal of the disk is told at most this often
 
 
@@ -48,7 +52,7 @@ class Analyst:
     ) -> None:
         self._answer, self._project, self._prior = answer, project, find_prior(project)
         self._chambers = [chamber.name for chamber in project.model.chambers]
-        self._generations = Generations(folder, project.digest)
+        self._generations, self._disk = Generations(folder, project.digest), threading.Lock()
         limit_bytes = project.sections.daemon.record_mb << 20
         self._folder = folder
         self._recorder: Recorder | None = None
@@ -61,14 +65,14 @@ class Analyst:
         self._offering = Offering(project, folder)
 
     def take(self, job: jobs.Job) -> None:
-        """Do one job."""
+        """Do one job; what is to be saved of it is for `save`."""
         if isinstance(job, jobs.Batch):
             self._batch(job)
-        elif isinstance(job, jobs.Handover):
+        elif isinstance(job, jobs.Handover) and job.publish:
             try:
-                self._handover(job)
+                self._publish(job)
             finally:
-                self._answer(jobs.Ready())
+                self._answer(jobs.Ready(to_save=False))
         elif isinstance(job, jobs.Note):
             self._note(job)
         elif isinstance(job, jobs.Recall) and self._handed:
@@ -80,6 +84,14 @@ class Analyst:
         elif isinstance(job, jobs.Found) and job.verdict is not None:
             verdict = job.verdict
             self._guarded("history", lambda: self._history().note_verdict(verdict))
+
+    def save(self, job: jobs.Handover) -> None:
+        """Write the snapshot, in any thread."""
+        with self._disk:
+            path = self._guarded("snapshot", lambda: self._generations.save(job.estimator))
+        if path is not None:
+            self._answer(jobs.Saved(job.number, str(path)))
+        self._answer(jobs.Ready(to_solve=False))
 
     def close(self) -> None:
         """Close the files."""
@@ -101,15 +113,6 @@ class Analyst:
                 self._segment = self._recorder.path
                 self._answer(jobs.Recording(self._segment))
 
-    def _handover(self, job: jobs.Handover) -> None:
-        if job.store:
-            path = self._guarded("snapshot", lambda: self._generations.save(job.estimator))
-            if path is not None:
-                self._answer(jobs.Saved(job.number, str(path)))
-        if job.publish and len(job.estimator.sums.blocks):
-            self._handed.append(job)
-            self._publish(job)
-
     def _relearn(self, job: jobs.Relearn) -> None:
         """Begin anew with the machine as it is; what was learned before is kept aside."""
         estimator = Estimator(self._project.model)
@@ -117,11 +120,15 @@ class Analyst:
         estimator.advance(job.chunk)
         self._handed.clear()
         self._answer(jobs.Recalled(estimator, is_accepted=True))
-        self._guarded("snapshot", self._generations.set_aside)
-        self._guarded("snapshot", lambda: self._generations.save(estimator))
+        with self._disk:
+            self._guarded("snapshot", self._generations.set_aside)
+            self._guarded("snapshot", lambda: self._generations.save(estimator))
         self._guarded("history", lambda: self._history().note_acceptance(job.acceptance))
 
     def _publish(self, job: jobs.Handover) -> None:
+        if not len(job.estimator.sums.blocks):
+            return
+        self._handed.append(job)
         start_s = time.monotonic()
         with np.errstate(divide="ignore"):  # compliance 0: the motion has not shown it yet
             solution = job.estimator.solution()
@@ -197,21 +204,42 @@ def edges_of(estimator: Estimator, solution: Solution, flow_map: FlowMap) -> tup
 def main() -> None:
     """Serve the daemon at the other end of the pipe until it says None or is gone."""
     fd, project, folder = sys.argv[1:]
-    pipe = Pipe(int(fd))
+    pipe, one_at_a_time = Pipe(int(fd)), threading.Lock()
+
+    def answer(told: jobs.Answer) -> None:
+        with one_at_a_time:
+            pipe.send(told)
+
     os.nice(NICE)
     loaded = boarded(load(project), lambda _: None)
     Estimator(loaded.model).solution()  # compiles
-    analyst = Analyst(loaded, Path(folder), pipe.send)
+    analyst = Analyst(loaded, Path(folder), answer)
+    waiting: Queue[jobs.Job | None] = Queue(QUEUED)
+    receiver = threading.Thread(target=_receive, args=(pipe, analyst, waiting), daemon=True)
     try:
-        pipe.send(jobs.Ready())
-        while (job := pipe.receive()) is not None:
+        answer(jobs.Ready())
+        receiver.start()
+        while (job := waiting.get()) is not None:
             try:
                 analyst.take(job)
             except RtidError as error:
-                pipe.send(jobs.NotSaved("analysis", str(error)))
-    except (EOFError, OSError):
+                answer(jobs.NotSaved("analysis", str(error)))
+    except OSError:
         pass  # the daemon is gone; what it had was stored by the last job
     analyst.close()
+
+
+def _receive(pipe: Pipe, analyst: Analyst, waiting: Queue[jobs.Job | None]) -> None:
+    """Queue the jobs, and save what is to be saved of them at once."""
+    try:
+        while (job := pipe.receive()) is not None:
+            if isinstance(job, jobs.Handover) and job.store:
+                analyst.save(job)
+            waiting.put(job)
+    except (EOFError, OSError):
+        pass  # the daemon is gone
+    finally:
+        waiting.put(None)
 
 
 if __name__ == "__main__":

@@ -45,7 +45,7 @@ class Core:
         self.newest_s = 0.0  # time of the newest sample, as in `to_chunk`
         self.last: deque[Frames] = deque()
         self.swap: Estimator | None = None
-        self.busy = True  # the analyst solves, or is not ready yet
+        self.is_solving = self.is_saving = True  # the analyst, or it is not ready yet
         self._kept = 0
         self._collector = Collector(2 + len(project.model.signals), daemon.record_mb > 0)
         self._publish_ns, self._store_ns = (
@@ -69,7 +69,7 @@ class Core:
         if now_ns >= self._due_batch_ns:
             self._due_batch_ns = now_ns + BATCH_NS
             self._send_batch()
-        if not self.busy and self.learner.learns:
+        if self.learner.learns:
             done = self._hand_over_if_due(now_ns) or done
         if self.notifier.watchdog_s and now_ns >= self._due_watchdog_ns:
             self._due_watchdog_ns = now_ns + round(0.25e9 * self.notifier.watchdog_s)
@@ -80,7 +80,8 @@ class Core:
         """Copy the estimator and queue the copy."""
         self._send_batch()  # what the copy knows must not be judged by it
         self.number += 1
-        self.busy = publish
+        self.is_solving |= publish
+        self.is_saving |= store
         self._analyst.put(Handover(self.number, twin(self.learner.estimator), publish, store))
 
     def finish(self, publish: bool) -> None:
@@ -124,7 +125,8 @@ class Core:
             self._kept -= len(self.last.popleft())
 
     def _hand_over_if_due(self, now_ns: int) -> str:
-        publish, store = now_ns >= self._due_publish_ns, now_ns >= self._due_store_ns
+        publish = not self.is_solving and now_ns >= self._due_publish_ns
+        store = not self.is_saving and now_ns >= self._due_store_ns
         if not (publish or store) or not self.samples:
             return ""
         if publish:

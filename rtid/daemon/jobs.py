@@ -82,7 +82,13 @@ class Check:
 
 @dataclass(frozen=True)
 class Ready:
-    """The helper has compiled everything, or is done with a handover: it takes the next one."""
+    """The helper has compiled everything, or is done with a handover: it takes the next one.
+
+    A handover is saved and solved apart from each other: which of them is done.
+    """
+
+    to_save: bool = True
+    to_solve: bool = True
 
 
 @dataclass(frozen=True)

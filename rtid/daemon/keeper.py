@@ -89,7 +89,8 @@ class Keeper:
         while self._answers:
             answer = self._answers.popleft()
             if isinstance(answer, jobs.Ready):
-                self._core.busy = False
+                self._core.is_solving &= not answer.to_solve
+                self._core.is_saving &= not answer.to_save
             elif isinstance(answer, jobs.Publication):
                 self.teller.publish(answer)
             elif isinstance(answer, jobs.Judgement):

@@ -40,7 +40,7 @@ def test_the_analyst_learns_anew_and_keeps_what_was(tmp_path: Path) -> None:
     analyst = Analyst(machine().project, tmp_path, answers.append)
     handed = learner.estimator.copy()
     handed.history = None
-    analyst.take(Handover(1, handed, publish=False, store=True))
+    analyst.save(Handover(1, handed, publish=False, store=True))
     analyst.take(Relearn(since, learner.estimator.origin_us, REQUEST))
     analyst.close()
     (found,) = (a for a in answers if isinstance(a, Recalled))
