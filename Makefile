@@ -11,7 +11,7 @@ demo: $(READY)
 	.venv/bin/rtid demo
 
 test: $(READY)
-	.venv/bin/python -m pytest -q -n 2 -p no:benchmark
+	.venv/bin/python -m pytest -q -n 2 --dist worksteal -p no:benchmark
 
 bench: $(READY)
 	@mkdir -p out
@@ -24,7 +24,7 @@ lint: $(READY)
 	.venv/bin/mypy
 
 campaign: $(READY)
-	.venv/bin/python -m pytest -q -s -p no:benchmark -m campaign tests/campaign; \
+	.venv/bin/python -m pytest -q -s -p no:benchmark -m campaign tests; \
 	  status=$$?; .venv/bin/python -m tests.campaign.report && exit $$status
 
 # Every view of the workbench on the demo's worn machine, light and dark, into out/screenshots.

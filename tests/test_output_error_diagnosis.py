@@ -293,7 +293,14 @@ def test_nothing_is_invented(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pair", ["dead_zone+pure_delay", "coulomb_friction+saturation"])
+@pytest.mark.parametrize(
+    "pair",
+    [
+        "dead_zone+pure_delay",
+        # a minute of processor time: dry friction asks for sixteen steps per sample
+        pytest.param("coulomb_friction+saturation", marks=pytest.mark.campaign),
+    ],
+)
 def test_two_effects_at_once(pair: str) -> None:
     """One masks the other until it is modelled; no third is invented."""
     plant, record, size = motor(np.random.default_rng(51), pair)
