@@ -1,4 +1,5 @@
 #include "rtid_download.h"
+#include "rtid_crc8.h"
 
 #include <float.h>
 #include <math.h>
@@ -37,14 +38,6 @@ static float float_of(const uint8_t *p)
     float x;
     memcpy(&x, &bits, sizeof x);
     return x;
-}
-
-static uint8_t crc8_step(uint8_t crc, uint8_t byte)
-{
-    crc ^= byte;
-    for (int bit = 0; bit < 8; bit++)
-        crc = (uint8_t)(crc & 0x80 ? crc << 1 ^ 0x1D : crc << 1);
-    return crc;
 }
 
 /* CRC-8 SAE J1850 over the session and the first seven bytes, as in rtid_frames.c. */

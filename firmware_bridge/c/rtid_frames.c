@@ -1,4 +1,5 @@
 #include "rtid_frames.h"
+#include "rtid_crc8.h"
 
 #include <string.h>
 
@@ -32,14 +33,6 @@ static uint64_t word_of(const uint8_t *data)
 }
 
 /* CRC-8 SAE J1850 over the data id and all bytes but the CRC (AUTOSAR E2E Profile 1). */
-static uint8_t crc8_step(uint8_t crc, uint8_t byte)
-{
-    crc ^= byte;
-    for (int bit = 0; bit < 8; bit++)
-        crc = (uint8_t)(crc & 0x80 ? crc << 1 ^ 0x1D : crc << 1);
-    return crc;
-}
-
 static uint8_t crc8(const message_row *row, const uint8_t *data)
 {
     uint8_t crc = crc8_step(0, (uint8_t)(row->data_id & 0xFF));
