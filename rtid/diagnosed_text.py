@@ -59,8 +59,8 @@ def _added(found: Diagnosis) -> list[str]:
 
 
 def _head(found: Diagnosis) -> str:
-    share = _percent(found, found.heldout_residual_before_m3s)
-    floor = _percent(found, found.noise_floor_m3s)
+    share = percent(found, found.heldout_residual_before_m3s)
+    floor = percent(found, found.noise_floor_m3s)
     match found.verdict:
         case "matches":
             return (
@@ -84,11 +84,11 @@ def _one(found: Diagnosis, effect: Effect) -> str:
     sizes = ", ".join(
         f"{name.replace('_', ' ')} {quantity(v)}" for name, v in effect.parameters.items()
     )
-    before = _percent(found, effect.heldout_residual_before_m3s)
-    after = _percent(found, effect.heldout_residual_after_m3s)
+    before = percent(found, effect.heldout_residual_before_m3s)
+    after = percent(found, effect.heldout_residual_after_m3s)
     text = (
         f"{title(effect.effect)} at {effect.where}: {sizes}. Adding it lowers the held-out error "
-        f"from {before} to {after}; the sensors' floor is {_percent(found, found.noise_floor_m3s)}."
+        f"from {before} to {after}; the sensors' floor is {percent(found, found.noise_floor_m3s)}."
     )
     if effect.cannot_be_told_from:
         others = ", ".join(name.replace("_", " ") for name in effect.cannot_be_told_from)
@@ -111,7 +111,8 @@ def quantity(value: Value) -> str:
     return f"{factor * value.value:.4g} +- {factor * value.std:.2g}{unit}"
 
 
-def _percent(found: Diagnosis, residual_m3s: float) -> str:
+def percent(found: Diagnosis, residual_m3s: float) -> str:
+    """A residual as a share of the rms flow."""
     return f"{100 * residual_m3s / found.rms_flow_m3s:.2f} %"
 
 

@@ -3,13 +3,8 @@
 from __future__ import annotations
 
 from rtid.diagnose.report import Diagnosis, Effect
-from rtid.diagnosed_text import title
+from rtid.diagnosed_text import percent, title
 from rtid.report_sizes import size
-
-
-def share(found: Diagnosis, residual_m3s: float) -> str:
-    """In per cent of the rms flow."""
-    return f"{100 * residual_m3s / found.rms_flow_m3s:.2f} %"
 
 
 def judged(found: Diagnosis) -> str:
@@ -19,8 +14,8 @@ def judged(found: Diagnosis) -> str:
 
 def said(found: Diagnosis) -> str:
     """The verdict and the next step."""
-    left = share(found, found.heldout_residual_before_m3s)
-    floor = f"the sensors' floor is {share(found, found.noise_floor_m3s)}"
+    left = percent(found, found.heldout_residual_before_m3s)
+    floor = f"the sensors' floor is {percent(found, found.noise_floor_m3s)}"
     match found.verdict:
         case "insufficient_data":
             return (
@@ -45,8 +40,8 @@ def said(found: Diagnosis) -> str:
 def _found(found: Diagnosis, first: Effect, floor: str) -> str:
     sizes = list(first.parameters.values())
     big = f", {size(sizes[0])} (95 %)" if len(sizes) == 1 else ""
-    before = share(found, first.heldout_residual_before_m3s)
-    after = share(found, first.heldout_residual_after_m3s)
+    before = percent(found, first.heldout_residual_before_m3s)
+    after = percent(found, first.heldout_residual_after_m3s)
     words = (
         f"{title(first.effect)} at {first.where}{big}. Adding it lowers the {judged(found)} from "
         f"{before} to {after}; {floor}."

@@ -5,7 +5,7 @@ from __future__ import annotations
 from re import sub
 
 from rtid.diagnose.report import Diagnosis, Effect, Unseen, Value
-from rtid.diagnosed_text import title
+from rtid.diagnosed_text import percent, title
 from rtid.effects import catalogue
 from rtid.effects import effect as page_of
 from rtid.effects.page import Effect as Page
@@ -16,7 +16,7 @@ from rtid.report_tables import named
 from rtid.report_words import VERDICTS, text
 from rtid.ui.desk import Told
 from rtid.ui.fragments import button, clearness, table
-from rtid.ui.verdict_words import judged, said, share
+from rtid.ui.verdict_words import judged, said
 from rtid.units import PRACTICAL
 
 MOST = 18  # candidates that are shown
@@ -64,8 +64,8 @@ def _found(found: Diagnosis, effect: Effect) -> str:
     return (
         f'<div class="card"><h2 class="found">{_link(effect.effect, title(effect.effect))} '
         f"at {text(effect.where)}</h2><dl>{sizes}<dt>{judged(found)}</dt><dd>"
-        f"{share(found, before)} → <b>{share(found, after)}</b> of the rms flow; the sensors' "
-        f"floor is {share(found, found.noise_floor_m3s)}</dd><dt>explains as much</dt>"
+        f"{percent(found, before)} → <b>{percent(found, after)}</b> of the rms flow; the sensors' "
+        f"floor is {percent(found, found.noise_floor_m3s)}</dd><dt>explains as much</dt>"
         f"<dd>{text(told_apart)}</dd><dt>by chance</dt><dd>"
         f"{_chance(effect.p_value)}</dd></dl>{_choices(effect)}</div>"
     )
