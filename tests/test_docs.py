@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import tomllib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import typer
 
 from firmware_bridge import checks, stamps
 from firmware_bridge.sources import blf_objects, slcan_lines, text
+from rtid.cli import main
 from rtid.cli.exits import Exit
+from rtid.cli.teaching import EXAMPLES, PANELS
 from rtid.daemon import wording
 from rtid.diagnose import verdict
 from rtid.effects import UserEffect
@@ -21,19 +25,25 @@ from rtid.estimator import blocks
 from rtid.estimator.published import publish
 from rtid.kernels import layout
 from rtid.mapfiles import WRITERS, write_map
+from rtid.project import load
 from tests.flow_maps import machine, orifice, solved
+from tools.api import PAGE, page
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 
 
+def text_of(page: str) -> str:
+    return (DOCS / page).read_text()
+
+
 def words(page: str) -> set[str]:
     """What stands between backticks."""
-    return set(re.findall(r"`([^`\n]+)`", (DOCS / page).read_text()))
+    return set(re.findall(r"`([^`\n]+)`", text_of(page)))
 
 
 def snippets(page: str, language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", (DOCS / page).read_text(), re.M | re.S)
+    return re.findall(rf"^```{language}\n(.*?)^```", text_of(page), re.M | re.S)
 
 
 def alarms() -> set[str]:
@@ -65,9 +75,16 @@ def test_every_alarm_and_exit_code_stands_in_operations() -> None:
     assert all(f"{code.value} " in told for code in Exit)
 
 
-def test_files_that_the_theory_names_exist() -> None:
-    for name in re.findall(r"`((?:rtid|tests|docs)/[\w/.]+)`", (DOCS / "theory.md").read_text()):
+@pytest.mark.parametrize("page", ["theory.md", "architecture.md", "guide.md"])
+def test_files_that_a_page_names_exist(page: str) -> None:
+    for name in re.findall(r"`((?:rtid|firmware_bridge|tests|docs)/[\w/.]+)`", text_of(page)):
         assert (ROOT / name).exists(), name
+
+
+def test_the_architecture_names_every_package() -> None:
+    packages = {str(p.parent.relative_to(ROOT)) for p in ROOT.glob("rtid/*/__init__.py")}
+    assert len(packages) > 15
+    assert packages <= words("architecture.md")
 
 
 def test_the_snippets_of_extending_run(tmp_path: Path) -> None:
@@ -88,7 +105,6 @@ def test_the_snippets_of_extending_run(tmp_path: Path) -> None:
 
 
 def test_the_formula_of_extending_is_a_project_s_effect(tmp_path: Path) -> None:
-    from rtid.project import load
     from rtid.sim.declare import declared_model
     from rtid.sim.plant import Plant
     from rtid.sim.project_file import project_text
@@ -98,3 +114,91 @@ def test_the_formula_of_extending_is_a_project_s_effect(tmp_path: Path) -> None:
     project.write_text(text_ + "\n" + snippets("extending.md", "toml")[0])
     (effect,) = load(project).effects
     assert effect.name == "worn_groove"
+
+
+def command(line: str) -> tuple[Any, list[str]]:
+    """The command that a line calls, with its arguments."""
+    program, name, *arguments = shlex.split(line)
+    assert program == "rtid" and name in main.COMMANDS, line
+    group: Any = typer.main.get_command(main.build([name]))
+    return group.commands[name], arguments
+
+
+def read(line: str) -> None:
+    """Take the line apart as if it was run; a name or option that does not exist is an error."""
+    found, arguments = command(line)
+    found.make_context(found.name, arguments)
+
+
+def lines(page: str, language: str) -> list[str]:
+    return [one for text in snippets(page, language) for one in text.splitlines()]
+
+
+def test_every_command_has_an_example_and_a_place_in_the_help() -> None:
+    assert set(EXAMPLES) == set(main.COMMANDS)
+    assert sorted(name for names in PANELS.values() for name in names) == sorted(EXAMPLES)
+    for name, example in EXAMPLES.items():
+        assert example.split()[1] == name
+        read(example)
+
+
+@pytest.mark.parametrize("name", main.COMMANDS)
+def test_no_help_loses_words_to_markup(name: str) -> None:
+    """What stands in square brackets would be taken for a colour and not be shown."""
+    found, _ = command(f"rtid {name}")
+    texts = [found.help, found.epilog, *(getattr(p, "help", "") for p in found.params)]
+    assert not [t for t in texts if t and re.search(r"\[[a-z/#@]", t)]
+    assert all(getattr(p, "help", None) for p in found.params)
+
+
+@pytest.mark.parametrize("page", sorted(path.name for path in DOCS.glob("*.md")))
+def test_links_between_the_pages_hold(page: str) -> None:
+    for target in re.findall(r"\]\(([^)#:]+)\)", text_of(page)):
+        assert (DOCS / target).exists(), target
+
+
+def test_the_lines_of_the_guide_that_are_not_run_can_be_read() -> None:
+    for line in lines("guide.md", "sh read"):
+        read(line)
+
+
+def test_the_guide_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """All its lines one after the other, each with success; then its sections in the file."""
+    monkeypatch.chdir(tmp_path)
+    told = {}
+    for line in lines("guide.md", "sh"):
+        with pytest.raises(SystemExit) as end:
+            main.run(shlex.split(line)[1:])
+        assert end.value.code == Exit.OK, line
+        told[" ".join(line.split()[1:3])] = capsys.readouterr().out
+    assert "Internal leakage, laminar at a-b" in told["diagnose run.blf"]
+    assert "after" in told["add run.blf"] and "Prior map maps" in told["export learned.npz"]
+    text_ = Path("run.toml").read_text() + "\n" + "\n".join(snippets("guide.md", "toml"))
+    Path("whole.toml").write_text(text_)
+    whole = load("whole.toml").sections
+    assert whole.prior is not None and whole.excite is not None and whole.publish.can_id == 0x700
+
+
+def test_the_api_page_is_what_the_docstrings_say() -> None:
+    assert PAGE.read_text() == page(), "run: python -m tools.api"
+
+
+def test_the_notebook_tells_its_story(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its cells in their order in one namespace; the repository has it without output."""
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    cells = json.loads((DOCS / "story.ipynb").read_text())["cells"]
+    code = [cell for cell in cells if cell["cell_type"] == "code"]
+    assert not any(cell["outputs"] or cell["execution_count"] for cell in code)
+    space: dict[str, Any] = {}
+    for cell in code:
+        exec(compile("".join(cell["source"]), "story.ipynb", "exec"), space)
+    before, after = (
+        space[name].held[0].parts["validation"].residual_share for name in ("before", "after")
+    )
+    assert (after < 0.35 * before).all()
+    assert "internal_leakage_laminar at a-b" in capsys.readouterr().out
+    assert space["after"].held[0].beta_pa == pytest.approx(space["worn"].beta_pa, rel=0.02)

@@ -18,7 +18,7 @@ def add(
         list[str],
         typer.Argument(
             metavar="[EFFECT[:WHERE]] TRACE",
-            help="The effect (what `rtid diagnose` names, without it), and a CAN log or table.",
+            help="TRACE: CAN log or table.  EFFECT: without it what `rtid diagnose` names.",
         ),
     ],
     project: ProjectOption,

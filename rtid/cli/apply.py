@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def apply(
-    project: Annotated[Path, typer.Argument(help="Project file, with [publish].")],
+    project: Annotated[Path, typer.Argument(help="Project file with a section `publish`.")],
     undo: Annotated[
         bool, typer.Option("--undo", help="Send back what was active before the last apply.")
     ] = False,
@@ -62,9 +62,9 @@ def apply(
 ) -> None:
     """Send the map that the daemon offers to the controller, all or nothing, and undo it.
 
-    Asks the controller what it holds, shows the difference per valve, keeps the limits of
-    [publish], asks, and sends.  It becomes active at one moment, or not at all.  Exit code 4 if
-    nothing is offered, a limit forbids it, or you say no.
+    Asks the controller what it holds, shows the difference per valve, keeps the limits of the
+    section `publish`, asks, and sends.  It becomes active at one moment, or not at all.  Exit code
+    4 if nothing is offered, a limit forbids it, or you say no.
     """
     from rtid.apply_session import apply_map
     from rtid.wished import Wish

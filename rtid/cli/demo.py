@@ -28,7 +28,7 @@ def demo(
     ),
     seed: Annotated[int, typer.Option(min=0, help="Another number, another machine.")] = 1,
     duration_s: Annotated[float, typer.Option("--duration", min=20.0, help="Seconds.")] = 60.0,
-    speed: Annotated[float, typer.Option(help="Pace on the bus; 0: as fast as possible.")] = 0.0,
+    speed: Annotated[float, typer.Option(help="Times real time; 0: as fast as possible.")] = 0.0,
     pictures: Annotated[
         Path | None, typer.Option(help="Also draw coverage, maps and residual into this folder.")
     ] = None,

@@ -25,7 +25,10 @@ def excite(
         typer.Option(help="Snapshot (.npz) or trace: design what is still missing after it."),
     ] = None,
     duration_s: Annotated[
-        float | None, typer.Option(min=1, help="Length in s, instead of the project's.")
+        float | None,
+        typer.Option(
+            "--duration", "--duration-s", min=1, help="Length in s, instead of the project's."
+        ),
     ] = None,
     picture: Annotated[
         Path | None, typer.Option(help="PNG or SVG of the standard errors over the plane.")
@@ -33,7 +36,12 @@ def excite(
     compare: Annotated[bool, typer.Option(help="Also choose D-optimally, for comparison.")] = True,
     as_json: AsJson = False,
 ) -> None:
-    """Design a motion within the limits of [excite], and say what it will tell before it runs.
+    """Design a motion within the machine's limits, and say what it will tell before it runs.
+
+    The limits stand in the section `excite` of the project file: stroke_mm, speed_mps, command_v,
+    pressure_mpa, usual_supply_mpa, mass_kg, kp_per_s and volts_per_mps are needed; duration_s,
+    command_rate_per_s, offset_v, supply_mpa, supply_pa_per_s, tank_mpa, may_shut, load_n,
+    load_slope_n_per_m, friction_n, friction_ns_per_m, deadband_v and blend_mps have defaults.
 
     The motion is a row of segments from rest to rest, chosen for what they tell per second on the
     nominal machine (the data sheet's or the learned maps).  Predicted are the standard error of

@@ -16,6 +16,7 @@ import typer
 
 import rtid
 from rtid.cli.exits import Exit
+from rtid.cli.teaching import EXAMPLES, GUIDE, panel
 
 COMMANDS = {
     "demo": "Learn the maps of a simulated machine from its CAN frames: the whole story.",
@@ -39,14 +40,17 @@ COMMANDS = {
     "undo": "Take the last change of the model back.",
     "history": "List what was added to the model and dropped, and what it brought.",
     "apply": "Send the learned maps to the controller, all or nothing; and back.",
-    "export": "Write the learned maps as CSV, JSON, npz or a C header.",
+    "export": "Write the learned maps for controllers, calibration tools and spreadsheets.",
     "mcu": "Write the estimator in C for a controller with no computer beside it.",
     "fleet": "Learn and diagnose thousands of traces, and rank the machines.",
     "paper": "Reproduce the figures and tables of the paper, beside its numbers.",
 }
 
 OUR_PACKAGES = ("rtid", "firmware_bridge")  # their own error classes are meant for the user
-EPILOG = "Exit codes: 0 ok, 1 internal error, 2 usage or project file, 3 input, 4 negative result."
+EPILOG = (
+    "Exit codes: 0 ok, 1 internal error, 2 usage or project file, 3 input, 4 negative result.  "
+    + GUIDE
+)
 
 
 def _print_version(wanted: bool) -> None:
@@ -82,7 +86,12 @@ def build(arguments: Sequence[str]) -> typer.Typer:
     for name, summary in COMMANDS.items():
         if find_spec(f"rtid.cli.{name}"):
             function = _function(name) if name == called else _unloaded
-            app.command(name, short_help=summary)(function)
+            app.command(
+                name,
+                short_help=summary,
+                rich_help_panel=panel(name),
+                epilog=f"Example: {EXAMPLES[name]}",
+            )(function)
     return app
 
 

@@ -13,7 +13,7 @@ PriorOption = Annotated[
     typer.Option(
         "--prior",
         help="A map known before, for blocks without data: .npz or .json of `rtid export`, a data "
-        "sheet (CSV), or a folder of `rtid fleet`; instead of [prior] in the project file.",
+        "sheet (CSV), or a folder of `rtid fleet`; instead of the project file's section `prior`.",
     ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]

@@ -20,12 +20,19 @@ def replay(
     bus: Annotated[
         bool, typer.Option("--bus", help="Through python-can's virtual bus instead of the file.")
     ] = False,
-    speed: Annotated[float, typer.Option(help="Pace with --bus; 0: as fast as possible.")] = 0.0,
+    speed: Annotated[
+        float, typer.Option(help="With --bus: times real time; 0: as fast as possible.")
+    ] = 0.0,
     snapshot: Annotated[
-        Path | None, typer.Option(help="Write the estimator's memory (.npz) here.")
+        Path | None,
+        typer.Option(help="Write what was learned (.npz) here, to go on from or to export."),
     ] = None,
     reference: Annotated[
-        Path | None, typer.Option("--map", help="Reference map (CSV) beside the learned one.")
+        Path | None,
+        typer.Option(
+            "--map",
+            help="Show beside the learned map: data sheet (CSV), .npz or .json of `rtid export`.",
+        ),
     ] = None,
     prior_map: PriorOption = None,
     pictures: Annotated[

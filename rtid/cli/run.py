@@ -34,7 +34,7 @@ def run(
     ] = None,
     rate_hz: Annotated[
         float | None,
-        typer.Option("--rate", min=1, max=20_000, help="Of the loop."),
+        typer.Option("--rate", min=1, max=20_000, help="Of the loop, Hz."),
     ] = None,
     state: Annotated[
         Path | None, typer.Option(help="Folder of snapshots, history, alarms; else the file's.")

@@ -60,7 +60,9 @@ def simulate(
         str | None, typer.Option(help="Send live: udp_multicast, virtual, or socketcan with vcan.")
     ] = None,
     channel: Annotated[str, typer.Option(help="Channel of the bus.")] = "239.74.163.2",
-    speed: Annotated[float, typer.Option(help="Pace on the bus; 0: as fast as possible.")] = 1.0,
+    speed: Annotated[
+        float, typer.Option(help="On the bus: times real time; 0: as fast as possible.")
+    ] = 1.0,
     as_json: AsJson = False,
 ) -> None:
     """Record a simulated machine: the trace, the truth (.truth.json), a project file (.toml).
@@ -68,6 +70,10 @@ def simulate(
     The trace then replays with `rtid replay TRACE --project TRACE.toml`.  With --bus the machine
     speaks live instead of, or after, writing.  With --example another plant is recorded, with an
     effect in it that its equations miss; --hide none leaves it out.
+
+    Motions: sweep is the paper's sine of rising frequency; dither, supply and load add steps of the
+    command, a wandering supply, a varying load; rich adds all three; push loads shut valves; moves
+    goes from point to point.  sweep_record and rich_record end in moves that are held out.
     """
     if example is not None:
         _example(example, trace, seed, hide, as_json)

@@ -1,0 +1,171 @@
+"""Write docs/api.md from the docstrings of the public entry points: `python -m tools.api`.
+
+The page holds what somebody calls who uses rtid as a library, and no more; a test holds it up to
+date.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import json
+import re
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+PAGE = Path(__file__).parents[1] / "docs" / "api.md"
+SECTIONS = {
+    "Project and trace": (
+        *("rtid.project:load", "rtid.project:Project", "rtid.replay:read_trace"),
+        *("rtid.replay:Trace", "firmware_bridge.samples:Samples"),
+    ),
+    "What is declared": (
+        *("rtid.model:Model", "rtid.model:Signal", "rtid.model:Chamber", "rtid.model:Edge"),
+        *("rtid.model:Grid", "rtid.model:Term"),
+    ),
+    "Learn": (
+        *("rtid.replay:replay", "rtid.beside:replay_beside", "rtid.replay:Replay"),
+        *("rtid.estimator.estimator:Estimator", "rtid.estimator.estimator:to_chunk"),
+        *("rtid.estimator.record:fit_record", "rtid.estimator.record:RecordFit"),
+        *("rtid.estimator.solution:Solution", "rtid.estimator.blocks:Block"),
+        "rtid.estimator.batch:fit_batch",
+    ),
+    "Map": (
+        *("rtid.estimator.published:publish", "rtid.estimator.flowmap:FlowMap"),
+        *("rtid.estimator.flowmap:EdgeMap", "rtid.priors:find_prior", "rtid.priors:published"),
+        *("rtid.mapfiles:write_map", "rtid.mapfiles:read_map", "rtid.datasheet:read_reference"),
+    ),
+    "Where the model fails": (
+        *("rtid.comparing:compare_trace", "rtid.comparing:study", "rtid.comparing:TraceComparison"),
+        *("rtid.comparing:Held", "rtid.compare.comparison:Comparison"),
+        *("rtid.comparing:spans_of_block", "rtid.comparing:blocks_in_span"),
+    ),
+    "What is missing, and adding it": (
+        *("rtid.diagnosing:diagnose_trace", "rtid.diagnosing:diagnose_live"),
+        *("rtid.diagnose.report:Diagnosis", "rtid.diagnose.report:Effect"),
+        *("rtid.revising:add", "rtid.revising:drop", "rtid.revising:undo", "rtid.revising:history"),
+        "rtid.effects:define",
+    ),
+    "A motion that tells more": ("rtid.exciting:excite",),
+    "Keep what was learned": ("rtid.store:save", "rtid.store:load"),
+    "Simulated machines": (
+        *("rtid.sim.run:simulate", "rtid.sim.run:Run", "rtid.sim.recording:write_run"),
+        "rtid.sim.declare:declared_model",
+    ),
+}
+HEAD = """# API
+
+Written from the docstrings by `python -m tools.api`. Arrays are NumPy float64 and SI unless a name
+or a text says otherwise; units stand in names (`dp_pa`, `q_m3s`), shapes in brackets. Every error
+that a user can meet derives from `rtid.errors.RtidError`. [story.ipynb](story.ipynb) uses most of
+this on one machine.
+"""
+
+
+def page() -> str:
+    """The whole page."""
+    parts = [HEAD]
+    for title, names in SECTIONS.items():
+        parts.append(f"## {title}\n")
+        parts += ["\n".join(entry(name)) for name in names]
+    return "\n".join(parts)
+
+
+def entry(name: str) -> Iterator[str]:
+    """Lines of one function or class, `module:object`."""
+    module, _, plain = name.partition(":")
+    found = getattr(import_module(module), plain)
+    yield f"### `{module}.{plain}`\n"
+    if inspect.isclass(found):
+        if dataclasses.is_dataclass(found):
+            yield from _fields(found)
+        else:
+            yield f"```python\n{signature(plain, found)}\n```\n"
+        yield text(found)
+        yield from _members(found)
+    else:
+        yield f"```python\n{signature(plain, found)}\n```\n"
+        yield text(found)
+
+
+def signature(name: str, found: Any) -> str:
+    """The call as it is written; one argument per line where it is long."""
+    told = inspect.signature(found)
+    kept = [p for p in told.parameters.values() if p.name != "self"]
+    kept = [_plain(p) for p in kept]
+    result = told.return_annotation
+    back = "" if result is told.empty or inspect.isclass(found) else f" -> {_type(result)}"
+    line = f"{name}({', '.join(map(str, kept))}){back}"
+    if len(line) <= 100:
+        return line
+    return f"{name}(\n" + "".join(f"    {p},\n" for p in kept) + f"){back}"
+
+
+def text(found: Any) -> str:
+    """The docstring, with displayed formulas as they are."""
+    return (inspect.getdoc(found) or "").strip() + "\n"
+
+
+def _fields(found: type) -> Iterator[str]:
+    rows = [f"{f.name}: {_type(f.type)}{_default(f)}" for f in dataclasses.fields(found)]
+    yield "```python\n" + "\n".join(rows) + "\n```\n"
+
+
+def _default(one: dataclasses.Field[Any]) -> str:
+    if one.default is dataclasses.MISSING or callable(one.default):
+        return "" if one.default_factory is dataclasses.MISSING else " = ..."
+    return f" = {_value(one.default)}"
+
+
+def _value(default: Any) -> str:
+    return json.dumps(default) if isinstance(default, str) else repr(default)
+
+
+def _members(found: type) -> Iterator[str]:
+    """Public methods and properties, one line each: the first line of what they say."""
+    rows = []
+    for name, member in vars(found).items():
+        call = member.__func__ if isinstance(member, classmethod | staticmethod) else member
+        if name.startswith("_") or not (inspect.isfunction(call) or isinstance(call, property)):
+            continue
+        told = text(call).splitlines()[0]
+        heading = name if isinstance(call, property) else _call(name, call)
+        rows.append(f"- `{heading}`: {told}")
+    if rows:
+        yield "\n".join(rows) + "\n"
+
+
+def _call(name: str, found: Any) -> str:
+    kept = [p for p in inspect.signature(found).parameters if p not in ("self", "cls")]
+    return f"{name}({', '.join(kept)})"
+
+
+def _plain(one: inspect.Parameter) -> inspect.Parameter:
+    """Without the address of a default that is a function."""
+    default = one.default
+    if default is not one.empty:
+        default = _Word("..." if callable(default) else _value(default))
+    annotation = one.annotation
+    if annotation is not one.empty:
+        annotation = _Word(_type(annotation))
+    return one.replace(default=default, annotation=annotation)
+
+
+class _Word(str):
+    """Shown without quotes."""
+
+    __slots__ = ()
+
+    def __repr__(self) -> str:
+        return str(self)
+
+
+def _type(annotation: Any) -> str:
+    name = annotation if isinstance(annotation, str) else inspect.formatannotation(annotation)
+    return re.sub(r"\b(?:np|numpy)\.ndarray\b", "FloatArray", name)
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")
