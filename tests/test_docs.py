@@ -26,6 +26,7 @@ from rtid.estimator.published import publish
 from rtid.kernels import layout
 from rtid.mapfiles import WRITERS, write_map
 from rtid.project import load
+from rtid.project.schema import ExciteSection
 from tests.flow_maps import machine, orifice, solved
 from tools.api import PAGE, page
 
@@ -149,6 +150,12 @@ def test_no_help_loses_words_to_markup(name: str) -> None:
     texts = [found.help, found.epilog, *(getattr(p, "help", "") for p in found.params)]
     assert not [t for t in texts if t and re.search(r"\[[a-z/#@]", t)]
     assert all(getattr(p, "help", None) for p in found.params)
+
+
+def test_the_help_of_excite_names_every_limit() -> None:
+    told = command("rtid excite")[0].help
+    for name in ExciteSection.model_fields:
+        assert re.sub(r"_(m|s|mps|pa|kg|n|v)$", "", name) in told, name
 
 
 @pytest.mark.parametrize("page", sorted(path.name for path in DOCS.glob("*.md")))
