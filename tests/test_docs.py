@@ -184,6 +184,7 @@ def test_the_guide_runs(
     assert "after" in told["add run.blf"]
     text_ = Path("run.toml").read_text() + "\n" + "\n".join(snippets("guide.md", "toml"))
     Path("whole.toml").write_text(text_)
+    Path("older.npz").touch()
     whole = load("whole.toml").sections
     assert whole.prior is not None and whole.excite is not None and whole.publish.can_id == 0x700
 
