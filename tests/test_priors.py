@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from rtid.cli import main
+from rtid.daemon.analyst import Analyst
+from rtid.daemon.jobs import Answer, Handover, Publication
 from rtid.errors import RtidError
 from rtid.estimator.flowmap import PRIOR, VALID, EdgeMap, FlowMap
 from rtid.mapfiles import read_map, write_map
@@ -177,3 +179,33 @@ def test_export_takes_a_prior_and_says_what_it_fills(
     assert "it has no map for bt" in told
     by_edge = {edge.name: (edge.status == PRIOR).sum() for edge in read_map(out)[0].edges}
     assert by_edge["pa"] > 50 and by_edge["bt"] == 0
+
+
+def named(project: Project, prior: str) -> Project:
+    """The same machine from a file that names a prior."""
+    path = project.path.with_name(f"with_{prior}.toml")
+    path.write_text(f'{project.path.read_text()}\n[prior]\nmap = "{prior}"\n')
+    return load(path)
+
+
+def test_on_board_the_map_that_is_published_has_the_prior(
+    project: Project, found: Replay, tmp_path: Path
+) -> None:
+    answers: list[Answer] = []
+    analyst = Analyst(named(project, "exact.npz"), tmp_path, answers.append)
+    handed = found.live.copy()
+    handed.history = None
+    analyst.take(Handover(1, handed, publish=True, store=False))
+    analyst.close()
+    (told,) = (answer for answer in answers if isinstance(answer, Publication))
+    assert all((edge.status == PRIOR).any() for edge in told.flow_map.edges)
+
+
+def test_the_daemon_refuses_a_prior_that_does_not_fit_before_it_listens(
+    project: Project, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = named(project, "names.npz").path
+    with pytest.raises(SystemExit) as end:
+        main.run(["run", str(path), "--bus", "virtual:nobody", "--test-bus", "--for", "1"])
+    assert end.value.code == 3
+    assert "p_to_a" in capsys.readouterr().err
