@@ -6,7 +6,6 @@ of the sample, true sticking instead of a smooth sign, a hard rim instead of a f
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -17,29 +16,14 @@ from rtid.effects.tree import FloatArray, Node
 from rtid.output_error import Input, Output, Parameter, Plant, Record, State, diagnose, refit
 from rtid.output_error.diagnosis import AMBIGUOUS, MATCHES, MISSING, UNKNOWN, Diagnosis
 from rtid.output_error.plant import FIRST_ORDER, named
+from rtid.sim.other_plants import moved, steps
 
 NOTHING = 0.0
 Case = tuple[Plant, Record, float]  # and the size of what is hidden
-Rate = Callable[[FloatArray, int, float], FloatArray]
 
 
 def tree(text: str) -> Node:
     return Expression.parse(text).root
-
-
-def steps(rng: np.random.Generator, low: float, high: float, each: int, n: int) -> FloatArray:
-    return np.repeat(rng.uniform(low, high, n // each + 1), each)[:n]
-
-
-def moved(step: Rate, start: list[float], n: int, dt: float, fine: int = 20) -> FloatArray:
-    """States (n, states); step(x, k, h) makes one fine step in interval k."""
-    x = np.array(start)
-    found = np.empty((n, len(x)))
-    for k in range(n):
-        found[k] = x
-        for _ in range(fine):
-            x = step(x, k, dt / fine)
-    return found
 
 
 def stick(velocity: float, impulse: float) -> float:
@@ -75,7 +59,7 @@ def motor(rng: np.random.Generator, hidden: str) -> Case:
         rate -= of.get("drag", 0.0) * w * abs(w)
         return np.array([stick(w + h * rate, h * of.get("coulomb_friction", 0.0)), lagged])
 
-    w = moved(step, [0.0, u[0]], n, dt)[:, 0]
+    w = moved(step, np.array([0.0, u[0]]), n, dt)[:, 0]
     plant = Plant(
         "motor",
         (State("w", tree("b*u - a*w"), 0, -50, 50, "rad/s", "velocity"),),
@@ -101,7 +85,7 @@ def spring(rng: np.random.Generator, hidden: str) -> Case:
         v = x[1] + h * (u[k] - k_n * x[0] - d * x[1] - cubic * x[0] ** 3) / m
         return np.array([x[0] + h * v, v])
 
-    z = moved(step, [0.0, 0.0], n, dt, 40)[:, 0]
+    z = moved(step, np.array([0.0, 0.0]), n, dt, 40)[:, 0]
     if hidden == "backlash":
         for k in range(1, n):
             z[k] = min(max(z[k - 1], z[k] - size / 2), z[k] + size / 2)
@@ -134,7 +118,7 @@ def room(rng: np.random.Generator, hidden: str) -> Case:
         warmer = p * u[k] - c * (air - wall) - size * (air - out)
         return np.array([air + h * warmer, wall + h * (0.1 * c * (air - wall) - g * (wall - out))])
 
-    air = moved(step, [18.0, 15.0], n, dt)[:, 0]
+    air = moved(step, np.array([18.0, 15.0]), n, dt)[:, 0]
     around = named("outside")
     wall = tree("0.1*c*(T - W) - g*(W - outside)")
     plant = Plant(
@@ -171,7 +155,7 @@ def tanks(rng: np.random.Generator, hidden: str) -> Case:
         spilled = max(upper - rim, 0.0)
         return np.array([upper - spilled, max(lower + share * spilled, 0.0)])
 
-    level = moved(step, [3.0, 3.0], n, dt)[:, 1]
+    level = moved(step, np.array([3.0, 3.0]), n, dt)[:, 1]
     plant = Plant(
         "tanks",
         (
@@ -200,7 +184,7 @@ def volume(rng: np.random.Generator, hidden: str) -> Case:
         flow = gain * u[k] * np.sqrt(supply - p) - drain * p - relief * max(p - opens, 0.0)
         return x + h * beta / v * (flow - leak * np.sqrt(max(p, 0.0)))
 
-    p = moved(step, [1e6], n, dt, 40)[:, 0]
+    p = moved(step, np.array([1e6]), n, dt, 40)[:, 0]
     flow_in = "k_v*u*ssqrt(1e7 - p) - 1.5e-11*p - k_r*pos(p - p_r)"
     plant = Plant(
         "volume",
