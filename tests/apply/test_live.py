@@ -61,7 +61,7 @@ def test_offer_apply_and_undo_beside_a_running_daemon(tmp_path: Path) -> None:
         at.wait(lambda status: status.bus.state == "open")
         listener = Listener(at.group)
         stack.callback(listener.stop)
-        stack.enter_context(process.sender(at.group, 60.0, loops=3))
+        stack.enter_context(process.sender(at.group, 60.0, speed=3.0, loops=9))
         start_s = time.monotonic()
         while not offered.exists(at.folder):
             assert time.monotonic() - start_s < LIMIT_S, at.status()
