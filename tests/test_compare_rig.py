@@ -73,7 +73,7 @@ def test_the_manufacturers_sheet_is_told_apart_from_the_calibration(
     assert (wrong > 20 * learned.parts["validation"].residual_share).all()
 
 
-@pytest.mark.parametrize("number", ["05", "08"])
+@pytest.mark.parametrize("number", ["05", pytest.param("08", marks=pytest.mark.campaign)])
 def test_with_the_missing_effect_added_maps_and_free_run_are_those_of_a_sound_machine(
     shared: Path, calibrated: ReferenceMap, tmp_path: Path, number: str
 ) -> None:
