@@ -10,8 +10,10 @@ that are not known from data the law and the prior are combined as two Gaussians
 
     gain = S (S + P)^-1,    theta = m + gain (p - m),    cov = S - gain S.
 
-A prior that misses the blocks that are known is believed less everywhere: its share is at least the
-rms of its misses there over the rms of its flow.
+Beside dp = 0 the law is one guess of how a flow turns laminar, with one size for all six terms; to
+combine it would take its shape for certain, so there the surer of the two counts alone.  A prior
+that misses the blocks that are known is believed less everywhere: its share is at least the rms of
+its misses there over the rms of its flow.
 """
 
 from __future__ import annotations
@@ -69,13 +71,17 @@ def add_prior(
     EXTRAPOLATED.  Cells that the prior does not cover stay as they are.  known: the blocks that the
     prior is held against.
     """
-    p, P = prior_terms(edge, prior, share, known)
-    open_ = np.isfinite(p).all(axis=2) & (status != VALID)
-    m, S = theta[open_], cov[open_]
-    surer = _mean_variance(P[open_]) < _mean_variance(S)
-    gain = np.linalg.solve(S + P[open_], S).transpose(0, 2, 1)
-    theta[open_] = m + (gain @ (p[open_] - m)[:, :, None])[:, :, 0]
-    cov[open_] = _symmetric(S - gain @ S)
+    every, spread = prior_terms(edge, prior, share, known)
+    open_ = np.isfinite(every).all(axis=2) & (status != VALID)
+    (m, S), (p, P) = (theta[open_], cov[open_]), (every[open_], spread[open_])
+    surer = _mean_variance(P) < _mean_variance(S)
+    apart = (p - m)[:, :, None]
+    gain = np.linalg.solve(S + P, S).transpose(0, 2, 1)
+    at_zero = np.broadcast_to(edge.grid.dp_pa[1:] * edge.grid.dp_pa[:-1] <= 0, open_.shape)[open_]
+    gain[at_zero] = 0.0
+    replaced = surer & at_zero
+    theta[open_] = m + np.where(replaced[:, None], p - m, (gain @ apart)[:, :, 0])
+    cov[open_] = np.where(replaced[:, None, None], P, _symmetric(S - gain @ S))
     empty = np.isin(status[open_], (EXTRAPOLATED, PRIOR))
     status[open_] = np.where(empty, np.where(surer, PRIOR, EXTRAPOLATED), status[open_])
 
