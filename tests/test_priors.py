@@ -66,10 +66,23 @@ def found(project: Project) -> Replay:
     return replay(project, project.path.with_name("run.parquet"))
 
 
-def maps(project: Project, found: Replay, file: str) -> tuple[FlowMap, FlowMap]:
-    """Without the prior and with it."""
+@pytest.fixture(scope="module")
+def alone(found: Replay) -> FlowMap:
+    """The map without a prior."""
+    return published(found.fit.solution, None)
+
+
+@pytest.fixture(scope="module")
+def exact(project: Project, found: Replay) -> FlowMap:
+    """The map with the machine's own as prior."""
+    return filled(project, found, "exact.npz")
+
+
+def filled(project: Project, found: Replay, file: str, share: float | None = None) -> FlowMap:
+    """The map with a prior."""
     prior = find_prior(with_prior(project, project.path.with_name(file)))
-    return published(found.fit.solution, None), published(found.fit.solution, prior)
+    assert prior is not None
+    return published(found.fit.solution, prior if share is None else replace(prior, share=share))
 
 
 def centres(edge: EdgeMap, chosen: np.ndarray) -> tuple[FloatArray, FloatArray]:
@@ -88,31 +101,35 @@ def misses(flowmap: FlowMap, status: str) -> tuple[FloatArray, FloatArray]:
     return np.concatenate(errors), np.concatenate(sds)
 
 
-@pytest.mark.parametrize("file", ["exact.npz", "off.json"])
-def test_data_overrule_a_prior_where_there_are_any(
-    project: Project, found: Replay, file: str
+def test_data_overrule_a_wrong_prior_where_there_are_any(
+    project: Project, found: Replay, alone: FlowMap
 ) -> None:
-    """Valid blocks stay what they are without it, to a fifth of their standard deviation."""
-    alone, both = maps(project, found, file)
+    """Valid blocks stay what they are without it, to a fiftieth of their standard deviation.
+
+    Elsewhere a prior whose gains are off by 20 %, declared to 5 %, is believed less.
+    """
+    both = filled(project, found, "off.json", 0.05)
     valid = 0
     for before, after in zip(alone.edges, both.edges, strict=True):
         kept = before.status == VALID
         np.testing.assert_array_equal(after.status == VALID, kept)
         w, dp = centres(before, kept)
         change = np.abs(after.flow(w, dp) - before.flow(w, dp)) / before.sd(w, dp)
-        assert np.quantile(change, 0.95) < 0.2
+        assert np.quantile(change, 0.95) < 0.02
         valid += int(kept.sum())
     assert valid > 60
-
-
-def test_a_good_prior_fills_what_was_not_visited(project: Project, found: Replay) -> None:
-    alone, both = maps(project, found, "exact.npz")
     error, sd = misses(both, PRIOR)
+    assert len(error) > 100
+    assert np.mean(np.abs(error) < 2 * sd) > 0.9
+
+
+def test_a_good_prior_fills_what_was_not_visited(alone: FlowMap, exact: FlowMap) -> None:
+    error, sd = misses(exact, PRIOR)
     assert len(error) > 250
     assert np.mean(np.abs(error) < 2 * sd) > 0.95
     assert not misses(alone, PRIOR)[0].size
     bare, there = [], []
-    for before, after in zip(alone.edges, both.edges, strict=True):
+    for before, after in zip(alone.edges, exact.edges, strict=True):
         w, dp = centres(after, after.status == PRIOR)
         bare.append(before.flow(w, dp) - true_flow(before.name, w, dp))
         there.append(after.flow(w, dp) - true_flow(after.name, w, dp))
@@ -121,16 +138,6 @@ def test_a_good_prior_fills_what_was_not_visited(project: Project, found: Replay
 
 def rms(parts: list[FloatArray]) -> float:
     return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
-
-
-def test_a_wrong_prior_is_believed_less_everywhere(project: Project, found: Replay) -> None:
-    """Gains off by 20 %, declared to 5 %: its misses beside the data widen what it fills."""
-    prior = find_prior(with_prior(project, project.path.with_name("off.json")))
-    assert prior is not None
-    sure = replace(prior, share=0.05)
-    error, sd = misses(published(found.fit.solution, sure), PRIOR)
-    assert len(error) > 100
-    assert np.mean(np.abs(error) < 2 * sd) > 0.9
 
 
 @pytest.mark.parametrize(
