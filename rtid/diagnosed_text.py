@@ -6,6 +6,7 @@ from rich.console import Console
 from rich.table import Table
 
 from rtid.diagnose.report import Diagnosis, Effect, Unseen, Value
+from rtid.diagnose.trials import MATCH_RHO
 from rtid.diagnose.verdict import MATERIAL
 from rtid.effects import catalogue
 from rtid.units import PRACTICAL
@@ -49,7 +50,11 @@ def sentences(found: Diagnosis) -> list[str]:
         )
     if found.negligible:
         names = ", ".join(f"{title(s.effect)} ({s.where})" for s in found.negligible)
-        lines.append(f"Too small to matter, if there at all: {names}.")
+        lines.append(
+            f"Seen, but too small on this motion to be sized: {names}."
+            if found.verdict == "insufficient_data"
+            else f"Too small to matter, if there at all: {names}."
+        )
     return lines + [f"{text}" for text in found.advice[:4]]
 
 
@@ -73,10 +78,20 @@ def _head(found: Diagnosis) -> str:
                 f"sensors' floor is {floor}; residual variance {found.rho_before:.3g} of the noise."
             )
         case "insufficient_data":
-            return "The record holds too little motion to tell."
+            return f"The record holds too little motion to tell{_left(found)}."
     return (
         f"The model does not match: residual variance {found.rho_before:.3g} times the noise, "
         f"{found.rho_after:.2f} with what was found."
+    )
+
+
+def _left(found: Diagnosis) -> str:
+    """What speaks against the model where nothing can be named."""
+    if not found.rho_before > MATCH_RHO:
+        return ""
+    return (
+        f", but the model misses something: residual variance {found.rho_before:.3g} of the "
+        "noise, most of which the maps may have taken in"
     )
 
 

@@ -87,7 +87,7 @@ def search(
     present, first, last = first, first.light(), before
     if can_judge(before):
         present, last = _extended(state, present, before)
-    said = verdict(state, present, last)
+    said = verdict(state, first, present, last, judged)
     if said == UNKNOWN:  # what explains a part of it only is not named, and not counted
         present, last, state.found = first, before, []
     found, negligible = tuple(state.found), state.negligible

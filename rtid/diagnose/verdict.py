@@ -22,15 +22,21 @@ def can_judge(held: Residual) -> bool:
     return len(held.t_s) >= LEAST_ROWS
 
 
-def verdict(state: State, last: Fit, after: Residual) -> str:
-    """The verdict on a search that ended with this fit and what it leaves of the held-out part."""
+def verdict(state: State, first: Fit, last: Fit, after: Residual, is_unseen: bool = True) -> str:
+    """The verdict on a search from the first to the last fit, and what that leaves of a part.
+
+    is_unseen: the part is not the one that taught the maps, which may have taken an effect in.
+    """
     has_moved = last.regression.rows >= LEAST_EVIDENCE and len(last.map.cells) > 0
     if not has_moved or not can_judge(after):
         return INSUFFICIENT
     if not state.found:
         # what is left may be no noise, and still be too small to matter
-        is_small = last.rho < MATCH_RHO or remainder(after) < MATERIAL
-        return MATCHES if is_small else UNKNOWN
+        if last.rho >= MATCH_RHO and remainder(after) >= MATERIAL:
+            return UNKNOWN
+        # what was seen and is too small there may matter on other motion
+        is_absorbed = not is_unseen and state.negligible and first.rho >= MATCH_RHO
+        return INSUFFICIENT if is_absorbed else MATCHES
     left = last.held.sse - last.regression.dof
     explained = 1.0 - left / state.excess if state.excess > 0 else 1.0
     if last.rho >= MATCH_RHO and explained < NAMED:

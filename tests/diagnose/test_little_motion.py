@@ -9,6 +9,7 @@ import pytest
 
 from rtid.diagnose.diagnosis import search
 from rtid.diagnose.report import Diagnosis, diagnosis
+from rtid.diagnosed_text import sentences
 from rtid.model import FloatArray, Model
 from tests.diagnose.records import record
 
@@ -39,6 +40,16 @@ def test_a_short_clean_record_raises_no_alarm(seconds: float) -> None:
     found = judged(model, chunk[chunk[:, 0] < seconds], held_out)
     assert found.verdict in ("matches", "insufficient_data")
     assert found.found == ()
+
+
+def test_a_leak_that_the_maps_have_taken_in_is_no_match() -> None:
+    """15 s with a leak and nothing else to judge by: its error is small, the misfit is not."""
+    model, chunk, held_out = record("internal_leakage_laminar", 2e-12)
+    found = judged(model, chunk[:15_000], held_out[:500])
+    assert not found.held_out_judged
+    assert found.verdict != "matches" and found.rho_before > 2.0
+    if found.verdict == "insufficient_data":
+        assert "misses something" in " ".join(sentences(found))
 
 
 def test_a_lag_that_nobody_declared_is_found() -> None:
