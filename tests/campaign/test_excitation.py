@@ -1,7 +1,7 @@
 """Designed motions against the paper's sweep, same time and limits, on random booms.
 
-The design knows the project file alone: a data sheet of the valves' type, estimates of load, mass
-and friction.  What it predicted is then held against the true machine.
+The design knows what a short sweep has taught, and estimates of load, mass and friction.  What it
+predicted is then held against the true machine.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def test_the_designed_motion_keeps_its_limits_on_the_true_machine() -> None:
     assert not any(broken.values()), broken
 
 
-@pytest.mark.xfail(strict=True, reason="measured 1.31 to 1.65, median 1.43")
+@pytest.mark.xfail(strict=True, reason="measured 1.31 to 1.64, median 1.48")
 def test_valid_blocks() -> None:
     ratios = [o.blocks for o in machines()]
     median = float(np.median(ratios))
@@ -39,7 +39,7 @@ def test_valid_blocks() -> None:
     assert median >= BLOCKS, ratios
 
 
-@pytest.mark.xfail(strict=True, reason="measured 0.47 to 0.67, median 0.59")
+@pytest.mark.xfail(strict=True, reason="measured 0.74 to 1.36, median 1.01")
 def test_median_standard_error() -> None:
     """Over the blocks that both motions visit."""
     ratios = [o.error for o in machines()]
@@ -61,16 +61,7 @@ def test_smallest_external_leak() -> None:
 
 @pytest.mark.parametrize(
     ("safe_v", "name"),
-    [
-        (1.0, "valves declared shut below 1 V"),
-        pytest.param(
-            FREE,
-            "free maps",
-            marks=pytest.mark.xfail(
-                strict=True, reason="four of six within 1.31, 7 and 11 found 8 to 33 times larger"
-            ),
-        ),
-    ],
+    [(1.0, "valves declared shut below 1 V"), (FREE, "free maps")],
 )
 def test_predicted_detection_limit(safe_v: float, name: str) -> None:
     """What `rtid diagnose` says of the true machine's record, over what was predicted before."""

@@ -1,13 +1,16 @@
 """Random booms with what their owner knows of them, and a designed motion run on the true ones.
 
 The owner knows the controller (it is his), the geometry exactly, the bulk modulus up to 30 %, and
-estimates load (10 %), mass (20 %) and friction (30 %).  The data sheet describes the type of the
-valves: the mean of the four, with up to 10 % of gain and 0.3 V of dead band wrong.
+estimates load (10 %), mass (20 %) and friction (30 %).  The data sheet has a column for every
+valve, each with up to 10 % of gain and 0.3 V of dead band wrong, as in Fig. 6.  The limits are what
+the paper's sweep itself takes on the true machine: its stroke, its largest speed, command and
+pressure.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -15,22 +18,34 @@ import numpy as np
 from rtid.excite.driving import OFFSET, SHUT, SUPPLY, V_REF, X_REF
 from rtid.exciting import read_csv
 from rtid.model import FloatArray
-from rtid.paper.boom import MOST_OF_STROKE, TOP_V, boom, grid
+from rtid.paper.boom import SWEEP_S, boom, grid, sweep
+from rtid.paper.fig6 import manufacturer
 from rtid.sim import loop
 from rtid.sim.declare import declared_model
 from rtid.sim.motion import Motion
-from rtid.sim.plant import Plant, Valve
+from rtid.sim.plant import Plant
 from rtid.sim.project_file import project_text
+from rtid.sim.run import EXACT, P_A, P_B, U, V, X, simulate
 
-COMMAND_V = 9.0
+GRID_END_V = 9.0
 LEAST_SUPPLY = 0.6  # of the usual one
-GAIN_ERROR, DEADBAND_ERROR_V = 0.1, 0.3
+STEPS_V = 0.6  # dither that is allowed on top of the controller's command
+LEAST_PA = 1e5  # of a chamber, against cavitation
+
+
+@cache
+def swept(number: int) -> FloatArray:
+    """Noise-free signals of the paper's sweep on the true machine."""
+    return simulate(_cut(boom(number), GRID_END_V), sweep, number, SWEEP_S, EXACT).truth.signals
 
 
 def machine(number: int) -> Plant:
-    """A random boom whose controller cuts the command at the limit."""
-    plant = boom(number)
-    return replace(plant, controller=plant.controller._replace(limit_v=COMMAND_V))
+    """A random boom whose controller cuts the command at the sweep's largest."""
+    return _cut(boom(number), float(np.abs(swept(number)[:, U]).max()))
+
+
+def _cut(plant: Plant, limit_v: float) -> Plant:
+    return replace(plant, controller=plant.controller._replace(limit_v=limit_v))
 
 
 def write_project(
@@ -40,44 +55,41 @@ def write_project(
 
     safe_v: up to which a valve is declared to be shut; 0: nothing is declared, the map is free.
     """
-    rng = np.random.default_rng([number, 91])
-    sheet = folder / "sheet.csv"
-    sheet.write_text(_sheet(plant, rng), "utf-8")
     blocks = grid()
     if safe_v == 0.0:
         blocks = replace(blocks, u_v=np.concatenate([[0.0, 0.5], blocks.u_v]))
     model = declared_model(plant, grid=blocks, seed=number, safe_band_v=safe_v)
     text = project_text(model, plant.constants.stroke_m, "boom")
+    (folder / "sheet.csv").write_text(_sheet(plant, number), "utf-8")
     for edge in plant.edges:
         text = text.replace(f"[edges.{edge}]\n", f'[edges.{edge}]\nreference_map = "sheet.csv"\n')
-    lines = [f"{key} = {value}" for key, value in (_section(plant, rng) | more).items()]
+    lines = [f"{key} = {value}" for key, value in (_section(plant, number) | more).items()]
     path = folder / "boom.toml"
     path.write_text(text + "\n[excite]\n" + "\n".join(lines) + "\n", "utf-8")
     return path
 
 
-def _sheet(plant: Plant, rng: np.random.Generator) -> str:
-    valves = plant.valves[:4]
-    gain = float(np.mean([v.gain for v in valves])) * rng.uniform(1 - GAIN_ERROR, 1 + GAIN_ERROR)
-    shift_v = rng.uniform(-DEADBAND_ERROR_V, DEADBAND_ERROR_V)
-    valve = Valve(gain, float(np.mean([v.deadband_v for v in valves])) + shift_v)
-    typical = replace(plant, valves=(valve,) * 5)
-    u = np.linspace(0.0, 10.0, 101)
-    k = typical.flow("pa", u, np.full_like(u, 1e6)) / 1e3
-    return "\n".join(["abs_u_V,K", *(f"{a:.6g},{b:.9g}" for a, b in zip(u, k, strict=True))]) + "\n"
+def _sheet(plant: Plant, number: int) -> str:
+    """K of every valve over the command: the manufacturer's of Fig. 6."""
+    flow, u, dp_pa = manufacturer(plant, number), np.linspace(0.0, 10.0, 101), 1e6
+    k = [flow(edge, u, np.full_like(u, dp_pa)) / np.sqrt(dp_pa) for edge in plant.edges]
+    head = ",".join(["abs_u_V", *(f"K_{edge}" for edge in plant.edges)])
+    rows = (",".join(f"{value:.9g}" for value in row) for row in np.column_stack([u, *k]))
+    return "\n".join([head, *rows]) + "\n"
 
 
-def _section(plant: Plant, rng: np.random.Generator) -> dict[str, object]:
-    """Limits: the sweep's stroke, 1.3 times its speed, its command, the range of the sensors."""
+def _section(plant: Plant, number: int) -> dict[str, object]:
+    """Limits: what the sweep takes; steps and supply as allowed here."""
     c, k, usual = plant.constants, plant.controller, plant.p_supply_pa * 1e-6
+    taken, rng = swept(number), np.random.default_rng([number, 91])
     about = {n: rng.uniform(1 - e, 1 + e) for n, e in (("mass", 0.2), ("load", 0.1), ("rub", 0.3))}
-    low, high = (0.5 - MOST_OF_STROKE) * c.stroke_m, (0.5 + MOST_OF_STROKE) * c.stroke_m
+    x, most_pa = taken[:, X], float(taken[:, [P_A, P_B]].max())
     return {
-        "stroke_m": [low, high],
-        "speed_mps": 1.3 * (TOP_V - k.deadband_v) / k.volts_per_mps,
-        "command_v": COMMAND_V,
-        "offset_v": 1.0,
-        "pressure_mpa": [0.1, 10.0],
+        "stroke_m": [float(x.min()), float(x.max())],
+        "speed_mps": float(np.abs(taken[:, V]).max()),
+        "command_v": k.limit_v,
+        "offset_v": STEPS_V,
+        "pressure_mpa": [LEAST_PA * 1e-6, most_pa * 1e-6],
         "supply_mpa": [LEAST_SUPPLY * usual, usual],
         "usual_supply_mpa": usual,
         "mass_kg": c.mass_kg * about["mass"],
