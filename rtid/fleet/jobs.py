@@ -50,7 +50,9 @@ def find(sources: Iterable[Path], project: Path | None) -> tuple[list[Job], list
 
 
 def key_of(trace: Path) -> str:
-    """Key of a trace by its content."""
+    """Key of a trace by its content; an empty one is no copy of another, each has its error."""
+    if not trace.stat().st_size:
+        return hashlib.sha256(str(trace.resolve()).encode()).hexdigest()[:DIGITS]
     with trace.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()[:DIGITS]
 

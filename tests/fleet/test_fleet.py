@@ -57,6 +57,11 @@ def test_every_trace_is_found_with_its_machine_and_copies_are_left_out(
     assert len(jobs) == 8 and copies == [again]
     with pytest.raises(RtidError, match="no project file"):
         find([traces / "traces" / "m1"], None)
+    broken = [tmp_path / "no.parquet", tmp_path / "none.parquet"]
+    for path in broken:
+        path.touch()
+    jobs, copies = find([traces / "traces", *broken], project)
+    assert len(jobs) == 10 and not copies, "each empty file is an error of its own"
     (tmp_path / "empty").mkdir()
     with pytest.raises(RtidError, match="no trace found"):
         find([tmp_path / "empty"], project)
