@@ -51,7 +51,7 @@ def fleet(
     again = archive.forget_errors() if retry else 0
     _run(run, jobs, archive, as_json, workers=workers, scheduler=scheduler, with_diagnosis=diagnose)
     loaded = [load(path) for path in dict.fromkeys(job.project for job in jobs)]
-    found = machines(archive, {one.digest: one.model for one in loaded})
+    found = machines(archive, {one.digest: one.model for one in loaded}, workers)
     types = typical(found)
     write(archive, found, types)
     rows = archive.rows()

@@ -10,8 +10,10 @@ from __future__ import annotations
 import csv
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import reduce
+from multiprocessing import get_context
 from operator import add
 from pathlib import Path
 from typing import Any
@@ -69,13 +71,20 @@ class Typical:
     flowmap: FlowMap  # the same as a prior for the next machine, see `_middle`
 
 
-def machines(archive: Archive, models: Mapping[str, Model]) -> list[Machine]:
-    """Every machine with at least one trace that was learned from; models by digest."""
+def machines(archive: Archive, models: Mapping[str, Model], workers: int = 1) -> list[Machine]:
+    """Every machine with at least one trace that was learned from; models by digest.
+
+    workers: processes; a machine takes some seconds, as long as a few of its traces.
+    """
     rows: dict[tuple[str, str], list[Row]] = defaultdict(list)
     for row in archive.rows():
         if not row["error"] and row["digest"] in models:
             rows[row["machine"], row["digest"]].append(row)
-    return [_machine(archive, models[d], name, d, own) for (name, d), own in rows.items()]
+    of = [(archive, models[d], name, d, own) for (name, d), own in rows.items()]
+    if min(workers, len(of)) < 2:
+        return [_machine(*one) for one in of]
+    with ProcessPoolExecutor(min(workers, len(of)), get_context("spawn")) as pool:
+        return list(pool.map(_machine, *zip(*of, strict=True)))
 
 
 def _machine(
