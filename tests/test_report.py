@@ -205,6 +205,8 @@ def test_a_record_of_which_nothing_could_be_judged_has_a_page_too(leaking: Repor
         told.diagnosed.diagnosis,
         verdict="insufficient_data",
         found=(),
+        rho_before=nan,
+        rho_after=nan,
         heldout_residual_before_m3s=nan,
         heldout_residual_after_m3s=nan,
         noise_floor_m3s=nan,

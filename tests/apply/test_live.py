@@ -61,11 +61,12 @@ def test_offer_apply_and_undo_beside_a_running_daemon(tmp_path: Path) -> None:
         at.wait(lambda status: status.bus.state == "open")
         listener = Listener(at.group)
         stack.callback(listener.stop)
-        stack.enter_context(process.sender(at.group, 60.0, speed=3.0, loops=9))
+        sending = stack.enter_context(process.sender(at.group, 60.0, speed=3.0, loops=9))
         start_s = time.monotonic()
         while not offered.exists(at.folder):
             assert time.monotonic() - start_s < LIMIT_S, at.status()
             time.sleep(0.2)
+        sending.kill()  # so that no other offer follows
         assert listener.heard == [], "a daemon that is not armed has sent something"
 
         it = Neighbour(at.group, Controller(), lambda data, _: [data], "udp_multicast")
