@@ -255,7 +255,7 @@ def test_row_21_overload(overload: Overload, figure: Figure) -> None:
 
 @pytest.mark.xfail(
     strict=True,
-    reason="20 s at load 13, when the machine was not calm behind it; never run on a calm one",
+    reason="20 s at load 13, 18.6 s on a calm machine",
 )
 def test_row_21_normal_again(overload: Overload, figure: Figure) -> None:
     """The alarm is over, which it says to a tenth of a second; one still on counts to the end."""
