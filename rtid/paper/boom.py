@@ -7,12 +7,15 @@ sweep that takes the command to 8.5 V.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from firmware_bridge.frames import Frames
 from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.published import publish
 from rtid.model import Grid, Model
@@ -88,11 +91,24 @@ def learn(
     """
     run = simulate(plant, motion, seed, duration_s)
     model = declared_model(plant, grid=blocks or grid(), seed=seed)
-    with TemporaryDirectory() as folder:
-        trace = Path(folder) / f"boom{LOGS}"
-        write_log(trace, run_frames(run, start_us=START_US))
-        project = trace.with_suffix(".toml")
-        text = project_text(model, plant.constants.stroke_m, "boom")
-        project.write_text(text + more, "utf-8")
+    return learn_frames(plant, model, run_frames(run, start_us=START_US), more)
+
+
+def learn_frames(plant: Plant, model: Model, frames: Frames, more: str = "") -> Learned:
+    """What these frames teach, as a log on the desk with the project file of this model."""
+    with logged(plant, model, frames, more) as (project, trace):
         found = replay(load(project), trace)
     return Learned(plant, found, publish(found.fit.solution))
+
+
+@contextmanager
+def logged(
+    plant: Plant, model: Model, frames: Frames, more: str = ""
+) -> Iterator[tuple[Path, Path]]:
+    """A project file and a log for as long as they are needed; more: text for the former."""
+    with TemporaryDirectory() as folder:
+        trace = Path(folder) / f"boom{LOGS}"
+        write_log(trace, frames)
+        project = trace.with_suffix(".toml")
+        project.write_text(project_text(model, plant.constants.stroke_m, "boom") + more, "utf-8")
+        yield project, trace

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rtid.errors import RtidError
-from rtid.paper import fig3, fig4, fig5, fig6, table1
+from rtid.paper import fig3, fig4, fig5, fig6, hidden, table1
 from rtid.paper.result import Part, all_met
 
 PAPER = "IMECE2005-79420"
@@ -21,6 +21,7 @@ PARTS: dict[str, Maker] = {  # each is given the seed and the number of random p
     "table1": table1.reproduce,
     "fig5": lambda seed, plants: fig5.reproduce(seed),
     "fig6": fig6.reproduce,
+    "hidden": hidden.reproduce,
 }
 SEED, PLANTS = 0, 30
 

@@ -21,6 +21,7 @@ from rtid.model import (
     Signal,
 )
 from rtid.sim.plant import AB, EDGES, FloatArray, Plant
+from rtid.sim.robust import COMMAND_STEP_V, TOP_V
 from rtid.sim.run import NAMES, Sensors
 
 ENDS = {
@@ -61,11 +62,13 @@ def declared_model(
     safe_band_v: float | None = None,
     lag: Lag | None = None,
     form: str = "integral",
+    one_by_one: bool = False,
 ) -> Model:
     """The declaration for this machine.
 
     grid: one for all edges or one per edge name; sensors: as given to `simulate`; seed: of the
-    error in the declared bulk modulus; safe_band_v: 1 V, or 0 for valves without a dead band.
+    error in the declared bulk modulus; safe_band_v: 1 V, or 0 for valves without a dead band;
+    one_by_one: each valve has a command of its own, as `rtid.sim.robust` gives.
     """
     sensors = sensors or Sensors()
     c = plant.constants
@@ -74,13 +77,18 @@ def declared_model(
         safe_band_v = 1.0 if min(valve.deadband_v for valve in plant.valves) >= 1.15 else 0.0
     grid = grid or default_grid(1.25 * plant.p_supply_pa)
     grids = grid if isinstance(grid, dict) else dict.fromkeys(EDGES, grid)
+    edges = tuple(
+        _edge(plant, name, grids[name], safe_band_v, f"u_{name}" if one_by_one else "u")
+        for name in plant.edges
+    )
+    signals = _signals(sensors)
     return Model(
-        signals=_signals(sensors),
+        signals=(*_valve_commands(edges), *signals[1:]) if one_by_one else signals,
         chambers=(
             Chamber("a", "p_a", c.area_a_m2, 1, c.v0_a_m3),
             Chamber("b", "p_b", c.area_b_m2, -1, c.v0_b_m3 + c.area_b_m2 * c.stroke_m),
         ),
-        edges=tuple(_edge(plant, name, grids[name], safe_band_v) for name in plant.edges),
+        edges=edges,
         position="x",
         beta_nominal_pa=plant.beta_pa * wrong,
         beta_bounds_pa=(200e6, 1600e6),
@@ -89,13 +97,18 @@ def declared_model(
     )
 
 
-def _edge(plant: Plant, name: str, grid: Grid, safe_band_v: float) -> Edge:
+def _valve_commands(edges: tuple[Edge, ...]) -> tuple[Signal, ...]:
+    """The commands of single valves, 0 to 10 V in the steps of their frame."""
+    return tuple(Signal(e.command, COMMAND, "V", 0.0, COMMAND_STEP_V, 0.0, TOP_V) for e in edges)
+
+
+def _edge(plant: Plant, name: str, grid: Grid, safe_band_v: float, command: str) -> Edge:
     """The edge with the data sheet's rated flow, the same for every valve of one machine."""
     source, sink = ENDS[name]
     gain = float(np.mean([valve.gain for valve in plant.valves[:AB]]))
     rated_q_m3s = gain * 4.0 * float(np.sqrt(RATED_DP_PA))
     direction = plant.directions[EDGES.index(name)]
-    return Edge(name, source, sink, "u", direction, grid, safe_band_v, rated_q_m3s, RATED_DP_PA)
+    return Edge(name, source, sink, command, direction, grid, safe_band_v, rated_q_m3s, RATED_DP_PA)
 
 
 def _signals(sensors: Sensors) -> tuple[Signal, ...]:

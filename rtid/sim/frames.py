@@ -50,6 +50,13 @@ CONTROLLER_ROUTES = {
     "x": Route("Motion", "X"),
     "v": Route("Motion", "V"),
 }
+VALVE_ROUTES = {  # where each valve has a command of its own
+    "u_pa": Route("ValveCommands5", "USupplyA", held=True),
+    "u_at": Route("ValveCommands5", "UTankA", held=True),
+    "u_pb": Route("ValveCommands5", "USupplyB", held=True),
+    "u_bt": Route("ValveCommands5", "UTankB", held=True),
+    "u_ab": Route("ValveCommands5", "UCross", held=True),
+} | {name: route for name, route in CONTROLLER_ROUTES.items() if name != "u"}
 
 
 def messages_of(routes: Mapping[str, Route]) -> tuple[str, ...]:

@@ -10,9 +10,10 @@ from typing import Any
 import tomlkit
 
 from rtid.model import Edge, Model
-from rtid.sim.frames import CONTROLLER_ROUTES, messages_of
+from rtid.sim.frames import CONTROLLER_ROUTES, VALVE_ROUTES, messages_of
 from rtid.units import LPM
 
+ROUTES = CONTROLLER_ROUTES | VALVE_ROUTES
 HEAD = "Written by `rtid simulate`: what the user of this simulated machine would declare.\n"
 
 
@@ -28,6 +29,7 @@ def project_text(model: Model, stroke_m: float, name: str) -> str:
 
 def _sections(model: Model, stroke_m: float, name: str) -> dict[str, Any]:
     low_pa, high_pa = model.beta_bounds_pa
+    routes = {signal.name: ROUTES[signal.name] for signal in model.signals}
     lag = {"nominal_ms": model.lag.nominal_s * 1e3, "tolerance_ms": model.lag.tolerance_s * 1e3}
     return {
         "project": {"name": name},
@@ -37,12 +39,12 @@ def _sections(model: Model, stroke_m: float, name: str) -> dict[str, Any]:
             "time_column": "t",
             "time_unit": "s",
         },
-        "messages": {message: {"period_ms": 1.0} for message in messages_of(CONTROLLER_ROUTES)},
+        "messages": {message: {"period_ms": 1.0} for message in messages_of(routes)},
         "signals": _signals(model),
         "geometry": {"stroke_mm": stroke_m * 1e3, "position": model.position},
         "chambers": _chambers(model, stroke_m),
         "edges": {edge.name: _edge(edge) for edge in model.edges},
-        "modes": _modes(model),
+        **_modes(model),
         "beta": {
             "nominal_mpa": model.beta_nominal_pa * 1e-6,
             "bounds_mpa": [low_pa * 1e-6, high_pa * 1e-6],
@@ -55,7 +57,7 @@ def _sections(model: Model, stroke_m: float, name: str) -> dict[str, Any]:
 def _signals(model: Model) -> dict[str, Any]:
     found = {}
     for signal in model.signals:
-        route = CONTROLLER_ROUTES[signal.name]
+        route = ROUTES[signal.name]
         found[signal.name] = {
             "message": route.message,
             "signal": route.signal,
@@ -94,8 +96,9 @@ def _edge(edge: Edge) -> dict[str, Any]:
     }
 
 
-def _modes(model: Model) -> dict[str, list[str]]:
-    return {
-        mode: [edge.name for edge in model.edges if edge.direction == direction]
-        for mode, direction in (("extend", 1), ("retract", -1))
-    }
+def _modes(model: Model) -> dict[str, Any]:
+    """What one command opens in either direction; nothing where each valve has its own."""
+    if len({edge.command for edge in model.edges}) > 1:
+        return {}
+    ways = (("extend", 1), ("retract", -1))
+    return {"modes": {m: [e.name for e in model.edges if e.direction == way] for m, way in ways}}

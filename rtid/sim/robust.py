@@ -1,59 +1,86 @@
-"""An adaptive robust controller of the boom (Liu and Yao), adaptation off: the product's neighbour.
+"""An adaptive robust controller of the boom (Liu and Yao), adaptation off.
 
-Each of four valves has a command of its own.  With z1 = x - x_d, v_r = v_d - k z1, z2 = v - v_r,
-and all gains k:
+The product's neighbour.  Each of the five valves has a command of its own.  With z1 = x - x_d,
+v_r = v_d - k z1, z2 = v - v_r, and gains k:
 
     F   = m (dv_r/dt - k z2) + gravity(x) + friction          force that is wanted of the cylinder
     P_d = (F + A_B P_B) / A_A                                  by chamber A
-    Q_A = A_A v + V_A / beta (dP_d/dt - k (P_A - P_d))         flow into A
-    Q_B = - A_B v - V_B / beta k (P_B - P_off)                 keeps B at its low pressure
+    Q_A = A_A v + V_A / beta (dP_d/dt - k (P_A - P_d)) + leak  flow into A
+    Q_B = - A_B v - V_B / beta k_off (P_B - P_off) - leak      keeps B at its low pressure
+    leak = c (P_A - P_B), c the internal leakage that the controller knows of
 
-A positive flow is metered in from the supply, a negative one out to the tank (the working modes):
-the command is w = Q^-1(|flow|, dp) of that valve's map.  The map is all that differs between runs.
+`working_modes` says which valves carry them.  What the controller knows is all that differs.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 
+from firmware_bridge.lookup import Table
 from rtid.sim.equations import flows
-from rtid.sim.loop import LOAD, P_SUPPLY, P_TANK, Machine, Spools, advance, new_spools, quantise
+from rtid.sim.extra import parts_of
+from rtid.sim.extra_flows import SUPPLY, extra_valve_flows
+from rtid.sim.loop import LOAD, P_SUPPLY, P_TANK, Machine, advance, new_spools, quantise
 from rtid.sim.motion import DT_S
-from rtid.sim.plant import AT, BT, EDGES, PA, PB, Constants, FloatArray, Plant, flow_gain
+from rtid.sim.plant import EDGES, PA, PB, Constants, FloatArray, Plant, flow_gain
+from rtid.sim.run import at_rest, machine_of
+from rtid.sim.schedule import schedule
 from rtid.sim.sensing import P_A, P_B, P_S, P_T, Sensors, U, V, X
+from rtid.sim.working_modes import Maps, commands, regenerates
 
 GAIN_1PS = 16.0  # of the paper
-OFF_SIDE_PA = 5e6  # takes A near the pressures that it has in the sweep
-LEAST_FLOW_M3S = 5e-7  # less is not metered: both valves of the chamber stay shut
+OFF_GAIN_1PS = 80.0  # of the pressure of B: a map that is 10 % wrong must not let it cavitate
+OFF_SIDE_PA = 1.5e6
+COMMAND_STEP_V, TOP_V = 0.01, 10.0  # of the command frame
 SUBSTEPS = 10
-FOUR = EDGES[:4]
-W_V, DP_PA = np.linspace(0.0, 9.0, 901), np.linspace(0.0, 10e6, 101)  # lattice of the maps
+W_V, S = np.linspace(0.0, TOP_V, 1001), np.sqrt(np.linspace(0.0, 10e6, 401))
 
 Flow = Callable[[str, FloatArray, FloatArray], FloatArray]
 
 
-class Knowledge(NamedTuple):
-    """What the controller knows: the machine's constants, and maps (4, w, dp) in m3/s."""
+@dataclass(frozen=True)
+class Knowledge:
+    """What the controller knows besides the machine's constants.
+
+    leak_m3spa: coefficient of the internal leakage that it makes up for; may_regenerate: whether it
+    uses the cross-port valve at all.
+    """
+
+    maps: Maps
+    leak_m3spa: float = 0.0
+    may_regenerate: bool = True
+
+
+class Law(NamedTuple):
+    """The numbers of the control law as the kernel takes them."""
 
     c: Constants
-    maps: FloatArray
-    w_v: FloatArray
-    dp_pa: FloatArray
+    gain_1ps: float
+    off_gain_1ps: float
+    off_side_pa: float
+    lead_s: float  # the flows are those of so much later, as far as the reference tells them
+    leak_m3spa: float
 
 
 @dataclass(frozen=True)
 class Tracked:
-    """One run: position error (n,) m, pressures of A and B (n, 2), commands (n, 4), energy in J."""
+    """One run of n samples at 1 kHz.
+
+    error_m (n,): true position less its reference; signals (n, 7): what the sensors said, columns
+    as `sensing.NAMES`; commands_v (n, 5) of `plant.EDGES`; true_pa (n, 2): P_A and P_B; energy_j:
+    from the supply.
+    """
 
     error_m: FloatArray
-    pressures_pa: FloatArray
-    commands_v: FloatArray
+    signals: FloatArray = field(repr=False)
+    commands_v: FloatArray = field(repr=False)
+    true_pa: FloatArray = field(repr=False)
     energy_j: float
 
     @property
@@ -67,40 +94,28 @@ class Tracked:
         return float(np.abs(self.error_m).max())
 
 
-def knowledge(plant: Plant, flow: Flow) -> Knowledge:
-    """The machine as the controller sees it; flow(edge, w, dp): its map, made to rise with w."""
-    w, dp = np.meshgrid(W_V, DP_PA, indexing="ij")
-    maps = [np.maximum.accumulate(np.nan_to_num(flow(e, w, dp)), axis=0) for e in FOUR]
-    return Knowledge(plant.constants, np.array(maps), W_V, DP_PA)
+def sampled(flow: Flow) -> Maps:
+    """A map that is known everywhere, on a fine lattice; flow(edge, w, dp) in m3/s."""
+    w, dp = np.meshgrid(W_V, S**2, indexing="ij")
+    return _maps((W_V, S, flow(edge, w, dp)) for edge in EDGES)
+
+
+def received(tables: Sequence[Table]) -> Maps:
+    """Maps as the bridge brought them, in the order of EDGES, opening with w > 0."""
+    return _maps((t.w_v.astype(float), t.s.astype(float), t.flow_m3s) for t in tables)
+
+
+def _maps(parts: Any) -> Maps:
+    """The controller's arrays; a flow that falls with the command is held, to have an inverse."""
+    w, s, flow = zip(*parts, strict=True)
+    rising = (np.ascontiguousarray(np.maximum.accumulate(q, axis=0)) for q in flow)
+    return Maps(tuple(w), tuple(s), tuple(rising))
 
 
 @njit(cache=True, error_model="numpy")
-def opening(flow: FloatArray, w_v: FloatArray, dp_pa: FloatArray, q: float, dp: float) -> float:
-    """The command of one map (w, dp), linear between its points, for a wanted flow q > 0."""
-    at = min(max(dp, dp_pa[1]), dp_pa[-1]) / (dp_pa[1] - dp_pa[0])
-    j = min(int(at), len(dp_pa) - 2)
-    share = at - j
-    low, high = 0, len(w_v) - 1
-    while high - low > 1:
-        middle = (low + high) // 2
-        if flow[middle, j] + share * (flow[middle, j + 1] - flow[middle, j]) < q:
-            low = middle
-        else:
-            high = middle
-    below = flow[low, j] + share * (flow[low, j + 1] - flow[low, j])
-    above = flow[high, j] + share * (flow[high, j + 1] - flow[high, j])
-    part = (q - below) / (above - below) if above > below else 1.0
-    return w_v[low] + min(max(part, 0.0), 1.0) * (w_v[high] - w_v[low])
-
-
-@njit(cache=True, error_model="numpy")
-def wanted_flows(
-    c: Constants, k: float, lead_s: float, seen: FloatArray, ref: FloatArray
-) -> tuple[float, float]:
-    """Q_A and Q_B for measured signals (7,) and the reference's x, v, a and jerk (4,).
-
-    lead_s: the flows are those of so much later, as far as the reference tells them.
-    """
+def wanted_flows(law: Law, seen: FloatArray, ref: FloatArray) -> tuple[float, float]:
+    """Q_A and Q_B for measured signals (7,) and the reference's x, v, a and jerk (4,)."""
+    c, k = law.c, law.gain_1ps
     x, v, p_a, p_b = seen[X], seen[V], seen[P_A], seen[P_B]
     gravity = c.gravity_n + c.gravity_slope_npm * (x - 0.5 * c.stroke_m)
     side = math.tanh(ref[1] / c.coulomb_width_mps)
@@ -111,31 +126,36 @@ def wanted_flows(
     j_r = ref[3] - k * (a - ref[2])
     rate = c.mass_kg * (j_r - k * (a - a_r)) + c.gravity_slope_npm * v + c.viscous_nspm * a
     rate += c.coulomb_n * (1.0 - side * side) / c.coulomb_width_mps * ref[2]
-    off = -k * (p_b - OFF_SIDE_PA)
+    off = -law.off_gain_1ps * (p_b - law.off_side_pa)
     p_d = (force + c.area_b_m2 * p_b) / c.area_a_m2
     p_rate = (rate + c.area_b_m2 * off) / c.area_a_m2
     volume_a = c.v0_a_m3 + c.area_a_m2 * x
     volume_b = c.v0_b_m3 + c.area_b_m2 * (c.stroke_m - x)
-    soon = v + lead_s * ref[2]
-    q_a = c.area_a_m2 * soon + volume_a / c.beta_pa * (p_rate - k * (p_a - p_d))
-    return q_a, -c.area_b_m2 * soon + volume_b / c.beta_pa * off
+    soon, leak = v + law.lead_s * ref[2], law.leak_m3spa * (p_a - p_b)
+    q_a = c.area_a_m2 * soon + volume_a / c.beta_pa * (p_rate - k * (p_a - p_d)) + leak
+    return q_a, -c.area_b_m2 * soon + volume_b / c.beta_pa * off - leak
 
 
 @njit(cache=True, error_model="numpy")
-def commands(known: Knowledge, seen: FloatArray, q_a: float, q_b: float, w: FloatArray) -> None:
-    """Fill w (5,) in place: each chamber is fed by one valve or drained by the other."""
-    w[:] = 0.0
-    for q, inlet, outlet, p in ((q_a, PA, AT, seen[P_A]), (q_b, PB, BT, seen[P_B])):
-        if abs(q) > LEAST_FLOW_M3S:
-            edge, dp = (inlet, seen[P_S] - p) if q > 0 else (outlet, p - seen[P_T])
-            w[edge] = opening(known.maps[edge], known.w_v, known.dp_pa, abs(q), dp)
+def drawn_w(
+    c: Constants, e: Any, gains: FloatArray, drive: FloatArray, y: FloatArray, q: FloatArray
+) -> float:
+    """Power that the supply gives for the gains (5,), W; q (5,) is filled with the flows."""
+    if e is None:
+        flows(c, gains, y, drive[P_SUPPLY], drive[P_TANK], q)
+        return drive[P_SUPPLY] * (q[PA] + q[PB])
+    extra_valve_flows(c, e, gains, drive[P_SUPPLY:], y, q)
+    power: float = y[SUPPLY] * (q[PA] + q[PB])
+    return power
 
 
 @njit(cache=True, error_model="numpy")
 def track(
     m: Machine,
-    known: Knowledge,
-    gain_1ps: float,
+    e: Any,
+    law: Law,
+    maps: Maps,
+    may_regenerate: bool,
     ref: FloatArray,
     drive: FloatArray,
     noise: FloatArray,
@@ -143,47 +163,54 @@ def track(
     y: FloatArray,
     record: FloatArray,
 ) -> float:
-    """Run the loop; ref (n, 4), drive (n + 1, 8), noise (n, 7), y (4,) is changed in place.
+    """Run the loop; ref (n, 4), drive (n + 1, 8), noise (n, 7), y is changed in place.
 
-    record (n, 7) is filled: error, P_A, P_B, four commands.  Returns the energy from the supply, J.
+    e: as of `loop.run_loop`.  record (n, 15) is filled: error, P_A, P_B, seven measured signals,
+    five commands.  Returns the energy from the supply, J.
     """
-    spools: Spools = new_spools(None, m.lag_s, 0.5 * DT_S / SUBSTEPS, 1)
-    decay = math.exp(-0.5 * DT_S / SUBSTEPS / m.lag_s) if m.lag_s > 0.0 else 0.0
-    gains, seen, q, energy_j = np.empty(5), np.empty(7), np.empty(5), 0.0
+    half_s = 0.5 * DT_S / SUBSTEPS
+    spools = new_spools(e, m.lag_s, half_s, 1)
+    decay = math.exp(-half_s / m.lag_s) if m.lag_s > 0.0 else 0.0
+    gains, q, energy_j, regenerate = np.empty(5), np.empty(5), 0.0, False
     for i in range(len(ref)):
-        p_s, p_t = drive[i, P_SUPPLY], drive[i, P_TANK]
-        seen[U], seen[P_S], seen[P_T] = 0.0, p_s, p_t
+        seen, w = record[i, 3:10], spools.commands[1]
+        seen[U], seen[P_S], seen[P_T] = 0.0, drive[i, P_SUPPLY], drive[i, P_TANK]
         seen[P_A], seen[P_B], seen[X], seen[V] = y[0], y[1], y[2], y[3]
         for column in range(7):
             seen[column] = quantise(seen[column] + noise[i, column], steps[column])
-        q_a, q_b = wanted_flows(known.c, gain_1ps, m.lag_s + 0.5 * DT_S, seen, ref[i])
-        commands(known, seen, q_a, q_b, spools.commands[1])
-        record[i, 0], record[i, 1], record[i, 2] = y[2] - ref[i, 0], y[0], y[1]
-        record[i, 3:] = spools.commands[1, :4]
+        q_a, q_b = wanted_flows(law, seen, ref[i])
+        regenerate = may_regenerate and regenerates(seen, regenerate)
+        commands(maps, seen, q_a, q_b, regenerate, w)
         for edge in range(5):
+            w[edge] = quantise(w[edge], COMMAND_STEP_V)
             gains[edge] = flow_gain(m.valves[edge], spools.w[edge])
-        flows(m.c, gains, y, p_s, p_t, q)
-        energy_j += p_s * (q[PA] + q[PB]) * DT_S
-        advance(m, None, gains, drive[i : i + 2], decay, 0.0, DT_S / SUBSTEPS, spools, y, SUBSTEPS)
+        record[i, 0], record[i, 1], record[i, 2] = y[2] - ref[i, 0], y[0], y[1]
+        record[i, 10:] = w
+        energy_j += drawn_w(m.c, e, gains, drive[i], y, q) * DT_S
+        advance(m, e, gains, drive[i : i + 2], decay, 0.0, DT_S / SUBSTEPS, spools, y, SUBSTEPS)
     return energy_j
 
 
-def run(plant: Plant, flow: Flow, reference: FloatArray, seed: int = 0) -> Tracked:
-    """Follow a reference (n, 4) with a map; the same seed gives the same sensor noise."""
+def run(plant: Plant, known: Knowledge, reference: FloatArray, seed: int = 0) -> Tracked:
+    """Follow a reference (n, 4); the same seed gives the same sensor noise.
+
+    Of hidden physics only flows act here, not what changes commands or sensors.
+    """
     n, sensors = len(reference), Sensors()
     noise = np.random.default_rng([seed, 11]).standard_normal((n, 7)) * sensors.noise()
     drive = np.zeros((n + 1, 8))
     drive[:, P_SUPPLY], drive[:, P_TANK], drive[:, LOAD] = plant.p_supply_pa, plant.p_tank_pa, 0.0
-    x, c = float(reference[0, 0]), plant.constants
-    p_a = (plant.gravity_n(x) + OFF_SIDE_PA * c.area_b_m2) / c.area_a_m2
-    y, record = np.array([p_a, OFF_SIDE_PA, x, 0.0]), np.empty((n, 7))
-    machine = Machine(
-        c, plant.controller, plant.valve_table(), np.array(plant.directions, float), plant.lag_s
-    )
+    drive[:, LOAD + 1 :] = schedule(plant.extra, n + 1, DT_S, np.random.default_rng([seed, 6]))
+    lead_s = plant.lag_s + 0.5 * DT_S
+    law = Law(plant.constants, GAIN_1PS, OFF_GAIN_1PS, OFF_SIDE_PA, lead_s, known.leak_m3spa)
+    y = at_rest(plant, drive[0], float(reference[0, 0]), OFF_SIDE_PA)
+    record = np.empty((n, 15))
     energy_j = track(
-        machine,
-        knowledge(plant, flow),
-        GAIN_1PS,
+        machine_of(plant),
+        parts_of(plant.extra),
+        law,
+        known.maps,
+        known.may_regenerate,
         reference,
         drive,
         noise,
@@ -191,4 +218,4 @@ def run(plant: Plant, flow: Flow, reference: FloatArray, seed: int = 0) -> Track
         y,
         record,
     )
-    return Tracked(record[:, 0], record[:, 1:3], record[:, 3:], float(energy_j))
+    return Tracked(record[:, 0], record[:, 3:10], record[:, 10:], record[:, 1:3], float(energy_j))

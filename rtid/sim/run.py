@@ -38,6 +38,9 @@ __all__ = [
 ]
 
 
+START_SHARE = 0.3  # of the supply pressure in chamber B
+
+
 class SimulationError(RtidError):
     """The machine left its stroke, cavitated or exceeded a sensor's range."""
 
@@ -114,7 +117,7 @@ def simulate(
     for present, first, end in zip(plants, ends, ends[1:], strict=False):
         clocked = schedule(present.extra, len(drive), DT_S, burst_rng)
         rows = np.column_stack([drive, clocked])[first : end + 1]
-        y = _taken_over(present, y, rows[0]) if len(y) else _resting_state(present, rows[0])
+        y = _taken_over(present, y, rows[0]) if len(y) else _started(present, rows[0])
         truth, seen = _part(present, rows, noise[first:end], sensors, substeps, y)
         truths.append(truth)
         values.append(seen)
@@ -161,7 +164,7 @@ def _integrate(
         nodes_pa=np.empty((n, 3)),
         extra_m3s=np.zeros((n, 2)),
     )
-    machine, e = _machine(plant), parts_of(plant.extra)
+    machine, e = machine_of(plant), parts_of(plant.extra)
     run_loop(machine, e, drive, x_noise_m, steps[X], steps[U], DT_S, substeps, start, record)
     signals = np.empty((n, 7))
     signals[:, [U, P_A, P_B, X, V]] = record.signals
@@ -178,18 +181,21 @@ def _integrate(
     return truth, record.x_measured_m
 
 
-def _machine(plant: Plant) -> Machine:
+def machine_of(plant: Plant) -> Machine:
     """What the kernel needs of the plant."""
     directions = np.array(plant.directions, dtype=float)
     return Machine(plant.constants, plant.controller, plant.valve_table(), directions, plant.lag_s)
 
 
-def _resting_state(plant: Plant, drive: FloatArray) -> FloatArray:
-    """At rest with the load held and chamber B at 30 % of the supply; all nodes at rest, too."""
-    c, x_m = plant.constants, float(drive[X_REF])
-    p_b = 0.3 * plant.p_supply_pa
-    p_a = (plant.gravity_n(x_m) + p_b * c.area_b_m2) / c.area_a_m2
-    return _spread(plant, np.array([p_a, p_b, x_m, 0.0]), drive)
+def _started(plant: Plant, drive: FloatArray) -> FloatArray:
+    return at_rest(plant, drive, float(drive[X_REF]), START_SHARE * plant.p_supply_pa)
+
+
+def at_rest(plant: Plant, drive: FloatArray, x_m: float, p_b_pa: float) -> FloatArray:
+    """The state of a machine that holds its load, chamber B at this pressure; all nodes at rest."""
+    c = plant.constants
+    p_a_pa = (plant.gravity_n(x_m) + p_b_pa * c.area_b_m2) / c.area_a_m2
+    return _spread(plant, np.array([p_a_pa, p_b_pa, x_m, 0.0]), drive)
 
 
 def _taken_over(plant: Plant, before: FloatArray, drive: FloatArray) -> FloatArray:

@@ -19,7 +19,7 @@ from rtid.excite.driving import OFFSET, SHUT, SUPPLY, V_REF, X_REF
 from rtid.exciting import read_csv
 from rtid.model import FloatArray
 from rtid.paper.boom import SWEEP_S, boom, grid, sweep
-from rtid.paper.fig6 import manufacturer
+from rtid.paper.commissioning import manufacturer
 from rtid.sim import loop
 from rtid.sim.declare import declared_model
 from rtid.sim.motion import Motion

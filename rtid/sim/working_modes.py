@@ -1,0 +1,110 @@
+"""Working modes of the five-valve block: which valves carry the flows that a controller wants.
+
+    Q_A > 0  supply -> A            Q_B > 0  supply -> B
+    Q_A < 0  A -> tank              Q_B < 0  B -> tank
+    Q_A < 0 < Q_B, P_A above P_B:   A -> B through the cross-port valve, as much as it can carry,
+                                    the rest as above: regeneration, the supply is spared
+
+(Liu and Yao, energy-saving programmable valves.)  Regeneration begins above one pressure difference
+and ends below a smaller one.  A command is w = Q^-1(|flow|, dp) of that valve's map; a flow too
+small to be metered leaves its valves shut.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from rtid.sim.plant import AB, AT, BT, PA, PB, FloatArray
+from rtid.sim.sensing import P_A, P_B, P_S, P_T
+
+LEAST_FLOW_M3S = 5e-7
+REGENERATE_ABOVE_PA, REGENERATE_UNTIL_PA = 0.8e6, 0.5e6
+CROSS_SHARE = 0.85  # of the cross-port valve's highest command: beyond it, the supply helps
+
+
+class Maps(NamedTuple):
+    """Five look-up tables, in the order of `plant.EDGES`: flow_m3s (nw, ns) rising with w.
+
+    w_v (nw,), s (ns,): nodes of the command and of sqrt(dp in Pa).
+    """
+
+    w_v: tuple[FloatArray, ...]
+    s: tuple[FloatArray, ...]
+    flow_m3s: tuple[FloatArray, ...]
+
+
+@njit(cache=True, error_model="numpy")
+def cell(nodes: FloatArray, x: float) -> tuple[int, float]:
+    """The interval of nodes (n,) that holds x, and where in it, 0 to 1; the ends hold beyond."""
+    i = min(max(int(np.searchsorted(nodes, x)) - 1, 0), len(nodes) - 2)
+    share: float = (x - nodes[i]) / (nodes[i + 1] - nodes[i])
+    return i, min(max(share, 0.0), 1.0)
+
+
+@njit(cache=True, error_model="numpy")
+def flow_at(maps: Maps, edge: int, w_v: float, dp_pa: float) -> float:
+    """Flow of one edge, m3/s."""
+    flow = maps.flow_m3s[edge]
+    i, a = cell(maps.w_v[edge], w_v)
+    j, b = cell(maps.s[edge], np.sqrt(max(dp_pa, 0.0)))
+    low: float = flow[i, j] + b * (flow[i, j + 1] - flow[i, j])
+    high: float = flow[i + 1, j] + b * (flow[i + 1, j + 1] - flow[i + 1, j])
+    return low + a * (high - low)
+
+
+@njit(cache=True, error_model="numpy")
+def opening(maps: Maps, edge: int, q_m3s: float, dp_pa: float) -> float:
+    """The command of one edge for a wanted flow > 0; its highest where it cannot carry that."""
+    flow, w_v = maps.flow_m3s[edge], maps.w_v[edge]
+    j, b = cell(maps.s[edge], np.sqrt(max(dp_pa, 0.0)))
+    low, high = 0, len(w_v) - 1
+    while high - low > 1:
+        middle = (low + high) // 2
+        if flow[middle, j] + b * (flow[middle, j + 1] - flow[middle, j]) < q_m3s:
+            low = middle
+        else:
+            high = middle
+    below: float = flow[low, j] + b * (flow[low, j + 1] - flow[low, j])
+    above: float = flow[high, j] + b * (flow[high, j + 1] - flow[high, j])
+    part = (q_m3s - below) / (above - below) if above > below else 1.0
+    w: float = w_v[low] + min(max(part, 0.0), 1.0) * (w_v[high] - w_v[low])
+    return w
+
+
+@njit(cache=True, error_model="numpy")
+def through_cross_port(maps: Maps, seen: FloatArray, q_a: float, q_b: float) -> float:
+    """What A gives to B directly, m3/s, for wanted flows of which A's is out and B's in."""
+    if q_a >= 0.0 or q_b <= 0.0:
+        return 0.0
+    top_v = CROSS_SHARE * maps.w_v[AB][-1]
+    most = flow_at(maps, AB, top_v, seen[P_A] - seen[P_B])
+    q: float = min(q_b, -q_a, most)
+    return q if q > LEAST_FLOW_M3S else 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def regenerates(seen: FloatArray, before: bool) -> bool:
+    """Whether the cross-port valve may open, by the measured pressures."""
+    dp: float = seen[P_A] - seen[P_B]
+    return dp > (REGENERATE_UNTIL_PA if before else REGENERATE_ABOVE_PA)
+
+
+@njit(cache=True, error_model="numpy")
+def commands(
+    maps: Maps, seen: FloatArray, q_a: float, q_b: float, regenerate: bool, w: FloatArray
+) -> None:
+    """Fill w (5,) in place from the measured signals (7,) and the wanted flows, m3/s."""
+    w[:] = 0.0
+    p_a, p_b = seen[P_A], seen[P_B]
+    if regenerate:
+        across = through_cross_port(maps, seen, q_a, q_b)
+        if across > 0.0:
+            w[AB] = opening(maps, AB, across, p_a - p_b)
+            q_a, q_b = q_a + across, q_b - across
+    for q, inlet, outlet, p in ((q_a, PA, AT, p_a), (q_b, PB, BT, p_b)):
+        if abs(q) > LEAST_FLOW_M3S:
+            edge, dp = (inlet, seen[P_S] - p) if q > 0 else (outlet, p - seen[P_T])
+            w[edge] = opening(maps, edge, abs(q), dp)
