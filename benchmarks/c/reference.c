@@ -184,6 +184,18 @@ static void clear_open(Engine *e, int k)
     for (int i = 0; i < n; i++) memset(&e->gram[i][first], 0, TERMS * sizeof(double));
 }
 
+/* ring x ring begins anew at a closing; what it was so far stays with the blocks closed before */
+static void begin_ring_ring(Tables *t)
+{
+    Engine *e = t->e;
+    const int ring = (int)e->ring;
+    for (int p = 0; p < e->n_recent; p++)
+        for (int s = 0; s < e->n_state; s++)
+            for (int r = 0; r < e->n_state; r++) t->closed[p].w_start[s][r] -= ring_ring(e, s, r);
+    for (int s = 0; s < e->n_state; s++)
+        for (int r = 0; r < e->n_state; r++) e->gram[ring + s][ring + r] = 0.0;
+}
+
 static void close_block(Tables *t, int k)
 {
     Engine *e = t->e;
@@ -192,6 +204,7 @@ static void close_block(Tables *t, int k)
     const double *d0 = e->d[0], *d1 = e->d[1];
     const double det = e->n_state == 2 ? d0[ring] * d1[ring + 1] - d0[ring + 1] * d1[ring] : 1.0;
     State left;
+    begin_ring_ring(t);
     item->status = YOUNG;
     item->size = 0.0;
     for (int i = 0; i < TERMS; i++) {
@@ -206,7 +219,7 @@ static void close_block(Tables *t, int k)
         }
     }
     for (int s = 0; s < e->n_state; s++) {
-        for (int r = 0; r < e->n_state; r++) item->w_start[s][r] = ring_ring(e, s, r);
+        memset(item->w_start[s], 0, sizeof item->w_start[s]);
         memcpy(item->shared_start[s], e->gram[ring + s], (size_t)(1 + e->n_shared) * sizeof(double));
     }
     read_through(e, k, 1.0, item->through);
@@ -341,10 +354,15 @@ static void settle_ringing(Tables *t)
 {
     Engine *e = t->e;
     const int n = (int)(TERMS * e->n_recent);
+    int first = 0;
+    while (first < e->n_recent && t->closed[first].status != RINGING) first++;
+    if (first == e->n_recent) return;
     memset(e->weighted, 0, sizeof e->weighted);
     for (int s = 0; s < e->n_state; s++)
-        for (int r = 0; r < e->n_state; r++)
-            for (int j = 0; j < n; j++) e->weighted[s][j] += ring_ring(e, s, r) * e->ringing[r][j];
+        for (int r = 0; r < e->n_state; r++) {
+            const double w = ring_ring(e, s, r) - t->closed[first].w_start[s][r];
+            for (int j = 0; j < n; j++) e->weighted[s][j] += w * e->ringing[r][j];
+        }
     for (int p = 0; p < e->n_recent; p++) {
         Closed *item = &t->closed[p];
         if (item->status != RINGING) continue;

@@ -41,6 +41,9 @@ typedef double rtid_sum;
 #define RTID_EST_OPEN_AT (RTID_EST_RING + 1)
 #define RTID_EST_WIDTH (RTID_EST_OPEN_AT + RTID_EST_TERMS * RTID_EST_MAX_OPEN)
 #define RTID_EST_UNKNOWNS (RTID_EST_SHARED + RTID_EST_TERMS * RTID_EST_MAX_BLOCKS)
+/* of a block with y, the shared columns and its own terms up to each */
+#define RTID_EST_KEPT \
+    (RTID_EST_TERMS * RTID_EST_BLOCKS_AT + RTID_EST_TERMS * (RTID_EST_TERMS + 1) / 2)
 #define RTID_EST_SUMS ((1 + RTID_EST_UNKNOWNS) * (2 + RTID_EST_UNKNOWNS) / 2)
 
 /* What became of samples; counts by these numbers. */
@@ -127,6 +130,9 @@ typedef struct {
     int16_t slot[RTID_EST_N_CELLS];      /* of each cell of the grids, -1 before the first visit */
     rtid_estimator_block block[RTID_EST_MAX_BLOCKS];
     rtid_sum sums[RTID_EST_SUMS]; /* lower triangle, row by row, of [y | shared | blocks] */
+#ifndef RTID_ESTIMATOR_FLOAT32
+    double lost[RTID_EST_MAX_BLOCKS][RTID_EST_KEPT]; /* of the sums: what rounding took off */
+#endif
     uint64_t counts[RTID_EST_N_COUNTS];
 } rtid_estimator;
 

@@ -5,7 +5,7 @@
 
 static const double FLOW_PRIOR = 1e-2;   /* ten times the rated flow, 1 sigma */
 static const double SHARED_PRIOR = 1e-2; /* beta is known to a factor of ten */
-static const double LEAST_PIVOT = 1e-14; /* of a unit diagonal: sums of rows and prior are above */
+static const double LEAST_PIVOT = 1e-14; /* of a diagonal of about 1: rows and prior are above */
 
 /* Lower triangle by rows; row and column 0 are y, so that row i is unknown i - 1. */
 static double *row_of(rtid_estimator_work *w, int i)
@@ -50,13 +50,15 @@ static void read_sums(rtid_estimator_work *w)
     }
 }
 
-/* Add the prior, scale to a unit diagonal. */
+/* Add the prior, scale to a diagonal of 1/4 to 2: powers of two leave the sums as they are. */
 static void scale_sums(rtid_estimator_work *w)
 {
     for (int i = 1; i <= unknowns(w); i++) {
         double *row = row_of(w, i);
+        int exponent = 0;
         row[i] += prior(i - 1);
-        w->scale[i - 1] = 1.0 / sqrt(row[i] > 0.0 ? row[i] : prior(i - 1));
+        frexp(row[i] > 0.0 ? row[i] : prior(i - 1), &exponent);
+        w->scale[i - 1] = ldexp(1.0, -exponent / 2);
         for (int j = 1; j <= i; j++)
             row[j] *= w->scale[i - 1] * w->scale[j - 1];
     }

@@ -14,12 +14,28 @@ static rtid_sum *sum_at(rtid_estimator *e, int i, int j)
 
 static int at_slot(int slot) { return RTID_EST_BLOCKS_AT + T * slot; }
 
+/* Term i of a block with column j of the sums: y, shared or its own, += x.  Its condition number
+ * multiplies the error of these sums: what one addition rounds off, the next one adds. */
+static void add_kept(rtid_estimator *e, int slot, int i, int j, rtid_sum x)
+{
+    rtid_sum *sum = sum_at(e, at_slot(slot) + i, j);
+#ifdef RTID_ESTIMATOR_FLOAT32
+    merge(sum, x); /* of two floats */
+#else
+    const int column = j < RTID_EST_BLOCKS_AT ? j : j - T * slot;
+    double *lost = &e->lost[slot][i * RTID_EST_BLOCKS_AT + i * (i + 1) / 2 + column];
+    const double before = *sum, added = x + *lost, back = (before + added) - before;
+    *sum = before + added;
+    *lost = (before - (*sum - back)) + (added - back);
+#endif
+}
+
 /* What a block shares with itself += left' right, which is symmetric: its lower triangle. */
 static void add_own_tile(rtid_estimator *e, int slot, const rtid_sum *left, const rtid_real *right)
 {
     for (int i = 0; i < T; i++)
         for (int j = 0; j <= i; j++)
-            merge(sum_at(e, at_slot(slot) + i, at_slot(slot) + j), times(left[i], right[j]));
+            add_kept(e, slot, i, at_slot(slot) + j, times(left[i], right[j]));
 }
 
 /* What two blocks share += left' right. */
@@ -74,12 +90,12 @@ static void read_through(const rtid_estimator *e, int k, rtid_sum *out)
 /* Of open block k with itself, y and the shared columns. */
 static void add_own(rtid_estimator *e, int k)
 {
-    const int first = first_of(k), at = at_slot(e->open[k].slot);
+    const int first = first_of(k), slot = e->open[k].slot;
     for (int i = 0; i < T; i++) {
         for (int j = 0; j < 1 + RTID_EST_SHARED; j++)
-            merge(sum_at(e, at + i, j), e->local[first + i][j]);
+            add_kept(e, slot, i, j, e->local[first + i][j]);
         for (int j = 0; j <= i; j++)
-            merge(sum_at(e, at + i, at + j), e->local[first + i][first + j]);
+            add_kept(e, slot, i, at_slot(slot) + j, e->local[first + i][first + j]);
     }
 }
 
@@ -116,11 +132,10 @@ static void weigh(const rtid_estimator *e, const rtid_estimator_recent *item, rt
 /* Of a closed block with y and the shared columns since it closed. */
 static void add_shared(rtid_estimator *e, const rtid_estimator_recent *item)
 {
-    const int at = at_slot(item->slot);
     for (int j = 0; j < 1 + RTID_EST_SHARED; j++) {
         const rtid_sum since = sum_of(e->local[RTID_EST_RING][j], minus(item->shared_start[j]));
         for (int i = 0; i < T; i++)
-            merge(sum_at(e, at + i, j), times(since, item->d[i]));
+            add_kept(e, item->slot, i, j, times(since, item->d[i]));
     }
 }
 

@@ -12,7 +12,7 @@ from scipy.linalg.lapack import dpotri
 from threadpoolctl import ThreadpoolController
 
 from rtid.estimator.sums import Normal
-from rtid.kernels.normal import mirror
+from rtid.kernels.normal import mirror, residual
 from rtid.model import FloatArray
 
 # One standard deviation of the prior on a flow term: ten times the rated flow, so that directions
@@ -23,23 +23,29 @@ SHARED_PRIOR = 1e-2  # information on beta_nominal / beta: worth knowing it to a
 
 @dataclass(frozen=True)
 class Factor:
-    """Cholesky factor of the scaled normal matrix: columns scaled to unit information."""
+    """Cholesky factor of the scaled normal matrix: columns scaled to about unit information.
+
+    The scales are powers of two, so that the scaled matrix is the sums to the last bit.
+    """
 
     matrix: FloatArray
     scale: FloatArray
     lower: FloatArray
 
     def theta(self, right: FloatArray) -> FloatArray:
-        """Solution for right-hand sides (n,) or (n, m), with one step of refinement."""
-        scale = self.scale if right.ndim == 1 else self.scale[:, None]
-        right = right * scale
+        """Solution (n,) for a right-hand side, with one step of refinement.
+
+        The residual is in twice the precision: the solution is that of the sums as they are, to
+        about the square of condition number x rounding.
+        """
+        right = right * self.scale
         theta = cho_solve((self.lower, True), right)
-        theta += cho_solve((self.lower, True), right - self.matrix @ theta)
-        return np.asarray(theta * scale)
+        theta += cho_solve((self.lower, True), residual(self.matrix, theta, right))
+        return np.asarray(theta * self.scale)
 
     def columns(self, m: int) -> FloatArray:
         """The first m columns (n, m) of the inverse."""
-        return self.theta(np.eye(len(self.scale), m))
+        return np.stack([self.theta(unit) for unit in np.eye(m, len(self.scale))], axis=1)
 
     def cov(self) -> FloatArray:
         """Inverse of the normal matrix (n, n)."""
@@ -53,7 +59,7 @@ def factorize(normal: Normal, n_shared: int) -> Factor:
     prior = np.full(len(normal.right), PRIOR_SD**-2)
     prior[:n_shared] = SHARED_PRIOR
     matrix = normal.gram + np.diag(prior)
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
+    scale = np.ldexp(1.0, -(np.frexp(np.maximum(np.diag(matrix), np.finfo(float).tiny))[1] // 2))
     matrix *= scale[:, None]
     matrix *= scale
     lower = cho_factor(matrix, lower=True)[0]

@@ -9,7 +9,8 @@ columns, d_closed(k) = ring(k) d_hat with constant d_hat, and what a closed bloc
 other column follows from the products of the ring with that column:
 
 * with an open block, from ring x open, kept with the open block when it closes (`through`);
-* with another closed block, from W = ring x ring since the later one closed.
+* with another closed block, from W = ring x ring since the later one closed.  It begins anew at
+  each closing: W since a late one is small, and would be a difference of two nearly equal sums.
 
 Both are settled when the ring begins anew (`rebase`), or when a block is entered again.  Blocks
 that rang all the time since the last rebase are settled as one product of matrices, those that
@@ -34,7 +35,7 @@ from rtid.kernels.recent import add_tile, admit, release, spread
 
 FloatArray = NDArray[np.float64]
 
-# Rebase before the ring columns lose digits: at det ring = 1e-3 they lose about five of sixteen.
+# Rebase before the ring columns lose digits: at det ring = 1e-3 they lose three of sixteen.
 RING_DET_LIMIT = 1e-3
 
 
@@ -43,7 +44,7 @@ RING_DET_LIMIT = 1e-3
 
 @inlined
 def _ring_ring(e: Any, s: int, r: int) -> float:
-    """W[s, r] since the ring began."""
+    """W[s, r] since the last closing."""
     ring = e.ring
     return e.gram[ring + max(s, r), ring + min(s, r)]
 
@@ -111,18 +112,32 @@ def _add_shared(e: Any, item: Any, block: Any) -> None:
 # --- changes of block ---
 
 
+@inlined
+def _begin_ring_ring(e: Any, closed: Any) -> None:
+    """Let W begin anew at a closing; what it was so far stays with the blocks closed before."""
+    for s in range(e.n_state):
+        for r in range(e.n_state):
+            w = _ring_ring(e, s, r)
+            for p in range(e.n_recent):
+                closed[p].w_start[s, r] -= w
+    for s in range(e.n_state):
+        for r in range(e.n_state):
+            e.gram[e.ring + s, e.ring + r] = 0.0
+
+
 @part
 def close_block(e: Any, closed: Any, blocks: Any, k: int) -> None:
     """Let open block k ring on, its state referred to the ring's origin; clear its columns."""
     p, first, ring = e.open_recent[k], e.first + TERMS * k, e.ring
     item = closed[p]
+    _begin_ring_ring(e, closed)
     item.status, item.size = YOUNG, 0.0
     for s in range(e.n_state):
         for i in range(TERMS):
             item.d[s, i] = e.d[s, first + i]
             item.size = max(item.size, abs(item.d[s, i]))
         for r in range(e.n_state):
-            item.w_start[s, r] = _ring_ring(e, s, r)
+            item.w_start[s, r] = 0.0
         for j in range(1 + e.n_shared):
             item.shared_start[s, j] = e.gram[ring + s, j]
     _read_through(e, k, 1.0, item.through)
@@ -284,12 +299,17 @@ def _settle_young(e: Any, closed: Any, a: int) -> None:
 @inlined
 def _settle_ringing(e: Any, closed: Any, blocks: Any) -> None:
     """d_a' W d_b of those that rang all the time, and their products with the shared columns."""
+    first = 0
+    while first < e.n_recent and closed[first].status != RINGING:
+        first += 1
+    if first == e.n_recent:
+        return
     for s in range(e.n_state):
         target = e.weighted[s]
         for j in range(TERMS * e.n_recent):
             target[j] = 0.0
         for r in range(e.n_state):
-            w, source = _ring_ring(e, s, r), e.ringing[r]
+            w, source = _ring_ring(e, s, r) - closed[first].w_start[s, r], e.ringing[r]
             for j in range(TERMS * e.n_recent):
                 target[j] += w * source[j]
     for p in range(e.n_recent):

@@ -223,7 +223,7 @@ CLOSED = np.dtype(
         ("size", _F),  # of its state when it closed
         ("d", _F, (MAX_STATE, TERMS)),  # state, referred to the ring's origin
         ("through", _F, (MAX_STATE, TERMS)),  # ring x block while it was open
-        ("w_start", _F, (MAX_STATE, MAX_STATE)),  # ring x ring when it closed
+        ("w_start", _F, (MAX_STATE, MAX_STATE)),  # ring x ring when it closed, less later restarts
         ("shared_start", _F, (MAX_STATE, 1 + MAX_SHARED)),  # ring x shared when it closed
         ("gram", _F, (TERMS, TERMS * MAX_RECENT)),
     ],

@@ -15,6 +15,8 @@ from rtid.kernels.layout import TERMS
 
 FloatArray = NDArray[np.float64]
 
+SPLIT = 2.0**27 + 1.0  # cuts a double into two halves of 26 bits, whose products are exact
+
 
 @kernel
 def assemble(
@@ -61,3 +63,28 @@ def mirror(matrix: FloatArray, scale: FloatArray) -> None:
             value = matrix[i, j] * scale[i] * scale[j]
             matrix[i, j] = value
             matrix[j, i] = value
+
+
+@kernel
+def residual(matrix: FloatArray, theta: FloatArray, right: FloatArray) -> FloatArray:
+    """right - matrix theta (n,) in twice the precision, rounded once; matrix (n, n) symmetric.
+
+    Products and sums with what they round off: Dot2 of Ogita, Rump and Oishi, SIAM J. Sci. Comput.
+    26 (2005), for all rows at once.  Entries of 1e300 overflow.
+    """
+    total, lost = right.copy(), np.zeros(len(right))
+    for j in range(len(right)):
+        column, b = matrix[j], -theta[j]
+        b_high = SPLIT * b - (SPLIT * b - b)
+        b_low = b - b_high
+        for i in range(len(right)):
+            a = column[i]
+            a_high = SPLIT * a - (SPLIT * a - a)
+            a_low, p = a - a_high, a * b
+            p_lost = ((a_high * b_high - p) + a_high * b_low + a_low * b_high) + a_low * b_low
+            before = total[i]
+            after = before + p
+            back = after - before
+            total[i] = after
+            lost[i] += (before - (after - back)) + (p - back) + p_lost
+    return total + lost

@@ -98,7 +98,11 @@ class Layout:
         fields += [("recent", _record(kept), (n.recent,)), ("young", _U2, (n.recent,))]
         fields += [("debt", _record(owed))]
         fields += [("slot", _I2, (n.cells,)), ("block", self.block, (n.blocks,))]
-        return _record([*fields, ("sums", total, (n.sums,)), ("counts", _U8, (len(COUNTS),))])
+        fields += [("sums", total, (n.sums,))]
+        if not self.single:
+            kept_sums = TERMS * (2 + n.terms) + TERMS * (TERMS + 1) // 2
+            fields += [("lost", np.float64, (n.blocks, kept_sums))]
+        return _record([*fields, ("counts", _U8, (len(COUNTS),))])
 
     @property
     def work(self) -> np.dtype[np.void]:

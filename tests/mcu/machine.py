@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from rtid.estimator.factor import factorize
 from rtid.estimator.solution import Solution, solve
 from rtid.estimator.state import State, Weights, build
 from rtid.estimator.sums import Normal, normal_equations
@@ -25,7 +26,10 @@ SMALL = Grid(
     np.array([0.0, 0.5, 1.0, 2.0, 4.0, 8.0]) * 1e6,
 )
 BLOCKS = 32
-WELL, LIMIT = 1e4, 1e6  # condition numbers of a block's information
+EPS = float(np.finfo(float).eps)
+# Condition numbers of a block's information.  Its sums are rounded at least once on either side, so
+# its terms may differ by 2 EPS times the condition number: by 1e-10 at SURE.
+SURE, LIMIT = 1e-10 / (2 * EPS), 1e6
 
 
 @dataclass(frozen=True)
@@ -113,8 +117,9 @@ class Apart:
     """Differences of two solutions.
 
     beta, beta_sd: relative; flows: of block means, in shares of the rated flow, on blocks whose
-    condition number is at most LIMIT; sds: the same in standard deviations; terms (well, limit): of
-    all unknowns, in shares of the largest, on blocks of condition at most WELL and LIMIT.
+    condition number is at most LIMIT; sds: the same in standard deviations; terms (sure, limit): in
+    shares of the largest unknown, on blocks of condition at most SURE and LIMIT; roundings: of all
+    unknowns, in units of `rounding_of`.
     """
 
     beta: float
@@ -122,6 +127,20 @@ class Apart:
     flows: float
     sds: float
     terms: tuple[float, float]
+    roundings: float
+
+
+def rounding_of(reference: Reference) -> FloatArray:
+    """What an error of EPS in every sum, of its two columns' sizes, may do to each unknown (n,).
+
+    To first order A d_theta = d_r - d_A theta, so |d_theta_i| <= EPS sum_j |A^-1|_ij g_j m_j with
+    g_j^2 = A_jj and m_j = |y| + sum of g_k |theta_k| over the columns k that j ever met.
+    """
+    normal, theta = reference.normal, reference.solution.unknowns
+    cov = factorize(normal, len(theta) - 6 * len(reference.solution.blocks)).cov()
+    size = np.sqrt(np.diag(normal.gram))
+    met = (normal.gram != 0) @ (size * np.abs(theta)) + np.sqrt(normal.square)
+    return np.asarray(EPS * np.abs(cov) @ (size * met))
 
 
 def solutions_apart(outcome: Outcome, reference: Reference) -> Apart:
@@ -130,7 +149,8 @@ def solutions_apart(outcome: Outcome, reference: Reference) -> Apart:
     blocks, maps = theirs.blocks, outcome.maps
     condition = np.array([block.condition for block in blocks])
     unknowns = outcome.work["theta"][: len(theirs.unknowns)]
-    apart = np.abs(unknowns - theirs.unknowns) / np.abs(theirs.unknowns).max()
+    off = np.abs(unknowns - theirs.unknowns)
+    apart = off / np.abs(theirs.unknowns).max()
     per_block = apart[len(apart) - 6 * len(blocks) :].reshape(-1, 6).max(axis=1)
     flow = np.abs(maps["mean_m3s"] - [block.mean_flow_m3s for block in blocks])
     rated = np.array([theirs.model.edges[block.edge].rated_q_m3s for block in blocks])
@@ -142,5 +162,6 @@ def solutions_apart(outcome: Outcome, reference: Reference) -> Apart:
         abs(float(ours["shared_sd"][0]) / theirs_sd - 1),
         float((flow / rated)[known].max()),
         float((flow / sd)[known].max()),
-        (float(per_block[condition <= WELL].max()), float(per_block[known].max())),
+        (float(per_block[condition <= SURE].max()), float(per_block[known].max())),
+        float((off / np.maximum(rounding_of(reference), 1e-300)).max()),
     )
