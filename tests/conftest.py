@@ -12,8 +12,10 @@ import pytest
 from can.interfaces.udp_multicast import UdpMulticastBus
 from can.interfaces.virtual import VirtualBus
 
-# Two test workers fill two cores already; numba reads this at its first import.
+# Two test workers fill two cores already, and OpenBLAS' idle threads spin: a diagnosis of the tanks
+# took 94 s of processor time instead of 28.  Read at the first import of numba and of numpy.
 os.environ.setdefault("NUMBA_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 SHARED = Path(__file__).parents[1].parent / "shared"
 

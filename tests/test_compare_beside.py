@@ -13,7 +13,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from rtid.beside import replay_beside, sentences
+from rtid import beside
+from rtid.beside import sentences
 from rtid.cli.compare import compare
 from rtid.cli.export import export
 from rtid.cli.replay import replay as replay_command
@@ -44,6 +45,7 @@ from rtid.sim.plant import Plant
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from tests.diagnose.records import record
+from tests.replays import shared_replays  # noqa: F401
 
 SEEN_S, ALL_S = 30.0, 40.0
 LEAK, DELAY, RELIEF = "internal_leakage_laminar", "input_delay", "relief_valve"
@@ -179,7 +181,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @cache
 def studied(folder: Path, project: str) -> TraceComparison:
     trace = folder / (project.removesuffix("_before") + ".parquet")
-    return study(replay_beside(load(folder / f"{project}.toml"), trace))
+    return study(beside.replay_beside(load(folder / f"{project}.toml"), trace))
 
 
 def errors(found: TraceComparison) -> tuple[float, float]:

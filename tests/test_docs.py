@@ -131,10 +131,6 @@ def read(line: str) -> None:
     found.make_context(found.name, arguments)
 
 
-def lines(page: str, language: str) -> list[str]:
-    return [one for text in snippets(page, language) for one in text.splitlines()]
-
-
 def test_every_command_has_an_example_and_a_place_in_the_help() -> None:
     assert set(EXAMPLES) == set(main.COMMANDS)
     assert sorted(name for names in PANELS.values() for name in names) == sorted(EXAMPLES)
@@ -162,31 +158,6 @@ def test_the_help_of_excite_names_every_limit() -> None:
 def test_links_between_the_pages_hold(page: str) -> None:
     for target in re.findall(r"\]\(([^)#:]+)\)", text_of(page)):
         assert (DOCS / target).exists(), target
-
-
-def test_the_lines_of_the_guide_that_are_not_run_can_be_read() -> None:
-    for line in lines("guide.md", "sh read"):
-        read(line)
-
-
-def test_the_guide_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """All its lines one after the other, each with success; then its sections in the file."""
-    monkeypatch.chdir(tmp_path)
-    told = {}
-    for line in lines("guide.md", "sh"):
-        with pytest.raises(SystemExit) as end:
-            main.run(shlex.split(line)[1:])
-        assert end.value.code == Exit.OK, line
-        told[" ".join(line.split()[1:3])] = capsys.readouterr().out
-    assert "Internal leakage, laminar at a-b" in told["diagnose run.blf"]
-    assert "after" in told["add run.blf"]
-    text_ = Path("run.toml").read_text() + "\n" + "\n".join(snippets("guide.md", "toml"))
-    Path("whole.toml").write_text(text_)
-    Path("older.npz").touch()
-    whole = load("whole.toml").sections
-    assert whole.prior is not None and whole.excite is not None and whole.publish.can_id == 0x700
 
 
 def test_the_api_page_is_what_the_docstrings_say() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -41,6 +42,19 @@ def test_version_and_help_load_neither_numba_nor_a_bus() -> None:
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert ends(["--version"]) == Exit.OK
     assert capsys.readouterr().out == f"rtid {rtid.__version__}\n"
+
+
+@pytest.mark.parametrize(("given", "used"), [(None, "1"), ("2", "2")])
+def test_linear_algebra_stays_on_one_thread_unless_asked(
+    given: str | None, used: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS")
+    if given:
+        monkeypatch.setenv("OPENBLAS_NUM_THREADS", given)
+    monkeypatch.setattr(sys, "argv", ["rtid", "--version"])
+    with pytest.raises(SystemExit):
+        main.main()
+    assert os.environ["OPENBLAS_NUM_THREADS"] == used
 
 
 @pytest.mark.parametrize("arguments", [["no-such-command"], ["--no-such-option"]])

@@ -28,7 +28,7 @@ def text_of(page: str) -> str:
 
 def commands(text: str) -> Iterator[list[str]]:
     """The words behind `rtid` of every command line, in blocks and between backticks."""
-    for block in re.findall(r"^```\w*\n(.*?)^```", text, re.M | re.S):
+    for block in re.findall(r"^```[\w ]*\n(.*?)^```", text, re.M | re.S):
         for line in block.replace("\\\n", " ").splitlines():
             if WORD.match(line):
                 yield from _calls(re.split(r"\s{2,}#|\s#\s", line)[0])

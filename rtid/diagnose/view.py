@@ -105,7 +105,7 @@ class View:
     @cached_property
     def t_s(self) -> FloatArray:
         """Instants of the samples (n,)."""
-        return np.asarray(self.chunk[:, 0])
+        return np.ascontiguousarray(self.chunk[:, 0])
 
     @cached_property
     def dt_s(self) -> FloatArray:

@@ -56,6 +56,7 @@ class State:
 
     def advance(self, chunk: FloatArray) -> None:
         """Take samples (n, 2 + signals), rows [t_s, flags, values...]; tables grow as needed."""
+        chunk = np.ascontiguousarray(chunk)  # or each layout in memory compiles the kernel anew
         taken = kernel.advance(self.memory, chunk)
         while taken < len(chunk):
             self.make_room()

@@ -22,6 +22,7 @@ from rtid.store import Generations
 from tests.faults.harness import SECONDS, machine
 
 LIMIT_S = 60.0
+ROOT = Path(__file__).parents[2]
 
 
 @dataclass
@@ -168,7 +169,7 @@ def sender(
         sys.executable, "-m", "tests.faults.sender", str(trace or machine().trace), group,
         str(seconds), str(speed), str(loops), str(flood_hz),
     ]  # fmt: skip
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT)
     try:
         yield process
     finally:
