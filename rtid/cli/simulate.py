@@ -25,6 +25,8 @@ from rtid.sim.recording import TABLE_SUFFIX, write_run
 from rtid.sim.run import Change, Run
 from rtid.sim.run import simulate as run_machine
 
+PROGRAMMABLE = "programmable_valve"
+
 
 def simulate(
     trace: Annotated[
@@ -54,7 +56,10 @@ def simulate(
     seed: Annotated[int, typer.Option(min=0, help="Of noise and motion.")] = 0,
     example: Annotated[
         str | None,
-        typer.Option(help="Another plant, as .csv for `rtid refit`: electric_drive | heated_room."),
+        typer.Option(
+            help="Another plant: programmable_valve, a boom on five valves, as a log; "
+            "electric_drive | heated_room, as .csv for `rtid refit`."
+        ),
     ] = None,
     bus: Annotated[
         str | None, typer.Option(help="Send live: udp_multicast, virtual, or socketcan with vcan.")
@@ -68,13 +73,18 @@ def simulate(
     """Record a simulated machine: the trace, the truth (.truth.json), a project file (.toml).
 
     The trace then replays with `rtid replay TRACE --project TRACE.toml`.  With --bus the machine
-    speaks live instead of, or after, writing.  With --example another plant is recorded, with an
-    effect in it that its equations miss; --hide none leaves it out.
+    speaks live instead of, or after, writing.  With --example another plant is recorded: a boom
+    whose five valves have a command each, its controller driven with the data sheet (--plant for
+    its number), or one for `rtid refit`, with an effect that its equations miss (not with --hide
+    none).
 
     Motions: sweep is the paper's sine of rising frequency; dither, supply and load add steps of the
     command, a wandering supply, a varying load; rich adds all three; push loads shut valves; moves
     goes from point to point.  sweep_record and rich_record end in moves that are held out.
     """
+    if example == PROGRAMMABLE:
+        _programmable(trace, 0 if plant is None else plant, hide, as_json)
+        return
     if example is not None:
         _example(example, trace, seed, hide, as_json)
         return
@@ -127,6 +137,20 @@ def _example(
         print(json.dumps({"hidden": hidden} | _files(written)))
         return
     print(f"hidden: {found.hidden}, {found.size:.3g} {found.unit}" if hidden else "hidden: nothing")
+    for path in written:
+        print(f"wrote {path}")
+
+
+def _programmable(trace: Path | None, number: int, hide: list[str] | None, as_json: bool) -> None:
+    """The boom with this number follows the paper's sweep, each valve by a command of its own."""
+    if trace is None or trace.suffix not in SUFFIXES or not trace.parent.is_dir():
+        raise _usage(f"{trace}: cannot be written", f"name a log: {', '.join(SUFFIXES)}")
+    from rtid.paper.commissioning import five_valves, record_sweep
+
+    written = record_sweep(trace, reduce(hide_wish, hide or (), five_valves(number)), number)
+    if as_json:
+        print(json.dumps(_files(written)))
+        return
     for path in written:
         print(f"wrote {path}")
 

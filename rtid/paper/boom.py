@@ -108,7 +108,12 @@ def logged(
     """A project file and a log for as long as they are needed; more: text for the former."""
     with TemporaryDirectory() as folder:
         trace = Path(folder) / f"boom{LOGS}"
-        write_log(trace, frames)
-        project = trace.with_suffix(".toml")
-        project.write_text(project_text(model, plant.constants.stroke_m, "boom") + more, "utf-8")
-        yield project, trace
+        yield write_boom(trace, plant, model, frames, more), trace
+
+
+def write_boom(trace: Path, plant: Plant, model: Model, frames: Frames, more: str = "") -> Path:
+    """Write the log and, beside it, the project file, which is returned; more: text for it."""
+    write_log(trace, frames)
+    project = trace.with_suffix(".toml")
+    project.write_text(project_text(model, plant.constants.stroke_m, "boom") + more, "utf-8")
+    return project

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -19,7 +20,7 @@ from firmware_bridge.lookup import Table, image, table_of
 from rtid.estimator.flowmap import FlowMap
 from rtid.lookup import sample
 from rtid.model import Grid, Model
-from rtid.paper.boom import Learned, boom, learn_frames
+from rtid.paper.boom import Learned, boom, learn_frames, write_boom
 from rtid.paper.references import swept
 from rtid.sim.bus import tracked_frames
 from rtid.sim.declare import declared_model
@@ -89,6 +90,15 @@ def over_the_bridge(model: Model, flowmap: FlowMap) -> tuple[Table, ...]:
     """The map as a controller has it: through the images of the download and back."""
     tables = (sample(edge, flowmap[edge.name]).table for edge in model.edges)
     return tuple(table_of(image(table, slot)) for slot, table in enumerate(tables))
+
+
+def record_sweep(trace: Path, plant: Plant, number: int) -> list[Path]:
+    """Write the first sweep of a commissioning and its project file.  Raises SimulationError."""
+    reference, known = swept(plant), Knowledge(sampled(manufacturer(plant, number)))
+    tracked = run(plant, known, reference, number)
+    check_sane(plant, tracked, reference)
+    frames = tracked_frames(tracked, reference, START_US)
+    return [trace, write_boom(trace, plant, declared(plant, number), frames)]
 
 
 def commission(plant: Plant, number: int, rounds: int = ROUNDS) -> Commissioned:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from firmware_bridge.download import Image, Session, download
 from firmware_bridge.lookup import image
+from rtid.cli.main import run as main_run
 from rtid.paper import hidden
 from rtid.paper.commissioning import (
     DEADBAND_ERROR_V,
@@ -23,6 +25,8 @@ from rtid.paper.commissioning import (
 from rtid.paper.fig6 import compare, repeated
 from rtid.paper.fig6_picture import CALIBRATED, ESTIMATED, MANUFACTURER, Compared, rms_m
 from rtid.paper.references import amplitude_m, point_to_point, swept
+from rtid.project import load
+from rtid.replay import read_trace
 from rtid.sim.plant import AB, AT, EDGES, PB, FloatArray, Plant
 from rtid.sim.robust import Knowledge, Tracked, received, run, sampled
 from rtid.sim.working_modes import REGENERATE_UNTIL_PA
@@ -112,6 +116,19 @@ def test_all_five_valves_are_identified_in_normal_operation(
         assert np.sqrt(np.mean(error**2)) < 0.01 * true.max(), edge
     beta = last.learned.replay.fit.solution.beta_pa
     np.testing.assert_allclose(beta, plant.beta_pa, rtol=0.02)
+
+
+def test_the_example_is_a_log_and_a_project_of_five_valves(tmp_path: Path) -> None:
+    trace = tmp_path / "boom.blf"
+    with pytest.raises(SystemExit) as end:
+        main_run(["simulate", str(trace), "--example", "programmable_valve", "--plant", "2003"])
+    assert end.value.code == 0
+    project = load(trace.with_suffix(".toml"))
+    samples = read_trace(project, trace).samples
+    assert [edge.name for edge in project.model.edges] == list(EDGES)
+    assert len(samples) == 80_000
+    for edge in project.model.edges:
+        assert (samples.column(edge.command) > OPEN_V).mean() > 0.05, edge.name
 
 
 def test_the_controller_in_c_holds_the_same_map(plant: Plant, done: Commissioned) -> None:
