@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rtid.colours import BLUE, GREEN, INK, ORANGE
+from rtid.colours import BLUE, GREEN, GREY, INK, ORANGE
 from rtid.pictures.style import STYLE
 from rtid.sim.motion import DT_S
 from rtid.sim.plant import FloatArray
@@ -20,6 +22,14 @@ FIRST_SWEEP = "estimated, first sweep"
 KINDS = CALIBRATED, ESTIMATED, FIRST_SWEEP, MANUFACTURER
 SHOWN = CALIBRATED, ESTIMATED, MANUFACTURER
 COLOURS = {CALIBRATED: GREEN, ESTIMATED: BLUE, MANUFACTURER: ORANGE}
+VALVES = {  # colours of their commands
+    "supply to A": BLUE,
+    "A to tank": GREEN,
+    "supply to B": ORANGE,
+    "B to tank": GREY,
+    "A to B": INK,
+}
+BESIDE_TITLE: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.97), "borderpad": 0}
 SURE = 2.0  # standard errors of a paired difference
 
 
@@ -60,11 +70,11 @@ class Compared:
 
 
 def draw(found: Compared) -> Figure:
-    """Reference on top, the errors below, once more without the largest."""
+    """Reference on top, the errors below, once more without the largest, then the five valves."""
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(9.0, 6.6))
-        first, second, third = figure.subplots(3, 1, sharex=True)
-        t = DT_S * np.arange(len(found.reference))
+        figure = Figure(figsize=(9.0, 8.6))
+        first, second, third, last = figure.subplots(4, 1, sharex=True)
+        t = DT_S * np.arange(len(found.reference), dtype=np.float64)
         first.plot(t, 1e3 * found.reference[:, 0], color=INK)
         first.set(ylabel="reference in mm", title=f"random boom {found.number}")
         for axis, kinds in ((second, SHOWN), (third, SHOWN[:2])):
@@ -72,8 +82,17 @@ def draw(found: Compared) -> Figure:
                 error_mm = 1e3 * found.runs[kind][0].error_m
                 axis.plot(t, error_mm, color=COLOURS[kind], lw=1.0, label=kind)
             axis.set_ylabel("error in mm")
-            axis.legend(loc="upper right", ncols=3)
+            axis.legend(**BESIDE_TITLE, ncols=3)
         second.set_title("tracking error")
         third.set_title("the same without the manufacturer's map")
-        third.set_xlabel("time in s")
+        _draw_valves(last, t, found.runs[ESTIMATED][0].commands_v)
     return figure
+
+
+def _draw_valves(axis: Axes, t: FloatArray, commands_v: FloatArray) -> None:
+    """The commands with the estimated map; a valve that is shut is not drawn."""
+    for i, (edge, colour) in enumerate(VALVES.items()):
+        w = np.where(commands_v[:, i] > 0, commands_v[:, i], np.nan)
+        axis.plot(t, w, ".", color=colour, ms=1.5, label=edge)
+    axis.set(ylabel="command in V", xlabel="time in s", title="valves, with the estimated map")
+    axis.legend(**BESIDE_TITLE, ncols=5, markerscale=5)
