@@ -191,6 +191,7 @@ def test_calibrated_is_not_beaten_but_by_noise(thirty: list[Compared]) -> None:
 @pytest.mark.xfail(strict=True, reason="both are at the noise: either is first in half of them")
 def test_calibrated_is_first(thirty: list[Compared]) -> None:
     order = [c.rms_m(CALIBRATED) <= c.rms_m(ESTIMATED) < c.rms_m(MANUFACTURER) for c in thirty]
+    leave("Fig. 6: in order", f"{np.mean(order):.0%}", "90 %", "30 booms")
     assert np.mean(order) >= 0.9
 
 
