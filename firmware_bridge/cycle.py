@@ -158,7 +158,8 @@ def push(
         flags = _complete(slots, slots[k], progress[0], messages[row_message].late_us, counts)
         if flags >= 0:
             out_t_us[n_out], out_flags[n_out] = slots[k].row_us, flags
-            out_values[n_out] = values[k]
+            for j in range(values.shape[1]):
+                out_values[n_out, j] = values[k, j]
             n_out += 1
     return n_out
 

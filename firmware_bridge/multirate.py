@@ -150,7 +150,8 @@ def _emit(
     if not pending.full:
         return n_out
     out_t_us[n_out], out_flags[n_out] = pending.t_us, pending.row_flags
-    out_values[n_out] = row
+    for j in range(len(row)):
+        out_values[n_out, j] = row[j]
     pending.full = False
     return n_out + 1
 
@@ -198,7 +199,8 @@ def _drain(
         n_out = _emit(pending[0], row, out_t_us, out_values, out_flags, n_out)
         if reason == checks.OK:
             _renew(pending[0], instant_us, flags, counts)
-            row[:] = new_row
+            for j in range(len(row)):
+                row[j] = new_row[j]
         instant_us = _next_instant(queues, times)
     return n_out
 

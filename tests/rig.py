@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
 from scipy.signal import lfilter
+from typer.testing import CliRunner
 
 from rtid.compare import ReferenceMap
 from rtid.comparing import TraceComparison, compare_trace
@@ -20,10 +20,13 @@ from rtid.kernels.explain import explain
 from rtid.model import Edge, FloatArray
 from rtid.project import load
 from rtid.replay import Replay, replay
+from tools import table_to_can
 
 ROOT = Path(__file__).parents[1]
 PROJECT = ROOT / "rtid" / "project" / "examples" / "cylinder.toml"
 TRUE_BETA_PA = 700e6
+CONVERTER = typer.Typer()
+CONVERTER.command()(table_to_can.main)
 
 
 @dataclass(frozen=True)
@@ -38,8 +41,8 @@ class EdgeFigures:
 
 def as_can_log(table: Path, log: Path, *options: str) -> Path:
     """Convert a table to a CAN log with the project's own converter."""
-    command = [sys.executable, "-m", "tools.table_to_can", str(table), str(log)]
-    subprocess.run([*command, *options], check=True, capture_output=True, cwd=ROOT)
+    done = CliRunner().invoke(CONVERTER, [str(table), str(log), *options], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
     return log
 
 

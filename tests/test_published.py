@@ -13,7 +13,7 @@ from rtid.compare.reference import GainTable, ReferenceMap
 from rtid.estimator import published
 from rtid.estimator.estimator import to_chunk
 from rtid.estimator.flowmap import EXTRAPOLATED, LEARNING, PRIOR, VALID, EdgeMap, FlowMap
-from rtid.estimator.monotone import FALLS, LIMIT
+from rtid.estimator.monotone import FALLS, LIMIT, looked_at
 from rtid.estimator.prior import reference_map
 from rtid.estimator.published import cell_terms, publish
 from rtid.estimator.record import fit_record
@@ -130,6 +130,16 @@ def test_the_change_stays_within_its_limit_and_costs_nothing(
     free_rms, rms = (float(np.sqrt(np.mean(np.concatenate(e) ** 2))) for e in errors)
     assert rms < 1.1 * free_rms
     assert rms < 1.2e-3
+
+
+def test_the_slopes_that_must_not_fall_are_the_maps_own(maps: list[FlowMap]) -> None:
+    """Their linear form in the terms, for random terms, is the gradient to 1e-12."""
+    rng = np.random.default_rng(3)
+    for edge in maps[0].edges:
+        other = replace(edge, theta=edge.theta * rng.uniform(-1, 1, edge.theta.shape))
+        found = looked_at(other, np.ones(edge.status.size, bool))
+        expected = other.gradient(found.w, found.dp)[0] * np.sign(found.dp)
+        np.testing.assert_allclose(found.of(other.theta), expected, atol=1e-12 * expected.max())
 
 
 def test_what_contradicts_a_rising_flow_is_kept_and_marked() -> None:

@@ -1,6 +1,8 @@
 """The converter from tables to CAN logs: exact stamps, exact values, honest sidecar."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import can
@@ -9,19 +11,17 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 import pytest
-import typer
 from typer.testing import CliRunner
 
 from firmware_bridge.catalog import load
 from firmware_bridge.frames import Frames, from_messages
 from rtid.sim.frames import CONTROLLER_ROUTES, cycle_frames
 from rtid.sim.log import START_US, write_log
+from tests.rig import CONVERTER, ROOT
 from tools import table_to_can
 
 N = 3000
 RIG = Path(__file__).parents[1].parent / "shared" / "data" / "rig" / "measured" / "rig_01.parquet"
-APP = typer.Typer()
-APP.command()(table_to_can.main)
 
 
 @pytest.fixture
@@ -44,7 +44,7 @@ def table(tmp_path: Path) -> Path:
 
 
 def convert(*arguments: object) -> str:
-    result = CliRunner().invoke(APP, [str(a) for a in arguments], catch_exceptions=False)
+    result = CliRunner().invoke(CONVERTER, [str(a) for a in arguments], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     return result.output
 
@@ -130,7 +130,7 @@ def test_wrong_arguments_are_named(
 ) -> None:
     out = tmp_path / "never.log"
     result = CliRunner(env={"COLUMNS": "200", "NO_COLOR": "1"}).invoke(
-        APP, [str(table), str(out), *arguments]
+        CONVERTER, [str(table), str(out), *arguments]
     )
     assert result.exit_code == 2
     assert said in " ".join(result.output.split())
@@ -140,6 +140,14 @@ def test_wrong_arguments_are_named(
 def test_unknown_log_format_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="use one of"):
         write_log(tmp_path / "run.xyz", from_messages([]))
+
+
+def test_it_is_a_command(table: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "tools.table_to_can"]
+    command += [str(table), str(tmp_path / "command.blf")]
+    subprocess.run(command, check=True, capture_output=True, cwd=ROOT)
+    convert(table, tmp_path / "here.blf")
+    assert (tmp_path / "command.blf").read_bytes() == (tmp_path / "here.blf").read_bytes()
 
 
 def test_the_help_tells_the_modes() -> None:

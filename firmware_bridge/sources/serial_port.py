@@ -121,7 +121,8 @@ def parse(
             continue
         t_us[n], can_id[n], length[n], ends[n] = stamp, number, size - 14, start
         data[n] = 0
-        data[n, : size - 14] = block[12 : size - 2]
+        for j in range(size - 14):
+            data[n, j] = block[12 + j]
         n += 1
     return n, start, bad
 

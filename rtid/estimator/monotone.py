@@ -12,7 +12,8 @@ than LIMIT standard deviations keeps what the data say, and is marked.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,37 +35,74 @@ FALLS = "flow falls with the command, {:.1f} standard deviations against it"
 Mask = NDArray[np.bool_]
 
 
+@dataclass(frozen=True)
+class Slopes:
+    """Slopes dQ/dw sign(dp) at k points, linear in the terms of the cells that blend there.
+
+    w (k,) in V, dp (k,) in Pa; cells (k, 4), by_term (k, 4, 6): a slope is by_term times these
+    cells' terms; parts (k, 4): the same cells, in place of one without weight that with the most.
+    """
+
+    w: FloatArray
+    dp: FloatArray
+    cells: NDArray[np.intp]
+    parts: NDArray[np.intp]
+    by_term: FloatArray
+
+    def __getitem__(self, at: Any) -> Slopes:
+        return Slopes(self.w[at], self.dp[at], self.cells[at], self.parts[at], self.by_term[at])
+
+    def of(self, theta: FloatArray) -> FloatArray:
+        """Slopes (k,) of a map with terms theta (nu, nd, 6)."""
+        own = theta.reshape(-1, TERMS)[self.cells]
+        return np.asarray(np.einsum("kci,kci->k", self.by_term, own))
+
+    def rows(self, root: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
+        """Rows (k, cells, 6) of unit norm on z, theta + root z; their norms; the cells."""
+        cells, where = np.unique(self.cells, return_inverse=True)
+        moved = self.by_term[:, :, None, :] @ root[self.cells]
+        rows = np.zeros((len(self.dp), len(cells), TERMS))
+        np.add.at(rows, (np.arange(len(rows))[:, None], where.reshape(-1, 4)), moved[:, :, 0])
+        sd = np.linalg.norm(rows, axis=(1, 2))
+        return rows / sd[:, None, None], sd, cells
+
+
 def monotone(edge: EdgeMap, spread: FloatArray) -> EdgeMap:
     """The map that does not fall where cells are known; spread (nu, nd, 6, 6): C of each cell."""
     known = np.isin(edge.status, KNOWN).ravel()
     root = _roots(spread.reshape(-1, TERMS, TERMS))
-    w, dp, parts = _points(edge, known)
-    reason, theta, needed = dict(edge.reason), edge.theta, _by_the_worst_row(edge, root, w, dp)
+    slopes = looked_at(edge, known)
+    reason, theta, needed = dict(edge.reason), edge.theta, _by_the_worst_row(edge, root, slopes)
     while True:
         against = known & (needed > LIMIT)
         for cell in np.flatnonzero(against).tolist():
             at = divmod(cell, edge.grid.shape[1])
             reason[at] = "; ".join(filter(None, (reason.get(at), FALLS.format(needed[cell]))))
-        left = ~against[parts].any(axis=1)
-        w, dp, parts = w[left], dp[left], parts[left]
-        theta, needed = _least_change(edge, root, w, dp, parts[:, 0])
+        slopes = slopes[~against[slopes.parts].any(axis=1)]
+        theta, needed = _least_change(edge, root, slopes)
         if not (known & (needed > LIMIT)).any():
             return replace(edge, theta=theta, reason=reason)
 
 
-def _points(edge: EdgeMap, known: Mask) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
-    """Where slopes are looked at: w, dp (k,) in known cells' reach, and the cells there (k, 4)."""
+def looked_at(edge: EdgeMap, known: Mask) -> Slopes:
+    """Slopes at all points in known cells' reach: closely along w, coarsely along dp."""
     w, dp = np.meshgrid(
         _around(edge.grid.u_v, DENSE), _around(edge.grid.dp_pa, COARSE), indexing="ij"
     )
     used = (w > edge.safe_band_v) & (dp != 0)
     w, dp = w[used], dp[used]
-    corners = [(i * edge.grid.shape[1] + j, g) for (i, j), g, *_ in edge.corners(w, dp)]
-    cells, weights = (np.stack(part, axis=1) for part in zip(*corners, strict=True))
+    risen, by_w = foot(edge.grid.u_v, edge.safe_band_v, w)
+    at, by_term, weight = [], [], []
+    for (i, j), g, g_w, _ in edge.corners(w, dp):
+        phi, phi_w, _ = edge.terms((i, j), w, dp)
+        by_term.append((risen * g)[:, None] * phi_w + (risen * g_w + by_w * g)[:, None] * phi)
+        at.append(i * edge.grid.shape[1] + j)
+        weight.append(g)
+    cells, weights = np.stack(at, axis=1), np.stack(weight, axis=1)
     main = np.take_along_axis(cells, weights.argmax(axis=1)[:, None], axis=1)
-    cells = np.where(weights > 0, cells, main)
-    some = known[cells].any(axis=1)
-    return w[some], dp[some], cells[some]
+    parts = np.where(weights > 0, cells, main)
+    signed = np.stack(by_term, axis=1) * np.sign(dp)[:, None, None]
+    return Slopes(w, dp, cells, parts, signed)[known[parts].any(axis=1)]
 
 
 def _around(border: FloatArray, count: int) -> FloatArray:
@@ -81,51 +119,24 @@ def _roots(spread: FloatArray) -> FloatArray:
     return np.asarray(vectors * np.sqrt(values)[:, None, :])
 
 
-def _slopes(edge: EdgeMap, w: FloatArray, dp: FloatArray) -> FloatArray:
-    return np.asarray(edge.gradient(w, dp)[0] * np.sign(dp))
-
-
-def _rows(
-    edge: EdgeMap, root: FloatArray, w: FloatArray, dp: FloatArray
-) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
-    """Slopes as rows (k, cells, 6) of unit norm on z, theta + root z; their norms; the cells."""
-    risen, by_w = foot(edge.grid.u_v, edge.safe_band_v, w)
-    data, at = [], []
-    for (i, j), g, g_w, _ in edge.corners(w, dp):
-        phi, phi_w, _ = edge.terms((i, j), w, dp)
-        data.append((risen * g)[:, None] * phi_w + (risen * g_w + by_w * g)[:, None] * phi)
-        at.append(i * edge.grid.shape[1] + j)
-    cells, where = np.unique(np.stack(at, axis=1), return_inverse=True)
-    where = where.reshape(len(w), 4)
-    moved = np.stack(data, axis=1)[:, :, None, :] @ root[cells[where]]
-    rows = np.zeros((len(w), len(cells), TERMS))
-    np.add.at(
-        rows, (np.arange(len(w))[:, None], where), moved[:, :, 0] * np.sign(dp)[:, None, None]
-    )
-    sd = np.linalg.norm(rows, axis=(1, 2))
-    return rows / sd[:, None, None], sd, cells
-
-
-def _by_the_worst_row(edge: EdgeMap, root: FloatArray, w: FloatArray, dp: FloatArray) -> FloatArray:
+def _by_the_worst_row(edge: EdgeMap, root: FloatArray, slopes: Slopes) -> FloatArray:
     """Standard deviations (cells,) by which a single slope that falls would move each cell."""
-    needed, slope = np.zeros(len(root)), _slopes(edge, w, dp)
+    needed, slope = np.zeros(len(root)), slopes.of(edge.theta)
     falls = slope < 0
     if falls.any():
-        rows, sd, cells = _rows(edge, root, w[falls], dp[falls])
+        rows, sd, cells = slopes[falls].rows(root)
         alone = (-slope[falls] / sd)[:, None] * np.linalg.norm(rows, axis=2)
         needed[cells] = alone.max(axis=0)
     return needed
 
 
-def _least_change(
-    edge: EdgeMap, root: FloatArray, w: FloatArray, dp: FloatArray, cell: NDArray[np.intp]
-) -> tuple[FloatArray, FloatArray]:
+def _least_change(edge: EdgeMap, root: FloatArray, slopes: Slopes) -> tuple[FloatArray, FloatArray]:
     """The nearest terms with slopes >= 0 at all points; each cell's change in standard deviations.
 
     Per cell and pressure drop only the steepest fall is demanded to rise, then what falls yet.
     """
-    line = np.stack([cell, dp], axis=1)
-    start = slope = _slopes(edge, w, dp)
+    line = np.stack([slopes.parts[:, 0], slopes.dp], axis=1)
+    start = slope = slopes.of(edge.theta)
     theta, needed = edge.theta, np.zeros(len(root))
     demanded = np.zeros(0, np.intp)
     for _ in range(ROUNDS):
@@ -134,14 +145,14 @@ def _least_change(
             break
         falls = falls[np.argsort(slope[falls])]
         demanded = np.append(demanded, falls[np.unique(line[falls], axis=0, return_index=True)[1]])
-        rows, sd, cells = _rows(edge, root, w[demanded], dp[demanded])
+        rows, sd, cells = slopes[demanded].rows(root)
         z = _least_distance(rows.reshape(len(rows), -1), MARGIN - start[demanded] / sd)
         z = z.reshape(-1, TERMS)
         needed = np.zeros(len(root))
         needed[cells] = np.linalg.norm(z, axis=1)
         theta = edge.theta.copy()
         theta.reshape(-1, TERMS)[cells] += (root[cells] @ z[:, :, None])[:, :, 0]
-        slope = _slopes(replace(edge, theta=theta), w, dp)
+        slope = slopes.of(theta)
     return theta, needed
 
 

@@ -90,7 +90,8 @@ def drive(
     )
     for i in range(e.n_edges):
         foot[i] = foot_width(e, i, overlap)
-    p[:n_c] = start[:n_c]
+    for c in range(n_c):
+        p[c] = start[c]
     x, v, h = start[n_c], start[n_c + 1], 1.0
     set_step(e, STEP_S)
     for k in range(len(reference)):

@@ -175,6 +175,7 @@ def filter_rows(
             due += period_s * max(1.0, math.ceil((t_s[k + 1] - due) / period_s))
             if t_s[k + 1] >= ready and rows < len(out):
                 out[rows, 0] = t_s[k + 1]
-                out[rows, 1:] = state[0]
+                for j in range(m):
+                    out[rows, 1 + j] = state[0, j]
                 rows += 1
     return rows

@@ -105,9 +105,11 @@ def advance(
     slopes, trial, q, net = np.empty((4, len(y))), np.empty(len(y)), np.empty(5), np.empty(2)
     valves, w, rate, table = m.valves, spools.w, spools.rate, spools.table
     before, after = spools.commands[0], spools.commands[1]
-    gains[2] = start_gains
+    for edge in range(5):
+        gains[2, edge] = start_gains[edge]
     for step in range(substeps):
-        gains[0] = gains[2]
+        for edge in range(5):
+            gains[0, edge] = gains[2, edge]
         for half in range(3):
             share = (step + 0.5 * half) / substeps
             for j in range(inputs.shape[1]):
@@ -125,8 +127,8 @@ def advance(
                     travel(e, m.lag_s, before, after, until_s, 0.5 * h_s, table, w, rate)
             for edge in range(5):
                 gains[half, edge] = flow_gain(valves[edge], w[edge])
-            if e is not None:
-                gains[half] *= inputs[half, FACTOR - P_SUPPLY]
+                if e is not None:
+                    gains[half, edge] *= inputs[half, FACTOR - P_SUPPLY]
         runge_kutta(m.c, e, gains, inputs, h_s, y, slopes, trial, q, net)
 
 
@@ -224,15 +226,17 @@ def run_loop(
     if e is not None:
         at_once = m.lag_s + e.whole.spool_lag_s + e.whole.spool_radps <= 0.0
     for i in range(len(x)):
-        record.signals[i, 1:] = y[:4]
+        for j in range(4):
+            record.signals[i, 1 + j] = y[j]
         x_measured_m = quantise(seen_position(e, x, i, dt_s) + x_noise_m[i], x_step_m)
         u = quantise(command(m.k, drive[i], x_measured_m), u_step_v)
         record.x_measured_m[i], record.signals[i, 0] = x_measured_m, u
         change_s = steer(m, e, i, dt_s, u, spools)
-        if at_once:
-            spools.w[:] = spools.commands[0 if change_s > 0.0 else 1]
-        record.opening_v[i] = spools.w
+        now = spools.commands[0 if change_s > 0.0 else 1]
         for edge in range(5):
+            if at_once:
+                spools.w[edge] = now[edge]
+            record.opening_v[i, edge] = spools.w[edge]
             gains[edge] = flow_gain(m.valves[edge], spools.w[edge])
         if e is not None:
             gains *= drive[i, FACTOR]

@@ -185,7 +185,8 @@ def track(
             w[edge] = quantise(w[edge], COMMAND_STEP_V)
             gains[edge] = flow_gain(m.valves[edge], spools.w[edge])
         record[i, 0], record[i, 1], record[i, 2] = y[2] - ref[i, 0], y[0], y[1]
-        record[i, 10:] = w
+        for j in range(5):
+            record[i, 10 + j] = w[j]
         energy_j += drawn_w(m.c, e, gains, drive[i], y, q) * DT_S
         advance(m, e, gains, drive[i : i + 2], decay, 0.0, DT_S / SUBSTEPS, spools, y, SUBSTEPS)
     return energy_j

@@ -38,11 +38,16 @@ pytest.importorskip("distributed", reason="pip install 'rtid[fleet]'")
 
 
 @pytest.fixture(scope="session")
-def learned(traces: Path, project: Path, tmp_path_factory: pytest.TempPathFactory) -> Archive:
+def outcomes(traces: Path, project: Path) -> list[Outcome]:
     """All traces learned from, in this process."""
+    return [outcome(job, False) for job in find([traces / "traces"], project)[0]]
+
+
+@pytest.fixture(scope="session")
+def learned(outcomes: list[Outcome], tmp_path_factory: pytest.TempPathFactory) -> Archive:
     archive = Archive(tmp_path_factory.mktemp("learned"))
-    for job in find([traces / "traces"], project)[0]:
-        archive.keep(outcome(job, False))
+    for found in outcomes:
+        archive.keep(found)
     return archive
 
 
@@ -201,12 +206,17 @@ def test_a_run_goes_on_where_it_was_stopped(traces: Path, project: Path, tmp_pat
 
 
 def test_the_command_ranks_the_machines_and_writes_what_others_read(
-    traces: Path, project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    traces: Path,
+    project: Path,
+    outcomes: list[Outcome],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     out = tmp_path / "out"
     archive = Archive(out)
-    for job in find([traces / "traces"], project)[0]:
-        archive.keep(outcome(job, job.machine == WORN and job.trace.stem == "day0"))
+    for found in outcomes:
+        is_diagnosed = found.job.machine == WORN and found.job.trace.stem == "day0"
+        archive.keep(outcome(found.job, True) if is_diagnosed else found)
     with pytest.raises(SystemExit) as end:
         main.run(["fleet", str(traces / "traces"), "-p", str(project), "-o", str(out), "--json"])
     assert not end.value.code
