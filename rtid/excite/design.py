@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rtid.diagnose.trials import Key
+from rtid.estimator.sums import IntArray
 from rtid.excite.driving import SHUT, STEP_S, SUPPLY
 from rtid.excite.information import Information, of_blocks, of_effects
 from rtid.excite.library import REST_S, Segment, library
@@ -130,31 +132,65 @@ def working_weights(machine: Machine, limits: Limits) -> FloatArray:
     return weights
 
 
-def missing(
-    segments: Sequence[Candidate], known: Known, weights: FloatArray
-) -> tuple[Candidate, ...]:
-    """Segments that are still worth running by what is learned, the most telling first.
+@dataclass(frozen=True)
+class Missing:
+    """Grid cells (m,) and effects that are not known well enough, and the segments that tell them.
+
+    Only what some segment of those that were tried would tell; segments: the most telling first.
+    """
+
+    cells: IntArray
+    effects: tuple[Key, ...]
+    segments: tuple[Candidate, ...]
+    tells: tuple[frozenset[int | Key], ...]  # which of the cells and effects each segment improves
+
+    def pieces(self, most: int) -> list[tuple[Candidate, int]]:
+        """A few segments that tell most together, each with how much it adds to those before."""
+        found, open_ = list[tuple[Candidate, int]](), set[int | Key]().union(*self.tells)
+        while open_ and len(found) < most:
+            best = max(range(len(self.tells)), key=lambda k: len(self.tells[k] & open_))
+            found.append((self.segments[best], len(self.tells[best] & open_)))
+            open_ -= self.tells[best]
+        return found
+
+
+def missing(segments: Sequence[Candidate], known: Known, weights: FloatArray) -> Missing:
+    """What is still missing by what is learned, and the segments that are worth running for it.
 
     Worth running is what improves blocks that are not known to GOAL, or named effects, by a share
     IMPROVED of their standard error, as long as these are a share WORTH of what it visits.
     """
-    shares = np.array([_share(c.told, known, weights) for c in segments])
-    order = np.argsort(-shares, kind="stable")
-    return tuple(segments[k] for k in order if shares[k] >= WORTH)
+    found = [_improved(c.told, known) for c in segments]
+    pairs = zip(segments, found, strict=True)
+    shares = np.array([_share(c.told, better, weights) for c, better in pairs])
+    order = [k for k in np.argsort(-shares, kind="stable").tolist() if shares[k] >= WORTH]
+    tells = tuple(found[k] for k in order)
+    every = frozenset[int | Key]().union(*tells)
+    cells = sorted(cell for cell in every if isinstance(cell, int))
+    effects = sorted(key for key in every if not isinstance(key, int))
+    kept = tuple(segments[k] for k in order)
+    return Missing(np.array(cells, dtype=np.int64), tuple(effects), kept, tells)
 
 
-def _share(told: Information, known: Known, weights: FloatArray) -> float:
+def _improved(told: Information, known: Known) -> frozenset[int | Key]:
+    """Cells and effects that a segment would still improve."""
+    own = known.blocks[told.cells]
+    before, after = standard_errors(own), standard_errors(own + told.blocks)
+    cells = told.cells[(before > GOAL) & (after < (1.0 - IMPROVED) * before)]
+    effects = [
+        key
+        for key, value in told.effects.items()
+        if (known.effects.get(key, 0.0) + value) * (1.0 - IMPROVED) ** 2
+        > known.effects.get(key, 0.0)
+    ]
+    return frozenset[int | Key]([*cells.tolist(), *effects])
+
+
+def _share(told: Information, better: frozenset[int | Key], weights: FloatArray) -> float:
     """Share of what a segment visits, by weight, that it would still improve."""
-    own, visited = known.blocks[told.cells], weights[told.cells]
-    before = standard_errors(own)
-    after = standard_errors(own + told.blocks)
-    open_ = (before > GOAL) & (after < (1.0 - IMPROVED) * before)
-    total, better = float(visited.sum()), float(visited[open_].sum())
-    for key, value in told.effects.items():
-        total += EFFECT_WEIGHT
-        past = known.effects.get(key, 0.0)
-        better += EFFECT_WEIGHT * ((past + value) * (1.0 - IMPROVED) ** 2 > past)
-    return better / max(total, 1e-12)
+    total = float(weights[told.cells].sum()) + EFFECT_WEIGHT * len(told.effects)
+    gained = sum(weights[key] if isinstance(key, int) else EFFECT_WEIGHT for key in better)
+    return float(gained / max(total, 1e-12))
 
 
 def stitched(segments: Sequence[Candidate], limits: Limits) -> tuple[list[Candidate], FloatArray]:

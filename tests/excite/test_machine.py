@@ -12,12 +12,13 @@ from rtid.cli.main import run
 from rtid.compare.reference import theta_cells
 from rtid.errors import RtidError
 from rtid.estimator.estimator import Estimator, to_chunk
+from rtid.excitable import limits_of, machine_of, section_of
 from rtid.excite import library
 from rtid.excite.driving import SHUT, STEP_S, Control, Piston
 from rtid.excite.limits import LimitError
 from rtid.excite.machine import Machine
 from rtid.excite.prediction import assess
-from rtid.exciting import excite, limits_of, machine_of, section_of
+from rtid.exciting import excite
 from rtid.model import Grid, Lag
 from rtid.project import load
 from rtid.sim.declare import declared_model

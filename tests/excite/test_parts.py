@@ -98,9 +98,30 @@ def test_what_is_learned_is_not_missing() -> None:
     segment = Segment("", np.zeros((10, 5)))
     pool = [Candidate(segment, _told(0, 1e6)), Candidate(segment, _told(1, 1e6))]
     known = Known.nothing(2)
-    assert set(map(id, missing(pool, known, np.ones(2)))) == set(map(id, pool))
+    assert missing(pool, known, np.ones(2)).cells.tolist() == [0, 1]
     known.add(_told(0, 1e9))
-    assert missing(pool, known, np.ones(2)) == (pool[1],)
+    left = missing(pool, known, np.ones(2))
+    assert (left.cells.tolist(), left.effects, left.segments) == ([1], (), (pool[1],))
+    known.add(_told(1, 1e9))
+    assert missing(pool, known, np.ones(2)).segments == ()
+
+
+def test_an_effect_is_missing_until_it_can_be_seen_well() -> None:
+    leak = "external_leakage_laminar", "a"
+    told = replace(_told(0, 1e6), effects={leak: 1.0})
+    pool, known = [Candidate(Segment("", np.zeros((10, 5))), told)], Known.nothing(1)
+    known.add(_told(0, 1e9))
+    assert missing(pool, known, np.ones(1)).effects == (leak,)
+    known.effects[leak] = 100.0
+    assert missing(pool, known, np.ones(1)).effects == ()
+
+
+def test_the_pieces_that_tell_most_do_not_tell_the_same() -> None:
+    both = Information(np.array([0, 1]), 1e6 * np.stack([np.eye(6)] * 2), np.full(2, 60.0))
+    told = [_told(0, 1e6), both, _told(1, 1e6), _told(2, 1e6)]
+    pool = [Candidate(Segment(str(k), np.zeros((10, 5))), t) for k, t in enumerate(told)]
+    pieces = missing(pool, Known.nothing(3), np.ones(3)).pieces(3)
+    assert [(c.segment.name, n) for c, n in pieces] == [("1", 2), ("3", 1)]
 
 
 def test_every_broken_limit_is_named_with_its_place() -> None:
