@@ -25,10 +25,10 @@ def advise(project: Project, snapshot: Path, chunk: FloatArray) -> Advice:
 
     chunk: the newest samples (n, 2 + signals), which tell of effects.  Raises RtidError.
     """
-    return _advice(start(project, after=snapshot, chunk=chunk))
+    return _advice(start(project, after=snapshot, chunk=chunk), snapshot)
 
 
-def _advice(found: Start) -> Advice:
+def _advice(found: Start, snapshot: Path) -> Advice:
     left = found.missing
     if left is None or not left.segments:
         return Advice(time.time(), NOTHING)
@@ -40,6 +40,6 @@ def _advice(found: Start) -> Advice:
     text = (
         f"Not known well enough: {', '.join([*open_, *effects])}. {len(left.segments)} of "
         f"{len(found.pool)} pieces of motion are worth running, above all: {'; '.join(pieces)}. "
-        f"`rtid excite --after {found.taught_by}` makes one motion of them."
+        f"`rtid excite --after {snapshot}` makes one motion of them."
     )
     return Advice(time.time(), text, blocks, effects, tuple(pieces))

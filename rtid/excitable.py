@@ -1,7 +1,8 @@
 """What a motion is designed for: the project's machine, its limits, and what is known before.
 
-What is known before is what a trace or a snapshot has taught.  One rule says what is missing after
-it, `rtid.excite.design.missing`, for `rtid excite` and for the coach on board.
+What is known before is the prior map of the project, and what a trace or a snapshot has taught.
+One rule says what is missing after it, `rtid.excite.design.missing`, for `rtid excite` and for the
+coach on board.
 """
 
 from __future__ import annotations
@@ -18,16 +19,17 @@ from rtid.comparing import find_reference
 from rtid.daemon.beside import load_for
 from rtid.effects import catalogue
 from rtid.errors import RtidError
-from rtid.estimator.published import publish
+from rtid.estimator.prior import Prior
 from rtid.estimator.solution import Solution
 from rtid.excite.design import Candidate, Missing, candidates, missing, working_weights
 from rtid.excite.driving import Control, Piston
 from rtid.excite.information import of_effects
-from rtid.excite.known import known_from
+from rtid.excite.known import known_from, prior_cells, take_prior
 from rtid.excite.limits import Limits
 from rtid.excite.machine import Machine, rated_map
 from rtid.excite.selection import Known
 from rtid.model import FloatArray
+from rtid.priors import find_prior, published
 from rtid.project import Project
 from rtid.project.schema import ExciteSection
 from rtid.replay import replay
@@ -82,30 +84,46 @@ def start(
     for name in see:
         if name not in catalogue():
             raise RtidError(f"no effect {name!r}", nearest(name, list(catalogue())), exit_code=2)
-    machine, known = _nominal(project, section, see, after)
+    prior = find_prior(project)
+    machine, known = _nominal(project, section, see, after, prior)
     if known is not None and see and chunk is not None and len(chunk):
         known.effects.update(of_effects(machine, chunk, see))
     limits = replace(limits_of(section), **changes)
     pool = candidates(machine, limits, see, progress)
     left = missing(pool, known, working_weights(machine, limits)) if known is not None else None
-    return Start(machine, limits, pool, known, left, str(after or ""))
+    told = [str(after)] if after is not None else []
+    told += [f"the prior {prior.name}"] if prior is not None else []
+    return Start(machine, limits, pool, known, left, " and ".join(told))
 
 
 def _nominal(
-    project: Project, section: ExciteSection, see: tuple[str, ...], after: Path | None
+    project: Project,
+    section: ExciteSection,
+    see: tuple[str, ...],
+    after: Path | None,
+    prior: Prior | None,
 ) -> tuple[Machine, Known | None]:
-    """The nominal machine, and what a snapshot or a trace has taught of it."""
-    if after is None:
+    """The nominal machine, and what a prior and a snapshot or a trace have taught of it."""
+    if after is None and prior is None:
         return machine_of(project, section), None
-    if after.suffix.lower() == SNAPSHOT:
-        solution = load_for(after, project)[0].solution()
-        return machine_of(project, section, solution), known_from(project.model, solution)
-    trace = replay(project, after)
-    machine = machine_of(project, section, trace.fit.solution)
-    known = known_from(project.model, trace.fit.solution)
-    if see:
-        known.effects.update(of_effects(machine, trace.part(trace.identification_s), see))
+    model, solution, chunk = project.model, None, None
+    if after is not None:
+        solution, chunk = _learned(project, after)
+    machine = machine_of(project, section, solution, prior)
+    known = Known.nothing(model.n_cells) if solution is None else known_from(model, solution)
+    if prior is not None:
+        take_prior(known, model, prior, solution.blocks if solution else ())
+    if see and chunk is not None:
+        known.effects.update(of_effects(machine, chunk, see))
     return machine, known
+
+
+def _learned(project: Project, after: Path) -> tuple[Solution, FloatArray | None]:
+    """What a snapshot or a trace has taught, and the trace's samples."""
+    if after.suffix.lower() == SNAPSHOT:
+        return load_for(after, project)[0].solution(), None
+    trace = replay(project, after)
+    return trace.fit.solution, trace.part(trace.identification_s)
 
 
 def section_of(project: Project) -> ExciteSection:
@@ -133,16 +151,22 @@ def limits_of(section: ExciteSection) -> Limits:
 
 
 def machine_of(
-    project: Project, section: ExciteSection, solution: Solution | None = None
+    project: Project,
+    section: ExciteSection,
+    solution: Solution | None = None,
+    prior: Prior | None = None,
 ) -> Machine:
-    """The nominal machine: maps as learned, else of the data sheet, else by the rated flow."""
+    """The nominal machine: maps as learned, else of the prior or data sheet, else by rated flow."""
     model, stroke_m = project.model, project.sections.geometry.stroke_m
     compliance = np.full(len(model.chambers), 1.0 / model.beta_nominal_pa)
-    reference: Reference | None = find_reference(project, None)
     if solution is not None:
-        theta, compliance = publish(solution).theta_cells(), solution.compliance
+        theta, compliance = published(solution, prior).theta_cells(), solution.compliance
     else:
+        reference: Reference | None = find_reference(project, None)
         theta = reference.theta_cells(model) if reference else rated_map(model)
+        if prior is not None:
+            own = prior_cells(model, prior)[0]
+            theta = np.where(np.isfinite(own), own, theta)
     middle_m = 0.5 * stroke_m
     piston = Piston(
         section.mass_kg,

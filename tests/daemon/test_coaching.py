@@ -58,7 +58,8 @@ def test_the_coach_is_asked_once_there_is_a_snapshot_and_now_and_then(
     project: Project, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(coaching, "Helper", Remembering)
-    monkeypatch.setattr(Remembering, "made", made := [])
+    made = list[Remembering]()
+    monkeypatch.setattr(Remembering, "made", made)
     coach, folder = Coaching(project, tmp_path, lambda _: None), tmp_path
     coach.look(Estimator(project.model))
     assert not made, "nothing is saved yet"
