@@ -1,7 +1,8 @@
 """Design a motion: candidates within the limits, the best of them in a row, and what it will tell.
 
-Every candidate is run on the nominal machine, which must keep the limits with a margin; the whole
-motion is run again at the end, and refused where it does not keep them.
+Every candidate is run on the nominal machine, which must keep the limits with a margin: what goes
+too far or too fast is run again smaller.  The whole motion is run at the end; a segment that breaks
+a limit beside the others is left out, and the time filled anew.
 """
 
 from __future__ import annotations
@@ -10,12 +11,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rtid.diagnose.trials import Key
 from rtid.estimator.sums import IntArray
 from rtid.excite.driving import SHUT, STEP_S, SUPPLY
 from rtid.excite.information import Information, of_blocks, of_effects
-from rtid.excite.library import REST_S, Segment, library
+from rtid.excite.library import REST_S, Segment, home_m, library
 from rtid.excite.limits import Extremes, LimitError, Limits, extremes, require_kept
 from rtid.excite.machine import Machine, MachineError
 from rtid.excite.prediction import Prediction, assess
@@ -32,9 +34,12 @@ from rtid.excite.sweep import swept_sine
 from rtid.model import FloatArray
 
 MARGIN, PRESSURE_MARGIN = 0.05, 0.02  # of a range, kept free by each candidate on its own
+HALF = 0.5  # of that margin is kept free by the whole motion
 ELSEWHERE = 0.02  # weight of a block that the working motion does not visit
 GOAL, IMPROVED, WORTH = 5e-3, 0.2, 0.25  # see `missing`; the goal is a share of the rated flow
 ROWS = 20  # that a block needs to be where the machine works
+TRIES = 5  # to fit a segment into the limits, to put a motion together
+SCALED, SHRINK = frozenset({"position", "speed"}), 0.01  # what shrinks with a segment; and beyond
 
 Progress = Callable[[str, float], None]
 
@@ -85,18 +90,38 @@ def design(
     known: what is learned already.  Raises LimitError, MachineError.
     """
     weights = working_weights(machine, limits)
-    start = known or Known.nothing(machine.model.n_cells)
-    costs = np.array([c.segment.duration_s + 2 * REST_S for c in pool])
-    problem = Problem([c.told for c in pool], costs, weights, criterion)
-    chosen = choose(problem, start, limits.duration_s)
-    if not chosen:
-        raise LimitError("no segment is worth running", "more time, or wider limits, in [excite]")
-    segments = sorted((pool[k] for k in chosen), key=lambda c: c.segment.reference[0, SUPPLY])
-    segments, reference = stitched(segments, limits)
-    expected = machine.run(reference)
-    found = checked(machine, limits, reference, expected)
+    start, inner = known or Known.nothing(machine.model.n_cells), tightened(limits, HALF)
+    for _ in range(TRIES):
+        best = _best(pool, start, weights, limits, criterion)
+        segments, reference, playing = stitched(best, limits)
+        expected = machine.run(reference)
+        found = checked(machine, limits, reference, expected)
+        bad = {
+            id(segment)
+            for k, segment in enumerate(segments)
+            if not _keeps(machine, inner, reference[playing == k], expected[playing == k])
+        }
+        if not bad:
+            break
+        pool = [c for c in pool if id(c) not in bad]
     require_kept(found)
     return Design(machine, limits, tuple(segments), reference, expected, found, weights)
+
+
+def _best(
+    pool: Sequence[Candidate],
+    start: Known,
+    weights: FloatArray,
+    limits: Limits,
+    criterion: Criterion,
+) -> list[Candidate]:
+    """The segments that tell most together, ordered by the supply's level.  Raises LimitError."""
+    costs = np.array([c.segment.duration_s + 2 * REST_S for c in pool])
+    problem = Problem([c.told for c in pool], costs, weights, criterion)
+    chosen = choose(problem, start, limits.duration_s) if pool else []
+    if not chosen:
+        raise LimitError("no segment is worth running", "more time, or wider limits, in [excite]")
+    return sorted((pool[k] for k in chosen), key=lambda c: c.segment.reference[0, SUPPLY])
 
 
 def candidates(
@@ -106,22 +131,53 @@ def candidates(
     found, every, tight = list[Candidate](), library(limits), tightened(limits)
     for k, segment in enumerate(every):
         progress("trying segments", k / len(every))
-        try:
-            chunk = machine.run(segment.reference)
-        except MachineError:
-            continue
-        if all(e.is_kept for e in checked(machine, tight, segment.reference, chunk)):
+        fitting = _fitted(machine, tight, segment)
+        if fitting is not None:
+            kept, chunk = fitting
             chunk = machine.measured(chunk, k)
             told = of_blocks(machine, chunk)
             if see:
                 told = replace(told, effects=of_effects(machine, chunk, see))
-            found.append(Candidate(segment, told))
+            found.append(Candidate(kept, told))
     if not found:
         raise LimitError(
             "the nominal machine can follow no segment within the limits",
             "are load, controller and supply of [excite] right?",
         )
     return found
+
+
+def _fitted(
+    machine: Machine, limits: Limits, segment: Segment
+) -> tuple[Segment, FloatArray] | None:
+    """The segment, smaller where it must be, and its noise-free samples; None: it does not fit."""
+    home = home_m(limits)
+    for _ in range(TRIES):
+        try:
+            chunk = machine.run(segment.reference)
+        except MachineError:
+            return None
+        broken = {e.quantity: e for e in checked(machine, limits, segment.reference, chunk)
+                  if not e.is_kept}  # fmt: skip
+        if not broken:
+            return segment, chunk
+        if not broken.keys() <= SCALED:
+            return None
+        share = min(_share_within(e, home if q == "position" else 0.0) for q, e in broken.items())
+        segment = segment.scaled(share - SHRINK, home)
+    return None
+
+
+def _keeps(machine: Machine, limits: Limits, reference: FloatArray, chunk: FloatArray) -> bool:
+    """Whether a run, or a part of one, keeps its limits."""
+    return all(e.is_kept for e in checked(machine, limits, reference, chunk))
+
+
+def _share_within(e: Extremes, centre: float) -> float:
+    """By how much an excursion from the centre must shrink to stay within its limit."""
+    above = (e.most - centre) / max(e.high - centre, e.most - centre)
+    below = (centre - e.least) / max(centre - e.low, centre - e.least, 1e-12)
+    return min(above, below) if centre > e.least else above
 
 
 def working_weights(machine: Machine, limits: Limits) -> FloatArray:
@@ -193,8 +249,13 @@ def _share(told: Information, better: frozenset[int | Key], weights: FloatArray)
     return float(gained / max(total, 1e-12))
 
 
-def stitched(segments: Sequence[Candidate], limits: Limits) -> tuple[list[Candidate], FloatArray]:
-    """One reference from segments in a row, the supply led over at rest; as many as fit."""
+def stitched(
+    segments: Sequence[Candidate], limits: Limits
+) -> tuple[list[Candidate], FloatArray, NDArray[np.intp]]:
+    """One reference from segments in a row, the supply led over at rest; as many as fit.
+
+    Segments that fit, the reference (n, 5), and which of the segments each sample (n,) belongs to.
+    """
     parts, kept, left = list[FloatArray](), list[Candidate](), round(limits.duration_s / STEP_S)
     for candidate in segments:
         row = candidate.segment.reference[:1]
@@ -213,7 +274,8 @@ def stitched(segments: Sequence[Candidate], limits: Limits) -> tuple[list[Candid
         parts += [lead, candidate.segment.reference]
         kept.append(candidate)
         left -= len(lead) + len(candidate.segment.reference)
-    return kept, np.concatenate(parts)
+    lengths = [len(lead) + len(part) for lead, part in zip(parts[::2], parts[1::2], strict=True)]
+    return kept, np.concatenate(parts), np.repeat(np.arange(len(kept)), lengths)
 
 
 def checked(
@@ -225,8 +287,8 @@ def checked(
     return extremes(limits, reference, chunk[:, 0], x, u, machine.pressures(chunk))
 
 
-def tightened(limits: Limits) -> Limits:
-    """The limits with a margin for what the true machine does otherwise."""
+def tightened(limits: Limits, part: float = 1.0) -> Limits:
+    """The limits with a margin, or a part of it, for what the true machine does otherwise."""
 
     def inner(span: tuple[float, float], share: float) -> tuple[float, float]:
         slack = share * (span[1] - span[0])
@@ -234,7 +296,7 @@ def tightened(limits: Limits) -> Limits:
 
     return replace(
         limits,
-        stroke_m=inner(limits.stroke_m, MARGIN),
-        pressure_pa=inner(limits.pressure_pa, PRESSURE_MARGIN),
-        speed_mps=(1.0 - MARGIN) * limits.speed_mps,
+        stroke_m=inner(limits.stroke_m, part * MARGIN),
+        pressure_pa=inner(limits.pressure_pa, part * PRESSURE_MARGIN),
+        speed_mps=(1.0 - part * MARGIN) * limits.speed_mps,
     )

@@ -50,6 +50,7 @@ def few_segments(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(library, "PACES", (0.15, 0.4))
     monkeypatch.setattr(library, "SWING_PACES", (0.65,))
     monkeypatch.setattr(library, "STEPS", ((0.5, 0.07),))
+    monkeypatch.setattr(library, "PASS_STEPS", ((0.5, 0.07),))
     monkeypatch.setattr(library, "ZIGZAGS", (0.3,))
 
 

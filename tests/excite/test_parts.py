@@ -66,7 +66,10 @@ def test_what_is_not_allowed_is_not_in_the_library() -> None:
 
 def test_a_row_of_segments_keeps_the_supplys_rate_and_the_time() -> None:
     pool = [Candidate(s, _told(0, 1.0)) for s in library(LIMITS)[::9]]
-    kept, reference = stitched(pool, LIMITS)
+    kept, reference, playing = stitched(pool, LIMITS)
+    assert len(playing) == len(reference)
+    assert (np.diff(playing) >= 0).all()
+    assert set(playing.tolist()) == set(range(len(kept)))
     assert 0 < len(kept) < len(pool)
     assert len(reference) * STEP_S <= LIMITS.duration_s
     assert np.abs(np.diff(reference[:, SUPPLY])).max() <= 5e6 * STEP_S * (1 + 1e-9)
