@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,8 @@ from rtid.errors import RtidError
 from rtid.estimator.estimator import Estimator, to_chunk
 from rtid.excitable import limits_of, machine_of, section_of
 from rtid.excite import library
-from rtid.excite.driving import SHUT, STEP_S, Control, Piston
+from rtid.excite.design import _fitted, checked, tightened
+from rtid.excite.driving import SHUT, STEP_S, X_REF, Control, Piston
 from rtid.excite.limits import LimitError
 from rtid.excite.machine import Machine
 from rtid.excite.prediction import assess
@@ -110,6 +112,22 @@ def test_a_design_from_the_file_to_the_true_machine(
         run([*asked, "--after", str(snapshot), "--json"])
     again = json.loads(capsys.readouterr().out)
     assert 0 < again["segments_worth_running"] <= again["segments_tried"]
+
+
+def test_what_goes_too_far_is_run_smaller(tmp_path: Path) -> None:
+    """A swing to the very ends: nothing of it is lost but what lies beyond the margin."""
+    project = load(write_project(tmp_path, machine(NUMBER), NUMBER))
+    nominal = machine_of(project, section_of(project))
+    limits = tightened(limits_of(section_of(project)))
+    swings = library.library(replace(limits, supply_pa=(6e6, 6e6), offset_v=0.0))
+    swing = next(s for s in swings if s.name.startswith("swing 0.65 in"))
+    wide = swing.scaled(1.3, library.home_m(limits))
+    fitting = _fitted(nominal, limits, wide)
+    assert fitting is not None
+    kept, chunk = fitting
+    assert all(e.is_kept for e in checked(nominal, limits, kept.reference, chunk))
+    ways = [np.ptp(s.reference[:, X_REF]) for s in (kept, swing, wide)]
+    assert 0.8 * ways[1] < ways[0] < ways[2]
 
 
 def test_what_cannot_be_designed_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
-from rtid.excite.design import Candidate, missing, stitched
+from rtid.excite import design as designing
+from rtid.excite.design import Candidate, design, missing, stitched
 from rtid.excite.driving import SHUT, STEP_S, SUPPLY, V_REF, X_REF
 from rtid.excite.information import Information
 from rtid.excite.library import Segment, library
-from rtid.excite.limits import LimitError, Limits, extremes, require_kept
+from rtid.excite.limits import Extremes, LimitError, Limits, extremes, require_kept
+from rtid.excite.machine import Machine
 from rtid.excite.selection import (
     BOUNDED,
     MOMENTS,
@@ -21,6 +25,7 @@ from rtid.excite.selection import (
     standard_errors,
     value,
 )
+from rtid.model import FloatArray
 
 LIMITS = Limits(
     20.0, (0.08, 0.42), 0.3, 9.0, (1e5, 1e7), (5e6, 8.5e6), supply_rate_paps=5e6, offset_v=0.6
@@ -54,6 +59,48 @@ def test_segments_begin_and_end_at_rest_at_home_within_the_limits() -> None:
         assert r[:, SUPPLY].max() <= 8.5e6
         assert np.abs(np.diff(r[:, SUPPLY])).max() <= 5e6 * STEP_S * (1 + 1e-9)
         assert np.abs(r[:, V_REF]).max() <= 0.3 * (1 + 1e-9)
+
+
+def test_a_segment_that_is_scaled_is_the_same_nearer_to_home() -> None:
+    segment = library(LIMITS)[0]
+    small = segment.scaled(0.5, 0.25).reference
+    assert np.allclose(small[:, X_REF] - 0.25, 0.5 * (segment.reference[:, X_REF] - 0.25))
+    assert np.allclose(small[:, V_REF], 0.5 * segment.reference[:, V_REF])
+    assert np.array_equal(small[:, SUPPLY:], segment.reference[:, SUPPLY:])
+
+
+def test_a_segment_that_breaks_a_limit_beside_the_others_is_left_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One goes 5 mm beyond the stroke; one stays within it, but not within half of the margin."""
+
+    def position(
+        _machine: Machine, limits: Limits, r: FloatArray, _run: FloatArray
+    ) -> list[Extremes]:
+        x = r[:, X_REF]
+        return [Extremes("position", "m", x.min(), x.max(), *limits.stroke_m, 0.0)]
+
+    monkeypatch.setattr(designing, "checked", position)
+    monkeypatch.setattr(designing, "working_weights", lambda *_: np.ones(3))
+    rest = np.tile([0.25, 0.0, 0.0, 6e6, 0.0], (3000, 1))
+    names = {"within": 0.1, "close": 0.169, "beyond": 0.175}
+    pool = []
+    for cell, (name, way) in enumerate(names.items()):
+        reference = rest.copy()
+        reference[1000:2000, X_REF] += way
+        pool.append(Candidate(Segment(name, reference), _told(cell, 1e6)))
+    machine = SimpleNamespace(model=SimpleNamespace(n_cells=3), run=lambda reference: reference)
+    found = design(cast("Machine", machine), LIMITS, None, pool)
+    assert {c.segment.name for c in found.segments} == {"within"}
+    with pytest.raises(LimitError, match="no segment"):
+        design(cast("Machine", machine), LIMITS, None, pool[2:])
+
+
+def test_what_is_known_well_enough_gains_nothing() -> None:
+    rows = np.array([100.0])
+    well, better = (BOUNDED.value(s * np.eye(6)[None], rows) for s in (1e10, 1e12))
+    poor, fair = (BOUNDED.value(s * np.eye(6)[None], rows) for s in (1e2, 1e4))
+    assert better - well < 0.01 < 1.0 < fair - poor
 
 
 def test_what_is_not_allowed_is_not_in_the_library() -> None:
