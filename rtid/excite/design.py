@@ -28,6 +28,7 @@ from rtid.excite.selection import (
     Known,
     Problem,
     choose,
+    filled,
     standard_errors,
 )
 from rtid.excite.sweep import swept_sine
@@ -38,7 +39,7 @@ HALF = 0.5  # of that margin is kept free by the whole motion
 ELSEWHERE = 0.02  # weight of a block that the working motion does not visit
 GOAL, IMPROVED, WORTH = 5e-3, 0.2, 0.25  # see `missing`; the goal is a share of the rated flow
 ROWS = 20  # that a block needs to be where the machine works
-TRIES = 5  # to fit a segment into the limits, to put a motion together
+TRIES, MOST_LEFT_OUT = 5, 50  # to fit a segment into the limits; to put a motion together
 SCALED, SHRINK = frozenset({"position", "speed"}), 0.01  # what shrinks with a segment; and beyond
 
 Progress = Callable[[str, float], None]
@@ -89,13 +90,17 @@ def design(
 
     known: what is learned already.  Raises LimitError, MachineError.
     """
-    weights = working_weights(machine, limits)
-    start, inner = known or Known.nothing(machine.model.n_cells), tightened(limits, HALF)
-    for _ in range(TRIES):
-        best = _best(pool, start, weights, limits, criterion)
-        segments, reference, playing = stitched(best, limits)
+    weights, inner = working_weights(machine, limits), tightened(limits, HALF)
+    start = known or Known.nothing(machine.model.n_cells)
+    costs = np.array([c.segment.duration_s + 2 * REST_S for c in pool])
+    problem = Problem([c.told for c in pool], costs, weights, criterion)
+    chosen = choose(problem, start, limits.duration_s)
+    for _ in range(MOST_LEFT_OUT):
+        if not chosen:
+            raise LimitError("no segment is worth running", "more time, or wider limits: [excite]")
+        chosen.sort(key=lambda k: pool[k].segment.reference[0, SUPPLY])
+        segments, reference, playing = stitched([pool[k] for k in chosen], limits)
         expected = machine.run(reference)
-        found = checked(machine, limits, reference, expected)
         bad = {
             id(segment)
             for k, segment in enumerate(segments)
@@ -103,25 +108,12 @@ def design(
         }
         if not bad:
             break
-        pool = [c for c in pool if id(c) not in bad]
+        costs[[k for k, c in enumerate(pool) if id(c) in bad]] = np.inf  # it fits no more
+        rest = [k for k in chosen if id(pool[k]) not in bad]
+        chosen = filled(problem, start.copy(), rest, limits.duration_s)
+    found = checked(machine, limits, reference, expected)
     require_kept(found)
     return Design(machine, limits, tuple(segments), reference, expected, found, weights)
-
-
-def _best(
-    pool: Sequence[Candidate],
-    start: Known,
-    weights: FloatArray,
-    limits: Limits,
-    criterion: Criterion,
-) -> list[Candidate]:
-    """The segments that tell most together, ordered by the supply's level.  Raises LimitError."""
-    costs = np.array([c.segment.duration_s + 2 * REST_S for c in pool])
-    problem = Problem([c.told for c in pool], costs, weights, criterion)
-    chosen = choose(problem, start, limits.duration_s) if pool else []
-    if not chosen:
-        raise LimitError("no segment is worth running", "more time, or wider limits, in [excite]")
-    return sorted((pool[k] for k in chosen), key=lambda c: c.segment.reference[0, SUPPLY])
 
 
 def candidates(

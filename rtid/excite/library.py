@@ -25,8 +25,8 @@ Steps = tuple[tuple[float, float], ...]
 REST_S = 0.1  # at both ends of a segment
 REACH, RANGE = 0.9, 0.96  # of stroke and supply: the true machine differs
 PACES = (0.06, 0.15, 0.3, 0.5)  # of the highest speed
-SWING_PACES = (0.35, 0.65, 0.9)
-LONGEST_S = 9.0  # of one segment
+SWINGS = ((0.35, 1.0), (0.35, 0.5), (0.65, 1.0), (0.65, 0.5), (0.9, 1.0))  # ... share of the reach
+LONGEST_S = 5.0  # of one segment: short ones make a finer choice
 TURN_S = 0.08  # between speeds
 ZIGZAGS, BRISK = (0.3, 1.0), 0.8  # shares of the supply's range; of its rate
 # Steps of the command: share of the largest offset, hold in s.  What a flow leaves in the position
@@ -108,16 +108,15 @@ def _passes(limits: Limits, rng: np.random.Generator) -> Iterator[Segment]:
 
 
 def _swings(limits: Limits, rng: np.random.Generator) -> Iterator[Segment]:
-    for pace in SWING_PACES:
+    for pace, size in SWINGS:
         speed = pace * limits.speed_mps
         for side in (1.0, -1.0):
-            way = side * min(_reach_m(limits), speed * LONGEST_S / np.pi)
+            way = side * min(size * _reach_m(limits), speed * LONGEST_S / np.pi)
             duration_s = np.pi * abs(way) / speed
             t = STEP_S * np.arange(round(duration_s / STEP_S))
             v = 0.5 * way * 2 * np.pi / duration_s * np.sin(2 * np.pi * t / duration_s)
-            yield from _at_levels(
-                f"swing {pace:g} {'out' if side > 0 else 'in'}", v, limits, STEPS, rng
-            )
+            name = f"swing {pace:g} of {size:g} {'out' if side > 0 else 'in'}"
+            yield from _at_levels(name, v, limits, STEPS, rng)
 
 
 def _shut(limits: Limits) -> Iterator[Segment]:

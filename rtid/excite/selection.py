@@ -134,13 +134,13 @@ def choose(problem: Problem, known: Known, budget_s: float) -> list[int]:
     What seems best first is not what is best beside the others: each in turn is taken out, and the
     time filled anew.
     """
-    chosen = _filled(problem, known.copy(), [], budget_s)
+    chosen = filled(problem, known.copy(), [], budget_s)
     for _ in range(EXCHANGES):
         before = list(chosen)
         for k in before:
             rest = list(chosen)
             rest.remove(k)
-            other = _filled(problem, known.copy(), rest, budget_s)
+            other = filled(problem, known.copy(), rest, budget_s)
             if value(problem, known, other) > value(problem, known, chosen):
                 chosen = other
         if chosen == before:
@@ -148,7 +148,7 @@ def choose(problem: Problem, known: Known, budget_s: float) -> list[int]:
     return chosen
 
 
-def _filled(problem: Problem, known: Known, chosen: list[int], budget_s: float) -> list[int]:
+def filled(problem: Problem, known: Known, chosen: list[int], budget_s: float) -> list[int]:
     """More segments, greedily, until the time is up; known is used up."""
     chosen, left = list(chosen), budget_s - float(problem.costs_s[chosen].sum())
     for k in chosen:

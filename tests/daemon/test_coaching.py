@@ -90,7 +90,7 @@ def test_the_coach_says_what_excite_after_the_same_snapshot_says(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(library, "PACES", (0.3, 0.5))
-    monkeypatch.setattr(library, "SWING_PACES", (0.65,))
+    monkeypatch.setattr(library, "SWINGS", ((0.65, 1.0),))
     monkeypatch.setattr(library, "STEPS", ((0.5, 0.07),))
     monkeypatch.setattr(library, "PASS_STEPS", ((0.5, 0.07),))
     monkeypatch.setattr(library, "ZIGZAGS", (0.3,))

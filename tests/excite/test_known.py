@@ -111,7 +111,7 @@ def test_a_prior_that_the_record_contradicts_is_believed_less(tmp_path: Path) ->
 @pytest.fixture
 def few_segments(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(library, "PACES", (0.3, 0.5))
-    monkeypatch.setattr(library, "SWING_PACES", (0.65,))
+    monkeypatch.setattr(library, "SWINGS", ((0.65, 1.0),))
     monkeypatch.setattr(library, "STEPS", ((0.5, 0.07),))
     monkeypatch.setattr(library, "PASS_STEPS", ((0.5, 0.07),))
     monkeypatch.setattr(library, "ZIGZAGS", (0.3,))

@@ -50,7 +50,7 @@ def exact_machine(plant: Plant) -> Machine:
 def few_segments(monkeypatch: pytest.MonkeyPatch) -> None:
     """A library of a few segments: a test has not the time for all."""
     monkeypatch.setattr(library, "PACES", (0.15, 0.4))
-    monkeypatch.setattr(library, "SWING_PACES", (0.65,))
+    monkeypatch.setattr(library, "SWINGS", ((0.65, 1.0),))
     monkeypatch.setattr(library, "STEPS", ((0.5, 0.07),))
     monkeypatch.setattr(library, "PASS_STEPS", ((0.5, 0.07),))
     monkeypatch.setattr(library, "ZIGZAGS", (0.3,))
@@ -61,7 +61,9 @@ def test_the_nominal_machine_moves_as_the_simulated_one(tmp_path: Path) -> None:
     project = load(write_project(tmp_path, plant, NUMBER))
     limits = limits_of(section_of(project))
     segments = [s for s in library.library(limits) if "at 8.43" in s.name]
-    moves = [next(s for s in segments if s.name.startswith(n)) for n in ("swing 0.65", "shut 0.4")]
+    moves = [
+        next(s for s in segments if s.name.startswith(n)) for n in ("swing 0.65 of 1", "shut 0.4")
+    ]
     reference = np.concatenate([s.reference for s in moves])
     true = simulate(plant, motion(reference), 0, len(reference) * STEP_S, EXACT).truth.signals
     found = exact_machine(plant).run(reference)[:, 2:]
@@ -120,7 +122,7 @@ def test_what_goes_too_far_is_run_smaller(tmp_path: Path) -> None:
     nominal = machine_of(project, section_of(project))
     limits = tightened(limits_of(section_of(project)))
     swings = library.library(replace(limits, supply_pa=(6e6, 6e6), offset_v=0.0))
-    swing = next(s for s in swings if s.name.startswith("swing 0.65 in"))
+    swing = next(s for s in swings if s.name.startswith("swing 0.65 of 1 in"))
     wide = swing.scaled(1.3, library.home_m(limits))
     fitting = _fitted(nominal, limits, wide)
     assert fitting is not None
