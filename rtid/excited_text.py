@@ -68,6 +68,8 @@ def _motions(found: Excited) -> Table:
 
 def _limits(found: Excited, see: Sequence[str]) -> Table:
     """Detection limit of every effect, those asked for first."""
+    section = found.project.sections.excite
+    see = (*see, *(section.see if section else ()))
     table = Table("effect", "where", title="Smallest size seen (4 sd)", title_justify="left")
     for p in found.predictions:
         table.add_column(p.name, justify="right")

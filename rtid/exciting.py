@@ -4,40 +4,25 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rtid.compare.reference import Reference
-from rtid.comparing import find_reference
-from rtid.daemon.beside import load_for
-from rtid.effects import catalogue
 from rtid.errors import RtidError
-from rtid.estimator.published import publish
-from rtid.estimator.solution import Solution
-from rtid.excite.design import Candidate, Design, candidates, design, missing, working_weights
-from rtid.excite.driving import OFFSET, SHUT, STEP_S, SUPPLY, V_REF, X_REF, Control, Piston
-from rtid.excite.information import of_effects
-from rtid.excite.known import known_from
+from rtid.excitable import start
+from rtid.excite.design import Design, design
+from rtid.excite.driving import OFFSET, SHUT, STEP_S, SUPPLY, V_REF, X_REF
 from rtid.excite.limits import Limits
-from rtid.excite.machine import Machine, rated_map
+from rtid.excite.machine import Machine
 from rtid.excite.prediction import Prediction, assess, median_ratio
-from rtid.excite.selection import D_OPTIMAL, Known
+from rtid.excite.selection import D_OPTIMAL
 from rtid.excite.sweep import swept_sine
 from rtid.model import FloatArray
 from rtid.project import Project
-from rtid.project.schema import ExciteSection
-from rtid.replay import replay
-from rtid.units import nearest
 
 SCHEMA = 1
-SNAPSHOT = ".npz"
-ADVICE = (
-    "add [excite] to the project file: stroke, speed, command and pressure limits, mass, load, "
-    "controller; `rtid excite --help` names them"
-)
 
 
 class NothingMissingError(RtidError):
@@ -87,107 +72,25 @@ def excite(
     see: effects to become visible; after: snapshot or trace that tells what is learned; compare:
     also choose D-optimally; changes: of the limits, by the names of `Limits`.  Raises RtidError.
     """
-    for name in see:
-        if name not in catalogue():
-            raise RtidError(f"no effect {name!r}", nearest(name, list(catalogue())), exit_code=2)
-    section = section_of(project)
-    machine, known = _nominal(project, section, tuple(see), after)
-    limits = replace(limits_of(section), **changes)
-    pool: Sequence[Candidate] = candidates(
-        machine, limits, tuple(see), lambda what, share: progress(what, 0.6 * share)
-    )
-    tried = len(pool)
-    if known is not None:
-        pool = missing(pool, known, working_weights(machine, limits))
-        if not pool:
-            raise NothingMissingError(f"by what {after} has taught, no segment tells much more")
+    begun = start(project, see, after, lambda what, share: progress(what, 0.6 * share), **changes)
+    machine, limits, pool = begun.machine, begun.limits, begun.worth
+    if not pool:
+        raise NothingMissingError(f"by {begun.taught_by}, no segment tells much more")
     progress("choosing", 0.6)
-    found = design(machine, limits, known, pool)
+    found = design(machine, limits, begun.known, pool)
     progress("predicting", 0.75)
     predictions = [found.predicted(), _swept(machine, limits)]
     if compare:
         progress("comparing", 0.9)
-        other = design(machine, limits, known, pool, D_OPTIMAL)
+        other = design(machine, limits, begun.known, pool, D_OPTIMAL)
         predictions.append(other.predicted("D-optimal"))
     progress("done", 1.0)
-    return Excited(project, found, tuple(predictions), len(pool), tried)
-
-
-def _nominal(
-    project: Project, section: ExciteSection, see: tuple[str, ...], after: Path | None
-) -> tuple[Machine, Known | None]:
-    """The nominal machine, and what a snapshot or a trace has taught of it."""
-    if after is None:
-        return machine_of(project, section), None
-    if after.suffix.lower() == SNAPSHOT:
-        solution = load_for(after, project)[0].solution()
-        return machine_of(project, section, solution), known_from(project.model, solution)
-    trace = replay(project, after)
-    machine = machine_of(project, section, trace.fit.solution)
-    known = known_from(project.model, trace.fit.solution)
-    if see:
-        known.effects.update(of_effects(machine, trace.part(trace.identification_s), see))
-    return machine, known
+    return Excited(project, found, tuple(predictions), len(pool), len(begun.pool))
 
 
 def _swept(machine: Machine, limits: Limits) -> Prediction:
     chunk = machine.measured(machine.run(swept_sine(machine, limits)), 1)
     return assess(machine.model, chunk, "paper's sweep")
-
-
-def section_of(project: Project) -> ExciteSection:
-    """The project's [excite].  Raises RtidError where there is none."""
-    if project.sections.excite is None:
-        raise RtidError(f"{project.path}: no section [excite]", ADVICE, exit_code=2)
-    return project.sections.excite
-
-
-def limits_of(section: ExciteSection) -> Limits:
-    """What the motion may do."""
-    usual = section.usual_supply_pa
-    return Limits(
-        duration_s=section.duration_s,
-        stroke_m=section.stroke_m,
-        speed_mps=section.speed_mps,
-        command_v=section.command_v,
-        pressure_pa=section.pressure_pa,
-        supply_pa=section.supply_pa or (usual, usual),
-        supply_rate_paps=section.supply_pa_per_s,
-        offset_v=section.offset_v,
-        command_rate_vps=section.command_rate_per_s,
-        may_shut=section.may_shut,
-    )
-
-
-def machine_of(
-    project: Project, section: ExciteSection, solution: Solution | None = None
-) -> Machine:
-    """The nominal machine: maps as learned, else of the data sheet, else by the rated flow."""
-    model, stroke_m = project.model, project.sections.geometry.stroke_m
-    compliance = np.full(len(model.chambers), 1.0 / model.beta_nominal_pa)
-    reference: Reference | None = find_reference(project, None)
-    if solution is not None:
-        theta, compliance = publish(solution).theta_cells(), solution.compliance
-    else:
-        theta = reference.theta_cells(model) if reference else rated_map(model)
-    middle_m = 0.5 * stroke_m
-    piston = Piston(
-        section.mass_kg,
-        section.load_n,
-        section.load_slope_n_per_m,
-        middle_m,
-        section.friction_ns_per_m,
-        section.friction_n,
-    )
-    control = Control(
-        section.kp_per_s,
-        section.volts_per_mps,
-        section.deadband_v,
-        section.blend_mps,
-        section.command_v,
-    )
-    usual, tank = section.usual_supply_pa, section.tank_pa
-    return Machine(model, theta, compliance, piston, control, stroke_m, usual, tank)
 
 
 COLUMNS = (

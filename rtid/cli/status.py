@@ -23,7 +23,7 @@ def status(
         bool, typer.Option("--metrics", help="Print it as Prometheus metrics.")
     ] = False,
 ) -> None:
-    """Tell how the daemon is: bus, signals, loop, maps, storage, alarms, the last verdict.
+    """Tell how the daemon is: bus, signals, loop, maps, storage, alarms, verdict, coach.
 
     Exit code 4 if it does not run, or an alarm is on.
     """
@@ -74,6 +74,8 @@ def _show(found: Status, age_s: float) -> None:
     _tables(console, found)
     if found.verdict is not None:
         console.print(f"verdict {found.verdict.verdict}: {found.verdict.text}")
+    if found.advice is not None:
+        console.print(f"coach   {found.advice.text}")
     for alarm in found.alarms:
         over = "" if alarm.until_unix_s is None else " (over)"
         console.print(f"ALARM   {alarm.name}{over}: {alarm.text} {alarm.trace}")

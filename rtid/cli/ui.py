@@ -45,8 +45,7 @@ def ui(
     from rtid.project import load
     from rtid.ui.server import Workbench, serve
 
-    loaded = load(project)
-    folder = state or state_folder(loaded)
+    folder = state or state_folder(load(project))
 
     def ready(bench: Workbench) -> None:
         print(f"{bench.url}  (Ctrl-C ends it)", flush=True)
@@ -61,5 +60,4 @@ def ui(
         host=host,
         port=port,
         sheet=sheet,
-        model=loaded.model,
     )

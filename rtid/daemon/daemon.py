@@ -4,7 +4,7 @@ main thread    the loop: take frames, learn, hand copies over        (SCHED_FIFO
 rtid-receive   only queues what the bus delivers
 rtid-keeper    hears answers, raises alarms, tells the status
 analyst        a process: solves, publishes, judges, records, saves
-diagnoser      a process per diagnosis
+diagnoser      a process per diagnosis, and per question to the coach
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from firmware_bridge import frames as fr
 from firmware_bridge.sources import candump
 from firmware_bridge.sources.live import Source
 from rtid.daemon.answers import answers_of
+from rtid.daemon.coaching import Coaching
 from rtid.daemon.configure import boarded
 from rtid.daemon.core import Core
 from rtid.daemon.diagnosing import Diagnosing
@@ -101,6 +102,7 @@ class Daemon:
             restored = self._restore(learner)
             analyst = Helper(ANALYST, [str(self._project.path), str(folder)], self._answers.append)
             diagnosing = Diagnosing(self._project, self._answers.append)
+            coaching = Coaching(self._project, folder, self._answers.append)
             try:
                 with self._bus.open() as source:
                     core = Core(self._project, learner, source, analyst)
@@ -115,12 +117,13 @@ class Daemon:
                         time.time(),
                         self._log_every_s,
                     )
-                    self._keeper = Keeper(facts, core, analyst, diagnosing, self._answers)
+                    self._keeper = Keeper(facts, core, analyst, diagnosing, coaching, self._answers)
                     bus = self._bus.interface, self._bus.channel
                     with telling(self._project, bus, folder, lambda: self.status):
                         return self._run(core, analyst, for_s)
             finally:
                 diagnosing.stop()
+                coaching.stop()
                 analyst.stop(0.0)
 
     def _run(self, core: Core, analyst: Helper, for_s: float | None) -> Status:

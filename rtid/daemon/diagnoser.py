@@ -1,4 +1,4 @@
-"""The helper that diagnoses and checks: one process per job, whose memory goes with it.
+"""The helper that diagnoses, checks and coaches: one process per job, whose memory goes with it.
 
 `python -m rtid.daemon.diagnoser FD PROJECT`: one job in, one answer out.
 """
@@ -14,7 +14,8 @@ from pathlib import Path
 from firmware_bridge.sources.errors import LogError
 from rtid.check import judge
 from rtid.check.reading import read_trace
-from rtid.daemon.jobs import Answer, Check, Checked, Diagnose, Found, Job
+from rtid.coaching import advise
+from rtid.daemon.jobs import Answer, Check, Checked, Coach, Coached, Diagnose, Found, Job
 from rtid.daemon.pipe import Pipe
 from rtid.daemon.status import Verdict
 from rtid.diagnosed_text import sentences
@@ -77,19 +78,23 @@ def main() -> None:
     pipe, project = Pipe(int(fd)), load(path)
     try:
         while (job := pipe.receive()) is not None:
-            pipe.send(_answer(job, project))
+            pipe.send(answer(job, project))
     except (EOFError, OSError):
         pass  # the daemon is gone
 
 
-def _answer(job: Job, project: Project) -> Answer:
+def answer(job: Job, project: Project) -> Answer:
+    """Do one job."""
     try:
         if isinstance(job, Check):
             return check(job, project)
+        if isinstance(job, Coach):
+            return Coached(advise(project, Path(job.snapshot), job.chunk))
         assert isinstance(job, Diagnose)
         return diagnose(job, project)
-    except (RtidError, LogError) as error:
-        return Found(None, str(error))
+    except (RtidError, LogError, OSError) as error:  # OSError: the file has just been set aside
+        reason = str(error)
+        return Coached(None, reason) if isinstance(job, Coach) else Found(None, reason)
 
 
 if __name__ == "__main__":

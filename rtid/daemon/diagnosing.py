@@ -108,7 +108,8 @@ class Diagnosing:
 
     def _start(self, job: Job) -> None:
         self._started_s = time.monotonic()
-        self._helper = Helper(DIAGNOSER, [str(self._project.path)], self._answer, restarts=False)
+        ended = Found(None, "the helper has ended")
+        self._helper = Helper(DIAGNOSER, [str(self._project.path)], self._answer, ended)
         self._helper.put(job)
 
     def _end_helper(self) -> None:

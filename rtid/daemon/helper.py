@@ -16,7 +16,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 
-from rtid.daemon.jobs import Answer, Batch, Found, Job
+from rtid.daemon.jobs import Answer, Batch, Job
 from rtid.daemon.pipe import Pipe, pair
 
 QUEUED = 500  # jobs that may wait: a slow disk or a long solve
@@ -27,8 +27,8 @@ RESTART_S = (1.0, 60.0)  # first and longest pause before a helper is started ag
 class Helper:
     """One `python -m MODULE FD ARGUMENTS...`; `answer` is called from its own thread.
 
-    failures counts how often it had to be started again; with restarts = False its end is answered
-    by Found without a verdict.
+    failures counts how often it had to be started again; with `ended` it is not, and its end is
+    answered by that.
     """
 
     def __init__(
@@ -36,9 +36,9 @@ class Helper:
         module: str,
         arguments: list[str],
         answer: Callable[[Answer], None],
-        restarts: bool = True,
+        ended: Answer | None = None,
     ) -> None:
-        self._restarts = restarts
+        self._ended = ended
         self._command = [sys.executable, "-m", module]
         self._arguments, self._answer = arguments, answer
         self._jobs: deque[Job] = deque()
@@ -96,8 +96,8 @@ class Helper:
                 self._serve()
             if self._stopping:
                 return
-            if not self._restarts:
-                self._answer(Found(None, "the helper has ended"))
+            if self._ended is not None:
+                self._answer(self._ended)
                 return
             self.failures += 1
             if time.monotonic() - started_s > RESTART_S[1]:

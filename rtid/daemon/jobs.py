@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from firmware_bridge.frames import Frames
 from rtid.daemon.acceptance import Acceptance
-from rtid.daemon.status import Alarm, EdgeHealth, Verdict
+from rtid.daemon.status import Advice, Alarm, EdgeHealth, Verdict
 from rtid.estimator.estimator import Estimator
 from rtid.estimator.flowmap import FlowMap
 from rtid.model import FloatArray, Model
@@ -70,6 +70,14 @@ class Diagnose:
     """Samples to diagnose, rows as in `to_chunk`."""
 
     model: Model
+    chunk: FloatArray
+
+
+@dataclass(frozen=True)
+class Coach:
+    """What is still missing after this snapshot?  chunk: the newest samples, for effects."""
+
+    snapshot: str
     chunk: FloatArray
 
 
@@ -165,5 +173,24 @@ class Checked:
     errors: tuple[str, ...]
 
 
-Job = Handover | Batch | Note | Recall | Relearn | Diagnose | Check | Found | Checked
-Answer = Ready | Publication | Judgement | Recalled | Saved | NotSaved | Recording | Found | Checked
+@dataclass(frozen=True)
+class Coached:
+    """Answer to Coach: advice, or the reason why there is none."""
+
+    advice: Advice | None
+    reason: str = ""
+
+
+Job = Handover | Batch | Note | Recall | Relearn | Diagnose | Coach | Check | Found | Checked
+Answer = (
+    Ready
+    | Publication
+    | Judgement
+    | Recalled
+    | Saved
+    | NotSaved
+    | Recording
+    | Found
+    | Coached
+    | Checked
+)

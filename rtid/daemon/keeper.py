@@ -15,6 +15,7 @@ from rtid.daemon import jobs, wording
 from rtid.daemon import status as st
 from rtid.daemon.acceptance import Acceptance, taken
 from rtid.daemon.alarms import Alarms
+from rtid.daemon.coaching import Coaching
 from rtid.daemon.core import Core
 from rtid.daemon.diagnosing import Diagnosing, newest
 from rtid.daemon.helper import Helper
@@ -39,10 +40,11 @@ class Keeper:
         core: Core,
         analyst: Helper,
         diagnosing: Diagnosing,
+        coaching: Coaching,
         answers: deque[jobs.Answer],
     ) -> None:
         self._facts, self._core, self._analyst = facts, core, analyst
-        self._diagnosing = diagnosing
+        self._diagnosing, self._coaching = diagnosing, coaching
         self.teller = Teller(facts, core)
         self.alarms = Alarms(self._told)
         self.plant = PlantWatch()
@@ -93,6 +95,7 @@ class Keeper:
                 self._core.is_saving &= not answer.to_save
             elif isinstance(answer, jobs.Publication):
                 self.teller.publish(answer)
+                self._coaching.published(answer)
             elif isinstance(answer, jobs.Judgement):
                 if self.plant.push(answer):
                     self._plant_changed()
@@ -107,6 +110,8 @@ class Keeper:
                 if answer.is_accepted:
                     self.plant.accept()
                     self._plant_changed()
+            elif isinstance(answer, jobs.Coached):
+                self._coaching.take(answer)
             elif isinstance(answer, jobs.Found | jobs.Checked):
                 self._analyst.put(answer)
                 self._diagnosing.take(answer)
@@ -151,7 +156,9 @@ class Keeper:
         self.alarms.put("implausible", "sensor", "; ".join(self._diagnosing.implausible))
         if not self._is_checked and self._recording and self._has_run_s() > CHECK_S:
             self._is_checked = self._diagnosing.check(self._recording)
-        self._diagnosing.look(self._core.learner.estimator, self._core.newest_s)
+        self._diagnosing.look(learner.estimator, self._core.newest_s)
+        if learner.learns and not self._diagnosing.is_running:
+            self._coaching.look(learner.estimator)
         self._look_at_load()
         if self.alarms.on != tuple(a for a in self.status.alarms if a.until_unix_s is None):
             self._tell_alarms()
@@ -193,7 +200,8 @@ class Keeper:
         return self._saving.store(why, self._facts.restored, self._recording, dropped)
 
     def _make_status(self) -> st.Status:
-        return self.teller.tell(self.alarms, self._store(), self.plant.surprise, self._diagnosing)
+        surprise, advice = self.plant.surprise, self._coaching.advice
+        return self.teller.tell(self.alarms, self._store(), surprise, self._diagnosing, advice)
 
     def _judge_signals(self, before: st.Status) -> None:
         """Alarms of messages and signals: what holds for two seconds, but not while all begins."""

@@ -177,6 +177,21 @@ class Verdict:
 
 
 @dataclass(frozen=True)
+class Advice:
+    """What is not known yet, and the motion that would tell it, see `rtid.coaching`.
+
+    blocks: how many, by edge; effects: named ones that cannot be seen well yet; segments: the
+    pieces of motion that tell most.
+    """
+
+    at_unix_s: float
+    text: str
+    blocks: dict[str, int] = field(default_factory=dict)
+    effects: tuple[str, ...] = ()
+    segments: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Alarm:
     """Something that somebody has to look at; over when `until_unix_s` is set."""
 
@@ -204,6 +219,7 @@ class Status:
     store: Store = Store()
     verdict: Verdict | None = None
     diagnosing: bool = False
+    advice: Advice | None = None
     alarms: tuple[Alarm, ...] = ()  # those that are on, then the last that are over
     rss_anon_mb: float = 0.0
     schema: int = SCHEMA

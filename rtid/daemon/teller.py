@@ -86,7 +86,12 @@ class Teller:
         self.version += 1
 
     def tell(
-        self, alarms: Alarms, store: st.Store, surprise: float | None, diagnosing: Diagnosing
+        self,
+        alarms: Alarms,
+        store: st.Store,
+        surprise: float | None,
+        diagnosing: Diagnosing,
+        advice: st.Advice | None,
     ) -> st.Status:
         """The status of now."""
         facts, now_ns = self._facts, time.monotonic_ns()
@@ -105,6 +110,7 @@ class Teller:
             store=store,
             verdict=diagnosing.verdict,
             diagnosing=diagnosing.is_running,
+            advice=advice,
             alarms=alarms.all,
             rss_anon_mb=resident_mb(),
         )

@@ -5,14 +5,14 @@
     swing    out and back, a sine of the position
     shut     a move, then shut valves with the pressures that it has left: what leaks shows itself
 
-each at several levels of the supply pressure, or while it goes up and down; passes and swings with
-steps of the command on top where an offset is allowed.
+each at several levels of the supply pressure, or while it goes up and down; passes and swings also
+with steps of the command on top where an offset is allowed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -21,15 +21,18 @@ from rtid.excite.driving import OFFSET, SHUT, STEP_S, SUPPLY, V_REF, X_REF
 from rtid.excite.limits import Limits
 from rtid.model import FloatArray
 
+Steps = tuple[tuple[float, float], ...]
 REST_S = 0.1  # at both ends of a segment
 REACH, RANGE = 0.9, 0.96  # of stroke and supply: the true machine differs
-PACES = (0.06, 0.15, 0.3, 0.5, 0.75)  # of the highest speed
-SWING_PACES = (0.35, 0.65, 0.9)
-LONGEST_S = 9.0  # of one segment
+PACES = (0.06, 0.15, 0.3, 0.5)  # of the highest speed
+SWINGS = ((0.35, 1.0), (0.35, 0.5), (0.65, 1.0), (0.65, 0.5), (0.9, 1.0))  # ... share of the reach
+LONGEST_S = 5.0  # of one segment: short ones make a finer choice
 TURN_S = 0.08  # between speeds
 ZIGZAGS, BRISK = (0.3, 1.0), 0.8  # shares of the supply's range; of its rate
-# Steps of the command: share of the largest offset, hold in s.
-STEPS = ((1.0, 0.05), (0.25, 0.03))
+# Steps of the command: share of the largest offset, hold in s.  What a flow leaves in the position
+# grows with the time for which it differs, to the power 1.5: some steps are long.
+STEPS: Steps = ((1.0, 0.1), (1.0, 0.05), (0.25, 0.15), (0.25, 0.03))
+PASS_STEPS: Steps = ((1.0, 0.1), (0.25, 0.03))  # passes creep by themselves
 SHUT_PACES, SHUT_S = (0.4, 0.9), 3.0
 
 
@@ -44,6 +47,13 @@ class Segment:
     def duration_s(self) -> float:
         """Its length."""
         return len(self.reference) * STEP_S
+
+    def scaled(self, share: float, home: float) -> Segment:
+        """The same in the same time, nearer to home and slower."""
+        reference = self.reference.copy()
+        reference[:, X_REF] = home + share * (reference[:, X_REF] - home)
+        reference[:, V_REF] *= share
+        return replace(self, reference=reference)
 
 
 def library(limits: Limits, seed: int = 0) -> tuple[Segment, ...]:
@@ -94,18 +104,19 @@ def _passes(limits: Limits, rng: np.random.Generator) -> Iterator[Segment]:
             aside = np.full(half, 0.5 * way / (half * STEP_S))
             turn = np.zeros(round(TURN_S / STEP_S))
             v = _eased(np.concatenate([-aside, turn, run, turn, -run, turn, aside]))
-            yield from _at_levels(f"pass {first:g} to {last:g}", v, limits, rng)
+            yield from _at_levels(f"pass {first:g} to {last:g}", v, limits, PASS_STEPS, rng)
 
 
 def _swings(limits: Limits, rng: np.random.Generator) -> Iterator[Segment]:
-    for pace in SWING_PACES:
+    for pace, size in SWINGS:
         speed = pace * limits.speed_mps
         for side in (1.0, -1.0):
-            way = side * min(_reach_m(limits), speed * LONGEST_S / np.pi)
+            way = side * min(size * _reach_m(limits), speed * LONGEST_S / np.pi)
             duration_s = np.pi * abs(way) / speed
             t = STEP_S * np.arange(round(duration_s / STEP_S))
             v = 0.5 * way * 2 * np.pi / duration_s * np.sin(2 * np.pi * t / duration_s)
-            yield from _at_levels(f"swing {pace:g} {'out' if side > 0 else 'in'}", v, limits, rng)
+            name = f"swing {pace:g} of {size:g} {'out' if side > 0 else 'in'}"
+            yield from _at_levels(name, v, limits, STEPS, rng)
 
 
 def _shut(limits: Limits) -> Iterator[Segment]:
@@ -123,13 +134,12 @@ def _shut(limits: Limits) -> Iterator[Segment]:
 
 
 def _at_levels(
-    name: str, v: FloatArray, limits: Limits, rng: np.random.Generator
+    name: str, v: FloatArray, limits: Limits, steps: Steps, rng: np.random.Generator
 ) -> Iterator[Segment]:
+    """With every kind of steps, as far as an offset is allowed, at every level of the supply."""
     for name_, reference in _supplied(name, v, limits):
-        if limits.offset_v == 0.0:
-            yield Segment(name_, reference)
-            continue
-        for share, hold_s in STEPS:
+        yield Segment(name_, reference)
+        for share, hold_s in steps if limits.offset_v > 0.0 else ():
             stepped = _with_steps(reference, limits, share, hold_s, rng)
             step = f"steps of {share * limits.offset_v:.2g} V, {hold_s:g} s"
             yield Segment(f"{name_}, {step}", stepped)

@@ -4,7 +4,8 @@ With P_b the information on block b (6 x 6, in units of the rated flow) and M th
 over a block, the standard error of its map is s_b^2 = tr(M (P_b + prior)^-1), rms over the block.
 What is maximised per second of motion:
 
-    bounded     sum over blocks of w_b (ln(s_1 / s) below s_1 + a ln(s_0 / s)) + effects' ln 1 / sd
+    bounded     sum over blocks of w_b (ln(s_1 / s) below s_1 + a ln(s_0 / s)) + effects' ln 1 / sd,
+                s^2 = s_b^2 + s_2^2: what is known well enough gains nothing more
     d-optimal   sum over blocks of ln det(P_b + prior) / 2
 
 Information of segments is added up, see `information`.
@@ -22,8 +23,8 @@ from rtid.kernels.layout import TERMS
 from rtid.model import FloatArray
 
 UNKNOWN = 1.0  # s_0: share of the rated flow
-USEFUL, BEFORE = 0.02, 0.15  # s_1, from which on it counts whole, and its share a before
-TARGET = 2e-4  # share of the rated flow below which a block is known well enough
+USEFUL, BEFORE = 0.1, 0.15  # s_1, from which on it counts whole, and its share a before
+TARGET = 1e-3  # s_2, share of the rated flow to which a block is known well enough
 ENOUGH_ROWS = 60.0
 EXCHANGES = 2  # rounds at most
 EFFECT_WEIGHT = 10.0  # blocks that halving the limit of one effect is worth
@@ -55,7 +56,7 @@ class Criterion:
 
 
 def _bounded(blocks: FloatArray, rows: FloatArray) -> FloatArray:
-    sd = np.clip(standard_errors(blocks), TARGET, UNKNOWN)
+    sd = np.minimum(np.hypot(standard_errors(blocks), TARGET), UNKNOWN)
     known = np.log(USEFUL / np.minimum(sd, USEFUL)) + BEFORE * np.log(UNKNOWN / sd)
     return np.asarray(known * np.minimum(rows / ENOUGH_ROWS, 1.0))
 
@@ -133,13 +134,13 @@ def choose(problem: Problem, known: Known, budget_s: float) -> list[int]:
     What seems best first is not what is best beside the others: each in turn is taken out, and the
     time filled anew.
     """
-    chosen = _filled(problem, known.copy(), [], budget_s)
+    chosen = filled(problem, known.copy(), [], budget_s)
     for _ in range(EXCHANGES):
         before = list(chosen)
         for k in before:
             rest = list(chosen)
             rest.remove(k)
-            other = _filled(problem, known.copy(), rest, budget_s)
+            other = filled(problem, known.copy(), rest, budget_s)
             if value(problem, known, other) > value(problem, known, chosen):
                 chosen = other
         if chosen == before:
@@ -147,7 +148,7 @@ def choose(problem: Problem, known: Known, budget_s: float) -> list[int]:
     return chosen
 
 
-def _filled(problem: Problem, known: Known, chosen: list[int], budget_s: float) -> list[int]:
+def filled(problem: Problem, known: Known, chosen: list[int], budget_s: float) -> list[int]:
     """More segments, greedily, until the time is up; known is used up."""
     chosen, left = list(chosen), budget_s - float(problem.costs_s[chosen].sum())
     for k in chosen:

@@ -309,7 +309,8 @@ class ExciteSection(Section):
     """[excite]: what a designed motion may do, the load and the position controller.
 
     supply: range of its setpoint, None where it cannot be changed; offset: steps that may be added
-    to the controller's command, 0 for none; load: force against growing x in mid-stroke.
+    to the controller's command, 0 for none; load: force against growing x in mid-stroke; see:
+    effects that are to become visible.
     The controller's u = deadband tanh(demand / blend) + volts_per_mps demand,
     demand = v_ref + kp (x_ref - x), with steps in the command's unit.
     """
@@ -326,6 +327,7 @@ class ExciteSection(Section):
     supply_pa_per_s: float = Field(default=5e6, gt=0)
     tank_pa: Annotated[float, PRESSURE] = 1e5
     may_shut: bool = True
+    see: list[str] = []
     mass_kg: float = Field(gt=0, description="mass_kg = 400")
     load_n: float = 0.0
     load_slope_n_per_m: float = 0.0
@@ -344,6 +346,7 @@ class DaemonSection(Section):
     publish_s: Annotated[float, TIME] = Field(default=10.0, gt=0)
     store_s: Annotated[float, TIME] = Field(default=30.0, gt=0)
     diagnose_s: Annotated[float, TIME] = Field(default=600.0, gt=0)
+    coach_s: Annotated[float, TIME] = Field(default=600.0, gt=0)
     max_age_s: Annotated[float, TIME] = Field(default=0.05, gt=0)
     priority: int = Field(default=0, ge=0, le=99)
     record_mb: int = Field(default=200, ge=0)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from rtid.colours import UNITS
 from rtid.daemon.status import (
+    Advice,
     Distribution,
     EdgeHealth,
     MessageHealth,
@@ -22,7 +23,6 @@ from rtid.daemon.status import (
     StatusError,
     read,
 )
-from rtid.model import Model
 from rtid.report_words import VERDICTS, text
 from rtid.ui.fragments import table
 
@@ -36,8 +36,8 @@ Clock = Callable[[], float]
 class Live:
     """The status of a daemon that keeps its state in a folder; None: there is none."""
 
-    def __init__(self, folder: Path | None, model: Model | None, clock: Clock = time.time) -> None:
-        self._folder, self._model, self._clock = folder, model, clock
+    def __init__(self, folder: Path | None, clock: Clock = time.time) -> None:
+        self._folder, self._clock = folder, clock
         self._status: Status | None = None
         self._trouble = ""
         self._stamp = -1
@@ -51,7 +51,7 @@ class Live:
         age_s = max(0.0, self._clock() - status.now_unix_s)
         health = _head(status, age_s) + _alarms(status, self._clock()) + _loop(status)
         health += _signals(status.signals) + _messages(status.messages)
-        learning = _learning(status) + _coach(status, self._model) + _verdict(status)
+        learning = _learning(status) + _coach(status.advice) + _verdict(status)
         css = "stale" if age_s > STALE_S else ""
         return {
             "live_health": f'<div class="{css}">{health}</div>',
@@ -255,26 +255,11 @@ def _edge(edge: EdgeHealth) -> str:
     )
 
 
-def _coach(status: Status, model: Model | None) -> str:
-    """Which motion fills what is missing."""
-    edges = sorted(status.estimate.edges, key=lambda e: (e.progress, e.blocks.get("valid", 0)))
-    if not edges or model is None:
+def _coach(advice: Advice | None) -> str:
+    """Which motion fills what is missing, as the daemon's coach has it."""
+    if advice is None:
         return ""
-    poorest = edges[0]
-    edge = next((e for e in model.edges if e.name == poorest.name), None)
-    if edge is None:
-        return ""
-    low, high = max(edge.safe_band_v, float(edge.grid.u_v[0])), float(edge.grid.u_v[-1])
-    sign = "positive" if edge.direction > 0 else "negative"
-    missing = sum(poorest.blocks.values()) - poorest.blocks.get("valid", 0)
-    words = (
-        f"Valve {edge.name} knows least. Move with {sign} {edge.command} between {low:g} and "
-        f"{high:g} V: hold each level for a second, then step to the next; repeat with another "
-        "load or supply pressure, so that its pressure drop changes."
-    )
-    if missing:
-        words += f" {missing} of its visited blocks only need more time where they are."
-    return f'<div class="card"><h2>To learn more</h2>{text(words)}</div>'
+    return f'<div class="card"><h2>To learn more</h2>{text(advice.text)}</div>'
 
 
 def _verdict(status: Status) -> str:

@@ -24,7 +24,6 @@ from tornado.netutil import bind_sockets
 from tornado.web import OutputTransform, RequestHandler
 
 from rtid.errors import RtidError
-from rtid.model import Model
 from rtid.ui.live import Live
 from rtid.ui.page import build
 from rtid.ui.security import COOKIE, TOKEN, Door, Refusal
@@ -150,12 +149,11 @@ def start(
     host: str = "127.0.0.1",
     port: int = 0,
     sheet: Path | None = None,
-    model: Model | None = None,
 ) -> Workbench:
     """Begin to serve on the current event loop; port 0: any that is free.
 
-    state: folder in which a daemon keeps its state, for the live page; model: its machine.  Raises
-    RtidError where the port is taken.
+    state: folder in which a daemon keeps its state, for the live page.  Raises RtidError where the
+    port is taken.
     """
     if trace is not None:
         import_module("rtid.ui.desk_views")  # now, not while somebody waits for a picture
@@ -163,7 +161,7 @@ def start(
     worker = Worker(loop.add_callback)
     session = Session(project, trace, worker, sheet)
     door = Door(host, "" if Door(host).is_local else secrets.token_urlsafe(24))
-    live = Live(state, model)
+    live = Live(state)
     app = Application(FunctionHandler(partial(build, session=session, live=live)))
     guarded = Guarded(
         door,

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 import pytest
 
 from benchmarks.live_page import growth, memory
-from rtid.project import load
 from rtid.sim.random_plants import draw
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
@@ -70,7 +69,7 @@ def machine(project: Path) -> Iterator[Path]:
 
 @pytest.fixture(scope="module")
 def live(project: Path, machine: Path) -> Iterator[Workbench]:
-    with served(project=project, state=machine, model=load(project).model) as running:
+    with served(project=project, state=machine) as running:
         yield running
 
 
@@ -121,7 +120,7 @@ def test_stale_is_shown_as_stale(
     while not status.exists() and time.monotonic() < end:
         time.sleep(0.2)
     (tmp_path / "status.json").write_bytes(status.read_bytes())
-    with served(project=project, state=tmp_path, model=load(project).model) as bench:
+    with served(project=project, state=tmp_path) as bench:
         for opened in open_page(browser, bench):
             opened.go("live")
             opened.page.wait_for_selector("#live_health .stale >> text=stale:")

@@ -16,6 +16,7 @@ from rtid.daemon.acceptance import Acceptance
 from rtid.daemon.health import Health
 from rtid.daemon.keeper import BEGINS_S, Keeper
 from rtid.daemon.lag import Lag
+from rtid.daemon.status import Advice
 from rtid.daemon.teller import Facts
 from rtid.estimator.estimator import Estimator
 from rtid.loop.loop import Loop
@@ -39,10 +40,15 @@ def keeper(tmp_path: Path) -> Keeper:
         verdict=None, is_of_change=False, is_acquitted=False, implausible=(), is_running=False,
         look=lambda *_: None, check=lambda _: True, begin=lambda _: None, end=lambda: None,
     )  # fmt: skip
+    coaching = SimpleNamespace(
+        advice=Advice(1e9, "go on"), look=put.append, published=put.append, take=put.append,
+    )  # fmt: skip
     analyst = SimpleNamespace(put=put.append, failures=0, dropped=0)
     long_ago = time.time() - 2 * BEGINS_S
     facts = Facts(machine().project, tmp_path, "x", "y", "", "other", False, long_ago, 1e9)
-    made: Keeper = Keeper(facts, core, analyst, diagnosing, deque())  # type: ignore[arg-type]
+    made: Keeper = Keeper(
+        facts, core, analyst, diagnosing, coaching, deque()  # type: ignore[arg-type]
+    )  # fmt: skip
     vars(made)["put"] = put
     return made
 
@@ -95,3 +101,18 @@ def test_an_accepted_change_is_learned_anew(keeper: Keeper) -> None:
     keeper._listen()
     assert (before, core.learner.learns) == (False, True)  # once the new estimate is there
     assert core.swap is anew and not keeper.plant.changed
+
+
+def test_the_coach_is_asked_while_the_machine_learns(keeper: Keeper) -> None:
+    core, put = keeper._core, vars(keeper)["put"]
+    core.learner.learns = False
+    keeper._look()
+    assert core.learner.estimator not in put
+    core.learner.learns = True
+    keeper._look()
+    assert core.learner.estimator in put
+    told = jobs.Coached(None, "no snapshot")
+    keeper._answers.append(told)
+    keeper._listen()
+    keeper._tell()
+    assert told in put and keeper.status.advice == Advice(1e9, "go on")

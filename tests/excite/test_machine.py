@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +13,14 @@ from rtid.cli.main import run
 from rtid.compare.reference import theta_cells
 from rtid.errors import RtidError
 from rtid.estimator.estimator import Estimator, to_chunk
+from rtid.excitable import limits_of, machine_of, section_of
 from rtid.excite import library
-from rtid.excite.driving import SHUT, STEP_S, Control, Piston
+from rtid.excite.design import _fitted, checked, tightened
+from rtid.excite.driving import SHUT, STEP_S, X_REF, Control, Piston
 from rtid.excite.limits import LimitError
 from rtid.excite.machine import Machine
 from rtid.excite.prediction import assess
-from rtid.exciting import excite, limits_of, machine_of, section_of
+from rtid.exciting import excite
 from rtid.model import Grid, Lag
 from rtid.project import load
 from rtid.sim.declare import declared_model
@@ -47,8 +50,9 @@ def exact_machine(plant: Plant) -> Machine:
 def few_segments(monkeypatch: pytest.MonkeyPatch) -> None:
     """A library of a few segments: a test has not the time for all."""
     monkeypatch.setattr(library, "PACES", (0.15, 0.4))
-    monkeypatch.setattr(library, "SWING_PACES", (0.65,))
+    monkeypatch.setattr(library, "SWINGS", ((0.65, 1.0),))
     monkeypatch.setattr(library, "STEPS", ((0.5, 0.07),))
+    monkeypatch.setattr(library, "PASS_STEPS", ((0.5, 0.07),))
     monkeypatch.setattr(library, "ZIGZAGS", (0.3,))
 
 
@@ -57,7 +61,9 @@ def test_the_nominal_machine_moves_as_the_simulated_one(tmp_path: Path) -> None:
     project = load(write_project(tmp_path, plant, NUMBER))
     limits = limits_of(section_of(project))
     segments = [s for s in library.library(limits) if "at 8.43" in s.name]
-    moves = [next(s for s in segments if s.name.startswith(n)) for n in ("swing 0.65", "shut 0.4")]
+    moves = [
+        next(s for s in segments if s.name.startswith(n)) for n in ("swing 0.65 of 1", "shut 0.4")
+    ]
     reference = np.concatenate([s.reference for s in moves])
     true = simulate(plant, motion(reference), 0, len(reference) * STEP_S, EXACT).truth.signals
     found = exact_machine(plant).run(reference)[:, 2:]
@@ -108,6 +114,22 @@ def test_a_design_from_the_file_to_the_true_machine(
         run([*asked, "--after", str(snapshot), "--json"])
     again = json.loads(capsys.readouterr().out)
     assert 0 < again["segments_worth_running"] <= again["segments_tried"]
+
+
+def test_what_goes_too_far_is_run_smaller(tmp_path: Path) -> None:
+    """A swing to the very ends: nothing of it is lost but what lies beyond the margin."""
+    project = load(write_project(tmp_path, machine(NUMBER), NUMBER))
+    nominal = machine_of(project, section_of(project))
+    limits = tightened(limits_of(section_of(project)))
+    swings = library.library(replace(limits, supply_pa=(6e6, 6e6), offset_v=0.0))
+    swing = next(s for s in swings if s.name.startswith("swing 0.65 of 1 in"))
+    wide = swing.scaled(1.3, library.home_m(limits))
+    fitting = _fitted(nominal, limits, wide)
+    assert fitting is not None
+    kept, chunk = fitting
+    assert all(e.is_kept for e in checked(nominal, limits, kept.reference, chunk))
+    ways = [np.ptp(s.reference[:, X_REF]) for s in (kept, swing, wide)]
+    assert 0.8 * ways[1] < ways[0] < ways[2]
 
 
 def test_what_cannot_be_designed_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

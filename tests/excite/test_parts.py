@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
-from rtid.excite.design import Candidate, missing, stitched
+from rtid.excite import design as designing
+from rtid.excite.design import Candidate, design, missing, stitched
 from rtid.excite.driving import SHUT, STEP_S, SUPPLY, V_REF, X_REF
 from rtid.excite.information import Information
 from rtid.excite.library import Segment, library
-from rtid.excite.limits import LimitError, Limits, extremes, require_kept
+from rtid.excite.limits import Extremes, LimitError, Limits, extremes, require_kept
+from rtid.excite.machine import Machine
 from rtid.excite.selection import (
     BOUNDED,
     MOMENTS,
@@ -21,6 +25,7 @@ from rtid.excite.selection import (
     standard_errors,
     value,
 )
+from rtid.model import FloatArray
 
 LIMITS = Limits(
     20.0, (0.08, 0.42), 0.3, 9.0, (1e5, 1e7), (5e6, 8.5e6), supply_rate_paps=5e6, offset_v=0.6
@@ -56,6 +61,48 @@ def test_segments_begin_and_end_at_rest_at_home_within_the_limits() -> None:
         assert np.abs(r[:, V_REF]).max() <= 0.3 * (1 + 1e-9)
 
 
+def test_a_segment_that_is_scaled_is_the_same_nearer_to_home() -> None:
+    segment = library(LIMITS)[0]
+    small = segment.scaled(0.5, 0.25).reference
+    assert np.allclose(small[:, X_REF] - 0.25, 0.5 * (segment.reference[:, X_REF] - 0.25))
+    assert np.allclose(small[:, V_REF], 0.5 * segment.reference[:, V_REF])
+    assert np.array_equal(small[:, SUPPLY:], segment.reference[:, SUPPLY:])
+
+
+def test_a_segment_that_breaks_a_limit_beside_the_others_is_left_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One goes 5 mm beyond the stroke; one stays within it, but not within half of the margin."""
+
+    def position(
+        _machine: Machine, limits: Limits, r: FloatArray, _run: FloatArray
+    ) -> list[Extremes]:
+        x = r[:, X_REF]
+        return [Extremes("position", "m", x.min(), x.max(), *limits.stroke_m, 0.0)]
+
+    monkeypatch.setattr(designing, "checked", position)
+    monkeypatch.setattr(designing, "working_weights", lambda *_: np.ones(3))
+    rest = np.tile([0.25, 0.0, 0.0, 6e6, 0.0], (3000, 1))
+    names = {"within": 0.1, "close": 0.169, "beyond": 0.175}
+    pool = []
+    for cell, (name, way) in enumerate(names.items()):
+        reference = rest.copy()
+        reference[1000:2000, X_REF] += way
+        pool.append(Candidate(Segment(name, reference), _told(cell, 1e6)))
+    machine = SimpleNamespace(model=SimpleNamespace(n_cells=3), run=lambda reference: reference)
+    found = design(cast("Machine", machine), LIMITS, None, pool)
+    assert {c.segment.name for c in found.segments} == {"within"}
+    with pytest.raises(LimitError, match="no segment"):
+        design(cast("Machine", machine), LIMITS, None, pool[2:])
+
+
+def test_what_is_known_well_enough_gains_nothing() -> None:
+    rows = np.array([100.0])
+    well, better = (BOUNDED.value(s * np.eye(6)[None], rows) for s in (1e10, 1e12))
+    poor, fair = (BOUNDED.value(s * np.eye(6)[None], rows) for s in (1e2, 1e4))
+    assert better - well < 0.01 < 1.0 < fair - poor
+
+
 def test_what_is_not_allowed_is_not_in_the_library() -> None:
     plain = replace(LIMITS, supply_pa=(7e6, 7e6), offset_v=0.0, may_shut=False)
     every = np.concatenate([s.reference for s in library(plain)])
@@ -66,7 +113,10 @@ def test_what_is_not_allowed_is_not_in_the_library() -> None:
 
 def test_a_row_of_segments_keeps_the_supplys_rate_and_the_time() -> None:
     pool = [Candidate(s, _told(0, 1.0)) for s in library(LIMITS)[::9]]
-    kept, reference = stitched(pool, LIMITS)
+    kept, reference, playing = stitched(pool, LIMITS)
+    assert len(playing) == len(reference)
+    assert (np.diff(playing) >= 0).all()
+    assert set(playing.tolist()) == set(range(len(kept)))
     assert 0 < len(kept) < len(pool)
     assert len(reference) * STEP_S <= LIMITS.duration_s
     assert np.abs(np.diff(reference[:, SUPPLY])).max() <= 5e6 * STEP_S * (1 + 1e-9)
@@ -98,9 +148,30 @@ def test_what_is_learned_is_not_missing() -> None:
     segment = Segment("", np.zeros((10, 5)))
     pool = [Candidate(segment, _told(0, 1e6)), Candidate(segment, _told(1, 1e6))]
     known = Known.nothing(2)
-    assert set(map(id, missing(pool, known, np.ones(2)))) == set(map(id, pool))
+    assert missing(pool, known, np.ones(2)).cells.tolist() == [0, 1]
     known.add(_told(0, 1e9))
-    assert missing(pool, known, np.ones(2)) == (pool[1],)
+    left = missing(pool, known, np.ones(2))
+    assert (left.cells.tolist(), left.effects, left.segments) == ([1], (), (pool[1],))
+    known.add(_told(1, 1e9))
+    assert missing(pool, known, np.ones(2)).segments == ()
+
+
+def test_an_effect_is_missing_until_it_can_be_seen_well() -> None:
+    leak = "external_leakage_laminar", "a"
+    told = replace(_told(0, 1e6), effects={leak: 1.0})
+    pool, known = [Candidate(Segment("", np.zeros((10, 5))), told)], Known.nothing(1)
+    known.add(_told(0, 1e9))
+    assert missing(pool, known, np.ones(1)).effects == (leak,)
+    known.effects[leak] = 100.0
+    assert missing(pool, known, np.ones(1)).effects == ()
+
+
+def test_the_pieces_that_tell_most_do_not_tell_the_same() -> None:
+    both = Information(np.array([0, 1]), 1e6 * np.stack([np.eye(6)] * 2), np.full(2, 60.0))
+    told = [_told(0, 1e6), both, _told(1, 1e6), _told(2, 1e6)]
+    pool = [Candidate(Segment(str(k), np.zeros((10, 5))), t) for k, t in enumerate(told)]
+    pieces = missing(pool, Known.nothing(3), np.ones(3)).pieces(3)
+    assert [(c.segment.name, n) for c, n in pieces] == [("1", 2), ("3", 1)]
 
 
 def test_every_broken_limit_is_named_with_its_place() -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from rtid.daemon.status import (
+    Advice,
     Alarm,
     BusHealth,
     Chamber,
@@ -22,9 +23,7 @@ from rtid.daemon.status import (
     Verdict,
     write,
 )
-from rtid.project import load
 from rtid.ui.live import Live
-from tests.ui.served import project_file
 
 NOW = 1_800_000_000.0
 
@@ -55,14 +54,14 @@ def status() -> Status:
         signals=(replace(pressure, verdict="ok"), position),
         estimate=estimate,
         store=Store("NOT SAVED", "disk full", 40.0),
+        advice=Advice(NOW - 3, "Valve <pa> knows least"),
         verdict=Verdict(NOW - 5, "missing", "Internal leakage at a-b"),
         alarms=(Alarm("frozen", "x does not move", NOW - 3, None, "sensor"),),
     )
 
 
 def shown(folder: Path, at: float = NOW + 0.5) -> str:
-    model = load(project_file(folder)).model
-    parts = Live(folder, model, lambda: at).fragments()
+    parts = Live(folder, lambda: at).fragments()
     return parts["live_health"] + parts["live_learning"]
 
 
@@ -73,7 +72,7 @@ def test_everything_that_the_daemon_says_is_there(tmp_path: Path) -> None:
         *("press &lt;1&gt;", "can0 is open", "3000 frames/s", "error frame 2", "NOT SAVED"),
         *("disk full", "1000 Hz", "3 overruns (late 3)", "2.5 MPa", "frozen", "crc 7", "0x101"),
         *("998 /s", "1060 ± 2.0 MPa", "30 of 42 visited blocks valid", "range 3"),
-        *("Internal leakage at a-b", "x does not move", "To learn more"),
+        *("Internal leakage at a-b", "x does not move", "To learn more", "Valve &lt;pa&gt;"),
     ):
         assert words in html, words
     assert "samples 60,000" not in html  # counted, not refused
@@ -90,7 +89,7 @@ def test_a_status_that_is_not_renewed_is_stale(tmp_path: Path) -> None:
 def test_the_newest_status_is_read_and_an_old_one_kept_where_the_file_is_torn(
     tmp_path: Path,
 ) -> None:
-    live = Live(tmp_path, None, lambda: NOW)
+    live = Live(tmp_path, lambda: NOW)
     assert "No daemon has been heard" in live.fragments()["live_health"]
     write(tmp_path, status())
     assert "3000 frames/s" in live.fragments()["live_health"]

@@ -1,0 +1,111 @@
+"""When to ask the coach: soon after the first snapshot, then now and then while the machine learns.
+
+The coach tries every segment on the nominal machine: about a minute of a processor, in a process of
+its own (`rtid.coaching`).  Without a section [excite] no limits are known, and there is nothing to
+try: then each publication tells which valve is known least.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import numpy as np
+
+from rtid.daemon.diagnosing import DIAGNOSER, newest
+from rtid.daemon.helper import Helper
+from rtid.daemon.jobs import Answer, Coach, Coached, Publication
+from rtid.daemon.log import logger
+from rtid.daemon.status import Advice, EdgeHealth
+from rtid.estimator.estimator import Estimator
+from rtid.model import FloatArray, Model
+from rtid.project import Project
+
+SNAPSHOTS = "state-[01].npz"
+LIMIT_S = 900.0  # a coach that takes longer is given up
+
+
+class Coaching:
+    """One question at a time; `advice` is the newest answer."""
+
+    def __init__(self, project: Project, folder: Path, answer: Callable[[Answer], None]) -> None:
+        self._project, self._folder, self._answer = project, folder, answer
+        self._section = project.sections.excite
+        self._every_s = project.sections.daemon.coach_s
+        self._next_s = 0.0
+        self._started_s = 0.0
+        self._helper: Helper | None = None
+        self.advice: Advice | None = None
+
+    @property
+    def is_running(self) -> bool:
+        """Whether a question is open."""
+        return self._helper is not None
+
+    def published(self, found: Publication) -> None:
+        """Another map is known."""
+        if self._section is None:
+            self.advice = by_valve(self._project.model, found.edges)
+
+    def look(self, estimator: Estimator) -> None:
+        """Ask if it is time and there is a snapshot; give up a coach that takes too long."""
+        now_s = time.monotonic()
+        if self._helper is not None:
+            if now_s - self._started_s > LIMIT_S:
+                logger.warning("coach given up after %.0f s", LIMIT_S)
+                self.stop()
+            return
+        if self._section is None or now_s < self._next_s:
+            return
+        snapshots = sorted(self._folder.glob(SNAPSHOTS), key=lambda path: path.stat().st_mtime)
+        if snapshots:
+            self._next_s, self._started_s = now_s + self._every_s, now_s
+            job = Coach(str(snapshots[-1]), self._samples(estimator))
+            ended = Coached(None, "the coach has ended")
+            self._helper = Helper(DIAGNOSER, [str(self._project.path)], self._answer, ended)
+            self._helper.put(job)
+
+    def take(self, told: Coached) -> None:
+        """An answer has come."""
+        self.stop()
+        if told.advice is None:
+            logger.info("no advice: %s", told.reason)
+            return
+        self.advice = told.advice
+        logger.info("coach text=%r", told.advice.text)
+
+    def stop(self) -> None:
+        """End a question that is open."""
+        if self._helper is not None:
+            self._helper.stop(0.0)
+            self._helper = None
+
+    def _samples(self, estimator: Estimator) -> FloatArray:
+        """The newest samples, where an effect is to be seen that snapshots do not tell of."""
+        history, section = estimator.history, self._section
+        if history is None or section is None or not section.see:
+            return np.empty((0, 0))
+        return newest(history, history.span_s)
+
+
+def by_valve(model: Model, edges: Iterable[EdgeHealth]) -> Advice | None:
+    """Which valve is known least, and how it is moved; all that can be said without limits."""
+    known = {edge.name: edge for edge in model.edges}
+    rows = [e for e in edges if e.name in known]
+    if not rows:
+        return None
+    poorest = min(rows, key=lambda e: (e.progress, e.blocks.get("valid", 0)))
+    edge = known[poorest.name]
+    low, high = max(edge.safe_band_v, float(edge.grid.u_v[0])), float(edge.grid.u_v[-1])
+    sign = "positive" if edge.direction > 0 else "negative"
+    left = sum(poorest.blocks.values()) - poorest.blocks.get("valid", 0)
+    text = (
+        f"Valve {edge.name} knows least. Move with {sign} {edge.command} between {low:g} and "
+        f"{high:g} V: hold each level for a second, then step to the next; repeat with another "
+        "load or supply pressure, so that its pressure drop changes."
+    )
+    if left:
+        text += f" {left} of its visited blocks only need more time where they are."
+    text += " With a section [excite] in the project file the coach names the motion."
+    return Advice(time.time(), text, {edge.name: left} if left else {})
