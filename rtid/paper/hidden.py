@@ -1,8 +1,8 @@
 """Fig. 6 with a hidden effect: tracking before it is known, and after it has been added.
 
 A piston seal leaks, and nobody told the model.  The boom is commissioned all the same; its owner
-diagnoses the frames and adds what is named, or, where nothing is, what comes first of all that is
-listed as too small to matter; maps are learned anew beside it.  The controller gets the new maps,
+diagnoses the frames and adds what is named, or, where nothing is, by `--force` what comes first of
+all that is listed as too small to matter; maps are learned anew beside it.  The controller gets the new maps,
 and the leakage to make up for.
 """
 
@@ -67,7 +67,7 @@ def learned_beside(found: Commissioned) -> tuple[Knowledge, bool]:
         listed = [(e.effect, e.where) for e in told.found or told.negligible]
         with suppress(RefusedError):
             if listed:
-                add(path, trace, *listed[0])
+                add(path, trace, *listed[0], force=not told.found)
         project = load(path)
         flowmap = publish(replay_beside(project, trace).fit.solution)
     sizes = (a.parameters["coefficient"] for a in project.sections.added if a.effect == EFFECT)
