@@ -2,8 +2,8 @@
 
 A piston seal leaks, and nobody told the model.  The boom is commissioned all the same; its owner
 diagnoses the frames and adds what is named, or, where nothing is, by `--force` what comes first of
-all that is listed as too small to matter; maps are learned anew beside it.  The controller gets the new maps,
-and the leakage to make up for.
+all that is listed as too small to matter; maps are learned anew beside it.  The controller gets the
+new maps, and the leakage to make up for.
 """
 
 from __future__ import annotations
