@@ -34,8 +34,7 @@ from rtid.excite.selection import (
 from rtid.excite.sweep import swept_sine
 from rtid.model import FloatArray
 
-MARGIN, PRESSURE_MARGIN = 0.05, 0.02  # of a range, kept free by each candidate on its own
-HALF = 0.5  # of that margin is kept free by the whole motion
+MARGIN, PRESSURE_MARGIN = 0.05, 0.02  # of a range, kept free on the nominal machine
 ELSEWHERE = 0.02  # weight of a block that the working motion does not visit
 GOAL, IMPROVED, WORTH = 5e-3, 0.2, 0.25  # see `missing`; the goal is a share of the rated flow
 ROWS = 20  # that a block needs to be where the machine works
@@ -90,7 +89,7 @@ def design(
 
     known: what is learned already.  Raises LimitError, MachineError.
     """
-    weights, inner = working_weights(machine, limits), tightened(limits, HALF)
+    weights, inner = working_weights(machine, limits), tightened(limits)
     start = known or Known.nothing(machine.model.n_cells)
     costs = np.array([c.segment.duration_s + 2 * REST_S for c in pool])
     problem = Problem([c.told for c in pool], costs, weights, criterion)
@@ -279,8 +278,8 @@ def checked(
     return extremes(limits, reference, chunk[:, 0], x, u, machine.pressures(chunk))
 
 
-def tightened(limits: Limits, part: float = 1.0) -> Limits:
-    """The limits with a margin, or a part of it, for what the true machine does otherwise."""
+def tightened(limits: Limits) -> Limits:
+    """The limits with a margin for what the true machine does otherwise."""
 
     def inner(span: tuple[float, float], share: float) -> tuple[float, float]:
         slack = share * (span[1] - span[0])
@@ -288,7 +287,7 @@ def tightened(limits: Limits, part: float = 1.0) -> Limits:
 
     return replace(
         limits,
-        stroke_m=inner(limits.stroke_m, part * MARGIN),
-        pressure_pa=inner(limits.pressure_pa, part * PRESSURE_MARGIN),
-        speed_mps=(1.0 - part * MARGIN) * limits.speed_mps,
+        stroke_m=inner(limits.stroke_m, MARGIN),
+        pressure_pa=inner(limits.pressure_pa, PRESSURE_MARGIN),
+        speed_mps=(1.0 - MARGIN) * limits.speed_mps,
     )
