@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from rtid.compare.comparison import Comparison
 from rtid.comparing import TraceComparison
 from rtid.comparing import as_json as compared_json
 from rtid.estimator.flowmap import LEARNING, VALID, EdgeMap
@@ -157,11 +158,7 @@ class Story:
         table.add_column("x sensor noise")
         for held in self.compared.held:
             for name, part in held.parts.items():
-                cells = [
-                    f"{rms * LPM:.3f} L/min = {100 * share:.2f} %"
-                    for rms, share in zip(part.residual_rms_m3s, part.residual_share, strict=True)
-                ]
-                table.add_row(held.name, name, *cells, f"{float(np.mean(part.rho)):.2f}")
+                table.add_row(held.name, name, *_left(part))
         console.print(table)
 
     def _print_blocks(self, console: Console) -> None:
@@ -216,6 +213,15 @@ def _spread(border: Any, used: Any, most: int) -> Any:
     index = np.unique(used)
     pick = np.unique(np.linspace(0, len(index) - 1, min(most, len(index))).round().astype(int))
     return centres[index[pick]]
+
+
+def _left(part: Comparison) -> list[str]:
+    """Residual per chamber, and in units of the noise; dashes for a part without rows."""
+    if not len(part.t_s):
+        return ["-"] * (part.residual_m3s.shape[1] + 1)
+    both = zip(part.residual_rms_m3s, part.residual_share, strict=True)
+    cells = [f"{rms * LPM:.3f} L/min = {100 * share:.2f} %" for rms, share in both]
+    return [*cells, f"{float(np.mean(part.rho)):.2f}"]
 
 
 def _block_counts(edge: EdgeMap) -> dict[str, int]:
