@@ -96,20 +96,28 @@ def record_sweep(trace: Path, plant: Plant, number: int) -> list[Path]:
     """Write the first sweep of a commissioning and its project file.  Raises SimulationError."""
     reference, known = swept(plant), Knowledge(sampled(manufacturer(plant, number)))
     tracked = run(plant, known, reference, number)
-    check_sane(plant, tracked, reference)
+    if fault := lost(plant, tracked, reference):
+        raise SimulationError(fault)
     frames = tracked_frames(tracked, reference, START_US)
     return [trace, write_boom(trace, plant, declared(plant, number), frames)]
 
 
 def commission(plant: Plant, number: int, rounds: int = ROUNDS) -> Commissioned:
-    """So many rounds, from the data sheet on.  Raises SimulationError where the boom gets lost."""
+    """So many rounds, from the data sheet on.
+
+    Raises SimulationError where the boom gets lost under the data sheet.  Where it gets lost
+    under a learned map there are no more rounds: that map has to do, and is judged.
+    """
     model, reference = declared(plant, number), swept(plant)
     known = Knowledge(sampled(manufacturer(plant, number)))
     done: list[Round] = []
     frames: list[Frames] = []
     for turn in range(rounds):
         tracked = run(plant, known, reference, number + 100_000 * turn)
-        check_sane(plant, tracked, reference)
+        if fault := lost(plant, tracked, reference):
+            if not done:
+                raise SimulationError(fault)
+            break
         start_us = START_US + turn * (1000 * len(reference) + PAUSE_US)
         frames.append(tracked_frames(tracked, reference, start_us))
         learned = learn_frames(plant, model, concatenate(frames))
@@ -118,17 +126,16 @@ def commission(plant: Plant, number: int, rounds: int = ROUNDS) -> Commissioned:
     return Commissioned(plant, model, concatenate(frames), tuple(done))
 
 
-def check_sane(plant: Plant, tracked: Tracked, reference: FloatArray) -> None:
-    """Raise SimulationError for a boom that left its stroke or cavitated."""
+def lost(plant: Plant, tracked: Tracked, reference: FloatArray) -> str:
+    """In what way a boom got lost, empty if it did not."""
     x = tracked.error_m + reference[:, 0]
     if not ((x > 0) & (x < plant.constants.stroke_m)).all():
-        raise SimulationError("the boom leaves its stroke")
-    if not (tracked.true_pa > 1e4).all():
-        raise SimulationError("the boom cavitates")
+        return "the boom leaves its stroke"
+    return "" if (tracked.true_pa > 1e4).all() else "the boom cavitates"
 
 
 def machines(compare: Callable[[int], Found], count: int, first: int = FIRST) -> Iterator[Found]:
-    """What `compare` finds of so many; one that gets lost on its first sweep is left out."""
+    """What `compare` finds of so many; one that gets lost under its data sheet is left out."""
     number, done = first, 0
     while done < count:
         with suppress(SimulationError):

@@ -94,6 +94,10 @@ def reproduce(seed: int = 0, plants: int = 30) -> Part:
             float(np.median(rms[MANUFACTURER] / rms[CALIBRATED])),
         ),
         Measure("energy with regeneration / without, median", float(np.median(spared))),
+        Measure(
+            "left out: lost on the first sweep, under the data sheet",
+            found[-1].number + 1 - FIRST - seed - plants, "booms",
+        ),
     )  # fmt: skip
     title = "Fig. 6: tracking with different flow maps"
     return Part("fig6", title, text, measures, (_table(found),), {"fig6": draw(found[0])})

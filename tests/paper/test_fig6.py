@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +13,13 @@ import pytest
 from firmware_bridge.download import Image, Session, download
 from firmware_bridge.lookup import image
 from rtid.cli.main import run as main_run
-from rtid.paper import hidden
+from rtid.paper import commissioning, hidden
 from rtid.paper.commissioning import (
     DEADBAND_ERROR_V,
     Commissioned,
     commission,
     five_valves,
+    lost,
     machines,
     manufacturer,
     over_the_bridge,
@@ -29,6 +31,7 @@ from rtid.project import load
 from rtid.replay import read_trace
 from rtid.sim.plant import AB, AT, EDGES, PB, FloatArray, Plant
 from rtid.sim.robust import Knowledge, Tracked, received, run, sampled
+from rtid.sim.run import SimulationError
 from rtid.sim.working_modes import REGENERATE_UNTIL_PA
 from tests.bridge.controller import Controller, Line
 from tests.campaign.report import leave
@@ -116,6 +119,29 @@ def test_all_five_valves_are_identified_in_normal_operation(
         assert np.sqrt(np.mean(error**2)) < 0.01 * true.max(), edge
     beta = last.learned.replay.fit.solution.beta_pa
     np.testing.assert_allclose(beta, plant.beta_pa, rtol=0.02)
+
+
+@pytest.mark.parametrize("turn", [0, 1])
+def test_only_a_boom_lost_under_its_data_sheet_is_left_out(
+    plant: Plant, turn: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One lost under a learned map is judged by that map: else failures would hide."""
+    faults = iter(["", "the boom cavitates"][1 - turn :])
+    monkeypatch.setattr(commissioning, "lost", lambda *given: next(faults))
+    if turn == 0:
+        with pytest.raises(SimulationError, match="cavitates"):
+            commission(plant, NUMBER)
+    else:
+        assert len(commission(plant, NUMBER).rounds) == 1
+
+
+def test_a_boom_that_leaves_its_stroke_or_cavitates_is_lost(plant: Plant) -> None:
+    reference = point_to_point(plant)
+    tracked = run(plant, Knowledge(sampled(plant.flow)), reference)
+    assert lost(plant, tracked, reference) == ""
+    away = replace(tracked, error_m=tracked.error_m + plant.constants.stroke_m)
+    assert "stroke" in lost(plant, away, reference)
+    assert "cavitates" in lost(plant, replace(tracked, true_pa=0 * tracked.true_pa), reference)
 
 
 def test_the_example_is_a_log_and_a_project_of_five_valves(tmp_path: Path) -> None:
