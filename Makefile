@@ -5,13 +5,18 @@ PYTHON ?= python3
 PIP = .venv/bin/python -m pip --disable-pip-version-check
 READY = .venv/.ready
 
-.PHONY: demo test bench lint campaign faults soak mutants paper pictures screenshots lock clean
+.PHONY: demo check test bench lint campaign faults fuzz soak mutants paper pictures screenshots lock clean
 
 demo: $(READY)
 	.venv/bin/rtid demo
 
 test: $(READY)
 	.venv/bin/python -m pytest -q -n 2 --dist worksteal -p no:benchmark
+
+# After each edit, a minute: lint, types, layers, and the unit tests that the change touches, nearest
+# first; all unit tests: make check ALL=1.
+check: $(READY)
+	.venv/bin/python -m tools.check $(if $(ALL),--all)
 
 bench: $(READY)
 	@mkdir -p out
@@ -31,12 +36,21 @@ campaign: $(READY)
 screenshots: $(READY)
 	.venv/bin/python -m tools.screenshots out/screenshots
 
-# Every fault of the on-board daemon with its figure: a table in out/faults.md.
+# All 40 faults with their figures: a table in out/faults.md; what takes longer is in `make soak`.
 faults: $(READY)
 	@mkdir -p out && rm -f out/faults.jsonl
-	RTID_FAULTS=out/faults.jsonl .venv/bin/python -m pytest -q -p no:benchmark tests/faults; \
+	RTID_FAULTS=out/faults.jsonl .venv/bin/python -m pytest -q -p no:benchmark \
+	  -m 'not campaign and not soak' tests/faults $$(.venv/bin/python -m tests.faults.elsewhere); \
 	  status=$$?; .venv/bin/python -m tests.faults.table out/faults.jsonl | tee out/faults.md; \
 	  exit $$status
+
+# Mutated projects, DBCs, logs, tables and plant files, each through its command (ten minutes):
+# make fuzz SEED=2 FUZZ="--logs 5000 --dbcs 0"; one case again: make fuzz FUZZ="--case logs-17"
+SEED ?= 1
+FUZZ ?= --projects 500 --dbcs 500 --logs 1000 --tables 1000 --plants 200 --bombs 8
+fuzz: $(READY)
+	@rm -rf out/fuzz && mkdir -p out
+	.venv/bin/python -m tests.fuzz --seed $(SEED) --out out/fuzz $(FUZZ)
 
 # The long ones (an hour): a full bus, 50 kills, hours in minutes, live diagnoses, an open page.
 soak: $(READY)
@@ -52,7 +66,7 @@ mutants: $(READY)
 # Every figure and table of the paper, into out/paper (half an hour), and the pictures of docs/paper.md;
 # it ends with 4 where a goal is missed.
 paper: $(READY)
-	.venv/bin/rtid paper --out out/paper; status=$$?; \
+	.venv/bin/python -m benchmarks.paper --out out/paper; status=$$?; \
 	  .venv/bin/python -m tools.paper_pictures out/paper tools/pictures && exit $$status
 
 # The pictures of README; the first one is the page's, as `make screenshots` takes it.

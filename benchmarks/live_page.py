@@ -81,48 +81,48 @@ def machine(stack: ExitStack, folder: Path, seconds: float, priority: int) -> tu
 
 def seconds_of(state: Path, seconds: float) -> FloatArray:
     """p99 of work and lateness (n, 2), us, of every second that the daemon tells of."""
-    told, last, end = [], 0, time.monotonic() + seconds
+    times, last, end = [], 0, time.monotonic() + seconds
     while time.monotonic() < end:
         loop = read(state).loop
         if loop.ticks != last:
             last = loop.ticks
-            told.append((loop.work_1s.p99_us, loop.lateness_1s.p99_us))
+            times.append((loop.work_1s.p99_us, loop.lateness_1s.p99_us))
         time.sleep(0.25)
-    return np.array(told)
+    return np.array(times)
 
 
 def cost(state: Path, page: Page, url: str, slice_s: float, pairs: int) -> FloatArray:
     """Medians of both p99 (pairs, closed or open, 2)."""
-    found = np.empty((pairs, 2, 2))
+    shares = np.empty((pairs, 2, 2))
     for k in range(pairs):
         for is_open in (k % 2, 1 - k % 2):  # neither comes first always
             page.goto(f"{url}#live" if is_open else "about:blank")
             if is_open:
                 page.wait_for_selector("#live_learning progress")
             time.sleep(SETTLE_S)
-            found[k, is_open] = np.median(seconds_of(state, slice_s), axis=0)
-        print(f"pair {k + 1}: closed {found[k, 0]}, open {found[k, 1]} us, load "
+            shares[k, is_open] = np.median(seconds_of(state, slice_s), axis=0)
+        print(f"pair {k + 1}: closed {shares[k, 0]}, open {shares[k, 1]} us, load "
               f"{os.getloadavg()[0]:.1f}", flush=True)  # fmt: skip
-    return found
+    return shares
 
 
-def report_cost(found: FloatArray) -> None:
+def report_cost(shares: FloatArray) -> None:
     """Ratios open / closed with their intervals."""
-    ratios = found[:, 1] / found[:, 0]
+    ratios = shares[:, 1] / shares[:, 0]
     rng = np.random.default_rng(0)
     again = np.median(ratios[rng.integers(0, len(ratios), (1000, len(ratios)))], axis=1)
     low, high = np.quantile(again, [0.025, 0.975], axis=0)
     for k, name in enumerate(("work", "lateness")):
-        print(f"loop p99, {name}: closed {np.median(found[:, 0, k]):.0f} us, open "
-              f"{np.median(found[:, 1, k]):.0f} us, ratio {np.median(ratios[:, k]):.3f} "
+        print(f"loop p99, {name}: closed {np.median(shares[:, 0, k]):.0f} us, open "
+              f"{np.median(shares[:, 1, k]):.0f} us, ratio {np.median(ratios[:, k]):.3f} "
               f"({low[k]:.3f} .. {high[k]:.3f})")  # fmt: skip
 
 
 def private_mb(browser: Browser) -> float:
     """Memory that the largest tab has for itself."""
-    told = browser.new_browser_cdp_session().send("SystemInfo.getProcessInfo")
+    answer = browser.new_browser_cdp_session().send("SystemInfo.getProcessInfo")
     sizes = [0.0]
-    for process in told["processInfo"]:
+    for process in answer["processInfo"]:
         if process["type"] == "renderer":
             lines = Path(f"/proc/{process['id']}/smaps_rollup").read_text().splitlines()
             sizes.append(sum(int(x.split()[1]) for x in lines if x.startswith("Private")) / 1e3)
@@ -148,23 +148,23 @@ def memory(browser: Browser, page: Page, url: str, minutes: float) -> tuple[floa
     return rate, np.array(rows)
 
 
-def growth(found: FloatArray) -> tuple[float, float]:
+def growth(sizes: FloatArray) -> tuple[float, float]:
     """Of script heap and private memory in 30 minutes, MB, after the first fifth.
 
     What a page frees at once comes and goes by 40 MB; what stays is the least of every minute.
     """
-    kept = found[found[:, 0] >= WARM * found[-1, 0]]
+    kept = sizes[sizes[:, 0] >= WARM * sizes[-1, 0]]
     minutes = [kept[kept[:, 0] // 1 == k] for k in np.unique(kept[:, 0] // 1)]
     least = np.array([rows.min(axis=0) for rows in minutes])
     slopes = np.polyfit(least[:, 0], least[:, 1:], 1)[0]
     return float(30 * slopes[0]), float(30 * slopes[1])
 
 
-def report_memory(rate: float, found: FloatArray) -> None:
+def report_memory(rate: float, sizes: FloatArray) -> None:
     """In words."""
-    heap, private = growth(found)
-    low, high = found[:, 1:].min(axis=0), found[:, 1:].max(axis=0)
-    print(f"tab, {found[-1, 0]:.0f} minutes at {rate:.1f} updates a second: script heap "
+    heap, private = growth(sizes)
+    low, high = sizes[:, 1:].min(axis=0), sizes[:, 1:].max(axis=0)
+    print(f"tab, {sizes[-1, 0]:.0f} minutes at {rate:.1f} updates a second: script heap "
           f"{low[0]:.1f} .. {high[0]:.1f} MB, private {low[1]:.0f} .. {high[1]:.0f} MB; growth of "
           f"what stays {heap:+.2f} and {private:+.1f} MB in 30 minutes")  # fmt: skip
 

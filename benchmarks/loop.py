@@ -45,14 +45,14 @@ def ours(rate_hz: float, seconds: float) -> tuple[Counts, dict[str, Any]]:
     """The same of our loop, in a process of its own, and what its ticks cost."""
     command = [sys.executable, "-m", "benchmarks.loop", "--child", str(rate_hz), str(seconds)]
     said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    found = json.loads(said.splitlines()[-1])
-    return np.array(found["late"], np.int64), found["told"]
+    measured = json.loads(said.splitlines()[-1])
+    return np.array(measured["late"], np.int64), measured["told"]
 
 
 def child(rate_hz: float, seconds: float) -> None:
     """Run the loop with frames, assembler, gates and estimator in each tick."""
-    from rtid.loop import realtime
-    from rtid.loop.loop import Loop
+    from rtid.daemon import realtime
+    from rtid.daemon.loop import Loop
     from tests.faults.harness import FRAMES_PER_CYCLE, machine
 
     learner = machine().learner()
@@ -84,8 +84,8 @@ def child(rate_hz: float, seconds: float) -> None:
     loop.run()
     counts = np.bincount(np.minimum(late // 1000, MOST_US - 1), minlength=MOST_US)
     cost = {f"p{100 * s:g}": loop.total.work.quantile_us(s) for s in (0.5, 0.99, 0.999)}
-    told = cost | {"overruns": loop.total.overruns, "causes": loop.total.causes}
-    print(json.dumps({"late": counts.tolist(), "told": told}))
+    answer = cost | {"overruns": loop.total.overruns, "causes": loop.total.causes}
+    print(json.dumps({"late": counts.tolist(), "told": answer}))
 
 
 def quantiles(counts: Counts) -> NDArray[np.float64]:
@@ -108,9 +108,11 @@ def main() -> None:
     mine, theirs = [], []
     for k in range(wanted.pairs):
         theirs.append(cyclictest(wanted.rate, wanted.slice))
-        counts, told = ours(wanted.rate, wanted.slice)
+        counts, answer = ours(wanted.rate, wanted.slice)
         mine.append(counts)
-        print(f"pair {k + 1}: cyclictest {quantiles(theirs[-1])}, rtid {quantiles(counts)}, {told}")
+        print(
+            f"pair {k + 1}: cyclictest {quantiles(theirs[-1])}, rtid {quantiles(counts)}, {answer}"
+        )
     a, b = np.array(mine), np.array(theirs)
     rng = np.random.default_rng(0)
     chosen = [rng.integers(0, len(a), len(a)) for _ in range(500)]

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from firmware_bridge.samples import Samples
 from rtid.estimator.state import State, build
-from rtid.kernels import tables
-from rtid.model import Grid, Model
+from rtid.kernels import housekeeping
+from rtid.model import Grid, Machine
 from rtid.sim.declare import declared_model, uniform_grid
-from rtid.sim.plant import Plant
 from rtid.sim.run import Run, simulate
+from rtid.sim.simulated_plant import SimulatedPlant
 
 FloatArray = NDArray[np.float64]
 
@@ -26,7 +26,7 @@ COARSE = (10, 8)
 @cache
 def run() -> Run:
     """The swept sine at 1 kHz with sensor noise."""
-    return simulate(Plant(), "sweep", seed=1, duration_s=SECONDS)
+    return simulate(SimulatedPlant(), "sweep", seed=1, duration_s=SECONDS)
 
 
 def record() -> Samples:
@@ -34,7 +34,7 @@ def record() -> Samples:
     return run().samples
 
 
-def model(blocks: tuple[int, int] = (30, 20), span: bool = False) -> Model:
+def model(blocks: tuple[int, int] = (30, 20), span: bool = False) -> Machine:
     """Two chambers, four edges, each with a uniform grid of blocks (along u, along dp).
 
     With `span` the blocks have the size of the 10 x 8 grid, and more blocks reach further.
@@ -44,17 +44,18 @@ def model(blocks: tuple[int, int] = (30, 20), span: bool = False) -> Model:
         high_v = low_v + (high_v - low_v) * blocks[0] / COARSE[0]
         high_pa = low_pa + (high_pa - low_pa) * blocks[1] / COARSE[1]
     return declared_model(
-        Plant(), grid=uniform_grid((low_v, high_v, blocks[0]), (low_pa, high_pa, blocks[1]))
+        SimulatedPlant(),
+        grid=uniform_grid((low_v, high_v, blocks[0]), (low_pa, high_pa, blocks[1])),
     )
 
 
-def one_chamber(full: Model) -> Model:
+def one_chamber(full: Machine) -> Machine:
     """Chamber A and its two edges alone: one shared parameter."""
     edges = tuple(e for e in full.edges if "p_a" in (e.source, e.sink))
     return replace(full, chambers=full.chambers[:1], edges=edges)
 
 
-def one_block(full: Model) -> Model:
+def one_block(full: Machine) -> Machine:
     """Chamber A, one edge that is always open, one block: 7 parameters, filter (10), all rows."""
     grid = Grid(np.array([-20.0, 20.0]), np.array([-3e7, 3e7]))
     edge = replace(full.edges[0], grid=grid, safe_band_v=-np.inf)
@@ -68,16 +69,16 @@ def chunk(samples: Samples) -> FloatArray:
     return np.column_stack([t_s, samples.flags, samples.values])
 
 
-def empty(of: Model, shared: int | None = None) -> State:
+def empty(of: Machine, shared: int | None = None) -> State:
     """Fresh state; `shared` sets the number of shared columns, those without an effect stay 0."""
     state = build(of)
     if shared is not None:
         state.engine[0]["n_shared"] = shared
-        tables.clear(state.engine, state.cells)
+        housekeeping.clear(state.engine, state.cells)
     return state
 
 
-def warmed(of: Model, data: FloatArray, shared: int | None = None) -> State:
+def warmed(of: Machine, data: FloatArray, shared: int | None = None) -> State:
     """State that has seen the data once: every block that data visits has its slot."""
     state = empty(of, shared)
     state.advance(data)

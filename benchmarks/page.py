@@ -79,11 +79,11 @@ def browser_s() -> dict[int, float]:
             parents[int(path.parent.name)] = int(path.read_text().rsplit(")", 1)[1].split()[1])
         except OSError:
             continue
-    own, grown = {os.getpid()}, True
+    pids, grown = {os.getpid()}, True
     while grown:
-        more = {pid for pid, parent in parents.items() if parent in own}
-        grown, own = not more <= own, own | more
-    return {pid: spent_s(pid) for pid in own if "chrom" in _name(pid)}
+        more = {pid for pid, parent in parents.items() if parent in pids}
+        grown, pids = not more <= pids, pids | more
+    return {pid: spent_s(pid) for pid in pids if "chrom" in _name(pid)}
 
 
 def _name(pid: int) -> str:

@@ -1,6 +1,6 @@
-"""Write the speed table of README between its markers, from what `make bench` measured.
+"""Write the speed table of docs/figures.md between its markers, from what `make bench` measured.
 
-python -m benchmarks.table [MEASURED.json README.md]
+python -m benchmarks.table [MEASURED.json docs/figures.md]
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ def replace_between(text: str, name: str, content: str) -> str:
 
 
 def main(arguments: list[str]) -> None:
-    """Read the measurement, rewrite the README."""
-    source, target = arguments or ("out/bench.json", "README.md")
+    """Read the measurement, rewrite the page."""
+    source, target = arguments or ("out/bench.json", "docs/figures.md")
     table = markdown(json.loads(Path(source).read_text()))
     readme = Path(target)
     readme.write_text(replace_between(readme.read_text(), "speed", table))

@@ -8,14 +8,14 @@ from typing import Any
 from benchmarks.interleave import Job, side_by_side
 from benchmarks.machine import chunk, model, record, warmed
 from rtid.estimator.solution import solve
-from rtid.model import BASES, Model, Term
+from rtid.model import BASES, Machine, Term
 
 FORMS = ("integral", "carry", "restart")
 SHAPES = ("linear", "root", "hinge")
 CANDIDATES = 20
 
 
-def machine(form: str, basis: str, candidates: int = 0) -> Model:
+def machine(form: str, basis: str, candidates: int = 0) -> Machine:
     """Two chambers, 16 x 12 blocks per edge; candidates: shared terms of all shapes."""
     full = model((16, 12))
     edges = tuple(replace(edge, basis=basis) for edge in full.edges)
@@ -29,7 +29,7 @@ def candidate(k: int) -> Term:
     return Term(f"leak {k}", weights, (("a", -1), ("b", 1)), 1e-11, -1e5 * k, SHAPES[k % 3])
 
 
-def update_job(name: str, of: Model) -> Job:
+def update_job(name: str, of: Machine) -> Job:
     """The update over arrays."""
     data = chunk(record())
     state = warmed(of, data)

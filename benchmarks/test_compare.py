@@ -12,15 +12,15 @@ from rtid.estimator.estimator import to_chunk
 from rtid.estimator.published import publish
 from rtid.estimator.record import fit_record
 from rtid.sim.declare import declared_model
-from rtid.sim.plant import Plant
 from rtid.sim.run import simulate as run_plant
+from rtid.sim.simulated_plant import SimulatedPlant
 
 SECONDS = 110.0
 SEEN = 80_000
 
 
 def test_compare(benchmark: Any) -> None:
-    run = run_plant(Plant(), "rich", seed=1, duration_s=SECONDS)
+    run = run_plant(SimulatedPlant(), "rich", seed=1, duration_s=SECONDS)
     model = declared_model(run.plant)
     chunk = to_chunk(model, run.samples, 0)
     fit = fit_record(model, chunk[:SEEN])

@@ -16,7 +16,8 @@ import pytest
 from benchmarks.interleave import report
 from rtid.diagnose.diagnosis import search
 from rtid.estimator.estimator import to_chunk
-from rtid.model import FloatArray, Model
+from rtid.model import Machine
+from rtid.plain import FloatArray
 from rtid.sim.declare import declared_model
 from rtid.sim.hidden import hide
 from rtid.sim.random_plants import draw
@@ -34,7 +35,7 @@ HIDDEN = (
 )
 
 
-def record(effect: str, strength: float) -> tuple[Model, FloatArray, FloatArray]:
+def record(effect: str, strength: float) -> tuple[Machine, FloatArray, FloatArray]:
     """Model, identification and held-out part of a random machine with a hidden effect."""
     plant = draw(SEED)
     if strength:
@@ -46,7 +47,7 @@ def record(effect: str, strength: float) -> tuple[Model, FloatArray, FloatArray]
     return model, chunk[t_s < LEARN_S], chunk[t_s >= TEST_S]
 
 
-def peak_mb(parts: tuple[Model, FloatArray, FloatArray]) -> float:
+def peak_mb(parts: tuple[Machine, FloatArray, FloatArray]) -> float:
     """Most that one diagnosis has allocated at a time, MB."""
     tracemalloc.start()
     try:
@@ -59,7 +60,7 @@ def peak_mb(parts: tuple[Model, FloatArray, FloatArray]) -> float:
 @pytest.mark.parametrize(("effect", "strength"), HIDDEN, ids=[name for name, _ in HIDDEN])
 def test_verdict(benchmark: Any, effect: str, strength: float) -> None:
     parts = record(effect, strength)
-    found = search(*parts)  # kernels compiled
+    result = search(*parts)  # kernels compiled
     wall, processor = [], []
 
     def once() -> None:
@@ -75,5 +76,5 @@ def test_verdict(benchmark: Any, effect: str, strength: float) -> None:
         {"name": "processor", "text": f"{median(processor):.2f} s"},
         {"name": "peak memory", "text": f"{memory:.0f} MB"},
     ]
-    report(benchmark, f"Verdict on 80 s at 1 kHz with {effect}: {found.verdict}", "record", rows)
+    report(benchmark, f"Verdict on 80 s at 1 kHz with {effect}: {result.verdict}", "record", rows)
     benchmark.extra_info.update(processor_s=median(processor), peak_mb=memory)

@@ -7,12 +7,12 @@ from typing import Any
 from benchmarks.interleave import Job, side_by_side
 from benchmarks.machine import chunk, model, one_chamber, record, warmed
 from rtid.kernels.layout import BLOCK_CHANGES, SAMPLES
-from rtid.model import Model
+from rtid.model import Machine
 
 GRIDS = ((10, 8), (30, 20), (100, 80))
 
 
-def arrays_job(label: str, machine: Model, shared: int | None = None) -> Job:
+def arrays_job(label: str, machine: Machine, shared: int | None = None) -> Job:
     """The update over arrays; the name tells how often the working point changed the block."""
     data = chunk(record())
     state = warmed(machine, data, shared)

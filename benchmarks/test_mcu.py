@@ -19,11 +19,11 @@ from benchmarks.interleave import Job, ratio, report, side_by_side
 from benchmarks.machine import COARSE, chunk, model, record, warmed
 from benchmarks.test_update import one_by_one
 from rtid.estimator.solution import solve
+from rtid.mcu.c_tables import sizes_of
 from rtid.mcu.memory import Layout
-from rtid.mcu.tables import sizes_of
 from rtid.mcu.valve import one_valve
 from rtid.mcu.write import write_sources
-from rtid.model import Model
+from rtid.model import Machine
 
 BLOCKS = 48
 KERNEL, BY_SAMPLE = "rtid, over arrays", "rtid, State.advance per sample"
@@ -36,7 +36,7 @@ FEW = 3000
 class Controller:
     """The estimator in C with its memory, on the samples of the record."""
 
-    def __init__(self, machine: Model, single: bool = False, *options: str) -> None:
+    def __init__(self, machine: Machine, single: bool = False, *options: str) -> None:
         gcc = shutil.which("gcc")
         if gcc is None:
             pytest.skip("no gcc on this machine: the controller's estimator is not measured")
@@ -57,7 +57,7 @@ class Controller:
         self.library.begin(pointer(self.memory))
 
     @staticmethod
-    def _samples(machine: Model, layout: Layout) -> NDArray[np.void]:
+    def _samples(machine: Machine, layout: Layout) -> NDArray[np.void]:
         taken = record()
         out = np.zeros(len(taken), layout.sample)
         out["t_us"], out["row"] = taken.t_us - taken.t_us[0], taken.flags & 1
@@ -85,12 +85,12 @@ class Controller:
         return ctypes.c_int64(len(self.samples))
 
 
-def valve() -> Model:
+def valve() -> Machine:
     """Chamber A of the benchmarks' machine with its two edges, 10 x 8 blocks each."""
     return one_valve(model(COARSE), "a")
 
 
-def valve_chunk(machine: Model) -> NDArray[np.float64]:
+def valve_chunk(machine: Machine) -> NDArray[np.float64]:
     """The record as the kernel takes it, the signals of one chamber."""
     whole, names = chunk(record()), record().names
     columns = [2 + names.index(signal.name) for signal in machine.signals]
@@ -122,13 +122,13 @@ def test_update(benchmark: Any) -> None:
 def test_longest_update(benchmark: Any) -> None:
     """A tick is longest where the sums of all blocks that ring are settled."""
     built = {DOUBLE: Controller(valve()), SINGLE: Controller(valve(), True)}
-    found = benchmark.pedantic(
+    result = benchmark.pedantic(
         lambda: {name: np.min([c.ticks() for _ in range(7)], axis=0) for name, c in built.items()},
         rounds=1,
     )
     rows = [
         {"name": f"{name}, {what}", "seconds": float(np.percentile(ticks, share))}
-        for name, ticks in found.items()
+        for name, ticks in result.items()
         for what, share in (("p50", 50), ("p99.9", 99.9), ("longest", 100))
     ]
     title = "The same, each update by itself (shortest of seven runs of the record)"

@@ -17,9 +17,9 @@ from benchmarks.frames import assembler, frames
 from benchmarks.interleave import Job, interleave, report
 from benchmarks.machine import COARSE, SECONDS, chunk, empty, model
 from firmware_bridge.frames import from_messages, to_messages
-from firmware_bridge.sources.log_file import open_log
+from firmware_bridge.sources import open_log
 from rtid.estimator.solution import solve
-from rtid.sim.log import write_log
+from rtid.sim.run_files import write_log
 
 PER_CYCLE = 3  # frames
 CYCLES = 6000

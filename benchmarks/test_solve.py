@@ -9,10 +9,10 @@ from benchmarks.machine import chunk, model, one_chamber, record, warmed
 from rtid.estimator.factor import factorize, one_thread
 from rtid.estimator.solution import solve
 from rtid.estimator.sums import normal_equations
-from rtid.model import Model
+from rtid.model import Machine
 
 
-def jobs_of(machine: Model) -> list[Job]:
+def jobs_of(machine: Machine) -> list[Job]:
     """Parameters and covariance alone, and the whole solution with every block's status."""
     state = warmed(machine, chunk(record()))
     n_shared, n_blocks = int(state.engine[0]["n_shared"]), int(state.engine[0]["n_slots"])

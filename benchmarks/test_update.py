@@ -19,7 +19,7 @@ from benchmarks.reference import Reference
 from rtid.estimator.state import State
 from rtid.estimator.sums import Sums
 from rtid.kernels.engine import advance
-from rtid.model import Model
+from rtid.model import Machine
 
 FloatArray = NDArray[np.float64]
 
@@ -52,11 +52,11 @@ def test_the_other_libraries_find_the_same_parameters() -> None:
     data = rls.samples(FEW)
     expected = rls.by_numpy(data)
     library = compile_c("rls")
-    for found in (rls.by_c(library, data), rls.by_filterpy(data), rls.by_padasip(data)):
-        np.testing.assert_allclose(found, expected, atol=1e-6)
+    for values in (rls.by_c(library, data), rls.by_filterpy(data), rls.by_padasip(data)):
+        np.testing.assert_allclose(values, expected, atol=1e-6)
 
 
-def joint_jobs(machine: Model) -> list[Job]:
+def joint_jobs(machine: Machine) -> list[Job]:
     """The joint update by C, by rtid over arrays and by rtid one sample at a time.
 
     A call of the kernel on prepared memory is the least that Python can do.

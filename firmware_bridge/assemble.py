@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge import checks, cycle, multirate
-from firmware_bridge.catalog import Catalog
+from firmware_bridge.catalog import Catalog, Layouts, words_of
 from firmware_bridge.config import CYCLE, MULTIRATE, Assembly, MessageSource, SignalSource
 from firmware_bridge.frames import Frames, add_counts
 from firmware_bridge.jit import Record, Records
@@ -35,6 +35,7 @@ class Assembler:
     def __init__(self, catalog: Catalog, assembly: Assembly) -> None:
         self.names = tuple(signal.name for signal in assembly.signals)
         self.assembly = assembly
+        self._long = _long_messages(catalog, assembly)
         self._plan = _plan(catalog, assembly)
         names = [message.name for message in assembly.messages]
         rows = [s for s in assembly.signals if s.name == assembly.row_signal]
@@ -85,12 +86,22 @@ class Assembler:
     def push(self, frames: Frames) -> Samples:
         """The samples that became complete with these frames (n frames, in order of arrival)."""
         add_counts(self._source_counts, frames.refused)
-        words = np.ascontiguousarray(frames.data).view("<u8")[:, 0]
+        words = self._words(frames)
         columns = (frames.t_us, frames.channel, frames.can_id, frames.length, words)
         arrays = tuple(np.ascontiguousarray(column) for column in columns)
         if self._cycle is not None:
             return self._push_cycle(arrays)
         return self._push_multirate(arrays)
+
+    def _words(self, frames: Frames) -> NDArray[np.uint64]:
+        """What is read of each frame: its first 8 bytes, or the wanted signals of a long one."""
+        words = words_of(frames.data)
+        for can_id, length, layouts in self._long:
+            mine = (frames.can_id == can_id) & (frames.length == length)
+            if mine.any():
+                words = np.where(mine, 0, words)
+                words[mine] = layouts.pack(frames.data[mine])
+        return words
 
     def _push_cycle(self, arrays: tuple[NDArray[np.generic], ...]) -> Samples:
         out = self._room(len(arrays[0]))
@@ -184,9 +195,9 @@ def _plan(catalog: Catalog, assembly: Assembly) -> checks.Plan:
     n_layouts = n_codes = n_table = 0
     for row, source in zip(messages, assembly.messages, strict=True):
         mine = [s for s in assembly.signals if s.constant is None and s.message == source.name]
-        wanted = [s.signal for s in mine] + ([source.counter] if source.counter else [])
-        found = catalog.layouts(source.name, wanted)
-        _fill_message(row, catalog, source, assembly, found.rows)
+        chosen = _layouts(catalog, assembly, source)
+        chosen = chosen.packed() if chosen.is_long else chosen
+        _fill_message(row, catalog, source, assembly, chosen.rows)
         row["first_role"], row["n_roles"] = len(roles), len(mine)
         row["counter"] = n_layouts + len(mine) if source.counter else -1
         for k, signal in enumerate(mine):
@@ -195,9 +206,9 @@ def _plan(catalog: Catalog, assembly: Assembly) -> checks.Plan:
             if signal.table is not None:
                 tables.append(np.array(signal.table, np.float64))
                 n_table += role["table_count"]
-        layouts.append(_shifted(found.rows, n_layouts, n_codes))
-        codes.append(found.codes)
-        n_layouts, n_codes = n_layouts + len(found.rows), n_codes + len(found.codes)
+        layouts.append(_shifted(chosen.rows, n_layouts, n_codes))
+        codes.append(chosen.codes)
+        n_layouts, n_codes = n_layouts + len(chosen.rows), n_codes + len(chosen.codes)
     if assembly.mode == CYCLE and len(np.unique(messages["counter_mask"])) > 1:
         raise AssemblyError("mode 'cycle': the alive counters must have the same number of bits")
     table = np.concatenate(tables, axis=1) if tables else np.zeros((2, 0))
@@ -205,6 +216,23 @@ def _plan(catalog: Catalog, assembly: Assembly) -> checks.Plan:
         messages, np.array(roles, checks.ROLE), np.concatenate(layouts), np.concatenate(codes),
         np.ascontiguousarray(table),
     )  # fmt: skip
+
+
+def _layouts(catalog: Catalog, assembly: Assembly, source: MessageSource) -> Layouts:
+    """Layouts of what is wanted of a message: its roles, then its counter."""
+    mine = [s for s in assembly.signals if s.constant is None and s.message == source.name]
+    wanted = [s.signal for s in mine] + ([source.counter] if source.counter else [])
+    return catalog.layouts(source.name, wanted)
+
+
+def _long_messages(catalog: Catalog, assembly: Assembly) -> list[tuple[int, int, Layouts]]:
+    """Identifier, length and layouts of messages of which more than the first 8 bytes is read."""
+    known = [(source.name, _layouts(catalog, assembly, source)) for source in assembly.messages]
+    return [
+        (catalog.can_id(name), catalog.message(name).length, layouts)
+        for name, layouts in known
+        if layouts.is_long
+    ]
 
 
 def _shifted(rows: Records, n_layouts: int, n_codes: int) -> Records:

@@ -66,7 +66,7 @@ def raw_number(bits: np.uint64, row: Record) -> float:
 
 @inlined
 def contains(codes: NDArray[np.uint64], first: Integer, count: Integer, bits: np.uint64) -> bool:
-    """Whether `bits` is one of codes[first : first + count]."""
+    """Whether `bits` is one of codes[first : first + count]; codes (codes,)."""
     for k in range(first, first + count):  # noqa: SIM110  numba has no generators
         if codes[k] == bits:
             return True
@@ -75,7 +75,7 @@ def contains(codes: NDArray[np.uint64], first: Integer, count: Integer, bits: np
 
 @inlined
 def selected(word: np.uint64, layouts: Records, k: Integer, codes: NDArray[np.uint64]) -> bool:
-    """Whether all multiplexers above signal k select it in this payload."""
+    """Whether all multiplexers above signal k, of layouts (signals,), select it in this payload."""
     while layouts[k].selector >= 0:
         above = layouts[k].selector
         page = raw_bits(word, layouts[above])
@@ -87,7 +87,7 @@ def selected(word: np.uint64, layouts: Records, k: Integer, codes: NDArray[np.ui
 
 @inlined
 def decode_one(word: np.uint64, layouts: Records, k: Integer, codes: NDArray[np.uint64]) -> float:
-    """Physical value of signal k; NaN where it is marked as not available or out of range."""
+    """Value of signal k of layouts (signals,), DBC units; NaN if not available or out of range."""
     row = layouts[k]
     bits = raw_bits(word, row)
     if row.absent_count and contains(codes, row.absent_first, row.absent_count, bits):
@@ -114,7 +114,7 @@ def _decode_integers(words: NDArray[np.uint64], row: Record, out: NDArray[np.flo
 def decode_words(
     words: NDArray[np.uint64], layouts: Records, n_signals: Integer, codes: NDArray[np.uint64]
 ) -> NDArray[np.float64]:
-    """Values float64 (n_signals, n) of n payloads; NaN where absent or not selected."""
+    """Values float64 (n_signals, n), DBC units, of n payloads; NaN where absent or not selected."""
     out = np.empty((n_signals, len(words)))
     for k in range(n_signals):
         row = layouts[k]

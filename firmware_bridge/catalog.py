@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import itertools
 import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +18,7 @@ from numpy.typing import NDArray
 
 from firmware_bridge import bits
 from firmware_bridge.config import MessageSource
-from firmware_bridge.frames import EXTENDED, MAX_LENGTH
+from firmware_bridge.frames import EXTENDED, MAX_LENGTH, WORD
 from firmware_bridge.jit import Record, Records
 
 CONTROLLER_DBC = Path(__file__).with_name("controller.dbc")
@@ -35,34 +37,85 @@ class Layouts:
     """Bit layouts of chosen signals of one message.
 
     rows: LAYOUT (n,), the chosen signals first, then the multiplexers they depend on;
-    names: the chosen ones; codes: uint64 (c,), pages and absent codes that the rows point to.
+    names: the chosen ones; codes: uint64 (c,), pages and absent codes that the rows point to;
+    firsts: where the 8 bytes begin in which each row lies, not 0 only in longer messages.
     """
 
     names: tuple[str, ...]
     rows: Records
     codes: NDArray[np.uint64]
+    firsts: tuple[int, ...]
+
+    @property
+    def is_long(self) -> bool:
+        """Whether any of the signals lies behind the eighth byte."""
+        return any(self.firsts)
 
     def decode(self, data: NDArray[np.uint8]) -> NDArray[np.float64]:
-        """Values float64 (n, len(names)) of payloads uint8 (n, 8); NaN where not available."""
-        words = np.ascontiguousarray(data).view("<u8")[:, 0]
-        values = bits.decode_words(words, self.rows, len(self.names), self.codes)
-        return cast("NDArray[np.float64]", values.T)
+        """Values float64 (n, names), DBC units, of payloads uint8 (n, bytes); NaN where absent."""
+        if not self.is_long:
+            values = bits.decode_words(words_of(data), self.rows, len(self.names), self.codes)
+            return cast("NDArray[np.float64]", values.T)
+        columns = [
+            bits.decode_words(words_of(data, first), self.rows[k : k + 1], 1, self.codes)[0]
+            for k, first in enumerate(self.firsts)
+        ]
+        return np.column_stack(columns)
+
+    def packed(self) -> Layouts:
+        """The layouts of the same signals in what `pack` makes; CatalogError if it is too much."""
+        n_bits = int(self.rows["length"].sum(dtype=np.int64))
+        if n_bits > 8 * WORD:
+            raise CatalogError(
+                f"{', '.join(self.names)} of one long message take {n_bits} bits together; "
+                f"{8 * WORD} can be read"
+            )
+        rows = self.rows.copy()
+        rows["shift"], rows["big_endian"] = self._places(), False
+        return Layouts(self.names, rows, self.codes, (0,) * len(rows))
+
+    def pack(self, data: NDArray[np.uint8]) -> NDArray[np.uint64]:
+        """The bits of the signals side by side in one word, uint64 (n,), of payloads (n, bytes)."""
+        packed = np.zeros(len(data), np.uint64)
+        for row, first, place in zip(self.rows, self.firsts, self._places(), strict=True):
+            words = words_of(data, first)
+            words = words.byteswap() if row["big_endian"] else words
+            mask = np.uint64(0xFFFF_FFFF_FFFF_FFFF) >> np.uint64(64 - row["length"])
+            packed |= ((words >> np.uint64(row["shift"])) & mask) << np.uint64(place)
+        return packed
+
+    def _places(self) -> NDArray[np.int64]:
+        """Where each signal begins in what `pack` makes."""
+        ends = np.cumsum(self.rows["length"], dtype=np.int64)
+        return ends - self.rows["length"]
 
     def encode(self, values: NDArray[np.float64]) -> NDArray[np.uint8]:
-        """Payloads uint8 (n, 8) from values (n, len(names)): saturating, NaN = not available."""
+        """Payloads uint8 (n, 8) from values (n, names), DBC units: saturating, NaN = no value."""
         words = np.zeros(len(values), np.dtype("<u8"))
         bits.encode_words(np.asarray(values, np.float64), self.rows, words)
         return words.view(np.uint8).reshape(-1, MAX_LENGTH)
 
 
+def words_of(data: NDArray[np.uint8], first: int = 0) -> NDArray[np.uint64]:
+    """Eight bytes of each payload uint8 (n, bytes) as a number, uint64 (n,); 0 behind its end."""
+    window = data[:, first : first + WORD]
+    if window.shape[1] < WORD:
+        window = np.pad(window, ((0, 0), (0, WORD - window.shape[1])))
+    words: NDArray[np.uint64] = np.ascontiguousarray(window).view("<u8")[:, 0]
+    return words
+
+
 class Catalog:
-    """The messages and signals of one DBC."""
+    """The messages and signals of one DBC.
+
+    Messages that share a name are told apart by their identifier: `Valve-064`, `Valve-18FF0001`.
+    """
 
     def __init__(self, database: Database) -> None:
         n_signals = sum(len(message.signals) for message in database.messages)
         if n_signals > MAX_SIGNALS:
             raise CatalogError(f"the DBC has {n_signals} signals; the limit is {MAX_SIGNALS}")
-        self._messages = {message.name: message for message in database.messages}
+        self._messages = _by_name(database.messages)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -71,9 +124,13 @@ class Catalog:
 
     def message(self, name: str) -> Message:
         """The cantools message `name`; CatalogError with the nearest name if there is none."""
-        if name not in self._messages:
-            raise CatalogError(f"the DBC has no message {name!r}" + _nearest(name, self._messages))
-        return self._messages[name]
+        if name in self._messages:
+            return self._messages[name]
+        alike = [name_of for name_of, message in self._messages.items() if message.name == name]
+        if alike:
+            text = f"the DBC has {len(alike)} messages {name!r}; name one of {', '.join(alike)}"
+            raise CatalogError(text)
+        raise CatalogError(f"the DBC has no message {name!r}" + _nearest(name, self._messages))
 
     def signal(self, message: str, signal: str) -> Signal:
         """One signal; CatalogError with the nearest name if the message has none such."""
@@ -86,29 +143,41 @@ class Catalog:
 
     def can_id(self, message: str) -> int:
         """Identifier as in `Frames.can_id`: bit 31 set for a 29 bit identifier."""
-        found = self.message(message)
-        return found.frame_id | (EXTENDED if found.is_extended_frame else 0)
+        declared = self.message(message)
+        return declared.frame_id | (EXTENDED if declared.is_extended_frame else 0)
 
     def layouts(self, message: str, signals: Sequence[str] | None = None) -> Layouts:
         """Bit layouts of the named signals of a message (all if None)."""
-        found = self.message(message)
-        wanted = [s.name for s in found.signals] if signals is None else list(signals)
+        declared = self.message(message)
+        wanted = [s.name for s in declared.signals] if signals is None else list(signals)
         names = list(wanted)
         for name in names:  # grows while it runs: selectors may have selectors
             above = self.signal(message, name).multiplexer_signal
             if above is not None and above not in names:
                 names.append(above)
         codes: list[int] = []
-        rows = np.zeros(len(names), bits.LAYOUT)
+        rows, firsts = np.zeros(len(names), bits.LAYOUT), []
         for row, name in zip(rows, names, strict=True):
-            _fill_row(row, self.signal(message, name), names, codes, message)
-        return Layouts(tuple(wanted), rows, np.array(codes, np.uint64))
+            signal, where = self.signal(message, name), f"{message}.{name}"
+            _fill_row(row, signal, names, codes, where)
+            if self.is_j1939(message):
+                _leave_out_indicators(row, signal)
+            first, row["shift"] = _place(signal, where)
+            firsts.append(first)
+        if any(firsts) and (rows["selector"] >= 0).any():
+            raise CatalogError(f"{message}: multiplexed signals behind byte 8 cannot be read")
+        return Layouts(tuple(wanted), rows, np.array(codes, np.uint64), tuple(firsts))
+
+    def is_j1939(self, message: str) -> bool:
+        """Whether the DBC says that a message is a parameter group of J1939."""
+        return self.message(message).protocol == "j1939"
 
     def byte_of(self, message: str, signal: str) -> int:
         """Index of the byte that a checksum fills; CatalogError if it is not one whole byte."""
-        row = self.layouts(message, [signal]).rows[0]
-        if row["length"] != 8 or row["shift"] % 8:
-            raise CatalogError(f"{message}.{signal}: a CRC-8 must fill one whole byte")
+        layouts = self.layouts(message, [signal])
+        row = layouts.rows[0]
+        if layouts.is_long or row["length"] != 8 or row["shift"] % 8:
+            raise CatalogError(f"{message}.{signal}: a CRC-8 must fill one of the first 8 bytes")
         byte = int(row["shift"]) // 8
         return 7 - byte if row["big_endian"] else byte
 
@@ -118,12 +187,12 @@ class Catalog:
         GenMsgCycleTime gives the period, E2EDataId the data id; a signal `AliveCounter` is the
         counter and `Crc` the checksum.  Anything absent stays at its default (period 0).
         """
-        found = self.message(message)
-        names = {s.name for s in found.signals}
-        data_id = found.dbc.attributes.get("E2EDataId") if found.dbc else None
+        declared = self.message(message)
+        names = {s.name for s in declared.signals}
+        data_id = declared.dbc.attributes.get("E2EDataId") if declared.dbc else None
         return MessageSource(
             name=message,
-            period_s=(found.cycle_time or 0) * 1e-3,
+            period_s=(declared.cycle_time or 0) * 1e-3,
             counter="AliveCounter" if "AliveCounter" in names else None,
             crc="Crc" if "Crc" in names else None,
             data_id=int(data_id.value) if data_id else 0,
@@ -150,20 +219,31 @@ def load(path: str | Path = CONTROLLER_DBC) -> Catalog:
         raise CatalogError(f"{path}: {error}") from None
 
 
+def _by_name(messages: Sequence[Message]) -> dict[str, Message]:
+    """Every message under a name of its own."""
+    count = Counter(message.name for message in messages)
+    declared: dict[str, Message] = {}
+    for message in messages:
+        name, digits = message.name, 8 if message.is_extended_frame else 3
+        if count[name] > 1:
+            name = f"{name}-{message.frame_id:0{digits}X}"
+        again = (f"{name}-{k}" for k in itertools.count(2))  # the same message twice
+        while name in declared:
+            name = next(again)
+        declared[name] = message
+    return declared
+
+
 def _nearest(name: str, known: Iterable[str]) -> str:
     close = difflib.get_close_matches(name, list(known), 1, 0.5)
     return f"; did you mean {close[0]!r}?" if close else ""
 
 
-def _fill_row(
-    row: Record, signal: Signal, names: list[str], codes: list[int], message: str
-) -> None:
-    """Set one LAYOUT row (changed in place) and append its codes."""
-    where = f"{message}.{signal.name}"
+def _fill_row(row: Record, signal: Signal, names: list[str], codes: list[int], where: str) -> None:
+    """Set one LAYOUT row but its shift (changed in place) and append its codes."""
     row["kind"] = _kind(signal, where)
     row["length"] = signal.length
     row["big_endian"] = signal.byte_order == "big_endian"
-    row["shift"] = _shift(signal, where)
     row["scale"], row["offset"] = float(signal.scale), float(signal.offset)
     row["minimum"], row["maximum"] = _range(signal)
     row["selector"] = -1
@@ -185,14 +265,38 @@ def _kind(signal: Signal, where: str) -> int:
     return bits.FLOAT32 if signal.length == 32 else bits.FLOAT64
 
 
-def _shift(signal: Signal, where: str) -> int:
-    """Position of the lowest bit in the word of the signal's own byte order."""
-    first = signal.start
-    if signal.byte_order == "big_endian":  # DBC names the highest bit, counted within its byte
-        first = 8 * (signal.start // 8) + 7 - signal.start % 8
-    if first + signal.length > 8 * MAX_LENGTH:
-        raise CatalogError(f"{where}: lies beyond byte {MAX_LENGTH}; only classic CAN is supported")
-    return 64 - first - signal.length if signal.byte_order == "big_endian" else first
+def _place(signal: Signal, where: str) -> tuple[int, int]:
+    """Where the 8 bytes begin that hold a signal, and its lowest bit in their word.
+
+    The word is in the signal's own byte order; the 8 bytes are the first ones where these will do.
+    """
+    begin, is_big = signal.start, signal.byte_order == "big_endian"
+    if is_big:  # DBC names the highest bit, counted within its byte
+        begin = 8 * (begin // 8) + 7 - begin % 8
+    if begin < 0:
+        raise CatalogError(f"{where}: it begins at bit {signal.start}, before the first")
+    first = begin // 8 if begin + signal.length > 8 * WORD else 0
+    begin -= 8 * first
+    if begin + signal.length > 8 * WORD:
+        raise CatalogError(f"{where}: its {signal.length} bits lie across 9 bytes")
+    return first, 8 * WORD - begin - signal.length if is_big else begin
+
+
+def _leave_out_indicators(row: Record, signal: Signal) -> None:
+    """Narrow the range (in place) to what J1939-71 calls a measurement.
+
+    Of numbers of 8 bits and more those from 0xFB.. on are errors, reserved or "not available"; of
+    smaller ones the two highest.
+    """
+    if row["kind"] != bits.UNSIGNED or signal.length < 2:
+        return
+    ones = 1 << signal.length
+    end = 0xFB << (signal.length - 8) if signal.length >= 8 else ones - 2
+    limit = float(signal.offset) + float(signal.scale) * (end - 0.5)
+    if signal.scale > 0:
+        row["maximum"] = min(row["maximum"], limit)
+    else:
+        row["minimum"] = max(row["minimum"], limit)
 
 
 def _range(signal: Signal) -> tuple[float, float]:

@@ -115,7 +115,10 @@ def _refuse(last: Record, reason: Integer, counts: NDArray[np.int64]) -> None:
 def check_sequence(
     row: Record, last: Record, t_us: Integer, counter: Integer, counts: NDArray[np.int64]
 ) -> Integer:
-    """OK or the reason against this frame, by its counter (-1: none) and time stamp."""
+    """OK or the reason against this frame, by its counter (-1: none) and time stamp.
+
+    counts (reasons,): changed in place.
+    """
     if not last.seen:
         return OK
     dt = t_us - last.t_us
@@ -132,7 +135,10 @@ def check_sequence(
 
 @inlined
 def interpolate(x: float, tables: NDArray[np.float64], first: Integer, count: Integer) -> float:
-    """`numpy.interp` of one finite value in the table of `count` points from `first` on."""
+    """`numpy.interp` of one finite value in the table of `count` points from `first` on.
+
+    tables (2, points): x and y of all tables, each in the units of its own.
+    """
     low, high = first, first + count - 1
     if x <= tables[0, low]:
         return tables[1, low]
@@ -158,7 +164,7 @@ def read_roles(
     word: np.uint64,
     values: NDArray[np.float64],
 ) -> Integer:
-    """SI values of the message's roles into values[:n_roles] (changed in place); OK or reason."""
+    """SI values of the message's roles into values (roles,), changed in place; OK or reason."""
     for i in range(row.n_roles):
         role = roles[row.first_role + i]
         if not bits.selected(word, layouts, role.layout, codes):

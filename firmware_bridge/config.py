@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 CYCLE = "cycle"  # all messages belong to one controller cycle: one sample per cycle
+FOUND, ANY = "found", "any"  # source addresses of J1939 that are not known before
 MULTIRATE = "multirate"  # messages have their own periods: one sample per instant of any of them
 
 
@@ -39,6 +40,7 @@ class MessageSource:
     """One message: nominal period, age of its values at the time stamp, end-to-end protection.
 
     t_signal = t_frame - offset_s.  `counter` and `crc` name its alive counter and CRC-8 signal.
+    `address`: source address of a J1939 message, FOUND or ANY; None: as the DBC's identifier says.
     """
 
     name: str
@@ -48,6 +50,7 @@ class MessageSource:
     crc: str | None = None
     data_id: int = 0
     channel: int | None = None
+    address: int | str | None = None
 
 
 @dataclass(frozen=True)

@@ -166,5 +166,5 @@ def push(
 
 @kernel
 def finish(state: State, counts: NDArray[np.int64]) -> None:
-    """Count the cycles that are still open and close them; state and counts changed in place."""
+    """Count the open cycles and close them; state and counts (reasons,) changed in place."""
     _close_older(state.slots, np.iinfo(np.int64).max, counts)

@@ -45,6 +45,10 @@ class UnconfirmedError(DownloadError):
     """The order to change maps was sent and not answered: the new or the old ones are active."""
 
 
+class ContradictedError(DownloadError):
+    """The controller said done, and what it holds is not what was sent."""
+
+
 class Link(Protocol):
     """The way to a controller and back."""
 
@@ -79,10 +83,13 @@ class Session:
         self._link = link
         self._session = session or 1 + secrets.randbelow(0xFFFF)
         self.repeated = 0  # frames that were sent again
+        self._probes = 0
 
     def open(self) -> Accepts:
         """Begin; DownloadError where nobody answers, another session is open, or it cannot be."""
         answer = self._ask([protocol.open_frame(self._session)], Op.OPEN, Op.ACCEPTS)
+        if answer[1] != protocol.FORMAT:
+            raise _refused(Reason.FORMAT)
         nodes, counts = (int.from_bytes(answer[k : k + 2], "little") for k in (3, 5))
         return Accepts(answer[1], answer[2], nodes, counts)
 
@@ -92,6 +99,22 @@ class Session:
         version = self._ask([query], Op.QUERY, Op.HELD_VERSION, slot)
         crc = self._ask([query], Op.QUERY, Op.HELD_CRC, slot)
         return Held(*(int.from_bytes(a[2:6], "little") for a in (version, crc)))
+
+    def flow(self, slot: int, u_v: float, dp_pa: float) -> tuple[float, int] | None:
+        """What the active map of a slot gives, m3/s, and what it stands on; see `probe_frames`.
+
+        None where the receiver does not answer: it is older than this question.
+        """
+        self._probes = (self._probes + 1) % protocol.PROBES
+        frames = protocol.probe_frames(self._session, slot, self._probes, u_v, dp_pa)
+        for _ in range(RETRIES):
+            for data in frames:
+                self._link.tell(data)
+            for answer in self._answers():
+                is_mine = answer[6] // protocol.PROBES == self._probes
+                if answer[0] == Op.FLOW and answer[1] == slot and is_mine:
+                    return protocol.flow_of(answer)
+        return None
 
     def put(self, slot: int, image: Image, version: int, progress: Progress) -> None:
         """Send an image to the side of a slot that is not active; it stays there until `commit`."""

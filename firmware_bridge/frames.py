@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 EXTENDED = 0x8000_0000  # bit 31 of can_id: 29 bit identifier
-MAX_LENGTH = 8  # classic CAN
+MAX_LENGTH, MAX_FD_LENGTH = 8, 64  # classic CAN, CAN FD
+WORD = 8  # payloads are kept in words of so many bytes
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,8 @@ class Frames:
 
     t_us: int64 (n,), microseconds; channel: uint8 (n,); can_id: uint32 (n,), bit 31 set for a
     29 bit identifier; length: uint8 (n,), bytes of payload; data: uint8 (n, 8), zero behind the
-    payload.  `refused` counts what the source had to leave out, by reason.
+    payload, or wider, by whole words, where a message is longer (CAN FD, transport protocols).
+    `refused` counts what the source had to leave out, by reason.
     """
 
     t_us: NDArray[np.int64]
@@ -54,15 +56,20 @@ class Frames:
             yield part
 
 
-def empty(n: int) -> Frames:
-    """Room for n frames, all zero."""
+def empty(n: int, length: int = MAX_LENGTH) -> Frames:
+    """Room for n frames of so many bytes, all zero."""
     return Frames(
         np.zeros(n, np.int64),
         np.zeros(n, np.uint8),
         np.zeros(n, np.uint32),
         np.zeros(n, np.uint8),
-        np.zeros((n, MAX_LENGTH), np.uint8),
+        np.zeros((n, _width(length)), np.uint8),
     )
+
+
+def _width(length: int) -> int:
+    """Columns of `Frames.data` that hold so many bytes: whole words of 8."""
+    return max(1, -(-length // WORD)) * WORD
 
 
 def concatenate(parts: Sequence[Frames]) -> Frames:
@@ -77,9 +84,26 @@ def concatenate(parts: Sequence[Frames]) -> Frames:
         np.concatenate([part.channel for part in parts]),
         np.concatenate([part.can_id for part in parts]),
         np.concatenate([part.length for part in parts]),
-        np.concatenate([part.data for part in parts]),
+        _stacked([part.data for part in parts]),
         refused,
     )
+
+
+def narrowed(frames: Frames) -> Frames:
+    """The same frames, as wide as the longest of them needs; without `refused`."""
+    width = _width(int(frames.length.max(initial=0)))
+    if frames.data.shape[1] == width:
+        return frames
+    data = frames.data[:, :width].copy()
+    return Frames(frames.t_us, frames.channel, frames.can_id, frames.length, data)
+
+
+def _stacked(parts: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    """Payloads one below the other, as wide as the widest."""
+    width = max(data.shape[1] for data in parts)
+    if all(data.shape[1] == width for data in parts):
+        return np.concatenate(parts)
+    return np.concatenate([np.pad(data, ((0, 0), (0, width - data.shape[1]))) for data in parts])
 
 
 def by_time(frames: Frames) -> Frames:
@@ -106,7 +130,7 @@ def channel_number(channel: int | str | Sequence[int] | None) -> int:
 
 
 def from_messages(messages: Iterable[can.Message]) -> Frames:
-    """Frames from python-can messages; error, remote and long FD frames are counted, not kept."""
+    """Frames from python-can messages; error and remote frames are counted, not kept."""
     refused: dict[str, int] = {}
     kept = []
     for message in messages:
@@ -116,13 +140,14 @@ def from_messages(messages: Iterable[can.Message]) -> Frames:
         else:
             kept.append(message)
     ids = [m.arbitration_id | (EXTENDED if m.is_extended_id else 0) for m in kept]
-    data = b"".join([bytes(m.data).ljust(MAX_LENGTH, b"\0") for m in kept])
+    width = _width(max((len(m.data) for m in kept), default=0))
+    data = b"".join([bytes(m.data).ljust(width, b"\0") for m in kept])
     return Frames(
         np.array([round(m.timestamp * 1e6) for m in kept], np.int64),
         np.array([channel_number(m.channel) for m in kept], np.uint8),
         np.array(ids, np.uint32),
         np.array([len(m.data) for m in kept], np.uint8),
-        np.frombuffer(bytearray(data), np.uint8).reshape(-1, MAX_LENGTH),  # writable
+        np.frombuffer(bytearray(data), np.uint8).reshape(-1, width),  # writable
         refused,
     )
 
@@ -132,7 +157,7 @@ def _refusal(message: can.Message) -> str:
         return "error_frame"
     if message.is_remote_frame:
         return "remote_frame"
-    if len(message.data) > MAX_LENGTH:
+    if len(message.data) > MAX_FD_LENGTH:
         return "fd_frame"
     return "" if len(message.data) == message.dlc else "short_frame"
 
@@ -146,5 +171,6 @@ def to_messages(frames: Frames) -> Iterator[can.Message]:
             arbitration_id=can_id & 0x1FFF_FFFF,
             is_extended_id=bool(can_id & EXTENDED),
             channel=int(frames.channel[k]),
+            is_fd=bool(frames.length[k] > MAX_LENGTH),
             data=bytes(frames.data[k, : frames.length[k]]),
         )

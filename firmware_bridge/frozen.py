@@ -61,11 +61,11 @@ def judge(
     for k in range(len(values)):
         frozen = False
         for j in range(len(signals)):
-            one, value = signals[j], values[k, j]
-            one.repeats = one.repeats + 1 if value == one.value else 0
-            one.value = value
-            one.minimum, one.maximum = min(one.minimum, value), max(one.maximum, value)
-            frozen = frozen or (one.limit > 0 and one.repeats >= one.limit)
+            signal, value = signals[j], values[k, j]
+            signal.repeats = signal.repeats + 1 if value == signal.value else 0
+            signal.value = value
+            signal.minimum, signal.maximum = min(signal.minimum, value), max(signal.maximum, value)
+            frozen = frozen or (signal.limit > 0 and signal.repeats >= signal.limit)
         if frozen:
             keep[k] = False
             refused += 1

@@ -65,11 +65,13 @@ def _places(beside: Path) -> Iterator[Path]:
         yield Path(config.CACHE_DIR)
     yield beside / "__pycache__"
     yield Path.home() / ".cache" / "rtid"
-    own = Path(tempfile.gettempdir()) / f"rtid-{os.getuid()}"  # survives this process: others start
+    temporary = (
+        Path(tempfile.gettempdir()) / f"rtid-{os.getuid()}"
+    )  # survives this process: others start
     with contextlib.suppress(OSError):
-        own.mkdir(mode=0o700, exist_ok=True)
-        if own.stat().st_uid == os.getuid() and not own.is_symlink():
-            yield own
+        temporary.mkdir(mode=0o700, exist_ok=True)
+        if temporary.stat().st_uid == os.getuid() and not temporary.is_symlink():
+            yield temporary
 
 
 def _is_writable(folder: Path) -> bool:

@@ -55,7 +55,7 @@ class Table:
     direction: int
 
     def flow(self, u_v: ArrayLike, dp_pa: ArrayLike) -> tuple[FloatArray, NDArray[np.uint8]]:
-        """Q in m3/s at broadcast points, and what it stands on; beyond the nodes as at their edge.
+        """Q (...), m3/s, at broadcast points, what it stands on; beyond the nodes as at their edge.
 
         NaN commands and pressures give 0 and "none".
         """
@@ -72,7 +72,7 @@ class Table:
         return flow, status.astype(np.uint8)
 
     def command(self, q_m3s: ArrayLike, dp_pa: ArrayLike) -> tuple[FloatArray, NDArray[np.uint8]]:
-        """The command u for a wanted flow, and what it stands on; see `rtid_map_command`."""
+        """Command u (...), V, for a wanted flow, and what it stands on; see `rtid_map_command`."""
         q, dp = np.broadcast_arrays(np.asarray(q_m3s, float), np.asarray(dp_pa, float))
         known, shape = (np.isfinite(q) & np.isfinite(dp)).ravel(), q.shape
         q, dp = np.where(known, q.ravel(), 0.0), np.where(known, dp.ravel(), 0.0)
@@ -100,8 +100,8 @@ class Table:
         return u.reshape(shape), status.astype(np.uint8).reshape(shape)
 
     def _along_s(self, i: NDArray[np.intp], j: NDArray[np.intp], share: FloatArray) -> FloatArray:
-        left = self.counts[i, j].astype(float)
-        return left + share * (self.counts[i, j + 1] - left)
+        lower = self.counts[i, j].astype(float)
+        return lower + share * (self.counts[i, j + 1] - lower)
 
     @property
     def dp_pa(self) -> FloatArray:
@@ -181,7 +181,7 @@ def numbers_image(numbers: ArrayLike, slot: int) -> bytes:
 
 
 def numbers_of(data: bytes) -> FloatArray:
-    """The numbers of an image (n,).  ImageError if it is none."""
+    """The numbers of an image (n,), units as sent.  ImageError if it is none."""
     if len(data) < HEAD.size or data[0] != NUMBERS or len(data) != HEAD.size + 4 * data[2]:
         raise ImageError(f"{len(data)} bytes are no image of numbers")
     return np.frombuffer(data, "<f4", -1, HEAD.size).astype(float)

@@ -254,13 +254,19 @@ def flush(
     out_values: NDArray[np.float64],
     out_flags: NDArray[np.uint8],
 ) -> Integer:
-    """Write the sample that still waits, if there is one; the number of samples in out_*."""
+    """Write the sample that still waits, if there is one; the number of samples in out_*.
+
+    out_t_us, out_flags (samples,) and out_values (samples, columns), SI, changed in place.
+    """
     return _emit(state.pending[0], state.row, out_t_us, out_values, out_flags, 0)
 
 
 @kernel
 def count_unpaired(state: State, counts: NDArray[np.int64]) -> None:
-    """Count and drop the samples that will never have a right neighbour; changed in place."""
+    """Count and drop the samples that will never have a right neighbour; changed in place.
+
+    counts (reasons,).
+    """
     for m in range(len(state.queues)):
         queue = state.queues[m]
         counts[checks.UNPAIRED] += queue.count - queue.left

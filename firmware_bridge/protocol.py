@@ -6,6 +6,7 @@ number and the seven bytes before.
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass
 from enum import IntEnum
 from math import isfinite
@@ -16,7 +17,9 @@ FORMAT = 1
 SLOTS = 16
 CHUNK = 6  # bytes of an image per frame
 SEQUENCE = 128  # chunks are numbered modulo this
+PROBES = 16  # questions for a flow are numbered modulo this
 DATA = 0x80
+LAST_VERSION = 0xFFFF_FFFF  # no map can be newer
 
 
 class Op(IntEnum):
@@ -31,10 +34,13 @@ class Op(IntEnum):
     END = 0x07
     COMMIT = 0x08
     CLOSE = 0x09
+    PROBE_COMMAND = 0x0A
+    PROBE_DROP = 0x0B
     ACCEPTS = 0x41
     REPLY = 0x42
     HELD_VERSION = 0x43
     HELD_CRC = 0x44
+    FLOW = 0x45
     STATUS = 0x61
     BETA = 0x62
 
@@ -71,6 +77,13 @@ WORDS = {
 }
 
 
+class FieldError(ValueError):
+    """A number that its field of a frame does not hold; `remedy` says what to do."""
+
+    exit_code = 3
+    remedy = "nothing was sent with it; the controller's maps are as before"
+
+
 @dataclass(frozen=True)
 class Accepts:
     """What the controller has room for: slots, nodes of both axes together, flows."""
@@ -87,6 +100,13 @@ class Held:
 
     version: int
     crc: int
+
+
+def _field(value: int, size: int, what: str) -> bytes:
+    """A number as it stands in a frame, in so many bytes.  Raises FieldError."""
+    if not 0 <= value < 1 << 8 * size:
+        raise FieldError(f"{what} {value} does not fit into {size} bytes of a frame")
+    return value.to_bytes(size, "little")
 
 
 def crc8(session: int, data: bytes) -> int:
@@ -111,18 +131,19 @@ def is_whole(session: int, data: bytes) -> bool:
 
 def open_frame(session: int) -> bytes:
     """Asks for a session: the only frame that belongs to none."""
-    return frame(0, Op.OPEN, session.to_bytes(2, "little") + bytes([FORMAT]))
+    return frame(0, Op.OPEN, _field(session, 2, "session") + bytes([FORMAT]))
 
 
 def begin_frames(
     session: int, slot: int, nu: int, ns: int, size: int, version: int, crc: int
 ) -> list[bytes]:
-    """Announce an image of nu x ns nodes, size bytes."""
-    head = bytes([slot, nu, ns]) + size.to_bytes(3, "little")
+    """Announce an image of nu x ns nodes, size bytes.  Raises FieldError, as all frames do."""
+    at = _field(slot, 1, "slot")
+    nodes = _field(nu, 1, "nodes") + _field(ns, 1, "nodes")
     return [
-        frame(session, Op.BEGIN_SIZE, head),
-        frame(session, Op.BEGIN_VERSION, bytes([slot]) + version.to_bytes(4, "little")),
-        frame(session, Op.BEGIN_CRC, bytes([slot]) + crc.to_bytes(4, "little")),
+        frame(session, Op.BEGIN_SIZE, at + nodes + _field(size, 3, "image size")),
+        frame(session, Op.BEGIN_VERSION, at + _field(version, 4, "version")),
+        frame(session, Op.BEGIN_CRC, at + _field(crc, 4, "CRC")),
     ]
 
 
@@ -134,7 +155,24 @@ def data_frame(session: int, chunk: int, image: bytes) -> bytes:
 def commit_frame(session: int, slots: list[int], version: int) -> bytes:
     """Make the images of these slots active, all at once."""
     mask = sum(1 << slot for slot in slots)
-    return frame(session, Op.COMMIT, mask.to_bytes(2, "little") + version.to_bytes(4, "little"))
+    return frame(session, Op.COMMIT, _field(mask, 2, "slots") + _field(version, 4, "version"))
+
+
+def probe_frames(session: int, slot: int, number: int, u_v: float, dp_pa: float) -> list[bytes]:
+    """Ask, as question `number`, what a slot's active map gives at a command and a pressure drop.
+
+    Of a slot with numbers u_v is the index of one, and dp_pa counts for nothing.
+    """
+    at, count = _field(slot, 1, "slot"), bytes([number % PROBES])
+    return [
+        frame(session, Op.PROBE_COMMAND, at + struct.pack("<f", u_v) + count),
+        frame(session, Op.PROBE_DROP, at + struct.pack("<f", dp_pa) + count),
+    ]
+
+
+def flow_of(answer: bytes) -> tuple[float, int]:
+    """The flow of a FLOW answer, m3/s, and what it stands on (`lookup.STATUS`)."""
+    return struct.unpack_from("<f", answer, 2)[0], answer[6] % PROBES
 
 
 def status_frame(
@@ -142,11 +180,12 @@ def status_frame(
 ) -> bytes:
     """How rtid is; see rtid_notice in c/rtid_download.h.  counter: taken modulo 256."""
     numbers = (learning | verdict << 4, alarms, progress, valid, flags)
-    return frame(0, Op.STATUS, bytes([*(min(n, 255) for n in numbers), counter & 0xFF]))
+    numbers_of = (min(max(n, 0), 255) for n in numbers)
+    return frame(0, Op.STATUS, bytes([*numbers_of, counter & 0xFF]))
 
 
 def beta_frame(chamber: int, beta_pa: float, sd_pa: float) -> bytes:
     """Bulk modulus of a chamber and its standard deviation, each in bar; 0: not known."""
     known = (x if isfinite(x) else 0.0 for x in (beta_pa, sd_pa))
     words = b"".join(min(max(round(x * 1e-5), 0), 0xFFFF).to_bytes(2, "little") for x in known)
-    return frame(0, Op.BETA, bytes([chamber]) + words)
+    return frame(0, Op.BETA, _field(chamber, 1, "chamber") + words)

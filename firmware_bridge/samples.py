@@ -32,7 +32,7 @@ class Samples:
         return len(self.t_us)
 
     def column(self, name: str) -> NDArray[np.float64]:
-        """Values of one signal, float64 (n,)."""
+        """Values of one signal, float64 (n,), SI units."""
         return self.values[:, self.names.index(name)]
 
     def between(self, start_s: float, stop_s: float) -> Samples:

@@ -44,20 +44,20 @@ SENDER = np.dtype(
 
 
 @inlined
-def _fill(one: Record, t_us: Integer) -> None:
+def _fill(record: Record, t_us: Integer) -> None:
     """One frame more in the bucket."""
-    periods = (t_us - one.last_us) / one.period_us if one.seen else 1.0
-    if periods < 0.0 and t_us < one.last_us - HOLD_US:  # the clock was set back
-        one.until_us, one.level, periods = t_us, 0.0, 1.0
+    periods = (t_us - record.last_us) / record.period_us if record.seen else 1.0
+    if periods < 0.0 and t_us < record.last_us - HOLD_US:  # the clock was set back
+        record.until_us, record.level, periods = t_us, 0.0, 1.0
     periods = max(periods, 0.0)
-    one.credit *= max(0.0, 1.0 - periods * one.period_us / CREDIT_US)
+    record.credit *= max(0.0, 1.0 - periods * record.period_us / CREDIT_US)
     if periods > SILENCE:
-        one.credit = min(one.credit + periods - 1.0, CREDIT_US / one.period_us)
-    one.level = min(max(0.0, one.level + 1.0 - LEAK * periods), one.full + 1.0)
-    used = min(one.credit, one.level)
-    one.level -= used
-    one.credit -= used
-    one.last_us, one.seen = t_us, True
+        record.credit = min(record.credit + periods - 1.0, CREDIT_US / record.period_us)
+    record.level = min(max(0.0, record.level + 1.0 - LEAK * periods), record.full + 1.0)
+    used = min(record.credit, record.level)
+    record.level -= used
+    record.credit -= used
+    record.last_us, record.seen = t_us, True
 
 
 @kernel
@@ -74,11 +74,11 @@ def mark(
         m = find_message(senders, can_id[i], channel[i])
         if m < 0:
             continue
-        one = senders[m]
-        _fill(one, t_us[i])
-        if one.level > one.full:
-            one.until_us = t_us[i] + HOLD_US
-        if t_us[i] < one.until_us:
+        sender = senders[m]
+        _fill(sender, t_us[i])
+        if sender.level > sender.full:
+            sender.until_us = t_us[i] + HOLD_US
+        if t_us[i] < sender.until_us:
             keep[i] = False
             refused += 1
     return refused

@@ -193,7 +193,10 @@ def follow(
     lines: Records, stamp_us: NDArray[np.int64], arrived_us: NDArray[np.int64],
     period_us: Integer, out_us: NDArray[np.int64], counts: NDArray[np.int64],
 ) -> None:  # fmt: skip
-    """Times of n frames into out_us, -1 where refused; lines, out_us, counts changed in place."""
+    """Times of n frames into out_us, -1 where refused; lines, out_us, counts changed in place.
+
+    stamp_us, arrived_us, out_us (n,); lines (1,); counts (reasons,).
+    """
     line = lines[0]
     for k in range(len(stamp_us)):
         stamp = _unwrapped(line, stamp_us[k], arrived_us[k], period_us)

@@ -21,7 +21,7 @@ GAP_US = 1_000_000  # what is put between the frames before and after a step
 def carry_on(t_us: NDArray[np.int64], state: NDArray[np.int64]) -> Integer:
     """Shift t_us so that it never goes back by a step; the steps.  Both changed in place.
 
-    state: [latest time, shift, whether it has begun].
+    t_us (n,).  state (3,): [latest time, us; shift, us; whether it has begun].
     """
     steps = 0
     for k in range(len(t_us)):

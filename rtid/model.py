@@ -9,19 +9,18 @@ the chamber, -1 for one that drains it.
 
 A plant of the general form (1), xdot = phi(x)' theta + f(u, x), is the same with other names: a
 chamber without pressure whose `area_m2` is 1, shared terms for phi, an edge for f.  Everything here
-is SI and immutable; the project file (`rtid.project`) is turned into one `Model`, and nothing below
-this module knows a file.
+is SI and immutable; the project file (`rtid.project`) is turned into one `Machine`, and nothing
+below this module knows a file.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from rtid.plain import FloatArray
 
 COMMAND, PRESSURE, POSITION, VELOCITY = "command", "pressure", "position", "velocity"
 MODE = "mode"  # kind of the signal that carries the number of the working mode
@@ -190,7 +189,7 @@ class Upkeep:
 
 
 @dataclass(frozen=True)
-class Model:
+class Machine:
     """The whole declared machine.  `signals` fixes the column order of the samples' values."""
 
     signals: tuple[Signal, ...]
@@ -213,7 +212,6 @@ class Model:
     # where a block is coupled to all that were visited within its memory, and cost information.
     recent_blocks: int = 64
     mode: str = NONE  # the signal that carries the number of the working mode
-    own_effects: tuple[Any, ...] = ()  # `rtid.effects.UserEffect`s that the diagnosis offers
 
     @property
     def n_cells(self) -> int:
@@ -227,9 +225,14 @@ class Model:
         return tuple(sum(sizes[:i]) for i in range(len(sizes)))
 
     @property
-    def with_taylor_maps(self) -> Model:
+    def with_taylor_maps(self) -> Machine:
         """The same machine with every map in Taylor terms, as maps are published."""
         return replace(self, edges=tuple(replace(e, basis=TAYLOR) for e in self.edges))
+
+    def with_noise(self, noise: Mapping[str, float]) -> Machine:
+        """The same machine with the noise of some signals (1 sigma, SI), by name, replaced."""
+        signals = tuple(replace(s, noise=noise.get(s.name, s.noise)) for s in self.signals)
+        return replace(self, signals=signals)
 
     def column(self, name: str) -> int:
         """Column of the signal `name` in `Samples.values`; KeyError if the model has none."""

@@ -2,22 +2,88 @@
 
 from __future__ import annotations
 
+import io
+import json
 import os
+import signal
+import tempfile
 from collections.abc import Iterator
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, NoReturn
 
 import can
+import pyarrow.csv
 import pytest
 from can.interfaces.udp_multicast import UdpMulticastBus
 from can.interfaces.virtual import VirtualBus
+
+from tests.left import Here, left_since
 
 # Two test workers fill two cores already, and OpenBLAS' idle threads spin: a diagnosis of the tanks
 # took 94 s of processor time instead of 28.  Read at the first import of numba and of numpy.
 os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("RTID_CACHE", "off")  # each test learns for itself
 
-SHARED = Path(__file__).parents[1].parent / "shared"
+LONG_S = 8 * 3600.0  # the limit of what is meant to take hours
+AGAIN_S = 5.0  # after its limit a test is ended as often as it begins anew, as hypothesis does
+ROOT = Path(__file__).parents[1]
+SHARED = ROOT.parent / "shared"
+
+
+@pytest.hookimpl(trylast=True)  # of those that are chosen
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Modules with slow tests come first, so that no worker is left with a long one at the end.
+
+    Every test has a time limit, `timeout` in pyproject.toml; the long ones have a longer one.
+    """
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)
+    for item in items:
+        if item.get_closest_marker("campaign") or item.get_closest_marker("soak"):
+            item.add_marker(pytest.mark.timeout(LONG_S))
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """Note for the table of `make faults` whether a test passed; a skipped one is none."""
+    path = os.environ.get("RTID_FAULTS")
+    if path and not report.skipped and (report.when == "call" or report.failed):
+        with open(path, "a", encoding="utf-8") as file:
+            file.write(json.dumps({"test": report.nodeid, "passed": report.passed}) + "\n")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_timeout_set_timer(item: pytest.Item, settings: Any) -> Iterator[Any]:
+    """Ring again: what catches the first alarm and goes on, or hangs while it ends, ends too."""
+    found = yield
+    if settings.method == "signal":
+        signal.setitimer(signal.ITIMER_REAL, settings.timeout, AGAIN_S)
+    return found
+
+
+@pytest.fixture(autouse=True)
+def nothing_left(own_folder: Path) -> Iterator[None]:
+    """Fail the test that leaves a thread, a process, a socket or a file behind."""
+    before = Here.now(own_folder, ROOT)
+    yield
+    left = left_since(before, own_folder, ROOT)
+    assert not left, f"left behind: {'; '.join(left)}"
+
+
+@pytest.fixture(scope="session")
+def own_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The folder of temporary files of this process and of those that it starts."""
+    folder = tmp_path_factory.mktemp("tmp")
+    pyarrow.csv.read_csv(io.BytesIO(b"t\n0\n"))  # from its first CSV on it keeps a pipe open
+    resource_tracker.ensure_running()  # as does multiprocessing from its first process on
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TMPDIR", str(folder))
+        patch.setenv(
+            "XDG_CONFIG_HOME", str(tmp_path_factory.mktemp("config"))
+        )  # what a test trusts, its user does not
+        patch.setattr(tempfile, "tempdir", str(folder))
+        yield folder
 
 
 @pytest.fixture(autouse=True)

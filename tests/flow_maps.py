@@ -10,17 +10,8 @@ import numpy as np
 from rtid.estimator.blocks import LEARNING, VALID, Block
 from rtid.estimator.solution import Solution, solve
 from rtid.estimator.state import build
-from rtid.model import (
-    COMMAND,
-    POSITION,
-    PRESSURE,
-    Chamber,
-    Edge,
-    FloatArray,
-    Grid,
-    Model,
-    Signal,
-)
+from rtid.model import COMMAND, POSITION, PRESSURE, Chamber, Edge, Grid, Machine, Signal
+from rtid.plain import FloatArray
 
 Flow = Callable[[FloatArray, FloatArray], FloatArray]
 RATED_Q_M3S, RATED_DP_PA = 3e-4, 3e6
@@ -43,7 +34,7 @@ def compensated(w_v: FloatArray, dp_pa: FloatArray) -> FloatArray:
     return np.asarray(5e-5 * above * np.sign(dp_pa) * np.abs(dp_pa / 3e6) ** 0.15)
 
 
-def machine(grid: Grid = GRID, safe_band_v: float = 1.0, edges: int = 1) -> Model:
+def machine(grid: Grid = GRID, safe_band_v: float = 1.0, edges: int = 1) -> Machine:
     """One chamber, fed by edges that are all alike."""
     signals = (
         Signal("u", COMMAND),
@@ -52,7 +43,7 @@ def machine(grid: Grid = GRID, safe_band_v: float = 1.0, edges: int = 1) -> Mode
         Signal("x", POSITION, noise=1e-5),
     )
     edge = (grid, safe_band_v, RATED_Q_M3S, RATED_DP_PA)
-    return Model(
+    return Machine(
         signals,
         (Chamber("a", "p_a", 2e-3, 1, 6e-4),),
         tuple(Edge(f"e{i}", "p_s", "p_a", "u", 1, *edge) for i in range(edges)),
@@ -63,7 +54,7 @@ def machine(grid: Grid = GRID, safe_band_v: float = 1.0, edges: int = 1) -> Mode
 
 
 def solved(
-    model: Model,
+    model: Machine,
     flow: Flow,
     rng: np.random.Generator,
     *,
@@ -79,7 +70,7 @@ def solved(
     return replace(empty(model), blocks=tuple(blocks))
 
 
-def empty(model: Model) -> Solution:
+def empty(model: Machine) -> Solution:
     """What is known before the first sample."""
     return solve(model, build(model))
 

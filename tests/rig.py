@@ -12,14 +12,15 @@ from scipy.signal import lfilter
 from typer.testing import CliRunner
 
 from rtid.compare import ReferenceMap
-from rtid.comparing import TraceComparison, compare_trace
-from rtid.datasheet import read_reference
 from rtid.estimator.flowmap import VALID
 from rtid.estimator.state import build
 from rtid.kernels.explain import explain
-from rtid.model import Edge, FloatArray
+from rtid.maps.datasheet import read_reference
+from rtid.model import Edge
+from rtid.plain import FloatArray
 from rtid.project import load
-from rtid.replay import Replay, replay
+from rtid.study.compared import TraceComparison, compare_trace
+from rtid.study.replay import Replay, replay
 from tools import table_to_can
 
 ROOT = Path(__file__).parents[1]
@@ -56,10 +57,10 @@ def calibrated(shared: Path) -> ReferenceMap:
     return read_reference(shared / "data" / "rig" / "truth" / "valve_maps_calibrated.csv")
 
 
-def figures(found: Replay, truth: ReferenceMap) -> list[EdgeFigures]:
+def figures(replayed: Replay, truth: ReferenceMap) -> list[EdgeFigures]:
     """Learned maps beside the true ones, per edge."""
-    compared = compare_trace(found, truth)
-    return [_edge_figures(i, e, compared, truth) for i, e in enumerate(found.model.edges)]
+    compared = compare_trace(replayed, truth)
+    return [_edge_figures(i, e, compared, truth) for i, e in enumerate(replayed.model.edges)]
 
 
 def _edge_figures(
@@ -88,13 +89,13 @@ def _edge_figures(
     return EdgeFigures(edge.name, *(np.abs(x) / largest for x in (blocks, nodes, points)))
 
 
-def _points(edge: Edge, found: Replay, chunk: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _points(edge: Edge, replayed: Replay, chunk: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Mean opening (behind the lag) and mean pressure drop of each interval."""
-    model, dt = found.model, np.median(np.diff(chunk[:, 0]))
+    model, dt = replayed.model, np.median(np.diff(chunk[:, 0]))
     w = edge.direction * chunk[:, 2 + model.column(edge.command)]
-    fade = np.exp(-dt / found.fit.lag_s)
+    fade = np.exp(-dt / replayed.fit.lag_s)
     lagged = lfilter([0, 1 - fade], [1, -fade], w - w[0]) + w[0]
-    mean = w + (lagged - w) * found.fit.lag_s / dt * (1 - fade)
+    mean = w + (lagged - w) * replayed.fit.lag_s / dt * (1 - fade)
     dp = chunk[:, 2 + model.column(edge.source)] - chunk[:, 2 + model.column(edge.sink)]
     return mean[:-1], 0.5 * (dp[1:] + dp[:-1])
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from firmware_bridge.lookup import NONE, Table
-from rtid.cfile import BESIDE, NoHeaderError, write_header
 from rtid.estimator.published import publish
-from rtid.lookup import Sampled
-from rtid.model import FloatArray
+from rtid.maps.c_header import BESIDE, NoHeaderError, write_header
+from rtid.maps.lookup import Sampled
+from rtid.plain import FloatArray
 from tests.bridge.controller import COMPILER, SANITISE, STRICT
 from tests.flow_maps import machine, orifice, solved
 
@@ -120,7 +120,12 @@ def test_the_functions_come_with_the_tables(written: tuple[Path, tuple[Sampled, 
 
 
 def test_numbers_that_do_not_fit(written: tuple[Path, tuple[Sampled, ...]]) -> None:
-    from rtid.cfile import _whole
+    from rtid.maps.c_header import _whole
 
     with pytest.raises(NoHeaderError, match="32 bits"):
         _whole("rtid_edge_pa", np.array([1.0, 3000.0]), 1e6)
+
+
+def test_the_header_says_its_units(written: tuple[Path, tuple[Sampled, ...]]) -> None:
+    text = (written[0] / "maps.h").read_text()
+    assert "NAME_u: V" in text and "sqrt(Pa)" in text and "NAME_q: m3/s over the scale" in text

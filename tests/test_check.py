@@ -9,7 +9,6 @@ import shutil
 import subprocess
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +17,12 @@ import pytest
 import tomlkit
 
 from firmware_bridge.frames import EXTENDED, empty
-from rtid.check import Finding, Report, bus, judge, timing
-from rtid.check.reading import read_trace
-from rtid.check.series import Series, describe, longest_frozen
 from rtid.cli.main import run
 from rtid.estimator.noise import estimate_noise
 from rtid.project import load
+from rtid.trace import Finding, Report, bus, judge, timing
+from rtid.trace.series import Series, describe, longest_frozen
+from rtid.trace.signals import read_recording
 
 ROOT = Path(__file__).parents[1]
 Edit = Callable[[dict[str, Any]], None]
@@ -34,12 +33,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """20 s of the simulated machine as trace.parquet and trace.toml."""
     found = tmp_path_factory.mktemp("check")
     from rtid.sim.declare import declared_model
-    from rtid.sim.log import write_table
-    from rtid.sim.plant import Plant
     from rtid.sim.project_file import project_text
     from rtid.sim.run import simulate
+    from rtid.sim.run_files import write_table
+    from rtid.sim.simulated_plant import SimulatedPlant
 
-    run = simulate(Plant(), "rich", 1, 20.0)
+    run = simulate(SimulatedPlant(), "rich", 1, 20.0)
     write_table(found / "trace.parquet", run)
     text = project_text(declared_model(run.plant, sensors=run.sensors), 0.5, "simulated")
     (found / "trace.toml").write_text(text)
@@ -60,7 +59,7 @@ def judged(folder: Path, edit: Edit) -> Report:
     path = folder / "edited.toml"
     path.write_text(tomlkit.dumps(raw))
     project = load(path)
-    trace = read_trace(project, folder / "trace.parquet")
+    trace = read_recording(project, folder / "trace.parquet")
     return judge(
         project.model, project.assembly, trace.samples, trace.series, trace.messages,
         trace.refused, project.sections.geometry.stroke_m,
@@ -136,8 +135,8 @@ def test_wrong_noise_is_a_warning_with_the_right_figure(folder: Path) -> None:
 
     report = judged(folder, quiet)
     (found,) = [f for f in report.findings if f.subject == "p_a"]
-    figure = re.search(r"noise is (\S+) Pa", found.text)
-    assert report.ok and figure and float(figure[1]) == pytest.approx(5e3, rel=0.015)
+    figure = re.search(r"noise is (\S+) MPa", found.text)
+    assert report.ok and figure and float(figure[1]) == pytest.approx(5e-3, rel=0.015)
 
 
 def test_grid_that_misses_the_motion_is_named(folder: Path) -> None:
@@ -255,9 +254,86 @@ def test_log_without_a_wanted_frame_says_what_it_holds(folder: Path, tmp_path: P
     assert json.loads(rtid("check", "--bus-only", log, "--json").stdout)["frames"] == 50
 
 
+def test_log_of_savvycan_is_a_log_of_frames_and_no_table(folder: Path, tmp_path: Path) -> None:
+    from firmware_bridge.sources import open_log
+    from rtid.sim.bus import run_frames
+    from rtid.sim.run import simulate
+    from rtid.sim.run_files import START_US, write_log
+    from rtid.sim.simulated_plant import SimulatedPlant
+
+    run = simulate(SimulatedPlant(), "rich", 1, 2.0)
+    write_log(tmp_path / "trace.blf", run_frames(run, start_us=START_US))
+    frames = open_log(tmp_path / "trace.blf")
+    lines = ["Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8"]
+    for t_us, can_id, n, data in zip(
+        frames.t_us, frames.can_id, frames.length, frames.data, strict=True
+    ):
+        shown = "".join(f"{byte:02X}," for byte in data)
+        lines.append(f"{t_us},{can_id:08X},false,Rx,0,{n},{shown}")
+    (tmp_path / "trace.csv").write_text("\n".join([*lines, ""]))
+    told = [
+        json.loads(rtid("check", folder / "trace.toml", tmp_path / name, "--json").stdout)
+        for name in ("trace.blf", "trace.csv")
+    ]
+    assert told[0] == told[1]
+    assert told[0]["samples"]["count"] > 1900
+
+
+LEFT_OUT = "remote_frame", "fd_frame", "error_frame"
+CAPTURES = {  # data frames and those of `LEFT_OUT`, as python-can counts them, and the exit code
+    "issue_1256.asc": (1457, (0, 0, 0), 0),
+    "issue_1299.asc": (4, (0, 0, 0), 0),
+    "issue_1905.blf": (22, (0, 0, 0), 0),
+    "logfile.asc": (12, (4, 0, 4), 0),
+    "logfile_errorframes.asc": (7, (2, 0, 3), 0),
+    "single_frame.asc": (None, (), 3),  # 64 bytes in a classic frame
+    "single_frame_us_locale.asc": (1, (0, 0, 0), 0),
+    "test_CanErrorFrameExt.blf": (0, (0, 0, 2), 0),
+    "test_CanErrorFrames.asc": (0, (0, 0, 4), 0),
+    "test_CanFdMessage.asc": (3, (0, 0, 0), 0),
+    "test_CanFdMessage.blf": (2, (0, 0, 0), 0),
+    "test_CanFdMessage64.asc": (2, (0, 0, 0), 0),
+    "test_CanFdMessage64.blf": (0, (2, 0, 0), 0),
+    "test_CanFdRemoteMessage.asc": (0, (1, 0, 0), 0),
+    "test_CanMessage.asc": (2, (0, 0, 0), 0),
+    "test_CanMessage.asc.gz": (2, (0, 0, 0), 0),
+    "test_CanMessage.blf": (0, (0, 0, 0), 0),  # two frames of 51 bytes, which no bus carries
+    "test_CanMessage.trc": (2, (0, 0, 0), 0),
+    "test_CanMessage2.blf": (0, (0, 0, 0), 0),  # the same
+    "test_CanMessage_V1_0_BUS1.trc": (10, (0, 0, 0), 3),  # the last line, a remote frame, is open
+    "test_CanMessage_V1_1.trc": (10, (1, 0, 0), 0),
+    "test_CanMessage_V1_3.trc": (10, (1, 0, 0), 0),
+    "test_CanMessage_V2_0_BUS1.trc": (10, (0, 0, 0), 3),  # the same
+    "test_CanMessage_V2_1.trc": (10, (0, 0, 0), 3),  # the same
+    "test_CanRemoteMessage.asc": (0, (3, 0, 0), 0),
+}
+
+
+@pytest.mark.parametrize("name", CAPTURES)
+def test_every_capture_of_python_can_is_read_or_refused_in_one_line(
+    shared: Path, name: str
+) -> None:
+    count, left_out, code = CAPTURES[name]
+    done = rtid("check", "--bus-only", shared / "data/can_logs" / name, "--json")
+    assert done.returncode == code
+    assert len(done.stderr.splitlines()) == (code == 3)
+    if count is not None:
+        report = json.loads(done.stdout)
+        assert report["frames"] == sum(one["timing"]["count"] for one in report["timing"]) == count
+        assert tuple(report["refused"].get(kind, 0) for kind in LEFT_OUT) == left_out
+
+
+def test_no_capture_of_python_can_is_left_untried(shared: Path) -> None:
+    assert {path.name for path in (shared / "data/can_logs").iterdir()} == set(CAPTURES)
+
+
+def test_a_capture_without_data_frames_says_what_it_holds(shared: Path) -> None:
+    done = rtid("check", "--bus-only", shared / "data/can_logs/test_CanErrorFrames.asc")
+    assert done.returncode == 0
+    assert done.stdout.splitlines() == ["No data frames.", "Left out: error_frame 4"]
+
+
 def test_real_capture_is_timed_frame_by_frame(shared: Path) -> None:
-    if find_spec("asammdf") is None:
-        pytest.skip("reading MF4 needs the extra: pip install 'rtid[mf4]'")
     capture = shared / "data" / "can_j1939"
     done = rtid(
         "check", "--bus-only", capture / "vehicle.mf4", "--dbc", capture / "j1939.dbc", "--json"
@@ -268,6 +344,7 @@ def test_real_capture_is_timed_frame_by_frame(shared: Path) -> None:
     assert any(2.0 < (worst or 0) < 2.03 for worst in worst_s)
 
 
+@pytest.mark.slow
 def test_rig_passes_and_its_sensors_are_as_told(shared: Path) -> None:
     example = ROOT / "rtid" / "project" / "examples" / "cylinder.toml"
     done = rtid("check", example, shared / "data/rig/measured/rig_01.parquet", "--json")

@@ -10,34 +10,35 @@ import pytest
 
 from rtid.compare import ReferenceMap, block_rows, compare, deviations, learned, refitted
 from rtid.compare.reference import GainTable, MissingEdgeError
-from rtid.datasheet import DataSheetError, read_reference
 from rtid.estimator.estimator import to_chunk
 from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.published import publish
 from rtid.estimator.record import RecordFit, fit_record
-from rtid.model import FloatArray, Grid, Lag, Model
+from rtid.maps.datasheet import DataSheetError, read_reference
+from rtid.model import Grid, Lag, Machine
+from rtid.plain import FloatArray
 from rtid.sim.declare import declared_model
-from rtid.sim.plant import Plant
 from rtid.sim.run import Run, simulate
+from rtid.sim.simulated_plant import SimulatedPlant
 
 GRID = Grid(
     np.concatenate([np.arange(1.0, 4.0, 0.25), np.arange(4.0, 10.1, 0.5)]),
     np.concatenate([[-0.5, 0.0, 0.25, 0.5, 1.0], np.arange(1.75, 9.5, 0.75)]) * 1e6,
 )
-Learned = tuple[Model, RecordFit, FlowMap, FloatArray, Run]
+Learned = tuple[Machine, RecordFit, FlowMap, FloatArray, Run]
 
 
 @pytest.fixture(scope="module")
 def machine() -> Learned:
     """A simulated machine, learned on 14 s, with 6 s that the fit has not seen."""
-    run = simulate(Plant(), "rich", seed=3, duration_s=20.0)
+    run = simulate(SimulatedPlant(), "rich", seed=3, duration_s=20.0)
     model = declared_model(run.plant, grid=GRID, lag=Lag(1.3e-3, 0.0))
     chunk = to_chunk(model, run.samples, 0)
     fit = fit_record(model, chunk[:14000])
     return model, fit, publish(fit.solution), chunk, run
 
 
-def truth_table(plant: Plant, share: float = 1.0) -> ReferenceMap:
+def truth_table(plant: SimulatedPlant, share: float = 1.0) -> ReferenceMap:
     """The true maps as a data sheet, every gain times `share`."""
     w = np.arange(0.0, 10.01, 0.02)
     tables = {}
@@ -126,7 +127,7 @@ def test_deviations_from_the_truth_are_small_where_valid(machine: Learned) -> No
 
 
 def test_reference_knows_only_its_range_and_is_sign_symmetric(machine: Learned) -> None:
-    sheet = truth_table(Plant())
+    sheet = truth_table(SimulatedPlant())
     assert np.isnan(sheet.flow("pa", [-1.0, 11.0], 4e6)).all()
     assert sheet.flow("pa", 4.0, -2e6) == -sheet.flow("pa", 4.0, 2e6)
     with pytest.raises(MissingEdgeError, match="'cross'"):

@@ -12,17 +12,18 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from firmware_bridge.sources.table import read_table
+from firmware_bridge.sources import read_table
 from rtid.cli.compare import compare
 from rtid.cli.export import export
 from rtid.cli.simulate import simulate
 from rtid.errors import RtidError
 from rtid.estimator.estimator import Estimator
-from rtid.mapfiles import read_map
+from rtid.maps.files import read_map
 from rtid.project import load
-from rtid.replay import read_trace
-from rtid.sim.plant import Plant
-from rtid.store import save
+from rtid.sim.simulated_plant import SimulatedPlant
+from rtid.trace.reading import read_trace
+from rtid.trace.snapshot import save
+from tests.replays import shared_replays  # noqa: F401
 
 APP = typer.Typer()
 for command in (compare, export, simulate):
@@ -50,7 +51,7 @@ def trace(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def sheet(tmp_path: Path) -> Path:
     """The true gains, 10 % too large."""
-    plant, w = Plant(), np.arange(0.0, 10.05, 0.1)
+    plant, w = SimulatedPlant(), np.arange(0.0, 10.05, 0.1)
     gains = [1.1 * plant.flow(edge, w, 4e6) / 2e3 for edge in plant.edges]
     path = tmp_path / "sheet.csv"
     with path.open("w", newline="") as file:
@@ -70,11 +71,12 @@ def test_compare_answers_the_first_question(trace: Path, sheet: Path) -> None:
         given = other["parts"][part]["residual_share_of_rms_flow"]
         assert max(learned) < 0.02
         assert min(given) > 0.04
-    assert own["beta_pa"] == pytest.approx([Plant().beta_pa] * 2, rel=0.03)
+    assert own["beta_pa"] == pytest.approx([SimulatedPlant().beta_pa] * 2, rel=0.03)
     assert {d["edge"] for d in found["differences"]} == {"pa", "at", "pb", "bt"}
     assert len(found["blocks"]) > 50
 
 
+@pytest.mark.slow
 def test_compare_in_words_and_pictures(trace: Path, sheet: Path, tmp_path: Path) -> None:
     folder = tmp_path / "pictures"
     project = trace.with_suffix(".toml")
@@ -109,6 +111,7 @@ def later(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_two_projects_on_one_trace(trace: Path, coarse: Path, tmp_path: Path) -> None:
     arguments = ("compare", trace, "-p", trace.with_suffix(".toml"), "--against", coarse)
     text = call(*arguments, "--pictures", tmp_path)

@@ -12,7 +12,7 @@ from filterpy.kalman import KalmanFilter
 from rtid.compare import (
     FREE_RUN,
     HORIZONS_S,
-    Candidate,
+    CandidateMap,
     Examination,
     ExtraFlowError,
     NoFreeRunError,
@@ -29,7 +29,6 @@ from rtid.compare import (
     spans_of_block,
 )
 from rtid.compare.comparison import Comparison, Intervals
-from rtid.compare.correlation import Z95
 from rtid.compare.cusum import factor, recursive_residuals
 from rtid.compare.motion import _roughness, _solve, smoothed
 from rtid.compare.tables import CAUSES, NEVER, cause_of
@@ -37,11 +36,14 @@ from rtid.estimator.estimator import to_chunk
 from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.published import publish
 from rtid.estimator.record import RecordFit, fit_record
-from rtid.model import POSITION, FloatArray, Grid, Model, Signal, Term
+from rtid.model import POSITION, Grid, Signal, Term
+from rtid.model import Machine as Declared
+from rtid.plain import FloatArray
 from rtid.sim.declare import declared_model
-from rtid.sim.plant import Plant
 from rtid.sim.random_plants import draw
 from rtid.sim.run import simulate as run_plant
+from rtid.sim.simulated_plant import SimulatedPlant
+from rtid.units import Z95
 from tests.test_other_plants import plant as other_plant
 
 SEEN_S = 25.0
@@ -52,15 +54,15 @@ LEAK_M3SPPA = 0.4e-12
 class Machine:
     """A plant, learned on 25 s of 35 s."""
 
-    model: Model
+    model: Declared
     fit: RecordFit
     flowmap: FlowMap
-    candidate: Candidate
+    candidate: CandidateMap
     seen: FloatArray
     new: FloatArray
 
 
-def learn(plant: Plant, seed: int, duration_s: float, seen_s: float) -> Machine:
+def learn(plant: SimulatedPlant, seed: int, duration_s: float, seen_s: float) -> Machine:
     run = run_plant(plant, "rich", seed=seed, duration_s=duration_s)
     model = declared_model(run.plant, seed=seed)
     chunk = to_chunk(model, run.samples, 0)
@@ -85,7 +87,7 @@ def new(machine: Machine, seen: Examination) -> Examination:
     return examine(machine.model, machine.candidate, machine.new, before=seen.equation)
 
 
-def smooth_valves(seed: int) -> Plant:
+def smooth_valves(seed: int) -> SimulatedPlant:
     """A random machine whose maps six terms per block can follow: what is left is noise."""
     plant = draw(seed)
     valves = tuple(
@@ -101,7 +103,7 @@ def clean() -> list[tuple[Machine, Comparison]]:
     return [(m, compare(m.model, m.candidate, m.seen, seen=True)) for m in machines]
 
 
-def leaking(chunk: FloatArray, model: Model, from_s: float) -> FloatArray:
+def leaking(chunk: FloatArray, model: Declared, from_s: float) -> FloatArray:
     """The record of a machine whose chamber a loses oil to the outside from an instant on.
 
     The pressures are as they were; what the piston has not received shows in its position.  So
@@ -176,6 +178,7 @@ def test_the_smoother_finds_its_bandwidth() -> None:
     assert np.sqrt(np.mean((found - x)[50:-50] ** 2)) < 4e-6
 
 
+@pytest.mark.slow
 def test_bands_hold_95_percent_of_the_lags_of_clean_records(
     clean: list[tuple[Machine, Comparison]],
 ) -> None:
@@ -195,7 +198,7 @@ def coloured(rng: np.random.Generator, n: int, pole: float) -> FloatArray:
     return found
 
 
-def pretended(model: Model, e: FloatArray, u: FloatArray) -> Comparison:
+def pretended(model: Declared, e: FloatArray, u: FloatArray) -> Comparison:
     """A comparison with given innovations of both chambers and a given command."""
     n = len(e)
     values = np.zeros((n, len(model.signals)))

@@ -7,14 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rtid.beside import replay_beside
 from rtid.compare import FREE_RUN, PAPER_DP_PA, PAPER_U_V, ReferenceMap, deviations
-from rtid.comparing import TraceComparison, compare_trace, study
-from rtid.datasheet import read_reference
 from rtid.estimator.flowmap import VALID
+from rtid.maps.datasheet import read_reference
 from rtid.project import load
-from rtid.replay import replay
-from rtid.revising import add
+from rtid.study.compared import TraceComparison, compare_trace, study
+from rtid.study.replay import replay
+from rtid.study.revisions import add
 from tests.rig import figures
 
 PROJECT = Path(__file__).parents[1] / "rtid" / "project" / "examples" / "cylinder.toml"
@@ -26,22 +25,22 @@ def calibrated(shared: Path) -> ReferenceMap:
 
 
 @pytest.fixture(scope="module")
-def found(shared: Path, calibrated: ReferenceMap) -> TraceComparison:
+def comparison(shared: Path, calibrated: ReferenceMap) -> TraceComparison:
     run = shared / "data" / "rig" / "measured" / "rig_01.parquet"
     return compare_trace(replay(load(PROJECT), run), calibrated)
 
 
-def test_validation_residual_is_below_0_7_percent_of_the_flow(found: TraceComparison) -> None:
-    part = found.held[0].parts["validation"]
+def test_validation_residual_is_below_0_7_percent_of_the_flow(comparison: TraceComparison) -> None:
+    part = comparison.held[0].parts["validation"]
     assert (part.residual_share < 0.007).all()
     assert 0.05 < part.shares["extrapolated"] < 0.5
     assert part.shares["outside"] < 0.01
 
 
-def test_nodes_inside_the_data(found: TraceComparison, calibrated: ReferenceMap) -> None:
+def test_nodes_inside_the_data(comparison: TraceComparison, calibrated: ReferenceMap) -> None:
     """Mean error at most 0.5 %, largest 1.5 % of the largest flow."""
     errors = []
-    for edge in found.flowmap.edges:
+    for edge in comparison.flowmap.edges:
         s = edge.status == VALID
         i, j = np.nonzero(s[1:, 1:] & s[:-1, 1:] & s[1:, :-1] & s[:-1, :-1])
         w, dp = edge.grid.u_v[i + 1], edge.grid.dp_pa[j + 1]
@@ -54,25 +53,26 @@ def test_nodes_inside_the_data(found: TraceComparison, calibrated: ReferenceMap)
 
 
 def test_table_1_of_the_paper_and_its_figures(
-    found: TraceComparison, calibrated: ReferenceMap
+    comparison: TraceComparison, calibrated: ReferenceMap
 ) -> None:
     """The paper reached 2.2 % mean and 8.4 % at worst, where it had data."""
-    for d in deviations(found.flowmap, calibrated, PAPER_U_V, PAPER_DP_PA):
+    for d in deviations(comparison.flowmap, calibrated, PAPER_U_V, PAPER_DP_PA):
         share = np.abs(d.share)
         assert share.mean() < 0.022
         assert share.max() < 0.084
 
 
 def test_the_manufacturers_sheet_is_told_apart_from_the_calibration(
-    found: TraceComparison, shared: Path
+    comparison: TraceComparison, shared: Path
 ) -> None:
-    learned, calibrated = found.held
+    learned, calibrated = comparison.held
     sheet = read_reference(shared / "data" / "rig" / "nominal" / "valve_map_manufacturer.csv")
-    wrong = compare_trace(found.replay, sheet).held[1].parts["validation"].residual_share
+    wrong = compare_trace(comparison.replay, sheet).held[1].parts["validation"].residual_share
     assert (calibrated.parts["validation"].residual_share < 0.005).all()
     assert (wrong > 20 * learned.parts["validation"].residual_share).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", ["05", pytest.param("08", marks=pytest.mark.campaign)])
 def test_with_the_missing_effect_added_maps_and_free_run_are_those_of_a_sound_machine(
     shared: Path, calibrated: ReferenceMap, tmp_path: Path, number: str
@@ -86,9 +86,9 @@ def test_with_the_missing_effect_added_maps_and_free_run_are_those_of_a_sound_ma
         shared / "data" / "rig" / "measured" / f"rig_{number}.parquet",
     )
     project.write_text(PROJECT.read_text())
-    before = study(replay_beside(load(project), run))
+    before = study(replay(load(project), run))
     add(project, run)
-    after = study(replay_beside(load(project), run))
+    after = study(replay(load(project), run))
     for edge in figures(after.replay, calibrated):
         assert len(edge.nodes) > 10
         assert edge.nodes.mean() < 0.001 and edge.nodes.max() < 0.003

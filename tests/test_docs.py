@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
+import tempfile
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -13,18 +14,19 @@ import numpy as np
 import pytest
 import typer
 
-from firmware_bridge import checks, stamps
+from firmware_bridge import checks, j1939, stamps
 from firmware_bridge.sources import blf_objects, slcan_lines, text
+from firmware_bridge.sources.formats import suffixes
 from rtid.cli import main
 from rtid.cli.exits import Exit
 from rtid.cli.teaching import EXAMPLES, PANELS
 from rtid.daemon import wording
 from rtid.diagnose import verdict
-from rtid.effects import UserEffect
+from rtid.effects import Effect
 from rtid.estimator import blocks
 from rtid.estimator.published import publish
 from rtid.kernels import layout
-from rtid.mapfiles import WRITERS, write_map
+from rtid.maps.files import WRITERS, write_map
 from rtid.project import load
 from rtid.project.schema import ExciteSection
 from tests.flow_maps import machine, orifice, solved
@@ -58,13 +60,13 @@ def alarms() -> set[str]:
 @pytest.mark.parametrize(
     "codes",
     [
-        checks.REASONS, stamps.REASONS, slcan_lines.REASONS, text.REASONS, blf_objects.REASONS,
-        layout.COUNTERS,
+        checks.REASONS, stamps.REASONS, j1939.REASONS, slcan_lines.REASONS, text.REASONS,
+        blf_objects.REASONS, layout.COUNTERS,
         (blocks.EMPTY, blocks.LEARNING, blocks.VALID, blocks.STALE, blocks.INVALID),
         (verdict.MATCHES, verdict.MISSING, verdict.AMBIGUOUS, verdict.UNKNOWN,
          verdict.INSUFFICIENT),
     ],
-    ids=["bridge", "stamps", "slcan", "text", "blf", "estimator", "blocks", "verdicts"],
+    ids=["bridge", "stamps", "j1939", "slcan", "text", "blf", "estimator", "blocks", "verdicts"],
 )  # fmt: skip
 def test_every_code_stands_in_operations(codes: tuple[str, ...]) -> None:
     assert set(codes) <= words("operations.md")
@@ -88,6 +90,10 @@ def test_the_architecture_names_every_package() -> None:
     assert packages <= words("architecture.md")
 
 
+def test_the_page_of_formats_names_each_suffix() -> None:
+    assert set(suffixes()) <= words("formats.md")
+
+
 def test_the_snippets_of_extending_run(tmp_path: Path) -> None:
     (own,) = tomllib.loads(snippets("extending.md", "toml")[0])["effects"].values()
     assert own["chambers"] == {"a": -1, "b": 1}
@@ -96,7 +102,7 @@ def test_the_snippets_of_extending_run(tmp_path: Path) -> None:
         exec(compile(code, "extending.md", "exec"), space)
         assert len(code.splitlines()) < 20
     try:
-        assert isinstance(space["worn_groove"], UserEffect)
+        assert isinstance(space["worn_groove"], Effect)
         assert space["needed"]
         flowmap = publish(solved(machine(edges=2), orifice, np.random.default_rng(0), rows=60))
         write_map(tmp_path / "map.lines", flowmap, {})
@@ -107,11 +113,11 @@ def test_the_snippets_of_extending_run(tmp_path: Path) -> None:
 
 def test_the_formula_of_extending_is_a_project_s_effect(tmp_path: Path) -> None:
     from rtid.sim.declare import declared_model
-    from rtid.sim.plant import Plant
     from rtid.sim.project_file import project_text
+    from rtid.sim.simulated_plant import SimulatedPlant
 
     project = tmp_path / "machine.toml"
-    text_ = project_text(declared_model(Plant()), 0.5, "simulated")
+    text_ = project_text(declared_model(SimulatedPlant()), 0.5, "simulated")
     project.write_text(text_ + "\n" + snippets("extending.md", "toml")[0])
     (effect,) = load(project).effects
     assert effect.name == "worn_groove"
@@ -164,11 +170,13 @@ def test_the_api_page_is_what_the_docstrings_say() -> None:
     assert PAGE.read_text() == page(), "run: python -m tools.api"
 
 
+@pytest.mark.slow
 def test_the_notebook_tells_its_story(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Its cells in their order in one namespace; the repository has it without output."""
     monkeypatch.setenv("MPLBACKEND", "agg")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     cells = json.loads((DOCS / "story.ipynb").read_text())["cells"]
     code = [cell for cell in cells if cell["cell_type"] == "code"]
     assert not any(cell["outputs"] or cell["execution_count"] for cell in code)

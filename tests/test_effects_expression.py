@@ -275,3 +275,29 @@ def test_a_missing_value_is_named() -> None:
 def test_depth_is_limited_but_long_sums_within_it_work() -> None:
     text = "+".join(["x"] * (MOST_DEPTH - 2))
     assert Expression.parse(text)(x=1.0) == MOST_DEPTH - 2
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+@pytest.mark.parametrize("depth", [10, MOST_DEPTH - 2, 400])
+def test_a_deep_or_long_formula_of_any_function_is_read_or_refused(name: str, depth: int) -> None:
+    """None ends in a RecursionError: not read, not evaluated, not derived, not written."""
+    more = ", x" * (FUNCTIONS[name][0] - 1)
+    texts = [f"{name}(" * depth + "x" + f"{more})" * depth]
+    if name in ("min", "max"):
+        texts.append(f"{name}({', '.join(['x'] * depth)})")
+    for text in texts:
+        with contextlib.suppress(ExpressionError):
+            read = Expression.parse(text, ["x"])
+            assert np.shape(read.value({"x": np.full(3, 0.5)})) == (3,)
+            slope = read.derivative("x")
+            assert np.size(slope.value({"x": np.full(3, 0.5)})) in (1, 3)
+            assert str(slope) and str(read)
+
+
+def test_the_largest_of_four_hundred_is_found() -> None:
+    letters = "abcdefghij"
+    read = Expression.parse(f"max({','.join(letters[k % 10] for k in range(400))})")
+    values = {name: float(k) for k, name in enumerate(letters)}
+    assert float(read.value(values)) == 9.0
+    few = Expression.parse("max(a, b, c, d, e)")
+    assert Expression.parse(str(few)).root == few.root

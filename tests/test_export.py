@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rtid.datasheet import read_reference
 from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.published import publish
-from rtid.mapfiles import SCHEMA, MapFileError, read_map, write_map
+from rtid.maps.datasheet import read_reference
+from rtid.maps.files import SCHEMA, MapFileError, read_map, write_map
 from tests.flow_maps import machine, orifice, solved
 
 PROVENANCE = {"trace": "run.blf", "digest": "abc"}

@@ -14,8 +14,8 @@ from scipy.io import loadmat
 from firmware_bridge.lookup import STATUS
 from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.published import publish
-from rtid.gridded import ERROR_SHARE, Gridded, gridded
-from rtid.mapfiles import write_map
+from rtid.maps.files import write_map
+from rtid.maps.gridded import ERROR_SHARE, Gridded, gridded
 from tests.flow_maps import machine, orifice, solved
 
 PROVENANCE = {"trace": "run.blf", "digest": "abc", "beta_pa": [7.1e8, 6.9e8]}
@@ -131,3 +131,22 @@ def test_the_matlab_script_holds_tables_of_the_right_shape(
             (body,) = re.findall(rf"^{g.name}_flow.Breakpoints\({k}\).Value = \[(.*?)\];", joined,
                                  re.M | re.S)  # fmt: skip
             np.testing.assert_allclose(np.array(body.split(), float), axis, rtol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "words"),
+    [
+        (".csv", ("u_V", "dp_Pa", "Q_m3/s", "sd_m3/s")),
+        (".json", ('"u_v": "V"', '"dp_pa": "Pa"', '"theta_m3s": "m3/s"')),
+        (".m", ("command in V", "pressure drop in Pa", "flow in m3/s", "deviation, m3/s")),
+        (".dcm", ('EINHEIT_X "MPa"', 'EINHEIT_Y "V"', 'EINHEIT_W "L/min"')),
+        (".cdfx", ("<UNIT-DISPLAY-NAME>MPa<", "<UNIT-DISPLAY-NAME>L/min<")),
+    ],
+)
+def test_every_file_says_its_units(
+    flowmap: FlowMap, tmp_path: Path, suffix: str, words: tuple[str, ...]
+) -> None:
+    path = tmp_path / f"maps{suffix}"
+    write_map(path, flowmap, PROVENANCE)
+    text = path.read_text()
+    assert [word for word in words if word not in text] == []

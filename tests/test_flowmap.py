@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from rtid.estimator.flowmap import EXTRAPOLATED, LEARNING, PRIOR, SHUT, VALID, EdgeMap, FlowMap
 from rtid.estimator.published import cell_terms, publish
-from rtid.model import FloatArray, Grid
+from rtid.model import Grid
+from rtid.plain import FloatArray
 from tests.flow_maps import GRID, RATED_Q_M3S, Flow, compensated, empty, machine, orifice, solved
 
 

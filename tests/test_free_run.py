@@ -14,11 +14,12 @@ from rtid.estimator.flowmap import VALID, EdgeMap, FlowMap
 from rtid.estimator.state import build, nominal_weights
 from rtid.estimator.windows import OVERLAP
 from rtid.kernels import free_run as module
-from rtid.kernels import published
+from rtid.kernels import map_point
 from rtid.kernels.free_run import BEYOND, GAP, INSIDE, OFF_GRID, RAN_AWAY, START
-from rtid.model import FloatArray, Grid, Lag, Model, Term
+from rtid.model import Grid, Lag, Machine, Term
+from rtid.plain import FloatArray
 from rtid.sim.declare import declared_model
-from rtid.sim.plant import Plant
+from rtid.sim.simulated_plant import SimulatedPlant
 
 GRID = Grid(
     np.array([1.0, 1.5, 2.0, 2.75, 3.5, 5.0, 7.0]),
@@ -35,9 +36,9 @@ TERMS = (
 THETA_TERMS = np.array([2.0, 0.5, 1.0, 1.5, 0.8, 1.0])
 
 
-def machine(terms: tuple[Term, ...] = (), lag_s: float = 1.3e-3) -> tuple[Model, FlowMap]:
+def machine(terms: tuple[Term, ...] = (), lag_s: float = 1.3e-3) -> tuple[Machine, FlowMap]:
     """A model and a map whose cells do not meet: the blending has work to do."""
-    plant = Plant()
+    plant = SimulatedPlant()
     model = declared_model(plant, grid=GRID, lag=Lag(lag_s, 0.0))
     told = tuple(replace(s, minimum=1e3) if s.name == "p_b" else s for s in model.signals)
     model = replace(model, signals=told, terms=terms)
@@ -67,7 +68,7 @@ def signals(n: int = 200, dt: float = 1e-3) -> FloatArray:
 
 
 def run(
-    model: Model,
+    model: Machine,
     flowmap: FlowMap,
     chunk: FloatArray,
     period_s: float = np.inf,
@@ -86,9 +87,9 @@ def run(
     return pressure, status
 
 
-def truth(model: Model, flowmap: FlowMap, chunk: FloatArray, lag_s: float) -> FloatArray:
+def truth(model: Machine, flowmap: FlowMap, chunk: FloatArray, lag_s: float) -> FloatArray:
     """The same by scipy, interval after interval, from the published map itself."""
-    c = Plant().constants
+    c = SimulatedPlant().constants
     area = np.array([c.area_a_m2, -c.area_b_m2])
     v0 = np.array([c.v0_a_m3, c.v0_b_m3 + c.area_b_m2 * c.stroke_m])
     theta, p = np.array([1 / 800e6, 1 / 900e6]), chunk[0, 3:5].copy()
@@ -141,7 +142,7 @@ def test_free_run_is_the_solution_of_the_equation(terms: tuple[Term, ...], lag_s
 
 def as_python(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every function of the kernel as Python."""
-    for place in (module, published):
+    for place in (module, map_point):
         for name, value in vars(place).copy().items():
             if hasattr(value, "py_func"):
                 monkeypatch.setattr(place, name, value.py_func)

@@ -9,11 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tomlkit
 
 from firmware_bridge import catalog
 from rtid.cli.main import run
 from rtid.project import ProjectError, load
-from rtid.project.proposal import Candidate, from_catalog, propose
+from rtid.project.guess import RoleCandidate, from_catalog, propose
 
 
 def init(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -52,6 +53,8 @@ def test_own_dbc_gives_a_project_that_loads_once_filled_in(tmp_path: Path) -> No
     assert signals["u"] == ("ValveCommand", "U")
     assert signals["x"] == ("Motion", "X")
     assert project.model.edges[0].grid.u_v[-1] == 10.0
+    steps = np.diff(project.model.edges[0].grid.u_v)
+    assert steps == pytest.approx(0.25), "with 0.5 V a healthy machine's residual is 1.4 its noise"
     assert project.model.edges[0].safe_band_v == 0.0, "with none, u < 0 would be off the grid"
 
 
@@ -97,5 +100,56 @@ def test_unreadable_source_is_refused(tmp_path: Path) -> None:
 def test_reference_values_are_not_taken_for_measurements() -> None:
     roles = propose(from_catalog(catalog.load()))
     assert "XRef" not in {found.name for found in roles.values()}
-    only_reference = [Candidate("XRef", "", "m", 0.0, 1.0)]
+    only_reference = [RoleCandidate("XRef", "", "m", 0.0, 1.0)]
     assert propose(only_reference) == {}
+
+
+TWINS = {  # two messages of one name, as tools write them that join the buses of a machine
+    "twins.dbc": """VERSION ""
+NS_ :
+BS_:
+BU_: Unit
+BO_ 100 Sensors: 8 Unit
+ SG_ PA : 0|16@1+ (0.01,0) [0|600] "bar" Unit
+BO_ 101 Sensors: 8 Unit
+ SG_ PB : 0|16@1+ (0.01,0) [0|600] "bar" Unit
+BO_ 102 Motion: 8 Unit
+ SG_ X : 0|16@1+ (0.01,0) [0|500] "mm" Unit
+""",
+    "twins.sym": """FormatVersion=6.0 // Do not edit this line!
+Title="twins"
+
+{SENDRECEIVE}
+
+[Sensors]
+ID=064h
+Len=8
+Var=PA unsigned 0,16 /u:bar /f:0.01 /max:600
+
+[Motion]
+ID=066h
+Len=8
+Var=X unsigned 0,16 /u:mm /f:0.01 /max:500
+
+[Sensors]
+ID=065h
+Len=8
+Var=PB unsigned 0,16 /u:bar /f:0.01 /max:600
+""",
+}
+
+
+@pytest.mark.parametrize("name", TWINS)
+def test_two_messages_of_one_name_are_both_there(tmp_path: Path, name: str) -> None:
+    """The later one took the place of the earlier one: 18 messages became 9 without a word."""
+    path = tmp_path / name
+    path.write_text(TWINS[name])
+    found = {one.name: one.message for one in from_catalog(catalog.load(path))}
+    assert found == {"PA": "Sensors-064", "PB": "Sensors-065", "X": "Motion"}
+    done = init(path, "-o", tmp_path / "project.toml")
+    assert done.returncode == 0, done.stderr
+    written = tomlkit.parse((tmp_path / "project.toml").read_text()).unwrap()
+    messages = {role: told.get("message") for role, told in written["signals"].items()}
+    assert (messages["p_a"], messages["p_b"]) == ("Sensors-064", "Sensors-065")
+    with pytest.raises(catalog.CatalogError, match="2 messages 'Sensors'; name one of Sensors-064"):
+        catalog.load(path).message("Sensors")

@@ -9,19 +9,19 @@ from firmware_bridge.lookup import NONE, STATUS
 from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.inverse import on_lattice
 from rtid.estimator.published import publish
-from rtid.lookup import NoTableError, on_wire, sample
-from rtid.model import Model
+from rtid.maps.lookup import NoTableError, on_wire, sample
+from rtid.model import Machine
 from tests.flow_maps import compensated, machine, orifice, solved
 
 
 @pytest.fixture(scope="module", params=[orifice, compensated], ids=["orifice", "compensated"])
-def made(request: pytest.FixtureRequest) -> tuple[Model, FlowMap]:
+def made(request: pytest.FixtureRequest) -> tuple[Machine, FlowMap]:
     model = machine()
     return model, publish(solved(model, request.param, np.random.default_rng(0)))
 
 
 @pytest.mark.parametrize("percent", [1.0, 0.3, 0.1])
-def test_the_table_follows_the_map(made: tuple[Model, FlowMap], percent: float) -> None:
+def test_the_table_follows_the_map(made: tuple[Machine, FlowMap], percent: float) -> None:
     (edge,), (published,) = made[0].edges, made[1].edges
     found, rng = sample(edge, published, percent), np.random.default_rng(7)
     w = rng.uniform(edge.grid.u_v[0], edge.grid.u_v[-1], 100_000)
@@ -35,7 +35,7 @@ def test_the_table_follows_the_map(made: tuple[Model, FlowMap], percent: float) 
     assert found.error_max_m3s == pytest.approx(off.max() * edge.rated_q_m3s, rel=0.35)
 
 
-def test_statuses_are_those_of_the_map(made: tuple[Model, FlowMap]) -> None:
+def test_statuses_are_those_of_the_map(made: tuple[Machine, FlowMap]) -> None:
     (edge,), (published,) = made[0].edges, made[1].edges
     table, rng = sample(edge, published).table, np.random.default_rng(8)
     w, dp = rng.uniform(0, 8, 20_000), rng.uniform(-0.5e6, 7e6, 20_000)
@@ -43,7 +43,7 @@ def test_statuses_are_those_of_the_map(made: tuple[Model, FlowMap]) -> None:
     assert (words == published.status_at(w, dp)).mean() > 0.9999
 
 
-def test_the_inverse_is_that_of_the_map(made: tuple[Model, FlowMap]) -> None:
+def test_the_inverse_is_that_of_the_map(made: tuple[Machine, FlowMap]) -> None:
     (edge,), (published,) = made[0].edges, made[1].edges
     table, rng = sample(edge, published).table, np.random.default_rng(9)
     w, dp = rng.uniform(2.0, 8.0, 5000), rng.uniform(0.1e6, 7e6, 5000)
@@ -63,7 +63,7 @@ def test_a_machine_without_safe_band() -> None:
     assert STATUS[found.table.flow(0.5, 1e6)[1]] == "outside"
 
 
-def test_less_room_costs_accuracy_and_too_little_is_refused(made: tuple[Model, FlowMap]) -> None:
+def test_less_room_costs_accuracy_and_too_little_is_refused(made: tuple[Machine, FlowMap]) -> None:
     (edge,), (published,) = made[0].edges, made[1].edges
     close = sample(edge, published, 0.1)
     rough = sample(edge, published, 0.1, lambda nu, ns: nu * ns <= 900)
@@ -74,7 +74,7 @@ def test_less_room_costs_accuracy_and_too_little_is_refused(made: tuple[Model, F
     assert on_wire(200, 100) and on_wire(255, 255) and not on_wire(256, 3)
 
 
-def test_a_map_on_a_lattice_is_the_map(made: tuple[Model, FlowMap]) -> None:
+def test_a_map_on_a_lattice_is_the_map(made: tuple[Machine, FlowMap]) -> None:
     (edge,), (published,) = made[0].edges, made[1].edges
     w, dp = np.linspace(1.0001, 8.0, 90), np.linspace(-0.5e6, 7e6, 70)
     exact = published.flow(w[:, None], dp)

@@ -39,6 +39,20 @@ def test_version_and_help_load_neither_numba_nor_a_bus() -> None:
         assert done.stdout.endswith("loaded: []\n")
 
 
+def test_a_command_that_reads_frames_does_not_load_what_reads_mf4(tmp_path: Path) -> None:
+    """python-can loads asammdf, and that pandas, where it finds them: at each start."""
+    log = tmp_path / "t.log"
+    log.write_text("(1.5) can0 120#0011\n")
+    code = (
+        "import sys\nfrom rtid.cli.main import main\n"
+        "try: main()\n"
+        "finally: print('loaded:', sorted({'can', 'asammdf.mdf', 'pandas'} & set(sys.modules)))"
+    )
+    command = [sys.executable, "-c", code, "check", "--bus-only", str(log), "--json"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.endswith("loaded: ['can']\n")
+
+
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert ends(["--version"]) == Exit.OK
     assert capsys.readouterr().out == f"rtid {rtid.__version__}\n"

@@ -16,13 +16,13 @@ from rtid.model import (
     TAYLOR,
     Chamber,
     Edge,
-    FloatArray,
     Gates,
     Grid,
-    Model,
+    Machine,
     Signal,
     Term,
 )
+from rtid.plain import FloatArray
 
 ONE = np.array([-1.0, 1.0])  # the single interval of a second argument that is not there
 
@@ -35,11 +35,11 @@ def plant(
     terms: tuple[Term, ...],
     others: tuple[Signal, ...] = (),
     max_gap_s: float = 0.05,
-) -> Model:
+) -> Machine:
     """xdot = f(u) + terms."""
     signs = ((name, 1),)
     drive = Edge("f", NONE, NONE, "u", 1, grid, -np.inf, size, 1.0, TAYLOR, COMMAND_ONLY, (), signs)
-    return Model(
+    return Machine(
         signals=(Signal("u", COMMAND), state, *others),
         chambers=(Chamber(name, NONE, 1.0, 1, 0.0),),
         edges=(drive,),
@@ -51,7 +51,7 @@ def plant(
     )
 
 
-def learned(model: Model, t_s: FloatArray, *columns: FloatArray) -> Solution:
+def learned(model: Machine, t_s: FloatArray, *columns: FloatArray) -> Solution:
     state = build(model)
     state.advance(np.column_stack([t_s, np.ones(len(t_s)), *columns]))
     return solve(model, state)
@@ -131,11 +131,11 @@ def test_heated_room() -> None:
     np.testing.assert_allclose(values, heating(at), atol=3e-5)  # 1 % of full scale
 
 
-def _flow(found: Solution, u: float) -> float:
+def _flow(solution: Solution, u: float) -> float:
     """The learned f at u, from the block that holds it."""
-    border = found.model.edges[0].grid.u_v
+    border = solution.model.edges[0].grid.u_v
     i = int(np.searchsorted(border, u, side="right")) - 1
-    block = found.block(0, i, 0)
+    block = solution.block(0, i, 0)
     assert block is not None
     xi = (2 * u - border[i] - border[i + 1]) / (border[i + 1] - border[i])
     return float(np.array([1.0, xi, 0.0, xi * xi, 0.0, 0.0]) @ block.theta)

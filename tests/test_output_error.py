@@ -12,18 +12,29 @@ from rtid.cli import main
 from rtid.cli.exits import Exit
 from rtid.effects import Expression
 from rtid.effects.dimension import dimension, dimension_of_unit, unit_of_dimension
-from rtid.effects.tree import FloatArray, Node, written
-from rtid.output_error import Input, Output, Parameter, Plant, PlantError, Record, State, refit
-from rtid.output_error.entries import ENTRIES
-from rtid.output_error.fit import fit
-from rtid.output_error.insertion import everywhere, insert, places, unit_of
-from rtid.output_error.plant import FIRST_ORDER, ZERO_ORDER, named, substituted
-from rtid.output_error.simulation import Simulator
-from rtid.output_error.statistics import memory
-from rtid.output_error.validation import on_record, rms
-from rtid.plantfile import load_plant
+from rtid.effects.tree import Node, named, substituted, written
+from rtid.plain import FloatArray
+from rtid.plants import (
+    Input,
+    Output,
+    Plant,
+    PlantError,
+    PlantParameter,
+    PlantRecord,
+    PlantState,
+    refit,
+)
+from rtid.plants.entries import effects_of_plants
+from rtid.plants.insertion import everywhere, insert, places, unit_of
+from rtid.plants.output_error import fit
+from rtid.plants.plant import FIRST_ORDER, ZERO_ORDER
+from rtid.plants.simulator import Simulator
+from rtid.plants.statistics import memory
+from rtid.plants.validation import on_record, rms
 from rtid.project.errors import ProjectError
-from rtid.refitting import load_records
+from rtid.project.plant_file import load_plant
+from rtid.study.refit import load_records
+from tests.eighty import eighty  # noqa: F401
 
 EXAMPLE = Path(__file__).parents[1] / "rtid" / "project" / "examples" / "cascaded_tanks.toml"
 
@@ -36,15 +47,15 @@ def first_order(hold: str = ZERO_ORDER, **of_input: str) -> Plant:
     """x' = b u - a x."""
     return Plant(
         "lag",
-        (State("x", tree("b*u - a*x"), 0.0, -5, 5, "m"),),
+        (PlantState("x", tree("b*u - a*x"), 0.0, -5, 5, "m"),),
         (Input("u", named("u"), hold, "V", **of_input),),
         (Output("y", named("x"), "m"),),
-        (Parameter("a", 1.0, 0.1, 10, "1/s"), Parameter("b", 1.0, 0.1, 10, "m/s/V")),
+        (PlantParameter("a", 1.0, 0.1, 10, "1/s"), PlantParameter("b", 1.0, 0.1, 10, "m/s/V")),
     )
 
 
 def run(plant: Plant, t: FloatArray, u: FloatArray, *values: float, sub_steps: int) -> FloatArray:
-    record = Record(t, u[:, None], np.zeros((len(t), len(plant.outputs))))
+    record = PlantRecord(t, u[:, None], np.zeros((len(t), len(plant.outputs))))
     return Simulator(plant, record, sub_steps).run(np.array(values)[:, None])[0][:, 0, 0]
 
 
@@ -80,10 +91,10 @@ def test_a_delay_need_not_be_a_whole_number_of_steps(delay: float) -> None:
     """x' = u(t - T) is the delayed integral of the held input, to rounding."""
     plant = Plant(
         "integrator",
-        (State("x", named("u"), 0.0, -9, 9),),
+        (PlantState("x", named("u"), 0.0, -9, 9),),
         (Input("u", named("u"), delay="T"),),
         (Output("y", named("x")),),
-        (Parameter("T", 0.1, 0.0, 1.0),),
+        (PlantParameter("T", 0.1, 0.0, 1.0),),
     )
     rng = np.random.default_rng(2)
     t = 0.1 * np.arange(60, dtype=np.float64)
@@ -108,12 +119,12 @@ def test_a_delay_need_not_be_a_whole_number_of_steps(delay: float) -> None:
 def test_instructions_give_what_the_expression_gives(text: str) -> None:
     plant = Plant(
         "any",
-        (State("x1", tree("0*x1"), 0.0, -9, 9),),
+        (PlantState("x1", tree("0*x1"), 0.0, -9, 9),),
         (Input("u", named("u")),),
         (Output("y", Expression.parse(text, ["x1", "u", "p"]).root),),
-        (Parameter("p", 1.0, 0.1, 10),),
+        (PlantParameter("p", 1.0, 0.1, 10),),
     )
-    record = Record(np.arange(3.0), np.full((3, 1), -0.8), np.zeros((3, 1)))
+    record = PlantRecord(np.arange(3.0), np.full((3, 1), -0.8), np.zeros((3, 1)))
     p, x1 = np.array([0.3, 2.5]), np.array([1.2, -0.4])
     with np.errstate(all="ignore"):
         expected = Expression.parse(text, ["x1", "u", "p"])(x1=x1, u=-0.8, p=p) * np.ones(2)
@@ -126,12 +137,12 @@ def spring() -> Plant:
     return Plant(
         "spring",
         (
-            State("z", named("v"), 0.0, -1, 1, "m", "displacement"),
-            State("v", tree("(u - k*z)/m"), 0.0, -1, 1, "m/s", "velocity", named("m")),
+            PlantState("z", named("v"), 0.0, -1, 1, "m", "displacement"),
+            PlantState("v", tree("(u - k*z)/m"), 0.0, -1, 1, "m/s", "velocity", named("m")),
         ),
         (Input("u", named("u"), unit="N"),),
         (Output("y", named("z"), "m"),),
-        (Parameter("k", 20.0, 1, 100, "N/m"), Parameter("m", 1.0, 0.1, 10, "kg")),
+        (PlantParameter("k", 20.0, 1, 100, "N/m"), PlantParameter("m", 1.0, 0.1, 10, "kg")),
     )
 
 
@@ -140,18 +151,18 @@ def store() -> Plant:
     return Plant(
         "stores",
         (
-            State("h1", tree("q*u - k*ssqrt(h1)"), 1.0, 0, 9, "m", "level"),
-            State("h2", tree("k*ssqrt(h1) - k*ssqrt(h2)"), 1.0, 0, 9, "m", "level"),
-            State("p", tree("g*u"), 1.0, 0, 9, "Pa", "pressure"),
-            State("T", tree("w*u"), 290.0, 0, 400, "K", "temperature", ambient=named("out")),
+            PlantState("h1", tree("q*u - k*ssqrt(h1)"), 1.0, 0, 9, "m", "level"),
+            PlantState("h2", tree("k*ssqrt(h1) - k*ssqrt(h2)"), 1.0, 0, 9, "m", "level"),
+            PlantState("p", tree("g*u"), 1.0, 0, 9, "Pa", "pressure"),
+            PlantState("T", tree("w*u"), 290.0, 0, 400, "K", "temperature", ambient=named("out")),
         ),
         (Input("u", named("u"), unit="V"), Input("out", named("out"), unit="K")),
         (Output("y", named("h2"), "m"),),
         (
-            Parameter("q", 1.0, 0, 2, "m/s/V"),
-            Parameter("k", 1.0, 0, 2, "sqrt(m)/s"),
-            Parameter("g", 1.0, 0, 2, "Pa/s/V"),
-            Parameter("w", 1.0, 0, 2, "K/s/V"),
+            PlantParameter("q", 1.0, 0, 2, "m/s/V"),
+            PlantParameter("k", 1.0, 0, 2, "sqrt(m)/s"),
+            PlantParameter("g", 1.0, 0, 2, "Pa/s/V"),
+            PlantParameter("w", 1.0, 0, 2, "K/s/V"),
         ),
     )
 
@@ -180,7 +191,7 @@ def test_inserted_equations_keep_their_units(plant: Plant, effect: str, where: s
 
 
 def test_every_entry_is_tried_somewhere() -> None:
-    assert {effect for _, effect, _ in CASES} == set(ENTRIES)
+    assert {effect for _, effect, _ in CASES} == set(effects_of_plants())
 
 
 def test_what_overflows_reaches_the_next_tank() -> None:
@@ -201,14 +212,14 @@ def test_places_are_physical() -> None:
         insert(spring(), "entrained_air", "v")
 
 
-def lag_record(rng: np.random.Generator, memory_of_noise: float, n: int = 600) -> Record:
+def lag_record(rng: np.random.Generator, memory_of_noise: float, n: int = 600) -> PlantRecord:
     t = 0.05 * np.arange(n, dtype=np.float64)
     u = np.repeat(rng.standard_normal(n // 20), 20)
     y = run(first_order(), t, u, 1.5, 2.0, 0.0, sub_steps=4)
     noise = np.zeros(n)
     for k in range(1, n):
         noise[k] = memory_of_noise * noise[k - 1] + 0.05 * rng.standard_normal()
-    return Record(t, u[:, None], (y + noise)[:, None])
+    return PlantRecord(t, u[:, None], (y + noise)[:, None])
 
 
 def test_intervals_hold_under_correlated_errors() -> None:
@@ -241,10 +252,10 @@ def test_what_cannot_be_identified_is_named() -> None:
     """b1 and b2 appear as a product only."""
     plant = Plant(
         "product",
-        (State("x", tree("b1*b2*u - a*x"), 0.0, -5, 5),),
+        (PlantState("x", tree("b1*b2*u - a*x"), 0.0, -5, 5),),
         (Input("u", named("u")),),
         (Output("y", named("x")),),
-        tuple(Parameter(name, 1.0, 0.1, 10) for name in ("a", "b1", "b2")),
+        tuple(PlantParameter(name, 1.0, 0.1, 10) for name in ("a", "b1", "b2")),
     )
     record = lag_record(np.random.default_rng(5), 0.0)
     number, names = refit(plant, record).fit.condition
@@ -257,7 +268,7 @@ def test_missing_outputs_are_left_out_and_validation_is_not_fitted() -> None:
     rng = np.random.default_rng(6)
     record, other = lag_record(rng, 0.0), lag_record(rng, 0.0)
     holes = np.where(rng.random((len(record.t_s), 1)) < 0.3, np.nan, record.y)
-    found = refit(first_order(), Record(record.t_s, record.u, holes)).fit
+    found = refit(first_order(), PlantRecord(record.t_s, record.u, holes)).fit
     assert found.samples == int(np.isfinite(holes).sum())
     np.testing.assert_allclose(found.values[:2], [1.5, 2.0], rtol=0.03)
     assert rms(on_record(found, other, same_start=True))[0] == pytest.approx(0.05, rel=0.1)
@@ -267,26 +278,26 @@ def test_missing_outputs_are_left_out_and_validation_is_not_fitted() -> None:
 def test_records_that_cannot_be_used() -> None:
     t, u = np.arange(5.0), np.zeros((5, 1))
     with pytest.raises(PlantError, match="time does not grow"):
-        Record(t[::-1], u, u)
+        PlantRecord(t[::-1], u, u)
     with pytest.raises(PlantError, match="missing in row 3"):
-        Record(t, np.where(t[:, None] == 3, np.nan, u), u)
+        PlantRecord(t, np.where(t[:, None] == 3, np.nan, u), u)
     with pytest.raises(PlantError, match="never measured"):
-        Record(t, u, u * np.nan)
+        PlantRecord(t, u, u * np.nan)
     with pytest.raises(PlantError, match="does not move"):
-        refit(first_order(), Record(t, u, u))
+        refit(first_order(), PlantRecord(t, u, u))
 
 
 def test_a_plant_that_runs_away_is_refused() -> None:
     plant = Plant(
         "bomb",
-        (State("x", tree("a*x**3 + u"), 3.0, 2, 5),),
+        (PlantState("x", tree("a*x**3 + u"), 3.0, 2, 5),),
         (Input("u", named("u")),),
         (Output("y", named("x")),),
-        (Parameter("a", 5.0, 4.0, 6.0),),
+        (PlantParameter("a", 5.0, 4.0, 6.0),),
     )
     t = np.arange(50.0)
     with pytest.raises(PlantError, match="leaves every range"):
-        refit(plant, Record(t, t[:, None], np.sin(t)[:, None]))
+        refit(plant, PlantRecord(t, t[:, None], np.sin(t)[:, None]))
 
 
 def test_problems_of_a_plant_file_are_named_by_key_path(tmp_path: Path) -> None:
@@ -342,6 +353,7 @@ def test_a_record_is_cut_where_the_file_says(tmp_path: Path) -> None:
         load_records(load_plant(plant), path)
 
 
+@pytest.mark.usefixtures("eighty")
 def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     plant, path = map(str, table(tmp_path))
     with pytest.raises(SystemExit) as end:
@@ -357,6 +369,8 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         main.run(["refit", plant, path, "--add", "dead_zone:u"])
     text = capsys.readouterr().out
     assert "error" in text and "dead_zone_u_threshold" in text
+    sd = value["std"]  # JSON tells the standard deviation, the table 95 %
+    assert f"{1.96 * sd:.2g}" in text and text.count("± is the 95 % interval.") == 1
     with pytest.raises(SystemExit) as end:
         main.run(["refit", plant, path, "--add", "overflow:q"])
     assert end.value.code == Exit.USAGE

@@ -12,14 +12,24 @@ import numpy as np
 import pytest
 
 from rtid.effects import Expression
-from rtid.effects.tree import FloatArray, Node
-from rtid.output_error import Input, Output, Parameter, Plant, Record, State, diagnose, refit
-from rtid.output_error.diagnosis import AMBIGUOUS, MATCHES, MISSING, UNKNOWN, Diagnosis
-from rtid.output_error.plant import FIRST_ORDER, named
+from rtid.effects.tree import Node, named
+from rtid.plain import FloatArray
+from rtid.plants import (
+    Input,
+    Output,
+    Plant,
+    PlantParameter,
+    PlantRecord,
+    PlantState,
+    diagnose,
+    refit,
+)
+from rtid.plants.missing import AMBIGUOUS, MATCHES, MISSING, UNKNOWN, PlantDiagnosis
+from rtid.plants.plant import FIRST_ORDER
 from rtid.sim.other_plants import moved, steps
 
 NOTHING = 0.0
-Case = tuple[Plant, Record, float]  # and the size of what is hidden
+Case = tuple[Plant, PlantRecord, float]  # and the size of what is hidden
 
 
 def tree(text: str) -> Node:
@@ -62,10 +72,10 @@ def motor(rng: np.random.Generator, hidden: str) -> Case:
     w = moved(step, np.array([0.0, u[0]]), n, dt)[:, 0]
     plant = Plant(
         "motor",
-        (State("w", tree("b*u - a*w"), 0, -50, 50, "rad/s", "velocity"),),
+        (PlantState("w", tree("b*u - a*w"), 0, -50, 50, "rad/s", "velocity"),),
         (Input("u", named("u"), unit="V"),),
         (Output("y", named("w"), "rad/s"),),
-        (Parameter("a", 3, 0.1, 50, "1/s"), Parameter("b", 40, 1, 500, "rad/s2/V")),
+        (PlantParameter("a", 3, 0.1, 50, "1/s"), PlantParameter("b", 40, 1, 500, "rad/s2/V")),
     )
     size = next(iter(of.values()), NOTHING)
     return plant, measured(rng, dt, u, w, 0.01 * w.std()), size
@@ -94,12 +104,12 @@ def spring(rng: np.random.Generator, hidden: str) -> Case:
     plant = Plant(
         "spring",
         (
-            State("z", named("v"), 0, -1, 1, "m", "displacement"),
-            State("v", force, 0, -2, 2, "m/s", "velocity", mass),
+            PlantState("z", named("v"), 0, -1, 1, "m", "displacement"),
+            PlantState("v", force, 0, -2, 2, "m/s", "velocity", mass),
         ),
         (Input("u", named("u"), unit="N"),),
         (Output("y", named("z"), "m"),),
-        (Parameter("k", 25, 1, 200, "N/m"), Parameter("d", 1, 0.05, 20, "N s/m")),
+        (PlantParameter("k", 25, 1, 200, "N/m"), PlantParameter("d", 1, 0.05, 20, "N s/m")),
     )
     return plant, measured(rng, dt, u, z, 0.005 * z.std()), size
 
@@ -124,15 +134,15 @@ def room(rng: np.random.Generator, hidden: str) -> Case:
     plant = Plant(
         "room",
         (
-            State("T", tree("p*u - c*(T - W)"), 18, 0, 40, "K", "temperature", ambient=around),
-            State("W", wall, 15, 0, 40, "K", "temperature", ambient=around),
+            PlantState("T", tree("p*u - c*(T - W)"), 18, 0, 40, "K", "temperature", ambient=around),
+            PlantState("W", wall, 15, 0, 40, "K", "temperature", ambient=around),
         ),
         (Input("u", named("u")), Input("outside", around, FIRST_ORDER, "K")),
         (Output("y", named("T"), "K"),),
         (
-            Parameter("p", 3e-3, 1e-4, 1e-1, "K/s"),
-            Parameter("c", 3e-4, 1e-5, 1e-2, "1/s"),
-            Parameter("g", 5e-5, 1e-6, 1e-2, "1/s"),
+            PlantParameter("p", 3e-3, 1e-4, 1e-1, "K/s"),
+            PlantParameter("c", 3e-4, 1e-5, 1e-2, "1/s"),
+            PlantParameter("g", 5e-5, 1e-6, 1e-2, "1/s"),
         ),
     )
     record = measured(rng, dt, u, air, 0.02)
@@ -159,12 +169,12 @@ def tanks(rng: np.random.Generator, hidden: str) -> Case:
     plant = Plant(
         "tanks",
         (
-            State("x1", tree("-k1*ssqrt(x1) + k4*u"), 3, 0, 50, "V", "level"),
-            State("x2", tree("k1*ssqrt(x1) - k3*ssqrt(x2)"), 3, 0, 50, "V", "level"),
+            PlantState("x1", tree("-k1*ssqrt(x1) + k4*u"), 3, 0, 50, "V", "level"),
+            PlantState("x2", tree("k1*ssqrt(x1) - k3*ssqrt(x2)"), 3, 0, 50, "V", "level"),
         ),
         (Input("u", named("u"), unit="V"),),
         (Output("y", named("x2"), "V"),),
-        tuple(Parameter(name, 0.05, 1e-4, 1) for name in ("k1", "k3", "k4")),
+        tuple(PlantParameter(name, 0.05, 1e-4, 1) for name in ("k1", "k3", "k4")),
     )
     return plant, measured(rng, dt, u, level, 0.02), rim if hidden == "overflow" else linear
 
@@ -188,14 +198,14 @@ def volume(rng: np.random.Generator, hidden: str) -> Case:
     flow_in = "k_v*u*ssqrt(1e7 - p) - 1.5e-11*p - k_r*pos(p - p_r)"
     plant = Plant(
         "volume",
-        (State("p", tree(f"b/1e-3*({flow_in})"), 1e6, 0, 1e7, "Pa", "pressure"),),
+        (PlantState("p", tree(f"b/1e-3*({flow_in})"), 1e6, 0, 1e7, "Pa", "pressure"),),
         (Input("u", named("u"), unit="V"),),
         (Output("y", named("p"), "Pa"),),
         (
-            Parameter("b", 7e8, 1e8, 2e9, "Pa"),
-            Parameter("k_v", 3e-8, 1e-9, 1e-6, "m3/s/V/sqrt(Pa)"),
-            Parameter("k_r", 3e-11, 1e-12, 1e-9, "m3/s/Pa"),
-            Parameter("p_r", 4e6, 1e6, 9e6, "Pa"),
+            PlantParameter("b", 7e8, 1e8, 2e9, "Pa"),
+            PlantParameter("k_v", 3e-8, 1e-9, 1e-6, "m3/s/V/sqrt(Pa)"),
+            PlantParameter("k_r", 3e-11, 1e-12, 1e-9, "m3/s/Pa"),
+            PlantParameter("p_r", 4e6, 1e6, 9e6, "Pa"),
         ),
     )
     size = leak * beta / v if leak else opens
@@ -204,9 +214,9 @@ def volume(rng: np.random.Generator, hidden: str) -> Case:
 
 def measured(
     rng: np.random.Generator, dt: float, u: FloatArray, y: FloatArray, noise: float
-) -> Record:
+) -> PlantRecord:
     t = dt * np.arange(len(u), dtype=np.float64)
-    return Record(t, u[:, None], (y + noise * rng.standard_normal(len(y)))[:, None])
+    return PlantRecord(t, u[:, None], (y + noise * rng.standard_normal(len(y)))[:, None])
 
 
 PLANTS = {"motor": motor, "spring": spring, "room": room, "tanks": tanks, "volume": volume}
@@ -229,7 +239,7 @@ HIDDEN = [
 ]
 
 
-def show(diagnosis: Diagnosis) -> None:
+def show(diagnosis: PlantDiagnosis) -> None:
     for f in diagnosis.found:
         added = diagnosis.last.parameters(f.key)
         sizes = {a.label: diagnosis.last.fit.value(a.name) for a in added}

@@ -13,12 +13,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtid.output_error import refit
-from rtid.output_error.diagnosis import AMBIGUOUS, MISSING
-from rtid.output_error.validation import on_record, rms
-from rtid.plantfile import load_plant
-from rtid.refitted import as_json, sentences
-from rtid.refitting import Records, Refitted, load_records, run
+from rtid.plants import refit
+from rtid.plants.missing import AMBIGUOUS, MISSING
+from rtid.plants.validation import on_record, rms
+from rtid.project.plant_file import load_plant
+from rtid.study.refit import Records, Refitted, load_records, run
+from rtid.tell.refit import as_json, sentences
+
+pytestmark = pytest.mark.slow
 
 EXAMPLE = Path(__file__).parents[1] / "rtid" / "project" / "examples" / "cascaded_tanks.toml"
 

@@ -13,16 +13,17 @@ from rtid.daemon.analyst import Analyst
 from rtid.daemon.jobs import Answer, Handover, Publication
 from rtid.errors import RtidError
 from rtid.estimator.flowmap import PRIOR, VALID, EdgeMap, FlowMap
-from rtid.mapfiles import read_map, write_map
-from rtid.model import FloatArray, Grid
-from rtid.priors import find_prior, of_flow, published, with_prior
+from rtid.maps.files import read_map, write_map
+from rtid.maps.prior_map import find_prior, of_flow, published, with_prior
+from rtid.model import Grid
+from rtid.plain import FloatArray
 from rtid.project import Project, ProjectError, load
-from rtid.replay import Replay, replay
-from rtid.sim.plant import EDGES, Plant, flow_points
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
+from rtid.sim.simulated_plant import EDGES, SimulatedPlant, flow_points
+from rtid.study.replay import Replay, replay
 
-PLANT = Plant()
+PLANT = SimulatedPlant()
 
 
 def true_flow(edge: str, w_v: FloatArray, dp_pa: FloatArray) -> FloatArray:
@@ -62,27 +63,27 @@ def in_ampere(edge: EdgeMap) -> EdgeMap:
 
 
 @pytest.fixture(scope="module")
-def found(project: Project) -> Replay:
+def replayed(project: Project) -> Replay:
     return replay(project, project.path.with_name("run.parquet"))
 
 
 @pytest.fixture(scope="module")
-def alone(found: Replay) -> FlowMap:
+def alone(replayed: Replay) -> FlowMap:
     """The map without a prior."""
-    return published(found.fit.solution, None)
+    return published(replayed.fit.solution, None)
 
 
 @pytest.fixture(scope="module")
-def exact(project: Project, found: Replay) -> FlowMap:
+def exact(project: Project, replayed: Replay) -> FlowMap:
     """The map with the machine's own as prior."""
-    return filled(project, found, "exact.npz")
+    return filled(project, replayed, "exact.npz")
 
 
-def filled(project: Project, found: Replay, file: str, share: float | None = None) -> FlowMap:
+def filled(project: Project, replayed: Replay, file: str, share: float | None = None) -> FlowMap:
     """The map with a prior."""
     prior = find_prior(with_prior(project, project.path.with_name(file)))
     assert prior is not None
-    return published(found.fit.solution, prior if share is None else replace(prior, share=share))
+    return published(replayed.fit.solution, prior if share is None else replace(prior, share=share))
 
 
 def centres(edge: EdgeMap, chosen: np.ndarray) -> tuple[FloatArray, FloatArray]:
@@ -102,13 +103,13 @@ def misses(flowmap: FlowMap, status: str) -> tuple[FloatArray, FloatArray]:
 
 
 def test_data_overrule_a_wrong_prior_where_there_are_any(
-    project: Project, found: Replay, alone: FlowMap
+    project: Project, replayed: Replay, alone: FlowMap
 ) -> None:
     """Valid blocks stay what they are without it, to a fiftieth of their standard deviation.
 
     Elsewhere a prior whose gains are off by 20 %, declared to 5 %, is believed less.
     """
-    both = filled(project, found, "off.json", 0.05)
+    both = filled(project, replayed, "off.json", 0.05)
     valid = 0
     for before, after in zip(alone.edges, both.edges, strict=True):
         kept = before.status == VALID
@@ -191,11 +192,11 @@ def named(project: Project, prior: str) -> Project:
 
 
 def test_on_board_the_map_that_is_published_has_the_prior(
-    project: Project, found: Replay, tmp_path: Path
+    project: Project, replayed: Replay, tmp_path: Path
 ) -> None:
     answers: list[Answer] = []
     analyst = Analyst(named(project, "exact.npz"), tmp_path, answers.append)
-    handed = found.live.copy()
+    handed = replayed.live.copy()
     handed.history = None
     analyst.take(Handover(1, handed, publish=True, store=False))
     analyst.close()

@@ -128,7 +128,7 @@ def test_modes_need_their_numbers_and_every_edge(raw: dict[str, Any], tmp_path: 
 def test_upkeep_basis_and_form_reach_the_model(raw: dict[str, Any], tmp_path: Path) -> None:
     raw["upkeep"] = {"every_s": 10, "forget_min": 10, "innovation_sd": 8, "folds": 5}
     assert "upkeep.forget_min" in refused(raw, tmp_path)
-    raw["upkeep"] = {"every_s": 10, "forget_s": 600, "innovation_sd": 8, "folds": 5}
+    raw["upkeep"] = {"every_s": 10, "forget_s": 600, "folds": 5}
     raw["edge_defaults"]["basis"] = "blended"
     raw["edges"]["at"]["terms"] = "drop"
     raw["edges"]["at"]["basis"] = "taylor"
@@ -151,6 +151,8 @@ def set_at(raw: dict[str, Any], path: str, value: Any) -> None:
     else:
         raw[last] = value
 
+
+PA = {"source": "p_supply", "sink": "p_a", "direction": 1}
 
 # One broken file per row: what to write where, which path the error names, words of the remedy.
 BROKEN = [
@@ -189,6 +191,19 @@ BROKEN = [
     ("messages.Motoin", {"period_ms": 1}, "messages.Motoin", "'Motion'"),
     ("messages.Motion.counter", "Alive", "messages.Motion.counter", "AliveCounter"),
     ("messages.Motion.period_bar", 1, "messages.Motion.period_bar", "period_ms"),
+    ("edge_defaults.rated_dp_mpa", 5e299, "edge_defaults.rated_dp_mpa", "number and unit"),
+    ("signals.x.noise", 1e-200, "signals.x.noise", "number and unit"),
+    (
+        "edges.pa.u_grid_v",
+        [{"start": [1], "stop": 2, "step": 1}],
+        "edges.pa.u_grid_v[0]",
+        "list the borders",
+    ),
+    ("edges.pa.u_grid_v", [{"start": "1", "stop": 2, "step": 1}], "edges.pa.u_grid_v[0]", "list"),
+    ("upkeep", {"innovation_sd": 8}, "upkeep.innovation_sd", "every_s = 10"),
+    ("filter.damping", 1.5, "filter.damping", "0.8"),
+    ("estimator.recent_blocks", 2, "estimator.recent_blocks", "64"),
+    ("edges.pa", PA | {"basis": "lapped", "terms": "command"}, "edges.pa", "taylor"),
     ("beta.bounds_mpa", [1600, 200], "beta.bounds_mpa", "[low, high]"),
     ("beta.nominal_mpa", 8, "beta", "around"),
     ("modes.extend", ["pa", "bb"], "modes.extend[1]", "there"),

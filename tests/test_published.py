@@ -18,14 +18,14 @@ from rtid.estimator.prior import reference_map
 from rtid.estimator.published import cell_terms, publish
 from rtid.estimator.record import fit_record
 from rtid.estimator.solution import Solution
-from rtid.model import FloatArray
+from rtid.plain import FloatArray
 from rtid.sim.declare import declared_model
-from rtid.sim.plant import EDGES, Plant, flow_points
 from rtid.sim.random_plants import draw
 from rtid.sim.run import Sensors, SimulationError, simulate
+from rtid.sim.simulated_plant import EDGES, SimulatedPlant, flow_points
 from tests.flow_maps import GRID, RATED_DP_PA, RATED_Q_M3S, empty, machine, orifice, solved
 
-Fit = tuple[Plant, Solution]
+Fit = tuple[SimulatedPlant, Solution]
 Mask = NDArray[np.bool_]
 MARK = FALLS.split(",")[0]
 
@@ -59,7 +59,7 @@ def free_maps(fits: list[Fit]) -> list[FlowMap]:
         return [publish(solution) for _, solution in fits]
 
 
-def true_flow(plant: Plant, edge: str, w_v: FloatArray, dp_pa: FloatArray) -> FloatArray:
+def true_flow(plant: SimulatedPlant, edge: str, w_v: FloatArray, dp_pa: FloatArray) -> FloatArray:
     w, dp = np.broadcast_arrays(w_v, dp_pa)
     q = np.empty(w.size)
     valve = plant.valve_table()[EDGES.index(edge)]

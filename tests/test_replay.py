@@ -13,15 +13,16 @@ from firmware_bridge.frames import Frames
 from firmware_bridge.sources import candump, open_log
 from rtid.errors import RtidError
 from rtid.estimator.estimator import Estimator
-from rtid.live import Learner, catalog_of
 from rtid.project import Project, load
-from rtid.replay import read_trace, replay
 from rtid.sim.random_plants import draw
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
-from rtid.store import SnapshotError
-from rtid.store import load as load_snapshot
-from rtid.store import save as save_snapshot
+from rtid.study.replay import replay
+from rtid.trace.learner import Learner, catalog_of
+from rtid.trace.reading import read_trace
+from rtid.trace.snapshot import SnapshotError
+from rtid.trace.snapshot import load as load_snapshot
+from rtid.trace.snapshot import save as save_snapshot
 
 DURATION_S = 12.0
 

@@ -15,18 +15,18 @@ import pytest
 
 from rtid.cli.main import run
 from rtid.diagnose.residual import Residual
-from rtid.diagnosed_text import sentences
-from rtid.diagnosing import added_parts
 from rtid.errors import RtidError
 from rtid.project import load
-from rtid.report_page import page
-from rtid.report_story import Told
-from rtid.reporting import Reported, report
-from rtid.revising import add
 from rtid.sim.hidden import hide_wish
 from rtid.sim.random_plants import draw
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
+from rtid.study.revisions import add
+from rtid.study.spans import added_parts
+from rtid.tell.diagnosed import sentences
+from rtid.tell.report import page
+from rtid.tell.report_file import Reported, report
+from rtid.tell.report_story import ReportStory
 
 SEED, DURATION_S = 3, 40.0
 MOST_BYTES = 3_000_000
@@ -88,7 +88,7 @@ def test_the_verdict_stands_in_plain_sentences(leaking: Reported) -> None:
     found = leaking.told.diagnosed.diagnosis
     assert found.verdict == "missing"
     for sentence in sentences(found):
-        assert " ".join(sentence.replace("+-", "±").split()) in words
+        assert " ".join(sentence.split()) in words
     assert "Internal leakage, laminar at a-b" in words
 
 
@@ -122,8 +122,8 @@ def test_every_picture_has_a_sentence_below(leaking: Reported) -> None:
     text = leaking.path.read_text("utf-8")
     captions = re.findall(r"(?s)<figure>.+?<figcaption>(.+?)</figcaption></figure>", text)
     _, words = read(leaking.path)
-    assert len(captions) == 4
-    assert text.count("data-root-id=") == 2  # drawn by Bokeh; the other two are HTML
+    assert len(captions) == 5
+    assert text.count("data-root-id=") == 3  # drawn by Bokeh; the other two are HTML
     assert all(unescape(c).strip().endswith(".") for c in captions)
     for heading in ("not found", "cannot show", "negligible", "Where this comes from"):
         assert heading in words
@@ -184,14 +184,14 @@ def test_a_place_that_cannot_be_written_is_refused_at_once(leaking: Reported, na
 def test_a_disk_that_refuses_leaves_no_half_file(
     leaking: Reported, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def told(*_arguments: object) -> Told:
+    def told(*_arguments: object) -> ReportStory:
         return leaking.told
 
     def refuse(*_arguments: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("rtid.reporting.tell", told)
-    monkeypatch.setattr("rtid.reporting.os.replace", refuse)
+    monkeypatch.setattr("rtid.tell.report_file.tell", told)
+    monkeypatch.setattr("rtid.tell.report_file.os.replace", refuse)
     found = leaking.told.diagnosed
     with pytest.raises(RtidError, match="No space left"):
         report(found.project, found.trace.path, tmp_path / "report.html")
@@ -219,11 +219,12 @@ def test_a_record_of_which_nothing_could_be_judged_has_a_page_too(leaking: Repor
         depends_before=(),
         depends_after=(),
         ranking=(),
+        evidence=(),
     )
     reader = Reader()
     reader.feed(page(bare))
     words = "".join(reader.words)
-    assert "The record holds too little motion to tell." in words
+    assert "Too little motion to tell." in words
     assert "No flow of this record could be judged." in words
     assert "nan" not in words.split()
 

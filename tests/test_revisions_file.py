@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+import shlex
 import tomllib
 from datetime import UTC, datetime
 from pathlib import Path
@@ -11,6 +13,7 @@ from typing import Any, NoReturn
 import pytest
 
 import rtid.project
+from rtid.cli.main import run
 from rtid.errors import RtidError
 from rtid.project import ProjectError, load
 from rtid.project.added import (
@@ -21,9 +24,10 @@ from rtid.project.added import (
     text_with,
 )
 from rtid.project.added import read as read_added
-from rtid.project.history import ADD, Change, path_of, read, write
-from rtid.revised_text import bars
-from rtid.revising import drop, history, undo
+from rtid.project.history import ADD, Change, history, path_of, read, write
+from rtid.study.revisions import drop, undo
+from rtid.tell.story import Bar, Bars
+from rtid.tell.terminal import bars
 
 EXAMPLE = Path(rtid.project.__file__).parent / "examples" / "cylinder.toml"
 LEAK = AddedSection(
@@ -247,6 +251,25 @@ def test_a_link_stays_a_link_and_rights_stay(project: Path) -> None:
 
 
 def test_bars_have_one_scale() -> None:
-    before, after, floor = bars({"before": 2.0, "after": 0.5}, 0.25)
+    shown = (Bar("before", 2.0), Bar("after", 0.5))
+    before, after, floor = bars(Bars("", "", shown, 0.25, "floor", "share of the flow"))
     assert (before.count("█"), after.count("█"), floor.count("█")) == (40, 10, 5)
     assert before.endswith(" 2.00 %") and floor.startswith("  floor")
+
+
+def test_the_line_that_takes_a_change_back_can_be_pasted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With the folder, quoted, and in one piece however long it is."""
+    folder = tmp_path / "the press's records" / ("of the long year " * 6).strip()
+    folder.mkdir(parents=True)
+    project = folder / "worn.toml"
+    project.write_text(text_with(EXAMPLE.read_text("utf-8"), (LEAK,)), "utf-8")
+    untouched = project.read_bytes()
+    with pytest.raises(SystemExit, match="0"):
+        run(["drop", LEAK.effect, "-p", str(project)])
+    assert project.read_bytes() != untouched
+    (line,) = re.findall(r"`(rtid undo[^`]*)` takes it back", capsys.readouterr().out)
+    with pytest.raises(SystemExit, match="0"):
+        run(shlex.split(line)[1:])
+    assert project.read_bytes() == untouched

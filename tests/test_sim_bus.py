@@ -20,8 +20,8 @@ from rtid.sim.frames import (
     cycle_frames,
     multirate_frames,
 )
-from rtid.sim.plant import Plant
 from rtid.sim.run import Run, simulate
+from rtid.sim.simulated_plant import SimulatedPlant
 
 N = 20_000
 T_US = 1000 * np.arange(N, dtype=np.int64)
@@ -34,7 +34,7 @@ def catalog() -> Catalog:
 
 @pytest.fixture(scope="module")
 def run() -> Run:
-    return simulate(Plant(), "sweep", duration_s=0.5)
+    return simulate(SimulatedPlant(), "sweep", duration_s=0.5)
 
 
 def ramps() -> dict[str, np.ndarray]:

@@ -20,12 +20,12 @@ from firmware_bridge.playback import SendError
 from rtid import project
 from rtid.cli.simulate import simulate
 from rtid.errors import RtidError
-from rtid.model import Model
+from rtid.model import Machine
 from rtid.sim.declare import declared_model
-from rtid.sim.log import START_US
-from rtid.sim.plant import Plant
 from rtid.sim.random_plants import draw
 from rtid.sim.run import simulate as run_machine
+from rtid.sim.run_files import START_US
+from rtid.sim.simulated_plant import SimulatedPlant
 
 APP = typer.Typer()
 APP.command()(simulate)
@@ -37,23 +37,23 @@ def call(*arguments: object) -> str:
     return result.output
 
 
-def assert_same_machine(found: Model, declared: Model) -> None:
-    assert [s.name for s in found.signals] == [s.name for s in declared.signals]
-    assert [s.kind for s in found.signals] == [s.kind for s in declared.signals]
+def assert_same_machine(machine: Machine, declared: Machine) -> None:
+    assert [s.name for s in machine.signals] == [s.name for s in declared.signals]
+    assert [s.kind for s in machine.signals] == [s.kind for s in declared.signals]
     noise = [s.noise for s in declared.signals]
-    assert [s.noise for s in found.signals] == pytest.approx(noise)
-    for a, b in zip(found.chambers, declared.chambers, strict=True):
+    assert [s.noise for s in machine.signals] == pytest.approx(noise)
+    for a, b in zip(machine.chambers, declared.chambers, strict=True):
         assert (a.name, a.pressure, a.sign) == (b.name, b.pressure, b.sign)
         assert (a.area_m2, a.v0_m3) == pytest.approx((b.area_m2, b.v0_m3), rel=1e-12)
-    for e, f in zip(found.edges, declared.edges, strict=True):
+    for e, f in zip(machine.edges, declared.edges, strict=True):
         assert (e.name, e.source, e.sink, e.command) == (f.name, f.source, f.sink, f.command)
         assert (e.direction, e.safe_band_v) == (f.direction, f.safe_band_v)
         assert np.array_equal(e.grid.u_v, f.grid.u_v)
         assert np.allclose(e.grid.dp_pa, f.grid.dp_pa, rtol=1e-9, atol=1e-3)
         assert e.rated_q_m3s == pytest.approx(f.rated_q_m3s)
-    assert found.beta_nominal_pa == pytest.approx(declared.beta_nominal_pa)
-    assert found.lag.nominal_s == pytest.approx(declared.lag.nominal_s)
-    assert found.lag.tolerance_s == pytest.approx(declared.lag.tolerance_s)
+    assert machine.beta_nominal_pa == pytest.approx(declared.beta_nominal_pa)
+    assert machine.lag.nominal_s == pytest.approx(declared.lag.nominal_s)
+    assert machine.lag.tolerance_s == pytest.approx(declared.lag.tolerance_s)
 
 
 @pytest.mark.parametrize("cross_port", [False, True])
@@ -77,7 +77,7 @@ def test_table(tmp_path: Path) -> None:
     trace = tmp_path / "run.parquet"
     call(trace, "--duration", 0.5)
     table = pyarrow.parquet.read_table(trace)
-    expected = run_machine(Plant(), "sweep", 0, 0.5).samples
+    expected = run_machine(SimulatedPlant(), "sweep", 0, 0.5).samples
     assert table.schema.field("p_a").metadata == {b"unit": b"Pa"}
     for name in expected.names:
         assert np.array_equal(table[name].to_numpy(), expected.column(name))
@@ -114,7 +114,7 @@ def test_hidden_effects_are_told_in_the_truth_alone(tmp_path: Path) -> None:
     assert truth["hidden"][1]["catalogue"] == "relief_valve"
     written = project.load(tmp_path / "run.toml")
     assert "relief" not in (tmp_path / "run.toml").read_text()
-    assert_same_machine(written.model, declared_model(Plant(), seed=0))
+    assert_same_machine(written.model, declared_model(SimulatedPlant(), seed=0))
 
 
 def test_as_json_the_same_is_told(tmp_path: Path) -> None:

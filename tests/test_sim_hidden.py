@@ -3,28 +3,29 @@
 import numpy as np
 import pytest
 
-from rtid.sim import equations, extra_flows, loop, sensing, spool
-from rtid.sim import extra as numbers
-from rtid.sim.extra import NONE, Extra, Parts, parts_of
+from rtid.plain import FloatArray
+from rtid.sim import closed_loop, dynamics, extra_flows, sensing, spool
+from rtid.sim import extra_physics as numbers
+from rtid.sim.extra_physics import NONE, Extra, Parts, parts_of
 from rtid.sim.hidden import HIDDEN, LEVELS, MECHANICAL, OUTSIDE, HiddenError, hide
-from rtid.sim.plant import EDGES, FloatArray, Plant
 from rtid.sim.random_plants import draw, draw_hidden
 from rtid.sim.run import EXACT, Run, simulate
+from rtid.sim.simulated_plant import EDGES, SimulatedPlant
 
 P_A, P_B = 1, 2
 PLAIN_FIGURES = [-7.792782482642862, 4217517.620223735, 5176918.3507615235, 0.22421678917025525]
 
 
-def rich(plant: Plant, duration_s: float = 6.0, substeps: int = 10) -> Run:
+def rich(plant: SimulatedPlant, duration_s: float = 6.0, substeps: int = 10) -> Run:
     return simulate(plant, "rich", 3, duration_s, EXACT, substeps)
 
 
-def still(plant: Plant, duration_s: float = 1.0) -> Run:
+def still(plant: SimulatedPlant, duration_s: float = 1.0) -> Run:
     return simulate(plant, "standstill", 3, duration_s, EXACT)
 
 
-def hidden(name: str, level: str = "middle", where: str = "") -> Plant:
-    return hide(Plant(), name, HIDDEN[name].strength(level), where)
+def hidden(name: str, level: str = "middle", where: str = "") -> SimulatedPlant:
+    return hide(SimulatedPlant(), name, HIDDEN[name].strength(level), where)
 
 
 def balance(run: Run, more: FloatArray | float = 0.0) -> FloatArray:
@@ -48,13 +49,13 @@ def balance(run: Run, more: FloatArray | float = 0.0) -> FloatArray:
 
 @pytest.mark.parametrize("name", HIDDEN)
 def test_strength_zero_is_the_plain_machine(name: str) -> None:
-    assert hide(Plant(), name, 0.0) == Plant()
+    assert hide(SimulatedPlant(), name, 0.0) == SimulatedPlant()
 
 
 def test_extra_kernels_without_extra_are_the_plain_machine() -> None:
     """An effect that cannot act runs the extra kernels and changes nothing but round-off."""
-    idle = Plant(extra=Extra(relief=(1e-30, 0.0), relief_open_pa=(1e9, 0.0)))
-    plain, same = rich(Plant(), 3.0).truth, rich(idle, 3.0).truth
+    idle = SimulatedPlant(extra=Extra(relief=(1e-30, 0.0), relief_open_pa=(1e9, 0.0)))
+    plain, same = rich(SimulatedPlant(), 3.0).truth, rich(idle, 3.0).truth
     assert np.allclose(plain.signals, same.signals, rtol=1e-9, atol=1e-12)
     assert np.allclose(plain.flow_m3s, same.flow_m3s, rtol=1e-8, atol=1e-15)
 
@@ -76,7 +77,7 @@ def test_the_step_is_fine_enough(name: str) -> None:
 @pytest.mark.parametrize("name", HIDDEN)
 def test_effects_are_felt_and_grow(name: str) -> None:
     """Each strength moves what is measured, more than the weaker one."""
-    plain = rich(Plant()).samples.values
+    plain = rich(SimulatedPlant()).samples.values
     felt = [np.abs(rich(hidden(name, k)).samples.values - plain).sum(axis=0) for k in LEVELS]
     columns = felt[0] > 0
     assert columns.any()
@@ -149,13 +150,13 @@ def test_dead_volume_stores_oil() -> None:
     assert balance(run)[0] > 1.5e-3
 
 
-def parts(plant: Plant) -> Parts:
+def parts(plant: SimulatedPlant) -> Parts:
     found = parts_of(plant.extra)
     assert found is not None
     return found
 
 
-def softness(plant: Plant, p_pa: FloatArray, chamber: int = 0) -> FloatArray:
+def softness(plant: SimulatedPlant, p_pa: FloatArray, chamber: int = 0) -> FloatArray:
     """1 / beta_c - 1 / beta at the pressures, 1/Pa."""
     c, e = plant.constants, parts(plant)
     r = (e.a, e.b)[chamber]
@@ -361,7 +362,7 @@ def test_two_effects_at_once() -> None:
 )
 def test_wrong_wishes(name: str, strength: float, where: str, said: str) -> None:
     with pytest.raises(HiddenError, match=said) as caught:
-        hide(Plant(), name, strength, where)
+        hide(SimulatedPlant(), name, strength, where)
     assert caught.value.remedy
 
 
@@ -386,7 +387,7 @@ def test_no_effect_replaces_another(first: str, second: str, where: str) -> None
 
 
 def test_what_has_either_sign() -> None:
-    less = rich(hide(Plant(), "pressure_sensor_bias", -0.2e6))
+    less = rich(hide(SimulatedPlant(), "pressure_sensor_bias", -0.2e6))
     assert (less.samples.values - less.truth.signals)[:, 1] == pytest.approx(-0.2e6)
     signs = {
         np.sign(draw_hidden(i, "valve_gain_drift", "weak").hidden[0].strength) for i in range(9)
@@ -407,16 +408,16 @@ def test_random_machines_hide_a_varied_strength_in_a_varied_place() -> None:
 
 def test_kernels_agree_with_their_python_source(monkeypatch: pytest.MonkeyPatch) -> None:
     """A machine that hides everything, six samples, every kernel as plain Python."""
-    plant = Plant()
+    plant = SimulatedPlant()
     for name, effect in HIDDEN.items():
         if name not in ("spool_lag_first_order", "line_dynamics", "supply_sag_measured"):
             plant = hide(plant, name, effect.strengths[0])
     compiled = simulate(plant, "rich", 2, 0.006)
-    for module in (equations, loop, extra_flows, spool, sensing):
+    for module in (dynamics, closed_loop, extra_flows, spool, sensing):
         for name, kernel in list(vars(module).items()):
             if hasattr(kernel, "py_func"):
                 monkeypatch.setattr(module, name, kernel.py_func)
-    monkeypatch.setattr("rtid.sim.run.run_loop", loop.run_loop)
+    monkeypatch.setattr("rtid.sim.run.run_loop", closed_loop.run_loop)
     plain = simulate(plant, "rich", 2, 0.006)
     assert np.allclose(plain.samples.values, compiled.samples.values, rtol=1e-12, atol=1e-12)
     assert np.allclose(plain.truth.extra_m3s, compiled.truth.extra_m3s, rtol=1e-9, atol=1e-18)

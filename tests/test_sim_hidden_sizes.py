@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from rtid.plain import FloatArray
 from rtid.sim import extra_flows
-from rtid.sim.extra import parts_of
+from rtid.sim.extra_physics import parts_of
 from rtid.sim.hidden import HIDDEN, hide
-from rtid.sim.plant import FloatArray, Plant
 from rtid.sim.run import EXACT, Run, simulate
+from rtid.sim.simulated_plant import SimulatedPlant
 
 Pair = tuple[FloatArray, FloatArray]  # what the simulator did, the plain column for a coefficient 1
 
@@ -131,7 +132,7 @@ SIZES: dict[str, Callable[[Run], Pair]] = {
 @pytest.mark.parametrize("name", SIZES)
 def test_stated_size_is_the_effective_one(name: str, motion: str) -> None:
     strength = HIDDEN[name].strengths[1]
-    run = simulate(hide(Plant(), name, strength), motion, 1, 40.0, EXACT)
+    run = simulate(hide(SimulatedPlant(), name, strength), motion, 1, 40.0, EXACT)
     done, column = SIZES[name](run)
     found = (done @ column) / (column @ column)
     assert found == pytest.approx(strength, rel=0.105)

@@ -3,32 +3,33 @@
 import numpy as np
 import pytest
 
-from rtid.sim import loop, spool
+from rtid.plain import FloatArray
+from rtid.sim import closed_loop, spool
 from rtid.sim.hidden import HIDDEN, hide
-from rtid.sim.plant import EDGES, Controller, FloatArray, Plant
 from rtid.sim.run import EXACT, Run, simulate
+from rtid.sim.simulated_plant import EDGES, Controller, SimulatedPlant
 
 AT_MS, SIZE_V = 100, 3.0
 
 
-def one_step(plant: Plant, rng: np.random.Generator, duration_s: float) -> FloatArray:
+def one_step(plant: SimulatedPlant, rng: np.random.Generator, duration_s: float) -> FloatArray:
     """Reference held, command steps by SIZE_V at AT_MS."""
     drive = np.zeros((round(duration_s * 1e3) + 1, 6))
-    drive[:, loop.X_REF], drive[:, loop.P_SUPPLY] = 0.25, 7e6
-    drive[:, loop.P_TANK], drive[AT_MS:, loop.DITHER] = 1e5, SIZE_V
+    drive[:, closed_loop.X_REF], drive[:, closed_loop.P_SUPPLY] = 0.25, 7e6
+    drive[:, closed_loop.P_TANK], drive[AT_MS:, closed_loop.DITHER] = 1e5, SIZE_V
     return drive
 
 
 def opening(name: str, strength: float, edge: str = "pb", lag_s: float = 1.3e-3) -> FloatArray:
     """Opening of an edge, signed as the command, after one step of it, V."""
-    plant = Plant(controller=Controller(kp_1ps=0.0, deadband_v=0.0), lag_s=lag_s)
+    plant = SimulatedPlant(controller=Controller(kp_1ps=0.0, deadband_v=0.0), lag_s=lag_s)
     run = simulate(hide(plant, name, strength), one_step, 0, 0.4, EXACT)
     column = EDGES.index(edge)
     return run.truth.opening_v[:, column] * plant.directions[column]
 
 
 def rich(name: str, level: str, duration_s: float = 4.0) -> Run:
-    plant = hide(Plant(), name, HIDDEN[name].strength(level))
+    plant = hide(SimulatedPlant(), name, HIDDEN[name].strength(level))
     return simulate(plant, "rich", 2, duration_s, EXACT)
 
 
@@ -109,10 +110,10 @@ def test_position_sensor_is_late_for_the_controller_too() -> None:
     x, seen = run.truth.signals[:, 5], run.samples.column("x")
     assert seen[5:] == pytest.approx(x[:-5], abs=1e-12)
     assert (seen[:5] == x[0]).all()
-    half = simulate(hide(Plant(), "position_sensor_delay", 1.5e-3), "rich", 2, 1.0, EXACT)
+    half = simulate(hide(SimulatedPlant(), "position_sensor_delay", 1.5e-3), "rich", 2, 1.0, EXACT)
     x, seen = half.truth.signals[:, 5], half.samples.column("x")
     assert seen[2:] == pytest.approx(0.5 * (x[1:-1] + x[:-2]), abs=1e-12)
-    k, drive_u = Plant().controller, half.truth.signals[:, 0]
+    k, drive_u = SimulatedPlant().controller, half.truth.signals[:, 0]
     assert k.kp_1ps > 0 and drive_u.any()
 
 
@@ -143,8 +144,8 @@ def test_line_sensors_sit_where_they_are_told() -> None:
 
 
 def test_wider_dead_bands_are_true_of_the_map() -> None:
-    plant = hide(Plant(), "deadband_shift", 0.15)
-    pairs = zip(plant.valves, Plant().valves, strict=True)
+    plant = hide(SimulatedPlant(), "deadband_shift", 0.15)
+    pairs = zip(plant.valves, SimulatedPlant().valves, strict=True)
     added = [new.deadband_v - old.deadband_v for new, old in pairs]
     assert added == pytest.approx([0.15, 0.165, 0.135, 0.1575, 0.1425])
-    assert plant.flow("pa", 1.95, 1e6) < 0.5 * Plant().flow("pa", 1.95, 1e6)
+    assert plant.flow("pa", 1.95, 1e6) < 0.5 * SimulatedPlant().flow("pa", 1.95, 1e6)

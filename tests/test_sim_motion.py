@@ -3,15 +3,16 @@
 import numpy as np
 import pytest
 
-from rtid.sim.loop import DITHER, LOAD, P_SUPPLY, V_REF, X_REF
-from rtid.sim.motion import MOTIONS, parts_s, usual_duration_s
-from rtid.sim.plant import FloatArray, Plant
+from rtid.plain import FloatArray
+from rtid.sim.closed_loop import DITHER, LOAD, P_SUPPLY, V_REF, X_REF
+from rtid.sim.demand import MOTIONS, parts_s, usual_duration_s
 from rtid.sim.random_plants import draw
 from rtid.sim.run import simulate
+from rtid.sim.simulated_plant import SimulatedPlant
 
 
 def drive(motion: str, duration_s: float = 20.0) -> FloatArray:
-    return MOTIONS[motion](Plant(), np.random.default_rng(5), duration_s)
+    return MOTIONS[motion](SimulatedPlant(), np.random.default_rng(5), duration_s)
 
 
 @pytest.mark.parametrize("motion", MOTIONS)
@@ -60,5 +61,5 @@ def test_other_motions_keep_a_quarter_to_be_judged_by() -> None:
 
 
 def test_a_record_lasts_110_s() -> None:
-    assert len(simulate(Plant(), "sweep_record", 1).samples) == 110_000
-    assert len(simulate(Plant(), "standstill", 1).samples) == 80_000
+    assert len(simulate(SimulatedPlant(), "sweep_record", 1).samples) == 110_000
+    assert len(simulate(SimulatedPlant(), "standstill", 1).samples) == 80_000

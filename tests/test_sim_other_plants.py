@@ -11,9 +11,9 @@ import pytest
 from rtid.cli import main
 from rtid.cli.exits import Exit
 from rtid.errors import RtidError
-from rtid.plantfile import load_plant
-from rtid.refitting import Refitted, load_records, run
+from rtid.project.plant_file import load_plant
 from rtid.sim.other_plants import EXAMPLES, write_example
+from rtid.study.refit import Refitted, load_records, run
 
 
 def refitted(folder: Path, name: str, hide: bool, diagnose: bool) -> Refitted:

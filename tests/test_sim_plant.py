@@ -5,14 +5,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtid.sim import equations, loop
-from rtid.sim import plant as plant_module
-from rtid.sim.motion import moves, rich
-from rtid.sim.plant import EDGES, Constants, Controller, FloatArray, Plant, Valve, smooth_plant
+from rtid.plain import FloatArray
+from rtid.sim import closed_loop, dynamics
+from rtid.sim import simulated_plant as plant_module
+from rtid.sim.demand import moves, rich
 from rtid.sim.random_plants import draw
 from rtid.sim.run import EXACT, Run, SimulationError, simulate
+from rtid.sim.simulated_plant import (
+    EDGES,
+    Constants,
+    Controller,
+    SimulatedPlant,
+    Valve,
+    smooth_plant,
+)
 
-BETA_PA = Plant().beta_pa
+BETA_PA = SimulatedPlant().beta_pa
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +58,7 @@ def test_work_balance(rich_run: Run) -> None:
     resisting = (
         c.gravity_n
         + c.gravity_slope_npm * (x - 0.5 * c.stroke_m)
-        + drive[:-1, loop.LOAD]
+        + drive[:-1, closed_loop.LOAD]
         + c.coulomb_n * np.tanh(v / c.coulomb_width_mps)
         + c.viscous_nspm * v
     )
@@ -61,7 +69,7 @@ def test_work_balance(rich_run: Run) -> None:
 
 
 def test_held_still_at_rest() -> None:
-    plant = Plant()
+    plant = SimulatedPlant()
     run = simulate(plant, "standstill", duration_s=2.0, sensors=EXACT)
     assert np.ptp(run.truth.signals[:, 1:3], axis=0) == pytest.approx([0, 0], abs=1e-3)
     assert not run.truth.flow_m3s.any()
@@ -70,14 +78,14 @@ def test_held_still_at_rest() -> None:
 def test_steady_speed_needs_the_flow_of_the_area() -> None:
     """Long after a ramp has begun, q_pa = A_A v and q_bt = A_B v."""
 
-    def ramp(plant: Plant, rng: np.random.Generator, duration_s: float) -> FloatArray:
+    def ramp(plant: SimulatedPlant, rng: np.random.Generator, duration_s: float) -> FloatArray:
         drive = np.zeros_like(moves(plant, rng, duration_s))
         t = np.arange(len(drive)) * 1e-3
-        drive[:, loop.X_REF], drive[:, loop.V_REF] = 0.05 + 0.08 * t, 0.08
-        drive[:, loop.P_SUPPLY], drive[:, loop.P_TANK] = 7e6, 1e5
+        drive[:, closed_loop.X_REF], drive[:, closed_loop.V_REF] = 0.05 + 0.08 * t, 0.08
+        drive[:, closed_loop.P_SUPPLY], drive[:, closed_loop.P_TANK] = 7e6, 1e5
         return drive
 
-    plant = Plant()
+    plant = SimulatedPlant()
     run = simulate(plant, ramp, duration_s=4.0, sensors=EXACT)
     last = slice(-200, None)
     v = run.truth.signals[last, 6].mean()
@@ -105,7 +113,7 @@ def test_true_flow_is_the_plants_own_map(rich_run: Run) -> None:
 
 
 def test_flow_near_zero_drop_is_smooth_and_odd() -> None:
-    plant = Plant()
+    plant = SimulatedPlant()
     dp = np.linspace(-1e5, 1e5, 2001)
     q = plant.flow("at", 5.0, dp)
     assert np.allclose(q, -q[::-1], rtol=0, atol=1e-18)
@@ -134,14 +142,14 @@ def test_smooth_plant_has_a_quadratic_map() -> None:
 
 def open_loop_end(substeps: int) -> FloatArray:
     """State after 1 s of a fixed command sequence, without noise and control."""
-    plant = Plant(controller=Controller(kp_1ps=0.0, deadband_v=0.0))
+    plant = SimulatedPlant(controller=Controller(kp_1ps=0.0, deadband_v=0.0))
 
-    def steps(plant: Plant, rng: np.random.Generator, duration_s: float) -> FloatArray:
+    def steps(plant: SimulatedPlant, rng: np.random.Generator, duration_s: float) -> FloatArray:
         drive = np.zeros_like(moves(plant, rng, duration_s))
         t = np.arange(len(drive)) * 1e-3
-        drive[:, loop.DITHER] = 4.0 * np.sign(np.sin(2 * np.pi * 3 * t + 0.1))
-        drive[:, loop.X_REF], drive[:, loop.P_TANK] = 0.25, 1e5
-        drive[:, loop.P_SUPPLY] = 7e6 + 1e6 * np.sin(20 * t)
+        drive[:, closed_loop.DITHER] = 4.0 * np.sign(np.sin(2 * np.pi * 3 * t + 0.1))
+        drive[:, closed_loop.X_REF], drive[:, closed_loop.P_TANK] = 0.25, 1e5
+        drive[:, closed_loop.P_SUPPLY] = 7e6 + 1e6 * np.sin(20 * t)
         return drive
 
     run = simulate(plant, steps, duration_s=1.0, sensors=EXACT, substeps=substeps)
@@ -159,14 +167,14 @@ def test_halving_the_step_converges() -> None:
 
 
 def test_spool_lag_is_exact_for_a_held_command() -> None:
-    run = simulate(Plant(), "rich", seed=1, duration_s=1.0, sensors=EXACT)
+    run = simulate(SimulatedPlant(), "rich", seed=1, duration_s=1.0, sensors=EXACT)
     u, w = run.truth.signals[:, 0], run.truth.opening_v[:, 0]
     decay = np.exp(-1e-3 / run.plant.lag_s)
     assert np.allclose(w[1:], u[:-1] + (w[:-1] - u[:-1]) * decay, rtol=0, atol=1e-12)
 
 
 def test_no_lag_opens_at_once() -> None:
-    run = simulate(Plant(lag_s=0.0), "rich", duration_s=0.5, sensors=EXACT)
+    run = simulate(SimulatedPlant(lag_s=0.0), "rich", duration_s=0.5, sensors=EXACT)
     assert np.array_equal(run.truth.opening_v[:, 0], run.truth.signals[:, 0])
 
 
@@ -178,10 +186,10 @@ def test_cross_port_feeds_one_chamber_from_the_other() -> None:
 
 
 def test_leaving_the_sane_range_is_an_error() -> None:
-    heavy = Plant(constants=Constants(gravity_n=14e3))
+    heavy = SimulatedPlant(constants=Constants(gravity_n=14e3))
     with pytest.raises(SimulationError, match=r"leaves its stroke, at 1\.\d+ s"):
         simulate(heavy, "rich", duration_s=20.0)
-    strong = Plant(p_supply_pa=12e6)
+    strong = SimulatedPlant(p_supply_pa=12e6)
     with pytest.raises(SimulationError, match="p_range_pa"):
         simulate(strong, "sweep", duration_s=1.0)
 
@@ -189,11 +197,11 @@ def test_leaving_the_sane_range_is_an_error() -> None:
 def test_the_loop_agrees_with_its_python_source(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ten samples of a moving machine, every kernel as plain Python, to the last bit or nearly."""
     compiled = simulate(draw(1), "rich", seed=2, duration_s=0.01)
-    for module in (plant_module, equations, loop):
+    for module in (plant_module, dynamics, closed_loop):
         for name, kernel in list(vars(module).items()):
             if hasattr(kernel, "py_func"):
                 monkeypatch.setattr(module, name, kernel.py_func)
-    monkeypatch.setattr("rtid.sim.run.run_loop", loop.run_loop)
+    monkeypatch.setattr("rtid.sim.run.run_loop", closed_loop.run_loop)
     plain = simulate(draw(1), "rich", seed=2, duration_s=0.01)
     assert np.allclose(plain.truth.signals, compiled.truth.signals, rtol=1e-12, atol=1e-12)
     assert np.allclose(plain.truth.flow_m3s, compiled.truth.flow_m3s, rtol=1e-9, atol=1e-18)
@@ -201,15 +209,19 @@ def test_the_loop_agrees_with_its_python_source(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_kernels_agree_with_their_python_source() -> None:
-    valve = np.array(Plant().valve_table()[0])
+    valve = np.array(SimulatedPlant().valve_table()[0])
     for w in (0.5, 1.8, 1.85, 3.0):
         assert plant_module.flow_gain(valve, w) == plant_module.flow_gain.py_func(valve, w)
     c, y = Constants(), np.array([3e6, 2e6, 0.2, 0.1])
     q, compiled, plain = np.full(5, 1e-4), np.zeros(4), np.zeros(4)
-    equations.rates(c, q, y, 10.0, compiled)
-    equations.rates.py_func(c, q, y, 10.0, plain)
+    dynamics.rates(c, q, y, 10.0, compiled)
+    dynamics.rates.py_func(c, q, y, 10.0, plain)
     assert np.array_equal(compiled, plain)
-    assert loop.quantise(0.26, 0.1) == loop.quantise.py_func(0.26, 0.1) == pytest.approx(0.3)
+    assert (
+        closed_loop.quantise(0.26, 0.1)
+        == closed_loop.quantise.py_func(0.26, 0.1)
+        == pytest.approx(0.3)
+    )
 
 
 def test_a_valve_row_has_the_kernels_columns() -> None:

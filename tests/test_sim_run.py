@@ -7,14 +7,14 @@ import pytest
 
 from firmware_bridge.samples import GAP, ROW
 from rtid.sim.declare import declared_model, uniform_grid
-from rtid.sim.plant import EDGES, Plant, smooth_plant
 from rtid.sim.random_plants import draw
 from rtid.sim.run import EXACT, NAMES, Run, Sensors, simulate
+from rtid.sim.simulated_plant import EDGES, SimulatedPlant, smooth_plant
 
 
 @pytest.fixture(scope="module")
 def sweep() -> Run:
-    return simulate(Plant(), "sweep", seed=7)
+    return simulate(SimulatedPlant(), "sweep", seed=7)
 
 
 def test_samples_are_complete(sweep: Run) -> None:
@@ -66,7 +66,7 @@ def test_exact_sensors_show_the_truth() -> None:
 
 
 def test_declaration_is_honest(sweep: Run) -> None:
-    for plant in (Plant(), draw(1), draw(9, cross_port=True)):
+    for plant in (SimulatedPlant(), draw(1), draw(9, cross_port=True)):
         model = declared_model(plant, seed=1)
         assert tuple(s.name for s in model.signals) == NAMES
         assert tuple(edge.name for edge in model.edges) == plant.edges
@@ -108,12 +108,12 @@ def test_an_80_s_run_takes_at_most_one_second_of_processor_warm(sweep: Run) -> N
 
 def test_a_long_rich_run_stays_sane() -> None:
     """80 s of everything at once, on the default machine and on some that once oscillated."""
-    for plant in (Plant(), draw(35), draw(43)):
+    for plant in (SimulatedPlant(), draw(35), draw(43)):
         p = simulate(plant, "rich", seed=35).truth.signals[:, 1:3]
         assert p.min() > 0.1e6 and p.max() < 9e6
 
 
 def _seconds() -> float:
     start = time.process_time()
-    simulate(Plant(), "sweep")
+    simulate(SimulatedPlant(), "sweep")
     return time.process_time() - start

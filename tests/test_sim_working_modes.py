@@ -10,13 +10,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rtid.plain import FloatArray
 from rtid.sim import working_modes
-from rtid.sim.plant import AB, AT, BT, PA, PB, FloatArray, Plant
 from rtid.sim.robust import sampled
 from rtid.sim.sensing import P_A, P_B, P_S, P_T
+from rtid.sim.simulated_plant import AB, AT, BT, PA, PB, SimulatedPlant
 from rtid.sim.working_modes import LEAST_FLOW_M3S, flow_at, opening, regenerates
 
-MAPS = sampled(Plant().flow)
+MAPS = sampled(SimulatedPlant().flow)
 SUPPLY, TANK = 8.5e6, 1e5
 ENDS = {PA: (P_S, P_A), AT: (P_A, P_T), PB: (P_S, P_B), BT: (P_B, P_T), AB: (P_A, P_B)}
 Commands = Callable[..., None]

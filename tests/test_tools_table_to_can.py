@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from firmware_bridge.catalog import load
 from firmware_bridge.frames import Frames, from_messages
 from rtid.sim.frames import CONTROLLER_ROUTES, cycle_frames
-from rtid.sim.log import START_US, write_log
+from rtid.sim.run_files import START_US, write_log
 from tests.rig import CONVERTER, ROOT
 from tools import table_to_can
 

@@ -18,38 +18,59 @@ from typing import Any
 PAGE = Path(__file__).parents[1] / "docs" / "api.md"
 SECTIONS = {
     "Project and trace": (
-        *("rtid.project:load", "rtid.project:Project", "rtid.replay:read_trace"),
-        *("rtid.replay:Trace", "firmware_bridge.samples:Samples"),
+        *("rtid.project:load", "rtid.project:Project", "rtid.trace.reading:read_trace"),
+        *("rtid.trace.reading:Trace", "firmware_bridge.samples:Samples"),
     ),
     "What is declared": (
-        *("rtid.model:Model", "rtid.model:Signal", "rtid.model:Chamber", "rtid.model:Edge"),
+        *("rtid.model:Machine", "rtid.model:Signal", "rtid.model:Chamber", "rtid.model:Edge"),
         *("rtid.model:Grid", "rtid.model:Term"),
     ),
     "Learn": (
-        *("rtid.replay:replay", "rtid.beside:replay_beside", "rtid.replay:Replay"),
+        *(
+            "rtid.study.replay:replay",
+            "rtid.study.replay:Replay",
+        ),
         *("rtid.estimator.estimator:Estimator", "rtid.estimator.estimator:to_chunk"),
+        *("rtid.tell.arrays:fit", "rtid.study.study:Study"),
         *("rtid.estimator.record:fit_record", "rtid.estimator.record:RecordFit"),
         *("rtid.estimator.solution:Solution", "rtid.estimator.blocks:Block"),
         "rtid.estimator.batch:fit_batch",
     ),
     "Map": (
         *("rtid.estimator.published:publish", "rtid.estimator.flowmap:FlowMap"),
-        *("rtid.estimator.flowmap:EdgeMap", "rtid.priors:find_prior", "rtid.priors:published"),
-        *("rtid.mapfiles:write_map", "rtid.mapfiles:read_map", "rtid.datasheet:read_reference"),
+        *(
+            "rtid.estimator.flowmap:EdgeMap",
+            "rtid.maps.prior_map:find_prior",
+            "rtid.maps.prior_map:published",
+        ),
+        *(
+            "rtid.maps.files:write_map",
+            "rtid.maps.files:read_map",
+            "rtid.maps.datasheet:read_reference",
+        ),
     ),
     "Where the model fails": (
-        *("rtid.comparing:compare_trace", "rtid.comparing:study", "rtid.comparing:TraceComparison"),
-        *("rtid.comparing:Held", "rtid.compare.comparison:Comparison"),
-        *("rtid.comparing:spans_of_block", "rtid.comparing:blocks_in_span"),
+        *(
+            "rtid.study.compared:compare_trace",
+            "rtid.study.compared:study",
+            "rtid.study.compared:TraceComparison",
+        ),
+        *("rtid.study.compared:Held", "rtid.compare.comparison:Comparison"),
+        *("rtid.study.compared:spans_of_block", "rtid.study.compared:blocks_in_span"),
     ),
     "What is missing, and adding it": (
-        *("rtid.diagnosing:diagnose_trace", "rtid.diagnosing:diagnose_live"),
-        *("rtid.diagnose.report:Diagnosis", "rtid.diagnose.report:Effect"),
-        *("rtid.revising:add", "rtid.revising:drop", "rtid.revising:undo", "rtid.revising:history"),
+        *("rtid.study.study:diagnose_trace", "rtid.study.study:diagnose_live"),
+        *("rtid.diagnose.report:Diagnosis", "rtid.diagnose.report:FoundEffect"),
+        *(
+            "rtid.study.revisions:add",
+            "rtid.study.revisions:drop",
+            "rtid.study.revisions:undo",
+            "rtid.project.history:history",
+        ),
         "rtid.effects:define",
     ),
-    "A motion that tells more": ("rtid.exciting:excite",),
-    "Keep what was learned": ("rtid.store:save", "rtid.store:load"),
+    "A motion that tells more": ("rtid.excite.exciting:excite",),
+    "Keep what was learned": ("rtid.trace.snapshot:save", "rtid.trace.snapshot:load"),
     "Simulated machines": (
         *("rtid.sim.run:simulate", "rtid.sim.run:Run", "rtid.sim.recording:write_run"),
         "rtid.sim.declare:declared_model",
@@ -76,81 +97,81 @@ def page() -> str:
 def entry(name: str) -> Iterator[str]:
     """Lines of one function or class, `module:object`."""
     module, _, plain = name.partition(":")
-    found = getattr(import_module(module), plain)
+    thing = getattr(import_module(module), plain)
     yield f"### `{module}.{plain}`\n"
-    if inspect.isclass(found):
-        if dataclasses.is_dataclass(found):
-            yield from _fields(found)
+    if inspect.isclass(thing):
+        if dataclasses.is_dataclass(thing):
+            yield from _fields(thing)
         else:
-            yield f"```python\n{signature(plain, found)}\n```\n"
-        yield text(found)
-        yield from _members(found)
+            yield f"```python\n{signature(plain, thing)}\n```\n"
+        yield text(thing)
+        yield from _members(thing)
     else:
-        yield f"```python\n{signature(plain, found)}\n```\n"
-        yield text(found)
+        yield f"```python\n{signature(plain, thing)}\n```\n"
+        yield text(thing)
 
 
-def signature(name: str, found: Any) -> str:
+def signature(name: str, thing: Any) -> str:
     """The call as it is written; one argument per line where it is long."""
-    told = inspect.signature(found)
-    kept = [p for p in told.parameters.values() if p.name != "self"]
+    signature_of = inspect.signature(thing)
+    kept = [p for p in signature_of.parameters.values() if p.name != "self"]
     kept = [_plain(p) for p in kept]
-    result = told.return_annotation
-    back = "" if result is told.empty or inspect.isclass(found) else f" -> {_type(result)}"
+    result = signature_of.return_annotation
+    back = "" if result is signature_of.empty or inspect.isclass(thing) else f" -> {_type(result)}"
     line = f"{name}({', '.join(map(str, kept))}){back}"
     if len(line) <= 100:
         return line
     return f"{name}(\n" + "".join(f"    {p},\n" for p in kept) + f"){back}"
 
 
-def text(found: Any) -> str:
+def text(thing: Any) -> str:
     """The docstring, with displayed formulas as they are."""
-    return (inspect.getdoc(found) or "").strip() + "\n"
+    return (inspect.getdoc(thing) or "").strip() + "\n"
 
 
-def _fields(found: type) -> Iterator[str]:
-    rows = [f"{f.name}: {_type(f.type)}{_default(f)}" for f in dataclasses.fields(found)]
+def _fields(kind: type) -> Iterator[str]:
+    rows = [f"{f.name}: {_type(f.type)}{_default(f)}" for f in dataclasses.fields(kind)]
     yield "```python\n" + "\n".join(rows) + "\n```\n"
 
 
-def _default(one: dataclasses.Field[Any]) -> str:
-    if one.default is dataclasses.MISSING or callable(one.default):
-        return "" if one.default_factory is dataclasses.MISSING else " = ..."
-    return f" = {_value(one.default)}"
+def _default(item: dataclasses.Field[Any]) -> str:
+    if item.default is dataclasses.MISSING or callable(item.default):
+        return "" if item.default_factory is dataclasses.MISSING else " = ..."
+    return f" = {_value(item.default)}"
 
 
 def _value(default: Any) -> str:
     return json.dumps(default) if isinstance(default, str) else repr(default)
 
 
-def _members(found: type) -> Iterator[str]:
+def _members(kind: type) -> Iterator[str]:
     """Public methods and properties, one line each: the first line of what they say."""
     rows = []
-    for name, member in vars(found).items():
+    for name, member in vars(kind).items():
         call = member.__func__ if isinstance(member, classmethod | staticmethod) else member
         if name.startswith("_") or not (inspect.isfunction(call) or isinstance(call, property)):
             continue
-        told = text(call).splitlines()[0]
+        words = text(call).splitlines()[0]
         heading = name if isinstance(call, property) else _call(name, call)
-        rows.append(f"- `{heading}`: {told}")
+        rows.append(f"- `{heading}`: {words}")
     if rows:
         yield "\n".join(rows) + "\n"
 
 
-def _call(name: str, found: Any) -> str:
-    kept = [p for p in inspect.signature(found).parameters if p not in ("self", "cls")]
+def _call(name: str, call: Any) -> str:
+    kept = [p for p in inspect.signature(call).parameters if p not in ("self", "cls")]
     return f"{name}({', '.join(kept)})"
 
 
-def _plain(one: inspect.Parameter) -> inspect.Parameter:
+def _plain(parameter: inspect.Parameter) -> inspect.Parameter:
     """Without the address of a default that is a function."""
-    default = one.default
-    if default is not one.empty:
+    default = parameter.default
+    if default is not parameter.empty:
         default = _Word("..." if callable(default) else _value(default))
-    annotation = one.annotation
-    if annotation is not one.empty:
+    annotation = parameter.annotation
+    if annotation is not parameter.empty:
         annotation = _Word(_type(annotation))
-    return one.replace(default=default, annotation=annotation)
+    return parameter.replace(default=default, annotation=annotation)
 
 
 class _Word(str):

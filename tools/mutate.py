@@ -104,15 +104,15 @@ def mutants(tree: ast.Module, names: tuple[str, ...]) -> Iterator[tuple[int, str
 
 def _inside(tree: ast.Module, names: tuple[str, ...]) -> set[int]:
     """The nodes in the bodies of these functions; docstrings and annotations are not code."""
-    found: set[int] = set()
+    lines: set[int] = set()
     for function in ast.walk(tree):
         if isinstance(function, ast.FunctionDef) and function.name in names:
             for statement in function.body:
                 if not (
                     isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
                 ):
-                    found |= {id(node) for node in ast.walk(statement)}
-    return found
+                    lines |= {id(node) for node in ast.walk(statement)}
+    return lines
 
 
 def _changes(node: ast.AST) -> Iterator[tuple[Change, str]]:
@@ -190,7 +190,7 @@ def _given(test: Callable[..., None]) -> list[dict[str, Any]]:
         names, values = mark.args
         keys = [names] if isinstance(names, str) else list(names)
         rows = [dict(zip(keys, v if len(keys) > 1 else (v,), strict=True)) for v in values]
-        given = [one | row for one in given for row in rows]
+        given = [case | row for case in given for row in rows]
     return given
 
 
@@ -225,7 +225,7 @@ def main() -> None:
     for name, module in modules.items():
         tree = ast.parse(Path(module.__file__ or "").read_text("utf-8"))
         first = sorted(TESTS, key=lambda t: name not in TESTS[t])
-        tests = [test for one in first for test in known[one]]
+        tests = [test for name in first for test in known[name]]
         n = k = 0
         for line, said, mutant in mutants(tree, GATES[name]):
             n += 1

@@ -1,4 +1,4 @@
-"""The two pictures of docs/paper.md from what `rtid paper` has drawn: `make paper`."""
+"""The two pictures of docs/paper.md from what `benchmarks.paper` has drawn: `make paper`."""
 
 from __future__ import annotations
 

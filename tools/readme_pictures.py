@@ -8,8 +8,8 @@ from pathlib import Path
 
 from PIL import Image
 
-from rtid.demo import prepare
-from rtid.present import Story
+from rtid.study.demo import prepare
+from rtid.tell.replay import LearnedStory
 
 NAMES = ("residual", "coverage", "slices")
 COLOURS, WIDTH = 64, 1100  # small files: README carries them in the repository
@@ -28,8 +28,8 @@ def main(folder: Path) -> None:
     """Learn the demo's machine and draw what it shows."""
     with tempfile.TemporaryDirectory() as name:
         work = Path(name)
-        found = prepare(work).desk(lambda text, share: None)
-        Story(found).draw(work, "png")
+        comparison = prepare(work).desk(lambda text, share: None)
+        LearnedStory(comparison).draw(work, "png")
         for picture in NAMES:
             shrink(work / f"{picture}.png", folder / f"{picture}.png")
             print(f"wrote {folder / picture}.png")

@@ -17,7 +17,7 @@ from pathlib import Path
 from PIL import Image
 from playwright.sync_api import Page, sync_playwright
 
-from rtid.demo import prepare, wear
+from rtid.study.demo import prepare, wear
 from rtid.ui.server import Workbench, start
 
 FLAGS = ["--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"]
@@ -86,12 +86,12 @@ def tour(page: Page, folder: Path) -> None:
 def main(folder: Path, readme: Path | None) -> None:
     """Open the worn machine of the demo and look at everything."""
     folder.mkdir(parents=True, exist_ok=True)
-    found = next(p for n in ("chromium", "chromium-browser", "google-chrome")
+    path = next(p for n in ("chromium", "chromium-browser", "google-chrome")
                  if (p := shutil.which(n)))  # fmt: skip
     with tempfile.TemporaryDirectory() as name:
         trace, project = wear(prepare(Path(name)))
         with serving(trace, project) as bench, sync_playwright() as running:
-            browser = running.chromium.launch(executable_path=found, args=FLAGS)
+            browser = running.chromium.launch(executable_path=path, args=FLAGS)
             context = browser.new_context(viewport={"width": 1366, "height": 768})
             context.set_default_timeout(PATIENCE_MS)
             page = context.new_page()

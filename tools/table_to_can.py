@@ -31,18 +31,18 @@ import pyarrow.parquet
 import typer
 
 from firmware_bridge.catalog import CONTROLLER_DBC, load
+from rtid.plain import FloatArray
 from rtid.sim.frames import (
     ARBITRATION_US,
     CONTROLLER_ROUTES,
     TASK_JITTER,
-    FloatArray,
     Route,
     Task,
     cycle_frames,
     messages_of,
     multirate_frames,
 )
-from rtid.sim.log import START_US, write_log
+from rtid.sim.run_files import START_US, write_log
 
 DEFAULT_RATES_HZ = {"ValveCommand": 100.0, "Pressures": 200.0, "Motion": 50.0}
 

@@ -232,6 +232,7 @@ static void on_open(exchange *x, uint32_t now_ms)
     if (d->session != session) {
         d->rx.begun = 0;
         d->staged = 0;
+        d->probe.asked = 0;
     }
     d->session = session;
     d->heard_ms = now_ms;
@@ -273,6 +274,54 @@ static void on_query(exchange *x)
     out = begin_answer(x, RTID_OP_HELD_CRC);
     out[1] = id;
     put_u32(out + 2, crc);
+    end_answer(out, d->session);
+}
+
+/* What an active map gives, or the number of that index; what it stands on. */
+static uint8_t value_at(const rtid_download *d, unsigned id, float u, float dp, float *q)
+{
+    unsigned count;
+    const float *numbers = rtid_download_numbers(d, id, &count);
+    *q = 0.0f;
+    if (numbers == NULL)
+        return (uint8_t)rtid_map_flow(rtid_download_map(d, id), u, dp, q);
+    if (!(u >= 0.0f && u < (float)count))
+        return RTID_MAP_NONE;
+    *q = numbers[(unsigned)u];
+    return RTID_MAP_VALID;
+}
+
+static void on_probe_command(rtid_download *d, const uint8_t *data)
+{
+    d->probe.id = data[1];
+    d->probe.u = float_of(data + 2);
+    d->probe.number = data[6];
+    d->probe.asked = 1;
+}
+
+/* The second half of a question: FLOW, from the very map that the firmware evaluates. */
+static void on_probe_drop(exchange *x)
+{
+    rtid_download *d = x->d;
+    const uint8_t id = x->data[1], number = x->data[6];
+    uint32_t bits;
+    uint8_t *out, stands_on;
+    float q;
+    if (id >= d->n_slots) {
+        reply(x, d->session, id, RTID_SLOT);
+        return;
+    }
+    if (!d->probe.asked || id != d->probe.id || number != d->probe.number) {
+        reply(x, d->session, id, RTID_ORDER);
+        return;
+    }
+    d->probe.asked = 0;
+    stands_on = value_at(d, id, d->probe.u, float_of(x->data + 2), &q);
+    memcpy(&bits, &q, sizeof bits);
+    out = begin_answer(x, RTID_OP_FLOW);
+    out[1] = id;
+    put_u32(out + 2, bits);
+    out[6] = (uint8_t)(stands_on | number << 4);
     end_answer(out, d->session);
 }
 
@@ -418,6 +467,10 @@ int rtid_download_push(rtid_download *d, uint32_t now_ms, const uint8_t *data, u
         on_data(d, data);
     else if (data[0] == RTID_OP_QUERY)
         on_query(&x);
+    else if (data[0] == RTID_OP_PROBE_COMMAND)
+        on_probe_command(d, data);
+    else if (data[0] == RTID_OP_PROBE_DROP)
+        on_probe_drop(&x);
     else if (data[0] >= RTID_OP_BEGIN_SIZE && data[0] <= RTID_OP_BEGIN_CRC)
         on_begin(&x);
     else if (data[0] == RTID_OP_POLL)

@@ -39,6 +39,8 @@ enum {
     RTID_OP_END = 0x07,
     RTID_OP_COMMIT = 0x08,
     RTID_OP_CLOSE = 0x09,
+    RTID_OP_PROBE_COMMAND = 0x0A, /* what does the active map give at this command ... */
+    RTID_OP_PROBE_DROP = 0x0B,    /* ... and this pressure drop? */
     RTID_OP_DATA = 0x80
 };
 
@@ -47,7 +49,8 @@ enum {
     RTID_OP_ACCEPTS = 0x41,
     RTID_OP_REPLY = 0x42,
     RTID_OP_HELD_VERSION = 0x43,
-    RTID_OP_HELD_CRC = 0x44
+    RTID_OP_HELD_CRC = 0x44,
+    RTID_OP_FLOW = 0x45
 };
 
 /* First byte of a notice that rtid sends unasked, if it is armed. */
@@ -103,6 +106,10 @@ typedef struct {
         uint8_t id, nu, ns, begun;  /* begun: bits 0..2 for the three BEGIN frames, 3: running */
         uint8_t head[RTID_DOWNLOAD_HEAD];
     } rx;
+    struct {
+        float u;                   /* V, or which of the numbers */
+        uint8_t id, number, asked; /* asked: the drop is still to come */
+    } probe;
     uint32_t damaged, strange, repeated; /* frames with a wrong CRC; of no session; not wanted */
 } rtid_download;
 

@@ -1,5 +1,5 @@
 /* Sparse information sums of rows that touch many blocks, each with a fading memory: see
- * rtid/kernels/information.py for the algebra.  Here the state of a column is one number, and what
+ * rtid/kernels/sparse_sums.py for the algebra.  Here the state of a column is one number, and what
  * two blocks share goes straight to the dense triangle of sums. */
 #include "rtid_estimator_sums.h"
 
@@ -85,7 +85,7 @@ static void read_through(const rtid_estimator *e, int k, rtid_sum *out)
         out[i] = e->local[first_of(k) + i][RTID_EST_RING];
 }
 
-/* ---- products of one block, see rtid/kernels/information.py ---- */
+/* ---- products of one block, see rtid/kernels/sparse_sums.py ---- */
 
 /* Of open block k with itself, y and the shared columns. */
 static void add_own(rtid_estimator *e, int k)

@@ -3,7 +3,9 @@
 A header names date, base of the numbers and kind of the time stamps; then one event per line:
 
     seconds channel ID[x] Rx|Tx d DLC bytes ... [Length = ...]
-    seconds CANFD channel Rx|Tx ID[x] [name] BRS ESI DLC length bytes ... duration ...
+    seconds CANFD channel Rx|Tx ID[x] [name] BRS ESI DLC length bytes [duration bits flags ...]
+
+A channel that is configured for CAN FD logs its classic frames in the second form as well.
 
 Absolute stamps count from the (first) `Begin Triggerblock`, or from `date` where there is none, in
 local time as Vector's and python-can's tools write it; relative ones from the event before, so what
@@ -32,6 +34,7 @@ HEX_BASE = 16
 RX, TX, LENGTH = tx.code("Rx"), tx.code("Tx"), tx.code("Length")
 ERROR_FRAME, CANFD, START = tx.code("ErrorFrame"), tx.code("CANFD"), tx.code("Start")
 HEADS = tuple(tx.code(name) for name in ("date", "base", "internal", "no", "begin", "end"))
+LENGTHS = np.array([*range(9), 12, 16, 20, 24, 32, 48, 64])  # of a CAN FD frame, by its DLC
 SLASH, SMALL_X, SMALL_D, SMALL_R = 47, 120, 100, 114
 
 
@@ -136,7 +139,7 @@ def _classic(  # noqa: PLR0911  each return names what is wrong with the line
 def _flexible(  # noqa: PLR0911  each return names what is wrong with the line
     text: NDArray[np.uint8], pos: Integer, end: Integer, base: Integer, rows: Rows, k: Integer
 ) -> tuple[Integer, Integer]:
-    """Read "Rx ID [name] BRS ESI DLC length bytes ..." of a CAN FD frame into row k."""
+    """Read "Rx ID [name] BRS ESI DLC length bytes ..." into row k."""
     first, last = tx.token(text, pos, end)
     direction = tx.word(text, first, last)
     first, last = tx.token(text, last, end)
@@ -159,10 +162,10 @@ def _flexible(  # noqa: PLR0911  each return names what is wrong with the line
         return BAD, end
     if size == 0 and dlc > 0:
         return REMOTE, end
-    if size > 8:
+    if size > len(rows.data[k]):
         return FD, end
     pos = _bytes(text, last, end, base, size, rows.data[k])
-    if pos < 0 or size != dlc:
+    if pos < 0 or size != LENGTHS[dlc]:
         return BAD, end
     rows.can_id[k], rows.length[k] = identifier, size
     return _behind(text, pos, end, True)
@@ -201,7 +204,10 @@ def parse(
     text: NDArray[np.uint8], starts: NDArray[np.int64], stops: NDArray[np.int64], rows: Rows,
     counts: NDArray[np.int64], base: Integer, relative: bool,
 ) -> Integer:  # fmt: skip
-    """Parse all lines into rows; the number of frames.  Changed in place: rows, counts."""
+    """Parse all lines into rows; the number of frames.  Changed in place: rows, counts.
+
+    text (bytes,); starts, stops (lines,); counts (reasons,).
+    """
     n, clock = 0, np.zeros(1, np.int64)
     for i in range(len(starts)):
         pos, first = starts[i], True
@@ -224,9 +230,9 @@ def read(path: Path) -> Frames:
     """All classic data frames of an ASC log; LogError if it is none."""
     text = np.fromfile(path, np.uint8)
     head = header(text[:HEAD_BYTES].tobytes())
-    found = tx.read(path, text, LIKE, parse, _base(head, text), head.is_relative)
-    found.t_us[:] += head.start_us
-    add_counts(found.refused, {"bad_date": int(head.has_bad_date)})
+    frames = tx.read(path, text, LIKE, parse, _base(head, text), head.is_relative)
+    frames.t_us[:] += head.start_us
+    add_counts(frames.refused, {"bad_date": int(head.has_bad_date)})
     if head.has_end_mark and b"end triggerblock" not in text[-TAIL_BYTES:].tobytes().lower():
-        found.refused.setdefault("truncated", 1)  # cut between two lines
-    return found
+        frames.refused.setdefault("truncated", 1)  # cut between two lines
+    return frames

@@ -55,18 +55,18 @@ def header(raw: bytes) -> Header:
 
 def _start_us(date: str) -> int | None:
     """Microseconds since 1970 of a date in local time; None if it is none."""
-    found = _DATE.search(date)
-    if not found:
+    match = _DATE.search(date)
+    if not match:
         return None
-    month, day, hour, minute, second, milli, half, year = found.groups()
+    month, day, hour, minute, second, milli, half, year = match.groups()
     if half:
         hour = int(hour) % 12 + 12 * (half.lower() == "p")
     try:
         start = datetime.datetime(
             int(year), _MONTHS[month.lower()], int(day), int(hour), int(minute), int(second)
-        )
-    except (KeyError, ValueError):
+        ).timestamp()
+    except (KeyError, ValueError, OverflowError):  # a damaged year may have forty digits
         return None
     # three digits, which python-can writes without their leading zeros
     milli = round(int(milli) * 10.0 ** min(0, 3 - len(milli))) if milli else 0
-    return round(start.timestamp()) * 1_000_000 + milli * 1000
+    return round(start) * 1_000_000 + milli * 1000

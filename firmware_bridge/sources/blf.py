@@ -10,12 +10,15 @@ count from the start named in the header, which has 1 ms.
 from __future__ import annotations
 
 import datetime
+import errno
 import itertools
 import os
 import re
 import struct
 import zlib
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple, Self
 
@@ -27,6 +30,8 @@ from firmware_bridge.frames import Frames
 from firmware_bridge.sources.blf_objects import (
     BAD,
     BAD_CONTAINER,
+    CAN_FD_MESSAGE,
+    FD,
     MIN_OBJECT,
     OTHER,
     REASONS,
@@ -35,13 +40,15 @@ from firmware_bridge.sources.blf_objects import (
     parse,
 )
 from firmware_bridge.sources.errors import LogError
+from firmware_bridge.sources.unpacked import Budget
 
 OBJECT = struct.Struct("<4sHHLL")  # signature, header size, header version, object size, type
 CONTAINER = struct.Struct("<H6xL4x")  # compression method, inflated size
 CONTAINER_TYPE = 10
 HEADER_BYTES = 144
 STORED, DEFLATED = 0, 2
-MAX_CONTAINER = 64 << 20  # inflated; python-can and Vector write 128 KiB
+MAX_CONTAINER = 16 << 20  # inflated; python-can and Vector write 128 KiB
+AT_ONCE = 4  # containers that are inflated together
 WRITE_BYTES = 128 << 10
 
 # signature, header size 16, header version 1, any size, type 10, and room for its own head
@@ -57,6 +64,16 @@ CAN_OBJECT = np.dtype(
         ("data", "u1", 8),
     ]
 )  # fmt: skip
+FD_OBJECT = np.dtype(
+    [
+        *CAN_OBJECT.descr[:-4],
+        ("flags_of_frame", "u1"), ("dlc", "u1"), ("can_id", "<u4"), ("frame_bits", "<u4"),
+        ("arbitration_bits", "u1"), ("fd_flags", "u1"), ("length", "u1"), ("reserved", "u1", 5),
+        ("data", "u1", fr.MAX_FD_LENGTH),
+    ]
+)  # fmt: skip
+DLC = np.repeat(np.arange(16), np.diff([-1, *range(9), 12, 16, 20, 24, 32, 48, 64]))  # of a length
+EDL = 1  # a CAN FD frame
 
 
 class Piece(NamedTuple):
@@ -64,14 +81,14 @@ class Piece(NamedTuple):
 
     method: int
     size: int
-    packed: bytes
+    packed: memoryview
     is_cut: bool
 
 
 class Content(NamedTuple):
     """What a container held, whether that is all of it, and what follows behind its end."""
 
-    data: bytes
+    data: bytes | memoryview
     is_whole: bool
     rest: bytes = b""
 
@@ -88,8 +105,8 @@ def _start_us(header: bytes) -> int:
     return round(start.timestamp() * 1e3) * 1000
 
 
-def _inflate(piece: Piece) -> Content:
-    """What a container holds.
+def _inflate(budget: Budget, piece: Piece) -> Content:
+    """What a container holds; LogError if that is more than any writer puts into one.
 
     zlib's checksum stands at the end of the stream: without it content is taken only where the
     file itself ends, because all bytes before a cut are good.
@@ -99,9 +116,11 @@ def _inflate(piece: Piece) -> Content:
         return Content(piece.packed if whole or piece.is_cut else b"", whole)
     engine = zlib.decompressobj()
     try:
-        content = engine.decompress(piece.packed, MAX_CONTAINER)
+        content = engine.decompress(piece.packed, MAX_CONTAINER + 1)
     except zlib.error:
         return Content(b"", False)
+    if len(content) > MAX_CONTAINER:
+        raise budget.exceeded()
     if not engine.eof:
         return Content(content if piece.is_cut else b"", False)
     return Content(content, True, engine.unused_data[PADDING:].strip(b"\0"))
@@ -112,34 +131,46 @@ def _containers(raw: bytes) -> list[Piece]:
 
     A deflated one reaches to the next one, whatever its own size field says: zlib knows its end.
     """
-    places = [found.start() for found in CONTAINER_START.finditer(raw)]
-    pieces = []
+    places = [match.start() for match in CONTAINER_START.finditer(raw)]
+    pieces, whole = [], memoryview(raw)
     for pos, stop in itertools.pairwise([*places, len(raw)]):
         end = pos + OBJECT.unpack_from(raw, pos)[3]
         method, size = CONTAINER.unpack_from(raw, pos + OBJECT.size)
-        packed = raw[pos + OBJECT.size + CONTAINER.size : min(stop, end) if not method else stop]
+        packed = whole[pos + OBJECT.size + CONTAINER.size : min(stop, end) if not method else stop]
         pieces.append(Piece(method, size, packed, stop == len(raw) and end > stop))
     return pieces
 
 
+def _contents(path: Path, pieces: list[Piece]) -> Iterator[Content]:
+    """What each container holds; LogError if all of it is too much."""
+    budget = Budget(path)
+    with ThreadPoolExecutor(2) as pool:  # zlib releases the interpreter lock
+        for k in range(0, len(pieces), AT_ONCE):
+            for content in pool.map(partial(_inflate, budget), pieces[k : k + AT_ONCE]):
+                budget.take(len(content.data))
+                yield content
+
+
 def _segments(
-    contents: list[Content], is_cut: bool, counts: NDArray[np.int64]
-) -> tuple[NDArray[np.uint8], list[int]]:
-    """All content in one piece, and the borders that no object may cross; counts them.
+    path: Path, pieces: list[Piece], is_cut: bool, counts: NDArray[np.int64]
+) -> tuple[NDArray[np.uint8], list[int], bool]:
+    """All content, the borders that no object may cross, and if the last piece is lost; counts.
 
     Between two containers lies nothing but padding, or a container whose head is damaged; behind
     the last one of a cut file, what is left of the next one.
     """
-    borders, size = [0], 0
-    for k, content in enumerate(contents, 1):
-        size += len(content.data)
-        if content.rest and not (is_cut and k == len(contents)):
+    text, borders, is_lost = bytearray(), [0], False
+    for k, content in enumerate(_contents(path, pieces)):
+        text += content.data
+        is_lost = not (content.is_whole or pieces[k].is_cut)
+        counts[BAD_CONTAINER] += is_lost
+        if content.rest and not (is_cut and k + 1 == len(pieces)):
             counts[OTHER if content.rest.startswith(SIGNATURE) else BAD_CONTAINER] += 1
         if content.rest or not content.is_whole:
-            borders.append(size)
-    if size > borders[-1]:
-        borders.append(size)
-    return np.frombuffer(b"".join([content.data for content in contents]), np.uint8), borders
+            borders.append(len(text))
+    if len(text) > borders[-1]:
+        borders.append(len(text))
+    return np.frombuffer(text, np.uint8), borders, is_lost
 
 
 def read(path: Path) -> Frames:
@@ -149,14 +180,26 @@ def read(path: Path) -> Frames:
     if len(raw) < HEADER_BYTES or (raw[:4] != b"LOGG" and not pieces):
         raise LogError(f"{path}: not a BLF file (no LOGG header); check the file or its suffix")
     counts = np.zeros(len(REASONS), np.int64)
-    with ThreadPoolExecutor(2) as pool:  # zlib releases the interpreter lock
-        contents = list(pool.map(_inflate, pieces))
-    lost = [not (c.is_whole or p.is_cut) for p, c in zip(pieces, contents, strict=True)]
-    counts[BAD_CONTAINER] += sum(lost)
     is_cut = _is_cut(raw, pieces)
-    text, borders = _segments(contents, is_cut, counts)
-    out = fr.empty(len(text) // MIN_OBJECT + 1)
-    n, start_us = 0, _start_us(raw)
+    text, borders, is_lost = _segments(path, pieces, is_cut, counts)
+    for longest in (fr.MAX_LENGTH, fr.MAX_FD_LENGTH):
+        frames, inner = _frames(text, borders, _start_us(raw), longest)
+        if not inner[FD]:  # all of them have room
+            break
+    counts += inner
+    if is_lost:
+        counts[BAD], counts[TRUNCATED] = counts[BAD] + counts[TRUNCATED], 0
+    counts[TRUNCATED] = counts[TRUNCATED] > 0 or is_cut
+    fr.add_counts(frames.refused, dict(zip(REASONS, counts.tolist(), strict=True)))
+    return frames
+
+
+def _frames(
+    text: NDArray[np.uint8], borders: list[int], start_us: int, longest: int
+) -> tuple[Frames, NDArray[np.int64]]:
+    """Frames of at most so many bytes in the pieces between the borders, and what else is there."""
+    counts = np.zeros(len(REASONS), np.int64)
+    out, n = fr.empty(len(text) // MIN_OBJECT + 1, longest), 0
     for begin, end in itertools.pairwise(borders):
         counts[BAD] += counts[TRUNCATED]  # the object before this one ends in a lost container
         counts[TRUNCATED] = 0
@@ -164,12 +207,7 @@ def read(path: Path) -> Frames:
             text, begin, end, start_us, out.t_us, out.channel, out.can_id, out.length, out.data,
             n, counts,
         )  # fmt: skip
-    if lost and lost[-1]:
-        counts[BAD], counts[TRUNCATED] = counts[BAD] + counts[TRUNCATED], 0
-    counts[TRUNCATED] = counts[TRUNCATED] > 0 or is_cut
-    found = out[:n]
-    fr.add_counts(found.refused, dict(zip(REASONS, counts.tolist(), strict=True)))
-    return found
+    return fr.narrowed(out[:n]), counts
 
 
 def _is_cut(raw: bytes, pieces: list[Piece]) -> bool:
@@ -196,12 +234,21 @@ class Writer:
         self._file_bytes = self._content_bytes = HEADER_BYTES
         self._objects = 0
         self._file = path.open("wb", buffering=0)
-        self._write_header()
+        try:
+            self._write_header()
+        except OSError:
+            self._file.close()
+            raise
 
     @property
     def size(self) -> int:
         """Bytes in the file."""
         return self._file_bytes
+
+    @property
+    def has_frames(self) -> bool:
+        """Whether some are in it."""
+        return self._objects > 0
 
     def write(self, frames: Frames) -> None:
         """Append frames, of at least the start's time; OSError where the disk takes no more."""
@@ -210,7 +257,8 @@ class Writer:
         content = _inner(frames, self._start_ms).tobytes()
         parts = [content[k : k + WRITE_BYTES] for k in range(0, len(content), WRITE_BYTES)]
         packed = b"".join(map(_container, parts))
-        self._file.write(packed)
+        if self._file.write(packed) != len(packed):  # unbuffered: a disk that fills takes a part
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), self._file.name)
         self._file_bytes += len(packed)
         self._content_bytes += len(content) + 32 * len(parts)
         self._objects += len(frames)
@@ -236,13 +284,18 @@ class Writer:
 
 def _inner(frames: Frames, start_ms: int) -> NDArray[np.void]:
     """The frames as objects of the inner chain."""
-    objects = np.zeros(len(frames), CAN_OBJECT)
+    is_fd = frames.length > fr.MAX_LENGTH
+    layout = FD_OBJECT if is_fd.any() else CAN_OBJECT
+    objects = np.zeros(len(frames), layout)
     objects["signature"], objects["header_size"], objects["header_version"] = SIGNATURE, 32, 1
-    objects["size"], objects["type"], objects["flags"] = CAN_OBJECT.itemsize, 86, 2
+    objects["size"], objects["type"], objects["flags"] = layout.itemsize, 86, 2
     objects["t_ns"] = (frames.t_us - start_ms * 1000) * 1000
     objects["channel"] = frames.channel.astype(np.uint16) + 1
     objects["length"], objects["can_id"] = frames.length, frames.can_id
-    objects["data"] = frames.data
+    objects["data"][:, : frames.data.shape[1]] = frames.data[:, : objects["data"].shape[1]]
+    if layout is FD_OBJECT:
+        objects["type"], objects["dlc"] = CAN_FD_MESSAGE, DLC[frames.length]
+        objects["fd_flags"] = np.where(is_fd, EDL, 0)
     return objects
 
 

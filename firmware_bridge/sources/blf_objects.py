@@ -24,6 +24,7 @@ OK, BAD, OTHER, REMOTE, FD, ERROR, TRUNCATED, BAD_CONTAINER = -1, 0, 1, 2, 3, 4,
 SIGNATURE = b"LOBJ"
 LOBJ = int.from_bytes(SIGNATURE, "little")
 MIN_OBJECT = 32
+CAN_FD_MESSAGE, CAN_FD_MESSAGE_64 = 100, 101  # hold classic frames too
 
 
 @inlined
@@ -50,10 +51,10 @@ def _layout(
     text: NDArray[np.uint8], kind: Integer, body: Integer
 ) -> tuple[Integer, Integer, Integer, bool]:
     """Payload length, position of the data, channel and remote flag of a frame object."""
-    if kind == 100:  # CAN_FD_MESSAGE
+    if kind == CAN_FD_MESSAGE:
         remote = text[body + 2] & 0x80 != 0
         return np.int64(text[body + 14]), body + 20, _number(text, body, 2), remote
-    if kind == 101:  # CAN_FD_MESSAGE_64
+    if kind == CAN_FD_MESSAGE_64:
         remote = text[body + 12] & 0x10 != 0
         return np.int64(text[body + 2]), body + 40, np.int64(text[body]), remote
     remote = text[body + 2] & 0x80 != 0
@@ -61,7 +62,7 @@ def _layout(
 
 
 @inlined
-def _object(
+def _object(  # noqa: PLR0911  each return names what is wrong with the object
     text: NDArray[np.uint8], pos: Integer, end: Integer, start_us: Integer, t_us: NDArray[np.int64],
     channel: NDArray[np.uint8], can_id: NDArray[np.uint32], length: NDArray[np.uint8],
     data: NDArray[np.uint8], k: Integer,
@@ -78,12 +79,14 @@ def _object(
     n, first, number, remote = _layout(text, kind, body)
     if remote:
         return REMOTE
-    if n > 8:
-        return FD if kind >= 100 else BAD
+    if n > (8 if kind in (1, 86) else 64):
+        return BAD
+    if n > data.shape[1]:
+        return FD
     stamp = _number(text, pos + 24, 8)
     t_us[k] = start_us + (stamp * 10 if text[pos + 16] == 1 else (stamp + 500) // 1000)
     channel[k], can_id[k], length[k] = number - 1, _number(text, body + 4, 4), n
-    for i in range(8):
+    for i in range(data.shape[1]):
         data[k, i] = text[first + i] if i < n and first + i < end else 0
     return OK
 
@@ -99,21 +102,21 @@ def parse(
     Changed in place: the arrays (room for every object) and counts (REASONS,).
     """
     while True:
-        found = _find(text, pos, stop)
-        counts[BAD] += found > pos + 8 and found < stop
-        if found >= stop:
+        start_at = _find(text, pos, stop)
+        counts[BAD] += start_at > pos + 8 and start_at < stop
+        if start_at >= stop:
             counts[TRUNCATED] += stop - pos > 8
             return n
-        size = _number(text, found + 8, 4)
-        if size < MIN_OBJECT or found + size > stop:
-            pos = found + 4
+        size = _number(text, start_at + 8, 4)
+        if size < MIN_OBJECT or start_at + size > stop:
+            pos = start_at + 4
             if _find(text, pos, stop) >= stop:
                 counts[TRUNCATED] += 1
                 return n
             counts[BAD] += 1
             continue
-        pos = found + size
-        result = _object(text, found, pos, start_us, t_us, channel, can_id, length, data, n)
+        pos = start_at + size
+        result = _object(text, start_at, pos, start_us, t_us, channel, can_id, length, data, n)
         if result == OK:
             n += 1
         else:

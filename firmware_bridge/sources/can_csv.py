@@ -20,6 +20,7 @@ from firmware_bridge.sources import text as tx
 from firmware_bridge.sources.text import BAD, ERROR, FD, NOTHING, OK, REMOTE, Rows
 
 LIKE = "'1.5,0x120,0,0,0,2,ABE=' (a table of samples is no log of frames)"
+LOOK = rb"\Atimestamp,arbitration_id,|\d,0x[0-9a-fA-F]+,[01],[01],[01],\d"
 COMMA, EQUALS, MINUS, SMALL_E, SMALL_X = 44, 61, 45, 101, 120
 HEADER = tx.code("timestamp")
 HEADER_BYTES = len("timestamp,arbitration_id,extended,remote,error,dlc,data\n")
@@ -108,7 +109,7 @@ def _line(  # noqa: PLR0911  each return names what is wrong with the line
         return REMOTE if is_empty else BAD, end
     if identifier > (0x1FFF_FFFF if extended else 0x7FF) or size > 64:
         return BAD, end
-    if size > 8:
+    if size > len(rows.data[k]):
         return FD, end
     rows.can_id[k], rows.length[k] = identifier | (EXTENDED if extended else 0), size
     behind = _base64(text, first, end, size, rows.data[k])
@@ -122,7 +123,10 @@ def parse(
     text: NDArray[np.uint8], starts: NDArray[np.int64], stops: NDArray[np.int64], rows: Rows,
     counts: NDArray[np.int64],
 ) -> Integer:  # fmt: skip
-    """Parse all lines into rows; the number of frames.  Changed in place: rows, counts."""
+    """Parse all lines into rows; the number of frames.  Changed in place: rows, counts.
+
+    text (bytes,); starts, stops (lines,); counts (reasons,).
+    """
     n = 0
     for i in range(len(starts)):
         pos, first = starts[i], True

@@ -1,4 +1,7 @@
-"""MF4 bus logs (ASAM MDF 4), through asammdf, which is an extra: pip install rtid[mf4].
+"""MF4 (ASAM MDF 4), through asammdf, which is an extra: pip install rtid[mf4].
+
+A log of a bus is read as frames.  Of a plain measurement every channel of numbers is read as a
+column, at the stamps of the group that has most of them; the others are interpolated to them.
 
 The index of a file may stand before its data (loggers) or behind (converters, asammdf, python-can).
 Of a log that is cut, all is read in the first case ("not_finalised": nothing says where such a log
@@ -9,12 +12,12 @@ blocks and the index carry none: damage there may yield wrong frames.  Stamps ar
 
 from __future__ import annotations
 
-import importlib.util
-import io
 import struct
 import subprocess
 import sys
+from importlib.machinery import PathFinder
 from pathlib import Path
+from tempfile import TemporaryFile
 
 import numpy as np
 
@@ -22,23 +25,33 @@ from firmware_bridge import frames as fr
 from firmware_bridge.frames import Frames
 from firmware_bridge.sources import mf4_child
 from firmware_bridge.sources.errors import LogError
+from firmware_bridge.sources.merged import Channel, merged
+from firmware_bridge.sources.table import Table
+from firmware_bridge.sources.unpacked import Budget
 
 FIRST_GROUP, GROUP_DATA = 88, 40  # where the links to the first data group and to its data stand
-LIMIT_S, BYTES_PER_S = 10.0, 2e6  # a reader that is slower than this has lost its way
+CPU_S, BYTES_PER_CPU_S = 10.0, 2e6  # of processor time: a load of the machine costs none
 
 
-def read(path: Path) -> Frames:
-    """All classic data frames of a bus-logging MF4, sorted by time; LogError if it holds none."""
-    if importlib.util.find_spec("asammdf") is None:
+def read(path: Path) -> Frames | Table:
+    """All data frames of a bus-logging MF4, sorted by time, else its channels as a table."""
+    if PathFinder.find_spec("asammdf") is None:
         raise LogError(f"{path}: reading MF4 needs asammdf; pip install 'rtid[mf4]'")
     finalised = _check_index(path)
     columns, refused = _extract(path)
-    if len(columns.get("t_us", ())) == 0:
-        lost = "all its blocks are damaged" if refused.get("bad_container") else "is it a bus log?"
-        raise LogError(f"{path}: holds no CAN data frames; {lost}")
-    found = fr.by_time(Frames(**columns))
-    fr.add_counts(found.refused, refused | {"not_finalised": int(not finalised)})
-    return found
+    if "titles" in columns:
+        named = zip(columns["titles"].tolist(), columns["units"].tolist(), strict=True)
+        return merged(path, [
+            Channel(title, unit, columns[f"t{k}"], columns[f"values{k}"])
+            for k, (title, unit) in enumerate(named)
+        ])  # fmt: skip
+    known = ("fd_frame", *mf4_child.COUNTED.values())
+    if not columns and not any(refused.get(kind) for kind in known):
+        lost = "all its blocks are damaged" if refused.get("bad_container") else "is it empty?"
+        raise LogError(f"{path}: holds neither CAN frames nor channels of numbers; {lost}")
+    frames = fr.by_time(Frames(**columns)) if columns else fr.empty(0)
+    fr.add_counts(frames.refused, refused | {"not_finalised": int(not finalised)})
+    return frames
 
 
 def _check_index(path: Path) -> bool:
@@ -65,20 +78,33 @@ def _check_index(path: Path) -> bool:
 
 def _extract(path: Path) -> tuple[mf4_child.Columns, dict[str, int]]:
     """`mf4_child.extract` in a process of its own; LogError if it fails, crashes or hangs."""
-    limit_s = LIMIT_S + path.stat().st_size / BYTES_PER_S
-    try:
+    budget = Budget(path)
+    cpu_s = CPU_S + path.stat().st_size / BYTES_PER_CPU_S
+    limits = [str(round(cpu_s)), str(budget.limit)]
+    with TemporaryFile() as answer:
         done = subprocess.run(
-            [sys.executable, "-P", mf4_child.__file__, str(path)],
-            capture_output=True, check=False, timeout=limit_s,
+            [sys.executable, "-P", mf4_child.__file__, str(path), *limits],
+            stdout=answer, stderr=subprocess.PIPE, check=False,
         )  # fmt: skip
-    except subprocess.TimeoutExpired:
-        raise LogError(f"{path}: not read in {limit_s:.0f} s; its index is damaged") from None
+        _check_end(done, path, cpu_s, budget)
+        answer.seek(0)
+        with np.load(answer) as arrays:
+            columns = dict(arrays)
+    reasons, counts = columns.pop("reasons").tolist(), columns.pop("counts").tolist()
+    return columns, dict(zip(reasons, map(int, counts), strict=True))
+
+
+def _check_end(
+    done: subprocess.CompletedProcess[bytes], path: Path, cpu_s: float, budget: Budget
+) -> None:
+    """LogError unless the child ended well."""
     if done.returncode == mf4_child.FAILED:
         why = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
         raise LogError(f"{path}: not a readable MF4 bus log: {why}")
+    if done.returncode == mf4_child.TOO_MUCH:
+        raise budget.exceeded()
+    if done.returncode == -mf4_child.OUT_OF_TIME:
+        spent = f"not read in {cpu_s:.0f} s of processor time"
+        raise LogError(f"{path}: {spent}; its index is damaged")
     if done.returncode:
         raise LogError(f"{path}: asammdf crashed ({done.returncode}); the log's index is damaged")
-    with np.load(io.BytesIO(done.stdout)) as arrays:
-        columns = dict(arrays)
-    reasons, counts = columns.pop("reasons").tolist(), columns.pop("counts").tolist()
-    return columns, dict(zip(reasons, map(int, counts), strict=True))

@@ -103,7 +103,10 @@ def parse(
     ends: NDArray[np.int64],
     block: NDArray[np.uint8],
 ) -> tuple[Integer, Integer, Integer]:
-    """Frames found, bytes used and bad blocks in text; the arrays are changed in place."""
+    """Frames found, bytes used and bad blocks in text; the arrays are changed in place.
+
+    text (bytes,); the columns of `Frames` with ends (frames,); block (bytes,): scratch.
+    """
     n, bad, start = 0, 0, 0
     for end in range(len(text)):
         if text[end] != 0:
@@ -148,9 +151,9 @@ class Decoder:
         )  # fmt: skip
         # What is longer cannot become a frame: its beginning is refused at the next 0x00.
         self._pending = text[used : used + MAX_PENDING]
-        found = out[:n]
-        fr.add_counts(found.refused, {"bad_serial_frame": bad})
-        return found, ends[:n] - kept
+        frames = out[:n]
+        fr.add_counts(frames.refused, {"bad_serial_frame": bad})
+        return frames, ends[:n] - kept
 
 
 class SerialPort(PortSource):

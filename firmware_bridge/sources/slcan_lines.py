@@ -146,7 +146,10 @@ def parse(
     text: NDArray[np.uint8], rows: Rows, ends: NDArray[np.int64], state: NDArray[np.int64],
     counts: NDArray[np.int64],
 ) -> tuple[Integer, Integer]:  # fmt: skip
-    """Frames found and bytes used; rows, ends, state [stamped, doubts], counts are changed."""
+    """Frames found and bytes used; rows, ends, state [stamped, doubts], counts are changed.
+
+    text (bytes,); ends (frames,); state (2,); counts (reasons,).
+    """
     n, start = 0, 0
     for end in range(len(text)):
         if text[end] != CR and text[end] != BEL:
@@ -191,6 +194,6 @@ class Decoder:
         self._pending = text[used:]
         if len(self._pending) > MAX_LINE:  # "?": what is left of it is no line
             self._pending = b"?" + self._pending[-MAX_LINE + 1 :]
-        found = out[:n]
-        fr.add_counts(found.refused, dict(zip(REASONS, counts.tolist(), strict=True)))
-        return found, ends[:n] - kept
+        frames = out[:n]
+        fr.add_counts(frames.refused, dict(zip(REASONS, counts.tolist(), strict=True)))
+        return frames, ends[:n] - kept

@@ -1,13 +1,14 @@
 """Tables of samples: Parquet, CSV and MATLAB .mat; one row per sample, one column per signal.
 
 value = offset + scale * number, with scale, offset and unit from the field metadata of a Parquet
-column (1, 0 and unknown elsewhere).  A CSV header may carry the unit: "p_a [MPa]", "p_a (MPa)".
+column (1, 0 and unknown elsewhere).  The name of a column may carry the unit in brackets in every
+kind of file, "p_a [MPa]" or "p_a (MPa)"; the unit in the metadata goes before it.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -18,12 +19,18 @@ from numpy.typing import NDArray
 
 from firmware_bridge.config import Assembly, SignalSource
 from firmware_bridge.frames import add_counts
+from firmware_bridge.names import split_brackets, split_unit
 from firmware_bridge.samples import GAP, ROW, Samples
+from firmware_bridge.sources import mat
 from firmware_bridge.sources.errors import LogError
+from firmware_bridge.sources.unpacked import Budget
 
-TIME_NAMES = ("t", "time", "t_s", "time_s", "timestamp", "zeit")
+NUMBER_BYTES = 8
+MOST_US = 2.0**62  # of a time stamp
+TIME_NAMES = ("t", "time", "timestamp", "zeit")  # with or without a unit behind: t_ms, time_s
 TIME_UNITS = {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
-_UNIT = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]\s*$")
+TIME_UNITS |= {"sec": 1.0, "seconds": 1.0, "msec": 1e-3, "usec": 1e-6, "h": 3600.0}
+TIME_UNITS["\N{GREEK SMALL LETTER MU}s"] = 1e-6
 
 
 @dataclass(frozen=True)
@@ -34,44 +41,55 @@ class Table:
     columns: dict[str, NDArray[np.float64]]
     units: dict[str, str]
 
+    def known_as(self, name: str) -> str:
+        """The name under which a column is kept; LogError with the nearest name if there is none.
+
+        A column may be asked for with its unit as the file writes it, "p_s [Pa]".
+        """
+        for known in (name, split_brackets(name)[0]):
+            if known in self.columns:
+                return known
+        close = get_close_matches(name, list(self.columns), 1, 0.5)
+        hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(self.columns)}"
+        raise LogError(f"{self.path}: no numeric column {name!r}; {hint}")
+
     def column(self, name: str) -> NDArray[np.float64]:
-        """One column; LogError with the nearest name if there is none such."""
-        if name not in self.columns:
-            close = get_close_matches(name, list(self.columns), 1, 0.5)
-            hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(self.columns)}"
-            raise LogError(f"{self.path}: no numeric column {name!r}; {hint}")
-        return self.columns[name]
+        """One column (n,), its unit in `units`; LogError with the nearest name if there is none."""
+        return self.columns[self.known_as(name)]
+
+    def time_name(self) -> str | None:
+        """The column that looks like time, by its name; None if none does."""
+        return next((name for name in self.columns if is_time(name)), None)
+
+    def time_unit(self, name: str) -> str:
+        """Unit of a column that holds the time, from the file or its name; "" if neither says."""
+        name = self.known_as(name)
+        return self.units.get(name, "") or _split_time(name)[1]
+
+    def seconds(self, name: str, unit: str | None = None) -> NDArray[np.float64]:
+        """A column of times in s, float64 (n,), from the unit given or its own; LogError."""
+        unit = self.time_unit(name) if unit is None else unit
+        if unit.lower() not in TIME_UNITS:
+            raise LogError(f"{self.path}: time column {name!r} has unit {unit!r}; use s")
+        return self.column(name) * TIME_UNITS[unit.lower()]
 
     def t_us(self) -> NDArray[np.int64]:
         """Time stamps, int64 (n,) microseconds; LogError if no column looks like time."""
-        for name in self.columns:
-            if name.lower() in TIME_NAMES:
-                unit = self.units.get(name, "")
-                if unit not in TIME_UNITS:
-                    raise LogError(f"{self.path}: time column {name!r} has unit {unit!r}; use s")
-                t = self.column(name) * (TIME_UNITS[unit] * 1e6)
-                return np.where(np.isfinite(t), np.rint(t), np.iinfo(np.int64).min).astype(np.int64)
-        raise LogError(f"{self.path}: no time column; name one of {', '.join(TIME_NAMES)}")
+        name = self.time_name()
+        if name is None:
+            raise LogError(f"{self.path}: no time column; name one of {', '.join(TIME_NAMES)}")
+        t = 1e6 * self.seconds(name)
+        usable = np.abs(t) < MOST_US  # never of NaN
+        return np.where(usable, np.rint(t), np.iinfo(np.int64).min).astype(np.int64)
 
 
-def read_table(path: str | Path) -> Table:
-    """Read a .parquet, .csv, .tsv, .txt or .mat file; LogError if it cannot be."""
-    path = Path(path)
-    readers = {".parquet": _parquet, ".csv": _csv, ".tsv": _csv, ".txt": _csv, ".mat": _mat}
-    suffix = path.suffix.lower()
-    if suffix not in readers:
-        raise LogError(f"{path}: unknown suffix {suffix!r}; known are {', '.join(readers)}")
-    if not path.is_file() or path.stat().st_size == 0:
-        raise LogError(f"{path}: no such file, or it is empty")
-    try:
-        table = readers[suffix](path)
-    except LogError:
-        raise
-    except Exception as error:  # pyarrow and scipy raise whatever a damaged file causes
-        raise LogError(f"{path}: not a readable {suffix} table: {error}") from error
-    if not table.columns:
-        raise LogError(f"{path}: holds no numeric column")
-    return table
+def is_time(name: str) -> bool:
+    """Whether a column looks like time: t, time_s, Zeit, t_ms."""
+    return _split_time(name)[0].lower() in TIME_NAMES
+
+
+def _split_time(name: str) -> tuple[str, str]:
+    return split_unit(name, lambda unit, _stem: bool(unit) and unit.lower() in TIME_UNITS)
 
 
 def to_samples(table: Table, assembly: Assembly) -> tuple[Samples, dict[str, int]]:
@@ -109,22 +127,24 @@ def _role(table: Table, source: SignalSource, n: int) -> NDArray[np.float64]:
     return source.factor * column + source.offset
 
 
-def _parquet(path: Path) -> Table:
+def read_parquet(path: Path) -> Table:
+    """A Parquet file; LogError if it unpacks to too much, else what pyarrow raises."""
     import pyarrow.parquet as pq  # noqa: PLC0415  30 MB that only tables need
 
-    content = pq.read_table(path)
-    columns, units = {}, {}
-    for field, column in zip(content.schema, content.columns, strict=True):
-        numbers = _numbers(column)
-        if numbers is None:
-            continue
+    file = pq.ParquetFile(path)
+    fields = [field for field in file.schema_arrow if _is_number(field.type)]
+    Budget(path).take(file.metadata.num_rows * NUMBER_BYTES * (len(fields) + 1))
+    result = []
+    for field in fields:
+        numbers = _numbers(file.read([field.name]).column(field.name))
         meta = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
         scale, offset = float(meta.get("scale", 1.0)), float(meta.get("offset", 0.0))
-        columns[field.name], units[field.name] = offset + scale * numbers, meta.get("unit", "")
-    return Table(path, columns, units)
+        result.append((field.name, offset + scale * numbers, meta.get("unit", "")))
+    return named_columns(path, result)
 
 
-def _csv(path: Path) -> Table:
+def read_text(path: Path) -> Table:
+    """A table of text: .csv, .tsv, .txt; the delimiter is found, a decimal comma is known."""
     from pyarrow import csv  # noqa: PLC0415
 
     n_comments, header, first = _csv_head(path)
@@ -136,13 +156,8 @@ def _csv(path: Path) -> Table:
         parse_options=csv.ParseOptions(delimiter=delimiter),
         convert_options=csv.ConvertOptions(decimal_point=decimal, strings_can_be_null=True),
     )
-    columns, units = {}, {}
-    for title, column in zip(content.column_names, content.columns, strict=True):
-        name, unit = _split_unit(title)
-        numbers = _numbers(column)
-        if numbers is not None:
-            columns[name], units[name] = numbers, unit
-    return Table(path, columns, units)
+    columns = zip(content.column_names, content.columns, strict=True)
+    return named_columns(path, [(t, _numbers(c), "") for t, c in columns if _is_number(c.type)])
 
 
 def _csv_head(path: Path) -> tuple[int, str, str]:
@@ -156,32 +171,44 @@ def _csv_head(path: Path) -> tuple[int, str, str]:
     raise LogError(f"{path}: holds nothing but comments")
 
 
-def _split_unit(title: str) -> tuple[str, str]:
-    found = _UNIT.match(title.strip())
-    return (found["name"], found["unit"].strip()) if found else (title.strip(), "")
+def named_columns(path: Path, result: Iterable[tuple[str, NDArray[np.float64], str]]) -> Table:
+    """A table of titles with their columns (n,) and the units of the metadata.
+
+    Columns whose names differ by the brackets alone keep them; of two of one title the second is
+    called "title.2": none is lost.
+    """
+    result = list(result)
+    stems = Counter(split_brackets(title)[0] for title, _, _ in result)
+    columns: dict[str, NDArray[np.float64]] = {}
+    units: dict[str, str] = {}
+    for title, column, unit in result:
+        stem, bracketed = split_brackets(title)
+        name = stem if stem and stems[stem] == 1 else title.strip()
+        copies = sum(known == name or known.startswith(f"{name}.") for known in columns)
+        name = f"{name}.{copies + 1}" if name in columns else name
+        columns[name], units[name] = column, unit or bracketed
+    return Table(path, columns, units)
 
 
-def _numbers(column: Any) -> NDArray[np.float64] | None:
-    """A pyarrow column as float64, NaN where null; None if it holds no numbers."""
+def _is_number(kind: Any) -> bool:
+    """Whether a pyarrow type is one of numbers."""
+    from pyarrow import types  # noqa: PLC0415
+
+    return bool(types.is_integer(kind) or types.is_floating(kind) or types.is_boolean(kind))
+
+
+def _numbers(column: Any) -> NDArray[np.float64]:
+    """A pyarrow column of numbers as float64, NaN where null."""
     import pyarrow as pa  # noqa: PLC0415
 
-    kind = column.type
-    if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)):
-        return None
     return np.asarray(column.cast(pa.float64()).to_numpy(zero_copy_only=False))
 
 
-def _mat(path: Path) -> Table:
-    from scipy.io import loadmat  # noqa: PLC0415
-
+def read_mat(path: Path) -> Table:
+    """The longest vectors of a MATLAB file up to version 7; LogError for a later one."""
     try:
-        content: Mapping[str, Any] = loadmat(path, squeeze_me=True)
+        vectors = mat.vectors(path)
     except NotImplementedError:
         raise LogError(f"{path}: a MATLAB 7.3 file; save it with save(..., '-v7')") from None
-    vectors = {
-        name: np.asarray(value, np.float64)
-        for name, value in content.items()
-        if isinstance(value, np.ndarray) and value.ndim == 1 and value.dtype.kind in "iufb"
-    }
     longest = max((len(value) for value in vectors.values()), default=0)
-    return Table(path, {k: v for k, v in vectors.items() if len(v) == longest}, {})
+    return named_columns(path, [(k, v, "") for k, v in vectors.items() if len(v) == longest])

@@ -47,7 +47,7 @@ class Rows(NamedTuple):
 
 @inlined
 def skip(text: NDArray[np.uint8], pos: Integer, end: Integer) -> Integer:
-    """Next position that is no blank."""
+    """Next position in text (bytes,) that is no blank."""
     while pos < end and (text[pos] == SPACE or text[pos] == TAB or text[pos] == CR):
         pos += 1
     return pos
@@ -55,7 +55,7 @@ def skip(text: NDArray[np.uint8], pos: Integer, end: Integer) -> Integer:
 
 @inlined
 def token(text: NDArray[np.uint8], pos: Integer, end: Integer) -> tuple[Integer, Integer]:
-    """Bounds of the next word between blanks; empty at the end of the line."""
+    """Bounds of the next word in text (bytes,) between blanks; empty at the end of the line."""
     first = skip(text, pos, end)
     last = first
     while last < end and text[last] != SPACE and text[last] != TAB and text[last] != CR:
@@ -65,7 +65,7 @@ def token(text: NDArray[np.uint8], pos: Integer, end: Integer) -> tuple[Integer,
 
 @inlined
 def number(text: NDArray[np.uint8], first: Integer, last: Integer, base: Integer) -> Integer:
-    """The whole word as a number of 1 to 10 digits; -1 if it is none."""
+    """The word of text (bytes,) as a number of 1 to 10 digits; -1 if it is none."""
     value: Integer = 0
     if last <= first or last - first > 10:
         return -1
@@ -82,7 +82,7 @@ def micro(
 ) -> tuple[Integer, Integer]:
     """A decimal number times 1e6, rounded, and the position behind it; -1 if malformed.
 
-    dotted: whether it must have a fraction.
+    text (bytes,).  dotted: whether it must have a fraction.
     """
     whole: Integer = 0
     fraction: Integer = 0
@@ -100,8 +100,14 @@ def micro(
 
 
 @inlined
+def is_fd_length(size: Integer) -> bool:
+    """Whether a CAN FD frame may hold so many bytes."""
+    return bool(0 <= size <= 8 or size in (12, 16, 20, 24, 32, 48, 64))
+
+
+@inlined
 def word(text: NDArray[np.uint8], first: Integer, last: Integer) -> Integer:
-    """The first four letters of a word in lower case, as `code` makes them a number."""
+    """The first four letters of a word of text (bytes,) in lower case, as `code` numbers them."""
     value: Integer = 0
     for k in range(min(last - first, 4)):
         value = value * 256 + np.int64(text[first + k] | 32)
@@ -115,7 +121,7 @@ def code(letters: str) -> int:
 
 @inlined
 def counted(result: Integer, is_first: bool, counts: NDArray[np.int64]) -> Integer:
-    """1 for a frame; else 0, and the reason is counted in place.
+    """1 for a frame; else 0, and the reason is counted in place in counts (reasons,).
 
     What is bad in the rest of a joined line was counted with its beginning.
     """
@@ -132,27 +138,30 @@ def scan(text: NDArray[np.uint8], parse: Callable[..., Any], *options: Any) -> t
     """
     stops = np.flatnonzero(text == NEWLINE)
     starts = np.concatenate([np.zeros(1, np.int64), stops + 1])
-    out = fr.empty(FRAMES_PER_LINE * len(stops))
-    rows = Rows(out.t_us, out.channel, out.can_id, out.length, out.data)
-    counts = np.zeros(len(REASONS), np.int64)
-    n = parse(text, starts[:-1], stops, rows, counts, *options)
+    for longest in (fr.MAX_LENGTH, fr.MAX_FD_LENGTH):
+        out = fr.empty(FRAMES_PER_LINE * len(stops), longest)
+        rows = Rows(out.t_us, out.channel, out.can_id, out.length, out.data)
+        counts = np.zeros(len(REASONS), np.int64)
+        n = parse(text, starts[:-1], stops, rows, counts, *options)
+        if not counts[FD]:  # all of them have room
+            break
     counts[TRUNCATED] += starts[-1] < len(text)
-    found = out[:n]
-    fr.add_counts(found.refused, dict(zip(REASONS, counts.tolist(), strict=True)))
-    return found, int(counts[BAD])
+    frames = fr.narrowed(out[:n])
+    fr.add_counts(frames.refused, dict(zip(REASONS, counts.tolist(), strict=True)))
+    return frames, int(counts[BAD])
 
 
 def read(
     path: Path, text: NDArray[np.uint8], like: str, parse: Callable[..., Any], *options: Any
 ) -> Frames:
-    """`scan`, but LogError if there are none but malformed lines; like: what one should be."""
-    found, n_bad = scan(text, parse, *options)
-    if len(found) == 0 and n_bad:
+    """`scan` of text (bytes,), but LogError where all lines are bad; like: what one should be."""
+    frames, n_bad = scan(text, parse, *options)
+    if len(frames) == 0 and n_bad:
         raise LogError(f"{path}: no line looks like {like}; give the file its right suffix")
-    return _without_stray_stamps(found)
+    return without_stray_stamps(frames)
 
 
-def _without_stray_stamps(frames: Frames) -> Frames:
+def without_stray_stamps(frames: Frames) -> Frames:
     """The frames but those whose stamp alone lies outside its neighbours, which are in order.
 
     One digit makes such a stamp; taken for true it would make all that follows come too late.

@@ -42,7 +42,8 @@ NUMBER, OFFSET, TYPE, BUS, IDENTIFIER, DIRECTION, BYTES = b"NOTBIdD"
 LENGTHS = (ord("l"), ord("L"))
 PARENTHESIS, SEMICOLON = 41, 59
 RX, TX = tx.code("Rx"), tx.code("Tx")
-DATA_TYPES = tuple(tx.code(name) for name in ("DT", "FD", "FB", "FE", "BI", "Rx", "Tx"))
+DATA_TYPES = tuple(tx.code(name) for name in ("DT", "Rx", "Tx"))
+FD_TYPES = tuple(tx.code(name) for name in ("FD", "FB", "FE", "BI"))  # plain, BRS, ESI, both
 OTHER_TYPES = tuple(tx.code(name) for name in ("ST", "EC", "EV", "Warn"))
 ERROR_TYPES = tuple(tx.code(name) for name in ("ER", "Error"))
 RTR, RR, ERROR_WORD = tx.code("RTR"), tx.code("RR"), tx.code("ERROR")
@@ -53,6 +54,8 @@ def _kind(letters: Integer) -> Integer:
     """OK if lines of this type hold data, else why not."""
     if letters in DATA_TYPES:
         return OK
+    if letters in FD_TYPES:
+        return FD
     if letters == RR:
         return REMOTE
     if letters in ERROR_TYPES:
@@ -144,7 +147,10 @@ def parse(
     text: NDArray[np.uint8], starts: NDArray[np.int64], stops: NDArray[np.int64], rows: Rows,
     counts: NDArray[np.int64], columns: NDArray[np.uint8],
 ) -> Integer:  # fmt: skip
-    """Parse all lines into rows; the number of frames.  Changed in place: rows, counts."""
+    """Parse all lines into rows; the number of frames.  Changed in place: rows, counts.
+
+    text (bytes,); starts, stops (lines,); counts (reasons,); columns (columns,).
+    """
     n = 0
     for i in range(len(starts)):
         pos, first = starts[i], True
@@ -173,9 +179,9 @@ def _columns(head: str, text: NDArray[np.uint8]) -> NDArray[np.uint8]:
     version = re.search(r"^;\$FILEVERSION=(\d\.\d)", head, re.MULTILINE)
     first = COLUMNS.get(version[1] if version else "1.0", COLUMNS["1.0"])
     letters = stated[1].replace(",", "").encode() if stated else b""
-    if KNOWN.fullmatch(letters) and all(letters.count(one) == 1 for one in b"OID"):
+    if KNOWN.fullmatch(letters) and all(letters.count(letter) == 1 for letter in b"OID"):
         first = letters
-    choices = [np.frombuffer(one, np.uint8) for one in (first, *COLUMNS.values())]
+    choices = [np.frombuffer(letter, np.uint8) for letter in (first, *COLUMNS.values())]
     sample = text[: HEAD_BYTES + SAMPLE_BYTES]
     if len(tx.scan(sample, parse, choices[0])[0]):
         return choices[0]
@@ -187,7 +193,7 @@ def read(path: Path) -> Frames:
     text = np.fromfile(path, np.uint8)
     head = text[:HEAD_BYTES].tobytes().decode("ascii", "replace").replace("\r", "")
     start_us, damaged = _start_us(head)
-    found = tx.read(path, text, LIKE, parse, _columns(head, text))
-    found.t_us[:] += start_us
-    add_counts(found.refused, {"bad_date": int(damaged)})
-    return found
+    frames = tx.read(path, text, LIKE, parse, _columns(head, text))
+    frames.t_us[:] += start_us
+    add_counts(frames.refused, {"bad_date": int(damaged)})
+    return frames

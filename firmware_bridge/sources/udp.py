@@ -93,7 +93,7 @@ class UdpMulticast(LiveSource[Datagram]):
         if frame["is_remote_frame"]:
             return "remote_frame"
         data = frame["data"] or b""
-        if len(data) > MAX_LENGTH:
+        if frame["is_fd"] or len(data) > MAX_LENGTH:
             return "fd_frame"
         if len(data) != frame["dlc"]:
             return "short_frame"

@@ -20,20 +20,20 @@ def accept(
 ) -> None:
     """Take a changed machine for the new normal: the running daemon learns on from the change.
 
-    Its maps begin anew with the samples since the change; what was learned before is kept beside
-    them as state-*.before.npz.  Who accepted it, when and why stands in history.sqlite.  Exit code
+    Its maps begin anew with the samples since the change; what was learned before is kept as a
+    point in time.  Who accepted it, when and why stands in history.sqlite.  Exit code
     4 where no change has been noticed.
     """
     from rtid.daemon import acceptance
-    from rtid.daemon.configure import state_of
     from rtid.daemon.status import OLD_S, read
+    from rtid.project.folder import state_of
 
     folder = state_of(where)
-    found = read(folder)
-    if time.time() - found.now_unix_s > OLD_S:
+    status = read(folder)
+    if time.time() - status.now_unix_s > OLD_S:
         raise RtidError(f"{folder}: no daemon is running here", "start it with `rtid run`")
-    if not found.has("plant_changed"):
-        print(f"{found.name}: nothing to accept, the machine does what the map says")
+    if not status.has("plant_changed"):
+        print(f"{status.name}: nothing to accept, the machine does what the map says")
         raise typer.Exit(Exit.NEGATIVE)
     request = acceptance.Acceptance(time.time(), getpass.getuser(), reason)
     acceptance.ask(folder, request)
@@ -45,4 +45,4 @@ def accept(
                 f"{folder}: the daemon has not answered within {WAIT_S:g} s", "see its log"
             )
         time.sleep(0.2)
-    print(f"{found.name}: accepted; it learns on from the change, the former state is kept aside")
+    print(f"{status.name}: accepted; it learns on from the change, the former state is kept aside")

@@ -9,8 +9,9 @@ from typing import Annotated
 import typer
 
 from rtid.cli.exits import Exit, refuse_truncated
-from rtid.cli.options import AsJson, DryRun, ProjectOption, Reason
+from rtid.cli.options import AsJson, DryRun, NoCache, ProjectOption, Reason, UnitsOption
 from rtid.errors import RtidError
+from rtid.units import System
 
 
 def add(
@@ -28,6 +29,8 @@ def add(
     dry_run: DryRun = False,
     reason: Reason = "",
     as_json: AsJson = False,
+    units: UnitsOption = System.DISPLAY,
+    no_cache: NoCache = False,
 ) -> None:
     """Refit with one effect more, show both errors before and after, and write it to the project.
 
@@ -38,13 +41,13 @@ def add(
     name, trace = words if len(words) == 2 else ("", words[0])
     if not Path(trace).exists():
         raise RtidError(f"{trace}: no such file", "rtid add [EFFECT[:WHERE]] TRACE -p PROJECT")
-    from rtid.present import progress_bar
-    from rtid.revised_text import as_json as plain
-    from rtid.revised_text import show
-    from rtid.revising import add as add_effect
+    from rtid.study.revisions import add as add_effect
+    from rtid.tell.replay import progress_bar
+    from rtid.tell.revised import as_json as plain
+    from rtid.tell.revised import show
 
     effect, _, where = name.partition(":")
-    with progress_bar(hidden=as_json) as progress:
+    with progress_bar() as progress:
         done = add_effect(
             project, Path(trace), effect, where,
             force=force, dry_run=dry_run, reason=reason, progress=progress,

@@ -2,28 +2,27 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from rtid.cli.exits import Exit, refuse_truncated
-from rtid.cli.options import AsJson
+from rtid.cli.options import AsJson, NoCache, UnitsOption
+from rtid.plain import Progress, plain
+from rtid.units import System, scale_of, with_unit
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from firmware_bridge.catalog import Catalog
-    from rtid.check import IdTiming, Report, Timing
+    from firmware_bridge.frames import Frames
     from rtid.project import Project
+    from rtid.tell.story import Table
+    from rtid.trace import IdTiming, Report, Stamps, Timing
 
 SCHEMA = 1
-WIDTH = 110  # where the output is no terminal
-TIMING_HEADS = ("count", "median", "1 %", "99 %", "worst", "gaps")
+TIMING_HEADS = ("count|", "median|", "1 %|", "99 %|", "worst|", "gaps|")
 
 
 def check(
@@ -34,6 +33,8 @@ def check(
     ] = False,
     dbc: Annotated[Path | None, typer.Option(help="Names of messages, for --bus-only.")] = None,
     as_json: AsJson = False,
+    units: UnitsOption = System.DISPLAY,
+    no_cache: NoCache = False,
 ) -> None:
     """Judge a project file, alone or against a trace.
 
@@ -49,100 +50,151 @@ def check(
     if trace is None:
         _print_project(loaded, as_json)
         return
-    from rtid.check import judge
-    from rtid.check.reading import read_trace
+    from rtid.tell.replay import progress_bar
 
-    read = read_trace(loaded, trace)
-    stroke_m = loaded.sections.geometry.stroke_m
-    assembly = loaded.table_assembly if read.is_table and loaded.table_assembly else loaded.assembly
-    report = judge(
-        loaded.model, assembly, read.samples, read.series, read.messages, read.refused, stroke_m
-    )
+    with progress_bar() as progress:
+        report = _judged(loaded, trace, progress)
     if as_json:
-        print(json.dumps({"schema": SCHEMA, "ok": report.ok} | _plain(report)))
+        print(json.dumps({"schema": SCHEMA, "ok": report.ok} | plain(report)))
     else:
         _print_report(report, loaded)
-    refuse_truncated(trace, read.refused)
+    refuse_truncated(trace, report.refused)
     if not report.ok:
         raise typer.Exit(Exit.NEGATIVE)
+
+
+def _judged(project: Project, path: Path, progress: Progress) -> Report:
+    """The report of a trace, and what replay learns from it where nothing stands against that."""
+    from rtid.estimator.flowmap import VALID
+    from rtid.study.study import Study
+    from rtid.trace import judge, with_learned
+    from rtid.trace.reading import NoSamplesError
+    from rtid.trace.signals import read_recording
+
+    progress("reading", 0.0)
+    read = read_recording(project, path)
+    progress("judging signals and motion", 0.2)
+    stroke_m = project.sections.geometry.stroke_m
+    tables = project.table_assembly if read.is_table else None
+    assembly = tables or project.assembly
+    report = judge(
+        project.model, assembly, read.samples, read.series, read.messages, read.refused, stroke_m
+    )
+    if not report.ok:
+        return report
+    try:
+        edges = Study(project, path, lambda t, share: progress(t, 0.4 + 0.6 * share)).map.edges
+    except NoSamplesError:
+        return with_learned(report, {edge.name: 0 for edge in project.model.edges})
+    return with_learned(report, {e.name: int((e.status == VALID).sum()) for e in edges})
 
 
 def _check_bus(log: Path, dbc: Path | None, as_json: bool) -> None:
     from firmware_bridge import catalog
     from firmware_bridge.sources import open_log
-    from rtid.check import bus
+    from rtid.trace import bus, stamps
 
     frames = open_log(log)
-    names = _names(catalog.load(dbc)) if dbc else {}
-    found = bus(frames)
+    described = catalog.load(dbc) if dbc else None
+    timings = bus(frames)
+    names = [_name(described, timed) for timed in timings]
+    signals = _signals(frames, described) if described else []
     if as_json:
-        ids = [_plain(one) | {"name": names.get((one.can_id, one.extended))} for one in found]
-        counts = {"frames": len(frames), "ids": len(found), "refused": frames.refused}
-        print(json.dumps({"schema": SCHEMA} | counts | {"timing": ids}))
+        ids = [plain(t) | {"name": name or None} for t, name in zip(timings, names, strict=True)]
+        counts = {"frames": len(frames), "ids": len(timings), "refused": frames.refused}
+        odd = {"stamps": plain(stamps(frames))}
+        print(json.dumps({"schema": SCHEMA} | counts | {"timing": ids, "signals": signals} | odd))
     else:
-        _print_bus(found, names, len(frames), frames.refused)
+        _print_bus(timings, names, len(frames), frames.refused)
+        _print_stamps(stamps(frames))
+        _print_signals(signals)
     refuse_truncated(log, frames.refused)
 
 
-def _names(catalog: Catalog) -> dict[tuple[int, bool], str]:
-    messages = [catalog.message(name) for name in catalog.names]
-    return {(m.frame_id, m.is_extended_frame): m.name for m in messages}
+def _name(catalog: Catalog | None, timed: IdTiming) -> str:
+    """What the DBC calls a message; one of J1939 goes by its group, whoever sends it."""
+    from firmware_bridge.frames import EXTENDED
+    from firmware_bridge.j1939 import pgn_of
+
+    can_id = timed.can_id | (EXTENDED if timed.extended else 0)
+    for name in catalog.names if catalog else ():
+        assert catalog is not None
+        known = catalog.can_id(name)
+        is_group = catalog.is_j1939(name) and timed.extended
+        if known == can_id or (is_group and pgn_of(known) == pgn_of(can_id)):
+            return catalog.message(name).name
+    return ""
 
 
-def _plain(value: Any) -> Any:
-    """JSON form of dataclasses and arrays; a number that is none becomes null."""
-    if dataclasses.is_dataclass(value):
-        names = [field.name for field in dataclasses.fields(value)]
-        return {name: _plain(getattr(value, name)) for name in names}
-    if isinstance(value, dict):
-        return {key: _plain(entry) for key, entry in value.items()}
-    if hasattr(value, "tolist"):
-        return _plain(value.tolist())
-    if isinstance(value, tuple | list):
-        return [_plain(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def _signals(frames: Frames, catalog: Catalog) -> list[dict[str, Any]]:
+    """Every signal that the log holds by the DBC: its unit, values and range."""
+    from rtid.trace.series import describe
+    from rtid.trace.signals import series_of
+
+    wanted = ("name", "count", "missing", "minimum", "maximum")
+    return [
+        {key: plain(getattr(report, key)) for key in wanted} | {"unit": unit}
+        for unit, report in ((u, describe(series)) for u, series in series_of(frames, catalog))
+    ]
 
 
-def _console() -> Console:
-    from rich.console import Console
-
-    console = Console(highlight=False, soft_wrap=False)
-    return console if console.is_terminal else Console(width=WIDTH, highlight=False)
-
-
-def _table(title: str, heads: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> Any:
-    from rich.table import Table
-
-    table = Table(*heads, title=title, title_justify="left", box=None, pad_edge=False)
-    for column in table.columns[1:]:
-        column.justify = "right"
-    for row in rows:
-        table.add_row(*row)
-    return table
+def _print_stamps(odd: Stamps) -> None:
+    """What is odd about the time stamps, and what it means for the lag; nothing if all is well."""
+    if odd.backward:
+        print(f"{odd.backward} time stamps go back: such frames are refused as out_of_order.")
+    if odd.repeated:
+        print(f"{odd.repeated} frames are the one before once more, with its stamp.")
+    if odd.in_bursts:
+        print(
+            f"{odd.in_bursts} frames came in bursts with one stamp, behind up to "
+            f"{with_unit(odd.late_s, 's')} of silence: the adapter's stamps are late by up to "
+            "that, and so is the lag that is learned from them."
+        )
 
 
-def _timing_cells(found: Timing) -> tuple[str, ...]:
-    steps = (found.median_s, found.p01_s, found.p99_s, found.worst_s)
-    shown = [f"{1e3 * step:.4g} ms" if math.isfinite(step) else "-" for step in steps]
-    return (str(found.count), *shown, str(found.gaps))
+def _print_signals(signals: list[dict[str, Any]]) -> None:
+    from rtid.tell.story import Table
+    from rtid.tell.terminal import make_console
+
+    if signals:
+        heads = ("signal", "unit", "values|", "not available|", "from|", "to|")
+        keys = ("count", "missing", "minimum", "maximum")
+        rows = [(s["name"], s["unit"], *(_shown(s[key]) for key in keys)) for s in signals]
+        make_console().print("", Table("Signals", heads, rows))
+
+
+def _shown(value: float | None) -> str:
+    return "-" if value is None else f"{value:.6g}"
+
+
+def _timing_cells(timing: Timing) -> tuple[str, ...]:
+    steps = (timing.median_s, timing.p01_s, timing.p99_s, timing.worst_s)
+    shown = [with_unit(step, "s") if math.isfinite(step) else "-" for step in steps]
+    return (str(timing.count), *shown, str(timing.gaps))
 
 
 def _print_bus(
-    found: tuple[IdTiming, ...],
-    names: dict[tuple[int, bool], str],
+    timings: tuple[IdTiming, ...],
+    names: list[str],
     count: int,
     refused: dict[str, int],
 ) -> None:
-    console = _console()
-    rows = [
-        (f"{one.channel}:{one.label}", names.get((one.can_id, one.extended), ""))
-        + _timing_cells(one.timing)
-        for one in found
-    ]
-    console.print(_table("Inter-arrival times", ("channel:id", "message", *TIMING_HEADS), rows))
-    identifiers = len({(one.can_id, one.extended) for one in found})
-    channels = len({one.channel for one in found})
-    console.print(f"\n{count} frames, {identifiers} ids, {channels} channel(s).")
+    from rtid.tell.story import Table
+    from rtid.tell.terminal import make_console
+
+    console = make_console()
+    if count:
+        rows = [
+            (f"{timing.channel}:{timing.label}", name, *_timing_cells(timing.timing))
+            for timing, name in zip(timings, names, strict=True)
+        ]
+        heads = ("channel:id", "message", *TIMING_HEADS)
+        console.print(Table("Inter-arrival times", heads, rows))
+        identifiers = len({(timing.can_id, timing.extended) for timing in timings})
+        channels = len({timing.channel for timing in timings})
+        console.print(f"\n{count} frames, {identifiers} ids, {channels} channel(s).")
+    else:
+        console.print("No data frames.")
     if refused:
         console.print("Left out: " + _counts(refused))
 
@@ -160,22 +212,25 @@ def _print_project(project: Project, as_json: bool) -> None:
         print(json.dumps({"schema": SCHEMA, "ok": True, "digest": project.digest} | counts))
         return
     declared = ", ".join(f"{n} {what}" for what, n in counts.items())
-    _console().print(f"{project.path}: {project.name} is valid: {declared}.")
-    _console().print("Name a trace to judge it by: rtid check PROJECT TRACE")
+    print(f"{project.path}: {project.name} is valid: {declared}.")
+    print("Name a trace to judge it by: rtid check PROJECT TRACE")
 
 
 def _print_report(report: Report, project: Project) -> None:
-    console = _console()
-    rows = [(name, *_timing_cells(found)) for name, found in report.messages.items()]
+    from rtid.tell.story import Table
+    from rtid.tell.terminal import make_console
+
+    console = make_console()
+    rows = [(name, *_timing_cells(timing)) for name, timing in report.messages.items()]
     rows.append(("complete samples", *_timing_cells(report.samples)))
-    console.print(_table("Timing", ("message", *TIMING_HEADS), rows), "")
+    console.print(Table("Timing", ("message", *TIMING_HEADS), rows), "")
     console.print(_signal_table(report, project), "")
     console.print(_coverage_table(report), "")
     if report.refused:
         console.print("Refused: " + _counts(report.refused))
     for finding in report.findings:
-        console.print(f"{finding.level.upper()} {finding.subject}: {finding.text}.", markup=False)
-        console.print(f"  -> {finding.remedy}", markup=False)
+        console.print(f"{finding.level.upper()} {finding.subject}: {finding.text}.")
+        console.print(f"  -> {finding.remedy}")
     console.print(_conclusion(report))
 
 
@@ -183,42 +238,57 @@ def _counts(counts: dict[str, int]) -> str:
     return ", ".join(f"{reason} {n}" for reason, n in counts.items())
 
 
-def _signal_table(report: Report, project: Project) -> Any:
-    heads = ("signal", "unit", "from", "to", "smallest step", "noise", "declared", "frozen")
+def _signal_table(report: Report, project: Project) -> Table:
+    from rtid.tell.story import Table
+
     rows = []
-    for one in report.signals:
-        signal = project.model.signals[project.model.column(one.name)]
-        numbers = (one.minimum, one.maximum, one.step, one.noise, signal.noise)
-        shown = [f"{number:.4g}" for number in numbers]
-        shown[-1] = "estimate" if one.name in project.noise_unknown else shown[-1]
-        frozen = f"{one.frozen_s:.3g} s" if one.frozen_s else "-"
-        rows.append((one.name, signal.unit, *shown, frozen))
-    return _table("Signals", heads, rows)
+    for signal_report in report.signals:
+        signal = project.model.signals[project.model.column(signal_report.name)]
+        scale = scale_of(signal.unit)
+        numbers = (
+            signal_report.minimum,
+            signal_report.maximum,
+            signal_report.step,
+            signal_report.noise,
+            signal.noise,
+        )
+        shown = [f"{scale.factor * number:.4g}" for number in numbers]
+        shown[-1] = "estimate" if signal_report.name in project.noise_unknown else shown[-1]
+        frozen = f"{signal_report.frozen_s:.3g} s" if signal_report.frozen_s else "-"
+        rows.append((signal_report.name, scale.name, *shown, frozen))
+    heads = ("signal", "unit", "from|", "to|", "smallest step|", "noise|", "declared|", "frozen|")
+    return Table("Signals", heads, rows)
 
 
-def _coverage_table(report: Report) -> Any:
-    heads = ("edge", "blocks", "excited", "touched", "open", "outside grid", "command", "dp MPa")
+def _coverage_table(report: Report) -> Table:
+    from rtid.tell.story import Table
+
+    pressure = scale_of("Pa")
+    enough = max((coverage.min_rows for coverage in report.coverage), default=0)
+    heads = ("edge", "blocks|", "learned|", f"{enough} rows|", "touched|", "open|", "outside|")
     rows = [
         (
-            one.edge,
-            str(one.rows.size),
-            str(one.enough),
-            str(one.touched),
-            f"{one.open_s:.4g} s",
-            f"{100 * one.outside:.1f} %",
-            f"{one.w_v[0]:.3g}..{one.w_v[1]:.3g}",
-            f"{1e-6 * one.dp_pa[0]:.3g}..{1e-6 * one.dp_pa[1]:.3g}",
+            coverage.edge,
+            str(coverage.rows.size),
+            "-" if report.learned is None else str(report.learned[coverage.edge]),
+            str(coverage.enough),
+            str(coverage.touched),
+            f"{coverage.open_s:.4g} s",
+            f"{100 * coverage.outside:.1f} %",
+            f"{coverage.w_v[0]:.3g}..{coverage.w_v[1]:.3g}",
+            "..".join(f"{pressure.factor * dp:.3g}" for dp in coverage.dp_pa),
         )
-        for one in report.coverage
+        for coverage in report.coverage
     ]
-    return _table("Flow maps: blocks that this trace excites", heads, rows)
+    title = "Flow maps: blocks that replay learns from this trace"
+    return Table(title, (*heads, "command|", f"dp {pressure.name}|"), rows)
 
 
 def _conclusion(report: Report) -> str:
     errors = sum(finding.level == "error" for finding in report.findings)
     warnings = len(report.findings) - errors
-    blocks = sum(one.enough for one in report.coverage)
+    blocks = sum((report.learned or {}).values())
     if errors:
         return f"\nNot ready: {errors} error(s), {warnings} warning(s). Mend the errors first."
-    ready = f"\nReady to learn: {report.duration_s:.4g} s excite {blocks} blocks"
+    ready = f"\nReady to learn: from {report.duration_s:.4g} s replay learns {blocks} blocks"
     return f"{ready}; {warnings} warning(s)." if warnings else f"{ready}; nothing to object to."

@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rtid.cli.exits import refuse_truncated
-from rtid.cli.options import AsJson, ProjectOption
+from rtid.cli.options import AsJson, NoCache, ProjectOption, UnitsOption
+from rtid.units import System
 
 if TYPE_CHECKING:
-    from rtid.comparing import TraceComparison
+    from rtid.study.compared import TraceComparison
 
 
 def compare(
@@ -46,6 +47,8 @@ def compare(
     pictures: Annotated[Path | None, typer.Option(help="Folder for pictures.")] = None,
     picture_format: Annotated[str, typer.Option(help="png or svg.")] = "png",
     as_json: AsJson = False,
+    units: UnitsOption = System.DISPLAY,
+    no_cache: NoCache = False,
 ) -> None:
     """Say how well the learned map, or a data sheet, explains this trace, where and when it fails.
 
@@ -53,10 +56,11 @@ def compare(
     residual, the simulated pressure (free run, 1 s and 0.1 s ahead), what the residual depends on,
     and whether the model begins to fail.  Effects that `rtid add` has added are in the model.
     """
-    from rtid.beside import replay_beside
-    from rtid.comparing import compare_two, find_reference, study
     from rtid.project import load
-    from rtid.residualfile import refuse_format, write_residuals
+    from rtid.study.compared import find_reference
+    from rtid.study.study import Study, compare_two
+    from rtid.tell.replay import progress_bar
+    from rtid.tell.residual_table import refuse_format, write_residuals
 
     if table is not None:
         refuse_format(table)
@@ -65,10 +69,11 @@ def compare(
     sheets: list[Path | None] = [*maps] if maps else [None]
     references = [find_reference(loaded, sheet) for sheet in sheets]
     studies: Sequence[TraceComparison]
-    if against is None:
-        studies = [study(replay_beside(loaded, trace), *references)]
-    else:
-        studies = compare_two(loaded, trace, against, *references)
+    with progress_bar() as progress:
+        if against is None:
+            studies = [Study(loaded, trace, progress).comparison(*references)]
+        else:
+            studies = compare_two(loaded, trace, against, *references, progress=progress)
     written = _draw(studies, pictures, picture_format) if pictures else []
     if table is not None:
         written.append(write_residuals(table, studies))
@@ -109,21 +114,21 @@ def _span(text: str | None) -> tuple[float, float] | None:
 def _json(
     studies: Sequence[TraceComparison], place: Place | None, when: tuple[float, float] | None
 ) -> dict[str, Any]:
-    from rtid.beside import as_json as added_json
-    from rtid.comparing import as_json, blocks_in_span, changes, spans_of_block
-    from rtid.comparing_json import deviation
+    from rtid.study.compared import as_json, blocks_in_span, changes, spans_of_block
+    from rtid.study.compared_json import deviation
+    from rtid.study.known_effects import as_json as added_json
 
     first = studies[0]
-    found = as_json(first) | {"added": added_json(first.replay.added)}
+    document = as_json(first) | {"added": added_json(first.replay.added)}
     if len(studies) > 1:
         added = added_json(studies[1].replay.added)
-        found["against"] = as_json(studies[1]) | {"added": added}
-        found["changes"] = [deviation(d) for d in changes(first, studies[1])]
+        document["against"] = as_json(studies[1]) | {"added": added}
+        document["changes"] = [deviation(d) for d in changes(first, studies[1])]
     if place is not None:
-        found["spans_of_block"] = spans_of_block(first, *place)
+        document["spans_of_block"] = spans_of_block(first, *place)
     if when is not None:
-        found["blocks_in_span"] = [vars(visit) for visit in blocks_in_span(first, *when)]
-    return found
+        document["blocks_in_span"] = [vars(visit) for visit in blocks_in_span(first, *when)]
+    return document
 
 
 def _print(
@@ -132,24 +137,25 @@ def _print(
     when: tuple[float, float] | None,
     written: list[Path],
 ) -> None:
-    from rtid.beside import sentences
-    from rtid.compared_text import make_console, tell, tell_block, tell_span
+    from rtid.tell.added import sentences
+    from rtid.tell.compared import of_block, of_span, story
+    from rtid.tell.terminal import make_console
 
     console = make_console()
     if place is not None:
-        tell_block(console, studies[0], *place)
+        console.print(of_block(studies[0], *place))
     if when is not None:
-        tell_span(console, studies[0], *when)
+        console.print(of_span(studies[0], *when))
     if place is None and when is None:
-        for found in studies:
-            for sentence in sentences(found.replay.added):
+        for comparison in studies:
+            for sentence in sentences(comparison.replay.added):
                 console.print(sentence)
-        tell(console, studies)
+        console.print(story(studies))
     for path in written:
-        console.print(f"wrote {path}")
+        console.print(f"wrote {path}", soft_wrap=True)
 
 
 def _draw(studies: Sequence[TraceComparison], folder: Path, suffix: str) -> list[Path]:
-    from rtid.compared_pictures import draw
+    from rtid.tell.compared_pictures import draw
 
     return draw(studies, folder, suffix)

@@ -10,15 +10,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rtid.units import LPM, MPA
+from rtid.units import LPM, MPA, Z95
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from rtid.comparing import TraceComparison
-    from rtid.demo import Demo
+    from rtid.study.compared import TraceComparison
+    from rtid.study.demo import Demo
 
-Z95 = 1.96
 WIDTH = 110  # where the output is no terminal
 
 
@@ -43,19 +42,20 @@ def demo(
     """
     from rich.console import Console
 
-    from rtid.demo import prepare, wear
+    from rtid.study.demo import prepare, wear
 
-    console = Console(highlight=False)
-    console = console if console.is_terminal else Console(highlight=False, width=WIDTH)
+    console = Console(highlight=False, markup=False, emoji=False)
+    if not console.is_terminal:
+        console = Console(highlight=False, markup=False, emoji=False, width=WIDTH)
     with console.status("simulating a machine nobody has measured ..."):
         machine = prepare(folder, seed, duration_s)
     _print_live(console, machine, speed or float("inf"))
-    found = _desk(machine)
-    _print_result(console, machine, found)
+    comparison = _desk(machine)
+    _print_result(console, machine, comparison)
     if pictures is not None:
-        from rtid.present import Story
+        from rtid.tell.replay import LearnedStory
 
-        for path in Story(found).draw(pictures, "png"):
+        for path in LearnedStory(comparison).draw(pictures, "png"):
             console.print(f"wrote {path}")
     with console.status("letting its piston seal wear out ..."):
         worn = wear(machine)
@@ -68,7 +68,8 @@ def _print_live(console: Console, machine: Demo, speed: float) -> None:
     """One line per look at the growing estimate."""
     console.print(
         "\n[bold]1  On board[/bold]  The machine's CAN frames arrive: valve command, pressures, "
-        "position.\n   No flow sensor, no data sheet; rtid starts with empty maps."
+        "position.\n   No flow sensor, no data sheet; rtid starts with empty maps.",
+        markup=True,
     )
     names = [chamber.name for chamber in machine.project.model.chambers]
     heads = "  ".join(f"{f'bulk modulus {name}, MPa':>21}" for name in names)
@@ -80,65 +81,69 @@ def _print_live(console: Console, machine: Demo, speed: float) -> None:
 
 
 def _desk(machine: Demo) -> TraceComparison:
-    from rtid.present import progress_bar
+    from rtid.tell.replay import progress_bar
 
-    with progress_bar(hidden=False) as progress:
+    with progress_bar() as progress:
         return machine.desk(progress)
 
 
-def _print_result(console: Console, machine: Demo, found: TraceComparison) -> None:
+def _print_result(console: Console, machine: Demo, comparison: TraceComparison) -> None:
     """What was learned, beside what the simulator kept to itself."""
-    fit, plant = found.replay.fit, machine.plant
+    fit, plant = comparison.replay.fit, machine.plant
     solution = fit.solution
     console.print(
         "\n[bold]2  On the desk[/bold]  The same frames, replayed from the log, with refined "
-        "weights and the spool lag as an unknown."
+        "weights and the spool lag as an unknown.",
+        markup=True,
     )
     console.print(f"\n   {'':24}{'learned (95 %)':>22}{'true':>12}")
     for chamber, b, sd in zip(
-        found.replay.model.chambers, solution.beta_pa, solution.beta_sd_pa, strict=True
+        comparison.replay.model.chambers, solution.beta_pa, solution.beta_sd_pa, strict=True
     ):
         learned = f"{b * MPA:.1f} ± {Z95 * sd * MPA:.1f} MPa"
         true = f"{plant.beta_pa * MPA:.1f} MPa"
         console.print(f"   {f'bulk modulus, chamber {chamber.name}':24}{learned:>22}{true:>12}")
     lag = f"{fit.lag_s * 1e3:.3f} ± {Z95 * fit.lag_sd_s * 1e3:.3f} ms"
     console.print(f"   {'lag of the spools':24}{lag:>22}{f'{plant.lag_s * 1e3:.3f} ms':>12}")
-    for error in machine.map_errors(found):
+    for error in machine.map_errors(comparison):
         learned = f"{100 * error.mean:.3f} % mean error"
         console.print(
             f"   {f'flow map of valve {error.edge}':24}{learned:>22}"
             f"   of its largest flow (worst {100 * error.largest:.2f} %)"
         )
-    _print_answer(console, found)
+    _print_answer(console, comparison)
 
 
-def _print_answer(console: Console, found: TraceComparison) -> None:
+def _print_answer(console: Console, comparison: TraceComparison) -> None:
     """Data sheet and learned map on the part of the trace that the fit has not seen."""
     console.print("\n   What each map leaves unexplained of the flow, on motion it has not seen:")
-    for held in reversed(found.held):
-        part = held.parts["validation"]
+    for tested in reversed(comparison.held):
+        part = tested.parts["validation"]
         cells = "   ".join(
             f"chamber {chamber.name} {rms * LPM:6.3f} L/min = {100 * share:5.2f} %"
             for chamber, rms, share in zip(
-                found.replay.model.chambers,
+                comparison.replay.model.chambers,
                 part.residual_rms_m3s,
                 part.residual_share,
                 strict=True,
             )
         )
-        console.print(f"   {held.name:12}{cells}")
+        console.print(f"   {tested.name:12}{cells}")
 
 
 def _print_next(console: Console, machine: Demo, worn: tuple[Path, Path]) -> None:
     """Commands to go on with, each on a line that can be pasted."""
     trace, project = machine.trace, machine.project.path
-    console.print("\n[bold]3  Your turn[/bold]  The trace and its project file are yours to try:")
+    console.print(
+        "\n[bold]3  Your turn[/bold]  The trace and its project file are yours to try:", markup=True
+    )
     _print_command(console, "check", project, trace)
     _print_command(console, "replay", trace, "--project", project, "--pictures", trace.parent)
     _print_command(console, "export", trace, trace.parent / "map.csv", "--project", project)
     console.print(
         "\n[bold]4  What is missing?[/bold]  Years later something in this machine has worn out, "
-        "and the model\n   does not know.  See it in the browser: where it fails, why, and add it:"
+        "and the model\n   does not know.  See it in the browser: where it fails, why, and add it:",
+        markup=True,
     )
     _print_command(console, "ui", worn[1], worn[0])
     console.print()
@@ -147,7 +152,7 @@ def _print_next(console: Console, machine: Demo, worn: tuple[Path, Path]) -> Non
 def _print_command(console: Console, *words: str | Path) -> None:
     """One line however long: what a terminal breaks by itself is still pasted as one."""
     line = shlex.join([*program(), *map(str, words)])
-    console.print(f"   {line}", style="bold", markup=False, soft_wrap=True)
+    console.print(f"   {line}", style="bold", soft_wrap=True)
 
 
 def program() -> list[str]:

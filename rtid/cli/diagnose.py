@@ -4,34 +4,61 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rtid.cli.exits import refuse_truncated
-from rtid.cli.options import AsJson, ProjectOption
+from rtid.cli.exits import Exit, refuse_truncated
+from rtid.cli.options import AsJson, NoCache, ProjectOption, UnitsOption
+from rtid.units import System
+
+if TYPE_CHECKING:
+    from rtid.tell.story import Chart
 
 
 def diagnose(
     trace: Annotated[Path, typer.Argument(help="CAN log or table.")],
     project: ProjectOption,
+    pictures: Annotated[
+        Path | None, typer.Option(help="Folder for pictures of the evidence for what is named.")
+    ] = None,
+    picture_format: Annotated[str, typer.Option(help="png or svg.")] = "png",
     as_json: AsJson = False,
+    units: UnitsOption = System.DISPLAY,
+    no_cache: NoCache = False,
 ) -> None:
     """Say which physical effect is missing, how large it is, and what could not be seen.
 
     Verdicts: matches, missing (an effect has a name), ambiguous (one of a set), unknown (something
-    is missing that no known effect explains), insufficient_data.
+    is missing that no known effect explains), insufficient_data.  Exit code 4: a bulk modulus is
+    impossible, and is said to be invalid.
     """
-    from rtid.diagnosed_text import show
-    from rtid.diagnosing import diagnose_trace
-    from rtid.present import progress_bar
-    from rtid.project import load
+    from rtid.study.study import Study
+    from rtid.tell.charts.evidence import charts_of
+    from rtid.tell.diagnosed import story
+    from rtid.tell.replay import progress_bar
+    from rtid.tell.terminal import make_console
 
-    loaded = load(project)
-    with progress_bar(hidden=as_json) as progress:
-        found = diagnose_trace(loaded, trace, progress)
+    with progress_bar() as progress:
+        study = Study(project, trace, progress)
+        diagnosed = study.diagnosis()
+        evidence = charts_of(study.evidence) if pictures or not as_json else ()
+    written = _drawn(evidence, pictures, picture_format) if pictures else []
     if as_json:
-        print(json.dumps({"trace": str(trace)} | found.diagnosis.as_json()))
+        more = {"pictures": [str(path) for path in written]} if pictures else {}
+        print(json.dumps({"trace": str(trace)} | diagnosed.as_json() | more))
     else:
-        show(found.diagnosis)
-    refuse_truncated(trace, found.trace.counters)
+        make_console().print(story(diagnosed, evidence))
+        for path in written:
+            print(f"wrote {path}")
+    refuse_truncated(trace, study.counters)
+    if any(doubt.is_invalid for doubt in diagnosed.doubts):
+        raise typer.Exit(Exit.NEGATIVE)
+
+
+def _drawn(charts: tuple[Chart, ...], folder: Path, suffix: str) -> list[Path]:
+    """Every chart as a file of the folder, which is made if it is not there."""
+    from rtid.tell import stills
+
+    folder.mkdir(parents=True, exist_ok=True)
+    return [stills.save(stills.draw(c), folder / f"{c.name}.{suffix}") for c in charts]

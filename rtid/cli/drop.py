@@ -9,7 +9,8 @@ from typing import Annotated
 import typer
 
 from rtid.cli.exits import refuse_truncated
-from rtid.cli.options import AsJson, DryRun, ProjectOption, Reason
+from rtid.cli.options import AsJson, DryRun, NoCache, ProjectOption, Reason, UnitsOption
+from rtid.units import System
 
 
 def drop(
@@ -21,15 +22,17 @@ def drop(
     dry_run: DryRun = False,
     reason: Reason = "",
     as_json: AsJson = False,
+    units: UnitsOption = System.DISPLAY,
+    no_cache: NoCache = False,
 ) -> None:
     """Take an effect out of the project's model; with a trace, show errors before and after."""
-    from rtid.present import progress_bar
-    from rtid.revised_text import as_json as plain
-    from rtid.revised_text import show
-    from rtid.revising import drop as drop_effect
+    from rtid.study.revisions import drop as drop_effect
+    from rtid.tell.replay import progress_bar
+    from rtid.tell.revised import as_json as plain
+    from rtid.tell.revised import show
 
     name, _, where = effect.partition(":")
-    with progress_bar(hidden=as_json or trace is None) as progress:
+    with progress_bar(hidden=trace is None) as progress:
         done = drop_effect(
             project, name, where, trace, dry_run=dry_run, reason=reason, progress=progress
         )

@@ -8,7 +8,8 @@ from typing import Annotated
 
 import typer
 
-from rtid.cli.options import AsJson, ProjectOption
+from rtid.cli.options import AsJson, ProjectOption, UnitsOption
+from rtid.units import System
 
 
 def excite(
@@ -35,6 +36,7 @@ def excite(
     ] = None,
     compare: Annotated[bool, typer.Option(help="Also choose D-optimally, for comparison.")] = True,
     as_json: AsJson = False,
+    units: UnitsOption = System.DISPLAY,
 ) -> None:
     """Design a motion within the machine's limits, and say what it will tell before it runs.
 
@@ -48,25 +50,26 @@ def excite(
     every block and of beta, and the smallest size of each effect that would be seen, beside the
     paper's swept sine and a D-optimal choice from the same segments.
     """
-    from rtid.excited_text import show
-    from rtid.exciting import as_json as plain
-    from rtid.exciting import excite as design
-    from rtid.exciting import write_csv
-    from rtid.present import progress_bar
+    from rtid.excite.exciting import as_json as plain
+    from rtid.excite.exciting import excite as design
+    from rtid.excite.exciting import write_csv
     from rtid.project import load
+    from rtid.tell.excited import story
+    from rtid.tell.replay import progress_bar
+    from rtid.tell.terminal import make_console
 
     loaded, changes = load(project), {} if duration_s is None else {"duration_s": duration_s}
-    with progress_bar(hidden=as_json) as progress:
-        found = design(loaded, see or [], after, compare, progress, **changes)
+    with progress_bar() as progress:
+        excited = design(loaded, see or [], after, compare, progress, **changes)
     if out is not None:
-        write_csv(out, found.design)
+        write_csv(out, excited.design)
     if picture is not None:
-        from rtid.pictures.excited import predicted
+        from rtid.tell.charts.excited import predicted
 
-        predicted(found.design.machine.model, found.predictions).savefig(picture, dpi=150)
+        predicted(excited.design.machine.model, excited.predictions).savefig(picture, dpi=150)
     if as_json:
-        print(json.dumps(plain(found) | {"written": str(out) if out else None}))
+        print(json.dumps(plain(excited) | {"written": str(out) if out else None}))
     else:
-        show(found, see or [])
+        make_console().print(story(excited, see or []))
         if out is not None:
             print(f"wrote {out}")

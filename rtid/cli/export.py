@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rtid.cli.options import PriorOption, ProjectOption
+from rtid.cli.options import NoCache, PriorOption, ProjectOption
 
 if TYPE_CHECKING:
+    from rtid.estimator.flowmap import FlowMap
     from rtid.estimator.solution import Solution
+    from rtid.estimator.validity import Doubt
     from rtid.project import Project
 
 SNAPSHOT = ".npz"
@@ -24,30 +26,40 @@ def export(
     ],
     project: ProjectOption,
     prior_map: PriorOption = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Write it even if what was learned is impossible.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print a summary as JSON.")] = False,
+    no_cache: NoCache = False,
 ) -> None:
     """Write the learned maps: flow, standard deviation and status over command and pressure drop.
 
     CSV is a long table at the nodes and centres of the grid; JSON and npz hold everything; .mat, .m
     (Simulink.LookupTable), .dcm and .cdfx (calibration tools) hold grids on which straight lines
     miss no more than 0.1 % of the largest flow, with deviation and status; a C99 header holds
-    look-up tables, float and fixed point, with their functions beside it.  From a trace the maps
-    are learned beside the effects that `rtid add` has added, whose flow is not in them; a snapshot
-    holds the maps as they were learned, on board beside those that can run live.
+    look-up tables, float and fixed point, with their functions beside it; packages may bring more.
+    From a trace the maps are learned beside the effects that `rtid add` has added, whose flow is
+    not in them; a snapshot holds the maps as they were learned, on board beside those that can run
+    live.  Exit code 4: what was learned is impossible, and nothing is written without --force.
     """
-    from rtid.cfile import SUFFIX, write_header
     from rtid.errors import RtidError
-    from rtid.mapfiles import FORMATS, provenance, write_map
-    from rtid.priors import find_prior, published, said_of, with_prior
+    from rtid.maps.c_header import SUFFIX, write_header
+    from rtid.maps.files import formats, provenance, write_map
+    from rtid.maps.prior_map import find_prior, said_of, with_prior
     from rtid.project import load
 
-    if output.suffix.lower() not in (*FORMATS, SUFFIX):
-        remedy = f"end its name in {', '.join((*FORMATS, SUFFIX))}"
+    if output.suffix.lower() not in (*formats(), SUFFIX):
+        remedy = f"end its name in {', '.join((*formats(), SUFFIX))}"
         raise RtidError(f"{output}: unknown format", remedy, exit_code=2)
     loaded = with_prior(load(project), prior_map)
     prior = find_prior(loaded)
-    solution, effects = _solution(loaded, source)
-    flowmap = published(solution, prior)
+    solution, flowmap, effects, invalid = _learned(loaded, source)
+    if invalid and not force:
+        raise RtidError(
+            f"{source}: not exported, {'; '.join(doubt.text for doubt in invalid)}",
+            "--force writes it all the same",
+            exit_code=4,
+        )
     origin = provenance(solution, loaded.name, loaded.digest, source.name, effects)
     if output.suffix.lower() == SUFFIX:
         percent = loaded.sections.publish.error_percent
@@ -56,8 +68,8 @@ def export(
         write_map(output, flowmap, origin)
     cells = {e.name: int((e.status == "valid").sum()) for e in flowmap.edges}
     if as_json:
-        told = {"schema": 1, "written": str(output), "valid_blocks": cells, "effects": effects}
-        print(json.dumps(told))
+        document = {"schema": 1, "written": str(output), "valid_blocks": cells, "effects": effects}
+        print(json.dumps(document))
     else:
         text = ", ".join(f"{name} {count}" for name, count in cells.items())
         print(f"wrote {output}; valid blocks: {text}")
@@ -80,14 +92,29 @@ def _beside(effects: list[dict[str, Any]], project: Project) -> str:
     return "The project has added no effects."
 
 
-def _solution(project: Project, source: Path) -> tuple[Solution, list[dict[str, Any]]]:
-    """From a snapshot as it is, from a trace by the record path; the effects beside it."""
+def _learned(
+    project: Project, source: Path
+) -> tuple[Solution, FlowMap, list[dict[str, Any]], list[Doubt]]:
+    """From a snapshot as it is, from a trace by the record path; effects beside, what is wrong."""
+    from rtid.estimator.validity import doubts_of
+
     if source.suffix.lower() == SNAPSHOT:
-        from rtid.daemon.beside import load_for
+        from rtid.maps.prior_map import find_prior, published
+        from rtid.study.on_board import load_for
 
         estimator, live = load_for(source, project)
-        return estimator.solution(), [{"effect": a.effect, "where": a.where} for a in live]
-    from rtid.beside import as_json, replay_beside
+        solution, lag = estimator.solution(), (0.0, 0.0)
+        flowmap = published(solution, find_prior(project))
+        effects = [{"effect": a.effect, "where": a.where} for a in live]
+    else:
+        from rtid.study.known_effects import as_json
+        from rtid.study.study import Study
+        from rtid.tell.replay import progress_bar
 
-    found = replay_beside(project, source)
-    return found.fit.solution, as_json(found.added)
+        with progress_bar() as progress:
+            study = Study(project, source, progress)
+            fit, flowmap = study.fit, study.map
+        solution, lag = fit.solution, (fit.lag_s, fit.lag_sd_s)
+        effects = as_json(study.effects)
+    invalid = [doubt for doubt in doubts_of(solution, *lag) if doubt.is_invalid]
+    return solution, flowmap, effects, invalid

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rtid.cli.options import AsJson
+from rtid.cli.options import AsJson, UnitsOption
+from rtid.units import System
 
 if TYPE_CHECKING:
     from rtid.fleet.archive import Archive
-    from rtid.fleet.jobs import Job
+    from rtid.fleet.traces import TraceJob
 
 
 def fleet(
@@ -31,6 +32,7 @@ def fleet(
     ] = True,
     retry: Annotated[bool, typer.Option("--retry", help="Try failed traces once more.")] = False,
     as_json: AsJson = False,
+    units: UnitsOption = System.DISPLAY,
 ) -> None:
     """Learn from thousands of traces, find the remarkable machines, and what is typical.
 
@@ -40,32 +42,34 @@ def fleet(
     """
     from rtid.cli.exits import Exit
     from rtid.fleet.archive import Archive
-    from rtid.fleet.jobs import find
     from rtid.fleet.merging import machines, ranked, typical, write
     from rtid.fleet.running import run
-    from rtid.fleet.text import summary, tell
+    from rtid.fleet.traces import find
     from rtid.project import load
+    from rtid.tell.fleet import summary, tell
 
     jobs, copies = find(sources, project)
     archive = Archive(output)
     again = archive.forget_errors() if retry else 0
     _run(run, jobs, archive, as_json, workers=workers, scheduler=scheduler, with_diagnosis=diagnose)
     loaded = [load(path) for path in dict.fromkeys(job.project for job in jobs)]
-    found = machines(archive, {one.digest: one.model for one in loaded}, workers)
-    types = typical(found)
-    write(archive, found, types)
+    fleet_machines = machines(
+        archive, {project.machine_digest: project.model for project in loaded}, workers
+    )
+    types = typical(fleet_machines)
+    write(archive, fleet_machines, types)
     rows = archive.rows()
-    told = summary(rows, ranked(found, types), len(copies), again)
+    document = summary(rows, ranked(fleet_machines, types), len(copies), again)
     if as_json:
-        print(json.dumps(told))
+        print(json.dumps(document))
     else:
-        tell(told, output)
+        tell(document, output)
     if rows and all(row["error"] for row in rows):
         raise typer.Exit(Exit.INPUT)
 
 
-def _run(run: Any, jobs: list[Job], archive: Archive, quiet: bool, **how: Any) -> None:
-    from rtid.present import progress_bar
+def _run(run: Any, jobs: list[TraceJob], archive: Archive, quiet: bool, **how: Any) -> None:
+    from rtid.tell.replay import progress_bar
 
     with progress_bar(hidden=quiet) as progress:
         run(jobs, archive, lambda n, of, last: progress(f"{n} of {of} traces", n / of), **how)

@@ -11,7 +11,7 @@ from rtid.cli.exits import Exit
 from rtid.errors import RtidError
 
 if TYPE_CHECKING:
-    from rtid.project.proposal import Candidate
+    from rtid.project.guess import RoleCandidate
 
 BUILTIN = "builtin:controller.dbc"
 
@@ -30,18 +30,19 @@ def init(
     if output.exists() and not force:
         raise RtidError(f"{output} exists", "give another -o, or --force", Exit.USAGE)
     from rtid.project import ProjectError, load
-    from rtid.project.proposal import propose
+    from rtid.project.guess import propose, unused
     from rtid.project.template import project_text
 
     keys, candidates = _read(source, output.parent)
     roles = propose(candidates)
-    used = {(c.message, c.name) for c in roles.values()}
-    rest = [c for c in candidates if (c.message, c.name) not in used]
+    rest = unused(candidates, roles)
     output.write_text(project_text(output.stem, keys, roles, rest), "utf-8")
     print(f"wrote {output}")
-    for role, found in roles.items():
-        guessed = ", unit guessed" if found.guessed_unit else ""
-        print(f"  {role:9} {f'{found.message}.{found.name}'.lstrip('.')} [{found.unit}{guessed}]")
+    for role, candidate in roles.items():
+        guessed = ", unit guessed" if candidate.guessed_unit else ""
+        print(f"  {role:9} {candidate.full_name} [{candidate.unit}{guessed}]")
+    if rest:
+        print(f"Not used: {', '.join(c.full_name for c in rest)}")
     try:
         load(output)
         print("It is complete. Next: rtid check PROJECT TRACE")
@@ -51,21 +52,20 @@ def init(
             print(f"  {problem}")
 
 
-def _read(source: str, folder: Path) -> tuple[dict[str, str], list[Candidate]]:
+def _read(source: str, folder: Path) -> tuple[dict[str, str], list[RoleCandidate]]:
     """Keys of [source] and all signals."""
     from firmware_bridge import catalog
-    from firmware_bridge.sources.table import read_table
-    from rtid.project import proposal
-    from rtid.project.table import is_table
+    from firmware_bridge.sources import read_table
+    from firmware_bridge.sources.formats import format_of
+    from rtid.project import guess as proposal
+    from rtid.trace.table import time_of
 
     path = Path(source)
     if source == BUILTIN:
         return {"dbc": BUILTIN}, proposal.from_catalog(catalog.load())
-    if not is_table(path):
-        return {"dbc": proposal.relative(path, folder)}, proposal.from_catalog(catalog.load(path))
+    if format_of(path) is None:
+        candidates = proposal.from_catalog(catalog.load(path))
+        return {"dbc": proposal.relative(path, folder)}, candidates
     table = read_table(path)
-    time = proposal.time_column(table)
-    if time is None:
-        raise RtidError(f"{path}: no column looks like time", 'call it "t", in seconds')
-    unit = table.units.get(time) or "s"
+    time, unit = time_of(table)
     return {"time_column": time, "time_unit": unit}, proposal.from_table(table)

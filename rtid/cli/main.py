@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Annotated, Any, NoReturn
@@ -31,7 +32,8 @@ COMMANDS = {
     "add": "Make a missing effect part of the model, and see the error fall.",
     "drop": "Take an effect out of the model again.",
     "undo": "Take the last change of the model back.",
-    "history": "List what was added to the model and dropped, and what it brought.",
+    "history": "List the changes of the model, and the points in time to go back to.",
+    "restore": "Go back to what the daemon had learned at a point in time.",
     "ui": "See a record and its model in the browser: where it fails, why, and add it.",
     "report": "Write the story of a trace as one HTML file with pictures.",
     "effects": "List the physical effects that may be missing in the model, or explain one.",
@@ -43,10 +45,11 @@ COMMANDS = {
     "apply": "Send the learned maps to the controller, all or nothing; and back.",
     "export": "Write the learned maps for controllers, calibration tools and spreadsheets.",
     "mcu": "Write the estimator in C for a controller with no computer beside it.",
+    "trust": "Let the Python that a project brings along run on this machine.",
     "fleet": "Learn and diagnose thousands of traces, and rank the machines.",
-    "paper": "Reproduce the figures and tables of the paper, beside its numbers.",
 }
 
+STDIN = "-"
 OUR_PACKAGES = ("rtid", "firmware_bridge")  # their own error classes are meant for the user
 EPILOG = (
     "Exit codes: 0 ok, 1 internal error, 2 usage or project file, 3 input, 4 negative result.  "
@@ -104,9 +107,27 @@ def _refuse(message: str, remedy: str, code: int) -> NoReturn:
 
 
 def run(arguments: Sequence[str]) -> NoReturn:
-    """Run one command line and exit; an expected error is one plain message, no traceback."""
+    """Run one command line of `rtid` and exit; an argument `-` is the standard input."""
+    with _with_stdin(arguments) as words:
+        carry_out(build(words), words, "rtid")
+
+
+@contextmanager
+def _with_stdin(arguments: Sequence[str]) -> Iterator[Sequence[str]]:
+    """The arguments, `-` replaced by a file that holds what the standard input does."""
+    if STDIN not in arguments:
+        yield arguments
+        return
+    from firmware_bridge.sources.formats import spooled
+
+    with spooled(sys.stdin.buffer) as path:
+        yield [str(path) if word == STDIN else word for word in arguments]
+
+
+def carry_out(app: typer.Typer, arguments: Sequence[str], name: str) -> NoReturn:
+    """Run a command line and exit; an expected error is one plain message, no traceback."""
     try:
-        typer.main.get_command(build(arguments)).main(args=list(arguments), prog_name="rtid")
+        typer.main.get_command(app).main(args=list(arguments), prog_name=name)
     except KeyboardInterrupt:
         sys.exit(Exit.INTERRUPTED)
     except OSError as error:
@@ -126,7 +147,10 @@ def main() -> NoReturn:
 
     Linear algebra stays on one thread, unless the environment says otherwise: matrices are small,
     and OpenBLAS' threads spin while they wait (`refit --diagnose` of the tanks beside another
-    program: 142 s instead of 39, with the same result).
+    program: 142 s instead of 39, with the same result).  python-can's own MF4 support is left out:
+    where asammdf is installed it loads that and pandas, 0.4 s and 100 MB at each start, and we read
+    MF4 in a process of its own (`firmware_bridge.sources.mf4`): None is what is not to be found.
     """
+    sys.modules.setdefault("asammdf", None)  # type: ignore[arg-type]
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read at the first import of numpy
     run(sys.argv[1:])

@@ -11,7 +11,7 @@ import typer
 from rtid.cli.options import ProjectOption
 
 if TYPE_CHECKING:
-    from rtid.mcu.tables import Sizes
+    from rtid.mcu.c_tables import Sizes
     from rtid.project import Project
 
 
@@ -33,8 +33,8 @@ def mcu(
     update.  The same samples give the sums of `rtid run`.  It learns what the project declares in
     the integral form with Taylor blocks, for ever: no forgetting, no gate by a map held, no modes.
     """
+    from rtid.mcu.c_tables import sizes_of
     from rtid.mcu.memory import Layout
-    from rtid.mcu.tables import sizes_of
     from rtid.mcu.valve import one_valve
     from rtid.mcu.write import write_sources
     from rtid.project import load
@@ -51,9 +51,9 @@ def mcu(
     }
     added = [f"{a.effect} at {a.where}" for a in loaded.sections.added]
     if as_json:
-        told = {"schema": 1, "written": [str(path) for path in written], "ram_bytes": ram}
-        told |= {"chamber": model.chambers[0].name, "blocks": sizes.blocks, "without": added}
-        print(json.dumps(told))
+        document = {"schema": 1, "written": [str(path) for path in written], "ram_bytes": ram}
+        document |= {"chamber": model.chambers[0].name, "blocks": sizes.blocks, "without": added}
+        print(json.dumps(document))
     else:
         _tell(output, model.chambers[0].name, sizes, ram, added)
 

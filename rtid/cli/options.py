@@ -7,6 +7,33 @@ from typing import Annotated
 
 import typer
 
+from rtid.units import System, show_in
+
+
+def _units(context: typer.Context, system: System) -> System:
+    """What is printed from here to the end of the command is in these units."""
+    show_in(system)
+    context.call_on_close(lambda: show_in(System.DISPLAY))
+    return system
+
+
+def _kept(context: typer.Context, no_cache: bool) -> bool:
+    """What is learned from here to the end of the command is kept beside the trace."""
+    from rtid.study.kept import keeping
+
+    context.with_resource(keeping(wanted=not no_cache))
+    return no_cache
+
+
+# Setting it is all: a command that has the option need not look at it.
+UnitsOption = Annotated[
+    System,
+    typer.Option(
+        "--units",
+        callback=_units,
+        help="What is printed: display (MPa, L/min, mm, ms) or si.  Files and JSON keep theirs.",
+    ),
+]
 ProjectOption = Annotated[Path, typer.Option("--project", "-p", help="Project file.")]
 PriorOption = Annotated[
     Path | None,
@@ -20,3 +47,11 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON."
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Say what would be; write nothing.")]
 Reason = Annotated[str, typer.Option(help="Why, for the history.")]
 Where = Annotated[Path, typer.Argument(help="Project file, or the daemon's state folder.")]
+NoCache = Annotated[
+    bool,
+    typer.Option(
+        "--no-cache",
+        callback=_kept,
+        help="Learn anew, and keep nothing (what is learned is kept in .rtid beside the trace).",
+    ),
+]

@@ -9,7 +9,8 @@ from typing import Annotated
 import typer
 
 from rtid.cli.exits import Exit, refuse_truncated
-from rtid.cli.options import AsJson
+from rtid.cli.options import AsJson, UnitsOption
+from rtid.units import System
 
 
 def quick(
@@ -29,6 +30,7 @@ def quick(
         typer.Option("--dead-volume", min=1e-4, help="Volume left at either end, hoses too, L."),
     ] = None,
     as_json: AsJson = False,
+    units: UnitsOption = System.DISPLAY,
 ) -> None:
     """Say within a minute whether this data is good enough, and which effect is missing.
 
@@ -37,10 +39,10 @@ def quick(
     for a role that is needed; 4: it is read, and too little for a verdict.
     """
     from rtid.errors import RtidError
-    from rtid.present import progress_bar
-    from rtid.quick import quick as look
-    from rtid.quick_machine import Given
-    from rtid.quick_text import lines
+    from rtid.study.quick import quick as look
+    from rtid.study.quick_machine import Given
+    from rtid.tell.quick import lines
+    from rtid.tell.replay import progress_bar
 
     if bore_mm is not None and rod_mm is not None and rod_mm >= bore_mm:
         raise RtidError("--rod is not thinner than --bore", "give diameters in mm", Exit.USAGE)
@@ -49,12 +51,12 @@ def quick(
         for value in (bore_mm, rod_mm, stroke_mm, dead_volume_l)
     )
     given = Given(bore_m, rod_m, stroke_m, dead_volume_m3)
-    with progress_bar(hidden=as_json) as progress:
-        found = look(file, dbc, given, progress)
+    with progress_bar() as progress:
+        looked = look(file, dbc, given, progress)
     if as_json:
-        print(json.dumps(found.as_json()))
+        print(json.dumps(looked.as_json()))
     else:
-        print("\n".join(lines(found)))
-    refuse_truncated(file, {"truncated": int(found.truncated)})
-    if not found.is_enough:
+        print("\n".join(lines(looked)))
+    refuse_truncated(file, {"truncated": int(looked.truncated)})
+    if not looked.is_enough:
         raise typer.Exit(Exit.NEGATIVE)

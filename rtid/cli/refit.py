@@ -28,24 +28,25 @@ def refit(
     """Fit parameters and initial states of a plant so that its free run follows the record.
 
     For plants with a state that nobody measures, and for nonlinear parameters.  The validation part
-    is never used to fit or to choose.
+    is never used to fit or to choose: it may only refute an effect that does not help there.  The
+    free run begins anew behind each gap of the record.
     """
-    from rtid.compared_text import make_console
-    from rtid.plantfile import load_plant
-    from rtid.present import progress_bar
-    from rtid.refitted import as_json as to_json
-    from rtid.refitted import tell
-    from rtid.refitting import load_records, run
+    from rtid.project.plant_file import load_plant
+    from rtid.study.refit import load_records, run
+    from rtid.tell.refit import as_json as to_json
+    from rtid.tell.refit import tell
+    from rtid.tell.replay import progress_bar
+    from rtid.tell.terminal import make_console
 
     keys = tuple(_key(text) for text in add or ())
     file = load_plant(plant)
     records = load_records(file, table)
-    with progress_bar(hidden=as_json) as progress:
-        found = run(file, records, keys, with_diagnosis=diagnose, progress=progress)
+    with progress_bar() as progress:
+        refitted = run(file, records, keys, with_diagnosis=diagnose, progress=progress)
     if as_json:
-        print(json.dumps(to_json(found)))
+        print(json.dumps(to_json(refitted)))
     else:
-        tell(make_console(), found)
+        tell(make_console(), refitted)
 
 
 def _key(text: str) -> tuple[str, str]:

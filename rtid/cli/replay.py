@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rtid.cli.exits import refuse_truncated
-from rtid.cli.options import AsJson, PriorOption, ProjectOption
+from rtid.cli.exits import Exit, refuse_truncated
+from rtid.cli.options import AsJson, NoCache, PriorOption, ProjectOption, UnitsOption
+from rtid.units import System
+
+if TYPE_CHECKING:
+    from rtid.tell.replay import LearnedStory
 
 
 def replay(
@@ -40,37 +44,53 @@ def replay(
     ] = None,
     picture_format: Annotated[str, typer.Option(help="png or svg.")] = "png",
     as_json: AsJson = False,
+    units: UnitsOption = System.DISPLAY,
+    no_cache: NoCache = False,
 ) -> None:
     """Learn flow maps and bulk modulus from a captured trace.
 
     Prints what the trace holds, what the gates refused, the bulk modulus with its interval and the
     maps; the same frames give the same snapshot, bit for bit, from the file or from a bus.  Effects
-    that `rtid add` has added are in the model: the maps are learned beside them.
+    that `rtid add` has added are in the model: the maps are learned beside them.  Exit code 4: what
+    was learned is impossible, and is said to be invalid.
     """
-    from rtid.beside import as_json as added_json
-    from rtid.beside import replay_beside, sentences
-    from rtid.comparing import compare_trace, find_reference
-    from rtid.present import Story, progress_bar
-    from rtid.priors import find_prior, said_of, with_prior
+    from rtid.maps.prior_map import find_prior, said_of, with_prior
     from rtid.project import load
-    from rtid.store import save
+    from rtid.study.compared import compare_trace, find_reference
+    from rtid.study.known_effects import as_json as added_json
+    from rtid.study.study import Study
+    from rtid.tell.replay import LearnedStory, progress_bar
+    from rtid.trace.snapshot import save
 
     loaded = with_prior(load(project), prior_map)
     prior = find_prior(loaded)  # refused before the work, not after it
-    with progress_bar(hidden=as_json) as progress:
+    with progress_bar() as progress:
         pace = (speed or float("inf")) if bus else None
-        result = replay_beside(loaded, trace, progress, bus_speed=pace)
+        result = Study(loaded, trace, progress, pace).replay
     if snapshot is not None:
         save(snapshot, result.live, loaded.digest)
-    story = Story(compare_trace(result, find_reference(loaded, reference)))
-    written = story.draw(pictures, picture_format) if pictures else []
+    learned = LearnedStory(compare_trace(result, find_reference(loaded, reference)))
+    written = learned.draw(pictures, picture_format) if pictures else []
     if as_json:
         more = {"added": added_json(result.added), "pictures": [str(p) for p in written]}
-        print(json.dumps(story.as_json() | more))
+        print(json.dumps(learned.as_json() | more))
     else:
-        for sentence in sentences(result.added):
-            print(sentence)
-        story.print(snapshot, written)
+        _show(learned, [*([snapshot] if snapshot else []), *written])
         if prior is not None:
-            print(said_of(prior, story.compared.flowmap))
+            print(said_of(prior, learned.compared.flowmap))
     refuse_truncated(trace, result.trace.counters)
+    if any(doubt.is_invalid for doubt in learned.doubts):
+        raise typer.Exit(Exit.NEGATIVE)
+
+
+def _show(learned: LearnedStory, written: list[Path]) -> None:
+    """What was learned, and the files that hold it."""
+    from rtid.tell.added import sentences
+    from rtid.tell.terminal import make_console
+
+    for sentence in sentences(learned.result.added):
+        print(sentence)
+    console = make_console()
+    console.print(learned.story)
+    for path in written:
+        console.print(f"wrote {path}", soft_wrap=True)

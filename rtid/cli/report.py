@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from rtid.cli.exits import refuse_truncated, refuse_without_bokeh
-from rtid.cli.options import AsJson, ProjectOption
+from rtid.cli.options import AsJson, NoCache, ProjectOption
 
 
 def report(
@@ -22,24 +22,25 @@ def report(
         Path | None, typer.Option(help="Also write the pictures as PNG files into this folder.")
     ] = None,
     as_json: AsJson = False,
+    no_cache: NoCache = False,
 ) -> None:
     """Write one HTML file that tells what the model misses: verdict, errors, pictures, tables.
 
     Everything is inside the file: it can be mailed, printed and read with the network off.
     """
     refuse_without_bokeh()
-    from rtid.diagnosed_text import sentences
-    from rtid.present import progress_bar
     from rtid.project import load
-    from rtid.reporting import report as write_report
+    from rtid.tell.diagnosed import sentences, with_convention
+    from rtid.tell.replay import progress_bar
+    from rtid.tell.report_file import report as write_report
 
     loaded = load(project)
-    with progress_bar(hidden=as_json) as progress:
+    with progress_bar() as progress:
         written = write_report(loaded, trace, output, progress, png)
     if as_json:
         print(json.dumps(written.as_json()))
     else:
-        for sentence in sentences(written.told.diagnosed.diagnosis):
+        for sentence in with_convention(sentences(written.told.diagnosed.diagnosis)):
             print(sentence)
         print(f"wrote {output}, {written.size / 1e3:.0f} kB")
         for path in written.pictures:

@@ -57,29 +57,31 @@ def run(
     It sends nothing, but for its status where the project file says publish.status = true.
 
     One line of statistics each second on a terminal, each minute in a log; `rtid status` tells more
-    from another shell.  SIGTERM and Ctrl-C end it in good order, with what was learned stored.
+    from another shell.  SIGTERM, SIGHUP and Ctrl-C end it in good order, with what was
+    learned stored; exit code 4 where that is not on the disk.
     """
     from rtid.daemon import log
-    from rtid.daemon.configure import configured, state_folder
     from rtid.daemon.daemon import Bus, Daemon, stopped_by_signals
     from rtid.project import load
+    from rtid.project.folder import configured, state_folder
 
     log.set_up()
     loaded = configured(load(project), rate_hz)
+    _note_untrusted(loaded)
     _refuse_unfit_prior(loaded)
     source = loaded.sections.source
     wanted = bus or f"{source.interface or ''}:{source.channel or ''}"
     interface, _, channel = wanted.partition(":")
     _refuse_untrusted(interface, project, test_bus)
     folder = state or state_folder(loaded)
-    if fresh:
-        _set_aside(folder)
     chosen = Bus(interface, channel, _opener(loaded, interface, channel))
-    daemon = Daemon(loaded, chosen, folder, 1.0 if sys.stderr.isatty() else LOG_SERVICE_S)
+    daemon = Daemon(loaded, chosen, folder, 1.0 if sys.stderr.isatty() else LOG_SERVICE_S, fresh)
     with _served(project, folder) if page else nullcontext(), stopped_by_signals(daemon):
         last = daemon.run(for_s)
     if as_json:
         print(last.to_json())
+    if not daemon.is_saved:
+        raise typer.Exit(Exit.NEGATIVE)
 
 
 @contextmanager
@@ -94,10 +96,20 @@ def _served(project: Path, state: Path) -> Iterator[None]:
         served.wait()
 
 
+def _note_untrusted(loaded: Project) -> None:
+    """It learns without: the effects in Python are candidates of the diagnosis alone."""
+    from rtid.daemon.log import logger
+    from rtid.project.trust import NotTrustedError
+
+    if loaded.untrusted is not None:
+        error = NotTrustedError(loaded.path, loaded.untrusted)
+        logger.warning("%s: the diagnosis does without its effects (%s)", error, error.remedy)
+
+
 def _refuse_unfit_prior(loaded: Project) -> None:
     """Here, not in the log: the helper that publishes would have nobody to tell."""
     if loaded.sections.prior is not None:
-        from rtid.priors import find_prior
+        from rtid.maps.prior_map import find_prior
 
         find_prior(loaded)
 
@@ -120,22 +132,21 @@ def _refuse_untrusted(interface: str, project: Path, test_bus: bool) -> None:
 def _opener(loaded: Project, interface: str, channel: str) -> Callable[[], Source]:
     """How to open the bus, listening only, with the frames of the project alone."""
     from firmware_bridge.catalog import load as load_catalog
+    from firmware_bridge.j1939 import Network
     from firmware_bridge.sources.live_bus import open_live
 
     assert loaded.dbc is not None
     catalog = load_catalog(loaded.dbc)
-    can_ids = [catalog.can_id(message.name) for message in loaded.assembly.messages]
+    messages = loaded.assembly.messages
+    can_ids = [catalog.can_id(message.name) for message in messages]
+    takes_all = interface in ("serial", "slcan") or Network(catalog, messages).is_needed
     bitrate = loaded.sections.source.bitrate
+    fd = {"fd": True} if loaded.sections.source.fd else {}
     return lambda: open_live(
         interface,
         channel or None,
         bitrate=bitrate if interface not in (*TEST_BUSES, "serial", "socketcan") else None,
-        can_ids=None if interface in ("serial", "slcan") else can_ids,
+        can_ids=None if takes_all else can_ids,
         reopen_s=math.inf,
+        **fd,
     )
-
-
-def _set_aside(folder: Path) -> None:
-    """Keep what the folder holds under another name."""
-    for path in folder.glob("state-[01].npz"):
-        path.replace(path.with_suffix(".before.npz"))

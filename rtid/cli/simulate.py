@@ -15,40 +15,47 @@ from rtid.cli.exits import Exit
 from rtid.cli.options import AsJson
 from rtid.errors import RtidError
 from rtid.sim.bus import open_test_bus, run_frames
+from rtid.sim.demand import MOTIONS
 from rtid.sim.hidden import hide_wish, known
-from rtid.sim.log import START_US, SUFFIXES
-from rtid.sim.motion import MOTIONS
 from rtid.sim.other_plants import write_example
-from rtid.sim.plant import Plant
 from rtid.sim.random_plants import draw
 from rtid.sim.recording import TABLE_SUFFIX, write_run
-from rtid.sim.run import Change, Run
+from rtid.sim.run import PlantChange, Run
 from rtid.sim.run import simulate as run_machine
+from rtid.sim.run_files import START_US, SUFFIXES
+from rtid.sim.simulated_plant import SimulatedPlant
 
 PROGRAMMABLE = "programmable_valve"
 
 
+TraceFile = Annotated[
+    Path | None, typer.Argument(help="File to write: .blf, .log (candump), .asc or .parquet.")
+]
+Number = Annotated[
+    int | None, typer.Option(help="Number of a random machine; the default one without it.")
+]
+CrossPort = Annotated[
+    bool, typer.Option("--cross-port", help="A fifth valve A<->B (random machines).")
+]
+Hide = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Physics to hide: EFFECT[:WHERE][=STRENGTH], STRENGTH weak, middle, strong or a "
+        "number in SI units; repeatable.  An unknown EFFECT lists all."
+    ),
+]
+HideAt = Annotated[
+    float | None,
+    typer.Option("--hide-at", min=0.0, help="Seconds into the run at which that begins."),
+]
+
+
 def simulate(
-    trace: Annotated[
-        Path | None, typer.Argument(help="File to write: .blf, .log (candump), .asc or .parquet.")
-    ] = None,
-    plant: Annotated[
-        int | None, typer.Option(help="Number of a random machine; the default one without it.")
-    ] = None,
-    cross_port: Annotated[
-        bool, typer.Option("--cross-port", help="A fifth valve A<->B (random machines).")
-    ] = False,
-    hide: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Physics to hide: EFFECT[:WHERE][=STRENGTH], STRENGTH weak, middle, strong or a "
-            "number in SI units; repeatable.  An unknown EFFECT lists all."
-        ),
-    ] = None,
-    hide_at_s: Annotated[
-        float | None,
-        typer.Option("--hide-at", min=0.0, help="Seconds into the run at which that begins."),
-    ] = None,
+    trace: TraceFile = None,
+    plant: Number = None,
+    cross_port: CrossPort = False,
+    hide: Hide = None,
+    hide_at_s: HideAt = None,
     motion: Annotated[str, typer.Option(help=" | ".join(MOTIONS))] = "sweep",
     duration_s: Annotated[
         float | None, typer.Option("--duration", min=0.01, help="Seconds; 80, a record 110.")
@@ -90,11 +97,16 @@ def simulate(
         return
     _check_arguments(trace, bus, motion, plant, cross_port)
     _check_hidden(hide, hide_at_s)
-    healthy = Plant() if plant is None else draw(plant, cross_port=cross_port)
+    from rtid.tell.replay import progress_bar
+
+    healthy = SimulatedPlant() if plant is None else draw(plant, cross_port=cross_port)
     machine = reduce(hide_wish, hide or (), healthy)
-    later = None if hide_at_s is None else Change(hide_at_s, machine)
-    run = run_machine(healthy if later else machine, motion, seed, duration_s, change=later)
-    written = write_run(trace, run, seed, motion) if trace else []
+    later = None if hide_at_s is None else PlantChange(hide_at_s, machine)
+    with progress_bar() as progress:
+        progress("simulating the machine", 0.0)
+        run = run_machine(healthy if later else machine, motion, seed, duration_s, change=later)
+        progress("writing the trace", 0.7)
+        written = write_run(trace, run, seed, motion) if trace else []
     sent = _send(run, bus, channel, speed or AS_FAST_AS_POSSIBLE) if bus else 0
     if as_json:
         print(json.dumps(_plain(machine, run) | _files(written) | {"frames_sent": sent}))
@@ -102,7 +114,7 @@ def simulate(
         _tell(machine, run, written, f"sent {sent} frames on {bus} {channel}" if sent else "")
 
 
-def _plain(machine: Plant, run: Run) -> dict[str, Any]:
+def _plain(machine: SimulatedPlant, run: Run) -> dict[str, Any]:
     hidden = [planted._asdict() for planted in machine.hidden]
     return {"samples": len(run.samples), "beta_pa": machine.beta_pa, "hidden": hidden}
 
@@ -111,7 +123,7 @@ def _files(written: list[Path]) -> dict[str, Any]:
     return {"files": [str(path) for path in written]}
 
 
-def _tell(machine: Plant, run: Run, written: list[Path], sent: str) -> None:
+def _tell(machine: SimulatedPlant, run: Run, written: list[Path], sent: str) -> None:
     print(f"{len(run.samples)} samples, bulk modulus {machine.beta_pa / 1e6:.0f} MPa")
     for name, where, strength in machine.hidden:
         place = f" at {where}" if where else ""
@@ -129,14 +141,20 @@ def _example(
         raise _usage("--example: nothing to write to", "name a .csv file")
     if hide not in (None, ["none"]):
         raise _usage("--example has one effect of its own", "--hide none leaves it out")
-    found, written = write_example(name, table, seed, hide is None)
+    recorded, written = write_example(name, table, seed, hide is None)
     hidden = (
-        [{"effect": found.hidden, "size": found.size, "unit": found.unit}] if found.size else []
+        [{"effect": recorded.hidden, "size": recorded.size, "unit": recorded.unit}]
+        if recorded.size
+        else []
     )
     if as_json:
         print(json.dumps({"hidden": hidden} | _files(written)))
         return
-    print(f"hidden: {found.hidden}, {found.size:.3g} {found.unit}" if hidden else "hidden: nothing")
+    print(
+        f"hidden: {recorded.hidden}, {recorded.size:.3g} {recorded.unit}"
+        if hidden
+        else "hidden: nothing"
+    )
     for path in written:
         print(f"wrote {path}")
 
@@ -145,7 +163,7 @@ def _programmable(trace: Path | None, number: int, hide: list[str] | None, as_js
     """The boom with this number follows the paper's sweep, each valve by a command of its own."""
     if trace is None or trace.suffix not in SUFFIXES or not trace.parent.is_dir():
         raise _usage(f"{trace}: cannot be written", f"name a log: {', '.join(SUFFIXES)}")
-    from rtid.paper.commissioning import five_valves, record_sweep
+    from rtid.sim.programmable import five_valves, record_sweep
 
     written = record_sweep(trace, reduce(hide_wish, hide or (), five_valves(number)), number)
     if as_json:
@@ -189,7 +207,7 @@ def _send(run: Run, interface: str, channel: str, speed: float) -> int:
     from firmware_bridge.frames import to_messages
 
     frames = run_frames(run, start_us=START_US)
-    console = Console(stderr=True)
+    console = Console(stderr=True, markup=False, emoji=False)
     messages = track(
         to_messages(frames),
         "sending",

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rtid.cli.exits import Exit
-from rtid.cli.options import Where
+from rtid.cli.options import UnitsOption, Where
+from rtid.units import CONVENTION, System, scale_of
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from rtid.daemon.status import Status
+    from rtid.tell.story import Table
 
 
 def status(
@@ -22,42 +22,46 @@ def status(
     metrics: Annotated[
         bool, typer.Option("--metrics", help="Print it as Prometheus metrics.")
     ] = False,
+    units: UnitsOption = System.DISPLAY,
 ) -> None:
     """Tell how the daemon is: bus, signals, loop, maps, storage, alarms, verdict, coach.
 
     Exit code 4 if it does not run, or an alarm is on.
     """
-    from rtid.daemon.configure import state_of
+    from rtid.apply.offer import as_text
     from rtid.daemon.metrics import exposition
     from rtid.daemon.status import OLD_S, read
-    from rtid.offered import as_text
+    from rtid.project.folder import state_of
 
     folder = state_of(where)
-    found = read(folder)
-    age_s = time.time() - found.now_unix_s
-    on = [alarm for alarm in found.alarms if alarm.until_unix_s is None]
+    daemon_status = read(folder)
+    age_s = time.time() - daemon_status.now_unix_s
+    on = [alarm for alarm in daemon_status.alarms if alarm.until_unix_s is None]
     if as_json:
-        print(found.to_json())
+        print(daemon_status.to_json())
     elif metrics:
-        print(exposition(found, age_s), end="")
+        print(exposition(daemon_status, age_s), end="")
     else:
-        _show(found, age_s)
+        _show(daemon_status, age_s)
         if text := as_text(folder):
             print(f"offered `rtid apply`: {text}")
     if on or age_s > OLD_S:
         raise typer.Exit(Exit.NEGATIVE)
 
 
-def _show(found: Status, age_s: float) -> None:
-    from rich.console import Console
-
+def _show(daemon_status: Status, age_s: float) -> None:
     from rtid.daemon.status import OLD_S
+    from rtid.tell.terminal import make_console
 
-    console = Console(highlight=False, soft_wrap=True)
-    up_s = found.now_unix_s - found.started_unix_s
+    console = make_console()
+    console.soft_wrap = True
+    up_s = daemon_status.now_unix_s - daemon_status.started_unix_s
     alive = f"up {up_s:.0f} s" if age_s <= OLD_S else f"NOT RUNNING: last heard {age_s:.0f} s ago"
-    console.print(f"{found.name}: {alive}, process {found.pid}, {found.rss_anon_mb:.0f} MB")
-    bus, loop, store = found.bus, found.loop, found.store
+    console.print(
+        f"{daemon_status.name}: {alive}, process {daemon_status.pid}, "
+        f"{daemon_status.rss_anon_mb:.0f} MB"
+    )
+    bus, loop, store = daemon_status.bus, daemon_status.loop, daemon_status.store
     console.print(
         f"bus     {bus.interface} {bus.channel}: {bus.state}, {bus.frames} frames, "
         f"{bus.frames_per_s:.0f}/s, opened again {bus.reopened} times"
@@ -68,54 +72,72 @@ def _show(found: Status, age_s: float) -> None:
         f"{loop.lateness.p50_us:.0f}/{loop.lateness.p99_us:.0f}/{loop.lateness.max_us:.0f} us, "
         f"{loop.overruns} overruns in {loop.ticks} ticks {loop.causes or ''}"
     )
-    console.print(f"maps    {_maps(found)}")
+    maps = _maps(daemon_status)
+    console.print(f"maps    {maps}")
+    if "±" in maps:
+        console.print(f"        {CONVENTION}")
     saved = "never" if store.age_s is None else f"{store.age_s:.0f} s ago"
     console.print(f"state   {store.state}, last {saved}, began {store.restored}. {store.reason}")
-    _tables(console, found)
-    if found.verdict is not None:
-        console.print(f"verdict {found.verdict.verdict}: {found.verdict.text}")
-    if found.advice is not None:
-        console.print(f"coach   {found.advice.text}")
-    for alarm in found.alarms:
+    console.print(_messages(daemon_status), soft_wrap=False)
+    console.print(_signals(daemon_status), soft_wrap=False)
+    if daemon_status.verdict is not None:
+        console.print(f"verdict {daemon_status.verdict.verdict}: {daemon_status.verdict.text}")
+    if daemon_status.advice is not None:
+        console.print(f"coach   {daemon_status.advice.text}")
+    for alarm in daemon_status.alarms:
         over = "" if alarm.until_unix_s is None else " (over)"
         console.print(f"ALARM   {alarm.name}{over}: {alarm.text} {alarm.trace}")
 
 
-def _maps(found: Status) -> str:
-    estimate = found.estimate
+def _maps(daemon_status: Status) -> str:
+    estimate = daemon_status.estimate
     blocks = {
         name: sum(edge.blocks.get(name, 0) for edge in estimate.edges)
         for edge in estimate.edges
         for name in edge.blocks
     }
+    pressure = scale_of("Pa")
     beta = ", ".join(
-        f"{c.name} {c.beta_pa / 1e6:.1f} +- {(c.beta_sd_pa or 0.0) / 1e6:.1f} MPa"
+        f"{c.name} {pressure.known(c.beta_pa, c.beta_sd_pa or 0.0, 1)} {pressure.name}"
         for c in estimate.chambers
         if c.beta_pa is not None
     )
     age = "-" if estimate.age_s is None else f"{1e3 * estimate.age_s:.0f} ms"
     stale = " STALE" if estimate.stale else ""
-    told = ", ".join(f"{n} {name}" for name, n in sorted(blocks.items())) or "none yet"
+    text = ", ".join(f"{n} {name}" for name, n in sorted(blocks.items())) or "none yet"
     return (
         f"{estimate.state} {estimate.reason}, {estimate.samples} samples, newest {age} old{stale}; "
-        f"blocks {told}; beta {beta or 'unknown'}"
+        f"blocks {text}; beta {beta or 'unknown'}"
     )
 
 
-def _tables(console: Console, found: Status) -> None:
-    from rich.table import Table
+def _messages(daemon_status: Status) -> Table:
+    from rtid.tell.story import Table
 
-    table = Table("message", "Hz", "of", "age ms", "gap ms", "", "refused", box=None)
-    for m in found.messages:
-        age = "-" if m.age_s is None else f"{1e3 * m.age_s:.0f}"
-        refused = " ".join(f"{name}={n}" for name, n in m.refused.items())
-        table.add_row(
-            m.name, f"{m.rate_hz:.0f}", f"{m.nominal_hz:.0f}", age, f"{1e3 * m.gap_s:.0f}",
-            m.verdict, refused,
-        )  # fmt: skip
-    console.print(table)
-    table = Table("signal", "value", "least", "largest", "unit", "", box=None)
-    for s in found.signals:
-        numbers = ("-" if v is None else f"{v:.6g}" for v in (s.value, s.minimum, s.maximum))
-        table.add_row(s.name, *numbers, s.unit, s.verdict)
-    console.print(table)
+    time = scale_of("s")
+    rows = [
+        (
+            m.name,
+            f"{m.rate_hz:.0f}",
+            f"{m.nominal_hz:.0f}",
+            "-" if m.age_s is None else time.number(m.age_s, 0),
+            time.number(m.gap_s, 0),
+            m.verdict,
+            " ".join(f"{name}={n}" for name, n in m.refused.items()),
+        )
+        for m in daemon_status.messages
+    ]
+    heads = ("message", "Hz|", "of|", f"age {time.name}|", f"gap {time.name}|", "", "refused~")
+    return Table("", heads, rows)
+
+
+def _signals(daemon_status: Status) -> Table:
+    from rtid.tell.story import Table
+
+    rows = []
+    for s in daemon_status.signals:
+        scale = scale_of(s.unit)
+        three = (s.value, s.minimum, s.maximum)
+        value, least, most = ("-" if v is None else f"{scale.factor * v:.6g}" for v in three)
+        rows.append((s.name, value, least, most, scale.name, s.verdict))
+    return Table("", ("signal", "value|", "least|", "largest|", "unit", ""), rows)

@@ -8,8 +8,8 @@ PANELS = {
         *("replay", "compare", "diagnose", "add", "drop", "undo", "history"),
         *("ui", "report", "effects", "excite", "refit"),
     ),
-    "On the machine": ("run", "status", "accept", "apply"),
-    "Take it along": ("export", "mcu", "fleet", "paper"),
+    "On the machine": ("run", "status", "accept", "restore", "apply"),
+    "Take it along": ("export", "mcu", "fleet", "trust"),
 }
 
 EXAMPLES = {
@@ -33,11 +33,12 @@ EXAMPLES = {
     "run": "rtid run machine.toml --bus socketcan:can0",
     "status": "rtid status machine.toml",
     "accept": "rtid accept machine.toml --reason 'new piston seal'",
+    "restore": "rtid restore -p machine.toml 17953830",
     "apply": "rtid apply machine.toml --dry-run",
     "export": "rtid export run.blf maps.csv -p machine.toml",
     "mcu": "rtid mcu c -p machine.toml --chamber a --blocks 64",
+    "trust": "rtid trust machine.toml",
     "fleet": "rtid fleet traces -o results -p machine.toml",
-    "paper": "rtid paper --only fig3,table1",
 }
 GUIDE = "Where to begin, by task: docs/guide.md in the repository."
 

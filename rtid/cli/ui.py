@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import typer
@@ -17,9 +18,7 @@ def ui(
         Path | None, typer.Argument(help="CAN log or table; without it, the live page alone.")
     ] = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="0: any that is free.")] = 5006,
-    host: Annotated[
-        str, typer.Option(help="Address to serve on; beyond 127.0.0.1 it takes a token.")
-    ] = "127.0.0.1",
+    host: Annotated[str, typer.Option(help="Address to serve on.")] = "127.0.0.1",
     state: Annotated[
         Path | None,
         typer.Option(help="State folder of a running daemon, for the live page; else the file's."),
@@ -34,15 +33,16 @@ def ui(
 ) -> None:
     """Compare a record with its model in the browser: where it fails, why, and add what is missing.
 
-    The page is served to this machine alone and loads nothing from anywhere else.  From another
-    machine: ssh -L 5006:127.0.0.1:5006 DEVICE.
+    The page is served to this machine alone, to whoever has the printed address with its token,
+    and loads nothing from anywhere else.  Of several browsers one works, the others follow.  From
+    another machine: ssh -L 5006:127.0.0.1:5006 DEVICE.  Ctrl-C, SIGTERM and SIGHUP end it.
     """
     for path in (project, trace):
         if path is not None and not path.exists():
             raise RtidError(f"{path}: no such file", "rtid ui PROJECT [TRACE]")
     refuse_without_bokeh()
-    from rtid.daemon.configure import state_folder
     from rtid.project import load
+    from rtid.project.folder import state_folder
     from rtid.ui.server import Workbench, serve
 
     folder = state or state_folder(load(project))
@@ -50,14 +50,26 @@ def ui(
     def ready(bench: Workbench) -> None:
         print(f"{bench.url}  (Ctrl-C ends it)", flush=True)
         if open_page:
-            typer.launch(bench.url)
+            typer.launch(_doorstep(bench.url, Path(scrap)).as_uri())
 
-    serve(
-        ready,
-        project=project,
-        trace=trace,
-        state=folder,
-        host=host,
-        port=port,
-        sheet=sheet,
-    )
+    with TemporaryDirectory(prefix="rtid-ui-") as scrap:
+        serve(
+            ready,
+            project=project,
+            trace=trace,
+            state=folder,
+            host=host,
+            port=port,
+            sheet=sheet,
+        )
+
+
+def _doorstep(url: str, folder: Path) -> Path:
+    """A file of the user's own that leads to the page.
+
+    The arguments of a browser that is started with the address can be read by everybody.
+    """
+    path = folder / "open.html"
+    path.write_text(f'<!DOCTYPE html><meta http-equiv="refresh" content="0;url={url}">', "utf-8")
+    path.chmod(0o600)
+    return path

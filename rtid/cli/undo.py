@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import json
 
-from rtid.cli.options import AsJson, ProjectOption
+from rtid.cli.options import AsJson, ProjectOption, UnitsOption
+from rtid.units import System
 
 
 def undo(
     project: ProjectOption,
     as_json: AsJson = False,
+    units: UnitsOption = System.DISPLAY,
 ) -> None:
     """Restore the project file as it was before the last change, byte for byte; repeatable."""
-    from rtid.revised_text import as_json as plain
-    from rtid.revised_text import show
-    from rtid.revising import undo as undo_change
+    from rtid.study.revisions import undo as undo_change
+    from rtid.tell.revised import as_json as plain
+    from rtid.tell.revised import show
 
     done = undo_change(project)
     if as_json:

@@ -1,12 +1,11 @@
 """See where a model agrees with the measurement and where it does not; arrays in, arrays out."""
 
-from rtid.compare.candidate import Candidate, learned
+from rtid.compare.candidate import CandidateMap, learned
 from rtid.compare.comparison import Comparison, Intervals, compare, refitted
 from rtid.compare.correlation import Correlation, correlations
 from rtid.compare.cusum import Cusum, cusums, recursive_residuals
 from rtid.compare.dependence import Dependence, against_signals, by_direction, over_time
 from rtid.compare.examination import Examination, examine
-from rtid.compare.extra import ExtraFlowError, with_extra_flow
 from rtid.compare.motion import smooth_position
 from rtid.compare.places import NoSuchBlockError, Visit, blocks_in_span, spans_of_block
 from rtid.compare.reference import LearnedReference, Reference, ReferenceMap
@@ -19,6 +18,7 @@ from rtid.compare.tables import (
     block_rows,
     deviations,
 )
+from rtid.effects.extra import ExtraFlowError, with_extra_flow
 
 __all__ = [
     "FREE_RUN",
@@ -26,7 +26,7 @@ __all__ = [
     "PAPER_DP_PA",
     "PAPER_U_V",
     "BlockRow",
-    "Candidate",
+    "CandidateMap",
     "Comparison",
     "Correlation",
     "Cusum",

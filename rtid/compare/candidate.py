@@ -12,11 +12,12 @@ from rtid.estimator.record import RecordFit
 from rtid.estimator.solution import Solution
 from rtid.estimator.state import Weights
 from rtid.kernels.layout import TERMS
-from rtid.model import TAYLOR, FloatArray
+from rtid.model import TAYLOR
+from rtid.plain import FloatArray
 
 
 @dataclass(frozen=True)
-class Candidate:
+class CandidateMap:
     """A map with its compressibility: theta (cells, 6) in m3/s, compliance (chambers,) in 1/Pa.
 
     status (cells,) holds the words of `rtid.estimator.flowmap`; weights gives lag and noise slopes.
@@ -34,13 +35,13 @@ class Candidate:
     fitted: FloatArray | None = None
 
 
-def learned(fit: RecordFit, flowmap: FlowMap, name: str = "learned") -> Candidate:
+def learned(fit: RecordFit, flowmap: FlowMap, name: str = "learned") -> CandidateMap:
     """The published map with the compliance and lag of the fit."""
     status = np.concatenate([edge.status.ravel() for edge in flowmap.edges])
     compliance = fit.solution.compliance
     terms, theta = fit.solution.terms_theta, flowmap.theta_cells()
-    own = _fitted(fit.solution)
-    return Candidate(name, theta, compliance, status, fit.weights, terms, own)
+    fitted = _fitted(fit.solution)
+    return CandidateMap(name, theta, compliance, status, fit.weights, terms, fitted)
 
 
 def _fitted(solution: Solution) -> FloatArray | None:
@@ -54,7 +55,7 @@ def _fitted(solution: Solution) -> FloatArray | None:
     return theta
 
 
-def itself(candidate: Candidate) -> Candidate:
+def itself(candidate: CandidateMap) -> CandidateMap:
     """The candidate with the fit's own terms in all blocks that it has visited."""
     if candidate.fitted is None:
         return candidate

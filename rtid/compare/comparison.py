@@ -13,14 +13,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rtid.compare.candidate import Candidate, itself
-from rtid.compare.extra import with_extra_flow
+from rtid.compare.candidate import CandidateMap, itself
 from rtid.compare.reference import Reference
+from rtid.effects.extra import with_extra_flow
 from rtid.estimator.flowmap import EXTRAPOLATED, LEARNING, PRIOR, SHUT, VALID
 from rtid.estimator.state import Weights, build
 from rtid.kernels.engine import GAP_FLAG
 from rtid.kernels.explain import explain, filter_rows
-from rtid.model import FloatArray, Model
+from rtid.model import Machine
+from rtid.plain import FloatArray, IntArray
 
 REFERENCE, OUTSIDE = "reference", "outside"
 # The status of an interval is that of its least certain open edge: the last of this list.
@@ -39,7 +40,7 @@ class Intervals:
     """
 
     t_s: FloatArray
-    cell: NDArray[np.int64]
+    cell: IntArray
     innovation: FloatArray
     own: FloatArray
     values: FloatArray
@@ -60,7 +61,7 @@ class Comparison:
     t_s: FloatArray
     measured_m3s: FloatArray
     modelled_m3s: FloatArray
-    cell: NDArray[np.int64]
+    cell: IntArray
     shares: dict[str, float]
     rho: FloatArray
     signals: FloatArray
@@ -83,41 +84,42 @@ class Comparison:
 
     @property
     def residual_share(self) -> FloatArray:
-        """Residual over flow, root mean squares (c,); NaN for a part without rows."""
+        """The residual's share of the flow, root mean squares (chambers,); NaN without rows."""
         return self.residual_rms_m3s / self.flow_rms_m3s
 
 
 def refitted(
-    model: Model,
+    model: Machine,
     reference: Reference,
     weights: Weights,
     chunk: FloatArray,
     terms: FloatArray | None = None,
-) -> Candidate:
+) -> CandidateMap:
     """A reference map with each chamber's compliance fitted to the chunk, all else as it is.
 
-    terms: coefficients of the model's shared terms; none of them where not given.
+    chunk (n, 2 + signals): SI; terms (terms,): coefficients of the model's shared terms, SI, zero
+    where not given.
     """
     theta, none = reference.theta_cells(model), np.zeros(len(model.terms))
     beside = none if terms is None else terms
-    one = np.ones(len(model.chambers))
+    ones = np.ones(len(model.chambers))
     unknown = np.full(len(theta), REFERENCE)
-    parts = Candidate(reference.name, theta, 0.0 * one, unknown, weights, beside)
+    parts = CandidateMap(reference.name, theta, 0.0 * ones, unknown, weights, beside)
     by_map = _rows(model, _hold(model, parts, chunk))
-    parts = replace(parts, theta=np.zeros_like(theta), compliance=one, terms=none)
+    parts = replace(parts, theta=np.zeros_like(theta), compliance=ones, terms=none)
     by_beta = _rows(model, _hold(model, parts, chunk))
     at = np.intersect1d(by_map.t_s, by_beta.t_s, return_indices=True)
     y = (by_map.measured - by_map.modelled)[at[1]]
     column = by_beta.modelled[at[2]]
     compliance = (column * y).sum(axis=0) / np.maximum((column**2).sum(axis=0), 1e-300)
     low, high = 1 / model.beta_bounds_pa[1], 1 / model.beta_bounds_pa[0]
-    found = np.clip(compliance, low, high)
-    return Candidate(reference.name, theta, found, unknown, weights, beside)
+    bounded = np.clip(compliance, low, high)
+    return CandidateMap(reference.name, theta, bounded, unknown, weights, beside)
 
 
 def compare(
-    model: Model,
-    candidate: Candidate,
+    model: Machine,
+    candidate: CandidateMap,
     chunk: FloatArray,
     extra_flow: FloatArray | None = None,
     seen: bool = False,
@@ -127,27 +129,27 @@ def compare(
     extra_flow (n - 1, chambers) m3/s is added to the modelled side.  seen: the candidate was fitted
     to these samples, so that its own terms hold in every block, else in the valid ones alone.
     """
-    held = _hold(model, candidate, chunk, extra_flow)
-    innovation = _innovation(model, candidate, chunk, extra_flow, held)
-    own = innovation
+    sums = _hold(model, candidate, chunk, extra_flow)
+    innovation = _innovation(model, candidate, chunk, extra_flow, sums)
+    innovations = innovation
     if seen and candidate.fitted is not None:
-        own = _hold(model, itself(candidate), chunk, extra_flow).innovation
-    rows = _rows(model, held, chunk)
-    interval = np.clip(np.searchsorted(held.t_s, rows.t_s) - 1, 0, len(held.cell) - 1)
+        innovations = _hold(model, itself(candidate), chunk, extra_flow).innovation
+    rows = _rows(model, sums, chunk)
+    interval = np.clip(np.searchsorted(sums.t_s, rows.t_s) - 1, 0, len(sums.cell) - 1)
     return Comparison(
         candidate.name,
         rows.t_s,
         rows.measured,
         rows.modelled,
-        held.cell[interval],
-        _shares(held, candidate.status),
-        _mean_squares(held.innovation),
+        sums.cell[interval],
+        _shares(sums, candidate.status),
+        _mean_squares(sums.innovation),
         rows.signals,
         Intervals(
-            held.t_s,
-            held.cell,
+            sums.t_s,
+            sums.cell,
             innovation,
-            own,
+            innovations,
             chunk[:-1, 2 : 2 + len(model.signals)],
         ),
     )
@@ -159,12 +161,12 @@ class _Held:
 
     t_s: FloatArray
     flow: FloatArray
-    cell: NDArray[np.int64]
+    cell: IntArray
     innovation: FloatArray
 
 
 def _hold(
-    model: Model, candidate: Candidate, chunk: FloatArray, extra_flow: FloatArray | None = None
+    model: Machine, candidate: CandidateMap, chunk: FloatArray, extra_flow: FloatArray | None = None
 ) -> _Held:
     model, terms, chunk = with_extra_flow(model, candidate.terms, chunk, extra_flow)
     n, c = max(len(chunk) - 1, 0), len(model.chambers)
@@ -187,18 +189,18 @@ class _Rows:
     signals: FloatArray
 
 
-def _rows(model: Model, held: _Held, chunk: FloatArray | None = None) -> _Rows:
+def _rows(model: Machine, sums: _Held, chunk: FloatArray | None = None) -> _Rows:
     """Row instants, measured and modelled flow through the project's filter, and the signals."""
     f, c = model.filter, len(model.chambers)
-    rate = held.flow
+    rate = sums.flow
     if chunk is not None:
         values = chunk[:, 2 : 2 + len(model.signals)]
         rate = np.hstack([rate, 0.5 * (values[1:] + values[:-1])])
-    if len(held.t_s) < 2:
+    if len(sums.t_s) < 2:
         return _Rows(np.empty(0), *(np.empty((0, m)) for m in (c, c, len(model.signals))))
-    span_s = held.t_s[-1] - held.t_s[0]
+    span_s = sums.t_s[-1] - sums.t_s[0]
     out = np.empty((int(span_s * f.rows_per_s) + 2, 1 + rate.shape[1]))
-    rows = filter_rows(held.t_s, rate, f.wn_rad_s, f.zeta, 1.0 / f.rows_per_s, out)
+    rows = filter_rows(sums.t_s, rate, f.wn_rad_s, f.zeta, 1.0 / f.rows_per_s, out)
     out = out[:rows]
     return _Rows(out[:, 0], out[:, 1 : 2 * c : 2], out[:, 2 : 2 * c + 1 : 2], out[:, 2 * c + 1 :])
 
@@ -211,29 +213,29 @@ def _mean_squares(innovation: FloatArray) -> FloatArray:
 
 
 def _innovation(
-    model: Model,
-    candidate: Candidate,
+    model: Machine,
+    candidate: CandidateMap,
     chunk: FloatArray,
     extra_flow: FloatArray | None,
-    held: _Held,
+    sums: _Held,
 ) -> FloatArray:
     """Whitened innovations, begun anew wherever a flow does not stand on data.
 
     What an unknown flow has done to the volume would stay in them for seconds.
     """
     known = np.isin(candidate.status, (SHUT, VALID, REFERENCE))
-    unsure = ((held.cell >= 0) & ~known[held.cell]).any(axis=1)
-    unsure |= ~np.isfinite(held.flow).all(axis=1)
+    unsure = ((sums.cell >= 0) & ~known[sums.cell]).any(axis=1)
+    unsure |= ~np.isfinite(sums.flow).all(axis=1)
     marked = chunk.copy()
     marked[1:, 1] += np.where(unsure & (chunk[1:, 1].astype(int) & GAP_FLAG == 0), GAP_FLAG, 0)
     return _hold(model, candidate, marked, extra_flow).innovation
 
 
-def _shares(held: _Held, status: NDArray[np.str_]) -> dict[str, float]:
+def _shares(sums: _Held, status: NDArray[np.str_]) -> dict[str, float]:
     """Share of the time per status of the least certain open edge."""
     rank = np.array([CERTAINTY.index(word) for word in status])
-    worst = np.where(held.cell >= 0, rank[held.cell], 0).max(axis=1, initial=0)
-    worst[~np.isfinite(held.flow).all(axis=1)] = CERTAINTY.index(OUTSIDE)
-    dt = np.diff(held.t_s)
+    worst = np.where(sums.cell >= 0, rank[sums.cell], 0).max(axis=1, initial=0)
+    worst[~np.isfinite(sums.flow).all(axis=1)] = CERTAINTY.index(OUTSIDE)
+    dt = np.diff(sums.t_s)
     total = max(float(dt.sum()), 1e-12)
     return {word: float(dt[worst == k].sum()) / total for k, word in enumerate(CERTAINTY)}

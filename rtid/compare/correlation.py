@@ -21,12 +21,13 @@ import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
 
 from rtid.compare.comparison import Comparison
-from rtid.model import COMMAND, PRESSURE, FloatArray, Model
+from rtid.model import COMMAND, PRESSURE, Machine
+from rtid.plain import FloatArray
+from rtid.units import Z95
 
 MAX_LAG_S = 0.2
 MOST_LAGS = 400
 MEMORY = 4  # of the bands' sum over j, in largest lags
-Z95 = 1.959964
 VARIES = 3.0  # an input's standard deviation in those of its noise, below which it is constant
 
 
@@ -62,7 +63,9 @@ class Correlation:
         return float(np.mean(np.abs(self.value[at]) > self.band[at])) if at.any() else 0.0
 
 
-def correlations(model: Model, part: Comparison, max_lag_s: float = MAX_LAG_S) -> list[Correlation]:
+def correlations(
+    model: Machine, part: Comparison, max_lag_s: float = MAX_LAG_S
+) -> list[Correlation]:
     """Autocorrelation of every chamber's innovations and their correlation with every input.
 
     Inputs are the commands and the pressures that are no chamber's, as far as they vary.
@@ -75,30 +78,30 @@ def correlations(model: Model, part: Comparison, max_lag_s: float = MAX_LAG_S) -
     step_s = float(np.median(np.diff(t_s)))
     lags = int(min(MOST_LAGS, len(at) // 4, max(1, round(max_lag_s / step_s))))
     row = np.round((t_s - t_s[0]) / step_s).astype(int)
-    n, found = int(row[-1]) + 1, []
+    n, correlated = int(row[-1]) + 1, []
     known = np.zeros(n)
     known[row] = 1.0
     for c, chamber in enumerate(model.chambers):
         error = _centred(row, e[at, c], n)
-        own = _Series(error, known, (MEMORY + 1) * lags)
-        found.append(_auto(chamber.name, own, lags, step_s))
+        errors = _Series(error, known, (MEMORY + 1) * lags)
+        correlated.append(_auto(chamber.name, errors, lags, step_s))
         for name, values in _inputs(model, part, at):
             other = _Series(_centred(row, values, n), known, (MEMORY + 1) * lags)
-            found.append(_cross(chamber.name, name, own, other, lags, step_s))
-    return found
+            correlated.append(_cross(chamber.name, name, errors, other, lags, step_s))
+    return correlated
 
 
-def _inputs(model: Model, part: Comparison, at: np.ndarray) -> list[tuple[str, FloatArray]]:
+def _inputs(model: Machine, part: Comparison, at: np.ndarray) -> list[tuple[str, FloatArray]]:
     """Inputs over the intervals that end in the rows `at`."""
     states = {chamber.pressure for chamber in model.chambers}
-    found = []
+    inputs = []
     for k, signal in enumerate(model.signals):
         if signal.kind in (COMMAND, PRESSURE) and signal.name not in states:
             values = part.intervals.values[at, k]
             noise = np.hypot(signal.noise, signal.resolution)
             if values.std() > max(VARIES * noise, 1e-9 * np.abs(values).max()):
-                found.append((signal.name, values))
-    return found
+                inputs.append((signal.name, values))
+    return inputs
 
 
 def _centred(row: np.ndarray, values: FloatArray, n: int) -> FloatArray:
@@ -122,23 +125,23 @@ class _Series:
         self.rho = (raw / pairs * scale)[: min(most, self.n - 1) + 1]
 
 
-def _auto(chamber: str, own: _Series, lags: int, step_s: float) -> Correlation:
+def _auto(chamber: str, series: _Series, lags: int, step_s: float) -> Correlation:
     k = np.arange(1, lags + 1)
     lags_s = np.asarray(k * step_s)
-    band = Z95 / np.sqrt(own.pairs[k])
-    return Correlation(chamber, "", lags_s, own.rho[k], band)
+    band = Z95 / np.sqrt(series.pairs[k])
+    return Correlation(chamber, "", lags_s, series.rho[k], band)
 
 
 def _cross(
-    chamber: str, name: str, own: _Series, other: _Series, lags: int, step_s: float
+    chamber: str, name: str, first: _Series, other: _Series, lags: int, step_s: float
 ) -> Correlation:
     k = np.arange(-lags, lags + 1)
     lags_s = np.asarray(k * step_s)
     # sum over t of e_t u_t-k: the inverse transform of E conj(U), at lag k
-    raw = irfft(own.spectrum * np.conj(other.spectrum), own.size)[k]
-    value = raw / np.sqrt(max(own.power * other.power, 1e-300))
-    most = min(len(own.rho), len(other.rho))
+    raw = irfft(first.spectrum * np.conj(other.spectrum), first.size)[k]
+    value = raw / np.sqrt(max(first.power * other.power, 1e-300))
+    most = min(len(first.rho), len(other.rho))
     taper = 1.0 - np.arange(1, most) / most
-    related = 1.0 + 2.0 * float((taper * own.rho[1:most] * other.rho[1:most]).sum())
-    band = Z95 * np.sqrt(max(related, 1.0 / own.n) / own.pairs[np.abs(k)])
+    related = 1.0 + 2.0 * float((taper * first.rho[1:most] * other.rho[1:most]).sum())
+    band = Z95 * np.sqrt(max(related, 1.0 / first.n) / first.pairs[np.abs(k)])
     return Correlation(chamber, name, lags_s, value, band)

@@ -23,7 +23,8 @@ from math import erfc, exp, sqrt
 import numpy as np
 
 from rtid.compare.comparison import Comparison
-from rtid.model import FloatArray, Model
+from rtid.model import Machine
+from rtid.plain import FloatArray
 
 LEVEL = 0.05
 TRIM = 0.02  # of the rows at either end cannot be told from the rest
@@ -54,11 +55,11 @@ class Cusum:
 
 
 def cusums(
-    model: Model, part: Comparison, before: Comparison | None = None, level: float = LEVEL
+    model: Machine, part: Comparison, before: Comparison | None = None, level: float = LEVEL
 ) -> list[Cusum]:
     """One per chamber; a block's mean goes on from what it was in the part `before`."""
-    own = level / max(1, len(model.chambers))
-    return [_cusum(model, part, before, c, own) for c in range(len(model.chambers))]
+    share = level / max(1, len(model.chambers))
+    return [_cusum(model, part, before, c, share) for c in range(len(model.chambers))]
 
 
 def factor(level: float) -> float:
@@ -72,7 +73,7 @@ def factor(level: float) -> float:
 
 
 def recursive_residuals(e: FloatArray, group: np.ndarray) -> FloatArray:
-    """w (n,) of innovations e (n,) whose group (n,) has one constant; NaN at its first row."""
+    """w (n,) of whitened innovations e (n,) whose group (n,) has one constant; NaN at its first."""
     order = np.argsort(group, kind="stable")
     sorted_e, start = e[order], np.diff(group[order], prepend=-2) != 0
     first = np.maximum.accumulate(np.where(start, np.arange(len(e)), 0))
@@ -81,17 +82,17 @@ def recursive_residuals(e: FloatArray, group: np.ndarray) -> FloatArray:
     with np.errstate(divide="ignore", invalid="ignore"):
         mean = (before - before[first]) / count
         w = (sorted_e - mean) / np.sqrt(1.0 + 1.0 / count)
-    found = np.empty(len(e))
-    found[order] = np.where(count > 0, w, np.nan)
-    return found
+    residuals = np.empty(len(e))
+    residuals[order] = np.where(count > 0, w, np.nan)
+    return residuals
 
 
 def _cusum(
-    model: Model, part: Comparison, before: Comparison | None, c: int, level: float
+    model: Machine, part: Comparison, before: Comparison | None, c: int, level: float
 ) -> Cusum:
     parts = [part] if before is None else [before, part]
-    own = [i for i, edge in enumerate(model.edges) if edge.sign(model.chambers[c]) != 0]
-    rows = [_rows(p, own, c, model.n_cells + 1, before is None) for p in parts]
+    edges = [i for i, edge in enumerate(model.edges) if edge.sign(model.chambers[c]) != 0]
+    rows = [_rows(p, edges, c, model.n_cells + 1, before is None) for p in parts]
     t_s, e, key = (np.concatenate(columns) for columns in zip(*rows, strict=True))
     new = np.arange(len(e)) >= len(e) - len(rows[-1][0])
     w = recursive_residuals(e, key)

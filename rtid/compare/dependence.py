@@ -11,11 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rtid.compare.comparison import Comparison
-from rtid.compare.extra import VOLUME
-from rtid.model import POSITION, VELOCITY, FloatArray, Model
+from rtid.effects.extra import VOLUME
+from rtid.model import POSITION, VELOCITY, Machine
+from rtid.plain import FloatArray, IntArray
 
 BINS, TIME_BINS = 16, 24
 LEAST_ROWS = 8  # rows that a bin needs
@@ -43,13 +43,13 @@ class Dependence:
     mean_m3s: FloatArray
     error_m3s: FloatArray
     rms_m3s: FloatArray
-    rows: NDArray[np.int64]
+    rows: IntArray
     explained: FloatArray
 
 
-def against_signals(model: Model, part: Comparison, bins: int = BINS) -> list[Dependence]:
+def against_signals(model: Machine, part: Comparison, bins: int = BINS) -> list[Dependence]:
     """Dependence on every signal that varies; on the position's rate where no velocity is there."""
-    found = []
+    dependences = []
     velocity = part.measured_m3s[:, 0] / (model.chambers[0].area_m2 * model.chambers[0].sign)
     columns = [
         (s.name, s.unit, part.signals[:, k])
@@ -61,24 +61,31 @@ def against_signals(model: Model, part: Comparison, bins: int = BINS) -> list[De
         columns.append((RATE, "m/s", velocity))
     for name, unit, values in columns:
         if len(values) and np.ptp(values) > 1e-9 * (np.abs(values).max() + 1e-30):
-            found.append(_binned(name, unit, values, _edges(values, bins), part))
-    return found
+            dependences.append(binned(name, unit, values, part.residual_m3s, bins))
+    return dependences
 
 
 def over_time(part: Comparison, bins: int = TIME_BINS) -> Dependence:
     """Dependence on time."""
     t_s = part.t_s if len(part.t_s) else np.zeros(1)
     edges = np.linspace(t_s[0], t_s[-1] + 1e-9, bins + 1)
-    return _binned(TIME, "s", part.t_s, edges, part)
+    return _binned(TIME, "s", part.t_s, edges, part.residual_m3s)
 
 
-def by_direction(model: Model, part: Comparison) -> Dependence:
+def by_direction(model: Machine, part: Comparison) -> Dependence:
     """Dependence on the direction of motion: three bins in the order of DIRECTIONS."""
     speed = part.measured_m3s[:, 0] / (model.chambers[0].area_m2 * model.chambers[0].sign)
     fast = np.quantile(np.abs(speed), 0.99) if len(speed) else 1.0
     rest = RESTING * max(float(fast), 1e-12)
     edges = np.array([-np.inf, -rest, rest, np.inf])
-    return _binned("direction", "m/s", speed, edges, part, least=1)
+    return _binned("direction", "m/s", speed, edges, part.residual_m3s, least=1)
+
+
+def binned(
+    name: str, unit: str, values: FloatArray, residual: FloatArray, bins: int = BINS
+) -> Dependence:
+    """Dependence of residual (rows, c), m3/s, in the order of time, on values (rows,) in `unit`."""
+    return _binned(name, unit, values, _edges(values, bins), residual)
 
 
 def _edges(values: FloatArray, bins: int) -> FloatArray:
@@ -93,10 +100,10 @@ def _binned(
     unit: str,
     values: FloatArray,
     edges: FloatArray,
-    part: Comparison,
+    residual: FloatArray,
     least: int = LEAST_ROWS,
 ) -> Dependence:
-    n, residual = len(edges) - 1, part.residual_m3s
+    n = len(edges) - 1
     index = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, n - 1)
     rows = np.bincount(index, minlength=n)
     kept = np.flatnonzero(rows >= least)
@@ -109,7 +116,7 @@ def _binned(
     square = np.stack([mean(r**2) for r in residual.T], axis=1)
     average = total / count
     spread = np.maximum(square / count - average**2, 0.0) * count / np.maximum(count - 1, 1)
-    inflation = np.array([_inflation(r) for r in residual.T])
+    inflation = np.array([inflation_of(r) for r in residual.T])
     error = np.sqrt(spread * inflation / count)
     explained = _explained(residual, average, count, inflation)
     return Dependence(
@@ -139,8 +146,8 @@ def _explained(
     return np.asarray(np.clip((between / variance - chance), 0.0, 1.0))
 
 
-def _inflation(residual: FloatArray) -> float:
-    """Rows that tell as much as one independent row; at least 1."""
+def inflation_of(residual: FloatArray) -> float:
+    """How many of the rows (rows,), any unit, tell as much as one independent row; at least 1."""
     r = residual - residual.mean() if len(residual) else residual
     power = float(r @ r)
     total = 0.0

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rtid.compare.candidate import Candidate
+from rtid.compare.candidate import CandidateMap
 from rtid.compare.comparison import Comparison, compare
 from rtid.compare.correlation import Correlation, correlations
 from rtid.compare.cusum import Cusum, cusums
 from rtid.compare.dependence import Dependence, against_signals, by_direction, over_time
 from rtid.compare.motion import smooth_position
 from rtid.compare.simulation import HORIZONS_S, Simulation, simulate, why_no_free_run
-from rtid.model import FloatArray, Model
+from rtid.model import Machine
+from rtid.plain import FloatArray
 
 
 @dataclass(frozen=True)
@@ -33,8 +34,8 @@ class Examination:
 
 
 def examine(
-    model: Model,
-    candidate: Candidate,
+    model: Machine,
+    candidate: CandidateMap,
     chunk: FloatArray,
     seen: bool = False,
     before: Comparison | None = None,

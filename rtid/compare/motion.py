@@ -10,10 +10,10 @@ bandwidth, by generalised cross-validation: n RSS / (n - trace)^2 least.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rtid.kernels.engine import GAP_FLAG, ROW_FLAG
-from rtid.model import FloatArray, Model
+from rtid.model import Machine
+from rtid.plain import BoolArray, FloatArray
 
 ORDER = 3
 # rad/sample that are tried; a narrower one would leave no digits: its system's condition is wc^-6
@@ -21,8 +21,8 @@ BANDWIDTHS = np.geomspace(0.012, 1.2, 13)
 LEAST = 32  # samples of a stretch without gap; a shorter one is taken as measured
 
 
-def smooth_position(model: Model, chunk: FloatArray) -> FloatArray:
-    """Smooth position (n,) of samples chunk (n, 2 + signals), each stretch between gaps alone."""
+def smooth_position(model: Machine, chunk: FloatArray) -> FloatArray:
+    """Smooth position (n,), m, of samples chunk (n, 2 + signals), each stretch alone."""
     t_s, flags = chunk[:, 0], chunk[:, 1].astype(int)
     x = np.ascontiguousarray(chunk[:, 2 + model.column(model.position)])
     measured = ((flags & ROW_FLAG) != 0) & np.isfinite(x)
@@ -36,7 +36,7 @@ def smooth_position(model: Model, chunk: FloatArray) -> FloatArray:
     return x
 
 
-def smoothed(t_s: FloatArray, x: FloatArray, measured: NDArray[np.bool_]) -> FloatArray:
+def smoothed(t_s: FloatArray, x: FloatArray, measured: BoolArray) -> FloatArray:
     """Smooth x (n,) at rising t_s (n,); only measured values count."""
     bands, wc_best, best = _roughness(t_s), BANDWIDTHS[0], np.inf
     for wc in BANDWIDTHS:
@@ -47,12 +47,12 @@ def smoothed(t_s: FloatArray, x: FloatArray, measured: NDArray[np.bool_]) -> Flo
     return _solve(bands, x, measured, wc_best)
 
 
-def _solve(bands: FloatArray, x: FloatArray, measured: NDArray[np.bool_], wc: float) -> FloatArray:
+def _solve(bands: FloatArray, x: FloatArray, measured: BoolArray, wc: float) -> FloatArray:
     from scipy.linalg import solveh_banded  # noqa: PLC0415 - lazily: not on the daemon's path
 
-    left = bands / wc ** (2 * ORDER)
-    left[-1] += measured
-    return np.asarray(solveh_banded(left, np.where(measured, x, 0.0), check_finite=False))
+    banded = bands / wc ** (2 * ORDER)
+    banded[-1] += measured
+    return np.asarray(solveh_banded(banded, np.where(measured, x, 0.0), check_finite=False))
 
 
 def _roughness(t_s: FloatArray) -> FloatArray:

@@ -8,7 +8,7 @@ import numpy as np
 
 from rtid.compare.comparison import Comparison
 from rtid.errors import RtidError
-from rtid.model import Model
+from rtid.model import Machine
 
 Span = tuple[float, float]
 
@@ -27,7 +27,7 @@ class Visit:
     time_s: float
 
 
-def cell_of(model: Model, edge: str, i: int, j: int) -> int:
+def cell_of(model: Machine, edge: str, i: int, j: int) -> int:
     """Number of a block among all grid cells.  Raises NoSuchBlockError naming what there is."""
     names = [e.name for e in model.edges]
     if edge not in names:
@@ -40,7 +40,7 @@ def cell_of(model: Model, edge: str, i: int, j: int) -> int:
     return model.first_cells[k] + i * nd + j
 
 
-def spans_of_block(model: Model, part: Comparison, edge: str, i: int, j: int) -> list[Span]:
+def spans_of_block(model: Machine, part: Comparison, edge: str, i: int, j: int) -> list[Span]:
     """When the working point of the edge was in block (i, j): [(t0, t1)] in s, in order."""
     cell = cell_of(model, edge, i, j)
     column = [e.name for e in model.edges].index(edge)
@@ -51,7 +51,7 @@ def spans_of_block(model: Model, part: Comparison, edge: str, i: int, j: int) ->
     return list(zip(t_s[first].tolist(), t_s[last].tolist(), strict=True))
 
 
-def blocks_in_span(model: Model, part: Comparison, t0_s: float, t1_s: float) -> list[Visit]:
+def blocks_in_span(model: Machine, part: Comparison, t0_s: float, t1_s: float) -> list[Visit]:
     """Blocks that the edges' working points were in between t0_s and t1_s, longest stay first."""
     t_s = part.intervals.t_s
     overlap = np.minimum(t_s[1:], t1_s) - np.maximum(t_s[:-1], t0_s)

@@ -19,7 +19,8 @@ from rtid.errors import RtidError
 from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.orifice import root
 from rtid.estimator.published import cell_terms
-from rtid.model import FloatArray, Model
+from rtid.model import Machine
+from rtid.plain import FloatArray
 
 ANY_EDGE = "*"
 
@@ -37,7 +38,7 @@ class GainTable:
     gain: FloatArray
 
     def at(self, w_v: FloatArray, dp_pa: FloatArray) -> FloatArray:
-        """K at points: linear between commands, linear and constant beyond along |dp|."""
+        """K (n,) at points (n,) in V, Pa: linear between commands, along |dp| constant beyond."""
         columns = np.stack([self._along_dp(row, np.abs(dp_pa)) for row in self.gain])
         at = np.clip(np.searchsorted(self.w_v, w_v) - 1, 0, max(len(self.w_v) - 2, 0))
         low, high = columns[at, np.arange(len(at))], columns[at + 1, np.arange(len(at))]
@@ -71,13 +72,13 @@ class ReferenceMap:
         )
 
     def flow(self, edge: str, w_v: ArrayLike, dp_pa: ArrayLike) -> FloatArray:
-        """Q in m3/s at broadcast points; NaN where the table has nothing."""
+        """Q in m3/s at broadcast points (...); NaN where the table has nothing."""
         w, dp = np.broadcast_arrays(np.asarray(w_v, float), np.asarray(dp_pa, float))
         gain = self.table(edge).at(w.ravel(), dp.ravel())
         return (gain * root(dp.ravel())).reshape(w.shape)
 
-    def theta_cells(self, model: Model) -> FloatArray:
-        """Its Taylor terms for all cells of the model's grids (cells, 6), for `kernels.explain`."""
+    def theta_cells(self, model: Machine) -> FloatArray:
+        """Its Taylor terms (cells, 6), m3/s, in all cells of the model's grids, for `explain`."""
         return theta_cells(model, self.flow)
 
 
@@ -89,15 +90,15 @@ class LearnedReference:
     flowmap: FlowMap
 
     def flow(self, edge: str, w_v: ArrayLike, dp_pa: ArrayLike) -> FloatArray:
-        """Q in m3/s at broadcast points; NaN off its grid.  Raises MissingEdgeError."""
+        """Q in m3/s at broadcast points (...); NaN off its grid.  Raises MissingEdgeError."""
         known = [e.name for e in self.flowmap.edges]
         if edge not in known:
             text = f"{self.name}: no map for edge {edge!r}, only for {', '.join(known)}"
             raise MissingEdgeError(text, "export it with the project of this machine")
         return self.flowmap.flow(edge, w_v, dp_pa)
 
-    def theta_cells(self, model: Model) -> FloatArray:
-        """Its Taylor terms for all cells of the model's grids (cells, 6)."""
+    def theta_cells(self, model: Machine) -> FloatArray:
+        """Its Taylor terms (cells, 6), m3/s, in all cells of the model's grids."""
         return theta_cells(model, self.flow)
 
 
@@ -109,17 +110,17 @@ class Reference(Protocol):
         """What it is called in tables and pictures."""
 
     def flow(self, edge: str, w_v: ArrayLike, dp_pa: ArrayLike) -> FloatArray:
-        """Q in m3/s, NaN where it knows nothing."""
+        """Q in m3/s at points of any one shape (...), V and Pa; NaN where it knows nothing."""
 
-    def theta_cells(self, model: Model) -> FloatArray:
-        """Taylor terms of all cells of the model's grids."""
+    def theta_cells(self, model: Machine) -> FloatArray:
+        """Taylor terms (cells, 6) of all cells of the model's grids, m3/s."""
 
 
 Flow = Callable[[str, FloatArray, FloatArray], FloatArray]
 
 
-def theta_cells(model: Model, flow: Flow) -> FloatArray:
-    """Taylor terms (cells, 6) of a known flow(edge, w, dp) for all cells of the model's grids."""
+def theta_cells(model: Machine, flow: Flow) -> FloatArray:
+    """Taylor terms (cells, 6), m3/s, of a flow(edge, w, dp) for all cells of the model's grids."""
     parts = []
     for edge in model.edges:
 

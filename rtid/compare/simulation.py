@@ -12,16 +12,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rtid.compare.candidate import Candidate
-from rtid.compare.extra import with_extra_flow
+from rtid.compare.candidate import CandidateMap
 from rtid.compare.motion import smooth_position
+from rtid.effects.extra import with_extra_flow
 from rtid.errors import RtidError
 from rtid.estimator.state import build
 from rtid.estimator.windows import OVERLAP
 from rtid.kernels.free_run import BEYOND, INSIDE, STATUSES, free_run
-from rtid.model import FloatArray, Model
+from rtid.model import Machine
+from rtid.plain import BoolArray, FloatArray, IntArray
 
 FREE_RUN = "free run"
 HORIZONS_S = {FREE_RUN: np.inf, "1 s ahead": 1.0, "0.1 s ahead": 0.1}
@@ -49,10 +49,10 @@ class Simulation:
     t_s: FloatArray
     measured_pa: FloatArray
     simulated_pa: FloatArray
-    status: NDArray[np.int64]
+    status: IntArray
 
     @property
-    def predicted(self) -> NDArray[np.bool_]:
+    def predicted(self) -> BoolArray:
         """Samples (n,) that were predicted: neither a start nor a stop."""
         return np.asarray((self.status == INSIDE) | (self.status == BEYOND))
 
@@ -95,15 +95,15 @@ class Simulation:
         return np.full(self.measured_pa.shape[1], np.nan)
 
 
-def why_no_free_run(model: Model) -> str:
+def why_no_free_run(model: Machine) -> str:
     """The reason why the model cannot run on its own pressures, empty where it can."""
     without = [chamber.name for chamber in model.chambers if not chamber.pressure]
     return f"chamber {', '.join(without)} has no pressure" if without else ""
 
 
 def simulate(
-    model: Model,
-    candidate: Candidate,
+    model: Machine,
+    candidate: CandidateMap,
     chunk: FloatArray,
     name: str = FREE_RUN,
     period_s: float | None = None,

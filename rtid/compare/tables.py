@@ -12,7 +12,8 @@ from rtid.compare.comparison import Comparison
 from rtid.estimator.blocks import EMPTY
 from rtid.estimator.flowmap import VALID, FlowMap
 from rtid.estimator.solution import Solution
-from rtid.model import FloatArray, Model
+from rtid.model import Machine
+from rtid.plain import BoolArray, FloatArray
 
 PAPER_U_V = (4.0, 5.0, 6.0, 7.0)  # Table 1 of IMECE2005-79420
 PAPER_DP_PA = (4.5e6, 5.0e6, 5.5e6)
@@ -22,7 +23,7 @@ class AnyMap(Protocol):
     """What a learned and a reference map have in common."""
 
     def flow(self, edge: str, w_v: ArrayLike, dp_pa: ArrayLike) -> FloatArray:
-        """Q in m3/s."""
+        """Q in m3/s at points of any one shape (...), V and Pa."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +112,7 @@ def block_rows(
 
 
 def _residual_by_cell(
-    model: Model, comparison: Comparison, k: int
+    model: Machine, comparison: Comparison, k: int
 ) -> tuple[FloatArray, FloatArray, float]:
     """Per cell of edge k: sum of squares of its chambers' residual, and their number; the total."""
     edge = model.edges[k]
@@ -140,8 +141,8 @@ class Deviation:
     status: NDArray[np.str_]
 
     @property
-    def valid(self) -> NDArray[np.bool_]:
-        """Points where the map is valid and the reference has a flow."""
+    def valid(self) -> BoolArray:
+        """Points (n,) where the map is valid and the reference has a flow."""
         return (self.status == VALID) & np.isfinite(self.reference_m3s)
 
     @property
@@ -165,12 +166,12 @@ def deviations(
     dp_pa: ArrayLike | None = None,
 ) -> list[Deviation]:
     """Per edge, map and reference at the points u_v x dp_pa; at the cells' centres if not given."""
-    found = []
+    deviatings = []
     for edge in flowmap.edges:
         u, p = edge.grid.u_v, edge.grid.dp_pa
         us = 0.5 * (u[1:] + u[:-1]) if u_v is None else np.asarray(u_v, float)
         ps = 0.5 * (p[1:] + p[:-1]) if dp_pa is None else np.asarray(dp_pa, float)
         w, dp = (a.ravel() for a in np.meshgrid(us, ps, indexing="ij"))
         flows = edge.flow(w, dp), edge.sd(w, dp), reference.flow(edge.name, w, dp)
-        found.append(Deviation(edge.name, w, dp, *flows, edge.status_at(w, dp)))
-    return found
+        deviatings.append(Deviation(edge.name, w, dp, *flows, edge.status_at(w, dp)))
+    return deviatings

@@ -10,6 +10,8 @@ import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from rtid.trace.state_files import read_bytes, write_bytes
+
 FILE = "accept.json"
 
 
@@ -25,7 +27,7 @@ class Acceptance:
 def ask(folder: Path, request: Acceptance) -> None:
     """Leave a request; OSError where this user may not write there."""
     temporary = folder / f"{FILE}.part"
-    temporary.write_text(json.dumps(asdict(request)), "utf-8")
+    write_bytes(temporary, json.dumps(asdict(request)).encode())
     os.replace(temporary, folder / FILE)
 
 
@@ -35,14 +37,22 @@ def withdraw(folder: Path) -> None:
 
 
 def taken(folder: Path) -> Acceptance | None:
-    """The request that lies there, taken away; one that cannot be read is no request."""
+    """The request that lies there, taken away; what cannot be read is no request.
+
+    OSError where something lies there that cannot be taken away.
+    """
     path = folder / FILE
-    try:
-        content = json.loads(path.read_bytes())
-        path.unlink()
-        return Acceptance(float(content["at_unix_s"]), str(content["who"]), str(content["reason"]))
-    except FileNotFoundError:
+    if not os.path.lexists(path):
         return None
-    except (ValueError, KeyError, TypeError):
-        path.unlink(missing_ok=True)
+    try:
+        content = read_bytes(path, follow=False)
+    except OSError:  # a FIFO, a folder, a link, not for us to read
+        content = b""
+    path.unlink(missing_ok=True)
+    try:
+        document = json.loads(content)
+        return Acceptance(
+            float(document["at_unix_s"]), str(document["who"]), str(document["reason"])
+        )
+    except (ValueError, KeyError, TypeError, RecursionError):
         return None

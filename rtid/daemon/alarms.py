@@ -63,6 +63,10 @@ class Alarms:
                     self._over[k] = replace(alarm, trace=trace)
                     return
 
+    def has(self, name: str) -> bool:
+        """Whether it is on."""
+        return name in self._on
+
     @property
     def on(self) -> tuple[Alarm, ...]:
         """Those that are on."""

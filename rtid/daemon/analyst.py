@@ -15,14 +15,17 @@ from collections import Counter, deque
 from collections.abc import Callable
 from pathlib import Path
 from queue import Queue
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 
+from rtid.compare import CandidateMap
+from rtid.compare.suspects import LikelyCause
 from rtid.daemon import jobs
 from rtid.daemon.chronicle import Chronicle
-from rtid.daemon.configure import boarded
-from rtid.daemon.judge import Judge
+from rtid.daemon.first import against_first
+from rtid.daemon.guard import PROOF, Guard, candidate_of
+from rtid.daemon.map_check import Judge
 from rtid.daemon.offering import Offering
 from rtid.daemon.pipe import Pipe
 from rtid.daemon.recorder import Recorder
@@ -31,17 +34,50 @@ from rtid.errors import RtidError
 from rtid.estimator.estimator import Estimator
 from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.solution import Solution
-from rtid.mapfiles import provenance, write_map
-from rtid.priors import find_prior, published
+from rtid.maps.files import provenance, write_map
+from rtid.maps.prior_map import find_prior, published
+from rtid.plain import FloatArray
 from rtid.project import Project, load
-from rtid.store import Generations
+from rtid.study.on_board import on_board
+from rtid.trace.snapshot import Generations
 
 T = TypeVar("T")
 NICE = 5
 MAP_FILE = "map.npz"
 KEPT = 3  # handovers that can be recalled
-QUEUED = 100  # jobs taken from the pipe while one is in work
+CLEAN_S = 2.0  # a handover must be older than a suspicion by the piece in which that began
+RESTORED_PAUSE, LONGEST_PAUSE = 60, 600  # seconds of motion between two writes of the baseline
+FIRST_S = 60.0  # of samples that a first map is checked by
+QUEUED_BYTES = 16 << 20  # of jobs taken from the pipe while one is in work
 FLOOD_S = 10.0  # the same refusal of the disk is told at most this often
+
+
+class Waiting(Queue[jobs.Job | None]):
+    """Jobs behind the one in work, bounded by what they hold and not by how many they are.
+
+    A handover is saved as it comes from the pipe: batches that come while a solve takes its time
+    must not keep it in there.
+    """
+
+    def _init(self, maxsize: int) -> None:
+        super()._init(maxsize)
+        self._bytes = 0
+
+    def _qsize(self) -> int:
+        return self._bytes
+
+    def _put(self, item: jobs.Job | None) -> None:
+        super()._put(item)
+        self._bytes += _size(item)
+
+    def _get(self) -> jobs.Job | None:
+        item = super()._get()
+        self._bytes -= _size(item)
+        return item
+
+
+def _size(job: jobs.Job | None) -> int:
+    return 1 + (job.size_bytes if isinstance(job, jobs.Batch) else 0)
 
 
 class Analyst:
@@ -63,6 +99,35 @@ class Analyst:
         self._told: dict[str, float] = {}
         self._handed: deque[jobs.Handover] = deque(maxlen=KEPT)
         self._offering = Offering(project, folder)
+        self._guard: Guard | None = None
+        self._baseline: Estimator | None = None
+        self._is_named = True  # what contradicts the baseline, if something does
+        self._has_baseline = False  # that this process has written
+        self._stored, self._pause = 0, PROOF  # `Guard.judged` of the last time, and until the next
+        self._next: tuple[jobs.Handover, CandidateMap, int] | None = (
+            None  # with `Guard.judged` then
+        )
+        self._first: deque[FloatArray] = deque()  # samples of a first map
+
+    def begin(self) -> None:
+        """Publish the baseline of before, which has to foretell the motion first."""
+        result = self._generations.baseline(self._project.model)
+        for reason in result.refused:
+            self._answer(jobs.NotSaved("baseline", reason))
+        self._guarded("points", lambda: self._generations.keep("start"))
+        if result.estimator is None:
+            return
+        level = result.notes.get("level_m3s")
+        job = jobs.Handover(0, result.estimator, publish=True, store=False)
+        candidate = self._tell(job)
+        assert candidate is not None, "only a first map can be refused"
+        self._baseline, self._pause = result.estimator, RESTORED_PAUSE
+        known = None if level is None else np.array(level)
+        share = float(result.notes.get("known_share", 0.0))
+        self._guard = Guard(self._project.model, candidate, known, "proving", share)
+        if proof := self._generations.shadow(self._project.model).notes.get("proof"):
+            self._guard.resume(proof)
+        self._answer(jobs.Foretold("proving"))
 
     def take(self, job: jobs.Job) -> None:
         """Do one job; what is to be saved of it is for `save`."""
@@ -75,43 +140,137 @@ class Analyst:
                 self._answer(jobs.Ready(to_save=False))
         elif isinstance(job, jobs.Note):
             self._note(job)
-        elif isinstance(job, jobs.Recall) and self._handed:
-            wanted = [one for one in self._handed if one.number <= job.number]
-            found = wanted[-1] if wanted else self._handed[0]
-            self._answer(jobs.Recalled(found.estimator))
+        elif isinstance(job, jobs.Recall):
+            self._recall(job)
         elif isinstance(job, jobs.Relearn):
             self._relearn(job)
-        elif isinstance(job, jobs.Found) and job.verdict is not None:
+        elif isinstance(job, jobs.VerdictAnswer) and job.verdict is not None:
             verdict = job.verdict
             self._guarded("history", lambda: self._history().note_verdict(verdict))
 
     def save(self, job: jobs.Handover) -> None:
         """Write the snapshot, in any thread."""
         with self._disk:
-            path = self._guarded("snapshot", lambda: self._generations.save(job.estimator))
+            path = self._guarded("snapshot", lambda: self._save(job))
         if path is not None:
-            self._answer(jobs.Saved(job.number, str(path)))
+            self._answer(jobs.SavedSnapshot(job.number, str(path)))
         self._answer(jobs.Ready(to_solve=False))
 
+    def _save(self, job: jobs.Handover) -> Path:
+        """As the state to go on with, or beside the baseline that has not proven itself yet."""
+        guard = self._guard
+        if guard is None or guard.state == "proven" or not job.is_proving:
+            return self._generations.save(job.estimator, not job.is_last)
+        if guard.state == "contradicted":  # meanwhile: what it has learned is not to be kept
+            return self._generations.baseline_path
+        notes = {"proof": guard.progress}
+        return self._generations.save_shadow(job.estimator, notes, not job.is_last)
+
     def close(self) -> None:
-        """Close the files."""
+        """Close the files; the newest baseline is on the disk."""
+        if self._has_baseline:
+            self._store_baseline()
         if self._recorder is not None:
             self._recorder.close()
         if self._chronicle is not None:
             self._chronicle.close()
+
+    def _recall(self, job: jobs.Recall) -> None:
+        """Give back what was learned before, and publish it again."""
+        older = [handover for handover in self._handed if handover.number <= job.number]
+        if job.before_s is None:
+            older = older or [*self._handed][:1]
+        elif self._baseline is not None:
+            older = self._before(older, job.before_s)
+        estimator = older[-1].estimator if older else self._baseline
+        self._next = None
+        if estimator is not None:
+            self._answer(jobs.Recalled(estimator))
+            self._tell(jobs.Handover(job.number, estimator, publish=True, store=False))
+
+    def _before(self, handed: list[jobs.Handover], before_s: float) -> list[jobs.Handover]:
+        """Those that a suspicion does not reach, of a run whose baseline has foretold the motion.
+
+        The baseline is older by what it takes to prove it: what was learned meanwhile stays.
+        """
+        if self._guard is None or not self._guard.has_foretold:
+            return []
+        return [job for job in handed if _newest_s(job.estimator) <= before_s - CLEAN_S]
+
+    def _watch(self, chunk: FloatArray) -> None:
+        """Hold the baseline against the samples; a map that foretells as well takes its place."""
+        guard = self._guard
+        if guard is None:
+            self._first.append(chunk)
+            while self._first[0][0, 0] < chunk[-1, 0] - FIRST_S:
+                self._first.popleft()
+            return
+        had_level = guard.level is not None
+        if guard.push(chunk):
+            self._judged(guard)
+        elif not self._is_named and (causes := guard.later_causes()):
+            self._is_named = True
+            self._answer(_foretold("named", guard, causes))
+        if guard.level is not None and not had_level:
+            self._store_baseline()
+        if self._next is not None and guard.is_calm and guard.judged - self._next[2] >= PROOF:
+            job, candidate, _ = self._next
+            self._next, self._baseline = None, job.estimator
+            guard.follow(candidate)
+            if guard.judged - self._stored >= self._pause:
+                self._pause = min(2 * self._pause, LONGEST_PAUSE)
+                self._store_baseline()
+
+    def _judged(self, guard: Guard) -> None:
+        """The baseline has foretold the motion, or does not."""
+        if guard.state == "contradicted":
+            self._next = None
+            with self._disk:
+                self._guarded("snapshot", self._generations.drop_shadow)
+            self._guarded("points", lambda: self._generations.keep("alarm"))
+            words = _foretold("contradicted", guard, guard.causes())
+            self._is_named = bool(words.text)
+            self._answer(words)
+        else:
+            self._answer(jobs.Foretold("proven"))
+
+    def _store_baseline(self) -> None:
+        """Write the baseline with its level, and now and then a point in time."""
+        guard, baseline = self._guard, self._baseline
+        if guard is None or baseline is None:
+            return
+        level = None if guard.level is None else guard.level.tolist()
+        notes = {"level_m3s": level, "known_share": guard.known_share, "unix_s": time.time()}
+        self._stored, self._has_baseline = guard.judged, True
+        with self._disk:
+            self._guarded("baseline", lambda: self._generations.save_baseline(baseline, notes))
+            self._guarded("points", lambda: self._generations.keep("publish"))
+
+    def _is_fit(self, job: jobs.Handover, solution: Solution) -> bool:
+        """Whether a first map may be published; from then on it is the baseline."""
+        if not self._first:
+            return True
+        chunk = np.concatenate(self._first)
+        if words := against_first(self._project.model, chunk, solution):
+            self._answer(jobs.Foretold("refused", text="; ".join(words)))
+            return False
+        self._baseline = job.estimator
+        return True
 
     def _batch(self, batch: jobs.Batch) -> None:
         if self._judge is not None:
             judgement = self._judge.push(batch.chunk)
             if judgement is not None:
                 self._answer(judgement)
+        if len(batch.chunk):
+            self._watch(batch.chunk)
         self._guarded("offer", lambda: self._offering.push(batch.chunk))
         frames = batch.frames
         if frames is not None and self._limit_bytes:
             self._guarded("recording", lambda: self._record().write(frames))
             if self._recorder is not None and self._recorder.path != self._segment:
                 self._segment = self._recorder.path
-                self._answer(jobs.Recording(self._segment))
+                self._answer(jobs.RecorderState(self._segment))
 
     def _relearn(self, job: jobs.Relearn) -> None:
         """Begin anew with the machine as it is; what was learned before is kept aside."""
@@ -119,9 +278,10 @@ class Analyst:
         estimator.history, estimator.origin_us = None, job.origin_us
         estimator.advance(job.chunk)
         self._handed.clear()
+        self._guard = self._baseline = self._next = None
         self._answer(jobs.Recalled(estimator, is_accepted=True))
         with self._disk:
-            self._guarded("snapshot", self._generations.set_aside)
+            self._guarded("snapshot", lambda: self._generations.set_aside("accept"))
             self._guarded("snapshot", lambda: self._generations.save(estimator))
         self._guarded("history", lambda: self._history().note_acceptance(job.acceptance))
 
@@ -129,32 +289,50 @@ class Analyst:
         if not len(job.estimator.sums.blocks):
             return
         self._handed.append(job)
+        candidate = self._tell(job)
+        if candidate is None:
+            return
+        if self._guard is None:
+            self._guard = Guard(self._project.model, candidate, None, "proven")
+            self._first.clear()
+            self._store_baseline()
+        elif self._guard.level is None and self._guard.state == "proven":
+            self._baseline = job.estimator  # the first maps: each is known for more places
+            self._guard.follow(candidate)
+        elif self._next is None:
+            self._next = job, candidate, self._guard.judged
+
+    def _tell(self, job: jobs.Handover) -> CandidateMap | None:
+        """Solve, judge from now on, and publish; None for a first map that cannot be."""
         start_s = time.monotonic()
         with np.errstate(divide="ignore"):  # compliance 0: the motion has not shown it yet
             solution = job.estimator.solution()
+            if self._guard is None and self._baseline is None and not self._is_fit(job, solution):
+                return None
             self._judge = Judge(job, solution)
             flow_map = published(solution, self._prior)
             beta_pa, beta_sd_pa = solution.beta_pa, solution.beta_sd_pa
-        found = jobs.Publication(
+        result = jobs.Publication(
             job.number,
             flow_map,
             beta_pa,
             beta_sd_pa,
             float(solution.rho),
-            float(job.estimator.state.engine[0]["t_s"]),
+            _newest_s(job.estimator),
             edges_of(job.estimator, solution, flow_map),
             time.monotonic() - start_s,
         )
-        self._answer(found)
-        self._offering.published(found, solution)
+        self._answer(result)
+        self._offering.published(result, solution)
         self._guarded("map", lambda: self._write_map(flow_map, solution))
-        self._guarded("history", lambda: self._history().note_publication(found, self._chambers))
+        self._guarded("history", lambda: self._history().note_publication(result, self._chambers))
+        return candidate_of(solution, flow_map)
 
     def _write_map(self, flow_map: FlowMap, solution: Solution) -> None:
         """Replace the map in the folder, for the page and for `rtid compare --map`."""
-        told = provenance(solution, self._project.name, self._project.digest, "rtid run")
+        origin = provenance(solution, self._project.name, self._project.digest, "rtid run")
         temporary = self._folder / f"part-{MAP_FILE}"
-        write_map(temporary, flow_map, told)
+        write_map(temporary, flow_map, origin)
         os.replace(temporary, self._folder / MAP_FILE)
 
     def _note(self, note: jobs.Note) -> None:
@@ -165,7 +343,7 @@ class Analyst:
                 "recording", lambda: self._record().keep(alarm.name, alarm.since_unix_s)
             )
             kept = {alarm.name: keep} if keep else {}
-            self._answer(jobs.Recording(self._recorder.path if self._recorder else "", kept))
+            self._answer(jobs.RecorderState(self._recorder.path if self._recorder else "", kept))
 
     def _record(self) -> Recorder:
         if self._recorder is None:
@@ -189,16 +367,30 @@ class Analyst:
         return None
 
 
+def _foretold(
+    state: Literal["contradicted", "named"], guard: Guard, causes: list[LikelyCause]
+) -> jobs.Foretold:
+    """A contradiction in words: what would mend it, else what speaks against the samples."""
+    text = ", or ".join(cause.text for cause in causes) or "; ".join(guard.against)
+    of_sensor = bool(text) and all(cause.of_sensor for cause in causes)
+    return jobs.Foretold(state, guard.since_s, text, of_sensor)
+
+
+def _newest_s(estimator: Estimator) -> float:
+    """Time of the newest sample that was learned."""
+    return float(estimator.state.engine[0]["t_s"])
+
+
 def edges_of(estimator: Estimator, solution: Solution, flow_map: FlowMap) -> tuple[EdgeHealth, ...]:
     """Blocks and cells of each edge by status."""
-    found = []
+    edge_health = []
     for i, edge in enumerate(estimator.model.edges):
         mine = [block for block in solution.blocks if block.edge == i]
         cells = Counter(str(status) for status in flow_map.edges[i].status.ravel())
         progress = sum(block.progress for block in mine) / max(1, len(mine))
         blocks = Counter(block.status for block in mine)
-        found.append(EdgeHealth(edge.name, dict(blocks), dict(cells), progress))
-    return tuple(found)
+        edge_health.append(EdgeHealth(edge.name, dict(blocks), dict(cells), progress))
+    return tuple(edge_health)
 
 
 def main() -> None:
@@ -206,17 +398,18 @@ def main() -> None:
     fd, project, folder = sys.argv[1:]
     pipe, one_at_a_time = Pipe(int(fd)), threading.Lock()
 
-    def answer(told: jobs.Answer) -> None:
+    def answer(reply: jobs.Answer) -> None:
         with one_at_a_time:
-            pipe.send(told)
+            pipe.send(reply)
 
     os.nice(NICE)
-    loaded = boarded(load(project), lambda _: None)
+    loaded = on_board(load(project), lambda _: None)
     Estimator(loaded.model).solution()  # compiles
     analyst = Analyst(loaded, Path(folder), answer)
-    waiting: Queue[jobs.Job | None] = Queue(QUEUED)
+    waiting = Waiting(QUEUED_BYTES)
     receiver = threading.Thread(target=_receive, args=(pipe, analyst, waiting), daemon=True)
     try:
+        analyst.begin()
         answer(jobs.Ready())
         receiver.start()
         while (job := waiting.get()) is not None:
@@ -229,7 +422,7 @@ def main() -> None:
     analyst.close()
 
 
-def _receive(pipe: Pipe, analyst: Analyst, waiting: Queue[jobs.Job | None]) -> None:
+def _receive(pipe: Pipe, analyst: Analyst, waiting: Waiting) -> None:
     """Queue the jobs, and save what is to be saved of them at once."""
     try:
         while (job := pipe.receive()) is not None:

@@ -38,16 +38,18 @@ class Chronicle:
         self._database.executescript(TABLES)
         self._pruned_s = 0.0
 
-    def note_publication(self, found: Publication, chambers: list[str]) -> None:
+    def note_publication(self, publication: Publication, chambers: list[str]) -> None:
         """One row per chamber and per edge."""
         now_s = time.time()
         estimates = [
             (now_s, name, float(beta), float(sd))
-            for name, beta, sd in zip(chambers, found.beta_pa, found.beta_sd_pa, strict=True)
+            for name, beta, sd in zip(
+                chambers, publication.beta_pa, publication.beta_sd_pa, strict=True
+            )
         ]
         maps = [
-            (now_s, e.name, e.blocks.get("valid", 0), sum(e.blocks.values()), found.rho)
-            for e in found.edges
+            (now_s, e.name, e.blocks.get("valid", 0), sum(e.blocks.values()), publication.rho)
+            for e in publication.edges
         ]
         self._database.execute("BEGIN")
         self._database.executemany("INSERT INTO estimate VALUES (?, ?, ?, ?)", estimates)
@@ -65,14 +67,19 @@ class Chronicle:
         row = (when_s, alarm.name, alarm.kind, alarm.text, over)
         self._database.execute("INSERT INTO alarm VALUES (?, ?, ?, ?, ?)", row)
 
-    def note_verdict(self, found: Verdict) -> None:
+    def note_verdict(self, verdict: Verdict) -> None:
         """One row per diagnosis."""
-        row = (found.at_unix_s, found.verdict, found.text, json.dumps(found.content))
+        row = (verdict.at_unix_s, verdict.verdict, verdict.text, json.dumps(verdict.content))
         self._database.execute("INSERT INTO verdict VALUES (?, ?, ?, ?)", row)
 
-    def note_acceptance(self, found: Acceptance) -> None:
+    def note_acceptance(self, acceptance: Acceptance) -> None:
         """One row: somebody has taken the changed machine for the new normal."""
-        row = (found.at_unix_s, "accepted the changed machine", found.who, found.reason)
+        row = (
+            acceptance.at_unix_s,
+            "accepted the changed machine",
+            acceptance.who,
+            acceptance.reason,
+        )
         self._database.execute("INSERT INTO decision VALUES (?, ?, ?, ?)", row)
 
     def close(self) -> None:

@@ -1,8 +1,8 @@
 """When to ask the coach: soon after the first snapshot, then now and then while the machine learns.
 
 The coach tries every segment on the nominal machine: about a minute of a processor, in a process of
-its own (`rtid.coaching`).  Without a section [excite] no limits are known, and there is nothing to
-try: then each publication tells which valve is known least.
+its own (`rtid.daemon.advice`).  Without a section [excite] no limits are known, and there is
+nothing to try: then each publication tells which valve is known least.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from rtid.daemon.jobs import Answer, Coach, Coached, Publication
 from rtid.daemon.log import logger
 from rtid.daemon.status import Advice, EdgeHealth
 from rtid.estimator.estimator import Estimator
-from rtid.model import FloatArray, Model
+from rtid.model import Machine
+from rtid.plain import FloatArray
 from rtid.project import Project
 
 SNAPSHOTS = "state-[01].npz"
@@ -43,10 +44,10 @@ class Coaching:
         """Whether a question is open."""
         return self._helper is not None
 
-    def published(self, found: Publication) -> None:
+    def published(self, publication: Publication) -> None:
         """Another map is known."""
         if self._section is None:
-            self.advice = by_valve(self._project.model, found.edges)
+            self.advice = by_valve(self._project.model, publication.edges)
 
     def look(self, estimator: Estimator) -> None:
         """Ask if it is time and there is a snapshot; give up a coach that takes too long."""
@@ -58,7 +59,8 @@ class Coaching:
             return
         if self._section is None or now_s < self._next_s:
             return
-        snapshots = sorted(self._folder.glob(SNAPSHOTS), key=lambda path: path.stat().st_mtime)
+        result = (path for path in self._folder.glob(SNAPSHOTS) if path.is_file())
+        snapshots = sorted(result, key=lambda path: path.stat().st_mtime)
         if snapshots:
             self._next_s, self._started_s = now_s + self._every_s, now_s
             job = Coach(str(snapshots[-1]), self._samples(estimator))
@@ -66,14 +68,14 @@ class Coaching:
             self._helper = Helper(DIAGNOSER, [str(self._project.path)], self._answer, ended)
             self._helper.put(job)
 
-    def take(self, told: Coached) -> None:
+    def take(self, coached: Coached) -> None:
         """An answer has come."""
         self.stop()
-        if told.advice is None:
-            logger.info("no advice: %s", told.reason)
+        if coached.advice is None:
+            logger.info("no advice: %s", coached.reason)
             return
-        self.advice = told.advice
-        logger.info("coach text=%r", told.advice.text)
+        self.advice = coached.advice
+        logger.info("coach text=%r", coached.advice.text)
 
     def stop(self) -> None:
         """End a question that is open."""
@@ -86,10 +88,10 @@ class Coaching:
         history, section = estimator.history, self._section
         if history is None or section is None or not section.see:
             return np.empty((0, 0))
-        return newest(history, history.span_s)
+        return newest(history, history.span_s)[:, : 2 + len(self._project.model.signals)]
 
 
-def by_valve(model: Model, edges: Iterable[EdgeHealth]) -> Advice | None:
+def by_valve(model: Machine, edges: Iterable[EdgeHealth]) -> Advice | None:
     """Which valve is known least, and how it is moved; all that can be said without limits."""
     known = {edge.name: edge for edge in model.edges}
     rows = [e for e in edges if e.name in known]
@@ -99,13 +101,13 @@ def by_valve(model: Model, edges: Iterable[EdgeHealth]) -> Advice | None:
     edge = known[poorest.name]
     low, high = max(edge.safe_band_v, float(edge.grid.u_v[0])), float(edge.grid.u_v[-1])
     sign = "positive" if edge.direction > 0 else "negative"
-    left = sum(poorest.blocks.values()) - poorest.blocks.get("valid", 0)
+    missing = sum(poorest.blocks.values()) - poorest.blocks.get("valid", 0)
     text = (
         f"Valve {edge.name} knows least. Move with {sign} {edge.command} between {low:g} and "
         f"{high:g} V: hold each level for a second, then step to the next; repeat with another "
         "load or supply pressure, so that its pressure drop changes."
     )
-    if left:
-        text += f" {left} of its visited blocks only need more time where they are."
+    if missing:
+        text += f" {missing} of its visited blocks only need more time where they are."
     text += " With a section [excite] in the project file the coach names the motion."
-    return Advice(time.time(), text, {edge.name: left} if left else {})
+    return Advice(time.time(), text, {edge.name: missing} if missing else {})

@@ -7,7 +7,7 @@ import numpy as np
 from firmware_bridge import frames as fr
 from firmware_bridge.frames import Frames
 from rtid.daemon.jobs import Batch
-from rtid.model import FloatArray
+from rtid.plain import FloatArray
 
 ROWS = 1024  # at first; it grows where ticks bring more
 
@@ -22,7 +22,7 @@ class Collector:
         self._n = self._m = 0
 
     def add(self, chunk: FloatArray, frames: Frames) -> None:
-        """Copy what one tick brought."""
+        """Copy what one tick brought; chunk (n, 2 + signals), SI."""
         n = len(chunk)
         if self._n + n > len(self._chunk):
             room = np.empty((2 * (n + ROWS), self._columns))

@@ -11,16 +11,16 @@ from collections import deque
 
 from firmware_bridge.frames import Frames
 from firmware_bridge.sources.live import Source
-from rtid.daemon.answers import Answers
+from rtid.apply.answers import Answers
 from rtid.daemon.collector import Collector
 from rtid.daemon.health import Health
 from rtid.daemon.helper import Helper
 from rtid.daemon.jobs import Handover
-from rtid.daemon.lag import Lag
+from rtid.daemon.lag import LagMeter
 from rtid.daemon.notify import Notifier
 from rtid.estimator.estimator import Estimator
-from rtid.live import Learner
 from rtid.project import Project
+from rtid.trace.learner import Learner
 
 BATCH_NS = 200_000_000
 KEPT_FRAMES = 2000  # of the last frames, to be dumped on failure
@@ -38,16 +38,17 @@ class Core:
         self.learner, self.source, self._analyst = learner, source, analyst
         self.notifier = Notifier()
         self.health = Health(project, learner)
-        self.lag = Lag()
+        self.lag = LagMeter()
         self.answers: Answers | None = None  # for an apply that cannot read the line itself
         self.number = number  # of the last handover
         self.frames = self.samples = 0
         self.newest_s = 0.0  # time of the newest sample, as in `to_chunk`
         self.last: deque[Frames] = deque()
         self.swap: Estimator | None = None
+        self.is_proving = False  # the map held has still to foretell: what is learned is a shadow
         self.is_solving = self.is_saving = True  # the analyst, or it is not ready yet
         self._kept = 0
-        self._collector = Collector(2 + len(project.model.signals), daemon.record_mb > 0)
+        self._collector = Collector(2 + len(learner.estimator.model.signals), daemon.record_mb > 0)
         self._publish_ns, self._store_ns = (
             round(1e9 * s) for s in (daemon.publish_s, daemon.store_s)
         )
@@ -62,6 +63,7 @@ class Core:
         done = ""
         if self.swap is not None:
             self._swap_in(self.swap)
+            self.hand_over(publish=False, store=True)  # what was taken back is not to be restored
             done = SWAP
         frames = self.source.read(0.0)
         if len(frames) or frames.refused:
@@ -76,23 +78,42 @@ class Core:
             self.notifier.tell("WATCHDOG=1")
         return done
 
-    def hand_over(self, publish: bool, store: bool) -> None:
+    def hand_over(self, publish: bool, store: bool, is_last: bool = False) -> None:
         """Copy the estimator and queue the copy."""
         self._send_batch()  # what the copy knows must not be judged by it
         self.number += 1
         self.is_solving |= publish
         self.is_saving |= store
-        self._analyst.put(Handover(self.number, twin(self.learner.estimator), publish, store))
+        copy = self.learner.estimator.copy(with_history=False)
+        job = Handover(self.number, copy, publish, store, is_last, self.is_proving)
+        self._analyst.put(job, first=not publish)
 
-    def finish(self, publish: bool) -> None:
-        """Take what has arrived and the last sample, and hand everything over to be stored."""
+    def finish(self, publish: bool) -> int:
+        """Take what has arrived and the last sample, and hand everything over to be stored.
+
+        The number of the handover that must be on the disk, 0 where there is nothing to store: it
+        goes ahead of all that waits, what is to be published behind it.
+        """
         frames = self.source.read(0.0)
         if len(frames):
             self._take(frames, time.monotonic_ns())
         self.learner.finish()
         self._send_batch()
-        if self.samples:
-            self.hand_over(publish=publish and self.learner.learns, store=True)
+        if self.swap is not None:
+            self._swap_in(self.swap)
+        if not self.samples or (self.is_proving and not self.learner.learns):
+            return 0
+        self.hand_over(publish=False, store=True, is_last=True)
+        last = self.number
+        if publish and self.learner.learns and not self.is_proving:
+            self.hand_over(publish=True, store=False)
+        return last
+
+    def close(self) -> None:
+        """Close the sockets to the service manager and to an `rtid apply`."""
+        self.notifier.close()
+        if self.answers is not None:
+            self.answers.close()
 
     def _send_batch(self) -> None:
         batch = self._collector.take()
@@ -125,7 +146,8 @@ class Core:
             self._kept -= len(self.last.popleft())
 
     def _hand_over_if_due(self, now_ns: int) -> str:
-        publish = not self.is_solving and now_ns >= self._due_publish_ns
+        free = not self.is_solving and not self.is_proving
+        publish = free and now_ns >= self._due_publish_ns
         store = not self.is_saving and now_ns >= self._due_store_ns
         if not (publish or store) or not self.samples:
             return ""
@@ -140,12 +162,3 @@ class Core:
         """Go on with another estimate, and with the samples that are kept for the diagnosis."""
         estimator.history = self.learner.estimator.history
         self.learner.estimator, self.swap = estimator, None
-
-
-def twin(estimator: Estimator) -> Estimator:
-    """An independent copy without the ring of samples."""
-    history, estimator.history = estimator.history, None
-    try:
-        return estimator.copy()
-    finally:
-        estimator.history = history

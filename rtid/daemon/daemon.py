@@ -23,25 +23,26 @@ from types import FrameType
 from firmware_bridge import frames as fr
 from firmware_bridge.sources import candump
 from firmware_bridge.sources.live import Source
-from rtid.daemon.answers import answers_of
+from rtid.apply.answers import answers_of
+from rtid.daemon import realtime
 from rtid.daemon.coaching import Coaching
-from rtid.daemon.configure import boarded
 from rtid.daemon.core import Core
 from rtid.daemon.diagnosing import Diagnosing
 from rtid.daemon.helper import Helper
-from rtid.daemon.jobs import Answer
+from rtid.daemon.jobs import Answer, NotSaved, SavedSnapshot
 from rtid.daemon.keeper import Keeper
 from rtid.daemon.log import logger
+from rtid.daemon.loop import Loop
 from rtid.daemon.notices import telling
 from rtid.daemon.status import Status
 from rtid.daemon.teller import Facts
 from rtid.daemon.warm import compiled
 from rtid.errors import RtidError
-from rtid.live import Learner, catalog_of
-from rtid.loop import realtime
-from rtid.loop.loop import Loop
 from rtid.project import Project
-from rtid.store import Generations
+from rtid.study.on_board import on_board
+from rtid.trace.learner import Learner, catalog_of
+from rtid.trace.snapshot import Generations
+from rtid.trace.state_files import create
 
 ANALYST = "rtid.daemon.analyst"
 LOCK_FILE = "lock"
@@ -63,7 +64,14 @@ class Bus:
 class Daemon:
     """One machine, one bus, one state folder."""
 
-    def __init__(self, project: Project, bus: Bus, folder: Path, log_every_s: float = 1.0) -> None:
+    def __init__(
+        self,
+        project: Project,
+        bus: Bus,
+        folder: Path,
+        log_every_s: float = 1.0,
+        is_fresh: bool = False,
+    ) -> None:
         if project.noise_unknown:
             names = ", ".join(project.noise_unknown)
             raise DaemonError(
@@ -71,12 +79,16 @@ class Daemon:
                 "record a trace, let `rtid check` tell the noise, and write it into the file",
             )
         self._project, self._bus, self._folder = project, bus, folder
-        self._board = boarded(project, logger.warning)  # with the added effects that can run live
+        self._board = on_board(project, logger.warning)  # with the added effects that can run live
         self._log_every_s = log_every_s
+        self._is_fresh = is_fresh  # do not go on with what the folder holds
+        self._generations = Generations(folder, self._board.digest)
         self._loop: Loop | None = None
         self._keeper: Keeper | None = None
         self._stopping = False
         self._answers: deque[Answer] = deque()  # of the helpers, for the keeper
+        self._saved = 0  # the newest handover that is on the disk
+        self.is_saved = True  # after the end: whether the last state is
 
     @property
     def status(self) -> Status | None:
@@ -100,9 +112,9 @@ class Daemon:
         with _locked(folder / LOCK_FILE):
             learner = compiled(self._learner)
             restored = self._restore(learner)
-            analyst = Helper(ANALYST, [str(self._project.path), str(folder)], self._answers.append)
+            analyst = Helper(ANALYST, [str(self._project.path), str(folder)], self._hear)
             diagnosing = Diagnosing(self._project, self._answers.append)
-            coaching = Coaching(self._project, folder, self._answers.append)
+            coaching = Coaching(self._project, self._generations.folder, self._answers.append)
             try:
                 with self._bus.open() as source:
                     core = Core(self._project, learner, source, analyst)
@@ -116,6 +128,7 @@ class Daemon:
                         *self._prepare(),
                         time.time(),
                         self._log_every_s,
+                        self._generations.folder,
                     )
                     self._keeper = Keeper(facts, core, analyst, diagnosing, coaching, self._answers)
                     bus = self._bus.interface, self._bus.channel
@@ -146,29 +159,48 @@ class Daemon:
             self._dump(core)
             raise
         finally:
-            core.notifier.tell("STOPPING=1")
-            core.source.stop()
-            core.finish(publish=for_s is not None)
-            if not analyst.stop():
-                logger.error("NOT SAVED: the last snapshot could not be written in time")
-            keeper.stop()
+            try:
+                self._finish(core, analyst, publish=for_s is not None)
+            finally:  # also where what failed the loop fails the end: nobody else ends its thread
+                keeper.stop()
+                core.close()
             logger.info("stopped")
         return keeper.status
 
+    def _finish(self, core: Core, analyst: Helper, publish: bool) -> None:
+        """Hear no more, take what is there, and have it stored."""
+        core.notifier.tell("STOPPING=1")
+        core.source.stop()
+        last = core.finish(publish)
+        if not analyst.stop():
+            logger.warning("the helper was ended before it had done everything")
+        self.is_saved = self._saved >= last
+        if not self.is_saved:
+            logger.error("NOT SAVED: the last state is not on the disk")
+            self._answers.append(NotSaved("last state", "it is not on the disk"))
+
+    def _hear(self, answer: Answer) -> None:
+        """From the analyst, in its listener's thread."""
+        if isinstance(answer, SavedSnapshot):
+            self._saved = answer.number
+        self._answers.append(answer)
+
     def _learner(self) -> Learner:
         board = self._board
-        return Learner(board.model, catalog_of(board), board.assembly)
+        return Learner(board.model, catalog_of(board), board.assembly, board.flows)
 
     def _restore(self, learner: Learner) -> str:
         """Go on with the newest whole snapshot of this project."""
-        found = Generations(self._folder, self._board.digest).restore(learner.estimator.model)
-        for text in found.refused:
+        if self._is_fresh:
+            self._generations.set_aside("fresh")
+        restored = self._generations.restore(learner.estimator.model)
+        for text in restored.refused:
             logger.warning("refused %s", text)
-        if found.estimator is not None:
-            found.estimator.history = learner.estimator.history
-            learner.estimator = found.estimator
-        logger.info("state %s", found.text)
-        return found.text
+        if restored.estimator is not None:
+            restored.estimator.history = learner.estimator.history
+            learner.estimator = restored.estimator
+        logger.info("state %s", restored.text)
+        return restored.text
 
     def _prepare(self) -> tuple[str, bool]:
         """Scheduling and memory of the loop's thread, as far as the system grants it."""
@@ -211,7 +243,7 @@ def _until(
 @contextlib.contextmanager
 def _locked(path: Path) -> Iterator[None]:
     """Only one daemon per state folder."""
-    with path.open("w") as file:
+    with create(path) as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
@@ -223,12 +255,18 @@ def _locked(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def stopped_by_signals(daemon: Daemon) -> Iterator[None]:
-    """SIGTERM and SIGINT end the daemon in good order; only from the main thread."""
+    """SIGTERM, SIGINT and SIGHUP end the daemon in good order; only from the main thread.
+
+    SIGHUP stays ignored where it is, as by nohup.
+    """
 
     def stop(_number: int, _frame: FrameType | None) -> None:
         daemon.stop()
 
-    before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
+    wanted = [signal.SIGTERM, signal.SIGINT]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        wanted.append(signal.SIGHUP)
+    before = {number: signal.signal(number, stop) for number in wanted}
     try:
         yield
     finally:

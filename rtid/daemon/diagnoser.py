@@ -12,24 +12,25 @@ from dataclasses import replace
 from pathlib import Path
 
 from firmware_bridge.sources.errors import LogError
-from rtid.check import judge
-from rtid.check.reading import read_trace
-from rtid.coaching import advise
-from rtid.daemon.jobs import Answer, Check, Checked, Coach, Coached, Diagnose, Found, Job
+from rtid.daemon.advice import advise
+from rtid.daemon.jobs import Answer, Check, Checked, Coach, Coached, Diagnose, Job, VerdictAnswer
 from rtid.daemon.pipe import Pipe
 from rtid.daemon.status import Verdict
-from rtid.diagnosed_text import sentences
-from rtid.diagnosing import added_parts, diagnose_live
 from rtid.effects import catalogue
 from rtid.errors import RtidError
 from rtid.estimator.estimator import Estimator
 from rtid.model import Upkeep
 from rtid.project import Project, load
+from rtid.study.spans import added_parts
+from rtid.study.study import diagnose_live
+from rtid.tell.diagnosed import sentences
+from rtid.trace import judge
+from rtid.trace.signals import read_recording
 
 NICE = 5
 
 
-def diagnose(job: Diagnose, project: Project) -> Found:
+def diagnose(job: Diagnose, project: Project) -> VerdictAnswer:
     """The verdict on these samples, or why there is none."""
     span_s = float(job.chunk[-1, 0] - job.chunk[0, 0]) if len(job.chunk) else 0.0
     now_s = time.time()
@@ -37,27 +38,27 @@ def diagnose(job: Diagnose, project: Project) -> Found:
     estimator = Estimator(replace(job.model, upkeep=upkeep))
     assert estimator.history is not None
     estimator.history.append(job.chunk)
-    found = diagnose_live(estimator, added_parts(project), project.effects)
-    effects = tuple(f"{e.effect} ({e.where})" if e.where else e.effect for e in found.found)
-    text = " ".join(sentences(found)[:3])
+    diagnosis = diagnose_live(estimator, added_parts(project), project.effects)
+    effects = tuple(f"{e.effect} ({e.where})" if e.where else e.effect for e in diagnosis.found)
+    text = " ".join(sentences(diagnosis)[:3])
     pages = catalogue()
-    places = [pages[e.effect].places for e in found.found if e.effect in pages]
-    of_sensor = bool(found.found) and all("sensor" in place for place in places)
-    told = Verdict(
+    places = [pages[e.effect].places for e in diagnosis.found if e.effect in pages]
+    of_sensor = bool(diagnosis.found) and all("sensor" in place for place in places)
+    verdict = Verdict(
         now_s,
-        found.verdict,
+        diagnosis.verdict,
         text,
         effects,
         (span_s, 0.0),
-        found.as_json(),
+        diagnosis.as_json(),
         of_sensor and bool(places),
     )
-    return Found(told)
+    return VerdictAnswer(verdict)
 
 
 def check(job: Check, project: Project) -> Checked:
     """What `rtid check` has against the project file, by the daemon's own recording."""
-    read = read_trace(project, Path(job.recording))
+    read = read_recording(project, Path(job.recording))
     report = judge(
         project.model,
         project.assembly,
@@ -94,7 +95,7 @@ def answer(job: Job, project: Project) -> Answer:
         return diagnose(job, project)
     except (RtidError, LogError, OSError) as error:  # OSError: the file has just been set aside
         reason = str(error)
-        return Coached(None, reason) if isinstance(job, Coach) else Found(None, reason)
+        return Coached(None, reason) if isinstance(job, Coach) else VerdictAnswer(None, reason)
 
 
 if __name__ == "__main__":

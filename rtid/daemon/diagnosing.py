@@ -8,12 +8,12 @@ from collections.abc import Callable
 import numpy as np
 
 from rtid.daemon.helper import Helper
-from rtid.daemon.jobs import Answer, Check, Checked, Diagnose, Found, Job
+from rtid.daemon.jobs import Answer, Check, Checked, Diagnose, Job, VerdictAnswer
 from rtid.daemon.log import logger
 from rtid.daemon.status import Verdict
 from rtid.estimator.estimator import Estimator
-from rtid.estimator.history import History
-from rtid.model import FloatArray
+from rtid.estimator.ring import History
+from rtid.plain import FloatArray
 from rtid.project import Project
 
 AFTER_CHANGE_S = (20.0, 35.0, 55.0)  # of samples since the change
@@ -83,18 +83,18 @@ class Diagnosing:
             self._next_s = time.monotonic() + self._every_s
             self._begin(estimator, history.span_s)
 
-    def take(self, found: Found | Checked) -> None:
+    def take(self, result: VerdictAnswer | Checked) -> None:
         """An answer has come."""
         self._end_helper()
-        if isinstance(found, Checked):
-            self.implausible = found.errors
+        if isinstance(result, Checked):
+            self.implausible = result.errors
             return
-        if found.verdict is None:
-            logger.info("no diagnosis: %s", found.reason)
+        if result.verdict is None:
+            logger.info("no diagnosis: %s", result.reason)
             return
-        self.verdict = found.verdict
+        self.verdict = result.verdict
         self.is_of_change = self._since_s is not None
-        logger.info("diagnosis verdict=%s text=%r", found.verdict.verdict, found.verdict.text)
+        logger.info("diagnosis verdict=%s text=%r", result.verdict.verdict, result.verdict.text)
 
     def _look_at_change(self, estimator: Estimator, held_s: float) -> None:
         if self._stage < len(AFTER_CHANGE_S) and held_s >= AFTER_CHANGE_S[self._stage]:
@@ -103,12 +103,12 @@ class Diagnosing:
 
     def _begin(self, estimator: Estimator, span_s: float) -> None:
         assert estimator.history is not None
-        chunk = newest(estimator.history, span_s)
+        chunk = newest(estimator.history, span_s)[:, : 2 + len(self._project.model.signals)]
         self._start(Diagnose(self._project.model, chunk))
 
     def _start(self, job: Job) -> None:
         self._started_s = time.monotonic()
-        ended = Found(None, "the helper has ended")
+        ended = VerdictAnswer(None, "the helper has ended")
         self._helper = Helper(DIAGNOSER, [str(self._project.path)], self._answer, ended)
         self._helper.put(job)
 
@@ -123,7 +123,7 @@ class Diagnosing:
 
 
 def newest(history: History, span_s: float) -> FloatArray:
-    """The last span_s seconds of a ring that another thread writes to; rows as in `to_chunk`.
+    """The last span_s seconds (n, 2 + signals), SI, of a ring that another thread writes to.
 
     Rows that were overwritten while they were copied stand before a step back of time, one that was
     not yet written stands at the very end; a clock that was set is a step back as well.

@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from firmware_bridge.checks import REASONS
 from rtid.daemon.status import MessageHealth, SignalHealth, SignalVerdict
-from rtid.live import Learner
+from rtid.plain import BoolArray
 from rtid.project import Project
+from rtid.trace.learner import Learner
 
 LATE = 1.5  # periods of silence that are late
 SILENT_PERIODS, SILENT_S = 5, 0.5
@@ -89,11 +90,11 @@ class Health:
         self,
         messages: tuple[MessageHealth, ...],
         rows: NDArray[np.void],
-        frozen: NDArray[np.bool_],
+        frozen: BoolArray,
     ) -> tuple[SignalHealth, ...]:
         by_name = {message.name: message for message in messages}
         declared = {signal.name: signal for signal in self._project.model.signals}
-        found = []
+        health = []
         for row, is_frozen, source in zip(
             rows, frozen, self._project.assembly.signals, strict=True
         ):
@@ -102,7 +103,7 @@ class Health:
             seen = np.isfinite(row["minimum"])
             low, high = float(row["minimum"]), float(row["maximum"])
             inside = not seen or (low >= signal.minimum and high <= signal.maximum)
-            found.append(
+            health.append(
                 SignalHealth(
                     name=source.name,
                     kind=signal.kind,
@@ -117,7 +118,7 @@ class Health:
                     verdict=_verdict(message, bool(is_frozen), inside, bool(seen)),
                 )
             )
-        return tuple(found)
+        return tuple(health)
 
 
 def _verdict(

@@ -50,10 +50,13 @@ class Helper:
         self._feeder = threading.Thread(target=self._run, name=f"rtid-{module}", daemon=True)
         self._feeder.start()
 
-    def put(self, job: Job) -> None:
-        """Queue a job; never waits."""
+    def put(self, job: Job, first: bool = False) -> None:
+        """Queue a job, with `first` ahead of all that wait; never waits."""
         with self._wake:
-            self._jobs.append(job)
+            if first:
+                self._jobs.appendleft(job)
+            else:
+                self._jobs.append(job)
             if isinstance(job, Batch):
                 self._bytes += job.size_bytes
             while len(self._jobs) > QUEUED or self._bytes > QUEUED_BYTES:

@@ -3,26 +3,31 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 from firmware_bridge.frames import Frames
 from rtid.daemon.acceptance import Acceptance
 from rtid.daemon.status import Advice, Alarm, EdgeHealth, Verdict
 from rtid.estimator.estimator import Estimator
 from rtid.estimator.flowmap import FlowMap
-from rtid.model import FloatArray, Model
+from rtid.model import Machine
+from rtid.plain import FloatArray
 
 
 @dataclass(frozen=True)
 class Handover:
     """The estimator as it was at one moment, without its ring of samples: solve it, and store it.
 
-    number: grows by one; publish = False only stores.
+    number: grows by one; publish = False only stores; is_last: stored also where nothing is new;
+    is_proving: the baseline has still to foretell the motion, so that this is its shadow.
     """
 
     number: int
     estimator: Estimator
     publish: bool
     store: bool
+    is_last: bool = False
+    is_proving: bool = False
 
 
 @dataclass(frozen=True)
@@ -48,9 +53,14 @@ class Note:
 
 @dataclass(frozen=True)
 class Recall:
-    """Give back the estimator of this handover, one of the last three."""
+    """Give back the newest estimator that is no younger than this handover.
+
+    before_s: it must be older than this sample time as well, else it is the baseline; None where
+    that does not matter, and the oldest one there is would do.
+    """
 
     number: int
+    before_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -69,7 +79,7 @@ class Relearn:
 class Diagnose:
     """Samples to diagnose, rows as in `to_chunk`."""
 
-    model: Model
+    model: Machine
     chunk: FloatArray
 
 
@@ -114,7 +124,7 @@ class Publication:
 
 
 @dataclass(frozen=True)
-class Judgement:
+class HandoverJudgement:
     """How well the map of handover `number` foretells the samples that came behind it.
 
     surprise: mean square of whitened innovations over `rows` of them; 1 is noise.
@@ -127,6 +137,21 @@ class Judgement:
 
 
 @dataclass(frozen=True)
+class Foretold:
+    """How the baseline stands to the motion.
+
+    "proving": it has still to foretell it, nothing learned counts; "proven"; "contradicted" since a
+    sample time, text: by what, of_sensor: by no change of the machine; "named": text and of_sensor
+    of a contradiction that had none; "refused": a first map that cannot be, text: why.
+    """
+
+    state: Literal["proving", "proven", "contradicted", "named", "refused"]
+    since_s: float = 0.0
+    text: str = ""
+    of_sensor: bool = False
+
+
+@dataclass(frozen=True)
 class Recalled:
     """Answer to Recall, the oldest one there is where the wanted one is not; or to Relearn."""
 
@@ -135,7 +160,7 @@ class Recalled:
 
 
 @dataclass(frozen=True)
-class Saved:
+class SavedSnapshot:
     """A snapshot is on the disk."""
 
     number: int
@@ -151,7 +176,7 @@ class NotSaved:
 
 
 @dataclass(frozen=True)
-class Recording:
+class RecorderState:
     """Where frames go now, and the folder in which an alarm's trace was kept."""
 
     path: str
@@ -159,7 +184,7 @@ class Recording:
 
 
 @dataclass(frozen=True)
-class Found:
+class VerdictAnswer:
     """Answer to Diagnose: a verdict, or the reason why there is none."""
 
     verdict: Verdict | None
@@ -181,16 +206,19 @@ class Coached:
     reason: str = ""
 
 
-Job = Handover | Batch | Note | Recall | Relearn | Diagnose | Coach | Check | Found | Checked
+Job = (
+    Handover | Batch | Note | Recall | Relearn | Diagnose | Coach | Check | VerdictAnswer | Checked
+)
 Answer = (
     Ready
     | Publication
-    | Judgement
+    | HandoverJudgement
     | Recalled
-    | Saved
+    | Foretold
+    | SavedSnapshot
     | NotSaved
-    | Recording
-    | Found
+    | RecorderState
+    | VerdictAnswer
     | Coached
     | Checked
 )

@@ -9,6 +9,7 @@ import math
 import threading
 import time
 from collections import Counter, deque
+from collections.abc import Callable
 from dataclasses import replace
 
 from rtid.daemon import jobs, wording
@@ -20,8 +21,9 @@ from rtid.daemon.core import Core
 from rtid.daemon.diagnosing import Diagnosing, newest
 from rtid.daemon.helper import Helper
 from rtid.daemon.log import logger
-from rtid.daemon.plant import PlantWatch
+from rtid.daemon.plant_watch import PlantWatch
 from rtid.daemon.story import line
+from rtid.daemon.suspension import remember, suspended
 from rtid.daemon.teller import Facts, Saving, Teller
 
 LOOK_S = 0.1
@@ -49,12 +51,16 @@ class Keeper:
         self.alarms = Alarms(self._told)
         self.plant = PlantWatch()
         self._answers = answers  # of the helpers, appended from their threads
-        self._saving = Saving(facts.project.sections.daemon.store_s)
+        self._saving = Saving(facts.project.sections.daemon.store_s, facts.folder)
         self._recording = ""
+        self._cause: jobs.Foretold | None = None  # what contradicts the baseline
+        self._refused = ""  # why the first map was not published
+        self._is_quarantined = False
         self._first_s: float | None = None  # time of the first sample of this run
         self._is_checked = self._is_ready = False
         self._told_s = 0.0
         self._loads: deque[tuple[int, int, Counter[str]]] = deque(maxlen=LOADS)
+        self._deaf = ""  # why no request can be taken
         self._fallen = 0
         self._fallen_s = -math.inf
         self._stopped = threading.Event()
@@ -76,16 +82,18 @@ class Keeper:
     def _run(self) -> None:
         next_s = time.monotonic()
         while not self._stopped.wait(LOOK_S):
-            try:
-                self._listen()
-                self._look()
-                if (request := taken(self._facts.folder)) is not None:
-                    self._accept(request)
-                if time.monotonic() >= next_s:
-                    next_s = time.monotonic() + 1.0
-                    self._tell()
-            except Exception:  # the keeper must not die: without it nobody hears of anything
-                logger.exception("keeper failed")
+            for step in (self._listen, self._look, self._hear_request):
+                self._survived(step)
+            if time.monotonic() >= next_s:
+                next_s = time.monotonic() + 1.0
+                self._survived(self._tell)
+
+    def _survived(self, step: Callable[[], None]) -> None:
+        """Take a step; one that fails must not keep the others from being taken."""
+        try:
+            step()
+        except Exception:  # the keeper must not die: without it nobody hears of anything
+            logger.exception("keeper failed")
 
     def _listen(self) -> None:
         while self._answers:
@@ -96,12 +104,12 @@ class Keeper:
             elif isinstance(answer, jobs.Publication):
                 self.teller.publish(answer)
                 self._coaching.published(answer)
-            elif isinstance(answer, jobs.Judgement):
+            elif isinstance(answer, jobs.HandoverJudgement):
                 if self.plant.push(answer):
                     self._plant_changed()
-            elif isinstance(answer, jobs.Saved | jobs.NotSaved):
+            elif isinstance(answer, jobs.SavedSnapshot | jobs.NotSaved):
                 self._saving.hear(answer)
-            elif isinstance(answer, jobs.Recording):
+            elif isinstance(answer, jobs.RecorderState):
                 self._recording = answer.path
                 for name, folder in answer.kept.items():
                     self.alarms.keep(name, folder)
@@ -109,23 +117,54 @@ class Keeper:
                 self._core.swap = answer.estimator
                 if answer.is_accepted:
                     self.plant.accept()
+                    self._core.is_proving = False
                     self._plant_changed()
+            elif isinstance(answer, jobs.Foretold):
+                self._foretold(answer)
             elif isinstance(answer, jobs.Coached):
                 self._coaching.take(answer)
-            elif isinstance(answer, jobs.Found | jobs.Checked):
+            elif isinstance(answer, jobs.VerdictAnswer | jobs.Checked):
                 self._analyst.put(answer)
                 self._diagnosing.take(answer)
-                if self._diagnosing.is_acquitted and self.plant.changed:
+                acquitted = self._diagnosing.is_acquitted and not self.plant.contradicted
+                if acquitted and self.plant.changed:
                     self.plant.accept()
                     self._plant_changed()
 
-    def _plant_changed(self) -> None:
+    def _foretold(self, answer: jobs.Foretold) -> None:
+        """The baseline has to prove itself, has done so, or is contradicted."""
+        self._core.is_proving = answer.state == "proving"
+        if answer.state == "proving":
+            self._cause = stored = suspended(self._facts.learned)
+            if stored is not None:
+                self.plant.contradict(0.0)
+                self._core.learner.learns = False
+        elif answer.state == "proven":
+            logger.info("the map held foretells the motion: what is learned counts")
+            if self.plant.contradicted:
+                self.plant.accept()
+                self._plant_changed()
+        elif answer.state == "contradicted":
+            self._cause = answer
+            self.plant.contradict(answer.since_s)
+            self._plant_changed(before_s=answer.since_s)
+        elif answer.state == "named":
+            if self.plant.contradicted:
+                self._cause = answer
+                remember(self._facts.learned, answer, is_changed=True)
+        else:
+            self._refused = answer.text
+
+    def _plant_changed(self, before_s: float | None = None) -> None:
         """Stop learning and go back to what was learned before, or go on."""
-        self._core.learner.learns = not self.plant.changed
+        self._core.learner.learns = not (self.plant.changed or self._is_quarantined)
+        if not self.plant.changed:
+            self._cause = None
+        remember(self._facts.learned, self._cause, self.plant.changed)
         if self.plant.changed:
             logger.warning("plant changed: learning is suspended, surprise=%.1f level=%.1f",
                            self.plant.surprise or 0.0, self.plant.level)  # fmt: skip
-            self._analyst.put(jobs.Recall(self.plant.trusted))
+            self._analyst.put(jobs.Recall(self.plant.trusted, before_s))
             self._diagnosing.begin(self.plant.since_s)
         else:
             logger.info("plant as before: learning goes on")
@@ -150,10 +189,13 @@ class Keeper:
         )
         self.alarms.put("not_saved", "store", self._why_not_saved())
         verdict = self._diagnosing.verdict if self._diagnosing.is_of_change else None
-        of_sensor = verdict is not None and verdict.of_sensor
-        text = wording.plant_changed(verdict) if self.plant.changed else ""
+        cause = self._cause or jobs.Foretold("proven")
+        of_sensor = cause.of_sensor if cause.text else verdict is not None and verdict.of_sensor
+        text = wording.plant_changed(verdict, cause.text) if self.plant.changed else ""
         self.alarms.put("plant_changed", "sensor" if of_sensor else "plant", text)
-        self.alarms.put("implausible", "sensor", "; ".join(self._diagnosing.implausible))
+        implausible = "; ".join(filter(None, (*self._diagnosing.implausible, self._refused)))
+        self.alarms.put("implausible", "sensor", implausible)
+        self._look_at_quarantine(bool(implausible))
         if not self._is_checked and self._recording and self._has_run_s() > CHECK_S:
             self._is_checked = self._diagnosing.check(self._recording)
         self._diagnosing.look(learner.estimator, self._core.newest_s)
@@ -162,6 +204,16 @@ class Keeper:
         self._look_at_load()
         if self.alarms.on != tuple(a for a in self.status.alarms if a.until_unix_s is None):
             self._tell_alarms()
+
+    def _look_at_quarantine(self, implausible: bool) -> None:
+        """Nothing is learned while a sensor cannot be believed."""
+        before = self._is_quarantined
+        self._is_quarantined = implausible or self.alarms.has("signal_range")
+        if self._is_quarantined == before:
+            return
+        self._core.learner.learns = not (self.plant.changed or self._is_quarantined)
+        if implausible:
+            self._analyst.put(jobs.Recall(self.plant.trusted, -math.inf))
 
     def _look_at_load(self) -> None:
         """Ticks that were lost within the last few looks."""
@@ -181,6 +233,18 @@ class Keeper:
             self._first_s = self._core.newest_s
         return abs(self._core.newest_s - self._first_s) if self._first_s is not None else 0.0
 
+    def _hear_request(self) -> None:
+        """What `rtid accept` has left; why it cannot be taken is told once."""
+        deaf = ""
+        try:
+            if (request := taken(self._facts.folder)) is not None:
+                self._accept(request)
+        except OSError as error:
+            deaf = str(error)
+        if deaf and deaf != self._deaf:
+            logger.warning("no request can be taken: %s", deaf)
+        self._deaf = deaf
+
     def _accept(self, request: Acceptance) -> None:
         """The changed machine is the new normal: learn anew from what came since the change."""
         estimator = self._core.learner.estimator
@@ -192,8 +256,7 @@ class Keeper:
         self._analyst.put(jobs.Relearn(chunk, estimator.origin_us, request))
 
     def _why_not_saved(self) -> str:
-        core = self._core
-        return self._saving.why_not(core.samples > 0 and core.learner.learns)
+        return self._saving.why_not(self._core.samples > 0 and self._core.learner.learns)
 
     def _store(self) -> st.Store:
         why, dropped = self._why_not_saved(), self._analyst.dropped

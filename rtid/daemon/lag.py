@@ -8,7 +8,7 @@ from __future__ import annotations
 WINDOW_US = 10_000_000
 
 
-class Lag:
+class LagMeter:
     """`note` each newest stamp with the time at which it was taken, us on the loop's clock."""
 
     def __init__(self) -> None:

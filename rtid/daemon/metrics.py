@@ -16,12 +16,12 @@ Line = tuple[str, str, str, dict[str, str], float | None]  # name, kind, help, l
 def exposition(status: Status, age_s: float) -> str:
     """All metrics; age_s: seconds since the status was told."""
     text: list[str] = []
-    told: set[str] = set()
+    described: set[str] = set()
     for name, kind, help_text, labels, value in _lines(status, age_s):
         if value is None:
             continue
-        if name not in told:
-            told.add(name)
+        if name not in described:
+            described.add(name)
             text += [f"# HELP rtid_{name} {help_text}", f"# TYPE rtid_{name} {kind}"]
         pairs = ",".join(f'{key}="{_escaped(text)}"' for key, text in labels.items())
         text.append(f"rtid_{name}{{{pairs}}} {value:.10g}")
@@ -70,7 +70,11 @@ def _lines(status: Status, age_s: float) -> Iterator[Line]:
             yield "alarm", "gauge", "1 while it is on", labels, 1.0
 
 
-def _quantiles(name: str, found: Distribution, machine: dict[str, str]) -> Iterator[Line]:
-    for share, value in (("0.5", found.p50_us), ("0.99", found.p99_us), ("0.999", found.p999_us)):
+def _quantiles(name: str, distribution: Distribution, machine: dict[str, str]) -> Iterator[Line]:
+    for share, value in (
+        ("0.5", distribution.p50_us),
+        ("0.99", distribution.p99_us),
+        ("0.999", distribution.p999_us),
+    ):
         labels = machine | {"quantile": share}
         yield f"{name}_seconds", "gauge", "Since the start", labels, 1e-6 * value

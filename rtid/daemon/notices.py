@@ -12,7 +12,8 @@ from pathlib import Path
 
 from firmware_bridge import protocol
 from firmware_bridge.playback import SendError
-from rtid import offered, reach
+from rtid.apply import offer as offered
+from rtid.apply import reach
 from rtid.daemon.log import logger
 from rtid.daemon.status import Status
 from rtid.project import Project
@@ -32,7 +33,7 @@ def frames_of(status: Status, is_offered: bool, counter: int) -> list[bytes]:
     blocks = sum(sum(edge.blocks.values()) for edge in edges)
     valid = sum(edge.blocks.get("valid", 0) for edge in edges)
     progress = sum(edge.progress for edge in edges) / max(1, len(edges))
-    told = protocol.status_frame(
+    frame = protocol.status_frame(
         LEARNING.index(estimate.state),
         VERDICTS.index(verdict) if verdict in VERDICTS else 0,
         sum(alarm.until_unix_s is None for alarm in status.alarms),
@@ -41,7 +42,7 @@ def frames_of(status: Status, is_offered: bool, counter: int) -> list[bytes]:
         STALE * estimate.stale + IS_OFFERED * is_offered,
         counter,
     )
-    return [told] + [
+    return [frame] + [
         protocol.beta_frame(k, chamber.beta_pa, chamber.beta_sd_pa or 0.0)
         for k, chamber in enumerate(estimate.chambers)
         if chamber.beta_pa is not None

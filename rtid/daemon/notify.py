@@ -20,6 +20,12 @@ class Notifier:
         mine = os.environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
         self.watchdog_s = watchdog_us * 1e-6 if mine else 0.0  # 0: nobody watches
 
+    def close(self) -> None:
+        """Tell nothing more."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
     def tell(self, *lines: str) -> None:
         """Send lines such as "READY=1"; a manager that does not listen is no concern of ours."""
         if self._socket is not None:

@@ -18,6 +18,8 @@ from firmware_bridge.sources import blf
 
 SEGMENT_S = 60.0
 AFTER_S = 30.0
+RETRY_S = 5.0  # so long nothing is tried after the disk has refused
+MOST_SEGMENTS = 10_000  # however small they are: a folder has to be listed
 MOST_ALARMS = 100  # folders of alarms that are kept
 RING, ALARMS = "recording", "alarms"
 
@@ -33,6 +35,7 @@ class Recorder:
         self._writer: blf.Writer | None = None
         self._path: Path | None = None
         self._end_us = 0
+        self._refused: tuple[OSError, float] | None = None  # what the disk has said, and when
         self._keep: list[tuple[Path, float]] = []  # folders that new segments belong to, until
         self._ring.mkdir(parents=True, exist_ok=True)
 
@@ -45,15 +48,31 @@ class Recorder:
         """Append a batch."""
         if not len(frames):
             return
+        if self._refused and 0 <= self._clock_s() - self._refused[1] < RETRY_S:
+            raise self._refused[0]
+        try:
+            self._write(frames)
+        except OSError as error:
+            self._refused = error, self._clock_s()
+            self._give_up()
+            raise
+        self._refused = None
+
+    def _write(self, frames: Frames) -> None:
         first_us = int(frames.t_us.min())
         if self._writer is None or not self._end_us - 2e6 * SEGMENT_S < first_us < self._end_us:
             self._begin(first_us)
         assert self._writer is not None
-        try:
-            self._writer.write(frames)
-        except OSError:
-            self.close()
-            raise
+        self._writer.write(frames)
+
+    def _give_up(self) -> None:
+        """Close the segment that the disk does not take; one without a frame goes."""
+        is_empty = self._writer is None or not self._writer.has_frames
+        self.close()
+        if is_empty and self._path is not None:
+            for folder in (self._ring, *(folder for folder, _ in self._keep)):
+                (folder / self._path.name).unlink(missing_ok=True)
+            self._path = None
 
     def keep(self, name: str, since_unix_s: float) -> str:
         """Keep what is recorded around now for good; the folder."""
@@ -75,10 +94,12 @@ class Recorder:
 
     def _begin(self, first_us: int) -> None:
         self.close()
+        self._path = None
         self._make_room()
         stamp = time.strftime("%Y%m%d-%H%M%S", time.gmtime(first_us * 1e-6))
         path = self._ring / f"{stamp}-{first_us % 1_000_000:06d}.blf"
-        self._writer, self._path = blf.Writer(path, first_us - 1_000_000), path
+        self._path = path
+        self._writer = blf.Writer(path, first_us - 1_000_000)
         self._end_us = first_us + round(1e6 * SEGMENT_S)
         now_s = self._clock_s()
         self._keep = [(folder, until_s) for folder, until_s in self._keep if until_s > now_s]
@@ -90,12 +111,13 @@ class Recorder:
         segments = self._segments()
         sizes = [segment.stat().st_size for segment in segments]
         spare = self._limit_bytes - max(sizes, default=0)
-        while segments and sum(sizes) > spare:
+        while segments and (sum(sizes) > spare or len(segments) >= MOST_SEGMENTS):
             segments.pop(0).unlink(missing_ok=True)
             sizes.pop(0)
 
     def _segments(self) -> list[Path]:
-        return sorted(self._ring.glob("*.blf"), key=lambda path: path.stat().st_mtime)
+        segments = (path for path in self._ring.glob("*.blf") if path.is_file())
+        return sorted(segments, key=lambda path: path.stat().st_mtime)
 
 
 def _link(segment: Path, folder: Path) -> None:

@@ -8,7 +8,6 @@ commands V: SI throughout.  Everything is JSON: NaN and infinities are None.
 from __future__ import annotations
 
 import json
-import math
 import os
 from dataclasses import asdict, dataclass, field
 from functools import cache
@@ -18,9 +17,12 @@ from typing import Any, Literal
 from pydantic import TypeAdapter
 
 from rtid.errors import RtidError
+from rtid.plain import plain
+from rtid.trace.state_files import create, exchange, read_bytes
 
 SCHEMA = 1
 STATUS_FILE = "status.json"
+ROOM_BYTES = 8192  # the file grows by so much, with half its length to spare
 OLD_S = 5.0  # a status of that age is that of a daemon that no longer runs
 
 SignalVerdict = Literal["ok", "silent", "frozen", "out_of_range", "not_available", "implausible"]
@@ -121,7 +123,7 @@ class EdgeHealth:
 
 
 @dataclass(frozen=True)
-class Chamber:
+class ChamberStatus:
     """Bulk modulus of one chamber with its standard deviation, Pa; None before it is known."""
 
     name: str
@@ -130,7 +132,7 @@ class Chamber:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class EstimateStatus:
     """What was learned by the last publication; `stale` while its samples are older than allowed.
 
     version counts publications of a changed map; samples, rows and refused count since the start
@@ -146,7 +148,7 @@ class Estimate:
     rows: int = 0
     rho: float | None = None
     surprise: float | None = None  # mean square of the last rows against the map held, in noise
-    chambers: tuple[Chamber, ...] = ()
+    chambers: tuple[ChamberStatus, ...] = ()
     edges: tuple[EdgeHealth, ...] = ()
     refused: dict[str, int] = field(default_factory=dict)  # all gates: bridge, watch, estimator
 
@@ -178,7 +180,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Advice:
-    """What is not known yet, and the motion that would tell it, see `rtid.coaching`.
+    """What is not known yet, and the motion that would tell it, see `rtid.daemon.advice`.
 
     blocks: how many, by edge; effects: named ones that cannot be seen well yet; segments: the
     pieces of motion that tell most.
@@ -215,7 +217,7 @@ class Status:
     bus: BusHealth
     messages: tuple[MessageHealth, ...] = ()
     signals: tuple[SignalHealth, ...] = ()
-    estimate: Estimate = Estimate()
+    estimate: EstimateStatus = EstimateStatus()
     store: Store = Store()
     verdict: Verdict | None = None
     diagnosing: bool = False
@@ -226,33 +228,22 @@ class Status:
 
     def has(self, alarm: str) -> bool:
         """Whether an alarm of this name is on."""
-        return any(one.name == alarm and one.until_unix_s is None for one in self.alarms)
+        return any(event.name == alarm and event.until_unix_s is None for event in self.alarms)
 
     def to_json(self) -> str:
         """One line of JSON."""
-        return json.dumps(_plain(asdict(self)))
-
-
-def _plain(value: Any) -> Any:
-    """JSON knows no NaN."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, dict):
-        return {key: _plain(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
-    return value
+        return json.dumps(plain(asdict(self)))
 
 
 def from_json(text: str | bytes) -> Status:
     """The status that `to_json` wrote.  Raises StatusError if it is none of this version."""
     try:
-        found = _adapter().validate_json(text)
+        status = _adapter().validate_json(text)
     except ValueError as error:
-        raise StatusError(f"not a status of rtid ({error})", "are both of one version?") from error
-    if found.schema != SCHEMA:
-        raise StatusError(f"status of schema {found.schema}, this program reads {SCHEMA}")
-    return found
+        raise StatusError("not a status of rtid", "are both of one version?") from error
+    if status.schema != SCHEMA:
+        raise StatusError(f"status of schema {status.schema}, this program reads {SCHEMA}")
+    return status
 
 
 @cache
@@ -261,16 +252,30 @@ def _adapter() -> TypeAdapter[Status]:
 
 
 def write(folder: Path, status: Status) -> None:
-    """Replace the status file; no fsync, it says nothing after a power cut."""
-    temporary = folder / (STATUS_FILE + ".part")
-    temporary.write_text(status.to_json(), "utf-8")
-    os.replace(temporary, folder / STATUS_FILE)
+    """Replace the status file; no fsync, it says nothing after a power cut.
+
+    Two files change their names and keep their room on the disk, filled up with spaces: a full disk
+    is told by the very status that it would not have room for.
+    """
+    temporary, content = folder / (STATUS_FILE + ".part"), status.to_json().encode()
+    with create(temporary) as file:
+        size = os.fstat(file.fileno()).st_size
+        if len(content) > size:
+            size = ROOM_BYTES * (1 + 3 * len(content) // (2 * ROOM_BYTES))
+        file.write(content.ljust(size))
+    exchange(temporary, folder / STATUS_FILE)
 
 
 def read(folder: Path) -> Status:
     """The newest status of the daemon that keeps its state in this folder."""
     path = folder / STATUS_FILE
     try:
-        return from_json(path.read_bytes())
+        content = read_bytes(path)
     except FileNotFoundError:
         raise StatusError(f"{path}: no daemon has run here", "start it with `rtid run`") from None
+    except OSError as error:
+        raise StatusError(f"{path}: {error.strerror}", "take it away; it comes anew") from error
+    try:
+        return from_json(content)
+    except StatusError as error:
+        raise StatusError(f"{path}: {error}", error.remedy) from error

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from rtid.daemon.histogram import EDGES_US, Histogram
+from rtid.daemon.loop import Loop
 from rtid.daemon.status import Distribution, LoopHealth, Status
-from rtid.loop.histogram import EDGES_US, Histogram
-from rtid.loop.loop import Loop
 from rtid.project import Project
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from dataclasses import dataclass, field, replace
@@ -11,12 +12,14 @@ from rtid.daemon import status as st
 from rtid.daemon.alarms import Alarms
 from rtid.daemon.core import Core
 from rtid.daemon.diagnosing import Diagnosing
-from rtid.daemon.jobs import NotSaved, Publication, Saved
+from rtid.daemon.jobs import NotSaved, Publication, SavedSnapshot
+from rtid.daemon.loop import Loop
 from rtid.daemon.story import loop_health, resident_mb
-from rtid.loop.loop import Loop
 from rtid.project import Project
 
-HOLDING = ("sensor_frozen", "second_sender")  # alarms while which nothing is learned
+# alarms while which nothing is learned
+HOLDING = ("implausible", "signal_range", "sensor_frozen", "second_sender")
+LEAST_FREE = 64 << 10  # bytes that any snapshot needs
 GRACE_S = 15.0  # a save may take so long before its absence is an alarm
 
 
@@ -33,6 +36,7 @@ class Facts:
     memory_locked: bool
     started_unix_s: float
     log_every_s: float
+    learned: Path | None = None  # folder of the project's snapshots
 
 
 @dataclass
@@ -40,14 +44,18 @@ class Saving:
     """What the disk has taken, and what it has refused."""
 
     interval_s: float
+    folder: Path
+    needed: int = LEAST_FREE  # bytes of a snapshot
     started_s: float = field(default_factory=time.monotonic)
     saved_s: float | None = None
     refused: dict[str, str] = field(default_factory=dict)
 
-    def hear(self, answer: Saved | NotSaved) -> None:
+    def hear(self, answer: SavedSnapshot | NotSaved) -> None:
         """The analyst has saved, or could not."""
-        if isinstance(answer, Saved):
+        if isinstance(answer, SavedSnapshot):
             self.saved_s, self.refused = time.monotonic(), {}
+            with contextlib.suppress(OSError):
+                self.needed = max(LEAST_FREE, os.stat(answer.path).st_size)
         else:
             self.refused[answer.what] = answer.reason
 
@@ -55,6 +63,8 @@ class Saving:
         """Why what was learned would not survive; "" if it would."""
         if self.refused:
             return "NOT SAVED: " + "; ".join(f"{w}: {r}" for w, r in self.refused.items())
+        if is_learning and (short := short_of_room(self.folder, self.needed)):
+            return f"NOT SAVED: {short}"
         since_s = self.started_s if self.saved_s is None else self.saved_s
         age_s = time.monotonic() - since_s
         if is_learning and age_s > self.interval_s + GRACE_S:
@@ -64,10 +74,24 @@ class Saving:
     def store(self, why: str, restored: str, recording: str, dropped: int) -> st.Store:
         """As the status has it."""
         age_s = None if self.saved_s is None else time.monotonic() - self.saved_s
-        told = st.Store("none", why, age_s, restored, recording, dropped)
+        store = st.Store("none", why, age_s, restored, recording, dropped)
         if why:
-            return replace(told, state="NOT SAVED")
-        return told if age_s is None else replace(told, state="saved")
+            return replace(store, state="NOT SAVED")
+        return store if age_s is None else replace(store, state="saved")
+
+
+def short_of_room(folder: Path, needed: int) -> str:
+    """Why the disk would not take so many bytes now, "" if it would: before it has refused them."""
+    try:
+        disk = os.statvfs(folder)
+    except OSError as error:
+        return f"{folder}: {error.strerror}"
+    free = (disk.f_bfree if os.geteuid() == 0 else disk.f_bavail) * disk.f_frsize
+    if disk.f_flag & os.ST_RDONLY:
+        return f"{folder} is read-only"
+    if disk.f_blocks and free < needed:
+        return f"{folder}: {free >> 10} KB are free, a snapshot needs {needed >> 10} KB"
+    return ""
 
 
 class Teller:
@@ -80,9 +104,9 @@ class Teller:
         self.version = 0
         self._frames_before = 0
 
-    def publish(self, found: Publication) -> None:
+    def publish(self, publication: Publication) -> None:
         """Another map is known."""
-        self.publication = found
+        self.publication = publication
         self.version += 1
 
     def tell(
@@ -131,16 +155,19 @@ class Teller:
 
     def _estimate(
         self, now_ns: int, counters: dict[str, int], alarms: Alarms, surprise: float | None
-    ) -> st.Estimate:
-        core, found = self._core, self.publication
+    ) -> st.EstimateStatus:
+        core, publication = self._core, self.publication
         age_s = core.lag.age_s(now_ns // 1000)
         learning: st.Learning = "learning" if core.samples else "waiting"
         reason = ""
-        if not core.learner.learns:
+        quarantine = [alarm.text for alarm in alarms.on if alarm.name in HOLDING]
+        if not core.learner.learns and (alarms.has("plant_changed") or not quarantine):
             learning, reason = "suspended", "the plant has changed"
-        elif held := [a.text for a in alarms.on if a.name in HOLDING]:
-            learning, reason = "held", held[0]
-        shown = st.Estimate(
+        elif quarantine:
+            learning, reason = "held", quarantine[0]
+        elif core.is_proving:
+            reason = "in the shadow: the map held has to foretell the motion first"
+        shown = st.EstimateStatus(
             state=learning,
             reason=reason,
             version=self.version,
@@ -151,9 +178,9 @@ class Teller:
             surprise=surprise,
             refused=counters,
         )
-        if found is None:
+        if publication is None:
             return shown
         names = [chamber.name for chamber in self._facts.project.model.chambers]
-        rows = zip(names, found.beta_pa, found.beta_sd_pa, strict=True)
-        chambers = tuple(st.Chamber(name, float(beta), float(sd)) for name, beta, sd in rows)
-        return replace(shown, rho=found.rho, chambers=chambers, edges=found.edges)
+        rows = zip(names, publication.beta_pa, publication.beta_sd_pa, strict=True)
+        chambers = tuple(st.ChamberStatus(name, float(beta), float(sd)) for name, beta, sd in rows)
+        return replace(shown, rho=publication.rho, chambers=chambers, edges=publication.edges)

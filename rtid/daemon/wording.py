@@ -22,8 +22,8 @@ MESSAGES = {  # verdict: what is said of the message, and how to go on
 }
 
 
-def _have(names: list[str], one: str, many: str) -> str:
-    return f"{', '.join(names)} {one if len(names) == 1 else many}"
+def _have(names: list[str], singular: str, many: str) -> str:
+    return f"{', '.join(names)} {singular if len(names) == 1 else many}"
 
 
 def second_sender(names: list[str]) -> str:
@@ -60,30 +60,39 @@ def helper_failed(times: int) -> str:
     )
 
 
-def message(verdict: str, found: Iterable[MessageHealth]) -> str:
+def message(verdict: str, health: Iterable[MessageHealth]) -> str:
     """Messages of one verdict of `MESSAGES`."""
-    names = [m.name for m in found if m.verdict == verdict]
+    names = [m.name for m in health if m.verdict == verdict]
     return f"{', '.join(names)}: {MESSAGES[verdict]}" if names else ""
 
 
-def signals(found: Iterable[SignalHealth]) -> str:
+def signals(health: Iterable[SignalHealth]) -> str:
     """Signals outside what the project file declares, or without a value."""
-    said = [_signal(s) for s in found if s.verdict in ("out_of_range", "not_available")]
+    said = [_signal(s) for s in health if s.verdict in ("out_of_range", "not_available")]
     return "; ".join(said)
 
 
-def _signal(one: SignalHealth) -> str:
-    if one.verdict == "not_available":
-        return f"{one.name} has no value: its sender says that it is not available"
+def _signal(health: SignalHealth) -> str:
+    if health.verdict == "not_available":
+        return f"{health.name} has no value: its sender says that it is not available"
     return (
-        f"{one.name} leaves its declared range, it went from {one.minimum:g} to {one.maximum:g} "
-        f"{one.unit} within a second; such samples are not learned"
+        f"{health.name} leaves its declared range, it went from {health.minimum:g} to "
+        f"{health.maximum:g} "
+        f"{health.unit} within a second; such samples are not learned"
     )
 
 
-def plant_changed(verdict: Verdict | None) -> str:
-    """The map no longer foretells the motion; verdict: of the change, as far as there is one."""
+def plant_changed(verdict: Verdict | None, cause: str = "") -> str:
+    """The map no longer foretells the motion.
+
+    cause: what would make it do so again; verdict: of the change, as far as there is one.
+    """
     text = "the machine no longer does what the map says; learning is suspended"
+    if cause:
+        return (
+            f"{text}. It would do so again with: {cause}. If the machine is to stay as it is now: "
+            "rtid accept"
+        )
     if verdict is None:
         return f"{text}, a diagnosis follows"
     return f"{text}. {verdict.text} If the machine is to stay as it is now: rtid accept"
@@ -92,9 +101,9 @@ def plant_changed(verdict: Verdict | None) -> str:
 def overload(lost: int, ticks: int, causes: Mapping[str, int]) -> str:
     """So many of the last ticks were lost; what the overruns among them came from."""
     why = sorted(causes.items(), key=lambda cause: -cause[1])
-    told = ", ".join(f"{CAUSES.get(cause, cause)} ({n})" for cause, n in why)
+    words = ", ".join(f"{CAUSES.get(cause, cause)} ({n})" for cause, n in why)
     return (
-        f"{lost} of the last {ticks} ticks were lost{': ' * bool(told)}{told}; frames wait, and "
+        f"{lost} of the last {ticks} ticks were lost{': ' * bool(words)}{words}; frames wait, and "
         "what is published comes late. Give the daemon more of the processor (daemon.priority) "
         "or a lower rate (daemon.rate_hz)"
     )

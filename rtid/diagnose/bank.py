@@ -6,28 +6,30 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from rtid.diagnose.candidates import Candidate, Cause, Columns, Shape, Volumes
-from rtid.diagnose.causes import cause_of, causes
-from rtid.diagnose.causes.common import supply_change
 from rtid.diagnose.commands import change_of
-from rtid.diagnose.pump import demand
 from rtid.diagnose.revision import Revision
-from rtid.diagnose.timing import COMMAND, SUPPLY, TIMINGS
-from rtid.diagnose.timing import lagged as lagged_command
-from rtid.diagnose.view import View
+from rtid.effects.column import Candidate, Cause, Columns
+from rtid.effects.law import Shape, Volumes
+from rtid.effects.laws import cause_of, causes
+from rtid.effects.laws.common import supply_change
+from rtid.effects.laws.pump import demand
+from rtid.effects.laws.timing import COMMAND, SUPPLY, TIMINGS
+from rtid.effects.laws.timing import lagged as lagged_command
+from rtid.effects.page import Effect
+from rtid.effects.record_view import RecordView
 from rtid.estimator.state import Weights
-from rtid.model import FloatArray
+from rtid.plain import FloatArray
 
 LAG_STEP_S = 5e-5
 
 
 def add_timing(
-    view: View, columns: Columns, sent: dict[str, tuple[int, FloatArray]], weights: Weights,
+    view: RecordView, columns: Columns, sent: dict[str, tuple[int, FloatArray]], weights: Weights,
     revision: Revision,
 ) -> int:  # fmt: skip
     """Derivative columns of the lag and of every timing parameter; their number.
 
-    sent: the commands before any timing.
+    sent: the commands (n,), V, before any timing.
     """
     dt_s, n = view.step_s, 0
     if not revision.replaces_lag:
@@ -53,7 +55,7 @@ def add_timing(
     return n
 
 
-def add_shapes(view: View, columns: Columns, revision: Revision) -> Iterator[tuple[int, int]]:
+def add_shapes(view: RecordView, columns: Columns, revision: Revision) -> Iterator[tuple[int, int]]:
     """Derivative columns of the nonlinear parameters of effects, but for those at a bound."""
     for e, effect in enumerate(revision.effects):
         cause = cause_of(view, effect)
@@ -65,8 +67,8 @@ def add_shapes(view: View, columns: Columns, revision: Revision) -> Iterator[tup
                 yield e, k
 
 
-def opening_change(view: View, change: dict[str, FloatArray]) -> Volumes:
-    """Volumes per interval and chamber of a small change of the commands (n,), in the blocks."""
+def opening_change(view: RecordView, change: dict[str, FloatArray]) -> Volumes:
+    """Volumes (n - 1,), m3, per chamber of a small change of commands (n,), V, in the blocks."""
     flows = [
         view.slope_u(i) * edge.direction * change[edge.command][:-1]
         for i, edge in enumerate(view.model.edges)
@@ -76,30 +78,33 @@ def opening_change(view: View, change: dict[str, FloatArray]) -> Volumes:
 
 
 def offer(
-    view: View,
+    view: RecordView,
     columns: Columns,
     revision: Revision,
     bank: bool,
     more: Iterable[tuple[Cause, Shape]],
+    suspects: tuple[Effect, ...],
 ) -> None:
-    """Columns of the revision's effects, and of all that is to be scored."""
+    """Columns of the revision's effects, and of all that is to be scored: suspects as well."""
     if not bank:
         for effect in revision.effects:
             columns.offer(effect, cause_of(view, effect).column(effect.shape))
-    for cause in causes(view) if bank else ():
-        own = [e for e in revision.effects if cause.makes(e)]
-        for effect in own:
+    for cause in causes(view, suspects) if bank else ():
+        present = [e for e in revision.effects if cause.makes(e)]
+        for effect in present:
             columns.offer(effect, cause.column(effect.shape))
-        if not own and cause.offered:
+        if not present and cause.offered:
             for shape in cause.shapes:
-                columns.offer(cause.at(shape), cause.column(shape))
+                volumes = cause.column(shape)
+                if any(series.any() for series in volumes.values()):  # else it cannot act here
+                    columns.offer(cause.at(shape), volumes)
     for cause, shape in more:
         columns.offer(cause.at(shape), cause.column(shape))
     if bank:
         _offer_timings(view, columns, revision)
 
 
-def _offer_timings(view: View, columns: Columns, revision: Revision) -> None:
+def _offer_timings(view: RecordView, columns: Columns, revision: Revision) -> None:
     """What each timing of the bank would change, first order in the opening; coefficient 1."""
     names = {e.command: e.direction for e in view.model.edges}
     for timing in TIMINGS:

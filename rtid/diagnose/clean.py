@@ -5,25 +5,28 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rtid.diagnose.view import has_noise
+from rtid.effects.record_view import has_noise
 from rtid.kernels.engine import GAP_FLAG
-from rtid.model import PRESSURE, FloatArray, Model
+from rtid.model import PRESSURE, Machine
+from rtid.plain import BoolArray, FloatArray
 
 
-def saturated(model: Model, chunk: FloatArray) -> NDArray[np.bool_]:
-    """Samples (n,) at which a pressure stands at the end of its declared range."""
-    found = np.zeros(len(chunk), bool)
+def saturated(model: Machine, chunk: FloatArray) -> BoolArray:
+    """Samples (n,) with a pressure at the end of its declared range; chunk (n, 2 + signals), SI."""
+    stuck = np.zeros(len(chunk), bool)
     for j, signal in enumerate(model.signals):
         if signal.kind == PRESSURE and np.ptp(chunk[:, 2 + j]) > 0:
             value, reach = chunk[:, 2 + j], 1.5 * signal.resolution
-            found |= (value <= signal.minimum + reach) | (value >= signal.maximum - reach)
-    return found
+            stuck |= (value <= signal.minimum + reach) | (value >= signal.maximum - reach)
+    return stuck
 
 
-def as_measured(model: Model, chunk: FloatArray) -> Model:
-    """The model with no noise on pressures that are no measurements but computed values."""
+def as_measured(model: Machine, chunk: FloatArray) -> Machine:
+    """The model with no noise on pressures that are no measurements but computed values.
+
+    chunk (n, 2 + signals), SI.
+    """
     signals = tuple(
         replace(s, noise=0.0, resolution=0.0)
         if s.kind == PRESSURE and not has_noise(chunk[:, 2 + j])
@@ -33,8 +36,8 @@ def as_measured(model: Model, chunk: FloatArray) -> Model:
     return replace(model, signals=signals)
 
 
-def usable(model: Model, chunk: FloatArray) -> FloatArray:
-    """The record with a gap at every saturated sample and at the one behind it."""
+def usable(model: Machine, chunk: FloatArray) -> FloatArray:
+    """The record (n, 2 + signals), SI, with a gap at every saturated sample and the next."""
     bad = saturated(model, chunk)
     if not bad.any():
         return chunk

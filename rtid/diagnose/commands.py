@@ -10,15 +10,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from rtid.diagnose.pump import demand
-from rtid.diagnose.timing import COMMAND, SUPPLY, Psi, Timing
-from rtid.diagnose.view import View
-from rtid.model import FloatArray, Model
+from rtid.effects.laws.pump import demand
+from rtid.effects.laws.timing import COMMAND, SUPPLY, Psi, TimingLaw
+from rtid.effects.record_view import RecordView
+from rtid.model import Machine
+from rtid.plain import FloatArray
 
-Timings = tuple[tuple[Timing, Psi], ...]
+Timings = tuple[tuple[TimingLaw, Psi], ...]
 
 
-def split(model: Model) -> Model:
+def split(model: Machine) -> Machine:
     """The same machine with a command of its own for either direction of every command."""
     signals, edges = list(model.signals), []
     for name in sorted({edge.command for edge in model.edges}):
@@ -33,27 +34,36 @@ def _half(name: str, direction: int) -> str:
     return name + ("+" if direction > 0 else "-")
 
 
-def commands(model: Model, chunk: FloatArray) -> dict[str, tuple[int, FloatArray]]:
-    """Direction and command (n,) as sent, by the names of the split machine."""
-    found: dict[str, tuple[int, FloatArray]] = {}
+def commands(model: Machine, chunk: FloatArray) -> dict[str, tuple[int, FloatArray]]:
+    """Direction and command (n,), V, as sent, by the names of the split machine.
+
+    chunk (n, 2 + signals), SI.
+    """
+    by_edge: dict[str, tuple[int, FloatArray]] = {}
     for name in sorted({edge.command for edge in model.edges}):
         u = chunk[:, 2 + model.column(name)]
-        found |= {_half(name, d): (d, u) for d in (1, -1)}
-    return found
+        by_edge |= {_half(name, d): (d, u) for d in (1, -1)}
+    return by_edge
 
 
-def transformed(model: Model, chunk: FloatArray, timings: Timings) -> FloatArray:
-    """The record of the split machine: commands as the timings let them reach the spools."""
+def transformed(model: Machine, chunk: FloatArray, timings: Timings) -> FloatArray:
+    """The record of the split machine: commands as the timings let them reach the spools.
+
+    chunk (n, 2 + signals), SI; the commands of the split machine stand behind its columns.
+    """
     dt_s = float(np.median(np.diff(chunk[:, 0])))
     sent = [through(u, d, dt_s, timings) for d, u in commands(model, chunk).values()]
     return lowered(split(model), np.column_stack([chunk, *sent]), timings)
 
 
-def lowered(model: Model, chunk: FloatArray, timings: Timings) -> FloatArray:
-    """The record of the split machine, its supply lowered as a timing of the supply says."""
+def lowered(model: Machine, chunk: FloatArray, timings: Timings) -> FloatArray:
+    """The record of the split machine, its supply lowered as a timing of the supply says.
+
+    chunk (n, 2 + signals), SI: changed in place.
+    """
     for timing, psi in timings:
         if timing.where == SUPPLY:
-            view = View.without_map(model, chunk)
+            view = RecordView.without_map(model, chunk)
             chunk[:, 2 + model.column(view.supply_name)] -= timing.apply(
                 demand(view), view.step_s, psi
             )
@@ -71,11 +81,14 @@ def through(u: FloatArray, direction: int, dt_s: float, timings: Timings) -> Flo
 def change_of(
     u: FloatArray, direction: int, dt_s: float, timings: Timings, k: int, j: int
 ) -> FloatArray:
-    """How the command at the spool follows parameter j of timing k, those behind it held."""
+    """How the command at the spool follows parameter j of timing k, those behind it held.
+
+    u (n,): the command as sent, V; result (n,): V per SI unit of the parameter.
+    """
     timing, psi = timings[k]
     before = through(u, direction, dt_s, timings[:k])
     change = timing.change(before, direction, dt_s, psi, j)
-    for behind, held in timings[k + 1 :]:  # linear ones pass it on, play lets it through
+    for behind, command in timings[k + 1 :]:  # linear ones pass it on, play lets it through
         if behind.where == COMMAND and behind.is_linear:
-            change = behind.apply(change, dt_s, held)
+            change = behind.apply(change, dt_s, command)
     return change

@@ -6,23 +6,23 @@ from dataclasses import replace
 
 from rtid.diagnose.exact import carried_on, timing_trials, with_pump
 from rtid.diagnose.fit import Fit
-from rtid.diagnose.timing import COMMAND
 from rtid.diagnose.trials import (
     TIE,
     TIE_SHARE,
-    Key,
-    State,
     Trial,
+    TrialState,
     best_by_key,
     refined,
     scored,
     with_effect,
 )
+from rtid.effects.laws.timing import COMMAND
+from rtid.plain import Key
 
 REFUTED, WITHIN = 3.0, 0.05  # times the best cause's misfit; least misfit, of dof
 
 
-def trials_of(state: State, present: Fit) -> list[Trial]:
+def trials_of(state: TrialState, present: Fit) -> list[Trial]:
     """Every possible cause with its best shape: fixed columns, and timings where they matter."""
     best = best_by_key(present, scored(present))
     trials = []
@@ -31,12 +31,14 @@ def trials_of(state: State, present: Fit) -> list[Trial]:
             continue
         trials.append(Trial(key, score.gain, with_effect(present, candidate)))
     trials = with_pump(state, present, refined(state, present, trials))
-    scored_timings = {key[0]: found for key, found in best.items() if key[1] == COMMAND}
+    scored_timings = {key[0]: scores for key, scores in best.items() if key[1] == COMMAND}
     other = max((t.gain for t in trials if t.key not in state.negligible), default=0.0)
     return trials + timing_trials(state, present, scored_timings, other)
 
 
-def alike_ones(state: State, present: Fit, best: Trial, trials: list[Trial]) -> tuple[Key, ...]:
+def alike_ones(
+    state: TrialState, present: Fit, best: Trial, trials: list[Trial]
+) -> tuple[Key, ...]:
     """Causes that this record does not tell from the best one: all but as good.
 
     One that leaves several times the misfit that the best one leaves is refuted.
@@ -53,7 +55,7 @@ def alike_ones(state: State, present: Fit, best: Trial, trials: list[Trial]) -> 
 
 
 def contest(
-    state: State, present: Fit, best: Trial, trials: list[Trial]
+    state: TrialState, present: Fit, best: Trial, trials: list[Trial]
 ) -> tuple[Trial, tuple[Key, ...]]:
     """The cause to add, and those that this record does not tell from it.
 
@@ -71,7 +73,7 @@ def contest(
     return chosen, tuple(t.key for t in equals if t.key != chosen.key)
 
 
-def _finished(state: State, present: Fit, trial: Trial) -> Trial:
+def _finished(state: TrialState, present: Fit, trial: Trial) -> Trial:
     now = carried_on(state, present, trial)
     gain = present.held.sse - now.held.sse
     return replace(trial, gain=gain, revision=now.revision, fit=now.light())

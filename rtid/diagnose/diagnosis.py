@@ -6,32 +6,33 @@ significant, possible and material; when nothing more is, the verdict follows fr
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from rtid.diagnose.candidates import Candidate
-from rtid.diagnose.clean import as_measured, usable
 from rtid.diagnose.contest import contest, trials_of
 from rtid.diagnose.exact import carried_on
-from rtid.diagnose.fit import Fit, fit, one_pass, prepare, with_covariances
-from rtid.diagnose.parts import Part, recall
+from rtid.diagnose.excuse import few_excused
+from rtid.diagnose.fit import Fit, fit, with_covariances
+from rtid.diagnose.parts import AddedEffect
 from rtid.diagnose.regression import Score
 from rtid.diagnose.residual import Residual, residual
 from rtid.diagnose.revision import Revision
+from rtid.diagnose.standing import Standing, stand, with_bank
 from rtid.diagnose.trials import (
     GAIN,
     MATCH_RHO,
-    Found,
-    Key,
-    State,
+    AcceptedEffect,
     Trial,
+    TrialState,
     material_share,
     own_share,
     physical,
     scored,
 )
 from rtid.diagnose.verdict import MATERIAL, NAMED, UNKNOWN, can_judge, verdict
-from rtid.model import FloatArray, Model
+from rtid.effects.column import Candidate
+from rtid.effects.page import Effect
+from rtid.model import Machine
+from rtid.plain import FloatArray, Key, Progress, silent
 
 LATER_GAIN = 25.0  # chi2 of every effect behind the first
 MOST = 6  # effects that are added at most
@@ -49,35 +50,37 @@ class Result:
 
     first: Fit
     last: Fit
-    found: tuple[Found, ...]
+    found: tuple[AcceptedEffect, ...]
     negligible: dict[Key, float]
     scores: list[tuple[Candidate, Score]]
     before: Residual
     after: Residual
     verdict: str
-    given: tuple[Part, ...] = ()
-    match_rho: float = MATCH_RHO
+    given: tuple[AddedEffect, ...] = ()
     held_out_judged: bool = True  # False: too little of it is known, and the record itself judged
 
 
-def _silent(_what: str, _share: float) -> None:
-    pass
-
-
 def search(
-    model: Model,
+    model: Machine,
     chunk: FloatArray,
     held_out: FloatArray,
-    progress: Callable[[str, float], None] = _silent,
-    parts: tuple[Part, ...] = (),
+    progress: Progress = silent,
+    parts: tuple[AddedEffect, ...] = (),
+    suspects: tuple[Effect, ...] = (),
 ) -> Result:
-    """Diagnose a record; chunk and held_out (n, 2 + signals) as from `to_chunk`.
+    """Diagnose a record; chunk and held_out (n, 2 + signals), SI, as from `to_chunk`.
 
-    parts: effects that the model has already.  Raises PartError where the record has none of them.
+    parts: effects that the model has already; suspects: effects of the user's that are scored
+    beside those of the catalogue.  Raises PartError where the record has none of them.
     Where the map is known over next to nothing of the held-out part, the record itself judges.
     """
-    state, first = begin(model, chunk, held_out, progress, parts)
-    before = residual(first, state.held_out)
+    return searched(stand(model, chunk, held_out, parts, progress, suspects=suspects), progress)
+
+
+def searched(standing: Standing, progress: Progress = silent) -> Result:
+    """Diagnose a record, from the model as it stands on."""
+    first, before, parts = standing.fit, standing.held_out, standing.state.given
+    state = standing.state.anew(progress)
     judged = can_judge(before)
     if not judged:
         state.held_out = state.chunk
@@ -90,14 +93,14 @@ def search(
     said = verdict(state, first, present, last, judged)
     if said == UNKNOWN:  # what explains a part of it only is not named, and not counted
         present, last, state.found = first, before, []
-    found, negligible = tuple(state.found), state.negligible
+    result, negligible = tuple(state.found), state.negligible
     return Result(
-        first, present.light(), found, negligible, scored(present), before, last, said, parts,
+        first, present.light(), result, negligible, scored(present), before, last, said, parts,
         held_out_judged=judged,
     )  # fmt: skip
 
 
-def _extended(state: State, first: Fit, before: Residual) -> tuple[Fit, Residual]:
+def _extended(state: TrialState, first: Fit, before: Residual) -> tuple[Fit, Residual]:
     """The model with every effect that deserves it, and what it leaves of the held-out part."""
     present, last = first, before
     for k in range(MOST):
@@ -109,23 +112,7 @@ def _extended(state: State, first: Fit, before: Residual) -> tuple[Fit, Residual
     return _look_back(state, present, last)
 
 
-def begin(
-    model: Model,
-    chunk: FloatArray,
-    held_out: FloatArray,
-    progress: Callable[[str, float], None],
-    parts: tuple[Part, ...],
-) -> tuple[State, Fit]:
-    """The usable part of a record, and the model with its parts fitted to it."""
-    model = as_measured(model, chunk)
-    chunk, held_out = usable(model, chunk), usable(model, held_out)
-    progress("fitting", 0.0)
-    weights = prepare(model, chunk)
-    first = fit(model, chunk, weights, recall(model, chunk, weights, parts))
-    return State(model, chunk, held_out, progress, given=parts), first
-
-
-def _bare(state: State, first: Fit) -> Fit:
+def _bare(state: TrialState, first: Fit) -> Fit:
     """The fit without any effect."""
     if not state.given:
         return first
@@ -133,7 +120,7 @@ def _bare(state: State, first: Fit) -> Fit:
     return fit(state.model, state.chunk, weights, Revision(), bank=False)
 
 
-def _add_best(state: State, present: Fit, last: Residual) -> tuple[Fit, Residual] | None:
+def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Residual] | None:
     """Add the best cause that is significant and material; None when there is none.
 
     One that is significant but changes next to nothing is only listed, unless it explains a part of
@@ -149,11 +136,13 @@ def _add_best(state: State, present: Fit, last: Residual) -> tuple[Fit, Residual
         trial, alike = contest(state, present, best, trials)
         now = with_covariances(carried_on(state, present, trial), like=present)
         after = residual(now, state.held_out)
-        own = BENT * own_share(now, trial, state.held_out)
-        share = min(material_share(last, after), own)
+        limit = BENT * own_share(now, trial, state.held_out)
+        share = min(material_share(last, after), limit)
         if share >= MATERIAL:
             kept, after = _with_bank(state, now)
-            state.found.append(Found(trial.key, alike, trial.gain, trial.n_parameters, last, after))
+            state.found.append(
+                AcceptedEffect(trial.key, alike, trial.gain, trial.n_parameters, last, after)
+            )
             return kept, after
         state.negligible[trial.key] = share
         if _is_noticed(present, trial) and after.rms_m3s <= WORSE * last.rms_m3s:
@@ -163,9 +152,9 @@ def _add_best(state: State, present: Fit, last: Residual) -> tuple[Fit, Residual
     return None
 
 
-def _with_bank(state: State, now: Fit) -> tuple[Fit, Residual]:
+def _with_bank(state: TrialState, now: Fit) -> tuple[Fit, Residual]:
     """A fit with every candidate beside it, and what it leaves of the held-out part."""
-    kept = one_pass(state.model, state.chunk, now.weights, now.revision, now, bank=True)
+    kept = with_bank(few_excused(now), state.suspects)
     return kept, residual(kept, state.held_out)
 
 
@@ -175,34 +164,43 @@ def _is_noticed(present: Fit, trial: Trial) -> bool:
     return trial.gain > max(NOTICED * dof, LEAST_SHARE * (present.held.sse - dof))
 
 
-def _explains(state: State, present: Fit, trial: Trial) -> bool:
+def _explains(state: TrialState, present: Fit, trial: Trial) -> bool:
     """False where a cause is a small part of what is left behind an effect of the wrong form.
 
     Once most of the first misfit is explained, the rest of a form that is nearly right would be
     named as effects of their own.
     """
-    left = present.held.sse - present.regression.dof
+    rest = present.held.sse - present.regression.dof
     excess = state.excess
     if present.rho < MATCH_RHO or excess <= 0:
         return True
-    return trial.gain > (SHARE if left < (1 - NAMED) * excess else LEAST_SHARE) * left
+    return trial.gain > (SHARE if rest < (1 - NAMED) * excess else LEAST_SHARE) * rest
 
 
-def _look_back(state: State, present: Fit, last: Residual) -> tuple[Fit, Residual]:
-    """Drop what has become superfluous."""
-    for effect in list(present.revision.effects) if len(present.revision.effects) > 1 else []:
-        if any(effect.key == given.key for given in state.given):
-            continue
-        column, estimate = present.column(effect), present.estimate
-        own = {column, *present.shape_columns(effect).values()}
-        without = present.regression.fit(tuple(k for k in estimate.used if k not in own))
-        possible = effect.is_possible(physical(present, effect, estimate.value(column)))
-        if without.sse - estimate.sse > GAIN and possible:
-            continue
+def _look_back(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Residual]:
+    """Drop what has become superfluous, one by one: the fit without it may move all the others."""
+    while (effect := _superfluous(state, present)) is not None:
         kept = tuple(e for e in present.revision.effects if e != effect)
         revision = replace(present.revision, effects=kept, sizes=())
-        present = fit(state.model, state.chunk, present.weights, revision, present)
+        present = fit(
+            state.model, state.chunk, present.weights, revision, present, suspects=state.suspects
+        )
         last = residual(present, state.held_out)
         state.found = [f for f in state.found if f.key != effect.key]
         state.negligible.pop(effect.key, None)
     return present, last
+
+
+def _superfluous(state: TrialState, present: Fit) -> Candidate | None:
+    """The first effect of several that the others explain as well, or whose size is impossible."""
+    effects, estimate = present.revision.effects, present.estimate
+    given = {part.key for part in state.given}
+    for effect in effects if len(effects) > 1 else ():
+        column = present.column(effect)
+        columns = {column, *present.shape_columns(effect).values()}
+        without = present.regression.fit(tuple(k for k in estimate.used if k not in columns))
+        possible = effect.is_possible(physical(present, effect, estimate.value(column)))
+        is_needed = without.sse - estimate.sse > GAIN and possible
+        if effect.key not in given and not is_needed:
+            return effect
+    return None

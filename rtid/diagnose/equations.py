@@ -4,38 +4,39 @@ from __future__ import annotations
 
 import numpy as np
 
-from rtid.diagnose.candidates import Candidate, Columns
-from rtid.diagnose.causes import total_softness
 from rtid.diagnose.evidence import Projected
 from rtid.diagnose.regression import Regression
 from rtid.diagnose.revision import Revision
-from rtid.diagnose.view import View
+from rtid.effects.column import Candidate, Columns
+from rtid.effects.laws import total_softness
+from rtid.effects.record_view import RecordView
 from rtid.estimator.factor import SHARED_PRIOR
 from rtid.estimator.state import Weights, variance
-from rtid.model import FloatArray, Model
+from rtid.model import Machine
+from rtid.plain import FloatArray
 
 HELD = 1e30  # information of a parameter that is held
 
 
 def softened(
-    model: Model, chunk: FloatArray, weights: Weights, sizes: tuple[tuple[Candidate, float], ...]
+    model: Machine, chunk: FloatArray, weights: Weights, sizes: tuple[tuple[Candidate, float], ...]
 ) -> FloatArray:
     """What storage effects add to the white variance of each row's equation (n, chambers), m6.
 
     The noise of a pressure moves what is stored: sd_P times V / beta and the effects' own share.
     """
-    view = View.without_map(model, chunk, weights.compliance)
+    view = RecordView.without_map(model, chunk, weights.compliance)
     more = np.zeros((view.n, len(model.chambers)))
-    own = total_softness(view, sizes)
+    softness = total_softness(view, sizes)
     for c, chamber in enumerate(model.chambers):
         plain = view.volume(c) * view.compliance[c]
         noise = variance(model, chamber.pressure) * model.pressure_share
-        more[:, c] = ((plain + own[:, c]) ** 2 - plain**2) * noise
+        more[:, c] = ((plain + softness[:, c]) ** 2 - plain**2) * noise
     return more
 
 
 def regression_of(
-    model: Model,
+    model: Machine,
     weights: Weights,
     revision: Revision,
     projected: Projected,

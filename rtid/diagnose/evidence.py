@@ -14,20 +14,18 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg.blas import dtrsm
 from scipy.linalg.lapack import dpotrf, dtrtri, dtrtrs
 
-from rtid.diagnose.candidates import Volumes
+from rtid.effects.law import Volumes
 from rtid.estimator.factor import PRIOR_SD, one_thread
 from rtid.estimator.state import Weights, build
-from rtid.kernels import evidence as kernel
 from rtid.kernels import products, ringing
+from rtid.kernels import record_rows as kernel
 from rtid.kernels.engine import ROW_FLAG
 from rtid.kernels.layout import TERMS
-from rtid.model import FloatArray, Model
-
-IntArray = NDArray[np.int64]
+from rtid.model import Machine
+from rtid.plain import BoolArray, FloatArray, IntArray
 
 ROW_S = 10e-3  # positions measured within so long make one row
 SPAN = 10  # rows in which only few blocks move
@@ -53,7 +51,7 @@ class Rows:
     row_of: IntArray
     share: FloatArray
     own: FloatArray
-    fresh: NDArray[np.bool_]
+    fresh: BoolArray
     whiten: FloatArray
     keep: FloatArray
     soft: FloatArray
@@ -64,7 +62,7 @@ class Rows:
         return self.own.shape[0] * self.own.shape[1]
 
     def condensed(self, series: FloatArray) -> FloatArray:
-        """What a series (n - 1,) of volumes per interval adds to each row (rows,)."""
+        """What a series (n - 1,) of volumes per interval, m3, adds to each row (rows,), m3."""
         out = np.empty(len(self.own))
         kernel.condense(np.ascontiguousarray(series), self.row_of, self.share, self.fresh, out)
         return out
@@ -88,11 +86,11 @@ class Rows:
         products.whitened(columns, self.fresh, self.whiten, self.keep)
         flat = columns.reshape(self.n, columns.shape[2])
         with one_thread():
-            own = flat.T @ flat
+            gram = flat.T @ flat
         products.adjoint(columns, self.fresh, self.whiten, self.keep)
         cross = np.zeros((TERMS * len(self.cells), columns.shape[2]))
         products.cross(columns, self.sign, self.start, self.block, self.terms, cross)
-        return own, cross
+        return gram, cross
 
     def _columns(self, given: list[Volumes]) -> FloatArray:
         """What all of them add to the rows (rows, chambers, h)."""
@@ -105,21 +103,21 @@ class Rows:
         return columns
 
     @cached_property
-    def factor(self) -> Factor:
+    def factor(self) -> EvidenceFactor:
         """Cholesky factor of the maps' products and their prior."""
-        return Factor.of(self.maps())
+        return EvidenceFactor.of(self.maps())
 
 
 @dataclass(frozen=True)
-class Factor:
+class EvidenceFactor:
     """U' U = products and prior, scaled: upper (6 V, 6 V) in Fortran order, scale (6 V,)."""
 
     upper: FloatArray
     scale: FloatArray
 
     @classmethod
-    def of(cls, gram: FloatArray) -> Factor:
-        """Factor of the lower triangle of gram, which is used up."""
+    def of(cls, gram: FloatArray) -> EvidenceFactor:
+        """Factor of the lower triangle of gram (6 V, 6 V), scaled here; gram is used up."""
         scale = np.empty(len(gram))
         products.scaled(gram, PRIOR_SD**-2, scale)
         with one_thread():
@@ -153,7 +151,7 @@ class Factor:
 
 
 def rows_of(
-    model: Model,
+    model: Machine,
     chunk: FloatArray,
     weights: Weights,
     row_s: float = ROW_S,
@@ -172,7 +170,7 @@ def rows_of(
     n, most = len(chunk), _measured(chunk).sum() // group + 1
     counts, noise = np.zeros(4, np.int64), np.zeros((4, 2, 2))
     row_of, share = np.full(max(0, n - 1), kernel.NO_ROW), np.zeros(max(0, n - 1))
-    own, fresh = np.zeros((most + 2, 2, 3)), np.zeros(most, np.bool_)
+    sums, fresh = np.zeros((most + 2, 2, 3)), np.zeros(most, np.bool_)
     whiten, keep = np.zeros((most, 3)), np.zeros((most, 2, 2))
     start = np.zeros(most + 2, np.int64)
     cell, terms, later = _entries(ENTRIES * most + ENTRIES)
@@ -180,7 +178,7 @@ def rows_of(
     at = 0
     while True:
         at = kernel.integrate(
-            e.engine, e.cells, chunk, soft / group, at, group, counts, noise, row_of, share, own,
+            e.engine, e.cells, chunk, soft / group, at, group, counts, noise, row_of, share, sums,
             fresh, whiten, keep, start, cell, terms, later,
         )  # fmt: skip
         if at == n:
@@ -193,7 +191,7 @@ def rows_of(
     cells, block = _numbered(cell[:entries])
     return Rows(
         cells, _signs(model)[cells], start[: rows + 1], block, terms[:entries].copy(), row_of,
-        share, own[:rows, :n_c, : 1 + n_c].copy(), fresh[:rows], whiten[:rows], keep[:rows], soft,
+        share, sums[:rows, :n_c, : 1 + n_c].copy(), fresh[:rows], whiten[:rows], keep[:rows], soft,
     )  # fmt: skip
 
 
@@ -210,7 +208,7 @@ def _numbered(cell: IntArray) -> tuple[IntArray, IntArray]:
     return cells[order], place[number]
 
 
-def _signs(model: Model) -> FloatArray:
+def _signs(model: Machine) -> FloatArray:
     """Sign with which the edge of each cell feeds each chamber (cells, 2)."""
     sign = np.zeros((model.n_cells, 2))
     at = 0
@@ -223,12 +221,12 @@ def _signs(model: Model) -> FloatArray:
 
 
 def rows_per_group(chunk: FloatArray, row_s: float) -> int:
-    """Measured positions per row: as many as come within row_s."""
+    """Measured positions per row: as many as come within row_s; chunk (n, 2 + signals), SI."""
     measured = chunk[_measured(chunk), 0]
     return max(1, round(row_s / float(np.median(np.diff(measured)))) if len(measured) > 1 else 1)
 
 
-def _measured(chunk: FloatArray) -> NDArray[np.bool_]:
+def _measured(chunk: FloatArray) -> BoolArray:
     return (chunk[:, 1].astype(int) & ROW_FLAG) != 0
 
 
@@ -237,24 +235,27 @@ class Projected:
     """What is left of y and the head columns once every map is free to follow them.
 
     schur (h, h): products after the projection; own (h,): squares before it; half (h, 6 V): what
-    the maps take of each, see `Factor.half`.
+    the maps take of each, see `EvidenceFactor.half`.
     """
 
     schur: FloatArray
     own: FloatArray
     half: FloatArray
-    factor: Factor
+    factor: EvidenceFactor
 
-    def terms(self, used: list[int], theta: FloatArray) -> FloatArray:
-        """Terms (V, 6) of the maps with these coefficients of the columns used."""
-        left = self.half[0] - theta @ self.half[used]
-        return self.factor.whole(left).reshape(-1, TERMS)
+    def terms(self, used: list[int], theta: FloatArray, column: int = 0) -> FloatArray:
+        """Terms (V, 6) of the maps with these coefficients of the columns used.
+
+        column: the one that all of them follow; y unless named.
+        """
+        rest = self.half[column] - theta @ self.half[used]
+        return self.factor.whole(rest).reshape(-1, TERMS)
 
 
 def project(rows: Rows, given: Iterable[Volumes]) -> Projected:
     """Take the maps out of y, theta_beta and all given columns, condensed to the rows."""
-    own, cross = rows.head(given)
+    gram, cross = rows.head(given)
     half = rows.factor.half(cross)
     with one_thread():
-        schur = own - half @ half.T
-    return Projected(0.5 * (schur + schur.T), own.diagonal().copy(), half, rows.factor)
+        schur = gram - half @ half.T
+    return Projected(0.5 * (schur + schur.T), gram.diagonal().copy(), half, rows.factor)

@@ -8,13 +8,14 @@ from types import MappingProxyType
 
 import numpy as np
 
-from rtid.diagnose.candidates import Candidate
 from rtid.diagnose.fit import Fit, fit, tried
-from rtid.diagnose.pump import PUMP, demand
 from rtid.diagnose.regression import Score
 from rtid.diagnose.search import Beside
-from rtid.diagnose.timing import COMMAND, TIMINGS, Psi, Timing
-from rtid.diagnose.trials import GAIN, Key, State, Trial, scored
+from rtid.diagnose.trials import GAIN, Trial, TrialState, scored
+from rtid.effects.column import Candidate
+from rtid.effects.laws.pump import PUMP, demand
+from rtid.effects.laws.timing import COMMAND, TIMINGS, Psi, TimingLaw
+from rtid.plain import Key
 
 LARGE = 1.5  # rho above which timing effects are refitted whatever their score
 CLOSE = 0.9  # timings whose coarse gain is this share of the best are refitted finely
@@ -24,7 +25,7 @@ PROMISING = 0.3  # share of the best gain that a timing's bank must reach to be 
 DROOPS, PUMP_LIMITS, STIFFNESSES = (0.1, 0.7), (0.8, 0.93, 0.98), (1e9, 1e10, 1e11, 1e12)
 
 
-def with_pump(state: State, present: Fit, trials: list[Trial]) -> list[Trial]:
+def with_pump(state: TrialState, present: Fit, trials: list[Trial]) -> list[Trial]:
     """A supply that sags is refitted exactly, from where its first-order forms point."""
     first = [t for t in trials if t.effect.effect == PUMP.effect]
     rest = [t for t in trials if t.effect.effect != PUMP.effect]
@@ -52,7 +53,7 @@ def _pumps(present: Fit) -> list[Psi]:
 
 
 def timing_trials(
-    state: State, present: Fit, scores: dict[str, tuple[Candidate, Score]], other: float
+    state: TrialState, present: Fit, scores: dict[str, tuple[Candidate, Score]], other: float
 ) -> list[Trial]:
     """Exact refits with one timing more, of those that may matter; scores: of the first order."""
     open_ = [t for t in TIMINGS if not present.revision.has((t.effect, COMMAND))]
@@ -64,15 +65,15 @@ def timing_trials(
     return exact_trials(state, present, open_, other, hints)
 
 
-def _strength(timing: Timing, candidate: Candidate, score: Score) -> float:
+def _strength(timing: TimingLaw, candidate: Candidate, score: Score) -> float:
     """How strong the first order takes a timing to be: so many times that of its column."""
     return score.value * timing.strength(candidate.shape)
 
 
 def exact_trials(
-    state: State,
+    state: TrialState,
     present: Fit,
-    timings: list[Timing],
+    timings: list[TimingLaw],
     other: float = 0.0,
     hints: Mapping[str, float] = NO_HINTS,
 ) -> list[Trial]:
@@ -97,7 +98,7 @@ def exact_trials(
     return list(trials.values())
 
 
-def carried_on(state: State, present: Fit, trial: Trial) -> Fit:
+def carried_on(state: TrialState, present: Fit, trial: Trial) -> Fit:
     """The fit with a trial's revision, to the end."""
     revision, weights, start = trial.revision, present.weights, present
     if trial.fit is not None:
@@ -106,12 +107,12 @@ def carried_on(state: State, present: Fit, trial: Trial) -> Fit:
 
 
 def _from_afar(
-    coarse: Beside, timings: list[Timing], other: float, hints: Mapping[str, float]
-) -> list[tuple[float, Timing, Psi]]:
+    coarse: Beside, timings: list[TimingLaw], other: float, hints: Mapping[str, float]
+) -> list[tuple[float, TimingLaw, Psi]]:
     """Gain and parameters of every promising timing on the coarse map; one of each name."""
     banks = {timing: coarse.bank(timing, hints.get(timing.effect, 0.0)) for timing in timings}
     bar = PROMISING * max([other, *(max(bank.values()) for bank in banks.values())])
-    best: dict[str, tuple[float, Timing, Psi]] = {}
+    best: dict[str, tuple[float, TimingLaw, Psi]] = {}
     for timing, bank in banks.items():
         if max(bank.values()) < bar or max(bank.values()) <= 0.0:
             continue

@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from rtid.diagnose.candidates import Candidate
 from rtid.diagnose.fit import Fit, one_pass
 from rtid.diagnose.regression import LIMIT_SD
-from rtid.model import FloatArray
+from rtid.effects.column import Candidate
+from rtid.plain import FloatArray
 
 SWING, RATES_HZ = 0.2, (0.03, 0.11)  # of the supply
 STEEP = 0.05  # of the largest dQ/du: a command that hardly opens its valve is left alone
@@ -24,7 +24,10 @@ Limits = dict[Candidate, tuple[float, float]]
 
 
 def varied_supply(fit: Fit) -> FloatArray | None:
-    """The record of a fit, as declared, with a wandering supply; None where no edge names one."""
+    """The record of a fit, as declared, with a wandering supply: (n, 2 + signals), SI.
+
+    None where no edge names a supply.
+    """
     view, declared = fit.view, fit.declared
     if not view.supply_name:
         return None
@@ -51,13 +54,15 @@ def limits(fit: Fit) -> Limits:
     chunk = varied_supply(fit)
     if chunk is None or not fit.columns.candidates:
         return {}
-    other = one_pass(fit.declared, chunk, fit.weights, fit.revision, fit, bank=True)
-    found: Limits = {}
+    other = one_pass(
+        fit.declared, chunk, fit.weights, fit.revision, fit, True, suspects=fit.suspects
+    )
+    limits_of: Limits = {}
     for k, candidate in enumerate(fit.columns.candidates):
         if candidate in fit.revision.effects or candidate not in other.columns.candidates:
             continue
         before = fit.regression.score(fit.estimate.used, fit.first + k).sd
         column = other.first + other.columns.candidates.index(candidate)
         after = other.regression.score(other.estimate.used, column).sd
-        found[candidate] = LIMIT_SD * before, LIMIT_SD * after
-    return found
+        limits_of[candidate] = LIMIT_SD * before, LIMIT_SD * after
+    return limits_of

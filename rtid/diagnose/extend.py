@@ -6,26 +6,21 @@ judged by the same limits.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rtid.diagnose.contest import alike_ones
-from rtid.diagnose.diagnosis import LEAST_SHARE, begin
+from rtid.diagnose.diagnosis import LEAST_SHARE
 from rtid.diagnose.exact import carried_on, exact_trials, with_pump
-from rtid.diagnose.fit import Fit, one_pass
-from rtid.diagnose.parts import Part
-from rtid.diagnose.pump import PUMP
-from rtid.diagnose.residual import Residual, residual
-from rtid.diagnose.timing import COMMAND, TIMINGS
+from rtid.diagnose.excuse import few_excused
+from rtid.diagnose.standing import Standing, with_bank
 from rtid.diagnose.trials import (
     GAIN,
     MATCH_RHO,
     TIE,
     TIE_SHARE,
-    Key,
-    State,
     Trial,
     best_by_key,
     material_share,
@@ -35,8 +30,10 @@ from rtid.diagnose.trials import (
     scored,
 )
 from rtid.diagnose.verdict import MATERIAL
+from rtid.effects.laws.pump import PUMP
+from rtid.effects.laws.timing import COMMAND, TIMINGS
 from rtid.errors import RtidError
-from rtid.model import FloatArray, Model
+from rtid.plain import Key
 from rtid.units import nearest
 
 UNJUDGED = "the held-out part has no place where the map is known well enough to judge"
@@ -46,21 +43,6 @@ class RefusedError(RtidError):
     """The effect cannot be added, or does not deserve it; the text has the figures."""
 
     exit_code = 4
-
-
-@dataclass(frozen=True)
-class Standing:
-    """A model on a record, every candidate beside it, and what it leaves of both parts."""
-
-    state: State
-    fit: Fit
-    identification: Residual
-    held_out: Residual
-
-    @classmethod
-    def of(cls, state: State, found: Fit) -> Standing:
-        """A fit held against both parts."""
-        return cls(state, found, residual(found, state.chunk), residual(found, state.held_out))
 
 
 @dataclass(frozen=True)
@@ -76,21 +58,6 @@ class Extension:
     after: Standing
     against: tuple[str, ...]
     better: str
-
-
-def _silent(_what: str, _share: float) -> None:
-    pass
-
-
-def stand(
-    model: Model,
-    chunk: FloatArray,
-    held_out: FloatArray,
-    parts: tuple[Part, ...] = (),
-    progress: Callable[[str, float], None] = _silent,
-) -> Standing:
-    """The model with its parts on a record; chunk and held_out (n, 2 + signals)."""
-    return Standing.of(*begin(model, chunk, held_out, progress, parts))
 
 
 def extend(present: Standing, effect: str, where: str = "") -> Extension:
@@ -109,8 +76,7 @@ def extend(present: Standing, effect: str, where: str = "") -> Extension:
         choices = " or ".join(f"{effect}:{place}" for _, place in (best.key, *alike))
         raise RefusedError(f"{effect} explains as much at several places", f"name one: {choices}")
     now = carried_on(state, present.fit, best)
-    now = one_pass(state.model, state.chunk, now.weights, now.revision, now, bank=True)
-    after = Standing.of(state, now)
+    after = Standing(state, with_bank(few_excused(now), state.suspects))
     against = tuple(_against(present, after, best))
     return Extension(best.key, best.gain, present, after, against, _better(present, best))
 
@@ -123,13 +89,13 @@ def _timings(present: Standing, effect: str, where: str) -> list[Trial]:
     _refuse_place(effect, where, [COMMAND])
     if present.fit.revision.has((effect, COMMAND)):
         raise _already(effect, COMMAND)
-    found = exact_trials(present.state, present.fit, timings)
-    if not found:
+    trials = exact_trials(present.state, present.fit, timings)
+    if not trials:
         raise RefusedError(
             f"{effect} at {COMMAND}: the fit ends at nothing, or at a bound of its parameters",
             "`rtid diagnose` says what this record would have shown",
         )
-    return found
+    return trials
 
 
 def _flows(present: Standing, effect: str, where: str) -> list[Trial]:
@@ -151,10 +117,13 @@ def _flows(present: Standing, effect: str, where: str) -> list[Trial]:
     if not possible:
         candidate, score = max(offered, key=lambda o: o[1].gain)
         value = physical(fit_, candidate, score.value)
+        searched = ", ".join(candidate.shape_names)
         raise RefusedError(
             f"{effect} at {candidate.where} would have {candidate.parameter} {value:.3g} "
-            f"{candidate.unit}, which is physically impossible",
-            "something else is missing: `rtid diagnose` names it",
+            f"{candidate.unit}, which is physically impossible"
+            + (f", wherever the search for {searched} begins" if searched else ""),
+            "something else is missing: `rtid diagnose` names it"
+            + (", or more values to begin from" if searched else ""),
         )
     trials = []
     for key, (candidate, score) in possible.items():
@@ -179,7 +148,7 @@ def _already(effect: str, where: str) -> RefusedError:
 def _against(before: Standing, after: Standing, trial: Trial) -> Iterator[str]:
     """What speaks against an effect, with figures."""
     old, new = before.held_out, after.held_out
-    without, having = (100 * held.rms_m3s / new.flow_m3s for held in (old, new))
+    without, having = (100 * residual.rms_m3s / new.flow_m3s for residual in (old, new))
     figures = f"held-out error {without:.2f} % without it, {having:.2f} % with it"
     if not np.isfinite(new.rms_m3s + old.rms_m3s):
         yield UNJUDGED
@@ -188,14 +157,14 @@ def _against(before: Standing, after: Standing, trial: Trial) -> Iterator[str]:
         yield f"it does not lower the held-out error: {figures}"
     elif material_share(old, new) < MATERIAL:
         yield f"it changes next to nothing: {figures}"
-    elif (own := own_share(after.fit, trial, after.state.held_out)) < MATERIAL:
-        yield f"its own flow on the held-out part is {100 * own:.2g} % of the rms flow: {figures}"
+    elif (share := own_share(after.fit, trial, after.state.held_out)) < MATERIAL:
+        yield f"its own flow on the held-out part is {100 * share:.2g} % of the rms flow: {figures}"
     if trial.gain <= GAIN:
         yield f"it is not significant: chi2 falls by {max(0.0, trial.gain):.1f}, {GAIN:.0f} needed"
-    left = before.fit.held.sse - before.fit.regression.dof
-    if before.fit.rho > MATCH_RHO and trial.gain < LEAST_SHARE * left:
+    rest = before.fit.held.sse - before.fit.regression.dof
+    if before.fit.rho > MATCH_RHO and trial.gain < LEAST_SHARE * rest:
         yield (
-            f"it explains {100 * max(0.0, trial.gain) / left:.2g} % of the misfit: "
+            f"it explains {100 * max(0.0, trial.gain) / rest:.2g} % of the misfit: "
             f"something else is missing first ({figures})"
         )
 

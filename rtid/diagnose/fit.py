@@ -14,21 +14,24 @@ from functools import cached_property
 import numpy as np
 
 from rtid.diagnose.bank import add_shapes, add_timing, offer
-from rtid.diagnose.candidates import Candidate, Cause, Columns, Shape, Volumes
-from rtid.diagnose.causes import add_echoes, cause_of
 from rtid.diagnose.commands import commands, split, transformed
 from rtid.diagnose.equations import regression_of, softened
 from rtid.diagnose.evidence import Rows, project, rows_of
 from rtid.diagnose.moving import halfway, is_as_good, is_worse, moved, reweighed
 from rtid.diagnose.regression import Estimate, Regression
 from rtid.diagnose.revision import Revision
-from rtid.diagnose.view import FlowMap, View
+from rtid.effects.column import Candidate, Cause, Columns
+from rtid.effects.law import Shape, Volumes
+from rtid.effects.laws import add_echoes, cause_of
+from rtid.effects.page import Effect
+from rtid.effects.record_view import MapTerms, RecordView
 from rtid.estimator.factor import PRIOR_SD, SHARED_PRIOR
 from rtid.estimator.record import refined, run
 from rtid.estimator.solution import sketch
 from rtid.estimator.state import Weights
 from rtid.kernels.layout import TERMS
-from rtid.model import FloatArray, Model
+from rtid.model import Machine
+from rtid.plain import FloatArray
 
 PASSES = 10  # of Gauss-Newton
 HALVINGS = 2  # of one step, before it is given up
@@ -47,37 +50,38 @@ class Fit:
     estimate: of all of them, which says where timings and shapes should move; held: with these
     where they are, to which `map` belongs and which everything else is judged by.
     shapes: (effect, nonlinear parameter) of each column of shapes.  rows: of the record, for
-    another fit with the same commands and weights; large.
+    another fit with the same commands and weights; large.  suspects: scored beside the catalogue.
     """
 
-    declared: Model
+    declared: Machine
     chunk: FloatArray
     weights: Weights
     revision: Revision
-    before: FlowMap
+    before: MapTerms
     columns: Columns
     regression: Regression
     estimate: Estimate
     held: Estimate
-    map: FlowMap
+    map: MapTerms
     first: int
     shapes: tuple[tuple[int, int], ...] = ()
     rows: Rows | None = None
+    suspects: tuple[Effect, ...] = ()
 
     @cached_property
-    def model(self) -> Model:
+    def model(self) -> Machine:
         """The machine with split commands."""
         return split(self.declared)
 
     @cached_property
     def sent(self) -> FloatArray:
-        """The record with the commands as they reach the spools."""
+        """The record (n, 2 + signals), SI, with the commands as they reach the spools."""
         return transformed(self.declared, self.chunk, self.revision.timings)
 
     @cached_property
-    def view(self) -> View:
+    def view(self) -> RecordView:
         """The record beside the map that gave the columns."""
-        return View.of(self.model, self.sent, self.weights, self.before)
+        return RecordView.of(self.model, self.sent, self.weights, self.before)
 
     @property
     def rho(self) -> float:
@@ -85,10 +89,22 @@ class Fit:
         return self.regression.rho(self.held)
 
     @property
+    def freedom(self) -> float:
+        """Degrees of freedom that are left to the rows."""
+        return max(1.0, self.regression.dof - len(self.held.used))
+
+    @property
     def compliance(self) -> FloatArray:
-        """1 / beta per chamber, 1/Pa."""
+        """1 / beta (chambers,), 1/Pa."""
         n_c = len(self.model.chambers)
         return np.asarray(self.held.theta[:n_c] * self.weights.compliance)
+
+    @property
+    def compliance_cov(self) -> FloatArray:
+        """Covariance of the compliances (chambers, chambers), 1/Pa2, by the misfit that is left."""
+        n_c, c0 = len(self.model.chambers), self.weights.compliance
+        spread = max(1.0, self.rho) * np.outer(c0, c0)
+        return np.asarray(self.held.cov[:n_c, :n_c] * spread)
 
     @property
     def first_given(self) -> int:
@@ -116,40 +132,44 @@ class Fit:
         return {k: first + j for j, (e, k) in enumerate(self.shapes) if e == at}
 
 
-def prepare(model: Model, chunk: FloatArray) -> Weights:
-    """Weights of the rows from a first estimate."""
+def prepare(model: Machine, chunk: FloatArray) -> Weights:
+    """Weights of the rows from a first estimate; chunk (n, 2 + signals), SI."""
     return refined(model, sketch(model, run(model, chunk)), model.lag.nominal_s)
 
 
 def fit(
-    model: Model,
+    model: Machine,
     chunk: FloatArray,
     weights: Weights,
     revision: Revision,
     start: Fit | None = None,
     bank: bool = True,
+    suspects: tuple[Effect, ...] = (),
 ) -> Fit:
-    """Fit a revision to chunk (n, 2 + signals); start: the fit to begin with.
+    """Fit a revision to chunk (n, 2 + signals), SI; start: the fit to begin with.
 
-    bank: also make the columns of every candidate, to score them.
+    bank: also make the columns of every candidate, to score them; suspects: effects of the user's
+    beside those of the catalogue.
     """
     best = one_pass(model, chunk, weights, revision, start, False, thorough=False)
     step, halvings = moved(best), 0
     for _ in range(PASSES):
         if step is None or halvings > HALVINGS:
             break
-        found = one_pass(model, chunk, step.weights, step.revision, best, False, thorough=False)
-        if is_worse(found, best):
+        fitted = one_pass(model, chunk, step.weights, step.revision, best, False, thorough=False)
+        if is_worse(fitted, best):
             step, halvings = halfway(best, step), halvings + 1
         else:
             halvings = 0
-            best, step = found, None if is_as_good(found, best) else moved(found)
-        del found  # its rows are large
-    return one_pass(model, chunk, best.weights, best.revision, best, bank) if bank else best
+            best, step = fitted, None if is_as_good(fitted, best) else moved(fitted)
+        del fitted  # its rows are large
+    if not bank:
+        return best
+    return one_pass(model, chunk, best.weights, best.revision, best, bank, suspects=suspects)
 
 
 def one_pass(
-    model: Model,
+    model: Machine,
     chunk: FloatArray,
     weights: Weights,
     revision: Revision,
@@ -157,11 +177,14 @@ def one_pass(
     bank: bool,
     more: Iterable[tuple[Cause, Shape]] = (),
     thorough: bool = True,
+    before: MapTerms | None = None,
+    suspects: tuple[Effect, ...] = (),
 ) -> Fit:
     """Fit with the timing parameters where they are; more: causes to add with other shapes.
 
-    start: the fit whose map gives the columns.  thorough = False: without the covariances of the
-    maps, and with them what the priors leave of their degrees of freedom.
+    chunk (n, 2 + signals), SI: the record as declared.  start: the fit whose map gives the
+    columns, or `before`, the map alone.  thorough = False: without the covariances of the maps,
+    and with them what the priors leave of their freedom.
     """
     if revision.replaces_lag:
         weights = replace(weights, lag_s=0.0)
@@ -169,13 +192,13 @@ def one_pass(
     model = split(declared)
     soft = softened(model, sent, weights, revision.sizes)
     rows = _same_rows(start, sent, weights, soft) or rows_of(model, sent, weights, soft=soft)
-    before = start.map if start else _map_alone(model, rows)
-    view = View.of(model, sent, weights, before)
+    before = start.map if start else before or _map_alone(model, rows)
+    view = RecordView.of(model, sent, weights, before)
     columns = Columns(rows.condensed)
     n_timing = add_timing(view, columns, commands(declared, chunk), weights, revision)
     shapes = tuple(add_shapes(view, columns, revision))
     first = 1 + len(model.chambers) + n_timing + len(shapes)
-    offer(view, columns, revision, bank, more)
+    offer(view, columns, revision, bank, more, suspects)
     slopes = [(cause_of(view, e), e.shape, k) for i, k in shapes for e in [revision.effects[i]]]
     add_echoes(view, columns, n_timing, slopes)
     projected = project(rows, columns.released())
@@ -185,39 +208,39 @@ def one_pass(
     regression.prior[weak] = RIDGE * regression.own[weak] + (regression.own[weak] == 0.0)
     at = [first + columns.candidates.index(e) for e in revision.effects]
     estimate = regression.fit((*range(1, first), *at))
-    held = regression.fit((*range(1, 1 + len(model.chambers)), *at))
-    flowmap = FlowMap(rows.cells, projected.terms(list(held.used), held.theta), NO_COV)
-    parts = chunk, weights, revision, before, columns, regression, estimate, held
-    found = Fit(declared, *parts, flowmap, first, shapes, rows)
-    vars(found).update(model=model, sent=sent, view=view)  # what is made when it is missing
-    return with_covariances(found) if thorough else found
+    fixed = regression.fit((*range(1, 1 + len(model.chambers)), *at))
+    flowmap = MapTerms(rows.cells, projected.terms(list(fixed.used), fixed.theta), NO_COV)
+    parts = chunk, weights, revision, before, columns, regression, estimate, fixed
+    fitted = Fit(declared, *parts, flowmap, first, shapes, rows, suspects)
+    vars(fitted).update(model=model, sent=sent, view=view)  # what is made when it is missing
+    return with_covariances(fitted) if thorough else fitted
 
 
-def with_covariances(found: Fit, like: Fit | None = None) -> Fit:
+def with_covariances(fitted: Fit, like: Fit | None = None) -> Fit:
     """A fit with the covariances of its maps, and what their priors leave of the freedom.
 
     like: a fit whose covariances are taken where its rows are weighed alike and meet the same
     blocks: an effect more changes them by next to nothing.
     """
-    if found.rows is None:
-        return found
-    cov = _covariances_of(like, found) if like is not None else None
+    if fitted.rows is None:
+        return fitted
+    cov = _covariances_of(like, fitted) if like is not None else None
     if cov is None:
-        cov = found.rows.factor.covariances
+        cov = fitted.rows.factor.covariances
     freed = float(np.einsum("bii->", cov)) * PRIOR_SD**-2
-    dof = found.rows.n - TERMS * len(found.rows.cells) + freed
+    dof = fitted.rows.n - TERMS * len(fitted.rows.cells) + freed
     better = replace(
-        found, map=replace(found.map, cov=cov), regression=replace(found.regression, dof=dof)
+        fitted, map=replace(fitted.map, cov=cov), regression=replace(fitted.regression, dof=dof)
     )
-    vars(better).update(model=found.model, sent=found.sent, view=found.view)
+    vars(better).update(model=fitted.model, sent=fitted.sent, view=fitted.view)
     return better
 
 
-def _covariances_of(like: Fit, found: Fit) -> FloatArray | None:
+def _covariances_of(like: Fit, fitted: Fit) -> FloatArray | None:
     """Those of another fit, in the order of this one's blocks; None where they are not the same."""
-    known, cells = like.map, found.map.cells
-    alike = like.revision.timings == found.revision.timings and np.allclose(
-        like.weights.compliance, found.weights.compliance, rtol=WEIGHED, atol=0.0
+    known, cells = like.map, fitted.map.cells
+    alike = like.revision.timings == fitted.revision.timings and np.allclose(
+        like.weights.compliance, fitted.weights.compliance, rtol=WEIGHED, atol=0.0
     )
     if not alike or not len(known.cov) or not np.isin(cells, known.cells).all():
         return None
@@ -225,13 +248,16 @@ def _covariances_of(like: Fit, found: Fit) -> FloatArray | None:
     return np.asarray(known.cov[order[np.searchsorted(known.cells[order], cells)]])
 
 
-def tried(model: Model, chunk: FloatArray, weights: Weights, revision: Revision) -> Fit:
-    """A revision fitted where it is, its rows weighed by what it finds; derivatives do the rest."""
-    found = one_pass(model, chunk, weights, revision, None, False, thorough=False)
-    better = reweighed(found)
+def tried(model: Machine, chunk: FloatArray, weights: Weights, revision: Revision) -> Fit:
+    """A revision fitted where it is, its rows weighed by what it finds; derivatives do the rest.
+
+    chunk (n, 2 + signals), SI.
+    """
+    fitted = one_pass(model, chunk, weights, revision, None, False, thorough=False)
+    better = reweighed(fitted)
     if better is not None:
-        found = one_pass(model, chunk, better, revision, found, False, thorough=False)
-    return found.light()
+        fitted = one_pass(model, chunk, better, revision, fitted, False, thorough=False)
+    return fitted.light()
 
 
 def _same_rows(
@@ -251,18 +277,18 @@ def _same_rows(
     return start.rows if all(np.array_equal(a, b) for a, b in pairs) else None
 
 
-def columns_of_effects(found: Fit) -> list[Volumes]:
+def columns_of_effects(fitted: Fit) -> list[Volumes]:
     """Volumes per interval of the effects of a fit, for coefficients of 1."""
-    return [cause_of(found.view, e).column(e.shape) for e in found.revision.effects]
+    return [cause_of(fitted.view, e).column(e.shape) for e in fitted.revision.effects]
 
 
-def first_map(model: Model, chunk: FloatArray, weights: Weights) -> FlowMap:
-    """The maps fitted without any effect."""
+def first_map(model: Machine, chunk: FloatArray, weights: Weights) -> MapTerms:
+    """The maps fitted without any effect; chunk (n, 2 + signals), SI."""
     return _map_alone(model, rows_of(model, chunk, weights))
 
 
-def _map_alone(model: Model, rows: Rows) -> FlowMap:
+def _map_alone(model: Machine, rows: Rows) -> MapTerms:
     projected, n_c = project(rows, ()), len(model.chambers)
     s = projected.schur
     theta = np.asarray(np.linalg.solve(s[1:, 1:] + SHARED_PRIOR * np.eye(n_c), s[1:, 0]))
-    return FlowMap(rows.cells, projected.terms(list(range(1, 1 + n_c)), theta), NO_COV)
+    return MapTerms(rows.cells, projected.terms(list(range(1, 1 + n_c)), theta), NO_COV)

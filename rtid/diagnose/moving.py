@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rtid.diagnose.candidates import Candidate
-from rtid.diagnose.causes import cause_of
 from rtid.diagnose.regression import Estimate
 from rtid.diagnose.revision import Revision
-from rtid.diagnose.timing import Psi, Timing
+from rtid.effects.column import Candidate
+from rtid.effects.laws import cause_of
+from rtid.effects.laws.timing import Psi, TimingLaw
 from rtid.estimator.state import Weights
-from rtid.model import FloatArray
+from rtid.plain import FloatArray
 
 if TYPE_CHECKING:
     from rtid.diagnose.fit import Fit
@@ -45,33 +45,32 @@ class Step:
     weights: Weights
 
 
-def moved(found: Fit) -> Step | None:
+def moved(fit: Fit) -> Step | None:
     """Where the derivatives point; None where nothing is left to move."""
-    old, way = found.revision, _Way.of(found)
+    old, way = fit.revision, _Way.of(fit)
     timings = tuple(
         (timing, way.timed(k, timing, psi)) for k, (timing, psi) in enumerate(old.timings)
     )
     effects = tuple(way.reshaped(effect) for effect in old.effects)
     sizes = tuple(
-        (e, found.estimate.value(found.column(o)))
-        for e, o in zip(effects, old.effects, strict=True)
+        (e, fit.estimate.value(fit.column(o))) for e, o in zip(effects, old.effects, strict=True)
     )
-    is_near = found.regression.rho(found.estimate) < FAR  # once all that may move has moved
-    weights = replace(found.weights, lag_s=way.lag_s(LAG_REACH if is_near else 1.0))
+    is_near = fit.regression.rho(fit.estimate) < FAR  # once all that may move has moved
+    weights = replace(fit.weights, lag_s=way.lag_s(LAG_REACH if is_near else 1.0))
     if is_near:
-        weights = replace(weights, compliance=_compliance(found))
+        weights = replace(weights, compliance=_compliance(fit))
     is_same = (timings, effects) == (old.timings, old.effects) and _weigh_alike(sizes, old.sizes)
-    is_same &= weights.lag_s == found.weights.lag_s
-    is_same &= weights.compliance is found.weights.compliance
+    is_same &= weights.lag_s == fit.weights.lag_s
+    is_same &= weights.compliance is fit.weights.compliance
     return None if is_same else Step(Revision(effects, timings, sizes), weights)
 
 
-def reweighed(found: Fit) -> Weights | None:
+def reweighed(fit: Fit) -> Weights | None:
     """Weights with the compliances that a fit has found; None where they weigh the same."""
-    compliance = _compliance(found)
-    if compliance is found.weights.compliance:
+    compliance = _compliance(fit)
+    if compliance is fit.weights.compliance:
         return None
-    return replace(found.weights, compliance=compliance)
+    return replace(fit.weights, compliance=compliance)
 
 
 def halfway(best: Fit, step: Step) -> Step:
@@ -90,35 +89,35 @@ def halfway(best: Fit, step: Step) -> Step:
     return Step(Revision(effects, timings, sizes), replace(step.weights, lag_s=lag_s))
 
 
-def is_as_good(found: Fit, best: Fit) -> bool:
+def is_as_good(fit: Fit, best: Fit) -> bool:
     """True where a step changed the misfit by next to nothing."""
     misfit = best.held.sse - best.regression.dof
-    return abs(best.held.sse - found.held.sse) < max(NOISE, ENOUGH * misfit)
+    return abs(best.held.sse - fit.held.sse) < max(NOISE, ENOUGH * misfit)
 
 
-def is_worse(found: Fit, best: Fit) -> bool:
+def is_worse(fit: Fit, best: Fit) -> bool:
     """True where a step made the misfit larger, both being weighed alike, or lost rows."""
-    if found.regression.rows < KEPT * best.regression.rows:
+    if fit.regression.rows < KEPT * best.regression.rows:
         return True
-    alike = np.array_equal(found.weights.compliance, best.weights.compliance)
-    alike = alike and _weigh_alike(found.revision.sizes, best.revision.sizes)
-    return alike and found.held.sse > best.held.sse and not is_as_good(found, best)
+    alike = np.array_equal(fit.weights.compliance, best.weights.compliance)
+    alike = alike and _weigh_alike(fit.revision.sizes, best.revision.sizes)
+    return alike and fit.held.sse > best.held.sse and not is_as_good(fit, best)
 
 
 def _mean(a: Psi, b: Psi) -> Psi:
-    return tuple(0.5 * (one + other) for one, other in zip(a, b, strict=True))
+    return tuple(0.5 * (x + other) for x, other in zip(a, b, strict=True))
 
 
 def _weigh_alike(
     a: tuple[tuple[Candidate, float], ...], b: tuple[tuple[Candidate, float], ...]
 ) -> bool:
-    one, other = [size for _, size in a], [size for _, size in b]
-    return len(one) == len(other) and np.allclose(one, other, rtol=SIZED, atol=0.0)
+    size_a, other = [size for _, size in a], [size for _, size in b]
+    return len(size_a) == len(other) and np.allclose(size_a, other, rtol=SIZED, atol=0.0)
 
 
-def _compliance(found: Fit) -> FloatArray:
-    low, high = sorted(1.0 / bound for bound in found.model.beta_bounds_pa)
-    target, now = np.clip(found.compliance, low, high), found.weights.compliance
+def _compliance(fit: Fit) -> FloatArray:
+    low, high = sorted(1.0 / bound for bound in fit.model.beta_bounds_pa)
+    target, now = np.clip(fit.compliance, low, high), fit.weights.compliance
     return now if np.allclose(target, now, rtol=SIZED, atol=0.0) else target
 
 
@@ -131,12 +130,12 @@ class _Way:
     share: float = 1.0
 
     @classmethod
-    def of(cls, found: Fit) -> _Way:
+    def of(cls, fit: Fit) -> _Way:
         """A declared lag that would leave its range stays, and the others go without it."""
-        way = cls(found, found.estimate)
-        if not found.revision.replaces_lag and way._lag_leaves():
-            used = tuple(k for k in found.estimate.used if k != found.first_given)
-            way = cls(found, found.regression.fit(used))
+        way = cls(fit, fit.estimate)
+        if not fit.revision.replaces_lag and way._lag_leaves():
+            used = tuple(k for k in fit.estimate.used if k != fit.first_given)
+            way = cls(fit, fit.regression.fit(used))
         return replace(way, share=min([1.0, *way._shares()]))
 
     def lag_s(self, reach: float) -> float:
@@ -151,7 +150,7 @@ class _Way:
         target = float(np.clip(target, min(max(0.0, low), now), max(high, now)))
         return target if abs(target - now) > max(self._least(at), LEAST_LAG_S) else now
 
-    def timed(self, k: int, timing: Timing, psi: Psi) -> Psi:
+    def timed(self, k: int, timing: TimingLaw, psi: Psi) -> Psi:
         """The parameters of timing k to go on with."""
         new = []
         for j, (value, at) in enumerate(zip(psi, self.found.timing_columns(k), strict=True)):

@@ -9,17 +9,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from rtid.diagnose.candidates import Candidate, Cause
-from rtid.diagnose.causes import causes
 from rtid.diagnose.commands import split, transformed
-from rtid.diagnose.fit import Fit, first_map
-from rtid.diagnose.pump import PUMP
+from rtid.diagnose.fit import first_map
 from rtid.diagnose.revision import Revision
-from rtid.diagnose.timing import COMMAND, TIMINGS, Psi, Timing
-from rtid.diagnose.view import View
+from rtid.effects.column import Candidate, Cause
+from rtid.effects.laws import causes
+from rtid.effects.laws.pump import PUMP
+from rtid.effects.laws.timing import COMMAND, TIMINGS, Psi, TimingLaw
+from rtid.effects.page import Effect
+from rtid.effects.record_view import RecordView
 from rtid.errors import RtidError
 from rtid.estimator.state import Weights
-from rtid.model import FloatArray, Model
+from rtid.model import Machine
+from rtid.plain import FloatArray
 
 
 class PartError(RtidError):
@@ -27,8 +29,8 @@ class PartError(RtidError):
 
 
 @dataclass(frozen=True)
-class Part:
-    """One effect that was added; parameters: name -> SI value; own_spools: as of `Timing`."""
+class AddedEffect:
+    """One effect that was added; parameters: name -> SI value; own_spools: as of `TimingLaw`."""
 
     effect: str
     where: str
@@ -41,28 +43,30 @@ class Part:
         return self.effect, self.where
 
 
-def part_of(fit: Fit, key: tuple[str, str], parameters: Mapping[str, float]) -> Part:
-    """The part that a cause of a fit becomes."""
-    own = any(t.own_spools for t, _ in fit.revision.timings if t.effect == key[0])
-    return Part(*key, parameters, own)
+def recall(
+    model: Machine,
+    chunk: FloatArray,
+    weights: Weights,
+    parts: tuple[AddedEffect, ...],
+    suspects: tuple[Effect, ...] = (),
+) -> Revision:
+    """The revision with these parts on a record, chunk (n, 2 + signals), SI.
 
-
-def recall(model: Model, chunk: FloatArray, weights: Weights, parts: tuple[Part, ...]) -> Revision:
-    """The revision with these parts on a record, chunk (n, 2 + signals).
+    suspects: effects of the user's beside those of the catalogue.
 
     Raises PartError where a part fits no effect of this machine and record.
     """
-    timings = tuple((t, psi) for p in parts if (found := _timing(p)) for t, psi in [found])
+    timings = tuple((t, psi) for p in parts if (timing := _timing(p)) for t, psi in [timing])
     fixed = [p for p in parts if _timing(p) is None]
     if not fixed:
         return Revision((), timings)
     sent, whole = transformed(model, chunk, timings), split(model)
-    view = View.of(whole, sent, weights, first_map(whole, sent, weights))
-    offered = causes(view)
+    view = RecordView.of(whole, sent, weights, first_map(whole, sent, weights))
+    offered = causes(view, suspects)
     return Revision(tuple(_candidate(p, offered) for p in fixed), timings)
 
 
-def _timing(part: Part) -> tuple[Timing, Psi] | None:
+def _timing(part: AddedEffect) -> tuple[TimingLaw, Psi] | None:
     for timing in (*TIMINGS, PUMP):
         if (timing.effect, timing.own_spools) == (part.effect, part.own_spools):
             return timing, tuple(_value(part, name) for name in timing.parameters)
@@ -71,7 +75,7 @@ def _timing(part: Part) -> tuple[Timing, Psi] | None:
     return None
 
 
-def _candidate(part: Part, offered: list[Cause]) -> Candidate:
+def _candidate(part: AddedEffect, offered: list[Cause]) -> Candidate:
     for cause in offered:
         candidate = cause.candidate
         if candidate.key == part.key and candidate.parameter in part.parameters:
@@ -80,7 +84,7 @@ def _candidate(part: Part, offered: list[Cause]) -> Candidate:
     raise _unfit(part, "cannot act in this record")
 
 
-def _value(part: Part, name: str, usual: float = 1.0) -> float:
+def _value(part: AddedEffect, name: str, usual: float = 1.0) -> float:
     """A parameter of a part; one that is usually zero may be left out."""
     if name not in part.parameters and usual == 0.0:
         return 0.0
@@ -89,7 +93,7 @@ def _value(part: Part, name: str, usual: float = 1.0) -> float:
     return part.parameters[name]
 
 
-def _unfit(part: Part, problem: str) -> PartError:
+def _unfit(part: AddedEffect, problem: str) -> PartError:
     return PartError(
         f"the project has added {part.effect} at {part.where}, which {problem}",
         f"rtid drop {part.effect}, or correct [[added]] in the project file",

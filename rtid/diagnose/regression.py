@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import eigh
 
-from rtid.model import FloatArray
+from rtid.plain import FloatArray
 
 CLEARLY = 3.0  # standard deviations of the noise's own products by which a column must exceed it
 VANISHED = 1e-10  # share of a column's square that rounding leaves
@@ -103,23 +103,23 @@ class Regression:
 
     def score(self, used: tuple[int, ...], column: int) -> Score:
         """A candidate beside the columns in use; what these follow entirely is not visible."""
-        left = self._left(used, column)
-        if left <= VANISHED * max(self.own[column], 1e-300):
+        rest = self._left(used, column)
+        if rest <= VANISHED * max(self.own[column], 1e-300):
             return Score(column, 0.0, np.inf, 0.0, 0.0)
         with_it = self.fit((*used, column))
         value, sd = with_it.value(column), with_it.sd(column)
         gain = (value / sd) ** 2 if sd > 0 else 0.0
-        visible = float(np.sqrt(max(0.0, left / max(self.own[column], 1e-300))))
+        visible = float(np.sqrt(max(0.0, rest / max(self.own[column], 1e-300))))
         return Score(column, value, sd, gain, visible)
 
     def _left(self, used: tuple[int, ...], column: int) -> float:
         at = list(used)
-        own = self.s[column, column]
+        square = self.s[column, column]
         if not at:
-            return float(own)
+            return float(square)
         cross = self.s[at, column]
         gram = self.s[np.ix_(at, at)] + np.diag(self.prior[at] + 1e-300)
-        return float(own - cross @ np.linalg.solve(gram, cross))
+        return float(square - cross @ np.linalg.solve(gram, cross))
 
     def alike(self, used: tuple[int, ...], a: int, b: int) -> float:
         """Correlation of two candidates after maps and columns in use are taken out."""

@@ -9,20 +9,26 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
-from rtid.diagnose.candidates import Candidate
 from rtid.diagnose.diagnosis import Result
+from rtid.diagnose.excuse import steady
 from rtid.diagnose.experiment import limits
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.regression import Score
-from rtid.diagnose.trials import Found, Key, detection_limit, physical
-from rtid.diagnose.verdict import INSUFFICIENT, UNKNOWN
+from rtid.diagnose.remains import described
+from rtid.diagnose.trials import AcceptedEffect, detection_limit, physical
+from rtid.diagnose.verdict import MATERIAL, UNKNOWN, doubts_about, most_rho
 from rtid.effects import catalogue
+from rtid.effects.column import Candidate
+from rtid.effects.laws.timing import RATE
+from rtid.estimator.validity import Doubt
+from rtid.plain import Key, plain
+from rtid.units import limit
 
 SCHEMA = 1
 WORTH = 2.0  # times better that an experiment must be to be proposed
-SILENT = (UNKNOWN, INSUFFICIENT)  # verdicts that say nothing of what remains
+NOBODY_LOOKED = "Not examined: the diagnosis has no column for it here."
 VISIBLE = 2e-3  # share of a column that must be left beside the maps
 HYDRAULIC = ("flow", "storage", "timing", "supply", "map")
 
@@ -37,7 +43,7 @@ class Value:
 
 
 @dataclass(frozen=True)
-class Effect:
+class FoundEffect:
     """An effect that was found, in the order of addition."""
 
     effect: str
@@ -49,9 +55,15 @@ class Effect:
     heldout_residual_before_m3s: float
     heldout_residual_after_m3s: float
 
+    @property
+    def alike(self) -> tuple[Key, ...]:
+        """Name and place of what it cannot be told from."""
+        parts = [text.partition(" (") for text in self.cannot_be_told_from]
+        return tuple((name, where.removesuffix(")") or self.where) for name, _, where in parts)
+
 
 @dataclass(frozen=True)
-class Added:
+class FittedEffect:
     """An effect that the project has added, as fitted to this record."""
 
     effect: str
@@ -61,7 +73,10 @@ class Added:
 
 @dataclass(frozen=True)
 class Unseen:
-    """An effect that was not found: the smallest size that the record would have shown."""
+    """An effect that was not found: the smallest size that the record would have shown.
+
+    examined: False where this machine and record have no column for it: nobody looked.
+    """
 
     effect: str
     where: str
@@ -69,6 +84,7 @@ class Unseen:
     unit: str
     visible: bool
     reason: str
+    examined: bool = True
 
 
 @dataclass(frozen=True)
@@ -85,8 +101,8 @@ class Diagnosis:
     """Everything that `rtid diagnose` says; residuals are root mean squares behind H_f."""
 
     verdict: str
-    added: tuple[Added, ...]
-    found: tuple[Effect, ...]
+    added: tuple[FittedEffect, ...]
+    found: tuple[FoundEffect, ...]
     rho_before: float
     rho_after: float
     heldout_residual_before_m3s: float
@@ -100,57 +116,56 @@ class Diagnosis:
     not_found: tuple[Unseen, ...]
     negligible: tuple[Small, ...]
     advice: tuple[str, ...]
+    doubts: tuple[Doubt, ...] = ()
+
+    @property
+    def is_slight(self) -> bool:
+        """True where what is left beyond the sensors' noise is immaterial for the flow."""
+        rest = max(0.0, self.heldout_residual_after_m3s**2 - self.noise_floor_m3s**2)
+        return float(np.sqrt(rest)) < MATERIAL * self.rms_flow_m3s
 
     def as_json(self) -> dict[str, Any]:
         """Plain JSON types; numbers that are not finite are null."""
-        return {"schema": SCHEMA} | _plain(asdict(self))
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    if isinstance(value, (float, np.floating)):
-        return float(value) if np.isfinite(value) else None
-    return value.item() if isinstance(value, np.generic) else value
+        return {"schema": SCHEMA} | plain(asdict(self))
 
 
 def diagnosis(result: Result) -> Diagnosis:
     """The plain values of a search."""
-    last, found = result.last, tuple(_effect(result, f) for f in result.found)
+    last, effects = result.last, tuple(_effect(result, f) for f in result.found)
+    words = steady(last)
     unseen = _not_found(result)
     return Diagnosis(
         verdict=result.verdict,
-        added=tuple(Added(*p.key, parameters(last, p.key)) for p in result.given),
-        found=found,
+        added=tuple(FittedEffect(*p.key, parameters(last, p.key)) for p in result.given),
+        found=effects,
         rho_before=result.first.rho,
         rho_after=last.rho,
         heldout_residual_before_m3s=result.before.rms_m3s,
         heldout_residual_after_m3s=result.after.rms_m3s,
         noise_floor_m3s=result.after.floor_m3s,
         rms_flow_m3s=result.after.flow_m3s,
-        beta_pa=tuple(1.0 / float(c) if c else float("inf") for c in last.compliance),
-        lag_s=last.weights.lag_s,
-        something_remains=result.verdict not in SILENT and last.rho > result.match_rho,
+        beta_pa=tuple(1.0 / float(c) if c else float("inf") for c in words.compliance),
+        lag_s=words.weights.lag_s,
+        something_remains=last.rho >= most_rho(last) or result.verdict == UNKNOWN,
         held_out_judged=result.held_out_judged,
         not_found=unseen,
         negligible=tuple(
             Small(effect, where, share) for (effect, where), share in result.negligible.items()
         ),
         advice=advice(result, unseen),
+        doubts=doubts_about(last),
     )
 
 
-def _effect(result: Result, found: Found) -> Effect:
-    before, after = found.before.rms_m3s, found.after.rms_m3s
+def _effect(result: Result, accepted: AcceptedEffect) -> FoundEffect:
+    before, after = accepted.before.rms_m3s, accepted.after.rms_m3s
     tests = max(1, len(result.scores) + len(result.last.revision.effects))
-    return Effect(
-        effect=found.key[0],
-        where=found.key[1],
-        cannot_be_told_from=tuple(_named(result, found.key, key) for key in found.alike),
-        parameters=parameters(result.last, found.key),
-        p_value=float(min(1.0, tests * chi2.sf(found.gain, found.n_parameters))),
+    return FoundEffect(
+        effect=accepted.key[0],
+        where=accepted.key[1],
+        cannot_be_told_from=tuple(_named(result, accepted.key, key) for key in accepted.alike),
+        parameters=parameters(result.last, accepted.key),
+        p_value=float(min(1.0, tests * chdtrc(accepted.n_parameters, accepted.gain))),
         heldout_gain_pct=100.0 * (1.0 - after / before),
         heldout_residual_before_m3s=before,
         heldout_residual_after_m3s=after,
@@ -164,25 +179,25 @@ def _named(result: Result, best: Key, other: Key) -> str:
 
 def parameters(fit: Fit, key: Key) -> dict[str, Value]:
     """The parameters of a cause that is part of a fit, by name."""
-    found: dict[str, Value] = {}
+    values: dict[str, Value] = {}
     spread = np.sqrt(max(1.0, fit.rho))
     for k, (timing, psi) in enumerate(fit.revision.timings):
         if timing.effect == key[0]:
             for name, unit, value, j in zip(
                 timing.parameters, timing.units, psi, fit.timing_columns(k), strict=True
             ):
-                found[name] = Value(value, fit.estimate.sd(j) * spread, unit)
+                values[name] = Value(value, fit.estimate.sd(j) * spread, unit)
     for effect in fit.revision.effects:
         if effect.key == key:
             column = fit.column(effect)
             value, sd = fit.held.value(column), fit.estimate.sd(column) * spread
             scale = physical(fit, effect, 1.0)
-            found[effect.parameter] = Value(scale * value, scale * sd, effect.unit)
+            values[effect.parameter] = Value(scale * value, abs(scale) * sd, effect.unit)
             free = fit.shape_columns(effect)
             for k, name in enumerate(effect.shape_names):
                 sd = fit.estimate.sd(free[k]) * spread / abs(value) if k in free else float("nan")
-                found[name] = Value(effect.shape[k], sd, effect.shape_units[k])
-    return found
+                values[name] = Value(effect.shape[k], sd, effect.shape_units[k])
+    return values
 
 
 def _not_found(result: Result) -> tuple[Unseen, ...]:
@@ -192,16 +207,16 @@ def _not_found(result: Result) -> tuple[Unseen, ...]:
         known = best.get(candidate.key)
         if known is None or score.sd < known[1].sd:
             best[candidate.key] = candidate, score
-    own = {f.key for f in result.found} | {p.key for p in result.given}
+    listed = {f.key for f in result.found} | {p.key for p in result.given}
     seen = [
         _limit(result, candidate, score)
         for key, (candidate, score) in best.items()
-        if key not in own
+        if key not in listed
     ]
-    named = {u.effect for u in seen} | {key[0] for key in own}
+    named = {u.effect for u in seen} | {key[0] for key in listed}
     absent = [
-        Unseen(name, "", None, "", False, page.visible_when or page.summary)
-        for name, page in catalogue().items()
+        Unseen(name, "", None, "", False, f"{NOBODY_LOOKED} {page.visible_when}", examined=False)
+        for name, page in (dict(catalogue()) | {s.name: s for s in result.last.suspects}).items()
         if page.kind in HYDRAULIC and name not in named
     ]
     return tuple(seen + absent)
@@ -212,38 +227,46 @@ def _limit(result: Result, candidate: Candidate, score: Score) -> Unseen:
     limit = physical(fit, candidate, detection_limit(score, fit.rho))
     if candidate.parameter == "share":  # of a timing: times the value that its column was made for
         limit, unit = _of_timing(candidate, limit), candidate.shape_units[0]
-        visible = np.isfinite(limit) and score.visible > VISIBLE
+        pages = catalogue()[candidate.effect].parameters
+        (page,) = [p for p in pages if p.name in candidate.shape_names]
+        is_possible = page.low < limit if page.unit == RATE else limit < page.high
+        visible = score.visible > VISIBLE and is_possible
     else:
-        visible = score.visible > VISIBLE and limit < candidate.largest
+        is_possible = limit < candidate.largest
+        visible = score.visible > VISIBLE and is_possible
     if candidate.key in result.negligible:
         reason = "present, negligible: it changes next to nothing on the held-out part"
     elif visible:
         reason = ""
+    elif score.visible > VISIBLE:
+        reason = "only a size beyond all that is possible would have shown"
     else:
         reason = f"the maps follow {100 * (1 - score.visible**2):.2f} % of it in this record"
-    return Unseen(candidate.effect, candidate.where, float(limit), unit, bool(visible), reason)
+    largest = float(limit) if is_possible else None
+    return Unseen(candidate.effect, candidate.where, largest, unit, bool(visible), reason)
 
 
 def _of_timing(candidate: Candidate, share: float) -> float:
     """Share of a timing as its parameter: a spool is the slower the lower its frequency."""
-    (shape,), (name,) = candidate.shape, candidate.shape_names
-    return shape / share if name == "natural_frequency" else shape * share
+    (shape,), (unit,) = candidate.shape, candidate.shape_units
+    return shape / share if unit == RATE else shape * share
 
 
 def advice(result: Result, unseen: tuple[Unseen, ...]) -> tuple[str, ...]:
-    """Which motion would tell more: from the catalogue, for what is open in this record."""
-    pages, found = catalogue(), []
+    """What an unknown residual follows; which motion would tell more of what is open."""
+    pages = catalogue()
+    lines = list(described(result.last)) if result.verdict == UNKNOWN else []
     for f in result.found:
         for key in f.alike:
             page = pages.get(f.key[0])
             if page is not None and key[0] in page.confounders:
-                found.append(f"To tell {f.key[0]} from {key[0]}: {page.separates}")
-    hidden = sorted({u.effect for u in unseen if not u.visible and u.detection_limit is not None})
+                lines.append(f"To tell {f.key[0]} from {key[0]}: {page.separates}")
+    hidden = sorted({u.effect for u in unseen if not u.visible and u.examined})
     for name in hidden:
         page = pages.get(name)
         if page is not None and page.visible_when:
-            found.append(f"{name} cannot be seen in this record: {page.visible_when}")
-    return tuple(dict.fromkeys(found + _experiment(result, unseen)))
+            lines.append(f"{name} cannot be seen in this record: {page.visible_when}")
+    return tuple(dict.fromkeys(lines + _experiment(result, unseen)))
 
 
 def _experiment(result: Result, unseen: tuple[Unseen, ...]) -> list[str]:
@@ -257,10 +280,11 @@ def _experiment(result: Result, unseen: tuple[Unseen, ...]) -> list[str]:
             known = best.get(candidate.key)
             if known is None or scale * after < known[1]:
                 best[candidate.key] = scale * before, scale * after
-    units = {c.key: "" if c.unit == "1" else f" {c.unit}" for c, _ in result.scores}
+    units = {c.key: c.unit for c, _ in result.scores}
     return [
         f"Supply varied by 20 % in the same motion: {effect} ({where}) would be seen from "
-        f"{after:.2g}{units.get((effect, where), '')} on, instead of {before:.2g}."
+        f"{limit(after, units.get((effect, where), '1'))} on, instead of "
+        f"{limit(before, units.get((effect, where), '1'))}."
         for (effect, where), (before, after) in best.items()
         if before > WORTH * after
     ]

@@ -10,14 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rtid.diagnose.candidates import Candidate
-from rtid.diagnose.causes import SEED, cause_of, total_softness
 from rtid.diagnose.commands import transformed
 from rtid.diagnose.fit import Fit
-from rtid.diagnose.view import View
+from rtid.effects.column import Candidate
+from rtid.effects.laws import SEED, cause_of, total_softness
+from rtid.effects.record_view import RecordView
 from rtid.estimator.state import variance
 from rtid.kernels.explain import filter_rows
-from rtid.model import FloatArray
+from rtid.plain import FloatArray
 
 WN_RAD_S, ZETA, ROWS_PER_S = 2 * np.pi * 10, 0.8, 50.0
 KNOWN = 0.004  # of the rated flow: where the map is known worse, nothing is judged
@@ -55,8 +55,8 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
 
 
-def modelled(fit: Fit, view: View, leave_out: Candidate | None = None) -> FloatArray:
-    """Mean flow into each chamber over each interval, storage taken off (n - 1, chambers)."""
+def modelled(fit: Fit, view: RecordView, leave_out: Candidate | None = None) -> FloatArray:
+    """Mean flow into each chamber per interval, storage taken off: (n - 1, chambers), m3/s."""
     flows = np.empty((view.n - 1, len(view.model.chambers)))
     for c, compliance in enumerate(fit.compliance):
         v, p = view.volume(c), view.pressure(c)
@@ -77,32 +77,49 @@ def effect_values(fit: Fit) -> list[tuple[Candidate, float]]:
 
 
 def residual(fit: Fit, chunk: FloatArray, leave_out: Candidate | None = None) -> Residual:
-    """Hold a fitted revision against a record, chunk (n, 2 + signals) as recorded.
+    """Hold a fitted revision against a record, chunk (n, 2 + signals), SI, as recorded.
 
     leave_out: an effect whose flow is not counted.
     """
     sent = transformed_like(fit, chunk)
-    view = View.of(fit.model, sent, fit.weights, fit.map)
-    measured = np.stack(
-        [c.sign * c.area_m2 * np.diff(view.x_m) / view.dt_s for c in fit.model.chambers], axis=1
-    )
-    rates = np.concatenate(
-        [measured, measured - modelled(fit, view, leave_out), _noise(fit, view)], axis=1
-    )
-    rates[~view.inside | (view.flow_sd() > KNOWN)] = np.nan
+    view = RecordView.of(fit.model, sent, fit.weights, fit.map)
+    flows = measured(view)
+    rates = [flows, flows - modelled(fit, view, leave_out), _noise(fit, view)]
+    t_s, parts = through_filter(view, rates)
+    return Residual(t_s, *parts)
+
+
+def measured(view: RecordView) -> FloatArray:
+    """Flow into each chamber over each interval by the piston's motion (n - 1, chambers), m3/s."""
+    speed = np.diff(view.x_m) / view.dt_s
+    return np.stack([c.sign * c.area_m2 * speed for c in view.model.chambers], axis=1)
+
+
+def through_filter(
+    view: RecordView, rates: list[FloatArray]
+) -> tuple[FloatArray, list[FloatArray]]:
+    """Instants (rows,) and rows (rows, chambers) of rates (n - 1, chambers) behind H_f.
+
+    Instants in s, rates in m3/s.  view: the record beside the map, whose unknown places are
+    left out.
+    """
+    rates_of_all = np.concatenate(rates, axis=1)
+    rates_of_all[~view.inside | (view.flow_sd() > KNOWN)] = np.nan
     period = 1.0 / ROWS_PER_S
-    out = np.empty((int((view.t_s[-1] - view.t_s[0]) / period) + 2, 1 + rates.shape[1]))
-    n = filter_rows(view.t_s, rates, WN_RAD_S, ZETA, period, out)
-    parts = np.split(out[:n, 1:], 3, axis=1)
-    return Residual(out[:n, 0], *parts)
+    out = np.empty((int((view.t_s[-1] - view.t_s[0]) / period) + 2, 1 + rates_of_all.shape[1]))
+    n = filter_rows(view.t_s, rates_of_all, WN_RAD_S, ZETA, period, out)
+    return out[:n, 0], np.split(out[:n, 1:], len(rates), axis=1)
 
 
 def transformed_like(fit: Fit, chunk: FloatArray) -> FloatArray:
-    """A record with the commands as the timings of a fit let them reach the spools."""
+    """A record with the commands as the timings of a fit let them reach the spools.
+
+    chunk (n, 2 + signals), SI, as declared; result: of the split machine (see `transformed`).
+    """
     return transformed(fit.declared, chunk, fit.revision.timings)
 
 
-def _noise(fit: Fit, view: View) -> FloatArray:
+def _noise(fit: Fit, view: RecordView) -> FloatArray:
     """A sample of the noise of the residual before the filter (n - 1, chambers), m3/s."""
     rng, model = np.random.default_rng(SEED), view.model
     names = {model.position, *(c.pressure for c in model.chambers)}
@@ -113,16 +130,16 @@ def _noise(fit: Fit, view: View) -> FloatArray:
         if variance(model, name) > 0
     }
     still = np.zeros(view.n)
-    own = total_softness(view, effect_values(fit))
-    found = np.empty((view.n - 1, len(model.chambers)))
+    softness = total_softness(view, effect_values(fit))
+    result = np.empty((view.n - 1, len(model.chambers)))
     for c, chamber in enumerate(model.chambers):
         p, v = noise.get(chamber.pressure, still), view.volume(c)
         x_rate = np.diff(noise.get(model.position, still)) / view.dt_s
-        found[:, c] = chamber.sign * chamber.area_m2 * x_rate
-        found[:, c] += np.diff((fit.compliance[c] * v + own[:, c]) * p) / view.dt_s
+        result[:, c] = chamber.sign * chamber.area_m2 * x_rate
+        result[:, c] += np.diff((fit.compliance[c] * v + softness[:, c]) * p) / view.dt_s
         slopes = []
         for i, edge in enumerate(model.edges):
             dp = noise.get(edge.source, still) - noise.get(edge.sink, still)
             slopes.append(view.slope_dp(i) * 0.5 * (dp[1:] + dp[:-1]))
-        found[:, c] -= view.into_chamber(c, slopes)
-    return found
+        result[:, c] -= view.into_chamber(c, slopes)
+    return result

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rtid.diagnose.candidates import Candidate
 from rtid.diagnose.commands import Timings
+from rtid.effects.column import Candidate
 
 
 @dataclass(frozen=True)

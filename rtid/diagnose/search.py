@@ -11,16 +11,17 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize
 
-from rtid.diagnose.candidates import Columns, Volumes
 from rtid.diagnose.commands import Timings, commands, split, through, transformed
 from rtid.diagnose.evidence import project, rows_of
 from rtid.diagnose.fit import Fit, columns_of_effects, prepare
 from rtid.diagnose.thinned import Thinning
-from rtid.diagnose.timing import SUPPLY, Psi, Timing
+from rtid.effects.column import Columns
+from rtid.effects.law import Volumes
+from rtid.effects.laws.timing import SUPPLY, Psi, TimingLaw
 from rtid.estimator.state import Weights
-from rtid.model import FloatArray, Grid, Model
+from rtid.model import Grid, Machine
+from rtid.plain import FloatArray
 
 ROW_S = 20e-3  # long rows are enough
 SIMPLEX, DOWNHILL = 0.25, 80  # first size in logarithms of the parameters; refits
@@ -30,7 +31,7 @@ FOUND = 0.02  # share of a parameter within which it is found well enough from a
 OFF = 0.05  # share of a bracket that a trial stays off its ends
 
 
-def coarse(model: Model) -> Model:
+def coarse(model: Machine) -> Machine:
     """The same machine with every second border of its maps."""
     edges = []
     for edge in model.edges:
@@ -47,7 +48,7 @@ def _thinned(border: FloatArray) -> FloatArray:
 class Search:
     """Costs of revisions on the coarse map of one record, thinned out."""
 
-    def __init__(self, model: Model, chunk: FloatArray) -> None:
+    def __init__(self, model: Machine, chunk: FloatArray) -> None:
         self.thinning = Thinning.of(model, chunk)
         self.model = self.thinning.model(coarse(model))
         self.split = split(self.model)
@@ -62,7 +63,7 @@ class Search:
         return Beside(self, fit)
 
     def sent(self, timings: Timings) -> FloatArray:
-        """The thinned record of the split machine."""
+        """The thinned record (n // m, 2 + signals), SI, of the split machine."""
         if any(timing.where == SUPPLY for timing, _ in timings):
             whole = transformed(self.declared, self.chunk, timings)
             return self.thinning.record(self.split, whole)
@@ -103,28 +104,28 @@ class Beside:
         theta = np.linalg.lstsq(s[1:, 1:], s[1:, 0], rcond=1e-12)[0]
         return float(s[0, 0] - s[0, 1:] @ theta)
 
-    def gain(self, timing: Timing, psi: Psi) -> float:
+    def gain(self, timing: TimingLaw, psi: Psi) -> float:
         """What a timing lowers the cost by."""
         return self.before - self.cost(((timing, psi),))
 
-    def bank(self, timing: Timing, hint: float = 0.0) -> dict[float, float]:
+    def bank(self, timing: TimingLaw, hint: float = 0.0) -> dict[float, float]:
         """Gains by strength, from the slightest value of the bank on, or from a hint below it.
 
         They rise towards the truth and fall behind it: two falls in a row, or a deep one, end it.
         """
-        found, falls = {0.0: 0.0}, 0
+        costs, falls = {0.0: 0.0}, 0
         strengths = sorted(timing.strength(psi) for psi in timing.bank)
         if 0.0 < hint < strengths[0] and not timing.replaces_lag:  # whose zero is no lag at all
             strengths.insert(0, hint)
         for strength in strengths:
-            found[strength] = self.gain(timing, timing.at(strength))
-            *_, second, third = found.values()
+            costs[strength] = self.gain(timing, timing.at(strength))
+            *_, second, third = costs.values()
             falls = falls + 1 if third < second else 0
-            if falls == 2 or third < -max(found.values()):
+            if falls == 2 or third < -max(costs.values()):
                 break
-        return found
+        return costs
 
-    def polished(self, timing: Timing, bank: list[Psi]) -> Psi:
+    def polished(self, timing: TimingLaw, bank: list[Psi]) -> Psi:
         """The best of a bank for a timing of several parameters, and from there downhill.
 
         Where parameters bend each other, a simplex finds the way that derivatives miss.
@@ -138,10 +139,12 @@ class Beside:
         start = min(starts, key=cost)
         simplex = np.vstack([start, start + SIMPLEX * np.eye(len(start))])
         options: Any = {"maxfev": DOWNHILL, "initial_simplex": simplex}
-        found = minimize(cost, start, method="Nelder-Mead", options=options)
-        return tuple(float(v) for v in np.clip(np.exp(found.x), timing.low, timing.high))
+        from scipy.optimize import minimize  # noqa: PLC0415 - takes long to import
 
-    def closed_in(self, timing: Timing, bank: dict[float, float]) -> tuple[Psi, float]:
+        minimum = minimize(cost, start, method="Nelder-Mead", options=options)
+        return tuple(float(v) for v in np.clip(np.exp(minimum.x), timing.low, timing.high))
+
+    def closed_in(self, timing: TimingLaw, bank: dict[float, float]) -> tuple[Psi, float]:
         """The parameters of the largest gain, by parabolas about the best of a bank."""
         known = dict(bank)
         for _ in range(CLOSING):

@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rtid.kernels.engine import GAP_FLAG, ROW_FLAG
-from rtid.model import FloatArray, Model
+from rtid.model import Machine
+from rtid.plain import FloatArray
 
 STEP_S = 5e-3  # of the thinned record
 STEADY = 1.5  # usual steps: a longer one is a gap
@@ -25,20 +26,23 @@ class Thinning:
     step_s: float
 
     @classmethod
-    def of(cls, model: Model, chunk: FloatArray) -> Thinning:
-        """What a record allows, chunk (n, 2 + signals)."""
+    def of(cls, model: Machine, chunk: FloatArray) -> Thinning:
+        """What a record allows, chunk (n, 2 + signals), SI."""
         step_s = float(np.median(np.diff(chunk[:, 0])))
         every = np.mean(chunk[:, 1].astype(int) & ROW_FLAG) > 0.9
         same = model.pressure_period_s <= STEADY * step_s
         most = min(STEP_S, 0.5 * model.gates.max_gap_s) / step_s
         return cls(max(1, int(most + 1e-9)) if every and same else 1, step_s)
 
-    def model(self, model: Model) -> Model:
+    def model(self, model: Machine) -> Machine:
         """The machine, its pressures still as noisy per second as they were."""
         return replace(model, pressure_period_s=model.pressure_period_s or self.step_s)
 
-    def record(self, model: Model, chunk: FloatArray) -> FloatArray:
-        """The record (n // m, 2 + signals); commands as over the intervals that begin there."""
+    def record(self, model: Machine, chunk: FloatArray) -> FloatArray:
+        """The record (n // m, 2 + signals), SI; commands as over the intervals that begin there.
+
+        chunk (n, 2 + signals), SI.
+        """
         if self.m == 1:
             return chunk
         windows = self._windows(chunk)
@@ -61,11 +65,11 @@ class Thinning:
         """A command (n,) as over the intervals (n // m,) of the thinned record."""
         if self.m == 1:
             return command
-        found = self.over_intervals(command) / self.m
-        return np.append(found, found[-1:])
+        mean = self.over_intervals(command) / self.m
+        return np.append(mean, mean[-1:])
 
     def over_intervals(self, series: FloatArray) -> FloatArray:
-        """Sums (n // m - 1,) of a series per interval, weighted by the triangle."""
+        """Sums (n // m - 1,) of a series (n - 1,) per interval, triangle-weighted, in its unit."""
         if self.m == 1:
             return series
         windows, rising = self._windows(series), np.arange(1, self.m + 1) / self.m

@@ -6,20 +6,22 @@ exactly where something large is left, because a bent map misleads their derivat
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from rtid.diagnose.candidates import Candidate
-from rtid.diagnose.causes import causes
 from rtid.diagnose.fit import Fit, one_pass
-from rtid.diagnose.parts import Part
+from rtid.diagnose.parts import AddedEffect
 from rtid.diagnose.regression import LIMIT_SD, Score
 from rtid.diagnose.residual import Residual, residual
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.search import Search
-from rtid.model import FloatArray, Model
+from rtid.effects.column import Candidate
+from rtid.effects.law import LENGTH, MODULUS, chambers_by_place, fitted_names
+from rtid.effects.laws import cause_of
+from rtid.effects.page import Effect
+from rtid.model import Machine
+from rtid.plain import FloatArray, Key, Progress
 
 GAIN = 16.0  # chi2 of the first effect: 60 candidates, 0.4 % for all of them together
 TIE, TIE_SHARE = 12.0, 0.03  # causes within so much of the best gain are not told apart
@@ -27,8 +29,6 @@ SHARE_OF_BEST = 0.2  # of the best gain that a cause must have for its shape to 
 ROUNDS = 8  # of refinement, each with half the step of the last
 SETTLED = 2e-3  # of the gain: what a round must add for another one
 MATCH_RHO = 1.10  # largest rho of a model that matches
-
-Key = tuple[str, str]
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class Found:
+class AcceptedEffect:
     """An effect that was added: by how much chi2 fell, with how many parameters; residuals."""
 
     key: Key
@@ -70,18 +70,23 @@ class Found:
 
 
 @dataclass
-class State:
+class TrialState:
     """State of a diagnosis."""
 
-    model: Model
+    model: Machine
     chunk: FloatArray
     held_out: FloatArray
-    progress: Callable[[str, float], None]
-    found: list[Found] = field(default_factory=list)
+    progress: Progress
+    found: list[AcceptedEffect] = field(default_factory=list)
     negligible: dict[Key, float] = field(default_factory=dict)
     excess: float = 0.0  # chi2 without any effect beyond what the noise gives
-    given: tuple[Part, ...] = ()  # effects that the model has already
+    given: tuple[AddedEffect, ...] = ()  # effects that the model has already
+    suspects: tuple[Effect, ...] = ()  # effects of the user's, scored beside the catalogue
     _coarse: Search | None = None
+
+    def anew(self, progress: Progress) -> TrialState:
+        """The state of a search that has not begun."""
+        return replace(self, progress=progress, found=[], negligible={}, excess=0.0)
 
     @property
     def coarse(self) -> Search:
@@ -119,18 +124,19 @@ def best_by_key(
 def physical(fit_: Fit, candidate: Candidate, value: float) -> float:
     """A coefficient as the effect's parameter.
 
-    A dead volume counts by the fitted modulus, a drift over the length of the record.
+    Where its equation has the oil's modulus, the fitted one counts, not that of the column; a
+    change over the record is one over its whole length.
     """
-    if candidate.effect == "valve_gain_drift":
-        return value * float(fit_.view.t_s[-1] - fit_.view.t_s[0])
-    if candidate.effect != "extra_dead_volume":
-        return value
-    names = [c.name for c in fit_.model.chambers]
-    at = [names.index(candidate.where)] if candidate.where in names else list(range(len(names)))
-    return float(value * np.mean(fit_.weights.compliance[at]) / np.mean(fit_.compliance[at]))
+    by_fit = fitted_names(candidate.law)
+    if LENGTH in by_fit:
+        value *= float(fit_.view.t_s[-1] - fit_.view.t_s[0])
+    if MODULUS in by_fit:
+        at = list(chambers_by_place(fit_.model)[candidate.where])
+        value *= float(np.mean(fit_.weights.compliance[at]) / np.mean(fit_.compliance[at]))
+    return value
 
 
-def refined(state: State, present: Fit, trials: list[Trial]) -> list[Trial]:
+def refined(state: TrialState, present: Fit, trials: list[Trial]) -> list[Trial]:
     """Shapes between those of the bank, where they could matter: one pass per round for all."""
     bar = max(GAIN, SHARE_OF_BEST * max((t.gain for t in trials), default=0.0))
     at = {t.key: t for t in trials}
@@ -139,11 +145,11 @@ def refined(state: State, present: Fit, trials: list[Trial]) -> list[Trial]:
         if not open_:
             break
         effects = {key: at[key].effect for key in open_}
+        open_causes = {key: cause_of(present.view, effect) for key, effect in effects.items()}
         more = [
             (cause, shape)
-            for cause in causes(present.view)
-            if cause.candidate.key in effects and cause.makes(effects[cause.candidate.key])
-            for shape in cause.about(effects[cause.candidate.key].shape, 0.5**k)
+            for key, cause in open_causes.items()
+            for shape in cause.about(effects[key].shape, 0.5**k)
         ]
         finer = one_pass(
             state.model, state.chunk, present.weights, present.revision, present, False, more
@@ -173,7 +179,10 @@ def material_share(before: Residual, after: Residual) -> float:
 
 
 def own_share(now: Fit, trial: Trial, held_out: FloatArray) -> float:
-    """Size of an effect's own flow on the held-out part, of the rms flow; inf for a timing."""
+    """Size of an effect's own flow on the held-out part, as a share of the rms flow.
+
+    held_out (n, 2 + signals), SI.  inf for a timing.
+    """
     if trial.is_timing:
         return float("inf")
     effect = now.revision.effects[-1]

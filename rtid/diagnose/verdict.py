@@ -4,25 +4,47 @@ from __future__ import annotations
 
 import numpy as np
 
+from rtid.diagnose.excuse import rho_of_all
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.residual import Residual
-from rtid.diagnose.trials import MATCH_RHO, State
+from rtid.diagnose.trials import MATCH_RHO, TrialState
+from rtid.estimator.validity import Doubt, doubts
 
 MATERIAL = 0.003  # of the rms flow: what an effect must change of the held-out residual
 NAMED = 0.8  # of the misfit that effects must explain to be named where something else remains
 LEAST_ROWS = 50  # filtered rows that a part must have to be judged by
 LEAST_EVIDENCE = 1000  # scalar rows of the record
+MOVES = 5.0  # times the sensors' floor that the measured flow of a part must reach to judge by it
+BAND_SD = 3.0  # standard deviations of rho that a record's own length gives it
 
 MATCHES, MISSING, AMBIGUOUS = "matches", "missing", "ambiguous"
 UNKNOWN, INSUFFICIENT = "unknown", "insufficient_data"
 
 
-def can_judge(held: Residual) -> bool:
-    """True where the map is known over enough of a part to hold the model against it."""
-    return len(held.t_s) >= LEAST_ROWS
+def can_judge(residual: Residual) -> bool:
+    """True where the machine moves in a part, and its map is known over enough of it."""
+    return len(residual.t_s) >= LEAST_ROWS and residual.flow_m3s > MOVES * residual.floor_m3s
 
 
-def verdict(state: State, first: Fit, last: Fit, after: Residual, is_unseen: bool = True) -> str:
+def is_slight(residual: Residual) -> bool:
+    """True where what is left beyond the sensors' noise is immaterial for the flow."""
+    beyond = max(0.0, residual.rms_m3s**2 - residual.floor_m3s**2)
+    return float(np.sqrt(beyond)) < MATERIAL * residual.flow_m3s
+
+
+def most_rho(fit: Fit) -> float:
+    """The largest rho of a model that matches: of any record, and wider for a short one."""
+    return max(MATCH_RHO, 1.0 + BAND_SD * float(np.sqrt(2.0 / max(1.0, fit.regression.dof))))
+
+
+def doubts_about(fit: Fit) -> tuple[Doubt, ...]:
+    """Compliances that are impossible, or contradict each other: no model that matches has them."""
+    return doubts(fit.declared, fit.compliance, fit.compliance_cov)
+
+
+def verdict(
+    state: TrialState, first: Fit, last: Fit, after: Residual, is_unseen: bool = True
+) -> str:
     """The verdict on a search from the first to the last fit, and what that leaves of a part.
 
     is_unseen: the part is not the one that taught the maps, which may have taken an effect in.
@@ -31,20 +53,14 @@ def verdict(state: State, first: Fit, last: Fit, after: Residual, is_unseen: boo
     if not has_moved or not can_judge(after):
         return INSUFFICIENT
     if not state.found:
-        # what is left may be no noise, and still be too small to matter
-        if last.rho >= MATCH_RHO and remainder(after) >= MATERIAL:
-            return UNKNOWN
-        # what was seen and is too small there may matter on other motion
-        is_absorbed = not is_unseen and state.negligible and first.rho >= MATCH_RHO
-        return INSUFFICIENT if is_absorbed else MATCHES
-    left = last.held.sse - last.regression.dof
-    explained = 1.0 - left / state.excess if state.excess > 0 else 1.0
-    if last.rho >= MATCH_RHO and explained < NAMED:
+        # what was seen and is too small in a record that judges itself may matter on other motion,
+        # and what is left there of its flow is less than its maps may have taken in
+        is_open = bool(state.negligible) or is_slight(after)
+        if not is_unseen and is_open and max(first.rho, rho_of_all(last)) >= most_rho(last):
+            return INSUFFICIENT
+        return MATCHES if last.rho < most_rho(last) and not doubts_about(last) else UNKNOWN
+    rest = last.held.sse - last.regression.dof
+    explained = 1.0 - rest / state.excess if state.excess > 0 else 1.0
+    if last.rho >= most_rho(last) and explained < NAMED:
         return UNKNOWN
     return AMBIGUOUS if any(f.alike for f in state.found[:1]) else MISSING
-
-
-def remainder(held: Residual) -> float:
-    """What a residual has beyond the sensors' noise, of the rms flow."""
-    left = max(0.0, held.rms_m3s**2 - held.floor_m3s**2)
-    return float(np.sqrt(left) / max(held.flow_m3s, 1e-12))

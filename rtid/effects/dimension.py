@@ -43,18 +43,18 @@ def dimension_of_unit(unit: str) -> Dimension:
     spelled = re.sub(r"([A-Za-z])(-?\d+)", r"\1**\2", unit.strip())
     spelled = re.sub(r"(?<=[\w)])\s+(?=[A-Za-z(])", "*", spelled)
     try:
-        found = dimension(Expression.parse(spelled, UNITS), UNITS)
+        spelled_dimension = dimension(Expression.parse(spelled, UNITS), UNITS)
     except ExpressionError as error:
         remedy = "write it in " + ", ".join(UNITS)
         raise ExpressionError(unit, 0, f"{unit!r} is no SI unit", remedy) from error
-    assert found is not None, "every unit has a dimension"
-    return found
+    assert spelled_dimension is not None, "every unit has a dimension"
+    return spelled_dimension
 
 
-def unit_of_dimension(found: Dimension) -> str:
+def unit_of_dimension(powers: Dimension) -> str:
     """The dimension as a unit, e.g. "m3/s"."""
-    parts = [_power(name, p) for name, p in zip(BASE, found, strict=True) if p > 0]
-    under = ["/" + _power(name, -p) for name, p in zip(BASE, found, strict=True) if p < 0]
+    parts = [_power(name, p) for name, p in zip(BASE, powers, strict=True) if p > 0]
+    under = ["/" + _power(name, -p) for name, p in zip(BASE, powers, strict=True) if p < 0]
     return (" ".join(parts) or "1") + "".join(under)
 
 
@@ -88,25 +88,23 @@ class _Judge:
             return literal if node.op == NUMBER else self.known[node.name]
         if node.op == "**":
             return self._power(node)
-        found = [self.of(arg) for arg in node.args]
+        dimensions = [self.of(arg) for arg in node.args]
         if node.op in ("*", "/"):
-            return _product(found[0], found[1], 1 if node.op == "*" else -1)
+            return _product(dimensions[0], dimensions[1], 1 if node.op == "*" else -1)
         if node.op in ("+", "-", "min", "max", "hypot"):
-            return self._alike(node, *found)
-        return self._function(node, found[0])
+            return self._alike(node, *dimensions)
+        return self._function(node, dimensions[0])
 
-    def _alike(
-        self, node: Node, left: Dimension | None, right: Dimension | None
-    ) -> Dimension | None:
+    def _alike(self, node: Node, a: Dimension | None, b: Dimension | None) -> Dimension | None:
         """Both sides must have one unit; a bare number takes the other's."""
-        if _is_literal(node.args[0]) or left is None:
-            return right
-        if _is_literal(node.args[1]) or right is None:
-            return left
-        if left != right:
-            units = f"{unit_of_dimension(left)} and {unit_of_dimension(right)}"
+        if _is_literal(node.args[0]) or a is None:
+            return b
+        if _is_literal(node.args[1]) or b is None:
+            return a
+        if a != b:
+            units = f"{unit_of_dimension(a)} and {unit_of_dimension(b)}"
             raise self._error(node, f"{node.op} joins {units}", "both sides need the same unit")
-        return left
+        return a
 
     def _function(self, node: Node, inner: Dimension | None) -> Dimension | None:
         if node.op in ("abs", "pos", NEG):
@@ -136,10 +134,10 @@ class _Judge:
         return ExpressionError(self.text, node.column, reason, remedy)
 
 
-def _product(left: Dimension | None, right: Dimension | None, turn: int) -> Dimension | None:
-    if left is None or right is None:
+def _product(first: Dimension | None, second: Dimension | None, turn: int) -> Dimension | None:
+    if first is None or second is None:
         return None
-    return tuple(a + turn * b for a, b in zip(left, right, strict=True))
+    return tuple(a + turn * b for a, b in zip(first, second, strict=True))
 
 
 def _is_literal(node: Node) -> bool:

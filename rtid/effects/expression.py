@@ -3,7 +3,7 @@
 Nothing of the text is ever run.  Known are numbers, pi, the given names, + - * / **, brackets and
 sqrt, ssqrt, abs, sign, pos, exp, log, sin, cos, tanh, min, max, hypot.  Values follow IEEE: sqrt of
 a negative number is NaN, a division by zero is infinite or NaN, NaN in one sample stays in this
-sample; no warning is printed.  Whoever needs finite values checks them (see `UserEffect.flow`).
+sample; no warning is printed.  Whoever needs finite values checks them (see `rtid.effects.law`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike
 
 from rtid.effects import tree
 from rtid.effects.parsing import ExpressionError, parse
-from rtid.effects.tree import FloatArray, Node
+from rtid.effects.tree import Node
+from rtid.plain import FloatArray
 from rtid.units import nearest
 
 
@@ -45,7 +46,7 @@ class Expression:
         return self.value(values)
 
     def value(self, values: Mapping[str, ArrayLike]) -> FloatArray:
-        """As a call, the values in a mapping; ExpressionError if one is missing."""
+        """As a call, values (...) of any unit in a mapping; ExpressionError if one is missing."""
         for name in self.names:
             if name not in values:
                 column = max(self.text.find(name), 0)

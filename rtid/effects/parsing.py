@@ -98,87 +98,97 @@ class _Reader:
     def refuse(self, at: ast.expr, reason: str, remedy: str) -> NoReturn:
         raise ExpressionError(self.text, at.col_offset, reason, remedy)
 
-    def node(self, found: ast.expr) -> Node:
-        if isinstance(found, ast.Constant):
-            return self._number(found)
-        if isinstance(found, ast.Name):
-            return self._name(found)
-        if isinstance(found, ast.UnaryOp):
-            return self._signed(found)
-        if isinstance(found, ast.BinOp):
-            return self._operator(found)
-        if isinstance(found, ast.Call):
-            return self._call(found)
-        what = type(found).__name__
-        self.refuse(found, f"{what} is not allowed in an expression", f"use {_ALLOWED}")
+    def node(self, tree: ast.expr) -> Node:
+        if isinstance(tree, ast.Constant):
+            return self._number(tree)
+        if isinstance(tree, ast.Name):
+            return self._name(tree)
+        if isinstance(tree, ast.UnaryOp):
+            return self._signed(tree)
+        if isinstance(tree, ast.BinOp):
+            return self._operator(tree)
+        if isinstance(tree, ast.Call):
+            return self._call(tree)
+        what = type(tree).__name__
+        self.refuse(tree, f"{what} is not allowed in an expression", f"use {_ALLOWED}")
 
-    def _number(self, found: ast.Constant) -> Node:
-        value = found.value
+    def _number(self, constant: ast.Constant) -> Node:
+        value = constant.value
         if isinstance(value, bool) or not isinstance(value, int | float):
-            self.refuse(found, f"{value!r} is not a number", "write a plain number")
+            self.refuse(constant, f"{value!r} is not a number", "write a plain number")
         try:
             size = float(value)
         except OverflowError:
             size = math.inf
         if math.isinf(size):
-            self.refuse(found, "the number is too large", "write it as e.g. 1.5e6")
-        return Node(NUMBER, value=size, column=found.col_offset)
+            self.refuse(constant, "the number is too large", "write it as e.g. 1.5e6")
+        return Node(NUMBER, value=size, column=constant.col_offset)
 
-    def _name(self, found: ast.Name) -> Node:
-        name = found.id
+    def _name(self, tree: ast.Name) -> Node:
+        name = tree.id
         if self.names is None or name in self.names:
-            return Node(NAME, name=name, column=found.col_offset)
+            return Node(NAME, name=name, column=tree.col_offset)
         if name in CONSTANTS:
-            return Node(NUMBER, value=CONSTANTS[name], column=found.col_offset)
+            return Node(NUMBER, value=CONSTANTS[name], column=tree.col_offset)
         if name in FUNCTIONS:
-            self.refuse(found, f"{name!r} is a function", f"write {name}(...)")
-        self.refuse(found, f"{name!r} is no known name", nearest(name, list(self.names)))
+            self.refuse(tree, f"{name!r} is a function", f"write {name}(...)")
+        self.refuse(tree, f"{name!r} is no known name", nearest(name, list(self.names)))
 
-    def _signed(self, found: ast.UnaryOp) -> Node:
-        if isinstance(found.op, ast.UAdd):
-            return self.node(found.operand)
-        if isinstance(found.op, ast.USub):
-            return Node(NEG, (self.node(found.operand),), column=found.col_offset)
-        self.refuse(found, "only + and - may stand before a value", f"use {_ALLOWED}")
+    def _signed(self, operation: ast.UnaryOp) -> Node:
+        if isinstance(operation.op, ast.UAdd):
+            return self.node(operation.operand)
+        if isinstance(operation.op, ast.USub):
+            return Node(NEG, (self.node(operation.operand),), column=operation.col_offset)
+        self.refuse(operation, "only + and - may stand before a value", f"use {_ALLOWED}")
 
-    def _operator(self, found: ast.BinOp) -> Node:
-        op = _BINARY.get(type(found.op))
+    def _operator(self, operation: ast.BinOp) -> Node:
+        op = _BINARY.get(type(operation.op))
         if op is None:
-            what = type(found.op).__name__
-            self.refuse(found, f"the operator {what} is not allowed", f"use {_ALLOWED}")
-        left, right = self.node(found.left), self.node(found.right)
+            if isinstance(operation.op, ast.BitXor):
+                self.refuse(operation, "^ is no operator here", "write a power as **")
+            what = type(operation.op).__name__
+            self.refuse(operation, f"the operator {what} is not allowed", f"use {_ALLOWED}")
+        left, right = self.node(operation.left), self.node(operation.right)
         if op == "**":
-            self._limit_power(found.right, right)
-        return Node(op, (left, right), column=found.col_offset)
+            self._limit_power(operation.right, right)
+        return Node(op, (left, right), column=operation.col_offset)
 
-    def _limit_power(self, found: ast.expr, power: Node) -> None:
+    def _limit_power(self, tree: ast.expr, power: Node) -> None:
         size = power.args[0] if power.op == NEG else power
         if size.op == NUMBER and size.value > MOST_POWER:
             reason = f"a power beyond {MOST_POWER:g} is not allowed"
-            self.refuse(found, reason, "use exp, or a smaller power")
+            self.refuse(tree, reason, "use exp, or a smaller power")
 
-    def _call(self, found: ast.Call) -> Node:
-        if not isinstance(found.func, ast.Name):
-            self.refuse(found, "only a function by its name can be called", f"use {_ALLOWED}")
-        name = found.func.id
+    def _call(self, call: ast.Call) -> Node:
+        if not isinstance(call.func, ast.Name):
+            self.refuse(call, "only a function by its name can be called", f"use {_ALLOWED}")
+        name = call.func.id
         if name not in FUNCTIONS:
             near = nearest(name, list(FUNCTIONS))
-            self.refuse(found, f"{name!r} is no known function", near)
-        if found.keywords or any(isinstance(arg, ast.Starred) for arg in found.args):
-            self.refuse(found, f"{name} takes plain arguments only", f"write {name}(z)")
-        return self._applied(found, name)
+            self.refuse(call, f"{name!r} is no known function", near)
+        if call.keywords or any(isinstance(arg, ast.Starred) for arg in call.args):
+            self.refuse(call, f"{name} takes plain arguments only", f"write {name}(z)")
+        return self._applied(call, name)
 
-    def _applied(self, found: ast.Call, name: str) -> Node:
+    def _applied(self, call: ast.Call, name: str) -> Node:
         """The call with its number of arguments checked; min and max take two or more."""
         wanted = FUNCTIONS[name][0]
-        least_or_exact = len(found.args) == wanted
+        least_or_exact = len(call.args) == wanted
         if name in ("min", "max"):
-            least_or_exact = len(found.args) >= wanted
+            least_or_exact = len(call.args) >= wanted
         if not least_or_exact:
-            reason = f"{name} takes {wanted} argument{'s' * (wanted > 1)}, not {len(found.args)}"
-            self.refuse(found, reason, "count the commas")
-        args = [self.node(arg) for arg in found.args]
-        node = Node(name, tuple(args[:wanted]), column=found.col_offset)
-        for more in args[wanted:]:
-            node = Node(name, (node, more), column=found.col_offset)
-        return node
+            reason = f"{name} takes {wanted} argument{'s' * (wanted > 1)}, not {len(call.args)}"
+            self.refuse(call, reason, "count the commas")
+        args = [self.node(arg) for arg in call.args]
+        return _balanced(name, args, call.col_offset)
+
+
+def _balanced(name: str, args: list[Node], column: int) -> Node:
+    """The function over its arguments; min and max of many become a tree of pairs, not a chain.
+
+    A chain of 400 would be 400 deep, and everything that walks a tree calls itself per level.
+    """
+    while len(args) > max(FUNCTIONS[name][0], 1):
+        pairs = [args[k : k + 2] for k in range(0, len(args), 2)]
+        args = [Node(name, tuple(p), column=column) if len(p) == 2 else p[0] for p in pairs]
+    return Node(name, tuple(args), column=column)

@@ -12,12 +12,12 @@ At a corner (abs, sign, pos, min, max) the derivative is the mean of both sides.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from rtid.plain import FloatArray
+
 NUMBER, NAME, NEG = "number", "name", "neg"
 
 
@@ -66,7 +66,7 @@ FUNCTIONS: dict[str, tuple[int, Callable[..., FloatArray]]] = {  # number of arg
 
 
 def evaluate(node: Node, values: Mapping[str, FloatArray]) -> FloatArray:
-    """Value of the tree, every name replaced by its array; IEEE rules, no exception."""
+    """Value (...) of the tree, every name replaced by its array, any unit; IEEE, no exception."""
     if node.op == NUMBER:
         return np.asarray(node.value)
     if node.op == NAME:
@@ -181,6 +181,21 @@ def _pair_slope(node: Node, da: Node, db: Node) -> Node:
     side = _call("sign", _sub(a, b))
     upper = _mul(_mul(HALF, _add(ONE, side)), larger)
     return _add(upper, _mul(_mul(HALF, _sub(ONE, side)), smaller))
+
+
+def named(name: str) -> Node:
+    """The tree of a name."""
+    return Node(NAME, name=name)
+
+
+def substituted(node: Node, by: Mapping[str, Node]) -> Node:
+    """The tree with names replaced by trees."""
+    if node.op == NAME:
+        return by.get(node.name, node)
+    args = tuple(substituted(arg, by) for arg in node.args)
+    if node.op == "-" and args[1] == ZERO:
+        return args[0]
+    return replace(node, args=args)
 
 
 _LEVEL = {"+": 1, "-": 1, "*": 2, "/": 2, NEG: 3, "**": 4}

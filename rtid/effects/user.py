@@ -5,122 +5,112 @@
         return np.maximum(view.x - x0, 0.0) * (view.p["p_a"] - view.p["p_b"])
 
 The flow into chamber c is coefficient * sign_c * flow(view, shape).  The coefficient is estimated;
-a shape parameter (x0) is tried over its bank of values.
+a shape parameter (x0) is tried over its bank of values, and refined between them.  What comes out
+is an `Effect` like those of the catalogue, in the names of the user's machine.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from itertools import product
 from typing import Any
-
-import numpy as np
 
 from rtid.effects.dimension import (
     FLOW,
+    UNITS,
     Dimension,
     dimension,
     dimension_of_unit,
     unit_of_dimension,
 )
 from rtid.effects.expression import Expression
-from rtid.effects.page import EffectError
-from rtid.effects.tree import FloatArray
-from rtid.effects.view import View
+from rtid.effects.page import FUNCTION, Effect, EffectError, Parameter, Symbol
+from rtid.effects.parsing import ExpressionError
+from rtid.plain import FloatArray
 
 MOST_SHAPES = 64  # combinations of all banks: each is a column of its own
+COEFFICIENT = "coefficient"
 Flow = Callable[..., FloatArray]  # (view, **shape) -> (n,)
-
-
-@dataclass(frozen=True)
-class UserEffect:
-    """A flow that somebody suspects: c * sign_c * function(view, **shape) into chamber c, m3/s.
-
-    unit: of the coefficient c, SI.  signs: (chamber, +1 or -1) pairs.  sign: of a possible c, 0 for
-    either; largest: its largest possible size.  shapes: bank of values of each shape parameter.
-    """
-
-    name: str
-    unit: str
-    signs: tuple[tuple[str, int], ...]
-    function: Flow = field(compare=False)
-    sign: int = 1
-    largest: float = math.inf
-    shapes: tuple[tuple[str, tuple[float, ...]], ...] = ()
-    title: str = ""
-    source: str = ""  # the expression, or where the function stands
-
-    def bank(self) -> Iterator[dict[str, float]]:
-        """Every combination of the shape parameters; one empty one where there are none."""
-        names = [name for name, _ in self.shapes]
-        for values in product(*(values for _, values in self.shapes)):
-            yield dict(zip(names, values, strict=True))
-
-    def flow(self, view: View, shape: Mapping[str, float] | None = None) -> FloatArray:
-        """Flow per unit of the coefficient, m3/s, (n,); EffectError unless (n,) and finite."""
-        shape = shape or {}
-        try:
-            found = np.asarray(self.function(view, **shape), dtype=np.float64)
-            found = np.broadcast_to(found, view.t_s.shape).copy()
-        except EffectError:
-            raise
-        except Exception as error:
-            reason = f"effect {self.name!r} fails: {type(error).__name__}: {error}"
-            raise EffectError(reason, f"correct {self.source or 'its function'}") from error
-        wrong = np.flatnonzero(~np.isfinite(found))
-        if len(wrong):
-            reason = f"effect {self.name!r} is not finite in {len(wrong)} of {len(found)} samples"
-            at = f"the first at {view.t_s[wrong[0]]:g} s" + (f", with {dict(shape)}" * bool(shape))
-            raise EffectError(f"{reason}, {at}", "guard roots, logarithms and quotients")
-        return found
-
-    def volume(self, view: View, shape: Mapping[str, float] | None = None) -> FloatArray:
-        """Volume per unit of the coefficient over each interval, m3, (n - 1,).
-
-        The command is held over the interval, all else is linear between its samples.
-        """
-        at_start = self.flow(view, shape)[:-1]
-        at_end = self.flow(view.before_the_next_command, shape)
-        return 0.5 * (at_start + at_end) * np.diff(view.t_s)
 
 
 def make(
     name: str,
     unit: str,
-    function: Flow,
+    flow: str | Flow,
     *,
     chambers: Mapping[str, int],
     sign: int = 1,
     largest: float = math.inf,
     shapes: Mapping[str, Sequence[float]] | None = None,
+    units: Mapping[str, str] | None = None,
+    constants: Mapping[str, float] | None = None,
     title: str = "",
     source: str = "",
-) -> UserEffect:
-    """A checked UserEffect; EffectError names what is wrong with it."""
+) -> Effect:
+    """A checked effect of a user's; EffectError names what is wrong with it.
+
+    flow: a formula in the names of the machine, or a function; units: of shape parameters.
+    """
     banks = {key: tuple(float(v) for v in values) for key, values in (shapes or {}).items()}
-    effect = UserEffect(
-        name, unit, tuple(chambers.items()), function, sign, largest, tuple(banks.items()), title,
-        source,
-    )  # fmt: skip
-    for wrong, remedy in _faults(effect):
+    for wrong, remedy in _faults(unit, chambers, sign, largest, banks):
         raise EffectError(f"effect {name!r}: {wrong}", remedy)
-    return effect
+    size = Parameter(
+        COEFFICIENT, unit, COEFFICIENT, 0.0 if sign > 0 else -largest,
+        largest if sign >= 0 else 0.0, sign, "flow per unit",
+    )  # fmt: skip
+    text = f"({flow})" if isinstance(flow, str) else FUNCTION
+    return Effect(
+        name=name,
+        title=title or name.replace("_", " "),
+        kind="flow",
+        places=("chamber",),
+        summary=title,
+        equation=tuple(
+            f"q_{chamber} = {'-' * (way < 0)}{COEFFICIENT} * {text}"
+            for chamber, way in chambers.items()
+        ),
+        symbols=tuple(Symbol(n, "", "", value) for n, value in (constants or {}).items()),
+        parameters=(
+            size,
+            *(_shape(n, bank, (units or {}).get(n, "")) for n, bank in banks.items()),
+        ),
+        signals=(),
+        signature="",
+        confounders=(),
+        separates="",
+        visible_when="",
+        invisible=False,
+        reference=source,
+        into=tuple(chambers.items()),
+        function=None if isinstance(flow, str) else flow,
+    )
 
 
-def _faults(effect: UserEffect) -> Iterator[tuple[str, str]]:
-    dimension_of_unit(effect.unit)
-    if not effect.signs or any(sign not in (1, -1) for _, sign in effect.signs):
+def _shape(name: str, bank: tuple[float, ...], unit: str) -> Parameter:
+    """A nonlinear parameter, a step beyond its bank at most."""
+    low, high = min(bank), max(bank)
+    step = (high - low) / max(1, len(bank) - 1)
+    return Parameter(name, unit, name, low - step, high + step, 0, "", start=tuple(sorted(bank)))
+
+
+def _faults(
+    unit: str,
+    chambers: Mapping[str, int],
+    sign: int,
+    largest: float,
+    banks: Mapping[str, tuple[float, ...]],
+) -> Iterator[tuple[str, str]]:
+    dimension_of_unit(unit)
+    if not chambers or any(way not in (1, -1) for way in chambers.values()):
         yield "chambers must give +1 or -1 for at least one", 'e.g. chambers={"a": -1, "b": 1}'
-    if effect.sign not in (1, 0, -1):
-        yield f"sign is {effect.sign}", "write 1, -1, or 0 for either"
-    if not effect.largest > 0:
-        yield f"largest is {effect.largest}", "give the largest size of the coefficient, > 0"
-    for name, values in effect.shapes:
+    if sign not in (1, 0, -1):
+        yield f"sign is {sign}", "write 1, -1, or 0 for either"
+    if not largest > 0:
+        yield f"largest is {largest}", "give the largest size of the coefficient, > 0"
+    for name, values in banks.items():
         if not values or not all(math.isfinite(v) for v in values):
             yield f"{name} has no finite values", f"e.g. {name}=[0.1, 0.2, 0.3]"
-    count = math.prod(len(values) for _, values in effect.shapes)
+    count = math.prod(len(values) for values in banks.values())
     if count > MOST_SHAPES:
         yield f"has {count} combinations of shapes", f"keep them to {MOST_SHAPES}"
 
@@ -133,13 +123,13 @@ def define(
     sign: int = 1,
     largest: float = math.inf,
     **shapes: Sequence[float],
-) -> Callable[[Flow], UserEffect]:
-    """Turn a function (view, **shape) -> (n,) into a `UserEffect`; all other keys are shapes.
+) -> Callable[[Flow], Effect]:
+    """Turn a function (view, **shape) -> (n,) into an `Effect`; all other keys are shapes.
 
     unit: of the coefficient; function times coefficient is m3/s.  name: the function's, if empty.
     """
 
-    def wrap(function: Flow) -> UserEffect:
+    def wrap(function: Flow) -> Effect:
         return make(
             name or function.__name__,
             unit,
@@ -163,8 +153,8 @@ def from_expression(
     names: Mapping[str, Dimension | None],
     constants: Mapping[str, float] | None = None,
     **keys: Any,
-) -> UserEffect:
-    """A UserEffect from an expression over the names of a view, constants and shape parameters.
+) -> Effect:
+    """An effect from an expression over the names of a view, constants and shape parameters.
 
     names: those of a view with their dimension, see `names_of_model`; keys: as of `make`.  Raises
     ExpressionError with the place in the text, EffectError where the unit does not fit or a shape
@@ -177,26 +167,38 @@ def from_expression(
         if shape not in expression.names:
             raise EffectError(f"effect {name!r}: flow does not use {shape!r}", "use it, or drop it")
     _check_unit(name, expression, unit, known)
-    own = {n: value for n, value in constants.items() if n not in names}
+    free = {n: v for n, v in constants.items() if n not in names and n in expression.names}
+    units = {shape: _unit_of(shape, expression, known) for shape in shapes}
+    return make(name, unit, expression.text, constants=free, units=units, **keys)
 
-    def function(view: View, **shape: float) -> FloatArray:
-        given = own | shape
-        return expression.value(
-            {n: given[n] if n in given else view.value(n) for n in expression.names}
-        )
 
-    return make(name, unit, function, source=text, **keys)
+def _unit_of(shape: str, expression: Expression, known: Mapping[str, Dimension | None]) -> str:
+    """The unit of a nonlinear parameter, by its place in the formula; "" where that is open."""
+    possible = [
+        unit
+        for unit in ("1", *UNITS)
+        if _fits(expression, {**known, shape: dimension_of_unit(unit)})
+    ]
+    return possible[0] if len({dimension_of_unit(unit) for unit in possible}) == 1 else ""
+
+
+def _fits(expression: Expression, known: Mapping[str, Dimension | None]) -> bool:
+    try:
+        dimension(expression, known, literal_is_pure=False)
+    except ExpressionError:
+        return False
+    return True
 
 
 def _check_unit(
     name: str, expression: Expression, unit: str, known: Mapping[str, Dimension | None]
 ) -> None:
     """Refuse a coefficient whose unit does not turn the expression into a flow."""
-    found, given = dimension(expression, known, literal_is_pure=False), dimension_of_unit(unit)
-    if found is None:
+    computed, given = dimension(expression, known, literal_is_pure=False), dimension_of_unit(unit)
+    if computed is None:
         return
-    wanted = tuple(a - b for a, b in zip(FLOW, found, strict=True))
+    wanted = tuple(a - b for a, b in zip(FLOW, computed, strict=True))
     if given != wanted:
-        reason = f"flow is in {unit_of_dimension(found)}, times {unit} that is no m3/s"
+        reason = f"flow is in {unit_of_dimension(computed)}, times {unit} that is no m3/s"
         remedy = f"write unit = {unit_of_dimension(wanted)!r}, or correct flow"
         raise EffectError(f"effect {name!r}: {reason}", remedy)

@@ -14,8 +14,8 @@ import numpy as np
 
 from rtid.effects.dimension import Dimension, dimension_of_unit
 from rtid.effects.page import EffectError
-from rtid.effects.tree import FloatArray
-from rtid.model import COMMAND, MODE, POSITION, PRESSURE, VELOCITY, Model
+from rtid.model import COMMAND, MODE, POSITION, PRESSURE, VELOCITY, Machine
+from rtid.plain import FloatArray
 from rtid.units import nearest
 
 _UNIT_OF_KIND = {COMMAND: "V", PRESSURE: "Pa", POSITION: "m", VELOCITY: "m/s", MODE: "1"}
@@ -38,7 +38,7 @@ def names_of(
     return known
 
 
-def names_of_model(model: Model) -> dict[str, Dimension | None]:
+def names_of_model(model: Machine) -> dict[str, Dimension | None]:
     """As `names_of`, for the signals and chambers of a model."""
     return names_of({s.name: s.kind for s in model.signals}, [c.name for c in model.chambers])
 
@@ -50,16 +50,23 @@ class View:
     A command at sample k acts from t_s[k] to t_s[k + 1]; all others are taken at t_s[k].
     """
 
-    model: Model
+    model: Machine
     t_s: FloatArray
     values: FloatArray
 
     def signal(self, name: str) -> FloatArray:
-        """One signal by its name, (n,); EffectError if the model has none."""
+        """One signal by its name, (n,), SI; EffectError if the model has none."""
         names = [s.name for s in self.model.signals]
         if name not in names:
             raise EffectError(f"there is no signal {name!r}", nearest(name, names))
-        return self.values[:, names.index(name)]
+        if name not in self._signals:
+            self._signals[name] = np.ascontiguousarray(self.values[:, names.index(name)])
+        return self._signals[name]
+
+    @cached_property
+    def _signals(self) -> dict[str, FloatArray]:
+        """Those that were asked for: next to one another, they are read much faster."""
+        return {}
 
     def _of_kind(self, kind: str) -> dict[str, FloatArray]:
         return {s.name: self.signal(s.name) for s in self.model.signals if s.kind == kind}
@@ -67,11 +74,11 @@ class View:
     @cached_property
     def before_the_next_command(self) -> View:
         """The same record at t_s[1:], with the command that acted until then."""
-        held = self.values[1:].copy()
+        values = self.values[1:].copy()
         for k, signal in enumerate(self.model.signals):
             if signal.kind in (COMMAND, MODE):
-                held[:, k] = self.values[:-1, k]
-        return View(self.model, self.t_s[1:], held)
+                values[:, k] = self.values[:-1, k]
+        return View(self.model, self.t_s[1:], values)
 
     @cached_property
     def dt_s(self) -> FloatArray:
@@ -81,7 +88,7 @@ class View:
 
     @cached_property
     def u(self) -> FloatArray:
-        """The first command, (n,)."""
+        """The first command, (n,), V."""
         commands = self._of_kind(COMMAND)
         if not commands:
             raise EffectError("the model has no command", "name a signal with view.signal(name)")
@@ -89,17 +96,17 @@ class View:
 
     @cached_property
     def p(self) -> dict[str, FloatArray]:
-        """Pressures by the names of their signals, Pa."""
+        """Pressures (n,) by the names of their signals, Pa."""
         return self._of_kind(PRESSURE)
 
     @property
     def x(self) -> FloatArray:
-        """Position, m."""
+        """Position (n,), m."""
         return self.signal(self.model.position)
 
     @cached_property
     def v(self) -> FloatArray:
-        """Velocity, m/s: as it is measured, else central differences of the position."""
+        """Velocity (n,), m/s: as measured, else central differences of the position."""
         measured = self._of_kind(VELOCITY)
         if measured:
             return next(iter(measured.values()))
@@ -107,7 +114,7 @@ class View:
 
     @cached_property
     def volume_m3(self) -> dict[str, FloatArray]:
-        """V(x) by the chamber's name."""
+        """V(x) (n,) by the chamber's name."""
         return {c.name: c.v0_m3 + c.sign * c.area_m2 * self.x for c in self.model.chambers}
 
     @property
@@ -116,15 +123,15 @@ class View:
         return {c.name: c.area_m2 for c in self.model.chambers}
 
     def value(self, name: str) -> FloatArray:
-        """Array of any name that an expression may use, (n,)."""
+        """Array of any name that an expression may use, (n,), SI."""
         if name in (signal.name for signal in self.model.signals):
             return self.signal(name)
-        own = {"t": lambda: self.t_s, "x": lambda: self.x, "v": lambda: self.v}
-        if name in own:
-            return own[name]()
+        known = {"t": lambda: self.t_s, "x": lambda: self.x, "v": lambda: self.v}
+        if name in known:
+            return known[name]()
         if name[:2] == "V_" and name[2:] in self.volume_m3:
             return self.volume_m3[name[2:]]
         areas = {f"A_{chamber}": area for chamber, area in self.area_m2.items()}
         if name not in areas:
-            raise EffectError(f"the record knows no {name!r}", nearest(name, [*own, *areas]))
+            raise EffectError(f"the record knows no {name!r}", nearest(name, [*known, *areas]))
         return np.full(len(self.t_s), areas[name])

@@ -9,14 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import expm
 
+from rtid.errors import door
 from rtid.estimator.state import MASKS, Weights, flow_noise_floor, nominal_weights, variance
-from rtid.estimator.track import ROW, IntArray, Track, follow, pressure_drop
-from rtid.model import BLENDED, TAYLOR, Edge, FloatArray, Model, Term
+from rtid.estimator.track import ROW, Track, follow, pressure_drop
+from rtid.model import BLENDED, TAYLOR, Edge, Machine, Term
+from rtid.plain import FloatArray, IntArray
 
 Blocks = tuple[tuple[int, int, int], ...]
 GAUSS_POINTS = 0.5 + 0.5 / np.sqrt(3) * np.array([-1.0, 1.0])  # of an interval, in its lengths
@@ -24,25 +27,33 @@ GAUSS_POINTS = 0.5 + 0.5 / np.sqrt(3) * np.array([-1.0, 1.0])  # of an interval,
 
 @dataclass(frozen=True)
 class BatchFit:
-    """theta (n,): [theta_beta / its weight's compliance, per chamber | flow terms / rated flow].
+    """Whitened rows (m, n) and y (m,), and what least squares makes of them.
 
-    blocks: (edge, i, j) of each visited block in the order of its six unknowns; rows (m, n) and
-    y (m,) are whitened; gram = rows' rows.
+    blocks: (edge, i, j) of each visited block in the order of its six unknowns; prior (n,):
+    information on each parameter.
     """
 
-    theta: FloatArray
     rows: FloatArray
     y: FloatArray
     blocks: Blocks
+    prior: FloatArray
 
-    @property
+    @cached_property
+    def theta(self) -> FloatArray:
+        """(n,), dimensionless: [theta_beta / weight's compliance | flow terms / rated flow]."""
+        keep = np.diag(np.sqrt(self.prior))[self.prior > 0]
+        rows, y = np.vstack([self.rows, keep]), np.concatenate([self.y, np.zeros(len(keep))])
+        return np.asarray(np.linalg.lstsq(rows, y, rcond=None)[0])
+
+    @cached_property
     def gram(self) -> FloatArray:
-        """Information matrix (n, n) without prior."""
+        """Information matrix (n, n) without prior; unknowns scaled as in the sums."""
         return np.asarray(self.rows.T @ self.rows)
 
 
+@door
 def fit_batch(
-    model: Model,
+    model: Machine,
     t_s: FloatArray,
     values: FloatArray,
     flags: ArrayLike = ROW,
@@ -65,15 +76,11 @@ def fit_batch(
     y, rows = stacked[:, 0], stacked[:, 1:]
     ridge = np.full(rows.shape[1], prior[1])
     ridge[: len(model.chambers) + len(model.terms)] = prior[0]
-    keep = np.diag(np.sqrt(ridge))[ridge > 0]
-    theta = np.linalg.lstsq(
-        np.vstack([rows, keep]), np.concatenate([y, np.zeros(len(keep))]), rcond=None
-    )[0]
-    return BatchFit(theta, rows, y, blocks)
+    return BatchFit(rows, y, blocks, ridge)
 
 
 def column_rates(
-    model: Model,
+    model: Machine,
     t_s: FloatArray,
     values: FloatArray,
     track: Track,
@@ -127,7 +134,7 @@ _SHAPES: dict[str, Callable[[FloatArray], FloatArray]] = {
 
 
 def _term_rates(
-    model: Model, term: Term, values: FloatArray, end: IntArray, dt: FloatArray
+    model: Machine, term: Term, values: FloatArray, end: IntArray, dt: FloatArray
 ) -> FloatArray:
     """(intervals, 2): flow of a shared term for theta = 1 at the start and end of each interval."""
     z = np.full(len(values), term.constant)
@@ -154,7 +161,7 @@ def _windows(edge: Edge, cell: IntArray) -> tuple[tuple[int, int], ...]:
     return tuple((i, j) for i in range(a, min(a + 2, nu)) for j in range(b, min(b + 2, nd)))
 
 
-def _visited(model: Model, track: Track) -> Blocks:
+def _visited(model: Machine, track: Track) -> Blocks:
     """Blocks in the order of their first visit, as the engine gives out its slots."""
     seen: dict[tuple[int, int, int], None] = {}
     for interval in track.cells:
@@ -167,9 +174,9 @@ def _visited(model: Model, track: Track) -> Blocks:
 
 def _at_gauss_points(opening: FloatArray, dt: float, lag_s: float) -> FloatArray:
     """Lagged command at the two Gauss points of one interval (2,)."""
-    held, start = opening
+    command, start = opening
     t = GAUSS_POINTS * dt
-    return np.asarray(held + (start - held) * (np.exp(-t / lag_s) if lag_s > 0 else 0 * t))
+    return np.asarray(command + (start - command) * (np.exp(-t / lag_s) if lag_s > 0 else 0 * t))
 
 
 def _windowed_terms(edge: Edge, i: int, j: int, w: FloatArray, dp: FloatArray) -> FloatArray:
@@ -216,10 +223,10 @@ def _moments(opening: FloatArray, dt: FloatArray, lag_s: float) -> FloatArray:
     nodes, weights = np.polynomial.legendre.leggauss(60)
     s = 0.5 * (nodes + 1)
     tau, weights = s**3, 0.5 * weights * 3 * s**2
-    held, start = opening[:, :, :1], opening[:, :, 1:]
+    command, start = opening[:, :, :1], opening[:, :, 1:]
     fade = np.exp(-tau * dt[:, None, None] / lag_s) if lag_s > 0 else np.zeros(len(tau))
-    w = held + (start - held) * fade
-    return np.stack([w @ weights, w**2 @ weights, (w - held) * (tau - 0.5) @ weights], axis=2)
+    w = command + (start - command) * fade
+    return np.stack([w @ weights, w**2 @ weights, (w - command) * (tau - 0.5) @ weights], axis=2)
 
 
 def _terms(edge: Edge, i: int, j: int, moments: FloatArray, dp: FloatArray) -> FloatArray:
@@ -238,7 +245,7 @@ def _terms(edge: Edge, i: int, j: int, moments: FloatArray, dp: FloatArray) -> F
     return np.stack([mean - half, mean + half])
 
 
-def position_noise(model: Model, x_m: float, weights: Weights) -> FloatArray:
+def position_noise(model: Machine, x_m: float, weights: Weights) -> FloatArray:
     """Covariance (chambers, chambers) of the white noise of one pair of rows, m6."""
     a = np.array([c.sign * c.area_m2 for c in model.chambers])
     v = np.array([c.v0_m3 + c.sign * c.area_m2 * x_m for c in model.chambers])
@@ -247,10 +254,10 @@ def position_noise(model: Model, x_m: float, weights: Weights) -> FloatArray:
     return np.asarray(np.outer(a, a) * variance(model, model.position) + white)
 
 
-def flow_noise(model: Model, cells: IntArray, dt: float, weights: Weights) -> FloatArray:
+def flow_noise(model: Machine, cells: IntArray, dt: float, weights: Weights) -> FloatArray:
     """Covariance added by one interval: pressure noise through the slope of the open maps.
 
-    cells (edges, 2): the interval's block per edge, -1 when shut.
+    (chambers, chambers), m6.  cells (edges, 2): the interval's block per edge, -1 when shut.
     """
     q, first = np.diag(flow_noise_floor(model)) * dt, 0
     for (a, b), edge in zip(cells, model.edges, strict=True):
@@ -265,7 +272,7 @@ def flow_noise(model: Model, cells: IntArray, dt: float, weights: Weights) -> Fl
 
 
 def _integral_rows(
-    model: Model,
+    model: Machine,
     t_s: FloatArray,
     values: FloatArray,
     rates: FloatArray,
@@ -301,7 +308,7 @@ def _ramp_step(a: FloatArray, wn: float, dt: float) -> FloatArray:
 
 
 def _carry_rows(
-    model: Model,
+    model: Machine,
     t_s: FloatArray,
     values: FloatArray,
     rates: FloatArray,

@@ -10,7 +10,8 @@ import numpy as np
 from rtid.estimator.state import MASKS, RecordArray
 from rtid.estimator.sums import Sums
 from rtid.kernels.layout import TERMS
-from rtid.model import FloatArray, Gates, Model
+from rtid.model import Gates, Machine
+from rtid.plain import FloatArray
 
 EMPTY, LEARNING, VALID, STALE, INVALID = "empty", "learning", "valid", "stale", "invalid"
 
@@ -54,14 +55,14 @@ def mean_phi(records: RecordArray) -> FloatArray:
     return np.asarray(records["phi_sum"] / np.maximum(records["dwell_s"], 1e-12)[:, None])
 
 
-def mean_flows(model: Model, sums: Sums, theta: FloatArray) -> FloatArray:
+def mean_flows(model: Machine, sums: Sums, theta: FloatArray) -> FloatArray:
     """Flow averaged over the data of each block (m,), m3/s; theta (n,) in Taylor terms."""
     rated = np.array([edge.rated_q_m3s for edge in model.edges])
     terms = theta[sums.n_shared :].reshape(-1, TERMS)
     return np.asarray(rated[sums.blocks["edge"]] * (mean_phi(sums.blocks) * terms).sum(axis=1))
 
 
-def largest_flows(model: Model, sums: Sums, theta: FloatArray) -> FloatArray:
+def largest_flows(model: Machine, sums: Sums, theta: FloatArray) -> FloatArray:
     """Largest block-mean flow of each edge (edges,), m3/s; the rated flow where none is known."""
     flows = np.abs(mean_flows(model, sums, theta))
     enough = sums.blocks["rows"] >= model.gates.min_rows
@@ -74,7 +75,7 @@ def largest_flows(model: Model, sums: Sums, theta: FloatArray) -> FloatArray:
 
 
 def read_blocks(
-    model: Model, sums: Sums, theta: FloatArray, cov: FloatArray, gram: FloatArray, now_s: float
+    model: Machine, sums: Sums, theta: FloatArray, cov: FloatArray, gram: FloatArray, now_s: float
 ) -> Iterator[Block]:
     """All visited blocks.
 
@@ -84,20 +85,20 @@ def read_blocks(
     first = model.first_cells
     for place, record in enumerate(sums.blocks):
         at = sums.n_shared + TERMS * place
-        own, edge = slice(at, at + TERMS), int(record["edge"])
+        columns, edge = slice(at, at + TERMS), int(record["edge"])
         shape, rated = model.edges[edge].grid.shape, model.edges[edge].rated_q_m3s
         i, j = divmod(int(record["cell"]) - first[edge], shape[1])
         used = at + np.flatnonzero(MASKS[model.edges[edge].terms])
         condition = _condition(gram[used[:, None], used])
-        variance = float(means[place] @ cov[own, own] @ means[place])
+        variance = float(means[place] @ cov[columns, columns] @ means[place])
         sd_share = rated / largest[edge] * max(0.0, variance) ** 0.5
         status, reason = _status(model.gates, record, condition, sd_share, now_s)
         yield Block(
             edge,
             i,
             j,
-            theta[own] * rated,
-            cov[own, own] * rated**2,
+            theta[columns] * rated,
+            cov[columns, columns] * rated**2,
             means[place],
             int(record["rows"]),
             float(record["dwell_s"]),
@@ -141,5 +142,5 @@ def _progress(gates: Gates, rows: int, condition: float, sd_share: float) -> flo
     It can fall when the data move to where the block is known less.
     """
     known = (gates.max_sd_share / max(sd_share, 1e-12)) ** 2
-    told = gates.condition_limit / max(condition, 1.0)
-    return float(min(1.0, rows / gates.min_rows, known, told))
+    share = gates.condition_limit / max(condition, 1.0)
+    return float(min(1.0, rows / gates.min_rows, known, share))

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from rtid.model import FloatArray, Grid
+from rtid.model import Grid
+from rtid.plain import FloatArray
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(4)
 
 
 def quadrature(grid: Grid, i: int) -> tuple[FloatArray, FloatArray]:
-    """Gauss points of all cells of column i: w, dp (nd, 16)."""
+    """Gauss points of all cells of column i: w in V and dp in Pa (nd, 16)."""
     w = 0.5 * (grid.u_v[i] + grid.u_v[i + 1]) + 0.5 * (grid.u_v[i + 1] - grid.u_v[i]) * NODES
     middle, half = 0.5 * (grid.dp_pa[1:] + grid.dp_pa[:-1]), 0.5 * np.diff(grid.dp_pa)
     dp = middle[:, None] + half[:, None] * NODES
@@ -19,24 +20,24 @@ def quadrature(grid: Grid, i: int) -> tuple[FloatArray, FloatArray]:
 
 
 def terms() -> FloatArray:
-    """The six terms at the Gauss points (16, 6)."""
+    """The six terms at the Gauss points (16, 6), dimensionless."""
     xi, eta = np.repeat(NODES, len(NODES)), np.tile(NODES, len(NODES))
     return np.stack([np.ones_like(xi), xi, eta, xi * xi, eta * eta, xi * eta], axis=1)
 
 
 def projection() -> FloatArray:
-    """Least squares from values at the Gauss points to the six terms (6, 16)."""
+    """Least squares from values at the Gauss points to the six terms (6, 16), dimensionless."""
     weight = np.sqrt(_weights())
     return np.asarray(np.linalg.pinv(weight[:, None] * terms()) * weight)
 
 
 def mean_square() -> FloatArray:
-    """Mean of phi phi' over a cell (6, 6)."""
+    """Mean of phi phi' over a cell (6, 6), dimensionless."""
     return np.asarray((terms().T * _weights()) @ terms())
 
 
 def mean() -> FloatArray:
-    """Mean of phi over a cell (6,)."""
+    """Mean of phi over a cell (6,), dimensionless."""
     return np.asarray(_weights() @ terms())
 
 

@@ -14,7 +14,8 @@ import numpy as np
 from rtid.estimator.factor import SHARED_PRIOR, Factor, misfit
 from rtid.estimator.sums import Normal, Sums
 from rtid.kernels.layout import TERMS
-from rtid.model import FloatArray, Model
+from rtid.model import Machine
+from rtid.plain import FloatArray
 
 
 @dataclass(frozen=True)
@@ -45,15 +46,15 @@ def correct(normal: Normal, factor: Factor, leverage: FloatArray) -> Corrected:
     information = np.linalg.inv(columns[:n_c])
     noise = np.diag(normal.noise * (1 - leverage))
     least = SHARED_PRIOR + 3 * np.sqrt(2 / max(1, normal.rows)) * normal.noise
-    left, drawn = _at_least(information - noise, least)
-    cov = np.linalg.inv(left)
+    rest, drawn = _at_least(information - noise, least)
+    cov = np.linalg.inv(rest)
     basis = columns @ information
     shift = cov @ information @ theta[:n_c] - theta[:n_c]
     # noise times noise: its share of the rows' own variance adds to that of the product
-    own = normal.noise / max(1, normal.rows)
-    cov_change = cov + cov @ (noise * (1 + own)) @ cov - columns[:n_c] + drawn
-    told = theta[:n_c] + shift
-    cost = misfit(normal, theta) + shift @ information @ shift - told @ noise @ told
+    noise_share = normal.noise / max(1, normal.rows)
+    cov_change = cov + cov @ (noise * (1 + noise_share)) @ cov - columns[:n_c] + drawn
+    shared = theta[:n_c] + shift
+    cost = misfit(normal, theta) + shift @ information @ shift - shared @ noise @ shared
     return Corrected(theta + basis @ shift, basis, cov_change, float(cost))
 
 
@@ -72,7 +73,7 @@ def _at_least(information: FloatArray, least: FloatArray) -> tuple[FloatArray, F
     return np.asarray(raised * np.outer(scale, scale)), np.asarray(drawn @ drawn.T)
 
 
-def leverage_of(model: Model, sums: Sums, effective: FloatArray) -> FloatArray:
+def leverage_of(model: Machine, sums: Sums, effective: FloatArray) -> FloatArray:
     """Share (chambers,) of the noise in each column -V dP that the flow terms absorb.
 
     Noise that the maps can follow never reaches theta_beta.  effective (n,): degrees of freedom

@@ -12,20 +12,25 @@ from copy import deepcopy
 import numpy as np
 
 from firmware_bridge.samples import Samples
+from rtid.errors import door, require
 from rtid.estimator.blocks import VALID
 from rtid.estimator.factor import one_thread
 from rtid.estimator.forgetting import faded, halved_surprise, without_surprise
-from rtid.estimator.history import History
+from rtid.estimator.ring import History
 from rtid.estimator.solution import Solution, solve
-from rtid.estimator.state import State, Weights, build
-from rtid.estimator.sums import IntArray, Sums
+from rtid.estimator.state import State, Weights, build, tell_unmarked
+from rtid.estimator.sums import Sums
 from rtid.kernels.layout import TERMS
-from rtid.model import FloatArray, Model
+from rtid.model import Machine
+from rtid.plain import BoolArray, FloatArray, IntArray
 
 KNOWN = 0.05  # relative sd of the compliances up to which a map may judge rows
+AT_ONCE = 4096  # rows that are looked through for the next upkeep
+NO_STAMP_US = 2.0**53  # a time that is no number, or beyond whole microseconds in a float
 
 
-def to_chunk(model: Model, samples: Samples, origin_us: int) -> FloatArray:
+@door
+def to_chunk(model: Machine, samples: Samples, origin_us: int) -> FloatArray:
     """The kernel's view of samples: (n, 2 + signals) = [s since origin_us, flags, values...].
 
     Raises KeyError if a signal of the model is missing among the samples.
@@ -40,13 +45,23 @@ def to_chunk(model: Model, samples: Samples, origin_us: int) -> FloatArray:
     return chunk
 
 
+def stamps_us(chunk: FloatArray) -> tuple[IntArray, BoolArray]:
+    """The time of each row in whole microseconds (n,), and whether it is one at all.
+
+    Times are compared as whole numbers: of seconds, (t - period) + period may be another stamp.
+    """
+    t_us = np.rint(1e6 * chunk[:, 0])
+    known = np.abs(t_us) < NO_STAMP_US
+    return np.where(known, t_us, 0.0).astype(np.int64), known
+
+
 class Estimator:
     """Learns all maps and compliances of a model together, sample by sample or trace by trace.
 
     The result does not depend on how the samples are cut into calls, bit for bit.
     """
 
-    def __init__(self, model: Model, weights: Weights | None = None) -> None:
+    def __init__(self, model: Machine, weights: Weights | None = None) -> None:
         self.model = model
         self.weights = weights
         self.reset()
@@ -56,7 +71,8 @@ class Estimator:
         self.state: State = build(self.model, self.weights)
         self.origin_us: int | None = None
         self.folds = [Sums.of(self.state)] * self.model.upkeep.folds
-        self.turns, self.due_s, upkeep = 0, -np.inf, self.model.upkeep
+        self.turns, upkeep = 0, self.model.upkeep
+        self.due_us: int | None = None  # time of the next upkeep, as in `to_chunk`; None: at once
         self.history: History | None = None
         if upkeep.history_s > 0:
             rate, signals = upkeep.history_rows_per_s, len(self.model.signals)
@@ -64,31 +80,47 @@ class Estimator:
 
     def update(self, samples: Samples) -> None:
         """Take a run of samples in their order."""
+        require("update", "samples", samples, Samples)
         if len(samples) == 0:
             return
+        tell_unmarked(samples.flags)
         if self.origin_us is None:
             self.origin_us = int(samples.t_us[0])
         self.advance(to_chunk(self.model, samples, self.origin_us))
 
     def advance(self, chunk: FloatArray) -> None:
-        """Take samples in the kernel's view, with upkeep where it is due."""
+        """Take samples (n, 2 + signals) in the kernel's view, SI, with upkeep where it is due."""
         if self.history is not None:
             self.history.append(chunk)
-        every_s = self.model.upkeep.every_s
-        while every_s > 0 and len(chunk):
-            t_s = chunk[:, 0]
-            due = (t_s >= self.due_s) | (t_s < self.due_s - every_s)
-            count = int(np.argmax(due)) if due.any() else len(chunk)
+        for k in range(0, len(chunk), AT_ONCE):
+            self._advance(chunk[k : k + AT_ONCE])
+
+    def _advance(self, chunk: FloatArray) -> None:
+        """Take a few rows: each upkeep looks through those that are left."""
+        while (count := self._until_due(chunk)) < len(chunk):
             self.state.advance(chunk[:count])
             chunk = chunk[count:]
-            if len(chunk):
-                self._keep_house(float(chunk[0, 0]))
+            self._keep_house(int(stamps_us(chunk[:1])[0][0]))
         self.state.advance(chunk)
 
-    def _keep_house(self, now_s: float) -> None:
+    @property
+    def _every_us(self) -> int:
+        """The period of upkeep, at least a microsecond: so the row at which it came is not due."""
+        return max(1, round(1e6 * self.model.upkeep.every_s))
+
+    def _until_due(self, chunk: FloatArray) -> int:
+        """How many rows come before the next upkeep; a clock that steps back calls for one too."""
+        if self.model.upkeep.every_s <= 0:
+            return len(chunk)
+        t_us, due = stamps_us(chunk)
+        if self.due_us is not None:
+            due &= (t_us >= self.due_us) | (t_us < self.due_us - self._every_us)
+        return int(np.argmax(due)) if due.any() else len(chunk)
+
+    def _keep_house(self, now_us: int) -> None:
         """End one turn; a clock that jumps ends it too, and the next one begins at the new time."""
         upkeep, fold = self.model.upkeep, self.turns % self.model.upkeep.folds
-        self.due_s = now_s + upkeep.every_s if np.isfinite(now_s) else self.due_s
+        self.due_us = now_us + self._every_us
         self.turns += 1
         news = Sums.drained(self.state)
         with one_thread():
@@ -151,11 +183,11 @@ class Estimator:
         """The joint estimate from everything seen so far; nothing is changed by asking."""
         return solve(self.model, self.sums, float(self.state.engine[0]["t_s"]), self.counters)
 
-    def copy(self) -> Estimator:
+    def copy(self, with_history: bool = True) -> Estimator:
         """An independent estimator that continues bit for bit like this one."""
         twin = Estimator.__new__(Estimator)
         twin.model, twin.weights = self.model, self.weights
         twin.state, twin.origin_us = self.state.copy(), self.origin_us
-        twin.folds, twin.turns, twin.due_s = list(self.folds), self.turns, self.due_s
-        twin.history = deepcopy(self.history)
+        twin.folds, twin.turns, twin.due_us = list(self.folds), self.turns, self.due_us
+        twin.history = deepcopy(self.history) if with_history else None
         return twin

@@ -13,7 +13,7 @@ from threadpoolctl import ThreadpoolController
 
 from rtid.estimator.sums import Normal
 from rtid.kernels.normal import mirror, residual
-from rtid.model import FloatArray
+from rtid.plain import FloatArray
 
 # One standard deviation of the prior on a flow term: ten times the rated flow, so that directions
 # without data stay finite and are seen as unknown by their variance.
@@ -33,7 +33,7 @@ class Factor:
     lower: FloatArray
 
     def theta(self, right: FloatArray) -> FloatArray:
-        """Solution (n,) for a right-hand side, with one step of refinement.
+        """Solution (n,) for a right-hand side (n,), in units of the scales, refined by one step.
 
         The residual is in twice the precision: the solution is that of the sums as they are, to
         about the square of condition number x rounding.
@@ -48,7 +48,7 @@ class Factor:
         return np.stack([self.theta(unit) for unit in np.eye(m, len(self.scale))], axis=1)
 
     def cov(self) -> FloatArray:
-        """Inverse of the normal matrix (n, n)."""
+        """Inverse of the normal matrix (n, n): covariance in units of the scales."""
         inverse, _ = dpotri(self.lower, lower=1)
         mirror(inverse.T, self.scale)  # Fortran order: the transpose holds the upper triangle
         return np.asarray(inverse)
@@ -67,7 +67,7 @@ def factorize(normal: Normal, n_shared: int) -> Factor:
 
 
 def misfit(normal: Normal, theta: FloatArray) -> float:
-    """Sum of squares of the rows that theta leaves."""
+    """Sum of squares of the rows, of unit variance, that theta (n,) leaves."""
     return float(normal.square - 2 * normal.right @ theta + theta @ normal.gram @ theta)
 
 

@@ -19,7 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 from rtid.estimator.inverse import invert
 from rtid.estimator.windows import blend, foot
 from rtid.kernels.layout import TERMS
-from rtid.model import FloatArray, Grid
+from rtid.model import Grid
+from rtid.plain import BoolArray, FloatArray
 
 # Status of a cell.
 VALID, LEARNING, EXTRAPOLATED, PRIOR, SHUT = "valid", "learning", "extrapolated", "prior", "shut"
@@ -45,15 +46,15 @@ class EdgeMap:
     reason: dict[tuple[int, int], str]
 
     def flow(self, w_v: ArrayLike, dp_pa: ArrayLike) -> FloatArray:
-        """Q in m3/s at broadcast points; 0 at or below the safe band, NaN off the grid."""
+        """Q in m3/s at broadcast points (...); 0 at or below the safe band, NaN off the grid."""
         return self._blended(w_v, dp_pa)[0]
 
     def gradient(self, w_v: ArrayLike, dp_pa: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """dQ/dw in m3/s/V and dQ/ddp in m3/s/Pa of the same map."""
+        """dQ/dw in m3/s/V and dQ/ddp in m3/s/Pa of the same map, shape (...) as its points."""
         return self._blended(w_v, dp_pa)[1:]
 
     def sd(self, w_v: ArrayLike, dp_pa: ArrayLike) -> FloatArray:
-        """Standard deviation of Q in m3/s; neighbours' errors are taken as wholly correlated."""
+        """Standard deviation (...) of Q in m3/s; neighbours' errors count as wholly correlated."""
         w, dp, open_, inside, shape = self._points(w_v, dp_pa)
         total = np.zeros(len(w))
         for cells, weight, *_ in self.corners(w, dp):
@@ -70,11 +71,11 @@ class EdgeMap:
         For q = 0 it is the safe band, the largest command that surely passes nothing.
         """
         q, dp = np.broadcast_arrays(np.asarray(q_m3s, float), np.asarray(dp_pa, float))
-        found = invert(self.grid, self.safe_band_v, self.theta, q.ravel(), dp.ravel())
-        return found.reshape(q.shape)
+        commands = invert(self.grid, self.safe_band_v, self.theta, q.ravel(), dp.ravel())
+        return commands.reshape(q.shape)
 
     def status_at(self, w_v: ArrayLike, dp_pa: ArrayLike) -> NDArray[np.str_]:
-        """Status of the cell that holds each point; "outside" off the grid."""
+        """Status (...) of the cell that holds each point; "outside" off the grid."""
         w, dp, open_, inside, shape = self._points(w_v, dp_pa)
         i, j = (_cell(b, x) for b, x in ((self.grid.u_v, w), (self.grid.dp_pa, dp)))
         status = np.where(inside, self.status[i, j], "outside")
@@ -88,7 +89,7 @@ class EdgeMap:
 
     def _points(
         self, w_v: ArrayLike, dp_pa: ArrayLike
-    ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_], NDArray[np.bool_], tuple[int, ...]]:
+    ) -> tuple[FloatArray, FloatArray, BoolArray, BoolArray, tuple[int, ...]]:
         """Flat points moved into the grid; which are open, which lay inside; the shape."""
         w, dp = np.broadcast_arrays(np.asarray(w_v, float), np.asarray(dp_pa, float))
         shape, w, dp = w.shape, w.ravel(), dp.ravel()
@@ -99,7 +100,10 @@ class EdgeMap:
         return np.clip(w, u[0], u[-1]), np.clip(dp, p[0], p[-1]), open_, inside, shape
 
     def corners(self, w: FloatArray, dp: FloatArray) -> Iterator[Corner]:
-        """Per blended block: its cells (i, j), the weight, and the weight's slopes in w and dp."""
+        """Per blended block: its cells (i, j), the weight, and the weight's slopes in w and dp.
+
+        All (k,); w in V, dp in Pa, weights dimensionless.
+        """
         i, b, b_w = blend(self.grid.u_v, w)
         j, c, c_p = blend(self.grid.dp_pa, dp)
         for di, wi, si in ((0, 1 - b, -b_w), (1, b, b_w)):
@@ -111,14 +115,14 @@ class EdgeMap:
     def terms(
         self, cells: Cells, w: FloatArray, dp: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """phi (k, 6) at the points in their cells, and its derivatives by w and dp."""
+        """phi (k, 6) at points w in V, dp in Pa (k,) in their cells, and its derivatives."""
         (i, j), u, p = cells, self.grid.u_v, self.grid.dp_pa
         hu, hp = 2.0 / (u[i + 1] - u[i]), 2.0 / (p[j + 1] - p[j])
         xi, eta = (w - u[i]) * hu - 1.0, (dp - p[j]) * hp - 1.0
-        one, zero = np.ones_like(xi), np.zeros_like(xi)
-        phi = np.stack([one, xi, eta, xi * xi, eta * eta, xi * eta], axis=1)
-        by_w = np.stack([zero, one, zero, 2 * xi, zero, eta], axis=1) * hu[:, None]
-        by_dp = np.stack([zero, zero, one, zero, 2 * eta, xi], axis=1) * hp[:, None]
+        ones, zero = np.ones_like(xi), np.zeros_like(xi)
+        phi = np.stack([ones, xi, eta, xi * xi, eta * eta, xi * eta], axis=1)
+        by_w = np.stack([zero, ones, zero, 2 * xi, zero, eta], axis=1) * hu[:, None]
+        by_dp = np.stack([zero, zero, ones, zero, 2 * eta, xi], axis=1) * hp[:, None]
         return phi, by_w, by_dp
 
     def _blended(
@@ -141,8 +145,8 @@ class EdgeMap:
     @staticmethod
     def _finish(
         value: FloatArray,
-        open_: NDArray[np.bool_],
-        inside: NDArray[np.bool_],
+        open_: BoolArray,
+        inside: BoolArray,
         shape: tuple[int, ...],
     ) -> FloatArray:
         return np.where(open_, np.where(inside, value, np.nan), 0.0).reshape(shape)
@@ -162,29 +166,29 @@ class FlowMap:
         """One edge by number or name; KeyError names the edges that exist."""
         if isinstance(edge, int):
             return self.edges[edge]
-        for found in self.edges:
-            if found.name == edge:
-                return found
+        for edge_map in self.edges:
+            if edge_map.name == edge:
+                return edge_map
         raise KeyError(f"the map has no edge {edge!r}, only {[e.name for e in self.edges]}")
 
     def flow(self, edge: int | str, w_v: ArrayLike, dp_pa: ArrayLike) -> FloatArray:
-        """Q of one edge in m3/s, see `EdgeMap.flow`."""
+        """Q (...) of one edge in m3/s, see `EdgeMap.flow`."""
         return self[edge].flow(w_v, dp_pa)
 
     def sd(self, edge: int | str, w_v: ArrayLike, dp_pa: ArrayLike) -> FloatArray:
-        """Its standard deviation in m3/s."""
+        """Its standard deviation (...) in m3/s."""
         return self[edge].sd(w_v, dp_pa)
 
     def gradient(
         self, edge: int | str, w_v: ArrayLike, dp_pa: ArrayLike
     ) -> tuple[FloatArray, FloatArray]:
-        """dQ/dw and dQ/ddp."""
+        """dQ/dw in m3/s/V and dQ/ddp in m3/s/Pa (...), see `EdgeMap.gradient`."""
         return self[edge].gradient(w_v, dp_pa)
 
     def inverse(self, edge: int | str, q_m3s: ArrayLike, dp_pa: ArrayLike) -> FloatArray:
-        """The command w in V for a wanted flow."""
+        """The command w (...) in V for a wanted flow in m3/s, see `EdgeMap.inverse`."""
         return self[edge].inverse(q_m3s, dp_pa)
 
     def theta_cells(self) -> FloatArray:
-        """Terms of all cells (cells, 6) in the order of `kernels.explain`."""
+        """Terms of all cells (cells, 6), m3/s, in the order of `kernels.explain`."""
         return np.concatenate([e.theta.reshape(-1, TERMS) for e in self.edges])

@@ -18,9 +18,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import eigh
 
-from rtid.estimator.sums import IntArray, Normal, Sums
+from rtid.estimator.sums import Normal, Sums
 from rtid.kernels.layout import TERMS
-from rtid.model import FloatArray
+from rtid.plain import FloatArray, IntArray
 
 ALL = 1.0 - 1e-6  # the most that is lost at once: a positive diagonal stays positive
 CHANGED = 0.99  # share that a block loses when its map is seen to hold no longer
@@ -32,21 +32,21 @@ def faded(past: Sums, news: Sums, share: float, shared: float, changed: IntArray
     """The past as it enters the sum with the news.
 
     share and shared: 1 - exp(-dt / T) of the blocks and of the shared unknowns since the last
-    time; changed: grid cells whose map holds no longer.
+    time; changed (n,): grid cells whose map holds no longer.
     """
     normal, ns = past.normal(), past.n_shared
     gram, right, square = normal.gram, normal.right, normal.square
     fresh = dict(zip(news.cells.tolist(), news.blocks["gram"], strict=True))
     groups = [(np.arange(ns), _told_apart(news), shared)]
     for place, cell in enumerate(past.cells.tolist()):
-        own = ns + TERMS * place + np.arange(TERMS)
+        columns = ns + TERMS * place + np.arange(TERMS)
         if cell in changed:
-            groups.append((own, np.full((TERMS, TERMS), np.nan), CHANGED))
+            groups.append((columns, np.full((TERMS, TERMS), np.nan), CHANGED))
         elif cell in fresh:
-            groups.append((own, fresh[cell], share))
+            groups.append((columns, fresh[cell], share))
     before = gram[np.arange(ns), np.arange(ns)].copy()
-    for own, gained, most in groups:
-        square -= _lose(gram, right, own, gained, most)
+    for columns, gained, most in groups:
+        square -= _lose(gram, right, columns, gained, most)
     keep = np.divide(gram[np.arange(ns), np.arange(ns)], before, where=before > 0, out=before * 0)
     noise = normal.noise * keep[: len(normal.noise)]
     return past.with_normal(Normal(gram, right, square, noise, normal.rows))
@@ -55,26 +55,26 @@ def faded(past: Sums, news: Sums, share: float, shared: float, changed: IntArray
 def _told_apart(news: Sums) -> FloatArray:
     """What the news say about the shared unknowns beside the maps and beyond pressure noise."""
     normal, ns, n_c = news.normal(), news.n_shared, len(news.noise)
-    own, cross = normal.gram[ns:, ns:], normal.gram[ns:, :ns]
-    size = np.sqrt(np.maximum(np.diag(own), np.finfo(float).tiny))
-    scaled = own / np.outer(size, size) + PRIOR * np.eye(len(own))
+    gram, cross = normal.gram[ns:, ns:], normal.gram[ns:, :ns]
+    size = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
+    scaled = gram / np.outer(size, size) + PRIOR * np.eye(len(gram))
     cross = cross / size[:, None]
-    left = normal.gram[:ns, :ns] - cross.T @ np.linalg.solve(scaled, cross)
+    rest = normal.gram[:ns, :ns] - cross.T @ np.linalg.solve(scaled, cross)
     at = np.arange(n_c)
-    left[at, at] = np.maximum(left[at, at] - normal.noise, 0.0)
-    return np.asarray(0.5 * (left + left.T))
+    rest[at, at] = np.maximum(rest[at, at] - normal.noise, 0.0)
+    return np.asarray(0.5 * (rest + rest.T))
 
 
 def _lose(
-    gram: FloatArray, right: FloatArray, own: IntArray, gained: FloatArray, most: float
+    gram: FloatArray, right: FloatArray, place: IntArray, gained: FloatArray, most: float
 ) -> float:
     """Let one group of unknowns fade, gram and right in place; returns what y'y loses."""
-    scale = np.sqrt(gram[own, own])
+    scale = np.sqrt(gram[place, place])
     used = scale > 0
     if not used.any() or most <= 0:
         return 0.0
-    own, scale = own[used], scale[used]
-    g = gram[np.ix_(own, own)] / np.outer(scale, scale)
+    place, scale = place[used], scale[used]
+    g = gram[np.ix_(place, place)] / np.outer(scale, scale)
     values, vectors = np.linalg.eigh(g)
     kept = values > TINY * values[-1]
     whitening = vectors[:, kept] / np.sqrt(values[kept])  # W' g W = I
@@ -85,7 +85,7 @@ def _lose(
         news, rotation = eigh(whitening.T @ n @ whitening)
         turn, loss = whitening @ rotation, np.clip(news, 0.0, min(most, ALL))
     v = turn / scale[:, None]
-    columns, toward = gram[:, own] @ v, right[own] @ v
+    columns, toward = gram[:, place] @ v, right[place] @ v
     gram -= (columns * loss) @ columns.T
     right -= (columns * loss) @ toward
     return float(loss @ toward**2)
@@ -100,7 +100,7 @@ def halved_surprise(past: Sums) -> Sums:
 
 
 def without_surprise(news: Sums, changed: IntArray) -> Sums:
-    """The news as knowledge: what surprised was the map given up, not what they say now."""
+    """The news as knowledge: what surprised was the map given up in the cells changed (n,)."""
     blocks = news.blocks.copy()
     here = np.isin(news.cells, changed)
     for name in ("surprise", "judged"):

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtid.estimator.windows import blend, foot, overlaps, rising
-from rtid.model import FloatArray, Grid
+from rtid.model import Grid
+from rtid.plain import FloatArray
 
 Index = NDArray[np.intp]
 
@@ -28,8 +29,8 @@ def invert(
 ) -> FloatArray:
     """Commands (n,) for flows (n,) at pressure drops (n,); NaN where there is none or several."""
     parts = [slice(k, k + BATCH) for k in range(0, len(q_m3s), BATCH)]
-    found = [_invert(grid, safe_band_v, theta, q_m3s[part], dp_pa[part]) for part in parts]
-    return np.concatenate([*found, np.zeros(0)])
+    pieces = [_invert(grid, safe_band_v, theta, q_m3s[part], dp_pa[part]) for part in parts]
+    return np.concatenate([*pieces, np.zeros(0)])
 
 
 def on_lattice(
@@ -80,8 +81,8 @@ def _sections(grid: Grid, theta: FloatArray, dp: FloatArray) -> FloatArray:
     out = np.zeros((len(dp), grid.shape[0], 3))
     for j, share in ((lower, 1.0 - weight), (np.minimum(lower + 1, nd - 1), weight)):
         eta = _local(border, j, dp)[:, None]
-        one, xi, eta1, xi2, eta2, mixed = theta[:, j].transpose(2, 1, 0)
-        out[:, :, 0] += share[:, None] * (one + eta * (eta1 + eta * eta2))
+        constant, xi, eta1, xi2, eta2, mixed = theta[:, j].transpose(2, 1, 0)
+        out[:, :, 0] += share[:, None] * (constant + eta * (eta1 + eta * eta2))
         out[:, :, 1] += share[:, None] * (xi + eta * mixed)
         out[:, :, 2] += share[:, None] * xi2
     out[~inside] = np.nan

@@ -16,33 +16,38 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rtid.estimator.solution import Solution, widen
+from rtid.estimator.solution import Sketch, Solution, widen
 from rtid.estimator.state import Weights, build
 from rtid.kernels.engine import ROW_FLAG
 from rtid.kernels.explain import explain
 from rtid.kernels.layout import TERMS
-from rtid.model import FloatArray, Model
+from rtid.model import Machine
+from rtid.plain import FloatArray, IntArray
 
-Cells = NDArray[np.int64]
+Cells = IntArray
 
 
-def count_misfit(model: Model, chunk: FloatArray, weights: Weights, solution: Solution) -> Solution:
-    """The solution with intervals that hold where its blocks' polynomials miss their maps."""
+def count_misfit(
+    model: Machine, chunk: FloatArray, weights: Weights, solution: Solution
+) -> Solution:
+    """The solution with intervals that hold where its blocks' polynomials miss their maps.
+
+    chunk (n, 2 + signals): the record that it was learned from, SI.
+    """
     if not can_be_explained(chunk):
         return solution
     scores, cells = _scores(model, chunk, weights, solution)
     if not len(scores):
         return solution
-    own = solution.compliance_cov / np.outer(solution.scale_pa, solution.scale_pa)
-    variance = _crossed(scores, [_of_chamber(model, cells, c) for c in range(len(own))])
-    ratio = np.sqrt(np.maximum(1.0, variance / np.diag(own)))
-    return widen(solution, own * np.outer(ratio, ratio) - own)
+    cov = solution.compliance_cov / np.outer(solution.scale_pa, solution.scale_pa)
+    variance = _crossed(scores, [_of_chamber(model, cells, c) for c in range(len(cov))])
+    ratio = np.sqrt(np.maximum(1.0, variance / np.diag(cov)))
+    return widen(solution, cov * np.outer(ratio, ratio) - cov)
 
 
 def can_be_explained(chunk: FloatArray) -> bool:
-    """True where every sample is a row.
+    """True where every sample of chunk (n, 2 + signals), SI, is a row.
 
     Where the position comes rarely, the engine may begin a new memory between two rows, which
     `explain` does not see: what is left of the blocks visited before would pass for misfit.
@@ -51,7 +56,7 @@ def can_be_explained(chunk: FloatArray) -> bool:
 
 
 @dataclass(frozen=True)
-class Residual:
+class Misfit:
     """A fit held against its record, per interval (n - 1).
 
     flow (n - 1, 2 x chambers): measured and modelled, m3/s; innovation (n - 1, chambers): whitened,
@@ -63,20 +68,24 @@ class Residual:
     cells: Cells
 
 
-def residual_of(model: Model, chunk: FloatArray, weights: Weights, solution: Solution) -> Residual:
-    """What a fit leaves of its record."""
-    theta = _per_cell(model, solution)[0]
-    return _residual(model, chunk, weights, theta, solution.compliance, solution.terms_theta)
+def residual_of(
+    model: Machine, chunk: FloatArray, weights: Weights, estimate: Solution | Sketch
+) -> Misfit:
+    """What an estimate leaves of its record, chunk (n, 2 + signals) in SI."""
+    n_c = len(model.chambers)
+    theta = _cells_of(model, estimate.cells, estimate.unknowns)
+    terms = estimate.unknowns[n_c : n_c + len(model.terms)]
+    return _residual(model, chunk, weights, theta, estimate.compliance, terms)
 
 
 def _scores(
-    model: Model, chunk: FloatArray, weights: Weights, solution: Solution
+    model: Machine, chunk: FloatArray, weights: Weights, solution: Solution
 ) -> tuple[FloatArray, Cells]:
     """w_k r_k (rows, chambers) about their mean, and the grid cells (rows, edges)."""
     theta, flows = _per_cell(model, solution)
     n_c, terms = len(solution.scale_pa), solution.terms_theta
-    found = _residual(model, chunk, weights, theta, solution.compliance, terms)
-    residual, cells = found.innovation, found.cells
+    misfit = _residual(model, chunk, weights, theta, solution.compliance, terms)
+    residual, cells = misfit.innovation, misfit.cells
     scores = np.empty((len(residual), len(solution.scale_pa)))
     for c, influence in enumerate(flows):
         moved = solution.compliance + solution.influence[c, :n_c] * solution.scale_pa
@@ -88,43 +97,46 @@ def _scores(
     return scores - scores.sum(axis=0) / max(1, len(scores)), cells
 
 
-def _per_cell(model: Model, solution: Solution) -> tuple[FloatArray, list[FloatArray]]:
+def _per_cell(model: Machine, solution: Solution) -> tuple[FloatArray, list[FloatArray]]:
     """The fitted map (cells, 6) in m3/s, and the influence on each compliance as such maps."""
-    first = len(solution.scale_pa) + len(model.terms)
-    maps = []
-    for unknowns in (solution.unknowns, *solution.influence):
-        theta = np.zeros((model.n_cells, TERMS))
-        theta[solution.cells] = unknowns[first:].reshape(-1, TERMS)
-        maps.append(theta * np.repeat(*_rated(model))[:, None])
+    rows = (solution.unknowns, *solution.influence)
+    maps = [_cells_of(model, solution.cells, unknowns) for unknowns in rows]
     return maps[0], maps[1:]
 
 
-def _rated(model: Model) -> tuple[FloatArray, list[int]]:
+def _cells_of(model: Machine, cells: IntArray, unknowns: FloatArray) -> FloatArray:
+    """The maps' part of the unknowns by grid cell (cells, 6), m3/s; 0 where never visited."""
+    theta = np.zeros((model.n_cells, TERMS))
+    theta[cells] = unknowns[len(model.chambers) + len(model.terms) :].reshape(-1, TERMS)
+    return np.asarray(theta * np.repeat(*_rated(model))[:, None])
+
+
+def _rated(model: Machine) -> tuple[FloatArray, list[int]]:
     """Rated flow and number of cells of each edge."""
     rated = np.array([edge.rated_q_m3s for edge in model.edges])
     return rated, [edge.grid.shape[0] * edge.grid.shape[1] for edge in model.edges]
 
 
 def _residual(
-    model: Model,
+    model: Machine,
     chunk: FloatArray,
     weights: Weights,
     theta: FloatArray,
     compliance: FloatArray,
     terms: FloatArray,
-) -> Residual:
+) -> Misfit:
     n, n_c, state = len(chunk), len(model.chambers), build(model, weights)
     state.engine[0]["term_theta"][: len(terms)] = terms
     flow, innovation = np.empty((n - 1, 2 * n_c)), np.empty((n - 1, n_c))
     cells = np.empty((n - 1, len(model.edges)), np.int64)
     explain(state.engine, state.cells, theta, compliance, chunk, flow, cells, innovation)
-    return Residual(flow, innovation, cells)
+    return Misfit(flow, innovation, cells)
 
 
-def _of_chamber(model: Model, cells: Cells, chamber: int) -> Cells:
+def _of_chamber(model: Machine, cells: Cells, chamber: int) -> Cells:
     """One number per row: which blocks the edges of a chamber are in."""
-    own = [i for i, e in enumerate(model.edges) if e.sign(model.chambers[chamber]) != 0]
-    return np.unique(cells[:, own], axis=0, return_inverse=True)[1].reshape(-1)
+    edges = [i for i, e in enumerate(model.edges) if e.sign(model.chambers[chamber]) != 0]
+    return np.unique(cells[:, edges], axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def _crossed(scores: FloatArray, clusters: list[Cells]) -> FloatArray:

@@ -13,12 +13,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rtid.estimator.misfit import Residual, residual_of
+from rtid.estimator.misfit import Misfit, residual_of
 from rtid.estimator.solution import Solution
 from rtid.estimator.state import Weights, variance
-from rtid.model import Chamber, FloatArray, Model
+from rtid.model import Chamber, Machine
+from rtid.plain import BoolArray, FloatArray, IntArray
 
 HOT = 1.2  # mean squared innovation from which on a cell is weighed ...
 CLEARLY = 4.0  # ... if it is so many standard deviations above 1
@@ -26,30 +26,59 @@ LEAST_ROWS = 20
 STAY_S = 0.1  # longer stays are cut: what is missed changes with the working point
 LEAST_S = 0.02  # time in a cell from which on a rate can be told
 
-IntArray = NDArray[np.int64]
 
+def weighed(model: Machine, chunk: FloatArray, weights: Weights, solution: Solution) -> Weights:
+    """The weights with `missed` for every cell that needs it; those that had it keep it.
 
-def weighed(model: Model, chunk: FloatArray, weights: Weights, solution: Solution) -> Weights:
-    """The weights with `missed` for every cell that needs it; those that had it keep it."""
+    chunk (n, 2 + signals): the record, SI.
+    """
     residual = residual_of(model, chunk, weights, solution)
-    hot = _is_hot(model, residual) | (weights.missed > 0)
+    return excusing(model, chunk, weights, residual, misses(model, residual).hot)
+
+
+def excusing(
+    model: Machine,
+    chunk: FloatArray,
+    weights: Weights,
+    residual: Misfit,
+    hot: BoolArray,
+) -> Weights:
+    """The weights with `missed`, m6/s, for the hot cells (cells,), and for those that had it.
+
+    chunk (n, 2 + signals), SI.
+    """
+    hot = hot | (weights.missed > 0)
     if not hot.any():
         return weights
     return replace(weights, missed=np.where(hot, _rates(model, chunk, weights, residual), 0.0))
 
 
-def _is_hot(model: Model, residual: Residual) -> NDArray[np.bool_]:
-    """Cells (cells,) whose innovations are clearly larger than the noise."""
+@dataclass(frozen=True)
+class Misses:
+    """Cells (cells,) that a record visits for long enough, and those that miss the flow there."""
+
+    visited: BoolArray
+    hot: BoolArray
+
+    @property
+    def share(self) -> float:
+        """Of the visited cells that miss it."""
+        return float(self.hot.sum() / max(1, self.visited.sum()))
+
+
+def misses(model: Machine, residual: Misfit) -> Misses:
+    """The cells whose innovations are clearly larger than the noise."""
     square = (residual.innovation**2).mean(axis=1)
     known, n_c = np.isfinite(square), residual.innovation.shape[1]
-    hot = np.zeros(model.n_cells, bool)
+    hot, visited = np.zeros(model.n_cells, bool), np.zeros(model.n_cells, bool)
     for cells in residual.cells.T:
         here = known & (cells >= 0)
         rows = np.bincount(cells[here], minlength=model.n_cells)
         mean = np.bincount(cells[here], square[here], model.n_cells) / np.maximum(rows, 1)
         clear = mean > 1.0 + CLEARLY * np.sqrt(2.0 / (np.maximum(rows, 1) * n_c))
+        visited |= rows >= LEAST_ROWS
         hot |= (rows >= LEAST_ROWS) & clear & (mean > HOT)
-    return hot
+    return Misses(visited, hot)
 
 
 @dataclass(frozen=True)
@@ -61,13 +90,13 @@ class _Stays:
     excess_m6: FloatArray
 
 
-def _rates(model: Model, chunk: FloatArray, weights: Weights, residual: Residual) -> FloatArray:
+def _rates(model: Machine, chunk: FloatArray, weights: Weights, residual: Misfit) -> FloatArray:
     """Variance rate of the missed flow per cell (cells,), m6/s; 0 where the noise explains all."""
     total, time_s = np.zeros(model.n_cells), np.zeros(model.n_cells)
     for c, chamber in enumerate(model.chambers):
-        own = [i for i, edge in enumerate(model.edges) if edge.sign(chamber) != 0]
-        stays = _stays(model, chunk, weights, residual, c, own)
-        for i in own:
+        edges = [i for i, edge in enumerate(model.edges) if edge.sign(chamber) != 0]
+        stays = _stays(model, chunk, weights, residual, c, edges)
+        for i in edges:
             cell = residual.cells[stays.first, i]
             here = (cell >= 0) & (stays.time_s > 0)
             cell, lasted = cell[here], stays.time_s[here]
@@ -78,16 +107,16 @@ def _rates(model: Model, chunk: FloatArray, weights: Weights, residual: Residual
 
 
 def _stays(
-    model: Model,
+    model: Machine,
     chunk: FloatArray,
     weights: Weights,
-    residual: Residual,
+    residual: Misfit,
     c: int,
-    own: list[int],
+    edges: list[int],
 ) -> _Stays:
     missed = residual.flow[:, 2 * c] - residual.flow[:, 2 * c + 1]
     dt, known = np.diff(chunk[:, 0]), np.isfinite(missed)
-    moved = (np.diff(residual.cells[:, own], axis=0) != 0).any(axis=1)
+    moved = (np.diff(residual.cells[:, edges], axis=0) != 0).any(axis=1)
     cut = np.diff(np.floor(chunk[1:, 0] / STAY_S)) != 0
     new = np.concatenate([[True], moved | cut | ~known[1:]])
     stay, n = np.cumsum(new) - 1, int(new.sum())
@@ -98,7 +127,7 @@ def _stays(
     return _Stays(np.flatnonzero(new), lasted, np.asarray(volume**2 - ends, np.float64))
 
 
-def _position_noise(model: Model, chunk: FloatArray, weights: Weights, c: int) -> FloatArray:
+def _position_noise(model: Machine, chunk: FloatArray, weights: Weights, c: int) -> FloatArray:
     """White noise of one row of a chamber at each sample (n,), m6."""
     chamber: Chamber = model.chambers[c]
     area = chamber.sign * chamber.area_m2
@@ -108,7 +137,7 @@ def _position_noise(model: Model, chunk: FloatArray, weights: Weights, c: int) -
     return np.asarray(area**2 * position + stiff**2 * pressure * model.pressure_share)
 
 
-def _pressure_noise(model: Model, weights: Weights, i: int) -> FloatArray:
+def _pressure_noise(model: Machine, weights: Weights, i: int) -> FloatArray:
     """Variance rate from pressure noise through the slope of edge i's map (cells,), m6/s."""
     edge, period_s = model.edges[i], model.pressure_period_s or 1e-3
     noise = variance(model, edge.source) + variance(model, edge.sink)

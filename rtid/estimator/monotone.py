@@ -22,7 +22,7 @@ from scipy.optimize import nnls
 from rtid.estimator.flowmap import LEARNING, VALID, EdgeMap
 from rtid.estimator.windows import foot, overlaps
 from rtid.kernels.layout import TERMS
-from rtid.model import FloatArray
+from rtid.plain import BoolArray, FloatArray
 
 KNOWN = (VALID, LEARNING)
 LIMIT = 3.0  # standard deviations by which a cell's terms may be changed
@@ -32,7 +32,7 @@ DENSE, COARSE = 13, 5  # slopes looked at per overlap, along w and along dp
 ROUNDS = 40  # of adding what the last change has left falling
 
 FALLS = "flow falls with the command, {:.1f} standard deviations against it"
-Mask = NDArray[np.bool_]
+Mask = BoolArray
 
 
 @dataclass(frozen=True)
@@ -53,12 +53,12 @@ class Slopes:
         return Slopes(self.w[at], self.dp[at], self.cells[at], self.parts[at], self.by_term[at])
 
     def of(self, theta: FloatArray) -> FloatArray:
-        """Slopes (k,) of a map with terms theta (nu, nd, 6)."""
-        own = theta.reshape(-1, TERMS)[self.cells]
-        return np.asarray(np.einsum("kci,kci->k", self.by_term, own))
+        """Slopes (k,), m3/s/Pa, of a map with terms theta (nu, nd, 6), m3/s."""
+        terms = theta.reshape(-1, TERMS)[self.cells]
+        return np.asarray(np.einsum("kci,kci->k", self.by_term, terms))
 
     def rows(self, root: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
-        """Rows (k, cells, 6) of unit norm on z, theta + root z; their norms; the cells."""
+        """Rows (k, cells, 6) of unit norm on z, theta + root z in m3/s; their norms; the cells."""
         cells, where = np.unique(self.cells, return_inverse=True)
         moved = self.by_term[:, :, None, :] @ root[self.cells]
         rows = np.zeros((len(self.dp), len(cells), TERMS))
@@ -68,7 +68,7 @@ class Slopes:
 
 
 def monotone(edge: EdgeMap, spread: FloatArray) -> EdgeMap:
-    """The map that does not fall where cells are known; spread (nu, nd, 6, 6): C of each cell."""
+    """The map that does not fall where cells are known; spread (nu, nd, 6, 6): C, (m3/s)^2."""
     known = np.isin(edge.status, KNOWN).ravel()
     root = _roots(spread.reshape(-1, TERMS, TERMS))
     slopes = looked_at(edge, known)

@@ -13,9 +13,9 @@ from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
-from rtid.model import FloatArray
+from rtid.plain import FloatArray
 
 ORDERS = range(2, 9)
 WINDOW = 32  # differences per window: shorter than the time between two steps of a command
@@ -75,7 +75,9 @@ def estimate_noise(
 
 
 def resolution_of(values: FloatArray) -> float:
-    """The step of which all differences are multiples, 0 where there is none: Euclid's algorithm.
+    """The step of which all differences of values (n,) are multiples, in their unit; 0: none.
+
+    Euclid's algorithm.
 
     With few levels they must be neighbours: what a signal jumps between is not its resolution.
     """
@@ -87,9 +89,9 @@ def resolution_of(values: FloatArray) -> float:
     step, rest = float(rest[-1]), rest[rest > rounding]
     while len(rest):
         step = float(rest[0])
-        left = np.abs(rest - step * np.round(rest / step))
-        left = left[left > rounding]
-        rest = np.unique(np.append(left, step)) if len(left) else left
+        rest_of = np.abs(rest - step * np.round(rest / step))
+        rest_of = rest_of[rest_of > rounding]
+        rest = np.unique(np.append(rest_of, step)) if len(rest_of) else rest_of
     span = float(levels[-1] - levels[0])
     apart = len(levels) < FEW_LEVELS and span > (len(levels) - 0.5) * step
     return 0.0 if apart or step < 10 * rounding else _refined(levels, step)
@@ -102,7 +104,7 @@ def _refined(levels: FloatArray, step: float) -> float:
 
 
 def measurements(t_s: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """One sample per measurement: without the repeats by which a slower message fills its gaps.
+    """One sample (n,) per measurement: without the repeats by which a slow message fills its gaps.
 
     Held values come at least twice nearly always; quantised ones often come once.
     """
@@ -135,10 +137,10 @@ def _floor(t_s: FloatArray, values: FloatArray, order: int) -> _Floor | None:
     # A correlated sum of squares scatters like one of fewer, independent ones.
     correlation = comb(4 * order, 2 * order) / comb(2 * order, order) ** 2
     dof = WINDOW / correlation
-    floor = float(np.quantile(squares, QUIET)) * dof / chi2.ppf(QUIET, dof)
+    floor = float(np.quantile(squares, QUIET)) * dof / _chi2(QUIET, dof)
     quiet = squares
     for _ in range(20):
-        quiet = squares[squares <= floor * chi2.ppf(LIKELY, dof) / dof]
+        quiet = squares[squares <= floor * _chi2(LIKELY, dof) / dof]
         before, floor = floor, float(quiet.mean()) if len(quiet) else 0.0
         if abs(floor - before) <= 1e-9 * before:
             break
@@ -166,7 +168,7 @@ def _windows(t_s: FloatArray, values: FloatArray, order: int) -> FloatArray:
 
 def _divided(t_s: FloatArray, values: FloatArray, order: int) -> FloatArray:
     """Divided differences at uneven instants, scaled to gain 1 on white noise."""
-    n, t = len(values) - order, t_s / np.median(np.diff(t_s))
+    n, t = len(values) - order, t_s / _usual_step(t_s)
     total, gain = np.zeros(n), np.zeros(n)
     for i in range(order + 1):
         product = np.ones(n)
@@ -177,6 +179,12 @@ def _divided(t_s: FloatArray, values: FloatArray, order: int) -> FloatArray:
         total += weight * values[i : i + n]
         gain += weight**2
     return np.divide(total, np.sqrt(gain), out=np.zeros(n), where=gain > 0)
+
+
+def _usual_step(t_s: FloatArray) -> float:
+    """Median step that is one: half of the values of a batch may share one stamp."""
+    steps = np.diff(t_s)
+    return float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
 
 
 def _settled(floors: list[_Floor]) -> tuple[float, float, int]:
@@ -191,3 +199,8 @@ def _settled(floors: list[_Floor]) -> tuple[float, float, int]:
             break
     fall = 1.0 - lowest.sd / f.sd if f.sd > 0 else 0.0
     return f.sd, float(np.hypot(f.relative_sd, fall)), f.samples
+
+
+def _chi2(share: float, dof: float) -> float:
+    """The quantile of chi2; `scipy.stats` takes half a second to import."""
+    return 2.0 * float(gammaincinv(0.5 * dof, share))

@@ -23,7 +23,8 @@ import numpy as np
 from scipy.linalg import cho_solve, cholesky, solve_triangular
 from scipy.optimize import OptimizeResult, minimize
 
-from rtid.model import Edge, FloatArray
+from rtid.model import Edge
+from rtid.plain import FloatArray
 
 REACH_LOG_DP = 1.0  # e fades by 1/e over this change of log |dp| ...
 REACH_W = 0.2  # ... and over this share of the command's range
@@ -51,7 +52,7 @@ class GainData:
 
 
 @dataclass(frozen=True)
-class Points:
+class KernelPoints:
     """Arguments of the kernel, arrays of one shape, dimensionless; size: that of e."""
 
     opening: FloatArray
@@ -59,20 +60,20 @@ class Points:
     size: FloatArray
     laminar: FloatArray
 
-    def rows(self) -> Points:
+    def rows(self) -> KernelPoints:
         """The same points with a new last axis."""
-        return Points(*(a[..., None] for a in self._arrays()))
+        return KernelPoints(*(a[..., None] for a in self._arrays()))
 
-    def columns(self) -> Points:
+    def columns(self) -> KernelPoints:
         """The same points with a new last axis but one."""
-        return Points(*(a[..., None, :] for a in self._arrays()))
+        return KernelPoints(*(a[..., None, :] for a in self._arrays()))
 
     def _arrays(self) -> tuple[FloatArray, ...]:
         return self.opening, self.log_dp, self.size, self.laminar
 
 
 @dataclass(frozen=True)
-class Scale:
+class RatedScale:
     """The edge's rated size: foot of the range, its length, gain there; mean and least |dp|."""
 
     foot_v: float
@@ -81,12 +82,12 @@ class Scale:
     dp_pa: float
     least_dp_pa: float
 
-    def points(self, w_v: FloatArray, dp_pa: FloatArray, size: FloatArray) -> Points:
-        """Kernel arguments of physical points; size in units of the rated gain."""
+    def points(self, w_v: FloatArray, dp_pa: FloatArray, size: FloatArray) -> KernelPoints:
+        """Kernel arguments of physical points (n,); size (n,) in units of the rated gain."""
         opening = np.maximum((w_v - self.foot_v) / self.range_v, 0.0)
         log_dp = np.log((np.abs(dp_pa) + self.least_dp_pa) / self.dp_pa)
         ratio = LAMINAR_DP_PA / (np.abs(dp_pa) + self.least_dp_pa)
-        return Points(opening, log_dp, size, 1.0 - (1.0 + ratio**2) ** -0.25)
+        return KernelPoints(opening, log_dp, size, 1.0 - (1.0 + ratio**2) ** -0.25)
 
 
 @dataclass(frozen=True)
@@ -96,11 +97,11 @@ class OrificeLaw:
     strength: variance rate of K'', standard deviations of h' and of e / K, and delta.
     """
 
-    scale: Scale
+    scale: RatedScale
     strength: Strength
     sizes: FloatArray  # size of e at `knots` of the opening
     knots: FloatArray
-    points: Points
+    points: KernelPoints
     alpha: FloatArray
     lower: FloatArray
 
@@ -112,18 +113,20 @@ class OrificeLaw:
         cross = self._kernel(flat, self.points)
         solved = solve_triangular(self.lower, cross.reshape(w_v.size, -1).T, lower=True)
         half = np.asarray(solved).T.reshape(cross.shape)
-        own = self._kernel(flat, points.columns())
+        gains = self._kernel(flat, points.columns())
         mean = opening + cross @ self.alpha
         unit = self.scale.gain * np.exp(self.strength[3] * points.log_dp)
-        cov = own - half @ half.transpose(0, 2, 1)
+        cov = gains - half @ half.transpose(0, 2, 1)
         return mean * unit, cov * unit[:, :, None] * unit[:, None, :]
 
-    def _kernel(self, a: Points, b: Points) -> FloatArray:
+    def _kernel(self, a: KernelPoints, b: KernelPoints) -> FloatArray:
         return kernel(a, b, *self.strength[:3])
 
 
-def kernel(a: Points, b: Points, rough: float, exponent: float, deviation: float) -> FloatArray:
-    """Covariance of Q / s(dp) between points, broadcast; in squares of the rated gain."""
+def kernel(
+    a: KernelPoints, b: KernelPoints, rough: float, exponent: float, deviation: float
+) -> FloatArray:
+    """Covariance (...) of Q / s(dp) between broadcast points; in squares of the rated gain."""
     low, high = np.minimum(a.opening, b.opening), np.maximum(a.opening, b.opening)
     both = np.abs(a.log_dp), np.abs(b.log_dp)
     smooth = SLOPE_SD**2 * low * high + rough * wiener(low, high)
@@ -152,7 +155,7 @@ def _descend(
 
 
 def wiener(low: FloatArray, high: FloatArray) -> FloatArray:
-    """Covariance of a once integrated Wiener process between 0 <= low <= high."""
+    """Covariance of an integrated Wiener process at 0 <= low <= high (...), dimensionless."""
     return np.asarray(low**2 * (3.0 * high - low) / 6.0)
 
 
@@ -179,18 +182,18 @@ def fit_law(edge: Edge, data: GainData) -> OrificeLaw:
     return _condition(scale, data, knots, sizes, _strength(best))
 
 
-def scale_of(edge: Edge, data: GainData) -> Scale:
+def scale_of(edge: Edge, data: GainData) -> RatedScale:
     """Rated size of an edge, and where its data lie."""
     u, dp = edge.grid.u_v, edge.grid.dp_pa
     foot = edge.safe_band_v if np.isfinite(edge.safe_band_v) else u[0]
     gain = edge.rated_q_m3s / np.sqrt(edge.rated_dp_pa)
     least = float(0.01 * np.diff(dp).min())
     usual = np.median(np.abs(data.dp_pa)) if len(data.dp_pa) else edge.rated_dp_pa
-    return Scale(float(foot), float(u[-1] - foot), float(gain), float(usual), least)
+    return RatedScale(float(foot), float(u[-1] - foot), float(gain), float(usual), least)
 
 
 def root(dp_pa: FloatArray) -> FloatArray:
-    """s(dp) = sign(dp) sqrt |dp|."""
+    """s(dp) = sign(dp) sqrt |dp|, (...) in sqrt(Pa)."""
     return np.asarray(np.sign(dp_pa) * np.sqrt(np.abs(dp_pa)))
 
 
@@ -200,7 +203,7 @@ def _strength(x: FloatArray) -> Strength:
 
 
 def _condition(
-    scale: Scale,
+    scale: RatedScale,
     data: GainData,
     knots: FloatArray,
     sizes: FloatArray,

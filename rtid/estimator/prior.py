@@ -29,7 +29,8 @@ from rtid.estimator.cells import mean, projection, quadrature, terms
 from rtid.estimator.flowmap import EXTRAPOLATED, PRIOR, VALID, EdgeMap, FlowMap
 from rtid.estimator.orifice import LEAST_SIZE, REACH_LOG_DP, REACH_W, root
 from rtid.kernels.layout import TERMS
-from rtid.model import Edge, FloatArray, Model
+from rtid.model import Edge, Machine
+from rtid.plain import FloatArray
 
 SHARE = 0.1  # relative standard deviation of a prior's flows
 FEWEST = 3  # blocks that tell how well a prior fits
@@ -44,8 +45,8 @@ class Prior:
     share: float = SHARE
 
 
-def reference_map(model: Model, theta_cells: FloatArray) -> FlowMap:
-    """A data sheet as a prior: terms (cells, 6) of all edges, NaN where the sheet has nothing."""
+def reference_map(model: Machine, theta_cells: FloatArray) -> FlowMap:
+    """A data sheet as a prior: terms (cells, 6) of all edges, m3/s; NaN where it has nothing."""
     edges, first = [], 0
     for edge in model.edges:
         nu, nd = edge.grid.shape
@@ -69,7 +70,7 @@ def add_prior(
 
     A cell without data is PRIOR where the prior is surer of its mean flow than the law, else
     EXTRAPOLATED.  Cells that the prior does not cover stay as they are.  known: the blocks that the
-    prior is held against.
+    prior is held against; theta (nu, nd, 6) m3/s, cov (nu, nd, 6, 6), status (nu, nd).
     """
     every, spread = prior_terms(edge, prior, share, known)
     open_ = np.isfinite(every).all(axis=2) & (status != VALID)
@@ -89,30 +90,33 @@ def add_prior(
 def prior_terms(
     edge: Edge, prior: EdgeMap, share: float, known: Sequence[Block] = ()
 ) -> tuple[FloatArray, FloatArray]:
-    """Taylor terms (nu, nd, 6) and covariance of the prior on the edge's grid; NaN off its own."""
+    """Taylor terms (nu, nd, 6), m3/s, and covariance (nu, nd, 6, 6), m6/s2, of the prior.
+
+    On the edge's grid; NaN off its own.
+    """
     points = [quadrature(edge.grid, i) for i in range(edge.grid.shape[0])]
     q = np.stack([prior.flow(w, dp) for w, dp in points])
     theta = q @ projection().T
     share = max(share, seen_share(theta, known))
-    cov = np.stack([_cov(edge, share, w, dp, own, prior.sd(w, dp))
-                    for own, (w, dp) in zip(q, points, strict=True)])  # fmt: skip
+    cov = np.stack([_cov(edge, share, w, dp, q_block, prior.sd(w, dp))
+                    for q_block, (w, dp) in zip(q, points, strict=True)])  # fmt: skip
     cov[..., 0, 0] += np.mean((q - theta @ terms().T) ** 2, axis=-1)  # beyond six terms
     return theta, cov
 
 
 def _cov(
-    edge: Edge, share: float, w: FloatArray, dp: FloatArray, q: FloatArray, own: FloatArray
+    edge: Edge, share: float, w: FloatArray, dp: FloatArray, q: FloatArray, q_block: FloatArray
 ) -> FloatArray:
-    """Covariance (nd, 6, 6) of the terms of one column of cells; q, own (nd, 16) at its points."""
+    """Covariance (nd, 6, 6) of a column of cells' terms; q, q_block (nd, 16) at its points."""
     least = LEAST_SIZE * edge.rated_q_m3s * np.abs(root(dp / edge.rated_dp_pa))
     sd = np.hypot(share * q, least)
     spread = sd[:, :, None] * _alike(edge, w, dp) * sd[:, None, :]
-    spread += own[:, :, None] * own[:, None, :]
+    spread += q_block[:, :, None] * q_block[:, None, :]
     return np.asarray(projection() @ spread @ projection().T)
 
 
 def seen_share(theta: FloatArray, known: Sequence[Block]) -> float:
-    """Rms miss of the prior's terms (nu, nd, 6) in the blocks' mean flows, of the rms flow.
+    """Rms miss of the prior's terms (nu, nd, 6), m3/s, in the blocks' mean flows, of the rms flow.
 
     0 where the prior covers fewer than three blocks.
     """

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rtid.model import FloatArray
+from rtid.plain import FloatArray
 
 MAX_STEPS = 5
 LONGEST_STEP = 3.0  # probes
@@ -36,7 +36,7 @@ def profile(
     least: FloatArray,
     stages: tuple[float, ...] = (1.0,),
 ) -> Profile:
-    """Minimise chi2 + prior from `nominal`; all arguments (n,).
+    """Minimise chi2 + prior from `nominal`; all arguments (n,), SI (lag and offsets: s).
 
     tolerance: 0 holds a parameter at its nominal value; probe: distance of the finite differences,
     of the order of what chi2 can resolve but above its roughness; least: lower bound; stages:

@@ -22,7 +22,7 @@ import numpy as np
 
 from rtid.errors import RtidError
 from rtid.estimator.windows import overlaps, profile
-from rtid.model import FloatArray
+from rtid.plain import FloatArray
 
 Function = Callable[[FloatArray], FloatArray]
 Function2 = Callable[[FloatArray, FloatArray], FloatArray]
@@ -53,7 +53,7 @@ def minus(f: Function, a: float = 0.0, eta: float = 1.0) -> Function:
 
 
 def piece(f: Function, border: FloatArray, i: int, eta: FloatArray | None = None) -> Function:
-    """P_i f of block i; border (n + 1,), eta (n + 1,) half overlaps, by default `overlaps`.
+    """P_i f of block i; border (n + 1,), eta (n + 1,) half overlaps in units of t, or `overlaps`.
 
     Raises OverlapError where two overlaps meet within a block.
     """
@@ -69,7 +69,7 @@ def piece_2d(
     block: tuple[int, int],
     etas: tuple[FloatArray | None, FloatArray | None] = (None, None),
 ) -> Function2:
-    """Tensor product of the projectors along both arguments, for block (i, j) of a grid."""
+    """Tensor product of the projectors for block (i, j); borders (n + 1,) in units of x, y."""
 
     def along_second(x: FloatArray, y: FloatArray) -> FloatArray:
         return piece(lambda t: f(x, t), borders[1], block[1], etas[1])(y)
@@ -82,7 +82,7 @@ def piece_2d(
 
 
 def plus_samples(values: FloatArray, t: FloatArray, a: float = 0.0, eta: float = 1.0) -> FloatArray:
-    """P+ along the last axis of values (..., n) at t (n,), which lie symmetrically around a.
+    """P+ along the last axis of values (..., n), any unit, at t (n,) symmetrical around a.
 
     Raises OverlapError where the samples within [a - eta, a + eta] have no mirror images.
     """
@@ -93,7 +93,7 @@ def plus_samples(values: FloatArray, t: FloatArray, a: float = 0.0, eta: float =
 def minus_samples(
     values: FloatArray, t: FloatArray, a: float = 0.0, eta: float = 1.0
 ) -> FloatArray:
-    """P- along the last axis of values (..., n), as `plus_samples`."""
+    """P- along the last axis of values (..., n), any unit, as `plus_samples`."""
     s, mirrored = _mirror_samples(values, t, a, eta)
     return np.asarray(profile(-s) * (profile(-s) * values - profile(s) * mirrored))
 
@@ -101,7 +101,7 @@ def minus_samples(
 def pieces_samples(
     values: FloatArray, t: FloatArray, border: FloatArray, eta: FloatArray | None = None
 ) -> FloatArray:
-    """All pieces (blocks, ..., n) of values (..., n); they sum to values within the borders."""
+    """All pieces (blocks, ..., n) of values (..., n), in their unit; they sum to them inside."""
     eta = _half_overlaps(border, eta)
     pieces, rest = [], np.where((t >= border[0]) & (t <= border[-1]), values, 0.0)
     for k in range(1, len(border) - 1):
@@ -120,7 +120,7 @@ def pieces_samples_2d(
 
 
 def window(border: FloatArray, i: int, t: FloatArray, eta: FloatArray | None = None) -> FloatArray:
-    """g_i(t) of block i; the squares of all windows sum to 1 within the borders."""
+    """g_i(t) of block i, t (...), dimensionless; the squares of all sum to 1 inside."""
     eta, n = _half_overlaps(border, eta), len(border) - 1
     left = profile((t - border[i]) / eta[i]) if i > 0 else 1.0
     right = profile((border[i + 1] - t) / eta[i + 1]) if i < n - 1 else 1.0
@@ -128,7 +128,7 @@ def window(border: FloatArray, i: int, t: FloatArray, eta: FloatArray | None = N
 
 
 def cosine(border: FloatArray, i: int, k: int, t: FloatArray) -> FloatArray:
-    """The k-th cosine of block i without its window, orthonormal over [b_i, b_i+1]."""
+    """The k-th cosine of block i without its window at t (...), of unit norm over [b_i, b_i+1]."""
     width = border[i + 1] - border[i]
     last = i == len(border) - 2
     scale = np.sqrt((1.0 if last and k == 0 else 2.0) / width)
@@ -142,13 +142,13 @@ def local_cosine(
 ) -> FloatArray:
     """g_i(t) sqrt(2 / width) cos(pi (k + 1/2) (t - b_i) / width), orthonormal for all i and k.
 
-    The last block has cos(pi k ...) instead, see above.
+    The last block has cos(pi k ...) instead, see above.  t (...) in the unit of border (n + 1,).
     """
     return window(border, i, t, eta) * cosine(border, i, k, t)
 
 
 def folded(f: Function, border: FloatArray, i: int, eta: FloatArray | None = None) -> Function:
-    """f folded into block i: what its cosines see, <f, local cosine k> = <folded f, cosine k>."""
+    """f folded into block i of border (n + 1,), in f's unit: what the block's cosines see of it."""
     inside = piece(f, border, i, eta)
 
     def part(t: FloatArray) -> FloatArray:
@@ -158,7 +158,7 @@ def folded(f: Function, border: FloatArray, i: int, eta: FloatArray | None = Non
 
 
 def unfolded(h: Function, border: FloatArray, i: int, eta: FloatArray | None = None) -> Function:
-    """The piece whose folding is h, given on [b_i, b_i+1]: even about b_i, odd about b_i+1."""
+    """The piece, in h's unit, whose folding is h on [b_i, b_i+1] of border (n + 1,)."""
 
     def part(t: FloatArray) -> FloatArray:
         low, high = border[i], border[i + 1]
@@ -172,7 +172,7 @@ def unfolded(h: Function, border: FloatArray, i: int, eta: FloatArray | None = N
 def coefficients(
     f: Function, border: FloatArray, i: int, count: int, eta: FloatArray | None = None
 ) -> FloatArray:
-    """<f, local cosine k> (count,) of block i, by Gauss quadrature of the folded function."""
+    """<f, local cosine k> (count,) of block i, in units of f, by Gauss quadrature."""
     low, high, reach = border[i], border[i + 1], _half_overlaps(border, eta)
     cuts = np.unique(np.clip([low, low + reach[i], high - reach[i + 1], high], low, high))
     nodes, weights = np.polynomial.legendre.leggauss(count + 40)

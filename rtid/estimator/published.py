@@ -15,8 +15,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rtid.errors import door
 from rtid.estimator.blocks import VALID as BLOCK_VALID
 from rtid.estimator.blocks import Block
 from rtid.estimator.cells import mean_square, projection, quadrature, terms
@@ -27,12 +27,16 @@ from rtid.estimator.orifice import GainData, OrificeLaw, fit_law, root
 from rtid.estimator.prior import SHARE as PRIOR_SHARE
 from rtid.estimator.prior import add_prior
 from rtid.estimator.solution import Solution
+from rtid.estimator.state import MASKS
 from rtid.kernels.layout import TERMS
-from rtid.model import Edge, FloatArray, Grid
+from rtid.model import COMMAND_ONLY, Edge, Grid
+from rtid.plain import BoolArray, FloatArray
 
+SHAPE = np.arange(1, TERMS)  # all terms but the constant
 COLUMN_PRIOR = 0.05  # share of the rise of K over a column by which its shape may differ
 
 
+@door
 def publish(
     solution: Solution, prior: FlowMap | None = None, prior_sd: float = PRIOR_SHARE
 ) -> FlowMap:
@@ -47,11 +51,16 @@ def publish(
     return FlowMap(
         tuple(
             _publish_edge(e, b, before.get(e.name), prior_sd)
-            if e.source or e.sink
+            if (e.source or e.sink) and not _over_command_alone(e)
             else _without_pressures(e, b)
             for e, b in zip(edges, of, strict=True)
         )
     )
+
+
+def _over_command_alone(edge: Edge) -> bool:
+    """Declared as Q(u): one interval of dp, and no term in it, so that the law says nothing."""
+    return edge.terms == COMMAND_ONLY and edge.grid.shape[1] == 1
 
 
 def _without_pressures(edge: Edge, blocks: list[Block]) -> EdgeMap:
@@ -63,10 +72,18 @@ def _without_pressures(edge: Edge, blocks: list[Block]) -> EdgeMap:
     )
     cov, status = cov.copy(), np.full(shape, PRIOR, dtype="<U12")
     for b in blocks:
-        theta[b.i, b.j], cov[b.i, b.j] = b.theta, b.cov
+        theta[b.i, b.j], cov[b.i, b.j] = b.theta, _declared(edge, b.cov)
         status[b.i, b.j] = VALID if b.status == BLOCK_VALID else LEARNING
+    shut = edge.grid.u_v[1:] <= edge.safe_band_v
+    theta[shut], cov[shut], status[shut] = 0.0, 0.0, SHUT
     reason = {(b.i, b.j): b.reason for b in blocks if b.reason}
     return EdgeMap(edge.name, edge.grid, edge.safe_band_v, theta, cov, status, reason)
+
+
+def _declared(edge: Edge, cov: FloatArray) -> FloatArray:
+    """A covariance (6, 6) in which the terms that the map is declared not to have are zero."""
+    has = MASKS[edge.terms]
+    return np.asarray(cov * np.outer(has, has))
 
 
 def _publish_edge(
@@ -125,7 +142,7 @@ def mean_root(grid: Grid, block: Block) -> float:
 
 
 def extrapolated(grid: Grid, law: OrificeLaw) -> tuple[FloatArray, FloatArray]:
-    """The law's Taylor terms of every cell, theta (nu, nd, 6) and cov (nu, nd, 6, 6)."""
+    """The law's Taylor terms of every cell, theta (nu, nd, 6), m3/s, and cov (nu, nd, 6, 6)."""
     nu, nd = grid.shape
     theta, cov = np.empty((nu, nd, TERMS)), np.empty((nu, nd, TERMS, TERMS))
     project, phi = projection(), terms()
@@ -137,7 +154,11 @@ def extrapolated(grid: Grid, law: OrificeLaw) -> tuple[FloatArray, FloatArray]:
         theta[i] = q @ project.T
         cov[i] = project @ (s[:, :, None] * spread * s[:, None, :]) @ project.T
         rest = q - theta[i] @ phi.T  # what six terms cannot follow
-        cov[i, :, 0, 0] += np.mean(rest**2, axis=1)
+        missed = np.mean(rest**2, axis=1)
+        cov[i, :, 0, 0] += missed
+        # Over a cell astride dp = 0 the law is odd: it would know the even terms without any error.
+        astride = np.flatnonzero((dp.min(axis=1) < 0) & (dp.max(axis=1) > 0))
+        cov[i, astride[:, None], SHAPE, SHAPE] += missed[astride, None]
     return theta, cov
 
 
@@ -147,8 +168,8 @@ def refine_columns(
     """Give each cell what the other visited cells of its column say about K(w) within it.
 
     The law is smooth; where the dead band ends K(w) is not.  Per column K gets a correction
-    c0 + c1 xi + c2 xi^2 from its blocks' terms, with a share of K's rise as prior.  theta and cov
-    are changed in place.
+    c0 + c1 xi + c2 xi^2 from its blocks' terms, with a share of K's rise as prior.  theta
+    (nu, nd, 6), m3/s, and cov (nu, nd, 6, 6) are changed in place.
     """
     for i in sorted({b.i for b in blocks}):
         _, dp = quadrature(grid, i)
@@ -167,7 +188,7 @@ def refine_columns(
 
 
 def cell_terms(grid: Grid, flow: Callable[[FloatArray, FloatArray], FloatArray]) -> FloatArray:
-    """Taylor terms (nu * nd, 6) of a known flow in every cell, by least squares over the cell."""
+    """Taylor terms (nu * nd, 6), m3/s, of a known flow in every cell, by least squares over it."""
     points = [quadrature(grid, i) for i in range(grid.shape[0])]
     return np.concatenate([flow(w, dp) @ projection().T for w, dp in points])
 
@@ -178,16 +199,16 @@ def combined(
     """Law (m, S) and block as two Gaussians; counted: the law contains the block's mean flow."""
     scale = np.sqrt(np.diag(S))
     law = np.linalg.inv(S / np.outer(scale, scale) + 1e-9 * np.eye(TERMS)) / np.outer(scale, scale)
-    own, phi = np.linalg.inv(block.cov), block.mean_phi
+    information, phi = np.linalg.inv(block.cov), block.mean_phi
     if counted:
-        own = own - np.outer(phi, phi) / block.mean_sd_m3s**2
-    total = (law + own) * np.outer(scale, scale)
+        information = information - np.outer(phi, phi) / block.mean_sd_m3s**2
+    total = (law + information) * np.outer(scale, scale)
     cov = np.linalg.inv(0.5 * (total + total.T)) * np.outer(scale, scale)
-    return cov @ (law @ m + own @ block.theta), cov
+    return cov @ (law @ m + information @ block.theta), cov
 
 
-def misfit(theta: FloatArray, cov: FloatArray, visited: NDArray[np.bool_]) -> FloatArray:
-    """Variance (nu, nd) of each visited cell's own misfit, from the steps at its borders.
+def misfit(theta: FloatArray, cov: FloatArray, visited: BoolArray) -> FloatArray:
+    """Variance (nu, nd), m6/s2, of each visited cell's own misfit, from steps at its borders.
 
     Six terms miss a cubic flow by opposite amounts at the two ends of a block, so that half of the
     step to a neighbour beyond what noise explains is the misfit of either.

@@ -13,15 +13,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rtid.errors import ArgumentError, door
 from rtid.estimator.correction import correct
 from rtid.estimator.factor import factorize, one_thread
 from rtid.estimator.misfit import can_be_explained, count_misfit
 from rtid.estimator.missed import weighed
 from rtid.estimator.profile import Profile, profile
 from rtid.estimator.solution import Sketch, Solution, sketch, solve
-from rtid.estimator.state import State, Weights, build, nominal_weights
+from rtid.estimator.state import State, Weights, build, nominal_weights, tell_unmarked
 from rtid.estimator.sums import Sums
-from rtid.model import Edge, FloatArray, Model
+from rtid.model import Edge, Machine
+from rtid.plain import FloatArray
 
 LAG_PROBE = 0.1  # of the lag, plus 0.05 ms: distance of the finite differences
 OFFSET_PROBE = 0.1  # of an offset's tolerance
@@ -39,7 +41,6 @@ class RecordFit:
     """
 
     solution: Solution
-    state: State
     weights: Weights
     lag_sd_s: float
     offsets_s: FloatArray
@@ -51,8 +52,9 @@ class RecordFit:
         return self.weights.lag_s
 
 
+@door
 def fit_record(
-    model: Model,
+    model: Machine,
     chunk: FloatArray,
     assemble: Assemble | None = None,
     offset_tolerance_s: FloatArray | None = None,
@@ -64,6 +66,10 @@ def fit_record(
     in seconds, which are then estimated within offset_tolerance_s (m,).  estimate_lag = False keeps
     the declared lag: to first order it is the same as an offset of the command's message.
     """
+    if chunk.shape[1:] != (2 + len(model.signals),):
+        wanted = f"(n, {2 + len(model.signals)}) = [t_s, flags, one column per signal]"
+        raise ArgumentError(f"fit_record: chunk must have the shape {wanted}, not {chunk.shape}")
+    tell_unmarked(chunk[:, 1])
     if not estimate_lag:
         model = replace(model, lag=replace(model.lag, tolerance_s=0.0))
     tolerance = np.zeros(0) if offset_tolerance_s is None else offset_tolerance_s
@@ -71,9 +77,9 @@ def fit_record(
     weights = _excused(model, chunk, refined(model, first, model.lag.nominal_s))
     lag_sd_s, offsets, offsets_sd = 0.0, np.zeros(len(tolerance)), np.zeros(len(tolerance))
     if model.lag.tolerance_s > 0 or len(tolerance):
-        found = _nuisance(model, assemble or (lambda _: chunk), weights, first.leverage, tolerance)
-        lag_sd_s, offsets, offsets_sd = float(found.sd[0]), found.value[1:], found.sd[1:]
-        weights = replace(weights, lag_s=float(found.value[0]))
+        result = _nuisance(model, assemble or (lambda _: chunk), weights, first.leverage, tolerance)
+        lag_sd_s, offsets, offsets_sd = float(result.sd[0]), result.value[1:], result.sd[1:]
+        weights = replace(weights, lag_s=float(result.value[0]))
         chunk = assemble(offsets) if assemble else chunk
         if len(tolerance):  # the first weights came from shifted signals
             weights = refined(model, sketch(model, run(model, chunk, weights)), weights.lag_s)
@@ -81,10 +87,10 @@ def fit_record(
     state = run(model, chunk, weights)
     solution = solve(model, state, counters=state.counters)
     solution = count_misfit(model, chunk, weights, solution)
-    return RecordFit(solution, state, weights, lag_sd_s, offsets, offsets_sd)
+    return RecordFit(solution, weights, lag_sd_s, offsets, offsets_sd)
 
 
-def _excused(model: Model, chunk: FloatArray, weights: Weights) -> Weights:
+def _excused(model: Machine, chunk: FloatArray, weights: Weights) -> Weights:
     """The weights with those blocks excused whose terms miss the flow (`missed`)."""
     if not can_be_explained(chunk):
         return weights
@@ -92,7 +98,7 @@ def _excused(model: Model, chunk: FloatArray, weights: Weights) -> Weights:
 
 
 def _nuisance(
-    model: Model,
+    model: Machine,
     assemble: Assemble,
     weights: Weights,
     leverage: FloatArray,
@@ -114,26 +120,26 @@ def _nuisance(
     )
 
 
-def run(model: Model, chunk: FloatArray, weights: Weights | None = None) -> State:
-    """State after one pass over the record."""
+def run(model: Machine, chunk: FloatArray, weights: Weights | None = None) -> State:
+    """State after one pass over the record, chunk (n, 2 + signals), SI."""
     state = build(model, weights)
     state.advance(chunk)
     return state
 
 
-def refined(model: Model, found: Sketch, lag_s: float) -> Weights:
+def refined(model: Machine, sketched: Sketch, lag_s: float) -> Weights:
     """Weights from a first estimate: the orifice slope Q / (2 dp) at each block's mean flow.
 
     A compliance outside its declared bounds tells that the motion did not show it.
     """
     slopes = nominal_weights(model).slopes.copy()
     span = np.concatenate([_span(edge) for edge in model.edges])
-    known = np.isfinite(found.flow_m3s)
-    cells = found.cells[known]
-    slopes[cells] = np.maximum(found.flow_m3s[known], 0.0) / span[cells]
+    known = np.isfinite(sketched.flow_m3s)
+    cells = sketched.cells[known]
+    slopes[cells] = np.maximum(sketched.flow_m3s[known], 0.0) / span[cells]
     low, high = 1 / model.beta_bounds_pa[1], 1 / model.beta_bounds_pa[0]
-    possible = (found.compliance >= low) & (found.compliance <= high)
-    compliance = np.where(possible, found.compliance, 1 / model.beta_nominal_pa)
+    possible = (sketched.compliance >= low) & (sketched.compliance <= high)
+    compliance = np.where(possible, sketched.compliance, 1 / model.beta_nominal_pa)
     return Weights(slopes, compliance, lag_s)
 
 
@@ -143,10 +149,13 @@ def _span(edge: Edge) -> FloatArray:
     return np.tile(np.maximum(np.abs(dp[1:] + dp[:-1]), np.diff(dp)), edge.grid.shape[0])
 
 
-def excess(model: Model, chunk: FloatArray, weights: Weights, leverage: FloatArray) -> float:
-    """Cost of the best linear fit minus its number of rows: comparable between nuisance values."""
+def excess(model: Machine, chunk: FloatArray, weights: Weights, leverage: FloatArray) -> float:
+    """Cost of the best linear fit minus its number of rows: comparable between nuisance values.
+
+    chunk (n, 2 + signals), SI; leverage (chambers,): shares, as in `correct`.
+    """
     sums = Sums.of(run(model, chunk, weights))
     normal = sums.normal()
     with one_thread():
-        found = correct(normal, factorize(normal, sums.n_shared), leverage)
-    return found.cost - normal.rows * len(model.chambers)
+        corrected = correct(normal, factorize(normal, sums.n_shared), leverage)
+    return corrected.cost - normal.rows * len(model.chambers)

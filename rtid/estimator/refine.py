@@ -11,10 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rtid.estimator.misfit import Residual, residual_of
+from rtid.estimator.misfit import Misfit, residual_of
 from rtid.estimator.record import RecordFit, fit_record
 from rtid.estimator.solution import Solution
-from rtid.model import Edge, FloatArray, Grid, Model
+from rtid.model import Edge, Grid, Machine
+from rtid.plain import FloatArray
 
 ROUNDS = 4
 AT_ONCE = 2  # intervals halved per axis and edge in one round
@@ -30,49 +31,49 @@ class Excess:
     beyond: FloatArray
 
 
-def refine(model: Model, chunk: FloatArray, rounds: int = ROUNDS) -> tuple[Model, RecordFit]:
-    """Fit a record, chunk (n, 2 + signals), with the grid as fine as it needs; model and fit."""
+def refine(model: Machine, chunk: FloatArray, rounds: int = ROUNDS) -> tuple[Machine, RecordFit]:
+    """Fit a record, chunk (n, 2 + signals), SI, its grid as fine as it needs; model and fit."""
     fit = fit_record(model, chunk)
-    left = _left(model, chunk, fit)
+    misfit = _left(model, chunk, fit)
     for _ in range(rounds):
-        found = excesses(model, left)
-        edges = tuple(_halved(e, x) for e, x in zip(model.edges, found, strict=True))
+        result = excesses(model, misfit)
+        edges = tuple(_halved(e, x) for e, x in zip(model.edges, result, strict=True))
         finer = replace(model, edges=edges)
         if finer.n_cells == model.n_cells:
             break
         trial = fit_record(finer, chunk)
         left_then = _left(finer, chunk, trial)
-        if criterion(left_then, trial.solution) >= criterion(left, fit.solution):
+        if criterion(left_then, trial.solution) >= criterion(misfit, fit.solution):
             break
-        model, fit, left = finer, trial, left_then
+        model, fit, misfit = finer, trial, left_then
     return model, fit
 
 
-def _left(model: Model, chunk: FloatArray, fit: RecordFit) -> Residual:
+def _left(model: Machine, chunk: FloatArray, fit: RecordFit) -> Misfit:
     """What a fit leaves, in units of the noise alone: excuses would hide a misfit."""
     plain = replace(fit.weights, missed=np.zeros(len(fit.weights.missed)))
     return residual_of(model, chunk, plain, fit.solution)
 
 
-def criterion(left: Residual, solution: Solution) -> float:
+def criterion(misfit: Misfit, solution: Solution) -> float:
     """Schwarz's criterion: squared innovations and what the unknowns cost."""
-    known, rows = len(solution.unknowns), int(np.isfinite(left.innovation).sum())
-    return float(np.nansum(left.innovation**2) + known * np.log(max(rows, 1)))
+    known, rows = len(solution.unknowns), int(np.isfinite(misfit.innovation).sum())
+    return float(np.nansum(misfit.innovation**2) + known * np.log(max(rows, 1)))
 
 
-def excesses(model: Model, left: Residual) -> list[Excess]:
+def excesses(model: Machine, misfit: Misfit) -> list[Excess]:
     """Where the innovations of a fit exceed the noise, per edge."""
-    square = (left.innovation**2).mean(axis=1) - 1.0
+    square = (misfit.innovation**2).mean(axis=1) - 1.0
     known = np.isfinite(square)
-    found = []
+    result = []
     for i, (edge, first) in enumerate(zip(model.edges, model.first_cells, strict=True)):
         size = edge.grid.shape[0] * edge.grid.shape[1]
-        own = left.cells[known, i] - first
-        here = (own >= 0) & (own < size)
-        rows = np.bincount(own[here], minlength=size).astype(np.float64)
-        total = np.bincount(own[here], square[known][here], size).astype(np.float64)
-        found.append(Excess(rows.reshape(edge.grid.shape), total.reshape(edge.grid.shape)))
-    return found
+        place = misfit.cells[known, i] - first
+        here = (place >= 0) & (place < size)
+        rows = np.bincount(place[here], minlength=size).astype(np.float64)
+        total = np.bincount(place[here], square[known][here], size).astype(np.float64)
+        result.append(Excess(rows.reshape(edge.grid.shape), total.reshape(edge.grid.shape)))
+    return result
 
 
 def _halved(edge: Edge, excess: Excess) -> Edge:

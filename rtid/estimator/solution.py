@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rtid.estimator.blocks import Block, mean_flows, read_blocks
 from rtid.estimator.correction import correct, leverage_of
@@ -14,7 +13,8 @@ from rtid.estimator.state import State
 from rtid.estimator.sums import Sums, sums_of
 from rtid.estimator.windowed import overlaps, to_taylor
 from rtid.kernels.layout import TERMS
-from rtid.model import FloatArray, Model
+from rtid.model import Machine
+from rtid.plain import FloatArray, IntArray
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Solution:
     terms (terms,) and terms_cov: coefficients of the model's shared terms.
     """
 
-    model: Model
+    model: Machine
     compliance: FloatArray
     compliance_cov: FloatArray
     blocks: tuple[Block, ...]
@@ -40,7 +40,7 @@ class Solution:
     basis: FloatArray
     influence: FloatArray
     unknowns: FloatArray
-    cells: NDArray[np.int64]
+    cells: IntArray
     cell_cov: FloatArray
     scale_pa: FloatArray
     terms: FloatArray
@@ -49,8 +49,9 @@ class Solution:
 
     @property
     def beta_pa(self) -> FloatArray:
-        """Effective bulk modulus per chamber."""
-        return 1.0 / self.compliance
+        """Effective bulk modulus (chambers,) in Pa; infinite where no compliance is seen."""
+        with np.errstate(divide="ignore"):
+            return 1.0 / self.compliance
 
     @property
     def terms_theta(self) -> FloatArray:
@@ -59,8 +60,9 @@ class Solution:
 
     @property
     def beta_sd_pa(self) -> FloatArray:
-        """Its standard deviation."""
-        return np.sqrt(np.diag(self.compliance_cov)) / self.compliance**2
+        """Its standard deviation (chambers,) in Pa."""
+        with np.errstate(divide="ignore"):
+            return np.sqrt(np.diag(self.compliance_cov)) / self.compliance**2
 
     def block(self, edge: int, i: int, j: int) -> Block | None:
         """The block of a cell, None if it was never visited."""
@@ -79,32 +81,33 @@ class Solution:
 class Sketch:
     """First estimate, no variances: compliance (chambers,), flow_m3s (blocks,), NaN: few rows.
 
-    cells (blocks,): the grid cells of the blocks.
+    cells (blocks,): the grid cells of the blocks; unknowns (n,): as of `Solution`.
     """
 
     compliance: FloatArray
     flow_m3s: FloatArray
-    cells: NDArray[np.int64]
+    cells: IntArray
     leverage: FloatArray
+    unknowns: FloatArray
 
 
-def sketch(model: Model, learned: State | Sums) -> Sketch:
+def sketch(model: Machine, learned: State | Sums) -> Sketch:
     """The estimate that weighs the next pass: no covariance, every term taken as learned."""
     sums = sums_of(learned)
     normal, n_c = sums.normal(), len(model.chambers)
     leverage = leverage_of(model, sums, np.ones(len(normal.right)))
     with one_thread():
         factor = factorize(normal, sums.n_shared)
-        theta = correct(normal, factor, leverage).theta
+        unknowns = theta = correct(normal, factor, leverage).theta
         if overlaps(model):
             theta = to_taylor(model, sums, factor.cov(), PRIOR_SD)[0] @ theta
     flow = mean_flows(model, sums, theta)
     flow[sums.blocks["rows"] < model.gates.min_rows] = np.nan
-    return Sketch(theta[:n_c] * sums.compliance, flow, sums.cells, leverage)
+    return Sketch(theta[:n_c] * sums.compliance, flow, sums.cells, leverage, unknowns)
 
 
 def solve(
-    model: Model,
+    model: Machine,
     learned: State | Sums,
     now_s: float = -np.inf,
     counters: dict[str, int] | None = None,
@@ -120,11 +123,11 @@ def solve(
         cov = factor.cov()
         effective = np.einsum("ij,ij->i", cov, normal.gram)
         leverage = leverage_of(model, sums, effective)
-        found = correct(normal, factor, leverage)
-        cov += found.basis @ found.cov_change @ found.basis.T
+        corrected = correct(normal, factor, leverage)
+        cov += corrected.basis @ corrected.cov_change @ corrected.basis.T
     influence, m = cov[:n_c].copy(), len(sums.blocks)
     tiles = cov[ns:, ns:].reshape(m, TERMS, m, TERMS)[np.arange(m), :, np.arange(m)]
-    theta, basis = found.theta, found.basis
+    theta, basis = corrected.theta, corrected.basis
     if overlaps(model):
         change, cov = to_taylor(model, sums, cov, PRIOR_SD)
         theta, basis = change @ theta, change @ basis
@@ -135,12 +138,12 @@ def solve(
         compliance=theta[:n_c] * sums.compliance,
         compliance_cov=cov[:n_c, :n_c] * np.outer(sums.compliance, sums.compliance),
         blocks=tuple(read_blocks(model, sums, theta, cov, normal.gram, now_s)),
-        rho=misfit(normal, found.theta) / dof,
+        rho=misfit(normal, corrected.theta) / dof,
         dof=dof,
         leverage=leverage,
         basis=basis,
         influence=influence,
-        unknowns=found.theta,
+        unknowns=corrected.theta,
         cells=sums.cells,
         cell_cov=tiles.copy(),
         scale_pa=sums.compliance,

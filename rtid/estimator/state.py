@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rtid.estimator.limits import most_open, refuse_unfit
 from rtid.kernels import engine as kernel
-from rtid.kernels import layout, tables
+from rtid.kernels import housekeeping, layout
+from rtid.kernels.engine import ROW_FLAG
 from rtid.kernels.recent import move_pairs
-from rtid.model import BASES, BOTH, COMMAND_ONLY, DROP_ONLY, SHAPES, Edge, FloatArray, Model
+from rtid.model import BASES, BOTH, COMMAND_ONLY, DROP_ONLY, SHAPES, Edge, Machine
+from rtid.plain import FloatArray, IntArray
 
 RecordArray = NDArray[np.void]
 
@@ -24,6 +28,7 @@ MEMORY_S = 2.0
 FLOW_NOISE_FLOOR = 0.01  # least flow noise, share of the variance that the rated slope gives
 FIRST_BLOCKS, FIRST_PAIRS = 64, 1024
 MAX_CLOSED = layout.MAX_RECENT
+MANY = 100  # samples of a run from which on one without a measured position is odd
 
 
 @dataclass
@@ -84,7 +89,7 @@ class State:
 
     def settle(self) -> None:
         """Bring all sums up to date, in place."""
-        while not tables.settle(self.engine, self.closed, self.blocks, self.pairs):
+        while not housekeeping.settle(self.engine, self.closed, self.blocks, self.pairs):
             self.make_room()
 
     def settled(self) -> State:
@@ -95,7 +100,7 @@ class State:
 
     def hold(
         self,
-        cells: NDArray[np.int64],
+        cells: IntArray,
         theta: FloatArray,
         cov: FloatArray,
         compliance: FloatArray,
@@ -115,7 +120,7 @@ class State:
 
     def clear_sums(self) -> None:
         """Empty the sums of a settled state; it goes on with its memory of recent columns."""
-        tables.clear_sums(self.engine, self.blocks, self.pairs)
+        housekeeping.clear_sums(self.engine, self.blocks, self.pairs)
 
     def copy(self) -> State:
         """An independent copy that continues bit for bit like this one."""
@@ -148,14 +153,24 @@ class Weights:
             object.__setattr__(self, "missed", np.zeros(len(self.slopes)))
 
 
-def nominal_weights(model: Model) -> Weights:
+def nominal_weights(model: Machine) -> Weights:
     """Weights from the declared values alone: what a start without data has."""
     compliance = np.full(len(model.chambers), 1.0 / model.beta_nominal_pa)
     slopes = np.concatenate([np.zeros(0), *(_edge_slopes(edge) for edge in model.edges)])
     return Weights(slopes, compliance, model.lag.nominal_s)
 
 
-def build(model: Model, weights: Weights | None = None) -> State:
+def tell_unmarked(flags: NDArray[Any]) -> None:
+    """Warn where none of many samples' flags (n,) has ROW, a share of none: they teach nothing."""
+    if len(flags) < MANY or (flags.astype(np.uint8) & ROW_FLAG).any():
+        return
+    text = f"none of {len(flags)} samples has the flag ROW (firmware_bridge.samples)"
+    warnings.warn(
+        f"{text}: nothing is learned; set it where the position was measured", stacklevel=3
+    )
+
+
+def build(model: Machine, weights: Weights | None = None) -> State:
     """Empty state for a model; nominal weights when none are given.
 
     Raises ValueError for a model that the kernels cannot hold.
@@ -168,7 +183,7 @@ def build(model: Model, weights: Weights | None = None) -> State:
     _configure(engine[0], model)
     engine[0]["compliance"][: len(model.chambers)] = weights.compliance
     engine[0]["lag_s"] = weights.lag_s
-    tables.clear(engine, cells)
+    housekeeping.clear(engine, cells)
     _know_terms(engine[0], model)
     return State(
         engine,
@@ -191,7 +206,7 @@ def _edge_slopes(edge: Edge) -> FloatArray:
     return np.outer(gain, 0.5 / np.sqrt(np.maximum(pressure, floor))).ravel()
 
 
-def _configure(e: np.void, model: Model) -> None:
+def _configure(e: np.void, model: Machine) -> None:
     e["form"] = FORMS[model.form]
     n_chambers = len(model.chambers)
     e["n_chambers"], e["n_edges"] = n_chambers, len(model.edges)
@@ -219,7 +234,7 @@ def _configure(e: np.void, model: Model) -> None:
     e["p_period_s"] = model.pressure_period_s
 
 
-def _configure_edge(e: np.void, model: Model, i: int, edge: Edge, first_cell: int) -> int:
+def _configure_edge(e: np.void, model: Machine, i: int, edge: Edge, first_cell: int) -> int:
     e["source"][i], e["sink"][i] = _column(model, edge.source), _column(model, edge.sink)
     e["command"][i], e["direction"][i] = model.column(edge.command), edge.direction
     e["modes"][i] = sum(1 << m for m in edge.modes) if edge.modes else -1
@@ -236,7 +251,7 @@ def _configure_edge(e: np.void, model: Model, i: int, edge: Edge, first_cell: in
     return first_cell + nu * nd
 
 
-def flow_noise_floor(model: Model) -> FloatArray:
+def flow_noise_floor(model: Machine) -> FloatArray:
     """Least intensity of the flow noise (chambers,), m6/s.
 
     A share of what the rated slope of the noisiest edge gives, and what is declared as disturbance;
@@ -256,7 +271,7 @@ def flow_noise_floor(model: Model) -> FloatArray:
     return least
 
 
-def _configure_terms(e: np.void, model: Model) -> None:
+def _configure_terms(e: np.void, model: Machine) -> None:
     e["n_terms"] = len(model.terms)
     names = [chamber.name for chamber in model.chambers]
     for k, term in enumerate(model.terms):
@@ -271,18 +286,18 @@ def _configure_terms(e: np.void, model: Model) -> None:
             e["term_sign"][k, names.index(name)] = sign
 
 
-def _know_terms(e: np.void, model: Model) -> None:
+def _know_terms(e: np.void, model: Machine) -> None:
     """What is known of the terms beforehand: a row (theta - 1) / sd for each."""
     shared, first = e["shared"], 1 + len(model.chambers)
     for k, term in enumerate(model.terms, first):
         shared[np.ix_((0, k), (0, k))] += term.sd**-2
 
 
-def _column(model: Model, name: str) -> int:
+def _column(model: Machine, name: str) -> int:
     return model.column(name) if name else layout.NOTHING
 
 
-def variance(model: Model, name: str) -> float:
+def variance(model: Machine, name: str) -> float:
     """Declared sensor noise and quantisation of a signal, SI squared; 0 for NONE."""
     if not name:
         return 0.0

@@ -10,14 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rtid.estimator.state import RecordArray, State
 from rtid.kernels.layout import TERMS
 from rtid.kernels.normal import assemble
-from rtid.model import FloatArray
-
-IntArray = NDArray[np.int64]
+from rtid.plain import FloatArray, IntArray
 
 # Fields of a block's record that add up; the time of the last visit is the latest.
 ADDING = ("rows", "dwell_s", "phi_sum", "surprise", "judged", "gram", "shared")
@@ -84,9 +81,9 @@ class Sums:
     def drained(cls, state: State) -> Sums:
         """Take everything out of a state, which goes on with its memory of recent columns."""
         state.settle()
-        found = cls._read(state)
+        sums = cls._read(state)
         state.clear_sums()
-        return found._touched()
+        return sums._touched()
 
     def _touched(self) -> Sums:
         """Without the blocks that no row has touched, and without empty pairs."""

@@ -9,13 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rtid.estimator.state import Weights, build
 from rtid.kernels.layout import RESTART_MEMORY
-from rtid.model import TAYLOR, Edge, FloatArray, Model
+from rtid.model import TAYLOR, Edge, Machine
+from rtid.plain import BoolArray, FloatArray, IntArray
 
-IntArray = NDArray[np.int64]
 ROW, GAP = 1, 2  # flags of a sample, as in firmware_bridge.samples
 
 
@@ -31,16 +30,16 @@ class Track:
     """
 
     end: IntArray
-    fresh: NDArray[np.bool_]
+    fresh: BoolArray
     started_s: FloatArray
-    row: NDArray[np.bool_]
+    row: BoolArray
     cells: IntArray
     home: IntArray
     opening: FloatArray
 
 
 def follow(
-    model: Model, t_s: FloatArray, values: FloatArray, flags: IntArray, weights: Weights
+    model: Machine, t_s: FloatArray, values: FloatArray, flags: IntArray, weights: Weights
 ) -> Track:
     """Gates, restarts and block assignment with hysteresis, sample by sample.
 
@@ -48,7 +47,7 @@ def follow(
     """
     new_memory = _memory_restarts(model, t_s, values, flags, weights)
     usable = _usable(model, t_s, values)
-    found: list[tuple[int, bool, float, bool]] = []
+    intervals: list[tuple[int, bool, float, bool]] = []
     cells, homes, openings = [], [], []
     running, fresh, started, ready = False, False, 0.0, -np.inf
     cell, w = _all_shut(model), np.zeros(len(model.edges))
@@ -60,16 +59,16 @@ def follow(
             stamped = t_s[k] if np.isfinite(t_s[k]) else _last_usable(t_s, usable, k)
             ready = stamped + model.gates.recovery_s
         if running and not broken:
-            held = _held(model, values[k - 1])
-            mean, last = _lagged(held, w, weights.lag_s, t_s[k] - t_s[k - 1])
+            command = _held(model, values[k - 1])
+            mean, last = _lagged(command, w, weights.lag_s, t_s[k] - t_s[k - 1])
             before = cell
             cell, home, inside = _cells(model, values[k - 1 : k + 1], mean, cell)
             if inside:
                 fresh = fresh or (model.form == "restart" and bool((cell != before).any()))
-                found.append((k, fresh or bool(new_memory[k]), started, bool(flags[k] & ROW)))
+                intervals.append((k, fresh or bool(new_memory[k]), started, bool(flags[k] & ROW)))
                 cells.append(cell)
                 homes.append(home)
-                openings.append(np.stack([held, w], axis=1))
+                openings.append(np.stack([command, w], axis=1))
                 w, fresh = last, False
         was_running = running
         running = running and not broken and inside
@@ -78,7 +77,7 @@ def follow(
             may_start = usable[k] and flags[k] & ROW and t_s[k] >= ready
             if may_start and not (was_running and not broken):
                 running, fresh, started, w = True, True, t_s[k], _held(model, values[k])
-    ends, begins, since, rows = zip(*found, strict=True) if found else ((), (), (), ())
+    ends, begins, since, rows = zip(*intervals, strict=True) if intervals else ((), (), (), ())
     return Track(
         np.array(ends, np.int64),
         np.array(begins, bool),
@@ -90,19 +89,19 @@ def follow(
     )
 
 
-def _usable(model: Model, t_s: FloatArray, values: FloatArray) -> NDArray[np.bool_]:
+def _usable(model: Machine, t_s: FloatArray, values: FloatArray) -> BoolArray:
     low = np.array([s.minimum for s in model.signals])
     high = np.array([s.maximum for s in model.signals])
     whole = np.isfinite(t_s) & (np.abs(values) < 1e30).all(axis=1)
     return whole & (values >= low).all(axis=1) & (values <= high).all(axis=1)
 
 
-def _last_usable(t_s: FloatArray, usable: NDArray[np.bool_], k: int) -> float:
+def _last_usable(t_s: FloatArray, usable: BoolArray, k: int) -> float:
     before = np.flatnonzero(usable[:k])
     return float(t_s[before[-1]]) if len(before) else 0.0
 
 
-def _held(model: Model, sample: FloatArray) -> FloatArray:
+def _held(model: Machine, sample: FloatArray) -> FloatArray:
     """Command of each edge (edges,); zero in a mode that keeps it shut."""
     mode = int(sample[model.column(model.mode)]) if model.mode else 0
     return np.array(
@@ -115,29 +114,29 @@ def _held(model: Model, sample: FloatArray) -> FloatArray:
     )
 
 
-def pressure_drop(model: Model, edge: Edge, values: FloatArray) -> FloatArray:
-    """dp over the edge (...,) from values (..., signals); an end that is NONE is at zero."""
+def pressure_drop(model: Machine, edge: Edge, values: FloatArray) -> FloatArray:
+    """dp over the edge (...,), Pa, from values (..., signals); an end that is NONE is at zero."""
     ends = [values[..., model.column(name)] if name else 0.0 for name in (edge.source, edge.sink)]
     return np.zeros(values.shape[:-1]) + ends[0] - ends[1]
 
 
 def _lagged(
-    held: FloatArray, start: FloatArray, lag_s: float, dt: float
+    command: FloatArray, start: FloatArray, lag_s: float, dt: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean and last value over dt of a command that approaches `held` from `start`."""
+    """Mean and last value over dt of a command that approaches `command` from `start`."""
     if lag_s <= 0.0:
-        return held, held
+        return command, command
     decay = np.exp(-dt / lag_s)
-    mean = held + (start - held) * (lag_s / dt * (1.0 - decay))
-    return mean, held + (start - held) * decay
+    mean = command + (start - command) * (lag_s / dt * (1.0 - decay))
+    return mean, command + (start - command) * decay
 
 
-def _all_shut(model: Model) -> IntArray:
+def _all_shut(model: Machine) -> IntArray:
     return np.full((len(model.edges), 2), -1, np.int64)
 
 
 def _cells(
-    model: Model, samples: FloatArray, mean_w: FloatArray, before: IntArray
+    model: Machine, samples: FloatArray, mean_w: FloatArray, before: IntArray
 ) -> tuple[IntArray, IntArray, bool]:
     """Blocks and homes per edge of the interval between two samples; False: one is off its grid."""
     cell, home, inside = _all_shut(model), _all_shut(model), True
@@ -184,8 +183,8 @@ def _cell(edge: Edge, point: tuple[float, float], before: IntArray, hysteresis: 
 
 
 def _memory_restarts(
-    model: Model, t_s: FloatArray, values: FloatArray, flags: IntArray, weights: Weights
-) -> NDArray[np.bool_]:
+    model: Machine, t_s: FloatArray, values: FloatArray, flags: IntArray, weights: Weights
+) -> BoolArray:
     """(n,): the engine began a new memory with the interval that ends at this sample."""
     state = build(model, weights)
     chunk = np.column_stack([t_s, flags, values])

@@ -16,20 +16,21 @@ from rtid.estimator.state import MASKS
 from rtid.estimator.sums import Sums
 from rtid.kernels.basis import window_terms_at
 from rtid.kernels.layout import TERMS
-from rtid.model import BASES, BLENDED, LAPPED, TAYLOR, Edge, FloatArray, Model
+from rtid.model import BASES, BLENDED, LAPPED, TAYLOR, Edge, Machine
+from rtid.plain import FloatArray
 
 # Standard deviation of what a block's terms cannot follow, in shares of the rated flow: six local
 # cosines miss about 1 % of a valve's flow on a usual grid, as measured on simulated plants.
 TRUNCATION = {LAPPED: 1e-2, BLENDED: 1e-3}
 
 
-def overlaps(model: Model) -> bool:
+def overlaps(model: Machine) -> bool:
     """True when the windows of a map overlap."""
     return any(edge.basis != TAYLOR for edge in model.edges)
 
 
 def to_taylor(
-    model: Model, sums: Sums, cov: FloatArray, prior_sd: float
+    model: Machine, sums: Sums, cov: FloatArray, prior_sd: float
 ) -> tuple[FloatArray, FloatArray]:
     """Matrix T (n, n) from the unknowns to those with Taylor terms, and their covariance (n, n).
 
@@ -68,14 +69,14 @@ def _least_squares(
     return tile, tile @ weighed.T
 
 
-def _places(model: Model, sums: Sums) -> dict[tuple[int, int, int], int]:
+def _places(model: Machine, sums: Sums) -> dict[tuple[int, int, int], int]:
     """Place of each visited (edge, i, j) among the blocks."""
-    found = {}
+    places = {}
     for place, record in enumerate(sums.blocks):
         edge = int(record["edge"])
         cell = int(record["cell"]) - model.first_cells[edge]
-        found[(edge, *divmod(cell, model.edges[edge].grid.shape[1]))] = place
-    return found
+        places[(edge, *divmod(cell, model.edges[edge].grid.shape[1]))] = place
+    return places
 
 
 def _near(edge: Edge, i: int, j: int) -> list[tuple[int, int]]:

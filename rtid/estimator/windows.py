@@ -17,24 +17,24 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from rtid.model import FloatArray
+from rtid.plain import FloatArray
 
 # Half the overlap at a border, in widths of the narrower neighbour; 0.5 is the most that fits.
 OVERLAP = 0.25
 
 
 def profile(t: FloatArray) -> FloatArray:
-    """beta(t) for t of any shape: the sine of an angle that eases from 0 to pi / 2."""
+    """beta(t), dimensionless, for t (...): the sine of an angle that eases from 0 to pi / 2."""
     return np.asarray(np.sin(_angle(t)))
 
 
 def rising(t: FloatArray) -> FloatArray:
-    """beta^2(t)."""
+    """beta^2(t) for t (...), dimensionless."""
     return np.asarray(np.sin(_angle(t)) ** 2)
 
 
 def rising_slope(t: FloatArray) -> FloatArray:
-    """Derivative of `rising`; zero outside [-1, 1] and continuous."""
+    """Derivative of `rising` at t (...), dimensionless; zero outside [-1, 1] and continuous."""
     slope = 0.125 * np.pi**2 * np.sin(0.5 * np.pi * (1.0 + np.clip(t, -1.0, 1.0)))
     return np.asarray(np.sin(2.0 * _angle(t)) * slope)
 

@@ -7,32 +7,30 @@ a limit beside the others is left out, and the time filled anew.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rtid.diagnose.trials import Key
-from rtid.estimator.sums import IntArray
 from rtid.excite.driving import SHUT, STEP_S, SUPPLY
 from rtid.excite.information import Information, of_blocks, of_effects
 from rtid.excite.library import REST_S, Segment, home_m, library
-from rtid.excite.limits import Extremes, LimitError, Limits, extremes, require_kept
-from rtid.excite.machine import Machine, MachineError
+from rtid.excite.machine import DrivenMachine, MachineError
+from rtid.excite.motion_limits import Extremes, LimitError, Limits, extremes, require_kept
 from rtid.excite.prediction import Prediction, assess
 from rtid.excite.selection import (
     BOUNDED,
     EFFECT_WEIGHT,
     Criterion,
-    Known,
-    Problem,
+    KnownCells,
+    SelectionProblem,
     choose,
     filled,
     standard_errors,
 )
 from rtid.excite.sweep import swept_sine
-from rtid.model import FloatArray
+from rtid.plain import FloatArray, IntArray, Key, Progress, silent
 
 MARGIN, PRESSURE_MARGIN = 0.05, 0.02  # of a range, kept free on the nominal machine
 ELSEWHERE = 0.02  # weight of a block that the working motion does not visit
@@ -41,11 +39,9 @@ ROWS = 20  # that a block needs to be where the machine works
 TRIES, MOST_LEFT_OUT = 5, 50  # to fit a segment into the limits; to put a motion together
 SCALED, SHRINK = frozenset({"position", "speed"}), 0.01  # what shrinks with a segment; and beyond
 
-Progress = Callable[[str, float], None]
-
 
 @dataclass(frozen=True)
-class Candidate:
+class CandidateSegment:
     """A feasible segment and what it tells."""
 
     segment: Segment
@@ -56,9 +52,9 @@ class Candidate:
 class Design:
     """A motion: segments in order, reference (n, 5) as `driving`, expected noise-free samples."""
 
-    machine: Machine
+    machine: DrivenMachine
     limits: Limits
-    segments: tuple[Candidate, ...]
+    segments: tuple[CandidateSegment, ...]
     reference: FloatArray
     expected: FloatArray
     extremes: tuple[Extremes, ...]
@@ -74,15 +70,11 @@ class Design:
         return assess(self.machine.model, self.machine.measured(self.expected), name, effects)
 
 
-def _silent(_what: str, _share: float) -> None:
-    pass
-
-
 def design(
-    machine: Machine,
+    machine: DrivenMachine,
     limits: Limits,
-    known: Known | None,
-    pool: Sequence[Candidate],
+    known: KnownCells | None,
+    pool: Sequence[CandidateSegment],
     criterion: Criterion = BOUNDED,
 ) -> Design:
     """Choose a motion from `candidates` of the same machine and limits.
@@ -90,9 +82,9 @@ def design(
     known: what is learned already.  Raises LimitError, MachineError.
     """
     weights, inner = working_weights(machine, limits), tightened(limits)
-    start = known or Known.nothing(machine.model.n_cells)
+    start = known or KnownCells.nothing(machine.model.n_cells)
     costs = np.array([c.segment.duration_s + 2 * REST_S for c in pool])
-    problem = Problem([c.told for c in pool], costs, weights, criterion)
+    problem = SelectionProblem([c.told for c in pool], costs, weights, criterion)
     chosen = choose(problem, start, limits.duration_s)
     for _ in range(MOST_LEFT_OUT):
         if not chosen:
@@ -110,36 +102,36 @@ def design(
         costs[[k for k, c in enumerate(pool) if id(c) in bad]] = np.inf  # it fits no more
         rest = [k for k in chosen if id(pool[k]) not in bad]
         chosen = filled(problem, start.copy(), rest, limits.duration_s)
-    found = checked(machine, limits, reference, expected)
-    require_kept(found)
-    return Design(machine, limits, tuple(segments), reference, expected, found, weights)
+    result = checked(machine, limits, reference, expected)
+    require_kept(result)
+    return Design(machine, limits, tuple(segments), reference, expected, result, weights)
 
 
 def candidates(
-    machine: Machine, limits: Limits, see: tuple[str, ...] = (), progress: Progress = _silent
-) -> list[Candidate]:
+    machine: DrivenMachine, limits: Limits, see: tuple[str, ...] = (), progress: Progress = silent
+) -> list[CandidateSegment]:
     """Segments of the library that the nominal machine can follow, and what each tells."""
-    found, every, tight = list[Candidate](), library(limits), tightened(limits)
+    segments, every, tight = list[CandidateSegment](), library(limits), tightened(limits)
     for k, segment in enumerate(every):
         progress("trying segments", k / len(every))
         fitting = _fitted(machine, tight, segment)
         if fitting is not None:
             kept, chunk = fitting
             chunk = machine.measured(chunk, k)
-            told = of_blocks(machine, chunk)
+            information = of_blocks(machine, chunk)
             if see:
-                told = replace(told, effects=of_effects(machine, chunk, see))
-            found.append(Candidate(kept, told))
-    if not found:
+                information = replace(information, effects=of_effects(machine, chunk, see))
+            segments.append(CandidateSegment(kept, information))
+    if not segments:
         raise LimitError(
             "the nominal machine can follow no segment within the limits",
             "are load, controller and supply of [excite] right?",
         )
-    return found
+    return segments
 
 
 def _fitted(
-    machine: Machine, limits: Limits, segment: Segment
+    machine: DrivenMachine, limits: Limits, segment: Segment
 ) -> tuple[Segment, FloatArray] | None:
     """The segment, smaller where it must be, and its noise-free samples; None: it does not fit."""
     home = home_m(limits)
@@ -159,7 +151,9 @@ def _fitted(
     return None
 
 
-def _keeps(machine: Machine, limits: Limits, reference: FloatArray, chunk: FloatArray) -> bool:
+def _keeps(
+    machine: DrivenMachine, limits: Limits, reference: FloatArray, chunk: FloatArray
+) -> bool:
     """Whether a run, or a part of one, keeps its limits."""
     return all(e.is_kept for e in checked(machine, limits, reference, chunk))
 
@@ -171,11 +165,11 @@ def _share_within(e: Extremes, centre: float) -> float:
     return min(above, below) if centre > e.least else above
 
 
-def working_weights(machine: Machine, limits: Limits) -> FloatArray:
-    """Weight of every grid cell: 1 where the paper's sweep at the usual supply works."""
-    told = of_blocks(machine, machine.measured(machine.run(swept_sine(machine, limits))))
+def working_weights(machine: DrivenMachine, limits: Limits) -> FloatArray:
+    """Weight (cells,), dimensionless: 1 where the paper's sweep at the usual supply works."""
+    information = of_blocks(machine, machine.measured(machine.run(swept_sine(machine, limits))))
     weights = np.full(machine.model.n_cells, ELSEWHERE)
-    weights[told.cells[told.rows >= ROWS]] = 1.0
+    weights[information.cells[information.rows >= ROWS]] = 1.0
     return weights
 
 
@@ -188,30 +182,33 @@ class Missing:
 
     cells: IntArray
     effects: tuple[Key, ...]
-    segments: tuple[Candidate, ...]
+    segments: tuple[CandidateSegment, ...]
     tells: tuple[frozenset[int | Key], ...]  # which of the cells and effects each segment improves
 
-    def pieces(self, most: int) -> list[tuple[Candidate, int]]:
+    def pieces(self, most: int) -> list[tuple[CandidateSegment, int]]:
         """A few segments that tell most together, each with how much it adds to those before."""
-        found, open_ = list[tuple[Candidate, int]](), set[int | Key]().union(*self.tells)
-        while open_ and len(found) < most:
+        pieces, open_ = list[tuple[CandidateSegment, int]](), set[int | Key]().union(*self.tells)
+        while open_ and len(pieces) < most:
             best = max(range(len(self.tells)), key=lambda k: len(self.tells[k] & open_))
-            found.append((self.segments[best], len(self.tells[best] & open_)))
+            pieces.append((self.segments[best], len(self.tells[best] & open_)))
             open_ -= self.tells[best]
-        return found
+        return pieces
 
 
-def missing(segments: Sequence[Candidate], known: Known, weights: FloatArray) -> Missing:
+def missing(
+    segments: Sequence[CandidateSegment], known: KnownCells, weights: FloatArray
+) -> Missing:
     """What is still missing by what is learned, and the segments that are worth running for it.
 
     Worth running is what improves blocks that are not known to GOAL, or named effects, by a share
     IMPROVED of their standard error, as long as these are a share WORTH of what it visits.
+    weights (cells,): as of `working_weights`.
     """
-    found = [_improved(c.told, known) for c in segments]
-    pairs = zip(segments, found, strict=True)
+    improved = [_improved(c.told, known) for c in segments]
+    pairs = zip(segments, improved, strict=True)
     shares = np.array([_share(c.told, better, weights) for c, better in pairs])
     order = [k for k in np.argsort(-shares, kind="stable").tolist() if shares[k] >= WORTH]
-    tells = tuple(found[k] for k in order)
+    tells = tuple(improved[k] for k in order)
     every = frozenset[int | Key]().union(*tells)
     cells = sorted(cell for cell in every if isinstance(cell, int))
     effects = sorted(key for key in every if not isinstance(key, int))
@@ -219,35 +216,42 @@ def missing(segments: Sequence[Candidate], known: Known, weights: FloatArray) ->
     return Missing(np.array(cells, dtype=np.int64), tuple(effects), kept, tells)
 
 
-def _improved(told: Information, known: Known) -> frozenset[int | Key]:
+def _improved(information: Information, known: KnownCells) -> frozenset[int | Key]:
     """Cells and effects that a segment would still improve."""
-    own = known.blocks[told.cells]
-    before, after = standard_errors(own), standard_errors(own + told.blocks)
-    cells = told.cells[(before > GOAL) & (after < (1.0 - IMPROVED) * before)]
+    known_blocks = known.blocks[information.cells]
+    before, after = (
+        standard_errors(known_blocks),
+        standard_errors(known_blocks + information.blocks),
+    )
+    cells = information.cells[(before > GOAL) & (after < (1.0 - IMPROVED) * before)]
     effects = [
         key
-        for key, value in told.effects.items()
+        for key, value in information.effects.items()
         if (known.effects.get(key, 0.0) + value) * (1.0 - IMPROVED) ** 2
         > known.effects.get(key, 0.0)
     ]
     return frozenset[int | Key]([*cells.tolist(), *effects])
 
 
-def _share(told: Information, better: frozenset[int | Key], weights: FloatArray) -> float:
+def _share(information: Information, better: frozenset[int | Key], weights: FloatArray) -> float:
     """Share of what a segment visits, by weight, that it would still improve."""
-    total = float(weights[told.cells].sum()) + EFFECT_WEIGHT * len(told.effects)
+    total = float(weights[information.cells].sum()) + EFFECT_WEIGHT * len(information.effects)
     gained = sum(weights[key] if isinstance(key, int) else EFFECT_WEIGHT for key in better)
     return float(gained / max(total, 1e-12))
 
 
 def stitched(
-    segments: Sequence[Candidate], limits: Limits
-) -> tuple[list[Candidate], FloatArray, NDArray[np.intp]]:
+    segments: Sequence[CandidateSegment], limits: Limits
+) -> tuple[list[CandidateSegment], FloatArray, NDArray[np.intp]]:
     """One reference from segments in a row, the supply led over at rest; as many as fit.
 
-    Segments that fit, the reference (n, 5), and which of the segments each sample (n,) belongs to.
+    Segments that fit, the reference (n, 5) in SI, and the segment of each sample (n,).
     """
-    parts, kept, left = list[FloatArray](), list[Candidate](), round(limits.duration_s / STEP_S)
+    parts, kept, free = (
+        list[FloatArray](),
+        list[CandidateSegment](),
+        round(limits.duration_s / STEP_S),
+    )
     for candidate in segments:
         row = candidate.segment.reference[:1]
         lead = row
@@ -260,19 +264,19 @@ def stitched(
             lead = np.repeat(row, steps, axis=0)
             lead[:, SUPPLY] = row[0, SUPPLY] - change * (1.0 - np.arange(1, steps + 1) / steps)
             lead[:, SHUT] = 0.0
-        if len(lead) + len(candidate.segment.reference) > left:
+        if len(lead) + len(candidate.segment.reference) > free:
             continue
         parts += [lead, candidate.segment.reference]
         kept.append(candidate)
-        left -= len(lead) + len(candidate.segment.reference)
+        free -= len(lead) + len(candidate.segment.reference)
     lengths = [len(lead) + len(part) for lead, part in zip(parts[::2], parts[1::2], strict=True)]
     return kept, np.concatenate(parts), np.repeat(np.arange(len(kept)), lengths)
 
 
 def checked(
-    machine: Machine, limits: Limits, reference: FloatArray, chunk: FloatArray
+    machine: DrivenMachine, limits: Limits, reference: FloatArray, chunk: FloatArray
 ) -> tuple[Extremes, ...]:
-    """The quantities of a run beside their limits."""
+    """Extremes of a run, SI, beside limits; reference (n, 5), chunk (n, 2 + signals)."""
     places = machine.places
     x, u = machine.signal(chunk, places.x), machine.signal(chunk, places.u)
     return extremes(limits, reference, chunk[:, 0], x, u, machine.pressures(chunk))

@@ -15,15 +15,13 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rtid.kernels.engine import remember, set_step
 from rtid.kernels.free_run import BEYOND, OFF_GRID, interval, spools
 from rtid.kernels.jit import kernel
 from rtid.kernels.layout import MAX_EDGES, MAX_SIGNALS
-from rtid.kernels.published import foot_width
-
-FloatArray = NDArray[np.float64]
+from rtid.kernels.map_point import foot_width
+from rtid.plain import FloatArray
 
 STEP_S = 1e-3
 X_REF, V_REF, OFFSET, SUPPLY, SHUT = range(5)  # columns of a reference
@@ -78,7 +76,7 @@ def drive(
     """Fill signals (n, signals) in place; the number of samples until the map ended, else n.
 
     engine (1,): freshly built, used up; theta, compliance, overlap as in `free_run`; reference
-    (n, 5); start: [P.., x, v]; sample (2 + signals,): values of the signals that stay as they are.
+    (n, 5) and start [P.., x, v] in SI; sample (2 + signals,): values of signals that stay.
     """
     e = engine[0]
     n_c = e.n_chambers

@@ -15,13 +15,13 @@ import numpy as np
 
 from rtid.diagnose.fit import one_pass
 from rtid.diagnose.revision import Revision
-from rtid.diagnose.trials import Key, physical, scored
+from rtid.diagnose.trials import physical, scored
 from rtid.estimator.factor import PRIOR_SD, factorize, one_thread
 from rtid.estimator.record import run
-from rtid.estimator.sums import IntArray, Normal, Sums
-from rtid.excite.machine import Machine
+from rtid.estimator.sums import Normal, Sums
+from rtid.excite.machine import DrivenMachine
 from rtid.kernels.layout import TERMS
-from rtid.model import FloatArray
+from rtid.plain import FloatArray, IntArray, Key
 
 PRIOR = np.eye(TERMS) * PRIOR_SD**-2
 LEAST_ROWS = 8  # of a block; one that is hardly touched tells nothing
@@ -38,28 +38,30 @@ class Information:
     effects: dict[Key, float] = field(default_factory=dict)
 
 
-def of_blocks(machine: Machine, chunk: FloatArray) -> Information:
-    """What samples (n, 2 + signals) tell of the blocks that they visit."""
+def of_blocks(machine: DrivenMachine, chunk: FloatArray) -> Information:
+    """What samples (n, 2 + signals), SI, tell of the blocks that they visit."""
     sums = Sums.of(run(machine.model, chunk, machine.weights))
     normal, ns = sums.normal(), sums.n_shared
     stayed = np.flatnonzero(sums.blocks["rows"] >= LEAST_ROWS)
-    m, held = len(stayed), KNOWN_SD**-2
+    m, prior = len(stayed), KNOWN_SD**-2
     at = (ns + TERMS * stayed[:, None] + np.arange(TERMS)).ravel()
-    gram = normal.gram[np.ix_(at, at)] + held * np.eye(TERMS * m)
+    gram = normal.gram[np.ix_(at, at)] + prior * np.eye(TERMS * m)
     maps = Normal(gram, normal.right[at], 0.0, normal.noise, normal.rows)
     with one_thread():
         cov = factorize(maps, 0).cov().reshape(m, TERMS, m, TERMS)
         tiles = cov[np.arange(m), :, np.arange(m)]
-        own = np.linalg.inv(tiles) - held * np.eye(TERMS) - PRIOR
-    return Information(sums.cells[stayed], own, sums.blocks["rows"][stayed].astype(float))
+        information = np.linalg.inv(tiles) - prior * np.eye(TERMS) - PRIOR
+    return Information(sums.cells[stayed], information, sums.blocks["rows"][stayed].astype(float))
 
 
-def of_effects(machine: Machine, chunk: FloatArray, names: tuple[str, ...]) -> dict[Key, float]:
-    """1 / sd^2 of the coefficients of named effects, everywhere that they can sit."""
+def of_effects(
+    machine: DrivenMachine, chunk: FloatArray, names: tuple[str, ...]
+) -> dict[Key, float]:
+    """1 / sd^2, SI, of named effects' coefficients, everywhere; chunk (n, 2 + signals)."""
     fit = one_pass(machine.model, chunk, machine.weights, Revision(), None, True, thorough=False)
-    found: dict[Key, float] = {}
+    by_effect: dict[Key, float] = {}
     for candidate, score in scored(fit):
         if candidate.effect in names:
             sd = physical(fit, candidate, score.sd)
-            found[candidate.key] = max(found.get(candidate.key, 0.0), sd**-2)
-    return found
+            by_effect[candidate.key] = max(by_effect.get(candidate.key, 0.0), sd**-2)
+    return by_effect

@@ -18,8 +18,8 @@ from itertools import pairwise
 import numpy as np
 
 from rtid.excite.driving import OFFSET, SHUT, STEP_S, SUPPLY, V_REF, X_REF
-from rtid.excite.limits import Limits
-from rtid.model import FloatArray
+from rtid.excite.motion_limits import Limits
+from rtid.plain import FloatArray
 
 Steps = tuple[tuple[float, float], ...]
 REST_S = 0.1  # at both ends of a segment
@@ -59,10 +59,10 @@ class Segment:
 def library(limits: Limits, seed: int = 0) -> tuple[Segment, ...]:
     """Every candidate within the limits of stroke, speed and supply, the same for one seed."""
     rng = np.random.default_rng([seed, 11])
-    found = [*_passes(limits, rng), *_swings(limits, rng)]
+    segments = [*_passes(limits, rng), *_swings(limits, rng)]
     if limits.may_shut:
-        found += _shut(limits)
-    return tuple(found)
+        segments += _shut(limits)
+    return tuple(segments)
 
 
 def home_m(limits: Limits) -> float:
@@ -128,9 +128,9 @@ def _shut(limits: Limits) -> Iterator[Segment]:
             run = np.full(round(abs(way) / speed / STEP_S), np.sign(way) * speed)
             v = _eased(np.concatenate([run, -run]))
             for name, reference in _supplied(f"shut {pace:g} {side:+g}", v, limits):
-                held = np.repeat(reference[-1:], round(SHUT_S / STEP_S), axis=0)
-                held[:, SHUT] = 1.0
-                yield Segment(name, np.concatenate([reference, held, reference[-1:]]))
+                rest = np.repeat(reference[-1:], round(SHUT_S / STEP_S), axis=0)
+                rest[:, SHUT] = 1.0
+                yield Segment(name, np.concatenate([reference, rest, reference[-1:]]))
 
 
 def _at_levels(
@@ -180,9 +180,9 @@ def _with_steps(
 
 
 def rate_limited(values: FloatArray, most: float) -> FloatArray:
-    """Values (n,) that follow the given ones by at most so much per sample."""
-    found, now = list[float](), float(values[0])
+    """Values (n,), any SI unit, that follow the given ones by at most so much per sample."""
+    limited, now = list[float](), float(values[0])
     for value in values.tolist():
         now += min(max(value - now, -most), most)
-        found.append(now)
-    return np.array(found)
+        limited.append(now)
+    return np.array(limited)

@@ -14,7 +14,8 @@ from rtid.estimator.state import Weights, build, nominal_weights, variance
 from rtid.estimator.windows import OVERLAP
 from rtid.excite.driving import STEP_S, SUPPLY, X_REF, Control, Piston, Places, drive
 from rtid.kernels.engine import GAP_FLAG, ROW_FLAG
-from rtid.model import VELOCITY, Edge, FloatArray, Model
+from rtid.model import VELOCITY, Edge, Machine
+from rtid.plain import FloatArray
 
 REST_SHARE = 0.3  # of the supply: pressure of the second chamber at rest
 SETTLE_S = 1.0  # held before a motion, so that it begins at rest
@@ -25,13 +26,13 @@ class MachineError(RtidError):
 
 
 @dataclass(frozen=True)
-class Machine:
+class DrivenMachine:
     """theta (cells, 6) m3/s in Taylor terms; compliance (chambers,) 1/Pa; tank_pa constant.
 
     slopes (cells,): dQ/ddp in m3/s/Pa, by which rows are weighed.
     """
 
-    model: Model
+    model: Machine
     theta: FloatArray
     compliance: FloatArray
     piston: Piston
@@ -75,7 +76,7 @@ class Machine:
         )
 
     def run(self, reference: FloatArray) -> FloatArray:
-        """Noise-free samples (n, 2 + signals) under a reference (n, 5), from rest.
+        """Noise-free samples (n, 2 + signals), SI, under a reference (n, 5), from rest.
 
         Raises MachineError where the command leaves the grids, or a pressure runs away.
         """
@@ -100,7 +101,7 @@ class Machine:
         return self._chunk(signals[len(lead) :])
 
     def measured(self, chunk: FloatArray, seed: int = 0) -> FloatArray:
-        """Samples with the declared sensor noise; commands are known exactly."""
+        """Samples (n, 2 + signals), SI, with the declared sensor noise; commands are exact."""
         rng, noisy = np.random.default_rng([seed, 17]), chunk.copy()
         for j, signal in enumerate(self.model.signals):
             sd = np.sqrt(variance(self.model, signal.name))
@@ -131,17 +132,17 @@ class Machine:
         return chunk
 
     def signal(self, chunk: FloatArray, place: int) -> FloatArray:
-        """One signal of samples (n,)."""
+        """One signal (n,) of samples (n, 2 + signals), SI."""
         return np.asarray(chunk[:, 2 + place])
 
     def pressures(self, chunk: FloatArray) -> FloatArray:
-        """Chamber pressures of samples (n, chambers)."""
+        """Chamber pressures (n, chambers), Pa, of samples (n, 2 + signals)."""
         columns = [2 + c for c in self.places.pressures[: len(self.model.chambers)]]
         return np.asarray(chunk[:, columns])
 
 
-def rated_map(model: Model) -> FloatArray:
-    """Terms (cells, 6) of Q = K(w) sqrt(dp), K rising linearly to the rated flow at the grid's end.
+def rated_map(model: Machine) -> FloatArray:
+    """Terms (cells, 6), m3/s, of Q = K(w) sqrt(dp), K linear to the rated flow at the grid's end.
 
     What is known where there is neither a data sheet nor anything learned.
     """

@@ -13,12 +13,13 @@ import numpy as np
 
 from rtid.diagnose.fit import fit, prepare
 from rtid.diagnose.revision import Revision
-from rtid.diagnose.trials import Key, detection_limit, physical, scored
+from rtid.diagnose.trials import detection_limit, physical, scored
 from rtid.estimator.blocks import VALID, Block
 from rtid.estimator.record import refined, run
 from rtid.estimator.solution import Solution, sketch, solve
 from rtid.excite.selection import MOMENTS
-from rtid.model import FloatArray, Model
+from rtid.model import Machine
+from rtid.plain import FloatArray, Key
 
 Cell = tuple[int, int, int]
 
@@ -71,7 +72,7 @@ class Prediction:
         return sum(block.valid for block in self.blocks)
 
     def sds(self, cells: Iterable[Cell], mean: bool = False) -> FloatArray:
-        """Standard errors of the map in some blocks (n,); inf where one was not visited."""
+        """Standard errors of the map in some blocks (n,), m3/s; inf where one was not visited."""
         known = {b.cell: b.mean_sd if mean else b.sd for b in self.blocks}
         return np.array([known.get(cell, np.inf) for cell in cells])
 
@@ -81,8 +82,8 @@ class Prediction:
         return next((x.value for x in self.limits if (x.effect, x.where) == key), np.inf)
 
 
-def assess(model: Model, chunk: FloatArray, name: str = "", effects: bool = True) -> Prediction:
-    """Judge samples (n, 2 + signals), noise included; effects: also the detection limits."""
+def assess(model: Machine, chunk: FloatArray, name: str = "", effects: bool = True) -> Prediction:
+    """Judge samples (n, 2 + signals), SI, with noise; effects: also the detection limits."""
     weights = refined(model, sketch(model, run(model, chunk)), model.lag.nominal_s)
     solution = solve(model, run(model, chunk, weights))
     return Prediction(
@@ -112,15 +113,15 @@ def largest_flows(blocks: Iterable[Block], n_edges: int) -> FloatArray:
     return largest
 
 
-def limits(model: Model, chunk: FloatArray) -> dict[Key, Limit]:
-    """Detection limit of every effect that the diagnosis knows for this machine and record."""
-    found: dict[Key, Limit] = {}
+def limits(model: Machine, chunk: FloatArray) -> dict[Key, Limit]:
+    """Detection limit, SI, of every effect that is known; chunk (n, 2 + signals): the record."""
+    result: dict[Key, Limit] = {}
     fitted = fit(model, chunk, prepare(model, chunk), Revision())
     for candidate, score in scored(fitted):
         value = float(physical(fitted, candidate, detection_limit(score, fitted.rho)))
-        if candidate.parameter != "share" and value < found.get(candidate.key, _NONE).value:
-            found[candidate.key] = Limit(*candidate.key, value, candidate.unit)
-    return found
+        if candidate.parameter != "share" and value < result.get(candidate.key, _NONE).value:
+            result[candidate.key] = Limit(*candidate.key, value, candidate.unit)
+    return result
 
 
 _NONE = Limit("", "", np.inf, "")

@@ -20,7 +20,7 @@ import numpy as np
 
 from rtid.excite.information import PRIOR, Information
 from rtid.kernels.layout import TERMS
-from rtid.model import FloatArray
+from rtid.plain import FloatArray
 
 UNKNOWN = 1.0  # s_0: share of the rated flow
 USEFUL, BEFORE = 0.1, 0.15  # s_1, from which on it counts whole, and its share a before
@@ -69,7 +69,7 @@ BOUNDED, D_OPTIMAL = Criterion(_bounded, True), Criterion(_d_optimal, False)
 
 
 @dataclass
-class Known:
+class KnownCells:
     """What is known so far, by grid cell: information (cells, 6, 6), rows (cells,), effects."""
 
     blocks: FloatArray
@@ -77,13 +77,13 @@ class Known:
     effects: dict[tuple[str, str], float]
 
     @classmethod
-    def nothing(cls, n_cells: int) -> Known:
+    def nothing(cls, n_cells: int) -> KnownCells:
         """Before any motion."""
         return cls(np.zeros((n_cells, TERMS, TERMS)), np.zeros(n_cells), {})
 
-    def copy(self) -> Known:
+    def copy(self) -> KnownCells:
         """The same, independent."""
-        return Known(self.blocks.copy(), self.rows.copy(), dict(self.effects))
+        return KnownCells(self.blocks.copy(), self.rows.copy(), dict(self.effects))
 
     def add(self, news: Information) -> None:
         """Take in what a segment tells."""
@@ -93,7 +93,7 @@ class Known:
             self.effects[key] = self.effects.get(key, 0.0) + value
 
     def gain(self, news: Information, criterion: Criterion, weights: FloatArray) -> float:
-        """What the criterion would rise by."""
+        """What the criterion would rise by, in its unit; weights (cells,): dimensionless."""
         old, rows = self.blocks[news.cells], self.rows[news.cells]
         new = criterion.value(old + news.blocks, rows + news.rows)
         total = float(weights[news.cells] @ (new - criterion.value(old, rows)))
@@ -111,7 +111,7 @@ def _halvings(before: float, after: float) -> float:
 
 
 @dataclass(frozen=True)
-class Problem:
+class SelectionProblem:
     """Segments to choose from: what they tell, what they cost (segments,); weights (cells,)."""
 
     told: Sequence[Information]
@@ -119,16 +119,16 @@ class Problem:
     weights: FloatArray
     criterion: Criterion = BOUNDED
 
-    def rates(self, known: Known, left_s: float) -> FloatArray:
+    def rates(self, known: KnownCells, left_s: float) -> FloatArray:
         """Gain per second of every segment (segments,); 0 where it does not fit."""
-        found = np.zeros(len(self.told))
+        rates = np.zeros(len(self.told))
         for k in np.flatnonzero(self.costs_s <= left_s).tolist():
             gain = known.gain(self.told[k], self.criterion, self.weights)
-            found[k] = gain / self.costs_s[k]
-        return found
+            rates[k] = gain / self.costs_s[k]
+        return rates
 
 
-def choose(problem: Problem, known: Known, budget_s: float) -> list[int]:
+def choose(problem: SelectionProblem, known: KnownCells, budget_s: float) -> list[int]:
     """Segments in the order of choice, each as often as it pays; then exchanged while that helps.
 
     What seems best first is not what is best beside the others: each in turn is taken out, and the
@@ -148,22 +148,24 @@ def choose(problem: Problem, known: Known, budget_s: float) -> list[int]:
     return chosen
 
 
-def filled(problem: Problem, known: Known, chosen: list[int], budget_s: float) -> list[int]:
+def filled(
+    problem: SelectionProblem, known: KnownCells, chosen: list[int], budget_s: float
+) -> list[int]:
     """More segments, greedily, until the time is up; known is used up."""
-    chosen, left = list(chosen), budget_s - float(problem.costs_s[chosen].sum())
+    chosen, budget = list(chosen), budget_s - float(problem.costs_s[chosen].sum())
     for k in chosen:
         known.add(problem.told[k])
     while True:
-        rates = problem.rates(known, left)
+        rates = problem.rates(known, budget)
         best = int(rates.argmax())
         if rates[best] <= 0.0:
             return chosen
         known.add(problem.told[best])
         chosen.append(best)
-        left -= float(problem.costs_s[best])
+        budget -= float(problem.costs_s[best])
 
 
-def value(problem: Problem, known: Known, chosen: list[int]) -> float:
+def value(problem: SelectionProblem, known: KnownCells, chosen: list[int]) -> float:
     """What the criterion rises by with all of the chosen segments."""
     after, gained = known.copy(), 0.0
     for k in chosen:

@@ -6,16 +6,16 @@ import numpy as np
 
 from rtid.excite.driving import STEP_S, SUPPLY, V_REF, X_REF
 from rtid.excite.library import home_m
-from rtid.excite.limits import Limits
-from rtid.excite.machine import Machine
-from rtid.model import FloatArray
+from rtid.excite.machine import DrivenMachine
+from rtid.excite.motion_limits import Limits
+from rtid.plain import FloatArray
 
 BAND_HZ = (0.1, 0.5)
 SHARE = 0.95  # of the largest command, at the highest speed
 
 
-def swept_sine(machine: Machine, limits: Limits) -> FloatArray:
-    """Its reference (n, 5), at the usual supply, as far as command, speed and stroke allow."""
+def swept_sine(machine: DrivenMachine, limits: Limits) -> FloatArray:
+    """Its reference (n, 5), SI, at the usual supply, as far as command, speed and stroke allow."""
     control, (low, high) = machine.control, BAND_HZ
     speed = (SHARE * limits.command_v - control.deadband_v) / control.volts_per_mps
     half = 0.5 * (limits.stroke_m[1] - limits.stroke_m[0])

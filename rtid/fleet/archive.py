@@ -3,7 +3,7 @@
     runs/machine=NAME/KEY.parquet    one row per trace: verdict, effects, beta, or the error
     sums/KEY.npz                     its accumulators
     machines.parquet                 one row per machine and declaration
-    maps/MACHINE-DIGEST.npz          its map from all its traces; read with `rtid.mapfiles.read_map`
+    maps/MACHINE-DIGEST.npz          its map from all its traces: `rtid.maps.files.read_map`
     typical-DIGEST.csv               typical map of a type and its spread: a reference map
 
 pandas, polars and DuckDB read `runs/` as one table partitioned by machine.
@@ -23,7 +23,7 @@ from pyarrow.dataset import partitioning
 
 from rtid.estimator.sums import Sums
 from rtid.fleet.learning import Outcome, unpacked
-from rtid.store import write_whole
+from rtid.trace.state_files import write_whole
 
 STRINGS, NUMBERS = pa.list_(pa.string()), pa.list_(pa.float64())
 SCHEMA = pa.schema(
@@ -51,13 +51,13 @@ class Archive:
         """Keys of the traces that have their row."""
         return {path.stem for path in (self.folder / "runs").glob("machine=*/[!.]*.parquet")}
 
-    def keep(self, found: Outcome) -> None:
+    def keep(self, outcome: Outcome) -> None:
         """Keep one outcome: the sums first, so that whoever has a row has them."""
-        if found.sums:
-            write_whole(self._sums(found.job.key), found.sums)
-        path = self._run(found.job.machine, found.job.key)
+        if outcome.sums:
+            write_whole(self._sums(outcome.job.key), outcome.sums)
+        path = self._run(outcome.job.machine, outcome.job.key)
         path.parent.mkdir(exist_ok=True)
-        row = {name: [found.row[name]] for name in SCHEMA.names}
+        row = {name: [outcome.row[name]] for name in SCHEMA.names}
         part = path.with_name(f".{path.name}")  # what begins with a dot belongs to no data set
         pq.write_table(pa.table(row, SCHEMA), part)
         os.replace(part, path)

@@ -17,13 +17,13 @@ import numpy as np
 
 from rtid.diagnose.report import Diagnosis
 from rtid.diagnose.verdict import INSUFFICIENT
-from rtid.diagnosing import diagnose_trace
 from rtid.estimator.estimator import Estimator
 from rtid.estimator.sums import Sums
-from rtid.fleet.jobs import Job
+from rtid.fleet.traces import TraceJob
 from rtid.project import Project, load
-from rtid.replay import NoSamplesError, model_for, read_trace
-from rtid.store import FOLD
+from rtid.study.study import Study
+from rtid.trace.reading import NoSamplesError
+from rtid.trace.snapshot import FOLD
 
 OURS = ("rtid", "firmware_bridge")  # their own error classes are meant for the user
 
@@ -32,21 +32,22 @@ OURS = ("rtid", "firmware_bridge")  # their own error classes are meant for the 
 class Outcome:
     """A row of the results, and the sums of the trace as bytes (empty where there are none)."""
 
-    job: Job
+    job: TraceJob
     row: dict[str, Any]
     sums: bytes = field(default=b"", repr=False)
 
 
-def outcome(job: Job, with_diagnosis: bool) -> Outcome:
+def outcome(job: TraceJob, with_diagnosis: bool) -> Outcome:
     """Learn from one trace and diagnose it; never raises: a defect is a row, too."""
     start_s = time.process_time()
     row, sums = empty_row(job), b""
     try:
         project = _project(job.project, job.project.stat().st_mtime_ns)
-        learned, found = _learned(project, job.trace)
-        row, sums = row | found, packed(learned)
+        study = Study(project, job.trace)
+        learned, figures = _learned(study)
+        row, sums = row | figures, packed(learned)
         if with_diagnosis:
-            row |= _verdict(project, job.trace)
+            row |= _verdict(study)
     except Exception as error:  # one trace must not stop the rest
         row |= _told(error)
     row["cpu_s"] = time.process_time() - start_s
@@ -60,7 +61,7 @@ def _told(error: Exception) -> dict[str, str]:
     return {"error": f"{type(error).__name__}: {error}", "remedy": "a defect: please report it"}
 
 
-def empty_row(job: Job) -> dict[str, Any]:
+def empty_row(job: TraceJob) -> dict[str, Any]:
     """A row that knows of its job alone."""
     return {
         "key": job.key, "trace": str(job.trace), "machine": job.machine, "digest": "",
@@ -76,13 +77,13 @@ def _project(path: Path, _changed_ns: int) -> Project:
     return load(path)
 
 
-def _learned(project: Project, path: Path) -> tuple[Sums, dict[str, Any]]:
-    trace = read_trace(project, path)
-    estimator = Estimator(model_for(project, trace.samples))
+def _learned(study: Study) -> tuple[Sums, dict[str, Any]]:
+    project, trace = study.project, study.read
+    estimator = Estimator(study.machine)
     estimator.update(trace.samples)
     solution = estimator.solution()
     return estimator.sums, {
-        "digest": project.digest,
+        "digest": project.machine_digest,
         "start_us": int(trace.samples.t_us[0]),
         "duration_s": trace.duration_s,
         "rows": int(solution.counters.get("rows", 0)),
@@ -93,25 +94,25 @@ def _learned(project: Project, path: Path) -> tuple[Sums, dict[str, Any]]:
     }
 
 
-def _verdict(project: Project, path: Path) -> dict[str, Any]:
+def _verdict(study: Study) -> dict[str, Any]:
     """What a diagnosis says; one that is too short for it has been learned from all the same."""
     try:
-        return _diagnosed(diagnose_trace(project, path).diagnosis)
+        return _diagnosed(study.diagnosis())
     except NoSamplesError as error:
         return {"verdict": INSUFFICIENT, "remedy": str(error)}
 
 
-def _diagnosed(told: Diagnosis) -> dict[str, Any]:
-    sizes = [next(iter(effect.parameters.values())) for effect in told.found]
-    percent = 100.0 / max(told.rms_flow_m3s, 1e-12)
+def _diagnosed(diagnosis: Diagnosis) -> dict[str, Any]:
+    sizes = [next(iter(effect.parameters.values())) for effect in diagnosis.found]
+    percent = 100.0 / max(diagnosis.rms_flow_m3s, 1e-12)
     return {
-        "verdict": told.verdict,
-        "effects": [effect.effect for effect in told.found],
-        "places": [effect.where for effect in told.found],
+        "verdict": diagnosis.verdict,
+        "effects": [effect.effect for effect in diagnosis.found],
+        "places": [effect.where for effect in diagnosis.found],
         "sizes": [float(size.value) for size in sizes],
         "units": [size.unit for size in sizes],
-        "heldout_before_pct": percent * told.heldout_residual_before_m3s,
-        "heldout_after_pct": percent * told.heldout_residual_after_m3s,
+        "heldout_before_pct": percent * diagnosis.heldout_residual_before_m3s,
+        "heldout_after_pct": percent * diagnosis.heldout_residual_after_m3s,
     }
 
 

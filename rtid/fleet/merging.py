@@ -24,8 +24,9 @@ from rtid.estimator.flowmap import PRIOR, SHUT, VALID, FlowMap
 from rtid.estimator.published import publish
 from rtid.estimator.solution import Solution, solve
 from rtid.fleet.archive import Archive
-from rtid.mapfiles import provenance, write_map
-from rtid.model import FloatArray, Model
+from rtid.maps.files import provenance, write_map
+from rtid.model import Machine
+from rtid.plain import FloatArray
 
 FEWEST = 3  # machines that a typical value takes
 MAD = 1.4826  # of a normal distribution
@@ -36,7 +37,7 @@ Row = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class Machine:
+class FleetMachine:
     """All traces of a machine of one declaration: its rows, and the joint estimate."""
 
     name: str
@@ -71,7 +72,9 @@ class Typical:
     flowmap: FlowMap  # the same as a prior for the next machine, see `_middle`
 
 
-def machines(archive: Archive, models: Mapping[str, Model], workers: int = 1) -> list[Machine]:
+def machines(
+    archive: Archive, models: Mapping[str, Machine], workers: int = 1
+) -> list[FleetMachine]:
     """Every machine with at least one trace that was learned from; models by digest.
 
     workers: processes; a machine takes some seconds, as long as a few of its traces.
@@ -80,31 +83,31 @@ def machines(archive: Archive, models: Mapping[str, Model], workers: int = 1) ->
     for row in archive.rows():
         if not row["error"] and row["digest"] in models:
             rows[row["machine"], row["digest"]].append(row)
-    of = [(archive, models[d], name, d, own) for (name, d), own in rows.items()]
+    of = [(archive, models[d], name, d, machine_rows) for (name, d), machine_rows in rows.items()]
     if min(workers, len(of)) < 2:
-        return [_machine(*one) for one in of]
+        return [_machine(*parts) for parts in of]
     with ProcessPoolExecutor(min(workers, len(of)), get_context("spawn")) as pool:
         return list(pool.map(_machine, *zip(*of, strict=True)))
 
 
 def _machine(
-    archive: Archive, model: Model, name: str, digest: str, rows: Sequence[Row]
-) -> Machine:
+    archive: Archive, model: Machine, name: str, digest: str, rows: Sequence[Row]
+) -> FleetMachine:
     solution = solve(model, reduce(add, archive.sums([row["key"] for row in rows])))
-    return Machine(name, digest, tuple(rows), solution, publish(solution))
+    return FleetMachine(name, digest, tuple(rows), solution, publish(solution))
 
 
-def typical(found: Iterable[Machine]) -> list[Typical]:
+def typical(fleet_machines: Iterable[FleetMachine]) -> list[Typical]:
     """One typical map per declaration with at least three machines."""
-    types: dict[str, list[Machine]] = defaultdict(list)
-    for machine in found:
+    types: dict[str, list[FleetMachine]] = defaultdict(list)
+    for machine in fleet_machines:
         types[machine.digest].append(machine)
-    return [_typical(digest, own) for digest, own in types.items() if len(own) >= FEWEST]
+    return [_typical(digest, alike) for digest, alike in types.items() if len(alike) >= FEWEST]
 
 
-def _typical(digest: str, own: Sequence[Machine]) -> Typical:
-    edge, u, dp = _nodes(own[0].flowmap)
-    flows = np.array([_known(machine.flowmap) for machine in own])
+def _typical(digest: str, alike: Sequence[FleetMachine]) -> Typical:
+    edge, u, dp = _nodes(alike[0].flowmap)
+    flows = np.array([_known(machine.flowmap) for machine in alike])
     enough = np.isfinite(flows).sum(axis=0) >= FEWEST
     flows = flows[:, enough]
     middle = np.nanmedian(flows, axis=0)
@@ -112,8 +115,8 @@ def _typical(digest: str, own: Sequence[Machine]) -> Typical:
     least = FLOOR * float(np.abs(middle).max(initial=0.0))
     names = [name for name, is_known in zip(edge, enough, strict=True) if is_known]
     spread = np.maximum(spread, least)
-    flowmap = _middle([machine.flowmap for machine in own])
-    return Typical(digest, names, u[enough], dp[enough], middle, spread, len(own), flowmap)
+    flowmap = _middle([machine.flowmap for machine in alike])
+    return Typical(digest, names, u[enough], dp[enough], middle, spread, len(alike), flowmap)
 
 
 def _middle(maps: Sequence[FlowMap]) -> FlowMap:
@@ -142,13 +145,13 @@ def _middle(maps: Sequence[FlowMap]) -> FlowMap:
     return FlowMap(tuple(edges))
 
 
-def deviation(machine: Machine, of: Typical) -> float:
+def deviation(machine: FleetMachine, of: Typical) -> float:
     """Rms of what a machine's map deviates from the typical one, in units of the spread."""
-    own = dict(
+    values = dict(
         zip(zip(*_nodes(machine.flowmap), strict=True), _known(machine.flowmap), strict=True)
     )
     at = zip(of.edge, of.u_v, of.dp_pa, strict=True)
-    off = (np.array([own[node] for node in at]) - of.flow_m3s) / of.spread_m3s
+    off = (np.array([values[node] for node in at]) - of.flow_m3s) / of.spread_m3s
     off = off[np.isfinite(off)]
     return float(np.sqrt(np.mean(off**2))) if len(off) else float("nan")
 
@@ -168,31 +171,35 @@ def _nodes(flowmap: FlowMap) -> tuple[list[str], FloatArray, FloatArray]:
 
 def _known(flowmap: FlowMap) -> FloatArray:
     """Flow at these centres, NaN in blocks that do not stand on their own data."""
-    found = []
+    known = []
     for edge in flowmap.edges:
         centres = [0.5 * (b[1:] + b[:-1]) for b in (edge.grid.u_v, edge.grid.dp_pa)]
         w, d = np.meshgrid(*centres, indexing="ij")
-        found.append(np.where(edge.status == VALID, edge.flow(w, d), np.nan).ravel())
-    return np.concatenate(found)
+        known.append(np.where(edge.status == VALID, edge.flow(w, d), np.nan).ravel())
+    return np.concatenate(known)
 
 
-def write(archive: Archive, found: Sequence[Machine], types: Sequence[Typical]) -> None:
+def write(
+    archive: Archive, fleet_machines: Sequence[FleetMachine], types: Sequence[Typical]
+) -> None:
     """Maps, typical maps and the table of machines, the most remarkable first."""
-    for machine in found:
+    for machine in fleet_machines:
         traces = f"{len(machine.rows)} traces of {machine.name}"
         origin = provenance(machine.solution, machine.name, machine.digest, traces)
         path = archive.folder / "maps" / f"{_plain(machine.name)}-{machine.digest[:8]}.npz"
         write_map(path, machine.flowmap, origin)
-    for one in types:
-        path = archive.folder / f"typical-{one.digest[:8]}.npz"
-        _write_typical(path.with_suffix(".csv"), one)
-        write_map(path, one.flowmap, {"digest": one.digest, "machines": one.machines})
-    archive.keep_machines(ranked(found, types))
+    for item in types:
+        path = archive.folder / f"typical-{item.digest[:8]}.npz"
+        _write_typical(path.with_suffix(".csv"), item)
+        write_map(path, item.flowmap, {"digest": item.digest, "machines": item.machines})
+    archive.keep_machines(ranked(fleet_machines, types))
 
 
-def ranked(found: Sequence[Machine], types: Sequence[Typical]) -> list[dict[str, Any]]:
+def ranked(
+    fleet_machines: Sequence[FleetMachine], types: Sequence[Typical]
+) -> list[dict[str, Any]]:
     """One row per machine: the worst verdict first, then the largest deviation from its type."""
-    of = {one.digest: one for one in types}
+    of = {item.digest: item for item in types}
     rows = [
         {
             "machine": machine.name,
@@ -208,7 +215,7 @@ def ranked(found: Sequence[Machine], types: Sequence[Typical]) -> list[dict[str,
             "valid_blocks": int(sum((e.status == VALID).sum() for e in machine.flowmap.edges)),
             "rho": float(machine.solution.rho),
         }
-        for machine in found
+        for machine in fleet_machines
     ]
     return sorted(rows, key=lambda r: (WORST.index(r["verdict"]), -np.nan_to_num(r["deviation"])))
 
@@ -217,11 +224,11 @@ def _plain(name: str) -> str:
     return "".join(c if c.isalnum() or c in "-_" else "_" for c in name)
 
 
-def _write_typical(path: Path, one: Typical) -> None:
+def _write_typical(path: Path, item: Typical) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
-        file.write(f"# typical of {one.machines} machines; sd: spread over them\n")
+        file.write(f"# typical of {item.machines} machines; sd: spread over them\n")
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["edge", "u_V", "dp_Pa", "Q_m3/s", "sd_m3/s", "status"])
-        columns = one.edge, one.u_v, one.dp_pa, one.flow_m3s, one.spread_m3s
+        columns = item.edge, item.u_v, item.dp_pa, item.flow_m3s, item.spread_m3s
         for name, u, dp, q, sd in zip(*columns, strict=True):
             writer.writerow([name, f"{u:.9g}", f"{dp:.9g}", f"{q:.9g}", f"{sd:.3g}", "prior"])

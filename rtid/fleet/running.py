@@ -14,8 +14,8 @@ from typing import Any
 
 from rtid.errors import RtidError
 from rtid.fleet.archive import Archive
-from rtid.fleet.jobs import Job
 from rtid.fleet.learning import Outcome, empty_row, outcome
+from rtid.fleet.traces import TraceJob
 
 AHEAD = 3  # jobs under way per worker
 HERE = "127.0.0.1"
@@ -24,7 +24,7 @@ Progress = Callable[[int, int, Outcome], None]
 
 
 def run(
-    jobs: list[Job],
+    jobs: list[TraceJob],
     archive: Archive,
     progress: Progress,
     *,
@@ -38,14 +38,14 @@ def run(
     progress is told how many are done, of how many, and the last one.
     """
     known = archive.done()
-    left = [job for job in jobs if job.key not in known]
-    if not left:
+    waiting = [job for job in jobs if job.key not in known]
+    if not waiting:
         return 0
-    with connected(min(workers, len(left)), scheduler) as client:
-        for n, found in enumerate(_outcomes(client, left, with_diagnosis), 1):
-            archive.keep(found)
-            progress(n, len(left), found)
-    return len(left)
+    with connected(min(workers, len(waiting)), scheduler) as client:
+        for n, result in enumerate(_outcomes(client, waiting, with_diagnosis), 1):
+            archive.keep(result)
+            progress(n, len(waiting), result)
+    return len(waiting)
 
 
 @contextmanager
@@ -63,11 +63,11 @@ def connected(workers: int, scheduler: str) -> Iterator[Any]:
     with ExitStack() as stack:
         stack.enter_context(dask.config.set(once))
         if not scheduler:
-            own = cluster(
+            local = cluster(
                 n_workers=workers, threads_per_worker=1, host=HERE, dashboard_address=board,
                 silence_logs="CRITICAL",
             )  # fmt: skip
-            scheduler = stack.enter_context(own).scheduler_address
+            scheduler = stack.enter_context(local).scheduler_address
         yield stack.enter_context(_client(client, scheduler))
 
 
@@ -79,14 +79,14 @@ def _client(make: Any, scheduler: str) -> Any:
         raise RtidError(f"no scheduler at {scheduler}", remedy) from error
 
 
-def _outcomes(client: Any, jobs: list[Job], with_diagnosis: bool) -> Iterator[Outcome]:
+def _outcomes(client: Any, jobs: list[TraceJob], with_diagnosis: bool) -> Iterator[Outcome]:
     import distributed  # noqa: PLC0415 - an extra
 
     as_completed: Any = distributed.as_completed
     waiting = iter(jobs)
-    of: dict[str, Job] = {}
+    of: dict[str, TraceJob] = {}
 
-    def submit(job: Job) -> Any:
+    def submit(job: TraceJob) -> Any:
         future = client.submit(outcome, job, with_diagnosis, key=f"rtid-{job.key}", pure=False)
         of[future.key] = job
         return future
@@ -102,11 +102,11 @@ def _outcomes(client: Any, jobs: list[Job], with_diagnosis: bool) -> Iterator[Ou
             under_way.add(submit(more))
 
 
-def _lost(job: Job, future: Any) -> Outcome:
+def _lost(job: TraceJob, future: Any) -> Outcome:
     """The outcome of a job that took its worker with it."""
     reason = future.exception()
-    told = {
+    figures = {
         "error": f"the worker died ({type(reason).__name__})",
         "remedy": "too little memory, or a defect: try `rtid diagnose` on this trace alone",
     }
-    return Outcome(job, empty_row(job) | told)
+    return Outcome(job, empty_row(job) | figures)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import rankdata, theilslopes
 
-from rtid.model import FloatArray
+from rtid.plain import FloatArray
 
 FEWEST, SIDE = 8, 3  # values of a trend; on either side of a change
 CHANCE = 0.01  # that a change is named where there is none
@@ -47,7 +47,10 @@ class Trend:
 
 
 def trend(name: str, t_d: FloatArray, values: FloatArray, limit: float = float("nan")) -> Trend:
-    """The trend of values (n,) at times (n,) in days; too few of them have infinite intervals."""
+    """The trend of values (n,) at times (n,) in days; too few of them have infinite intervals.
+
+    values, limit: in any one unit, in which the trend comes as well.
+    """
     order = np.argsort(t_d, kind="stable")
     t, y = np.asarray(t_d, float)[order], np.asarray(values, float)[order]
     t, y = t[np.isfinite(y)], y[np.isfinite(y)]
@@ -75,8 +78,8 @@ def _days_to(distance: float, slope: float) -> float:
 def change_point(y: FloatArray) -> int:
     """Index of the first value after a change of level; 0 where chance or a drift explains it.
 
-    Pettitt's test (1979) on ranks, then two levels against one straight line by the sums of their
-    absolute deviations.
+    y (n,) in any unit.  Pettitt's test (1979) on ranks, then two levels against one straight line
+    by the sums of their absolute deviations.
     """
     n = len(y)
     if n < FEWEST:
@@ -96,17 +99,22 @@ def _spread(y: FloatArray) -> float:
 
 
 def series(rows: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, str, FloatArray, FloatArray]]:
-    """Machine, quantity, days and values of all that can be followed: moduli, sizes of effects."""
+    """Machine, quantity, days (n,) and values (n,) of all that can be followed.
+
+    These are moduli in Pa, and sizes of effects in the SI units of their coefficients.
+    """
     machines = dict.fromkeys(row["machine"] for row in rows)
     for machine in machines:
-        own = [r for r in rows if r["machine"] == machine and not r["error"]]
-        days = np.array([(r["start_us"] - own[0]["start_us"]) / DAY_US for r in own])
-        for c in range(max((len(r["beta_pa"]) for r in own), default=0)):
-            beta = [r["beta_pa"][c] if c < len(r["beta_pa"]) else np.nan for r in own]
+        of_machine = [r for r in rows if r["machine"] == machine and not r["error"]]
+        days = np.array([(r["start_us"] - of_machine[0]["start_us"]) / DAY_US for r in of_machine])
+        for c in range(max((len(r["beta_pa"]) for r in of_machine), default=0)):
+            beta = [r["beta_pa"][c] if c < len(r["beta_pa"]) else np.nan for r in of_machine]
             yield machine, f"beta_{c}", days, np.array(beta, float)
-        named = dict.fromkeys(e for r in own for e in zip(r["effects"], r["places"], strict=True))
+        named = dict.fromkeys(
+            e for r in of_machine for e in zip(r["effects"], r["places"], strict=True)
+        )
         for effect, where in named:
-            sizes = np.array([_size(r, effect, where) for r in own])
+            sizes = np.array([_size(r, effect, where) for r in of_machine])
             yield machine, f"{effect}:{where}", days, sizes
 
 

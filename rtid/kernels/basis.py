@@ -18,17 +18,15 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rtid.kernels.jit import inlined, kernel, part
 from rtid.kernels.layout import BLENDED
-
-FloatArray = NDArray[np.float64]
+from rtid.plain import FloatArray
 
 
 @inlined
 def locate(border: FloatArray, n: int, value: float) -> int:
-    """Index of the interval of border[0..n] that holds value; -1 outside.  Bisection."""
+    """Index of the interval of border (n + 1,) that holds value, in its unit; -1 outside."""
     if not (value >= border[0] and value <= border[n]):
         return -1
     low, high = 0, n
@@ -43,7 +41,7 @@ def locate(border: FloatArray, n: int, value: float) -> int:
 
 @inlined
 def relocate(border: FloatArray, n: int, value: float, current: int, hysteresis: float) -> int:
-    """As `locate`, but stay in `current` until value leaves it by hysteresis * its width."""
+    """As `locate` in border (n + 1,), but stay in `current` until left by a share of its width."""
     if current >= 0:
         margin = hysteresis * (border[current + 1] - border[current])
         if value >= border[current] - margin and value <= border[current + 1] + margin:
@@ -52,14 +50,14 @@ def relocate(border: FloatArray, n: int, value: float, current: int, hysteresis:
 
 
 @inlined
-def taylor(xi: float, eta: float, out: FloatArray) -> None:
-    """The six terms at one point; out (6,) is changed in place."""
-    out[0] = 1.0
-    out[1] = xi
-    out[2] = eta
-    out[3] = xi * xi
-    out[4] = eta * eta
-    out[5] = xi * eta
+def taylor(xi: float, eta: float, phi: FloatArray) -> None:
+    """The six terms at one point, dimensionless; phi (6,) is changed in place."""
+    phi[0] = 1.0
+    phi[1] = xi
+    phi[2] = eta
+    phi[3] = xi * xi
+    phi[4] = eta * eta
+    phi[5] = xi * eta
 
 
 OVERLAP = 0.5  # half the overlap at a border, in widths of the narrower neighbour: the most
@@ -71,8 +69,8 @@ def locate_pair(border: FloatArray, n: int, value: float) -> tuple[int, int]:
     home = locate(border, n, value)
     if home < 0:
         return -1, -1
-    left = value < 0.5 * (border[home] + border[home + 1])
-    return max(0, min(home - 1 if left else home, n - 2)), home
+    is_lower = value < 0.5 * (border[home] + border[home + 1])
+    return max(0, min(home - 1 if is_lower else home, n - 2)), home
 
 
 @inlined
@@ -87,7 +85,7 @@ def _rise(t: float) -> float:
 def window_axis(
     border: FloatArray, n: int, i: int, value: float, basis: int, out: FloatArray
 ) -> None:
-    """Window i times its three functions at one value; out (3,) is changed in place.
+    """Window i times its three functions, dimensionless, at one value; out (3,) changed in place.
 
     The outer borders have no neighbour: no window falls there, and the last block's cosines are
     even about its end instead of odd.
@@ -112,14 +110,14 @@ def window_axis(
 
 
 @inlined
-def window_terms(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
-    """Products of the two axes' functions up to total order two, in the order of `taylor`."""
-    out[0] = a[0] * b[0]
-    out[1] = a[1] * b[0]
-    out[2] = a[0] * b[1]
-    out[3] = a[2] * b[0]
-    out[4] = a[0] * b[2]
-    out[5] = a[1] * b[1]
+def window_terms(a: FloatArray, b: FloatArray, phi: FloatArray) -> None:
+    """phi (6,): products of the axes' functions (3,) as in `taylor`, dimensionless."""
+    phi[0] = a[0] * b[0]
+    phi[1] = a[1] * b[0]
+    phi[2] = a[0] * b[1]
+    phi[3] = a[2] * b[0]
+    phi[4] = a[0] * b[2]
+    phi[5] = a[1] * b[1]
 
 
 @kernel
@@ -130,14 +128,14 @@ def window_terms_at(
     i: int,
     j: int,
     points: FloatArray,
-    out: FloatArray,
+    phi: FloatArray,
 ) -> None:
-    """The six windowed terms of block (i, j) at points (n, 2) = [w, dp]; out (n, 6) is changed.
+    """The six windowed terms of block (i, j) at points (n, 2) = [w, dp]; phi (n, 6) is changed.
 
-    u (nu + 1,), dp (nd + 1,): the borders of the grid.
+    u (nu + 1,) V, dp (nd + 1,) Pa: the borders of the grid.
     """
     a, b = np.empty(3), np.empty(3)
     for k in range(len(points)):
         window_axis(u, len(u) - 1, i, points[k, 0], basis, a)
         window_axis(dp, len(dp) - 1, j, points[k, 1], basis, b)
-        window_terms(a, b, out[k])
+        window_terms(a, b, phi[k])

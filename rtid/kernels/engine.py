@@ -13,7 +13,6 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rtid.kernels.basis import locate_pair, relocate
 from rtid.kernels.gate import admitted, forgive
@@ -23,12 +22,6 @@ from rtid.kernels.increments import (
     shared_increments,
     term_increments,
     windowed_increments,
-)
-from rtid.kernels.information import (
-    RING_DET_LIMIT,
-    close_block,
-    open_block,
-    rebase,
 )
 from rtid.kernels.jit import inlined, kernel, part
 from rtid.kernels.layout import (
@@ -58,8 +51,13 @@ from rtid.kernels.rows import (
     integral_row_two,
     start_whitener,
 )
-
-FloatArray = NDArray[np.float64]
+from rtid.kernels.sparse_sums import (
+    RING_DET_LIMIT,
+    close_block,
+    open_block,
+    rebase,
+)
+from rtid.plain import FloatArray
 
 ENGINE_BYTES, CELL_BYTES, CLOSED_BYTES = ENGINE.itemsize, CELL.itemsize, CLOSED.itemsize
 BLOCK_BYTES = BLOCK.itemsize
@@ -135,7 +133,7 @@ def step_s(e: Any, t_s: float) -> float:
 
 @part
 def acceptable(e: Any, sample: FloatArray) -> bool:
-    """Finite and sane first (NaN passes no comparison), then the declared range of each signal."""
+    """Sample (2 + signals,), SI: finite and sane first (NaN passes none), then in its range."""
     for j in range(2 + e.n_signals):
         if not abs(sample[j]) < INSANE:
             e.counters[NOT_FINITE] += 1
@@ -149,7 +147,7 @@ def acceptable(e: Any, sample: FloatArray) -> bool:
 
 @inlined
 def remember(e: Any, sample: FloatArray) -> None:
-    """Keep the sample: it is the start of the next interval."""
+    """Keep the sample (2 + signals,), SI: it is the start of the next interval."""
     e.t_s = sample[0]
     for j in range(e.n_signals):
         e.values[j] = sample[2 + j]
@@ -265,31 +263,31 @@ def set_step(e: Any, dt: float) -> None:
 
 @part
 def working_points(e: Any, sample: FloatArray, dt: float) -> tuple[bool, bool]:
-    """Per edge: moments of the lagged command, dp at both ends, and the block of its mean point.
+    """Per edge: moments of the lagged command in V, dp at both ends in Pa, block of the mean.
 
     Returns (every edge that is open lies inside its grid, some edge changes its block).
     """
     inside, moved, moments, dp, target = True, False, e.moments, e.dp_pa, e.target
     for i in range(e.n_edges):
-        held = commanded(e, i)
-        end, m1, m2, mt = lagged_moments(held, e.w_v[i], e.lag_s, e.lag_decay, dt)
-        e.held_v[i], e.start_v[i], e.w_v[i] = held, e.w_v[i], end
-        u, p = SHUT, e.cell[i, 1]
+        u = commanded(e, i)
+        end, m1, m2, mt = lagged_moments(u, e.w_v[i], e.lag_s, e.lag_decay, dt)
+        e.held_v[i], e.start_v[i], e.w_v[i] = u, e.w_v[i], end
+        iu, ip = SHUT, e.cell[i, 1]
         if m1 > e.safe_v[i]:
             dp[i, 0] = e.values[e.source[i]] - e.values[e.sink[i]]
             dp[i, 1] = sample[2 + e.source[i]] - sample[2 + e.sink[i]]
             moments[i, 0], moments[i, 1], moments[i, 2] = m1, m2, mt
-            mid, before = 0.5 * (dp[i, 0] + dp[i, 1]), p if e.cell[i, 0] != SHUT else SHUT
+            mid, before = 0.5 * (dp[i, 0] + dp[i, 1]), ip if e.cell[i, 0] != SHUT else SHUT
             if e.map_basis[i] != TAYLOR:
-                u, e.home[i, 0] = locate_pair(e.u_border[i], e.n_u[i], m1)
-                p, e.home[i, 1] = locate_pair(e.dp_border[i], e.n_dp[i], mid)
+                iu, e.home[i, 0] = locate_pair(e.u_border[i], e.n_u[i], m1)
+                ip, e.home[i, 1] = locate_pair(e.dp_border[i], e.n_dp[i], mid)
             else:
-                u = relocate(e.u_border[i], e.n_u[i], m1, e.cell[i, 0], e.hysteresis)
-                p = relocate(e.dp_border[i], e.n_dp[i], mid, before, e.hysteresis)
-                e.home[i, 0], e.home[i, 1] = u, p
-            inside = inside and u >= 0 and p >= 0
-        moved = moved or u != e.cell[i, 0] or p != e.cell[i, 1]
-        target[i, 0], target[i, 1] = u, p
+                iu = relocate(e.u_border[i], e.n_u[i], m1, e.cell[i, 0], e.hysteresis)
+                ip = relocate(e.dp_border[i], e.n_dp[i], mid, before, e.hysteresis)
+                e.home[i, 0], e.home[i, 1] = iu, ip
+            inside = inside and iu >= 0 and ip >= 0
+        moved = moved or iu != e.cell[i, 0] or ip != e.cell[i, 1]
+        target[i, 0], target[i, 1] = iu, ip
     return inside, moved
 
 

@@ -10,7 +10,6 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rtid.kernels.engine import ROW_FLAG, SHUT, remember
 from rtid.kernels.holds import second_order
@@ -19,8 +18,7 @@ from rtid.kernels.jit import inlined, kernel, part
 from rtid.kernels.layout import TAYLOR, TERMS
 from rtid.kernels.rows import fade, innovations
 from rtid.kernels.taking import begin, take
-
-FloatArray = NDArray[np.float64]
+from rtid.plain import FloatArray
 
 MEASURED, MODELLED = 0, 1
 

@@ -6,16 +6,13 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rtid.kernels.engine import ROW_FLAG, SHUT, remember
 from rtid.kernels.increments import mean_terms
 from rtid.kernels.jit import kernel, part
 from rtid.kernels.layout import TERMS
 from rtid.kernels.taking import begin, take
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from rtid.plain import FloatArray, IntArray
 
 
 @kernel

@@ -18,7 +18,6 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rtid.kernels.engine import GAP_FLAG, acceptable, commanded, remember, set_step, step_s
 from rtid.kernels.holds import lagged_moments
@@ -34,9 +33,8 @@ from rtid.kernels.layout import (
     RATE,
     ROOT,
 )
-from rtid.kernels.published import foot_width, map_flow, rise
-
-FloatArray = NDArray[np.float64]
+from rtid.kernels.map_point import foot_width, map_flow, rise
+from rtid.plain import FloatArray
 
 # How the pressure of a sample came about.  BEYOND: a pressure drop was off its grid on the way.
 # GAP to RAN_AWAY end a run, which begins anew at that sample; no pressure is predicted there.
@@ -69,7 +67,7 @@ STAGES = 7
 def free_run(
     engine: Any,
     theta: FloatArray,
-    compliance: FloatArray,
+    theta_beta: FloatArray,
     overlap: float,
     chunk: FloatArray,
     position: FloatArray,
@@ -80,7 +78,7 @@ def free_run(
     """Predicted pressures at all samples; pressure and status are changed in place.
 
     engine (1,): freshly built, used up; its term_theta holds the coefficients of the shared terms.
-    theta (cells, 6) m3/s, Taylor terms; compliance (chambers,) 1/Pa; overlap: half the overlap of
+    theta (cells, 6) m3/s, Taylor terms; theta_beta (chambers,) 1/Pa; overlap: half the overlap of
     the windows in widths of the narrower neighbour.  chunk (n, 2 + signals), position (n,) smooth.
     period_s: the run begins anew from the measurement so often; inf: only after a stop.
     pressure (n, chambers) Pa, NaN where a run was stopped; status (n,): the codes above.
@@ -106,7 +104,7 @@ def free_run(
             if spools(e, dt):
                 x0, x1 = position[k - 1], position[k]
                 code, h = interval(
-                    e, theta, compliance, overlap, foot, x0, x1, dt, p, now, slopes, h
+                    e, theta, theta_beta, overlap, foot, x0, x1, dt, p, now, slopes, h
                 )
         pressure[k], status[k] = np.nan, code
         e.running = 0
@@ -133,9 +131,9 @@ def spools(e: Any, dt: float) -> bool:
     """Move the spools over the interval; False where an open one is off its grid."""
     inside = True
     for i in range(e.n_edges):
-        held, n = commanded(e, i), e.n_u[i]
-        end, mean, _, _ = lagged_moments(held, e.w_v[i], e.lag_s, e.lag_decay, dt)
-        e.held_v[i], e.start_v[i], e.w_v[i] = held, e.w_v[i], end
+        u, n = commanded(e, i), e.n_u[i]
+        end, mean, _, _ = lagged_moments(u, e.w_v[i], e.lag_s, e.lag_decay, dt)
+        e.held_v[i], e.start_v[i], e.w_v[i] = u, e.w_v[i], end
         if mean > e.safe_v[i]:
             inside = inside and mean >= e.u_border[i, 0] and mean <= e.u_border[i, n]
     return inside
@@ -145,7 +143,7 @@ def spools(e: Any, dt: float) -> bool:
 def interval(
     e: Any,
     theta: FloatArray,
-    compliance: FloatArray,
+    theta_beta: FloatArray,
     overlap: float,
     foot: FloatArray,
     x0: float,
@@ -172,14 +170,14 @@ def interval(
                     trial[c] += h * A[stage, j] * slopes[j, c]
             at = s + NODE[stage] * h
             off = _rates(
-                e, theta, compliance, overlap, foot, x0, x1, dt, at, trial, now, slopes[stage]
+                e, theta, theta_beta, overlap, foot, x0, x1, dt, at, trial, now, slopes[stage]
             )
             beyond = beyond or off
         for c in range(e.n_chambers):
-            left = 0.0
+            missed = 0.0
             for j in range(STAGES):
-                left += ERROR[j] * slopes[j, c]
-            error = max(error, abs(h * left))
+                missed += ERROR[j] * slopes[j, c]
+            error = max(error, abs(h * missed))
         if not error < INSANE_PA:
             h *= SHRINK
             continue
@@ -212,7 +210,7 @@ def _is_away(e: Any, c: int, p: float) -> bool:
 def _rates(
     e: Any,
     theta: FloatArray,
-    compliance: FloatArray,
+    theta_beta: FloatArray,
     overlap: float,
     foot: FloatArray,
     x0: float,
@@ -245,11 +243,11 @@ def _rates(
             beyond = beyond or off
     x = x0 + s * (x1 - x0)
     f0 -= e.area_m2[0] * (x1 - x0) / dt
-    m00, m01 = (e.v0_m3[0] + e.area_m2[0] * x) * compliance[0], 0.0
+    m00, m01 = (e.v0_m3[0] + e.area_m2[0] * x) * theta_beta[0], 0.0
     m10, m11 = 0.0, 1.0
     if e.n_chambers == 2:
         f1 -= e.area_m2[1] * (x1 - x0) / dt
-        m11 = (e.v0_m3[1] + e.area_m2[1] * x) * compliance[1]
+        m11 = (e.v0_m3[1] + e.area_m2[1] * x) * theta_beta[1]
     for k in range(e.n_terms):
         flow, d0, d1 = _term(e, k, now, x, dt)
         f0, f1 = f0 + e.term_sign[k, 0] * flow, f1 + e.term_sign[k, 1] * flow
@@ -272,14 +270,14 @@ def _term(e: Any, k: int, now: FloatArray, x: float, dt: float) -> tuple[float, 
     if volume != RATE:
         theta *= e.v0_m3[volume] + e.area_m2[volume] * x
     z, rate, shape = e.term_constant[k], 0.0, e.term_shape[k]
-    own0, own1 = 0.0, 0.0
+    by_p0, by_p1 = 0.0, 0.0
     for j in range(e.n_signals):
         weight = e.term_weight[k, j]
         z += weight * now[j]
         if j == e.p_column[0]:
-            own0 += weight
+            by_p0 += weight
         elif e.n_chambers == 2 and j == e.p_column[1]:
-            own1 += weight
+            by_p1 += weight
         else:
             rate += weight * (e.sample[2 + j] - e.values[j]) / dt
     slope = 1.0
@@ -289,4 +287,4 @@ def _term(e: Any, k: int, now: FloatArray, x: float, dt: float) -> tuple[float, 
         slope = 1.0 if z > 0.0 else 0.0
     elif shape == INVERSE:
         slope = 1.0 / (z * z)
-    return -theta * slope * rate, theta * slope * own0, theta * slope * own1
+    return -theta * slope * rate, theta * slope * by_p0, theta * slope * by_p1

@@ -8,19 +8,15 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
 from rtid.kernels.jit import inlined, kernel
-
-FloatArray = NDArray[np.float64]
+from rtid.plain import FloatArray
 
 
 @kernel
 def second_order(wn: float, zeta: float, dt: float, a: FloatArray, b: FloatArray) -> None:
     """Discretise H_f for an input that is linear over dt: x+ = a x + b [u_start, u_end].
 
-    State x = (output, output' / wn).  a and b, both (2, 2), are changed in place.  zeta < 1.
+    State x = (output, output' / wn).  a, b (2, 2) are changed in place.  wn in rad/s, zeta < 1.
     The continuous system is x' = wn [[0, 1], [-1, -2 zeta]] x + wn [0, 1] u; with G = A^-1,
     int e^{As} B ds = G (a - I) B and the ramp part follows by parts.
     """
@@ -44,17 +40,17 @@ GAUSS = 0.5 / math.sqrt(3.0)
 
 @inlined
 def lagged_moments(
-    held: float, start: float, lag: float, decay: float, dt: float
+    u: float, w0: float, lag: float, decay: float, dt: float
 ) -> tuple[float, float, float, float]:
-    """Moments over dt of w(t) = held + (start - held) e^{-t / lag}, decay = e^{-dt / lag}.
+    """Moments over dt of w(t) = u + (w0 - u) e^{-t / lag}, decay = e^{-dt / lag}.
 
     Returns (w at dt, mean of w, mean of w^2, mean of w (t/dt - 1/2)).
     """
     if lag <= 0.0:
-        return held, held, held * held, 0.0
-    g = start - held
+        return u, u, u * u, 0.0
+    g = w0 - u
     k = lag / dt
     m1 = k * (1.0 - decay)
     m2 = 0.5 * k * (1.0 - decay * decay)
     mt = k * (k * (1.0 - decay) - decay) - 0.5 * m1
-    return held + g * decay, held + g * m1, held * held + 2.0 * held * g * m1 + g * g * m2, g * mt
+    return u + g * decay, u + g * m1, u * u + 2.0 * u * g * m1 + g * g * m2, g * mt

@@ -8,9 +8,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from rtid.kernels.basis import window_axis, window_terms
 from rtid.kernels.holds import GAUSS
 from rtid.kernels.jit import inlined, part
@@ -23,8 +20,7 @@ from rtid.kernels.layout import (
     ROOT,
     TERMS,
 )
-
-FloatArray = NDArray[np.float64]
+from rtid.plain import FloatArray
 
 HELD_MISFIT = 5e-4  # of an edge's scale: what six terms miss of a flow at the borders of a block
 
@@ -33,7 +29,8 @@ HELD_MISFIT = 5e-4  # of an edge's scale: what six terms miss of a flow at the b
 def shared_increments(e: Any, sample: FloatArray, dt: float) -> None:
     """y: s A dx; theta_beta: -V dP (scaled by the nominal compliance), exact for linear x and P.
 
-    Carry form: the rates at both ends of the interval instead of the integrals.
+    sample (2 + signals,), SI.  Carry form: the rates at both ends of the interval instead of the
+    integrals.
     """
     x0, x1 = e.values[e.x_column], sample[2 + e.x_column]
     for c in range(e.n_chambers):
@@ -52,7 +49,7 @@ def shared_increments(e: Any, sample: FloatArray, dt: float) -> None:
 
 @inlined
 def shaped(e: Any, k: int, values: FloatArray, first: int) -> float:
-    """Shape of shared term k at an instant; the signals stand in values from `first` on."""
+    """Shape of shared term k, SI; its signals stand in values (m,) from `first` on."""
     z = e.term_constant[k]
     for j in range(e.n_signals):
         z += e.term_weight[k, j] * values[first + j]
@@ -68,7 +65,7 @@ def shaped(e: Any, k: int, values: FloatArray, first: int) -> float:
 
 @part
 def term_rates(e: Any, k: int, sample: FloatArray, dt: float) -> tuple[float, float]:
-    """Flow of shared term k for theta = 1 at the start and the end of an interval, m3/s."""
+    """Flow of shared term k for theta = 1 at both ends, m3/s; sample (2 + signals,)."""
     start, end = shaped(e, k, e.values, 0), shaped(e, k, sample, 2)
     scale, volume = e.term_scale[k], e.term_volume[k]
     if volume == FLOW:
@@ -83,7 +80,7 @@ def term_rates(e: Any, k: int, sample: FloatArray, dt: float) -> tuple[float, fl
 
 @part
 def term_increments(e: Any, sample: FloatArray, dt: float) -> None:
-    """Integrals (carry form: end values) of the shared terms."""
+    """Integrals, m3 (carry form: end values), of the shared terms; sample (2 + signals,), SI."""
     for k in range(e.n_terms):
         start, end = term_rates(e, k, sample, dt)
         j = 1 + e.n_chambers + k

@@ -8,12 +8,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rtid.kernels.jit import inlined, kernel
 from rtid.kernels.layout import TERMS
-
-FloatArray = NDArray[np.float64]
+from rtid.plain import FloatArray
 
 SPLIT = 2.0**27 + 1.0  # cuts a double into two halves of 26 bits, whose products are exact
 
@@ -27,7 +25,7 @@ def assemble(
     gram: FloatArray,
     right: FloatArray,
 ) -> None:
-    """Fill gram (n, n) and right (n,), changed in place; arguments as in `estimator.sums.Sums`."""
+    """Fill gram (n, n) and right (n,) in place, in units of the scales of `estimator.sums.Sums`."""
     ns = len(shared) - 1
     for i in range(ns):
         right[i] = shared[1 + i, 0]
@@ -56,7 +54,7 @@ def _place(tile: FloatArray, low: int, high: int, gram: FloatArray) -> None:
 
 @kernel
 def mirror(matrix: FloatArray, scale: FloatArray) -> None:
-    """matrix (n, n) <- scale_i scale_j upper_ij, both triangles, from its upper one; in place."""
+    """matrix (n, n) <- scale_i scale_j upper_ij, both triangles scaled by scale (n,); in place."""
     n = len(matrix)
     for i in range(n):
         for j in range(i, n):
@@ -70,7 +68,7 @@ def residual(matrix: FloatArray, theta: FloatArray, right: FloatArray) -> FloatA
     """right - matrix theta (n,) in twice the precision, rounded once; matrix (n, n) symmetric.
 
     Products and sums with what they round off: Dot2 of Ogita, Rump and Oishi, SIAM J. Sci. Comput.
-    26 (2005), for all rows at once.  Entries of 1e300 overflow.
+    26 (2005), for all rows at once.  Entries of 1e300 overflow; any units that fit.
     """
     total, lost = right.copy(), np.zeros(len(right))
     for j in range(len(right)):

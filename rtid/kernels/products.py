@@ -12,18 +12,14 @@ For what they share among themselves see `ringing`.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rtid.kernels.jit import inlined, kernel
 from rtid.kernels.layout import TERMS
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
+from rtid.plain import BoolArray, FloatArray, IntArray
 
 
 @kernel
-def whitened(columns: FloatArray, fresh: BoolArray, whiten: FloatArray, keep: FloatArray) -> None:
+def whitened(columns: FloatArray, fresh: BoolArray, whiten: FloatArray, A: FloatArray) -> None:
     """What columns add to the rows (rows, chambers, m) becomes their whitened rows, in place."""
     rows, n_c, m = columns.shape
     d = np.zeros((2, m))
@@ -31,48 +27,48 @@ def whitened(columns: FloatArray, fresh: BoolArray, whiten: FloatArray, keep: Fl
         if fresh[r]:
             d[:] = 0.0
         b, i0, half, i1 = columns[r], whiten[r, 0], whiten[r, 1], whiten[r, 2]
-        k00, k01, k10, k11 = _transition(keep, r)
+        a00, a01, a10, a11 = _transition(A, r)
         if n_c == 1:
             for j in range(m):
-                d[0, j] = k00 * d[0, j] + b[0, j]
+                d[0, j] = a00 * d[0, j] + b[0, j]
                 b[0, j] = i0 * d[0, j]
             continue
         for j in range(m):
             d0, d1 = d[0, j], d[1, j]
-            d[0, j] = k00 * d0 + k01 * d1 + b[0, j]
-            d[1, j] = k10 * d0 + k11 * d1 + b[1, j]
+            d[0, j] = a00 * d0 + a01 * d1 + b[0, j]
+            d[1, j] = a10 * d0 + a11 * d1 + b[1, j]
             b[0, j] = i0 * d[0, j]
             b[1, j] = i1 * (d[1, j] - half * b[0, j])
 
 
 @inlined
-def _transition(keep: FloatArray, r: int) -> tuple[float, float, float, float]:
+def _transition(A: FloatArray, r: int) -> tuple[float, float, float, float]:
     """A of the row before; of no meaning for the first."""
-    k = keep[r - 1]
-    return k[0, 0], k[0, 1], k[1, 0], k[1, 1]
+    a = A[r - 1]
+    return a[0, 0], a[0, 1], a[1, 0], a[1, 1]
 
 
 @kernel
-def adjoint(rows: FloatArray, fresh: BoolArray, whiten: FloatArray, keep: FloatArray) -> None:
+def adjoint(rows: FloatArray, fresh: BoolArray, whiten: FloatArray, A: FloatArray) -> None:
     """Whitened rows (rows, chambers, m) become their adjoint l, in place."""
     n, n_c, m = rows.shape
     for r in range(n - 1, -1, -1):
         row, i0, half, i1 = rows[r], whiten[r, 0], whiten[r, 1], whiten[r, 2]
         rings = r + 1 < n and not fresh[r + 1]
-        k, after = keep[r], rows[r + 1] if rings else row
-        k00, k01, k10, k11 = k[0, 0], k[0, 1], k[1, 0], k[1, 1]
+        a, after = A[r], rows[r + 1] if rings else row
+        a00, a01, a10, a11 = a[0, 0], a[0, 1], a[1, 0], a[1, 1]
         for j in range(m):
             if n_c == 1:
                 row[0, j] *= i0
                 if rings:
-                    row[0, j] += k00 * after[0, j]
+                    row[0, j] += a00 * after[0, j]
                 continue
             e1 = i1 * row[1, j]
             row[0, j] = i0 * (row[0, j] - half * e1)
             row[1, j] = e1
             if rings:
-                row[0, j] += k00 * after[0, j] + k10 * after[1, j]
-                row[1, j] += k01 * after[0, j] + k11 * after[1, j]
+                row[0, j] += a00 * after[0, j] + a10 * after[1, j]
+                row[1, j] += a01 * after[0, j] + a11 * after[1, j]
 
 
 @kernel

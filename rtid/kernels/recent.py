@@ -10,13 +10,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from rtid.kernels.jit import inlined, kernel, part
 from rtid.kernels.layout import FREE, OPEN, TERMS
-
-FloatArray = NDArray[np.float64]
+from rtid.plain import FloatArray
 
 
 @part
@@ -64,10 +60,10 @@ def admit(e: Any, closed: Any, slot: int) -> int:
 def hand_over(e: Any, closed: Any, blocks: Any, pairs: Any, p: int) -> None:
     """Move what recent block p shares with itself and all others to the tables."""
     item = closed[p]
-    own = blocks[item.slot]
+    block = blocks[item.slot]
     for i in range(TERMS):
         for j in range(TERMS):
-            own.gram[i, j] += item.gram[i, TERMS * p + j]
+            block.gram[i, j] += item.gram[i, TERMS * p + j]
             item.gram[i, TERMS * p + j] = 0.0
     for q in range(e.n_recent):
         if closed[q].status != FREE and q != p:
@@ -95,7 +91,7 @@ def release(e: Any, closed: Any, blocks: Any, pairs: Any, p: int) -> None:
 
 @part
 def spread(e: Any, item: Any, right: FloatArray, count: int) -> None:
-    """item.gram[:, :count] += left' right[:, :count]; e.left (states, 6), right (states, ...)."""
+    """item.gram[:, :count] += e.left' right[:, :count], (states, 6) and (states, m), scaled."""
     for i in range(TERMS):
         target = item.gram[i]
         for s in range(0, e.n_state - 1, 2):  # by twos: one pass over target for both chambers
@@ -109,9 +105,9 @@ def spread(e: Any, item: Any, right: FloatArray, count: int) -> None:
 
 
 @inlined
-def add_tile(e: Any, item: Any, p: int, left: FloatArray, right: FloatArray) -> None:
-    """item.gram[:, of p] += left' right, both (states, 6)."""
+def add_tile(e: Any, item: Any, p: int, a: FloatArray, b: FloatArray) -> None:
+    """item.gram[:, of p] += a' b, both (states, 6), scaled as the gram is."""
     for s in range(e.n_state):
         for i in range(TERMS):
             for j in range(TERMS):
-                item.gram[i, TERMS * p + j] += left[s, i] * right[s, j]
+                item.gram[i, TERMS * p + j] += a[s, i] * b[s, j]

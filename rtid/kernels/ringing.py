@@ -12,14 +12,10 @@ and the many blocks that ring are met once in a span of rows by the few that mov
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rtid.kernels.jit import inlined, kernel, part
 from rtid.kernels.layout import TERMS
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
+from rtid.plain import BoolArray, FloatArray, IntArray
 
 
 @kernel
@@ -30,7 +26,7 @@ def map_products(
     terms: FloatArray,
     fresh: BoolArray,
     whiten: FloatArray,
-    keep: FloatArray,
+    A: FloatArray,
     span: int,
     quiet: float,
     gram: FloatArray,
@@ -38,14 +34,14 @@ def map_products(
     """Add the products of all columns of the maps to the lower triangle of gram (6 V, 6 V).
 
     sign (V, 2) of the blocks' edges; start (rows + 1,), block (entries,), terms (entries, 6),
-    fresh, whiten, keep: see `evidence.integrate`.  Rows are taken `span` at a time; a block whose
+    fresh, whiten, A: see `evidence.integrate`.  Rows are taken `span` at a time; a block whose
     whitened state is below `quiet` is forgotten.
     """
     n_v, rows = len(sign), len(whiten)
-    memory = np.empty((rows, 3))
-    _memories(fresh, whiten, keep, memory)
-    # per block: what it left behind before the span, adds in it, and what that meets
-    left, new, felt = np.zeros((n_v, 12)), np.zeros((n_v, 12)), np.zeros((n_v, 12))
+    M = np.empty((rows, 3))
+    _memories(fresh, whiten, A, M)
+    # per block: d, what it left behind before the span; what it adds in it, and what that meets
+    d, new, felt = np.zeros((n_v, 12)), np.zeros((n_v, 12)), np.zeros((n_v, 12))
     live, moving = np.empty(n_v, np.int64), np.empty(n_v, np.int64)
     is_live, moves = np.zeros(n_v, np.bool_), np.zeros(n_v, np.bool_)
     n_live, r = 0, 0
@@ -53,85 +49,85 @@ def map_products(
     while r < rows:
         if fresh[r]:
             for n in range(n_live):
-                left[live[n]] = 0.0
+                d[live[n]] = 0.0
                 is_live[live[n]] = False
             n_live = 0
         way[0, 0], way[0, 1], way[1, 0], way[1, 1] = 1.0, 0.0, 0.0, 1.0
         n_moving, first = 0, r
         while r < rows and r < first + span and (r == first or not fresh[r]):
             if r > first:
-                _carry(keep[r - 1], way)
+                _carry(A[r - 1], way)
                 for n in range(n_moving):
-                    _fade(keep[r - 1], new[moving[n]])
+                    _fade(A[r - 1], new[moving[n]])
             for n in range(start[r], start[r + 1]):
                 v = block[n]
                 if not moves[v]:
                     moves[v] = True
                     moving[n_moving] = v
                     n_moving += 1
-                _meet(v, terms[n], sign[v], memory[r], way, moving[:n_moving], new, felt, gram)
+                _meet(v, terms[n], sign[v], M[r], way, moving[:n_moving], new, felt, gram)
             r += 1
         for a in range(n_moving):
-            _ring(moving[a], felt[moving[a]], live[:n_live], left, gram)
+            _ring(moving[a], felt[moving[a]], live[:n_live], d, gram)
         if r < rows:
-            _carry(keep[r - 1], way)
+            _carry(A[r - 1], way)
             for n in range(n_live):
-                _fade(way, left[live[n]])
+                _fade(way, d[live[n]])
             for n in range(n_moving):
                 v = moving[n]
-                _leave(keep[r - 1], new[v], felt[v], left[v])
+                _leave(A[r - 1], new[v], felt[v], d[v])
                 if not is_live[v]:
                     is_live[v] = True
                     live[n_live] = v
                     n_live += 1
-            n_live = _loud(whiten[r], quiet, moves, live, n_live, is_live, left)
+            n_live = _loud(whiten[r], quiet, moves, live, n_live, is_live, d)
             for n in range(n_moving):
                 moves[moving[n]] = False
 
 
 @part
-def _memories(fresh: BoolArray, whiten: FloatArray, keep: FloatArray, out: FloatArray) -> None:
-    """M00, M01, M11 of every row, out (rows, 3)."""
+def _memories(fresh: BoolArray, whiten: FloatArray, A: FloatArray, M: FloatArray) -> None:
+    """M00, M01, M11 of every row, M (rows, 3)."""
     m00, m01, m11 = 0.0, 0.0, 0.0
-    for r in range(len(out) - 1, -1, -1):
+    for r in range(len(M) - 1, -1, -1):
         i0, half, i1 = whiten[r, 0], whiten[r, 1], whiten[r, 2]
-        if r + 1 == len(out) or fresh[r + 1]:
+        if r + 1 == len(M) or fresh[r + 1]:
             m00, m01, m11 = 0.0, 0.0, 0.0
-        k = keep[r]
-        a00, a01 = m00 * k[0, 0] + m01 * k[1, 0], m00 * k[0, 1] + m01 * k[1, 1]
-        a10, a11 = m01 * k[0, 0] + m11 * k[1, 0], m01 * k[0, 1] + m11 * k[1, 1]
+        a = A[r]
+        ma00, ma01 = m00 * a[0, 0] + m01 * a[1, 0], m00 * a[0, 1] + m01 * a[1, 1]
+        ma10, ma11 = m01 * a[0, 0] + m11 * a[1, 0], m01 * a[0, 1] + m11 * a[1, 1]
         l10 = -i1 * half * i0
-        m00 = i0 * i0 + l10 * l10 + k[0, 0] * a00 + k[1, 0] * a10
-        m01 = l10 * i1 + k[0, 0] * a01 + k[1, 0] * a11
-        m11 = i1 * i1 + k[0, 1] * a01 + k[1, 1] * a11
-        out[r, 0], out[r, 1], out[r, 2] = m00, m01, m11
+        m00 = i0 * i0 + l10 * l10 + a[0, 0] * ma00 + a[1, 0] * ma10
+        m01 = l10 * i1 + a[0, 0] * ma01 + a[1, 0] * ma11
+        m11 = i1 * i1 + a[0, 1] * ma01 + a[1, 1] * ma11
+        M[r, 0], M[r, 1], M[r, 2] = m00, m01, m11
 
 
 @inlined
-def _carry(k: FloatArray, way: FloatArray) -> None:
-    """way <- k way, 2 x 2, in place."""
+def _carry(a: FloatArray, way: FloatArray) -> None:
+    """way <- a way, 2 x 2, in place."""
     for j in range(2):
         w0, w1 = way[0, j], way[1, j]
-        way[0, j] = k[0, 0] * w0 + k[0, 1] * w1
-        way[1, j] = k[1, 0] * w0 + k[1, 1] * w1
+        way[0, j] = a[0, 0] * w0 + a[0, 1] * w1
+        way[1, j] = a[1, 0] * w0 + a[1, 1] * w1
 
 
 @inlined
-def _fade(k: FloatArray, d: FloatArray) -> None:
-    """A block's state d (12,), six terms per chamber, <- k d, in place."""
-    k00, k01, k10, k11 = k[0, 0], k[0, 1], k[1, 0], k[1, 1]
+def _fade(a: FloatArray, d: FloatArray) -> None:
+    """A block's state d (12,), six terms per chamber, <- a d, in place."""
+    a00, a01, a10, a11 = a[0, 0], a[0, 1], a[1, 0], a[1, 1]
     for j in range(TERMS):
         d0, d1 = d[j], d[TERMS + j]
-        d[j] = k00 * d0 + k01 * d1
-        d[TERMS + j] = k10 * d0 + k11 * d1
+        d[j] = a00 * d0 + a01 * d1
+        d[TERMS + j] = a10 * d0 + a11 * d1
 
 
 @inlined
-def _leave(k: FloatArray, new: FloatArray, felt: FloatArray, left: FloatArray) -> None:
+def _leave(a: FloatArray, new: FloatArray, felt: FloatArray, d: FloatArray) -> None:
     """What a block added in a span is left behind at the next row."""
-    _fade(k, new)
+    _fade(a, new)
     for j in range(2 * TERMS):
-        left[j] += new[j]
+        d[j] += new[j]
         new[j] = 0.0
         felt[j] = 0.0
 
@@ -155,7 +151,7 @@ def _meet(
     v: int,
     t: FloatArray,
     s: FloatArray,
-    m: FloatArray,
+    M: FloatArray,
     way: FloatArray,
     moving: IntArray,
     new: FloatArray,
@@ -163,7 +159,7 @@ def _meet(
     gram: FloatArray,
 ) -> None:
     """Products of one entry with what blocks have added since the span began, and with itself."""
-    m0, m1 = m[0] * s[0] + m[1] * s[1], m[1] * s[0] + m[2] * s[1]
+    m0, m1 = M[0] * s[0] + M[1] * s[1], M[1] * s[0] + M[2] * s[1]
     both = np.empty(TERMS)
     for n in range(len(moving)):
         w = moving[n]
@@ -174,9 +170,9 @@ def _meet(
         elif w > v:
             _outer(gram, TERMS * w, TERMS * v, both, t)
         else:
-            own = 0.5 * (m0 * s[0] + m1 * s[1])
+            half = 0.5 * (m0 * s[0] + m1 * s[1])
             for p in range(TERMS):
-                both[p] += own * t[p]
+                both[p] += half * t[p]
             _outer(gram, TERMS * v, TERMS * v, t, both)
             _outer(gram, TERMS * v, TERMS * v, both, t)
     f0, f1 = way[0, 0] * m0 + way[1, 0] * m1, way[0, 1] * m0 + way[1, 1] * m1
@@ -188,15 +184,15 @@ def _meet(
 
 
 @part
-def _ring(v: int, f: FloatArray, live: IntArray, left: FloatArray, gram: FloatArray) -> None:
+def _ring(v: int, f: FloatArray, live: IntArray, d: FloatArray, gram: FloatArray) -> None:
     """Products of what block v added in a span with what others had left behind before it."""
     for n in range(len(live)):
         w = live[n]
-        d = left[w]
+        d_w = d[w]
         if w <= v:
-            _twice(gram, TERMS * v, TERMS * w, f, d)
+            _twice(gram, TERMS * v, TERMS * w, f, d_w)
         if w >= v:
-            _twice(gram, TERMS * w, TERMS * v, d, f)
+            _twice(gram, TERMS * w, TERMS * v, d_w, f)
 
 
 @inlined
@@ -222,7 +218,7 @@ def _loud(
     live: IntArray,
     n_live: int,
     is_live: BoolArray,
-    left: FloatArray,
+    d: FloatArray,
 ) -> int:
     """Keep the blocks that still ring, in place; their number."""
     kept = 0
@@ -230,13 +226,13 @@ def _loud(
         v = live[n]
         loud = moves[v]
         for j in range(TERMS):
-            first = whiten[0] * left[v, j]
-            second = whiten[2] * (left[v, TERMS + j] - whiten[1] * first)
+            first = whiten[0] * d[v, j]
+            second = whiten[2] * (d[v, TERMS + j] - whiten[1] * first)
             loud = loud or abs(first) > quiet or abs(second) > quiet
         if loud:
             live[kept] = v
             kept += 1
         else:
             is_live[v] = False
-            left[v] = 0.0
+            d[v] = 0.0
     return kept

@@ -45,29 +45,29 @@ def position_noise(e: Any, a: int, b: int) -> float:
 
 
 @inlined
-def innovations(e: Any, gap: Any, more_a: float, more_b: float) -> tuple[float, float]:
-    """L^-1 gap (chambers,) of a column, L L' = S + diag(more); the second is 0 for one chamber."""
+def innovations(e: Any, d: Any, more_a: float, more_b: float) -> tuple[float, float]:
+    """L^-1 d (chambers,) of a column, L L' = S + diag(more); the second is 0 for one chamber."""
     s00 = e.cov[0, 0] + position_noise(e, 0, 0) + more_a
-    first = gap[0] / math.sqrt(s00)
+    first = d[0] / math.sqrt(s00)
     if e.n_chambers == 1:
         return first, 0.0
     s01, s11 = e.cov[0, 1] + position_noise(e, 0, 1), e.cov[1, 1] + position_noise(e, 1, 1) + more_b
-    return first, (gap[1] - s01 / s00 * gap[0]) / math.sqrt(s11 - s01 * s01 / s00)
+    return first, (d[1] - s01 / s00 * d[0]) / math.sqrt(s11 - s01 * s01 / s00)
 
 
 @inlined
-def fade(e: Any, gap: Any) -> None:
-    """gap <- R S^-1 gap (chambers,) of one column at a row, in place."""
+def fade(e: Any, d: Any) -> None:
+    """d <- R S^-1 d (chambers,) of one column at a row, in place."""
     r00 = position_noise(e, 0, 0)
     s00 = e.cov[0, 0] + r00
     if e.n_chambers == 1:
-        gap[0] *= r00 / s00
+        d[0] *= r00 / s00
         return
     r01, r11 = position_noise(e, 0, 1), position_noise(e, 1, 1)
     s01, s11 = e.cov[0, 1] + r01, e.cov[1, 1] + r11
     det = s00 * s11 - s01 * s01
-    g0, g1 = (s11 * gap[0] - s01 * gap[1]) / det, (s00 * gap[1] - s01 * gap[0]) / det
-    gap[0], gap[1] = r00 * g0 + r01 * g1, r01 * g0 + r11 * g1
+    g0, g1 = (s11 * d[0] - s01 * d[1]) / det, (s00 * d[1] - s01 * d[0]) / det
+    d[0], d[1] = r00 * g0 + r01 * g1, r01 * g0 + r11 * g1
 
 
 @inlined
@@ -90,15 +90,15 @@ def _add_column_noise(
     v, echo = _column_variance(e, c), e.echo[c]
     a = (1.0 - k00) if c == 0 else -k01
     b = -k10 if c == 0 else (1.0 - k11)
-    s00, s01, s11 = echo[0], echo[1], echo[2]
-    x00 = s00 + (v if c == 0 else 0.0)
-    x11 = s11 + (v if c == 1 else 0.0)
+    e00, e01, e11 = echo[0], echo[1], echo[2]
+    x00 = e00 + (v if c == 0 else 0.0)
+    x11 = e11 + (v if c == 1 else 0.0)
     # S^-1 = [[s11, -s01], [-s01, s00]] det, with the whitener's S kept in e.innovation
-    big = e.innovation
-    e.noise_gram[c] += det * (big[2] * x00 - 2.0 * big[1] * s01 + big[0] * x11)
-    echo[0] = k00 * k00 * s00 + 2.0 * k00 * k01 * s01 + k01 * k01 * s11 + a * a * v
-    echo[1] = k00 * k10 * s00 + (k00 * k11 + k01 * k10) * s01 + k01 * k11 * s11 + a * b * v
-    echo[2] = k10 * k10 * s00 + 2.0 * k10 * k11 * s01 + k11 * k11 * s11 + b * b * v
+    S = e.innovation
+    e.noise_gram[c] += det * (S[2] * x00 - 2.0 * S[1] * e01 + S[0] * x11)
+    echo[0] = k00 * k00 * e00 + 2.0 * k00 * k01 * e01 + k01 * k01 * e11 + a * a * v
+    echo[1] = k00 * k10 * e00 + (k00 * k11 + k01 * k10) * e01 + k01 * k11 * e11 + a * b * v
+    echo[2] = k10 * k10 * e00 + 2.0 * k10 * k11 * e01 + k11 * k11 * e11 + b * b * v
 
 
 @inlined
@@ -120,15 +120,15 @@ def integral_row_one(e: Any) -> None:
     d, row, n = e.d, e.row, e.width
     r = position_noise(e, 0, 0)
     s = e.cov[0, 0] + r
-    scale, keep = 1.0 / math.sqrt(s), r / s
+    scale, k = 1.0 / math.sqrt(s), r / s
     for j in range(n):
         row[0, j] = scale * d[0, j]
-        d[0, j] *= keep
+        d[0, j] *= k
     v = _column_variance(e, 0)
     e.noise_gram[0] += (v + e.echo[0, 0]) / s
-    e.echo[0, 0] = keep * keep * e.echo[0, 0] + (1.0 - keep) ** 2 * v
-    e.cov[0, 0] *= keep
-    e.ring_det *= keep
+    e.echo[0, 0] = k * k * e.echo[0, 0] + (1.0 - k) ** 2 * v
+    e.cov[0, 0] *= k
+    e.ring_det *= k
     e.counters[ROWS] += 1
     e.rows += 1.0
     add_products(e, 1)

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
 from rtid.kernels.jit import kernel
+from rtid.plain import FloatArray
 
-FloatArray = NDArray[np.float64]
 BLOCK = 1024
 
 

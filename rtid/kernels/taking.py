@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from rtid.kernels.engine import (
     GAP_FLAG,
     SHUT,
@@ -19,13 +16,12 @@ from rtid.kernels.engine import (
 )
 from rtid.kernels.jit import inlined
 from rtid.kernels.rows import start_whitener
-
-FloatArray = NDArray[np.float64]
+from rtid.plain import FloatArray
 
 
 @inlined
 def take(e: Any, chunk: FloatArray, k: int) -> tuple[bool, bool, float]:
-    """Sample k into e.sample: (it can be used, it continues the last one on the grids, step)."""
+    """Sample k of chunk (n, 2 + signals) to e.sample: (usable, joins the last one, step in s)."""
     for j in range(2 + e.n_signals):
         e.sample[j] = chunk[k, j]
     sample, flags, dt = e.sample, int(e.sample[1]), step_s(e, e.sample[0])
@@ -40,7 +36,7 @@ def take(e: Any, chunk: FloatArray, k: int) -> tuple[bool, bool, float]:
 
 @inlined
 def begin(e: Any, sample: FloatArray) -> None:
-    """Start at one measured position, spools at rest."""
+    """Start at one measured position, sample (2 + signals,) in SI, spools at rest."""
     remember(e, sample)
     e.running = 1
     for i in range(e.n_edges):

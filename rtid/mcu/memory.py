@@ -14,8 +14,8 @@ import numpy as np
 
 from rtid.estimator.sums import Normal
 from rtid.kernels.layout import COUNTERS, OUTLIER, TERMS
-from rtid.mcu.tables import Sizes
-from rtid.model import FloatArray
+from rtid.mcu.c_tables import Sizes
+from rtid.plain import FloatArray
 
 COUNTS = (*COUNTERS[:OUTLIER], "no_room")  # as far as no row is judged by a map held
 _I2, _U1, _U2, _U8, _I8 = np.int16, np.uint8, np.uint16, np.uint64, np.int64

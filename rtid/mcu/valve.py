@@ -9,29 +9,33 @@ from typing import TypeVar
 
 from rtid.estimator.limits import refuse_unfit
 from rtid.mcu.errors import ValveError
-from rtid.model import NONE, TAYLOR, Chamber, Edge, Model, Term
+from rtid.model import NONE, TAYLOR, Chamber, Edge, Machine, Term
 
 Part = TypeVar("Part", Chamber, Edge)
 
 
-def one_valve(model: Model, chamber: str, edges: Sequence[str] = ()) -> Model:
+def one_valve(model: Machine, chamber: str, edges: Sequence[str] = ()) -> Machine:
     """The part of a machine that is one chamber: its edges (all when none are named), its signals.
 
     Raises ValveError that names everything which the estimator in C does not do.
     """
-    own = _named(model.chambers, [chamber], "chamber")[0]
-    touching = tuple(edge for edge in model.edges if edge.sign(own) != 0)
+    chamber_of = _named(model.chambers, [chamber], "chamber")[0]
+    touching = tuple(edge for edge in model.edges if edge.sign(chamber_of) != 0)
     kept = _named(touching, edges, f"edge of chamber {chamber}") if edges else touching
-    terms = tuple(_own_term(term, own) for term in model.terms if own.name in dict(term.signs))
-    faults = [*_faults(model), *_edge_faults(kept), *_term_faults(terms, own)]
+    terms = tuple(
+        _own_term(term, chamber_of) for term in model.terms if chamber_of.name in dict(term.signs)
+    )
+    faults = [*_faults(model), *_edge_faults(kept), *_term_faults(terms, chamber_of)]
     if faults:
         raise ValveError(
             "the estimator in C cannot learn this machine: " + "; ".join(faults),
             "declare a project of its own for the controller, without these",
         )
-    used = _used_signals(model, own, kept, terms)
+    used = _used_signals(model, chamber_of, kept, terms)
     signals = tuple(signal for signal in model.signals if signal.name in used)
-    valve = replace(model, signals=signals, chambers=(own,), edges=kept, terms=terms, mode=NONE)
+    valve = replace(
+        model, signals=signals, chambers=(chamber_of,), edges=kept, terms=terms, mode=NONE
+    )
     try:
         refuse_unfit(valve)
     except ValueError as error:
@@ -51,7 +55,7 @@ def _own_term(term: Term, chamber: Chamber) -> Term:
     return replace(term, signs=tuple(s for s in term.signs if s[0] == chamber.name))
 
 
-def _faults(model: Model) -> Iterator[str]:
+def _faults(model: Machine) -> Iterator[str]:
     upkeep = model.upkeep
     if model.form != "integral":
         yield f"estimator.form is {model.form!r}, it knows 'integral'"
@@ -80,7 +84,7 @@ def _term_faults(terms: tuple[Term, ...], chamber: Chamber) -> Iterator[str]:
 
 
 def _used_signals(
-    model: Model, chamber: Chamber, edges: tuple[Edge, ...], terms: tuple[Term, ...]
+    model: Machine, chamber: Chamber, edges: tuple[Edge, ...], terms: tuple[Term, ...]
 ) -> set[str]:
     used = {model.position, chamber.pressure}
     for edge in edges:

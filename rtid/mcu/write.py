@@ -7,8 +7,8 @@ from pathlib import Path
 
 import firmware_bridge
 from rtid.estimator.state import Weights
-from rtid.mcu.tables import tables
-from rtid.model import Model
+from rtid.mcu.c_tables import tables
+from rtid.model import Machine
 
 SOURCES = Path(firmware_bridge.__file__).parent / "c"
 TABLES = "rtid_estimator_tables.h"
@@ -20,7 +20,7 @@ def sources() -> list[Path]:
 
 
 def write_sources(
-    folder: Path, model: Model, blocks: int = 0, weights: Weights | None = None, title: str = ""
+    folder: Path, model: Machine, blocks: int = 0, weights: Weights | None = None, title: str = ""
 ) -> list[Path]:
     """Write tables and sources for a machine of `one_valve`; the files, each whole or not there.
 

@@ -1,7 +1,7 @@
 """[[added]]: the effects that `rtid add` has made part of the model, and their text in the file.
 
     [[added]]
-    effect = "internal_leakage_laminar"
+    effect = "NAME"
     where = "a-b"
     date = 2026-03-01T09:30:00Z
     ...
@@ -63,7 +63,7 @@ class ErrorsSection(Section):
 class AddedSection(Section):
     """[[added]]: an effect that is part of the model, with what it was found with."""
 
-    effect: str = Field(min_length=1, description='effect = "internal_leakage_laminar"')
+    effect: str = Field(min_length=1, description='effect = "NAME", as `rtid effects` lists it')
     where: str = Field(description='where = "a-b"')
     own_spools: bool = False
     date: datetime | None = None
@@ -85,16 +85,16 @@ def read(raw: Any) -> tuple[tuple[AddedSection, ...], list[Problem]]:
     """All of [[added]], and what is wrong with them."""
     if not isinstance(raw, list):
         return (), [Problem("added", "must be a list of tables", "write [[added]]")]
-    found: dict[tuple[str, str], AddedSection] = {}
+    sections: dict[tuple[str, str], AddedSection] = {}
     problems: list[Problem] = []
     for k, table in enumerate(raw):
         section, more = _read_one(table, f"added[{k}]")
         problems += more
-        if section and section.key in found:
+        if section and section.key in sections:
             problems.append(Problem(f"added[{k}]", "is added twice", "keep one"))
         elif section:
-            found[section.key] = section
-    return tuple(found.values()), problems
+            sections[section.key] = section
+    return tuple(sections.values()), problems
 
 
 def _read_one(raw: Any, path: str) -> tuple[AddedSection | None, list[Problem]]:

@@ -1,4 +1,4 @@
-"""From valid sections to the machine (`rtid.model.Model`) and the bridge's `Assembly`."""
+"""From valid sections to the machine (`rtid.model.Machine`) and the bridge's `Assembly`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from rtid.model import (
     Gates,
     Grid,
     Lag,
-    Model,
+    Machine,
     Signal,
     Upkeep,
 )
@@ -34,11 +34,11 @@ MIN_GAP_S = 0.05
 _SI_UNIT = {"pressure": "Pa", "position": "m", "velocity": "m/s"}
 
 
-def build_model(sections: Sections, catalog: Catalog | None) -> Model:
+def build_model(sections: Sections, catalog: Catalog | None) -> Machine:
     """The declared machine, SI."""
     signals = tuple(_signal(n, s, catalog) for n, s in sections.signals.items())
     gates, lag = sections.gates, sections.dynamics.spool_lag
-    return Model(
+    return Machine(
         signals=signals,
         chambers=tuple(_chamber(name, sections) for name in sections.chambers),
         edges=tuple(_edge(name, edge, sections, signals) for name, edge in sections.edges.items()),
@@ -70,7 +70,7 @@ def build_model(sections: Sections, catalog: Catalog | None) -> Model:
 
 
 def build_assembly(
-    sections: Sections, model: Model, catalog: Catalog | None, *, table: bool
+    sections: Sections, model: Machine, catalog: Catalog | None, *, table: bool
 ) -> Assembly:
     """What the assembler needs for a CAN trace, or with `table` for the columns of a table."""
     used = [] if table else _used(sections, catalog)
@@ -85,8 +85,25 @@ def build_assembly(
 
 
 def digest(value: object) -> str:
-    """Restore key: a hash of the model, exact to the last bit of each number."""
+    """A hash of a declaration, exact to the last bit of each number."""
     return hashlib.sha256(_canonical(value).encode()).hexdigest()[:16]
+
+
+def feed(assembly: Assembly, catalog: Catalog | None) -> tuple[object, ...]:
+    """What turns frames into samples: roles, scales, offsets, signs, and the bits of each signal.
+
+    Of the DBC only the signals that carry a role or protect them: a comment changes no sample.
+    """
+    if catalog is None:
+        return (assembly,)
+    bits = []
+    for message in assembly.messages:
+        carried = [s.signal for s in assembly.signals if s.message == message.name and s.signal]
+        names = [*dict.fromkeys(carried), *(n for n in (message.counter, message.crc) if n)]
+        layouts = catalog.layouts(message.name, names)
+        matched = catalog.can_id(message.name), catalog.is_j1939(message.name)
+        bits.append((matched, layouts.rows, layouts.firsts, layouts.codes))
+    return assembly, tuple(bits)
 
 
 def _canonical(value: object) -> str:
@@ -115,9 +132,9 @@ def _dbc(signal: SignalSection, catalog: Catalog | None) -> tuple[float, tuple[f
     everything = (-math.inf, math.inf)
     if catalog is None or not signal.message or not signal.signal or signal.constant is not None:
         return 0.0, everything
-    found = catalog.signal(signal.message, signal.signal)
-    step = 0.0 if found.is_float else abs(float(found.scale))
-    low, high = found.minimum, found.maximum
+    result = catalog.signal(signal.message, signal.signal)
+    step = 0.0 if result.is_float else abs(float(result.scale))
+    low, high = result.minimum, result.maximum
     if low is None or high is None or not low < high:
         return step, everything
     return step, (float(low) - step / 2, float(high) + step / 2)
@@ -157,7 +174,7 @@ def _slope(signal: SignalSection, unit: Unit) -> float:
 
 def _to_si(limits: tuple[float, float], signal: SignalSection, unit: Unit) -> tuple[float, float]:
     if signal.table is None:
-        return unit.factor * limits[0], unit.factor * limits[1]
+        return unit.si(limits[0]), unit.si(limits[1])
     angle, position_m = np.array(signal.table.angle), np.array(signal.table.position_m)
     inside = np.clip(angle, limits[0], limits[1])
     values = np.interp(inside, angle, position_m)
@@ -180,9 +197,9 @@ def _source(
         message="" if column else signal.message or "",
         signal=(signal.column if column else signal.signal) or "",
         factor=unit.factor * scale,
-        offset=unit.factor * signal.offset,
+        offset=unit.si(signal.offset),
         table=table,
-        constant=None if signal.constant is None else unit.factor * signal.constant,
+        constant=None if signal.constant is None else unit.si(signal.constant),
         hold=signal.hold or ("zero" if kind in ("command", "mode") else "linear"),
         command=kind == "command",
     )
@@ -209,6 +226,7 @@ def _message(name: str, sections: Sections, catalog: Catalog | None) -> MessageS
         crc=declared.crc if "crc" in given else known.crc,
         data_id=declared.data_id if "data_id" in given else known.data_id,
         channel=declared.channel,
+        address=declared.address,
     )
 
 

@@ -1,29 +1,29 @@
 """The user's own effects: the formulas of [effects.NAME], and the Python file of `effects_module`.
 
-The formulas are read, never run (`rtid.effects.expression`).  The Python file is ordinary code and
-is run whenever the project is loaded, as any program that the user starts: every `UserEffect` among
-its global names is taken.
+The formulas are read, never run (`rtid.effects.expression`).  The Python file is ordinary code: it
+is run only where the user has trusted exactly this content (`rtid.project.trust`), and every
+`Effect` among its global names is taken.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import traceback
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from firmware_bridge.catalog import Catalog
 from rtid.effects import (
+    Effect,
     EffectError,
     ExpressionError,
-    UserEffect,
     catalogue,
     from_expression,
     names_of,
 )
-from rtid.project import references
+from rtid.project import references, trust
 from rtid.project.errors import Problem
 from rtid.project.schema import EffectSection
 from rtid.project.sections import Raw, read_section
@@ -37,16 +37,16 @@ def read(raw: Any, path: str) -> tuple[EffectSection | None, list[Problem]]:
     shapes = {key: value for key, value in raw.items() if isinstance(value, list)}
     plain = {key: value for key, value in raw.items() if key not in (*shapes, "shapes")}
     section, problems = read_section(EffectSection, plain | {"shapes": shapes}, path)
-    told = [replace(p, path=p.path.replace(f"{path}.shapes.", f"{path}.")) for p in problems]
+    shown = [replace(p, path=p.path.replace(f"{path}.shapes.", f"{path}.")) for p in problems]
     if "shapes" in raw:
         remedy = "write each shape parameter as a key of its own, x0 = [0.1, 0.2]"
-        told.append(Problem(f"{path}.shapes", "unknown key", remedy))
-    return section, told
+        shown.append(Problem(f"{path}.shapes", "unknown key", remedy))
+    return section, shown
 
 
 def build(
     parts: dict[str, Any], raw: Raw, catalog: Catalog | None, folder: Path
-) -> tuple[tuple[UserEffect, ...], list[Problem]]:
+) -> tuple[tuple[Effect, ...], list[Problem]]:
     """All effects of the file and of its module, and what is wrong with them."""
     signals = references.tables(raw, "signals").items()
     kinds = {n: references.kind_of(s, references.find_dbc_unit(s, catalog)) for n, s in signals}
@@ -54,20 +54,20 @@ def build(
     names = names_of(kinds, chambers)
     geometry = parts.get("geometry")
     constants = {"stroke": geometry.stroke_m} if geometry else {}
-    found: dict[str, UserEffect] = {}
+    user_effects: dict[str, Effect] = {}
     problems: list[Problem] = []
     for name, section in parts.get("effects", {}).items():
         path = f"effects.{name}"
         effect = section and _from_section(name, section, names, constants, problems)
         if effect:
-            problems += _fit(effect, path, f"{path}.chambers", chambers, found)
-            found[name] = effect
+            problems += _fit(effect, path, f"{path}.chambers", chambers, user_effects)
+            user_effects[name] = effect
     module = getattr(parts.get("project"), "effects_module", None)
-    for effect in _from_module(folder / module, problems) if module else ():
+    for effect in _from_module(folder, module, problems) if module else ():
         path = "project.effects_module"
-        problems += _fit(effect, path, path, chambers, found)
-        found[effect.name] = effect
-    return tuple(found.values()), problems
+        problems += _fit(effect, path, path, chambers, user_effects)
+        user_effects[effect.name] = effect
+    return tuple(user_effects.values()), problems
 
 
 def _from_section(
@@ -76,7 +76,7 @@ def _from_section(
     names: dict[str, Any],
     constants: dict[str, float],
     problems: list[Problem],
-) -> UserEffect | None:
+) -> Effect | None:
     """The effect of one section; what is wrong with it joins `problems` (changed in place)."""
     path = f"effects.{name}"
     keys = section.model_dump(exclude={"flow", "unit"}, exclude_none=True)
@@ -94,10 +94,10 @@ def _from_section(
 
 
 def _fit(
-    effect: UserEffect, path: str, place: str, chambers: list[str], others: dict[str, UserEffect]
+    effect: Effect, path: str, place: str, chambers: list[str], others: dict[str, Effect]
 ) -> Iterator[Problem]:
     """Chambers that do not exist, names that are taken."""
-    for chamber, _ in effect.signs:
+    for chamber, _ in effect.into:
         if chamber not in chambers:
             where = place if place == path else f"{place}.{chamber}"
             yield Problem(
@@ -109,26 +109,26 @@ def _fit(
         yield Problem(path, f"{effect.name!r} is an effect of the catalogue", "choose another name")
 
 
-def _from_module(path: Path, problems: list[Problem]) -> list[UserEffect]:
-    """Run the file and take its effects; an error in it joins `problems` (changed in place)."""
+def _from_module(folder: Path, name: str, problems: list[Problem]) -> list[Effect]:
+    """Run a trusted file and take its effects; an error joins `problems` (changed in place)."""
     place = "project.effects_module"
-    if not path.is_file():
-        problems.append(Problem(place, f"{path} is no file", "name a Python file beside this one"))
+    path, wrong = trust.located(folder, name)
+    if wrong:
+        problems.append(Problem(place, *wrong))
         return []
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    if spec is None or spec.loader is None:
-        problems.append(Problem(place, f"{path} is not Python", "name a file that ends in .py"))
+    content = path.read_bytes()
+    if not trust.is_trusted(content):
         return []
-    module = importlib.util.module_from_spec(spec)
-    try:
-        spec.loader.exec_module(module)
+    module = ModuleType(path.stem)
+    try:  # these very bytes, and no compiled file that lies beside
+        exec(compile(content, str(path), "exec"), vars(module))
     except (Exception, SystemExit) as error:
         problems.append(Problem(place, _where(path, error), "correct the Python file"))
         return []
-    found = list({id(v): v for v in vars(module).values() if isinstance(v, UserEffect)}.values())
-    if not found:
+    user_effects = list({id(v): v for v in vars(module).values() if isinstance(v, Effect)}.values())
+    if not user_effects:
         problems.append(Problem(place, f"{path} defines no effect", "use rtid.effects.define"))
-    return found
+    return user_effects
 
 
 def _where(path: Path, error: BaseException) -> str:

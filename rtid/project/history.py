@@ -10,13 +10,13 @@ import hashlib
 import json
 import os
 import shutil
+import tomllib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from rtid.errors import RtidError
-from rtid.project.loading import load
+from rtid.errors import RtidError, door
 
 SUFFIX = ".history.jsonl"
 ADD, DROP, UNDO = "add", "drop", "undo"
@@ -56,13 +56,35 @@ def read(project: Path) -> list[Change]:
     if not path.exists():
         return []
     changes = []
-    for k, line in enumerate(path.read_text("utf-8").splitlines()):
+    lines = path.read_text("utf-8").splitlines(keepends=True)
+    if lines and not lines[-1].endswith("\n"):  # a power cut: its change was not carried out
+        lines.pop()
+    for k, line in enumerate(lines):
         try:
             changes.append(Change(**json.loads(line)))
         except (ValueError, TypeError) as error:
             remedy = "take this line out; the project file itself is not affected"
             raise RtidError(f"{path}: line {k + 1} is no change: {error}", remedy) from None
     return changes
+
+
+@door
+def history(project: str | Path) -> list[Change]:
+    """All changes of a project that is there, oldest first.  RtidError where it is not."""
+    project = Path(project)
+    if not project.is_file():
+        raise RtidError(f"{project}: no such file", "name a project file", 2)
+    return read(project)
+
+
+def state_beside(project: Path) -> Path:
+    """The daemon's state folder, by the file alone: the project need not be loaded for it."""
+    try:
+        daemon = tomllib.loads(project.read_text("utf-8")).get("daemon", {})
+    except (OSError, ValueError):  # the changes are told also of a file that cannot be read
+        daemon = {}
+    named = daemon.get("folder") if isinstance(daemon, dict) else None
+    return project.parent / (named if isinstance(named, str) else f"{project.stem}.state")
 
 
 def standing(changes: Sequence[Change]) -> list[Change]:
@@ -99,6 +121,8 @@ def write(project: Path, steps: Sequence[tuple[Change, str]]) -> list[Change]:
     ]
     if project.read_bytes() != steps[0][0].before.encode():
         raise RtidError(f"{project} has changed meanwhile", "run the command again")
+    from rtid.project.loading import load  # noqa: PLC0415 - who only reads need not wait for it
+
     temporary, history = project.with_name(project.name + ".part"), path_of(project)
     length = history.stat().st_size if history.exists() else None
     try:
@@ -107,6 +131,7 @@ def write(project: Path, steps: Sequence[tuple[Change, str]]) -> list[Change]:
         load(temporary)
         _append(history, lines)
         os.replace(temporary, project)
+        _sync(project.parent)
     except BaseException:
         temporary.unlink(missing_ok=True)
         _shorten(history, length)
@@ -127,10 +152,24 @@ def _put(path: Path, data: bytes) -> None:
 
 
 def _append(path: Path, lines: Sequence[Change]) -> None:
-    with path.open("a", encoding="utf-8") as file:
-        file.writelines(json.dumps(asdict(line)) + "\n" for line in lines)
+    """Behind the last whole line; what a power cut has left of another one goes."""
+    whole = path.read_bytes().rpartition(b"\n") if path.exists() else (b"", b"", b"")
+    with path.open("ab") as file:
+        file.truncate(len(whole[0] + whole[1]))
+        for line in lines:
+            file.write(json.dumps(asdict(line)).encode() + b"\n")
         file.flush()
         os.fsync(file.fileno())
+    _sync(path.parent)
+
+
+def _sync(folder: Path) -> None:
+    """Have the names in a folder on the disk."""
+    fd = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
 
 
 def _shorten(path: Path, length: int | None) -> None:

@@ -8,9 +8,11 @@ from typing import Any
 
 from firmware_bridge import catalog as catalogs
 from firmware_bridge.catalog import Catalog
-from rtid.effects import UserEffect
-from rtid.model import Model
-from rtid.project import added, build, effects, references, schema
+from rtid.effects import Effect
+from rtid.errors import door
+from rtid.estimator.limits import unfit
+from rtid.model import Machine
+from rtid.project import added, build, effects, references, schema, trust
 from rtid.project.errors import Problem, ProjectError
 from rtid.project.project import Project, Sections
 from rtid.project.sections import Raw, read_section
@@ -45,6 +47,7 @@ NAMED: dict[str, type[schema.Section]] = {
 REQUIRED = ("project", "source", "signals", "geometry", "chambers", "edges")
 
 
+@door
 def load(path: str | Path) -> Project:
     """Read and check a project file; `ProjectError` names every problem."""
     path = Path(path)
@@ -53,22 +56,27 @@ def load(path: str | Path) -> Project:
     dbc, catalog = _open_dbc(raw, path.parent, problems)
     problems += references.check(raw, catalog, path.parent)
     problems += _across(parts)
-    own, more = effects.build(parts, raw, catalog, path.parent)
+    user_effects, more = effects.build(parts, raw, catalog, path.parent)
     problems += more
     if problems:
         first = {problem.path: problem for problem in reversed(problems)}  # one per place
         raise ProjectError(path, [p for p in problems if first[p.path] is p])
-    return _assemble(path, Sections(**parts), dbc, catalog, own)
+    return _assemble(path, Sections(**parts), dbc, catalog, user_effects)
 
 
 def _parse(path: Path) -> Raw:
     try:
+        if not path.is_file() and path.exists():  # a folder; a FIFO would be waited for
+            raise ProjectError(path, [Problem("file", "is no file", "name a project file")])
         if path.stat().st_size > MAX_FILE_BYTES:
             problem = Problem("file", f"larger than {MAX_FILE_BYTES >> 20} MiB", "is it a project?")
             raise ProjectError(path, [problem])
         return tomllib.loads(path.read_text("utf-8"))
     except FileNotFoundError:
         problem = Problem("file", "does not exist", "name a project file; `rtid init` writes one")
+        raise ProjectError(path, [problem]) from None
+    except OSError as error:
+        problem = Problem("file", f"cannot be read: {error.strerror}", "name a project file")
         raise ProjectError(path, [problem]) from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         problem = Problem("file", f"not valid TOML: {error}", "correct this place first")
@@ -86,14 +94,14 @@ def _read_sections(raw: Raw) -> tuple[dict[str, Any], list[Problem]]:
     parts: dict[str, Any] = {"messages": {}}
     for name, kind in SINGLE.items():
         if name in raw:
-            parts[name], found = read_section(kind, raw[name], name)
-            problems += found
+            parts[name], result = read_section(kind, raw[name], name)
+            problems += result
     for name, kind in NAMED.items():
         if name in raw:
-            parts[name], found = _read_named(kind, raw[name], name)
-            problems += found
-    parts["added"], found = added.read(raw.get("added", []))
-    problems += found
+            parts[name], result = _read_named(kind, raw[name], name)
+            problems += result
+    parts["added"], result = added.read(raw.get("added", []))
+    problems += result
     modes = raw.get("modes", {})
     if isinstance(modes, dict):
         lists = {mode: edges for mode, edges in modes.items() if isinstance(edges, list)}
@@ -108,15 +116,15 @@ def _read_named(
 ) -> tuple[dict[str, Any], list[Problem]]:
     if not isinstance(raw, dict) or not raw:
         return {}, [Problem(name, "must hold named tables", f"write [{name}.NAME]")]
-    found: dict[str, Any] = {}
+    sections: dict[str, Any] = {}
     problems: list[Problem] = []
     for key, table in raw.items():
         place = f"{name}.{key}"
-        found[key], more = (
+        sections[key], more = (
             effects.read(table, place) if name == "effects" else read_section(kind, table, place)
         )
         problems += more
-    return found, problems
+    return sections, problems
 
 
 def _open_dbc(
@@ -190,9 +198,11 @@ def _assemble(
     sections: Sections,
     dbc: Path | None,
     catalog: Catalog | None,
-    own: tuple[UserEffect, ...],
+    user_effects: tuple[Effect, ...],
 ) -> Project:
     model = build.build_model(sections, catalog)
+    unknown = _noise_unknown(sections, model)
+    _refuse_unfit(path, model.with_noise(dict.fromkeys(unknown, 1.0)))
     signals = sections.signals
     has_columns = all(s.column or s.constant is not None for s in signals.values())
     bus = build.build_assembly(sections, model, catalog, table=False) if catalog else None
@@ -208,18 +218,34 @@ def _assemble(
         table_assembly=table,
         dbc=dbc,
         reference_maps={n: path.parent / e.reference_map for n, e in edges if e.reference_map},
-        noise_unknown=_noise_unknown(sections, model),
+        noise_unknown=unknown,
         offset_tolerance_s={
             m.name: sections.messages[m.name].tolerance_s or m.period_s
             for m in assembly.messages
             if m.name in sections.messages and sections.messages[m.name].offset_s is None
         },
-        digest=build.digest(model),
-        effects=own,
+        digest=build.digest((model, build.feed(assembly, catalog if bus else None))),
+        machine_digest=build.digest(model),
+        effects=user_effects,
+        untrusted=_untrusted(path.parent, sections.project.effects_module),
     )
 
 
-def _noise_unknown(sections: Sections, model: Model) -> tuple[str, ...]:
+def _untrusted(folder: Path, module: str | None) -> Path | None:
+    """The project's Python where it was not run; its place has been checked."""
+    if module is None or trust.is_trusted((folder / module).read_bytes()):
+        return None
+    return folder / module
+
+
+def _refuse_unfit(path: Path, model: Machine) -> None:
+    """What the estimator cannot hold is wrong with the file: said here, before any work."""
+    problems = [Problem(fault.where, fault.problem, fault.remedy) for fault in unfit(model)]
+    if problems:
+        raise ProjectError(path, problems)
+
+
+def _noise_unknown(sections: Sections, model: Machine) -> tuple[str, ...]:
     kinds = {signal.name: signal.kind for signal in model.signals}
     return tuple(
         name

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from firmware_bridge.config import Assembly
-from rtid.effects import UserEffect
-from rtid.model import Model
+from rtid.effects import Effect
+from rtid.model import Machine
 from rtid.project.added import AddedSection
 from rtid.project.schema import (
     BetaSection,
@@ -32,6 +33,10 @@ from rtid.project.schema import (
     SourceSection,
     UpkeepSection,
 )
+from rtid.project.trust import NotTrustedError
+
+if TYPE_CHECKING:
+    from rtid.effects.live import LiveFlow
 
 
 @dataclass(frozen=True)
@@ -69,12 +74,16 @@ class Project:
     `assembly` serves a CAN trace, or a table if the project has no DBC; `table_assembly` serves a
     table, None unless every signal names a `column` or is constant.  `noise_unknown` and
     `offset_tolerance_s` list what the file leaves to be estimated.  `effects` are the user's own,
-    of the file and of its Python module: candidates of the diagnosis, not part of the model.
+    of the file and of its trusted Python: candidates of the diagnosis, not part of the model;
+    `untrusted` is Python that was not run; `flows` are those of added effects that are
+    evaluated beside the kernels, on board.
+    `digest` is the restore key: it covers the machine and all that gives a sample its meaning;
+    `machine_digest` the machine alone, as machines of one type share it.
     """
 
     path: Path
     sections: Sections
-    model: Model
+    model: Machine
     assembly: Assembly
     table_assembly: Assembly | None
     dbc: Path | None
@@ -82,13 +91,21 @@ class Project:
     noise_unknown: tuple[str, ...]
     offset_tolerance_s: dict[str, float]
     digest: str
-    effects: tuple[UserEffect, ...] = ()
+    machine_digest: str
+    effects: tuple[Effect, ...] = ()
+    untrusted: Path | None = None
+    flows: tuple[LiveFlow, ...] = ()
 
-    def model_with(self, noise: Mapping[str, float]) -> Model:
+    @property
+    def all_effects(self) -> tuple[Effect, ...]:
+        """The user's own effects.  NotTrustedError where some are in Python that may not run."""
+        if self.untrusted is not None:
+            raise NotTrustedError(self.path, self.untrusted)
+        return self.effects
+
+    def model_with(self, noise: Mapping[str, float]) -> Machine:
         """The model with the noise of some signals (1 sigma, SI) replaced, e.g. by an estimate."""
-        signals = self.model.signals
-        told = tuple(replace(s, noise=noise.get(s.name, s.noise)) for s in signals)
-        return replace(self.model, signals=told)
+        return self.model.with_noise(noise)
 
     @property
     def name(self) -> str:

@@ -48,15 +48,15 @@ EDGE_NEEDS = {
 
 def table(raw: Raw, section: str) -> Raw:
     """A section as written, without keys that should be text and are not (named elsewhere)."""
-    found = raw.get(section)
-    entries = found.items() if isinstance(found, dict) else ()
+    section_table = raw.get(section)
+    entries = section_table.items() if isinstance(section_table, dict) else ()
     return {k: value for k, value in entries if k not in TEXT_KEYS or isinstance(value, str)}
 
 
 def tables(raw: Raw, section: str) -> dict[str, Raw]:
     """The well-formed sub-tables of a section, e.g. all [edges.NAME]."""
-    found = raw.get(section)
-    entries = found.items() if isinstance(found, dict) else ()
+    value = raw.get(section)
+    entries = value.items() if isinstance(value, dict) else ()
     return {name: table({name: entry}, name) for name, entry in entries if isinstance(entry, dict)}
 
 
@@ -279,7 +279,7 @@ def _messages(raw: Raw, catalog: Catalog | None) -> Iterator[Problem]:
             continue
         signals = [s.name for s in catalog.message(name).signals]
         for key in ("counter", "crc"):
-            if message.get(key, signals[0]) not in signals:
+            if key in message and message[key] not in signals:
                 problem = f"{name} has no signal {message[key]!r}"
                 yield Problem(f"messages.{name}.{key}", problem, nearest(message[key], signals))
     used = {signal.get("message") for signal in tables(raw, "signals").values()}

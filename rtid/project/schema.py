@@ -35,10 +35,12 @@ def _estimate(value: Any) -> Any:
 
 def _piece(value: Any, index: int) -> list[float]:
     """One entry of a grid: a border, or {start, stop, step} with both ends included."""
-    if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+    if _is_number(value):
         return [float(value)]
     if not isinstance(value, dict) or set(value) != {"start", "stop", "step"}:
         raise _grid_error(index, "must be a number or {start, stop, step}")
+    if not all(_is_number(value[key]) for key in ("start", "stop", "step")):
+        raise _grid_error(index, "start, stop and step must be numbers")
     start, stop, step = (float(value[key]) for key in ("start", "stop", "step"))
     count = (stop - start) / step if step > 0 else 0.0
     if not 0.5 < count < MAX_BORDERS:
@@ -47,6 +49,10 @@ def _piece(value: Any, index: int) -> list[float]:
     if abs(count - n) > 1e-6 * n:
         raise _grid_error(index, "stop is not a whole number of steps away from start")
     return [start + (stop - start) * k / n for k in range(n + 1)]
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _grid_error(index: int, problem: str) -> PydanticCustomError:
@@ -116,7 +122,7 @@ class ProjectSection(Section):
     """[project]: what the machine is called, and a file of Python code with effects of its own."""
 
     name: str = Field(min_length=1, description='name = "boom cylinder"')
-    effects_module: str | None = None  # a Python file with effects; it is run at every load
+    effects_module: str | None = None  # a Python file with effects; run only if trusted
 
 
 class SourceSection(Section):
@@ -128,6 +134,7 @@ class SourceSection(Section):
     interface: str | None = None
     channel: str | None = None
     bitrate: int | None = Field(default=None, gt=0)
+    fd: bool = False
     mode: Literal["cycle", "multirate"] | None = None
 
 
@@ -141,6 +148,7 @@ class MessageSection(Section):
     crc: str | None = None
     data_id: int = Field(default=0, ge=0, le=0xFFFF)
     channel: int | None = Field(default=None, ge=0)
+    address: Annotated[int, Field(ge=0, le=0xFD)] | Literal["found", "any"] | None = None
 
 
 class AngleTable(Section):
@@ -217,7 +225,7 @@ class EdgeSection(EdgeDefaults):
 
 
 class PriorSection(Section):
-    """[prior]: a map known before, relative to this file; see `rtid.priors`."""
+    """[prior]: a map known before, relative to this file; see `rtid.maps.prior_map`."""
 
     map: str = Field(description='map = "older.npz", or a data sheet, or a folder of `rtid fleet`')
     error_percent: float | None = Field(default=None, gt=0, le=100)
@@ -356,8 +364,9 @@ class DaemonSection(Section):
 class PublishSection(Section):
     """[publish]: maps to the controller on `rtid apply`; without can_id nothing can be sent.
 
-    Slots are the edges in the order of the file, then the bulk moduli.  Limits are of one apply:
-    the change of a flow that data stand behind, in per cent of the rated flow.
+    Slots are the edges in the order of the file, then the bulk moduli.  max_change_percent is of
+    one apply: the change of a flow that data stand behind, of the rated flow.  The others are of
+    any map (`rtid.apply.bounds`): its flows, what its table is off by, its distance from the prior.
     """
 
     can_id: int | None = Field(default=None, ge=0, lt=1 << 29)
@@ -370,6 +379,9 @@ class PublishSection(Section):
     frames_per_s: float = Field(default=1000.0, gt=0, le=10_000)
     error_percent: float = Field(default=0.1, gt=0, le=10)
     max_change_percent: float = Field(default=20.0, gt=0)
+    max_flow_percent: float = Field(default=500.0, gt=0)
+    max_error_percent: float = Field(default=2.0, gt=0)
+    max_prior_percent: float = Field(default=50.0, gt=0)
     least_interval_s: Annotated[float, TIME] = Field(default=60.0, ge=0)
     judge_s: Annotated[float, TIME] = Field(default=30.0, ge=5)
     gain_percent: float = Field(default=1.0, gt=0, lt=100)

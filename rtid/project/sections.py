@@ -6,6 +6,8 @@ Paths are those of the file: `edges.pa.dp_grid_mpa[3]`, whatever the field is ca
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from typing import Any, TypeVar, get_args, get_origin
 
 from pydantic import ValidationError
@@ -16,6 +18,8 @@ from rtid.project.schema import Dimension, Section
 from rtid.units import Unit, nearest, units_of
 
 Raw = dict[str, Any]
+LARGEST = 1e30  # of any number in a project file, in SI; its inverse is the smallest
+ABSURD = f"the number is larger than {LARGEST:g} or smaller than {1 / LARGEST:g}, in SI"
 S = TypeVar("S", bound=Section)
 
 
@@ -27,8 +31,8 @@ def read_section(kind: type[S], raw: Any, path: str) -> tuple[S | None, list[Pro
     try:
         section = kind.model_validate(values)
     except ValidationError as error:
-        found = error.errors(include_url=False)
-        return None, problems + _explain(kind, raw, keys, found, path, problems)
+        details = error.errors(include_url=False)
+        return None, problems + _explain(kind, raw, keys, details, path, problems)
     return (section, []) if not problems else (None, problems)
 
 
@@ -39,12 +43,12 @@ def key_of(raw: Raw, stem: str) -> str:
 
 def quantities(kind: type[Section]) -> dict[str, tuple[str, Dimension]]:
     """Fields that are quantities: stem of the key -> (field name, dimension)."""
-    found = {}
+    by_name = {}
     for name, field in kind.model_fields.items():
         for mark in field.metadata:
             if isinstance(mark, Dimension):
-                found[name.rpartition("_")[0]] = (name, mark)
-    return found
+                by_name[name.rpartition("_")[0]] = (name, mark)
+    return by_name
 
 
 def _to_si(kind: type[Section], raw: Raw, path: str) -> tuple[Raw, dict[str, str], list[Problem]]:
@@ -67,7 +71,26 @@ def _to_si(kind: type[Section], raw: Raw, path: str) -> tuple[Raw, dict[str, str
             values |= {field: section} if section is not None else {}
         else:
             values[field], keys[field] = _scaled(value, factor), key
+            if any(_is_absurd(number) for number in _numbers(values[field])):
+                problems.append(Problem(_join(path, key), ABSURD, "check number and unit"))
     return values, keys, problems
+
+
+def _numbers(value: Any) -> Iterator[float]:
+    """Every number in a value, in lists and tables too."""
+    if isinstance(value, list | dict):
+        for entry in value.values() if isinstance(value, dict) else value:
+            yield from _numbers(entry)
+    elif isinstance(value, int | float):
+        yield value
+
+
+def _is_absurd(number: float) -> bool:
+    """Too large or too small for its square to mean anything; inf and nan are refused by pydantic.
+
+    A rated pressure of 5e305 Pa passed every other check, and ended in a covariance of NaN.
+    """
+    return 0 < abs(number) < 1 / LARGEST or LARGEST < abs(number) < math.inf
 
 
 def _nested(kind: type[Section], field: str) -> type[Section] | None:
@@ -126,13 +149,13 @@ def _explain(
     kind: type[Section],
     raw: Raw,
     keys: dict[str, str],
-    found: list[ErrorDetails],
+    details: list[ErrorDetails],
     path: str,
     known: list[Problem],
 ) -> list[Problem]:
     """Pydantic's errors in our words; one per place; none for a key that is already named."""
     problems: dict[str, Problem] = {}
-    for error in found:
+    for error in details:
         field = str(error["loc"][0])
         stem = field.rpartition("_")[0]
         named = any(p.path.startswith(_join(path, stem)) for p in known if stem)

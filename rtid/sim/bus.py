@@ -10,12 +10,13 @@ import numpy as np
 from firmware_bridge.catalog import Catalog, load
 from firmware_bridge.frames import Frames
 from firmware_bridge.playback import SendError
+from rtid.plain import FloatArray
+from rtid.sim.demand import DT_S
 from rtid.sim.frames import CONTROLLER_ROUTES, VALVE_ROUTES, cycle_frames
-from rtid.sim.motion import DT_S
-from rtid.sim.plant import EDGES, FloatArray
 from rtid.sim.robust import Tracked
 from rtid.sim.run import Run
 from rtid.sim.sensing import NAMES
+from rtid.sim.simulated_plant import EDGES
 
 TEST_BUSES = ("virtual", "udp_multicast")
 

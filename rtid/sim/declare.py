@@ -1,4 +1,4 @@
-"""What an honest user would declare of a simulated machine: its `Model`, with what it cannot know.
+"""What an honest user would declare of a simulated machine, its `Machine`, and cannot know of it.
 
 Geometry and sensors are exact; the bulk modulus is up to 30 % off, the lag is the data sheet's
 1.3 +- 0.2 ms, the maps are unknown above a safe band of 1 V.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from rtid.errors import door
 from rtid.model import (
     COMMAND,
     POSITION,
@@ -17,12 +18,13 @@ from rtid.model import (
     Edge,
     Grid,
     Lag,
-    Model,
+    Machine,
     Signal,
 )
-from rtid.sim.plant import AB, EDGES, FloatArray, Plant
+from rtid.plain import FloatArray
 from rtid.sim.robust import COMMAND_STEP_V, TOP_V
 from rtid.sim.run import NAMES, Sensors
+from rtid.sim.simulated_plant import AB, EDGES, SimulatedPlant
 
 ENDS = {
     "pa": ("p_supply", "p_a"),
@@ -34,7 +36,6 @@ ENDS = {
 KINDS = (COMMAND, PRESSURE, PRESSURE, PRESSURE, PRESSURE, POSITION, VELOCITY)
 UNITS = ("V", "Pa", "Pa", "Pa", "Pa", "m", "m/s")
 RATED_DP_PA = 5e5
-RATED_V = 6.0
 
 
 def default_grid(
@@ -53,8 +54,9 @@ def uniform_grid(u_v: tuple[float, float, int], dp_pa: tuple[float, float, int])
     return Grid(*(np.linspace(low, high, count + 1) for low, high, count in (u_v, dp_pa)))
 
 
+@door
 def declared_model(
-    plant: Plant,
+    plant: SimulatedPlant,
     *,
     grid: Grid | dict[str, Grid] | None = None,
     sensors: Sensors | None = None,
@@ -63,7 +65,7 @@ def declared_model(
     lag: Lag | None = None,
     form: str = "integral",
     one_by_one: bool = False,
-) -> Model:
+) -> Machine:
     """The declaration for this machine.
 
     grid: one for all edges or one per edge name; sensors: as given to `simulate`; seed: of the
@@ -82,7 +84,7 @@ def declared_model(
         for name in plant.edges
     )
     signals = _signals(sensors)
-    return Model(
+    return Machine(
         signals=(*_valve_commands(edges), *signals[1:]) if one_by_one else signals,
         chambers=(
             Chamber("a", "p_a", c.area_a_m2, 1, c.v0_a_m3),
@@ -102,7 +104,7 @@ def _valve_commands(edges: tuple[Edge, ...]) -> tuple[Signal, ...]:
     return tuple(Signal(e.command, COMMAND, "V", 0.0, COMMAND_STEP_V, 0.0, TOP_V) for e in edges)
 
 
-def _edge(plant: Plant, name: str, grid: Grid, safe_band_v: float, command: str) -> Edge:
+def _edge(plant: SimulatedPlant, name: str, grid: Grid, safe_band_v: float, command: str) -> Edge:
     """The edge with the data sheet's rated flow, the same for every valve of one machine."""
     source, sink = ENDS[name]
     gain = float(np.mean([valve.gain for valve in plant.valves[:AB]]))

@@ -15,9 +15,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from numba import njit
-
-from rtid.sim.plant import AB, AT, BT, PA, PB, Constants, FloatArray, metered_flow
+from rtid.plain import FloatArray
+from rtid.sim.compiled import compiled
+from rtid.sim.simulated_plant import AB, AT, BT, PA, PB, Constants, metered_flow
 
 # the state of a machine with extra physics; the first four are the plain machine's
 P_A, P_B, X, V, PORT_A, PORT_B, LINE_A, LINE_B, DEAD_A, DEAD_B, HOSE_A, HOSE_B = range(12)
@@ -46,14 +46,14 @@ PUMP_M3S, SUPPLY_LAG_S, ACCUMULATOR = 6e-4, 0.4, 1.8  # exponent of C(P)
 BRANCH_RADPS, BRANCH_DAMPING = 2 * math.pi * 9.0, 0.1
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def gap_flow(k: float, p1_pa: float, p2_pa: float) -> float:
     """Laminar leak from p1 to p2, m3/s; k (m3/s/Pa) at a mean pressure of 3 MPa."""
     q: float = k * (p1_pa - p2_pa) * (1 + (0.5 * (p1_pa + p2_pa) - GAP_MEAN_PA) / GAP_WIDENS_PA)
     return q
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def orifice_flow(k: float, dp_pa: float) -> float:
     """Leak through a sharp edge, m3/s; k in m3/s/sqrt(Pa); none costs no root."""
     if k == 0.0:
@@ -61,22 +61,22 @@ def orifice_flow(k: float, dp_pa: float) -> float:
     return k * dp_pa / math.sqrt(abs(dp_pa) + TRANSITION_PA)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def knee(d_pa: float) -> float:
     """0 far below zero, d far above, smooth between; Pa."""
     return 0.5 * (d_pa + math.sqrt(d_pa * d_pa + KNEE_PA * KNEE_PA))
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def groove_opening(x_m: float, stroke_m: float) -> float:
     """0..1: a bump of the leak in the worn part of the stroke."""
     s = (x_m - 0.5 * stroke_m - GROOVE_SHIFT_M) / GROOVE_M
     return math.exp(-0.5 * s * s)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def crossing_flow(c: Constants, e: Any, y: FloatArray) -> float:
-    """All leaks from A to B past the piston, m3/s."""
+    """All leaks from A to B past the piston, m3/s, at the state y (STATES,)."""
     p_a, p_b = y[P_A], y[P_B]
     k = e.whole.internal_laminar
     if e.whole.groove + e.whole.groove_one_way > 0.0:
@@ -85,7 +85,7 @@ def crossing_flow(c: Constants, e: Any, y: FloatArray) -> float:
     return gap_flow(k, p_a, p_b) + orifice_flow(e.whole.internal_turbulent, p_a - p_b)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def outward_flow(r: Any, p_pa: float, p_tank_pa: float) -> float:
     """All flows from one chamber to tank, m3/s; negative where more is made up."""
     leak = gap_flow(r.external_laminar, p_pa, p_tank_pa)
@@ -97,7 +97,7 @@ def outward_flow(r: Any, p_pa: float, p_tank_pa: float) -> float:
     return leak
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def extra_flows(c: Constants, e: Any, inputs: FloatArray, y: FloatArray, net: FloatArray) -> None:
     """Fill net (2,) in place: what flows into A and B past valves and hoses, m3/s."""
     crossing, p_tank_pa = crossing_flow(c, e, y), inputs[TANK_IN]
@@ -105,7 +105,7 @@ def extra_flows(c: Constants, e: Any, inputs: FloatArray, y: FloatArray, net: Fl
     net[1] = crossing - outward_flow(e.b, y[P_B], p_tank_pa)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def edge_flow(c: Constants, seat: float, compensated: float, gain: float, dp_pa: float) -> float:
     """Flow of a metering edge with its seat leak and its pressure compensator, m3/s.
 
@@ -120,9 +120,9 @@ def edge_flow(c: Constants, seat: float, compensated: float, gain: float, dp_pa:
     return q
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def tie_nodes(e: Any, p_supply_pa: float, y: FloatArray) -> None:
-    """Set the pressures at the valves that follow from the others: where nothing lies between."""
+    """Set the pressures of y (STATES,) at the valves that follow from others, Pa."""
     y[SUPPLY] = p_supply_pa - y[DROOP]
     if e.whole.branch_kgpm4 == 0.0:
         y[BRANCH] = y[SUPPLY]
@@ -132,11 +132,11 @@ def tie_nodes(e: Any, p_supply_pa: float, y: FloatArray) -> None:
         y[PORT_B] = y[P_B]
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def extra_valve_flows(
     c: Constants, e: Any, gains: FloatArray, inputs: FloatArray, y: FloatArray, q: FloatArray
 ) -> None:
-    """Fill q (5,) in place with the flow of each edge; y's pressures at the valves are tied."""
+    """Fill q (5,), m3/s, with the flow of each edge; y's pressures at the valves are tied."""
     tie_nodes(e, inputs[SUPPLY_IN], y)
     w, p_tank_pa = e.whole, inputs[TANK_IN]
     port_a, port_b, p_s = y[PORT_A], y[PORT_B], y[SUPPLY]
@@ -147,7 +147,7 @@ def extra_valve_flows(
     q[AB] = edge_flow(c, w.seat_ab, w.compensated_ab, gains[AB], port_a - port_b)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def compressibility(c: Constants, e: Any, r: Any, p_pa: float) -> float:
     """1 / beta_c of oil with free and released gas at the absolute pressure, 1/Pa."""
     oil = 1.0 / c.beta_pa
@@ -161,7 +161,7 @@ def compressibility(c: Constants, e: Any, r: Any, p_pa: float) -> float:
     return oil
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def chamber_rates(
     c: Constants,
     e: Any,
@@ -175,7 +175,7 @@ def chamber_rates(
     """Fill in place the rates of one chamber, its hose, its dead volume and its soft hose wall.
 
     r: the chamber's numbers; valves: net flow through its metering edges; net: its extra flows,
-    m3/s.
+    m3/s; y, dy (STATES,): the state and its rate, SI.
     """
     p = y[P_A + chamber]
     line_m3 = r.line_m * HOSE_AREA_M2
@@ -203,9 +203,9 @@ def chamber_rates(
     dy[P_A + chamber] = (into + net - area * y[V]) / room
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def supply_rates(e: Any, q: FloatArray, p_set_pa: float, y: FloatArray, dy: FloatArray) -> None:
-    """Fill in place the rates of the supply: pump, accumulator, and the branch to the edge pa."""
+    """Fill the supply's rates dy (STATES,): pump, accumulator, branch to pa; q (5,) in m3/s."""
     to_pa: float = q[PA]
     if e.whole.branch_kgpm4 > 0.0:
         capacity = 1.0 / (BRANCH_RADPS**2 * e.whole.branch_kgpm4)
@@ -221,7 +221,7 @@ def supply_rates(e: Any, q: FloatArray, p_set_pa: float, y: FloatArray, dy: Floa
         dy[DROOP] = (to_pa + q[PB] - delivered) / capacity
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def extra_rates(
     c: Constants,
     e: Any,
@@ -231,7 +231,7 @@ def extra_rates(
     net: FloatArray,
     dy: FloatArray,
 ) -> None:
-    """Replace the pressure rates of dy (STATES,) for the flows q (5,); fill net (2,); in place."""
+    """Replace the pressure rates of dy (STATES,) for the flows q (5,); fill net (2,), m3/s."""
     extra_flows(c, e, inputs, y, net)
     dy[PORT_A:] = 0.0
     chamber_rates(c, e, e.a, 0, q[PA] - q[AT] - q[AB], net[0], y, dy)

@@ -10,15 +10,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_bridge import e2e
 from firmware_bridge.catalog import Catalog
 from firmware_bridge.frames import Frames, by_time, concatenate
 from firmware_bridge.frames import empty as empty_frames
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from rtid.plain import FloatArray, IntArray
 
 FRAME_US = 130  # 8 data bytes at 1 Mbit/s with stuff bits
 ARBITRATION_US = 200  # longest wait for the bus
@@ -131,7 +128,7 @@ def message_frames(
     columns: Mapping[str, FloatArray],
     counter: IntArray,
 ) -> Frames:
-    """n frames of one message; signals without a route are zero."""
+    """n frames of one message at t_us (n,); signals without a route are zero."""
     names = [signal.name for signal in catalog.message(message).signals]
     source = catalog.message_source(message)
     values = np.zeros((len(t_us), len(names)))
@@ -166,9 +163,9 @@ def _task_instants_us(
     return np.clip(nominal + spread, first_us, last_us)
 
 
-def _sample(column: FloatArray, t_us: IntArray, at_us: FloatArray, held: bool) -> FloatArray:
-    """The column at the instants at_us, held or interpolated linearly."""
-    if not held:
+def _sample(column: FloatArray, t_us: IntArray, at_us: FloatArray, is_held: bool) -> FloatArray:
+    """The column at the instants at_us, as held or interpolated linearly."""
+    if not is_held:
         return np.interp(at_us, t_us, column)
     row = np.searchsorted(t_us, at_us, side="right") - 1
     return np.asarray(column[np.maximum(row, 0)])

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from rtid.sim.extra import Planted
+from rtid.sim.extra_physics import Planted
 from rtid.sim.hideable import BEYOND, KNOWN, LEVELS, MECHANICS, Hidden, HiddenError
-from rtid.sim.plant import Plant
+from rtid.sim.simulated_plant import SimulatedPlant
 
 __all__ = ["HIDDEN", "LEVELS", "MECHANICAL", "OUTSIDE", "Hidden", "HiddenError", "hide"]
 
@@ -16,7 +16,7 @@ OUTSIDE = tuple(BEYOND)  # in no catalogue: a diagnosis has to say that it does 
 MECHANICAL = tuple(MECHANICS)  # not in the pressure equations: a diagnosis has to stay silent
 
 
-def hide(plant: Plant, name: str, strength: float, where: str = "") -> Plant:
+def hide(plant: SimulatedPlant, name: str, strength: float, where: str = "") -> SimulatedPlant:
     """The plant with the effect in it, besides what it hides already; strength 0 changes nothing.
 
     Raises HiddenError for an unknown name, an impossible place or strength, or where two effects
@@ -37,7 +37,7 @@ def hide(plant: Plant, name: str, strength: float, where: str = "") -> Plant:
     return replace(changed, hidden=(*plant.hidden, Planted(name, where, float(strength))))
 
 
-def hide_wish(plant: Plant, wish: str) -> Plant:
+def hide_wish(plant: SimulatedPlant, wish: str) -> SimulatedPlant:
     """The plant with a wish of the form EFFECT[:WHERE][=STRENGTH] fulfilled, middle by default."""
     place, _, strength = wish.partition("=")
     name, _, where = place.partition(":")

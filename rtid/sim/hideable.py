@@ -2,8 +2,8 @@
 
 Each effect is simulated in another form, or by another integrator, than the column that looks for
 it: gaps widen with pressure, edges have a laminar foot, valves a soft knee, plays rounded corners.
-Its strength is in the unit of the effect catalogue, and is the coefficient that the plain column
-has over a record, within about 10 %.
+Its strength is in the unit of its page, and is the coefficient that the plain column has over a
+record, within about 10 %.
 """
 
 from __future__ import annotations
@@ -14,11 +14,13 @@ from typing import Any
 
 import numpy as np
 
+from rtid.effects import effect
 from rtid.errors import RtidError
 from rtid.sim import extra_flows as flows
-from rtid.sim.extra import Extra
-from rtid.sim.plant import EDGES, Plant
+from rtid.sim.extra_physics import Extra
+from rtid.sim.simulated_plant import EDGES, SimulatedPlant
 
+WORN = "internal_leakage_laminar=middle"  # what the demo's machine has
 LEVELS = ("weak", "middle", "strong")
 CHAMBERS = ("a", "b")
 EITHER = ("", *CHAMBERS)  # "" is both
@@ -49,7 +51,7 @@ class Hidden:
     unit: str
     strengths: tuple[float, float, float]
     places: tuple[str, ...]
-    apply: Callable[[Plant, float, str], Plant]
+    apply: Callable[[SimulatedPlant, float, str], SimulatedPlant]
     catalogue: str
     signed: bool = False  # a negative strength is possible, too
 
@@ -64,7 +66,7 @@ class Hidden:
             raise HiddenError(f"{self.name}={level}: no strength", remedy) from error
 
 
-def _extra(plant: Plant, **numbers: Any) -> Plant:
+def _extra(plant: SimulatedPlant, **numbers: Any) -> SimulatedPlant:
     for name, value in numbers.items():
         old = np.asarray(getattr(plant.extra, name))
         if np.any((old != 0.0) & (old != value)):
@@ -74,15 +76,17 @@ def _extra(plant: Plant, **numbers: Any) -> Plant:
     return replace(plant, extra=changed)
 
 
-def _number(field: str) -> Callable[[Plant, float, str], Plant]:
+def _number(field: str) -> Callable[[SimulatedPlant, float, str], SimulatedPlant]:
     """An effect that is one number of `Extra`, of the whole machine."""
     return lambda plant, strength, where: _extra(plant, **{field: strength})
 
 
-def _at(field: str, names: tuple[str, ...]) -> Callable[[Plant, float, str], Plant]:
+def _at(
+    field: str, names: tuple[str, ...]
+) -> Callable[[SimulatedPlant, float, str], SimulatedPlant]:
     """An effect that is one number of `Extra` per chamber or edge; "" is all of them."""
 
-    def apply(plant: Plant, strength: float, where: str) -> Plant:
+    def apply(plant: SimulatedPlant, strength: float, where: str) -> SimulatedPlant:
         old = getattr(plant.extra, field)
         pairs = zip(names, old, strict=True)
         new = tuple(strength if where in ("", name) else value for name, value in pairs)
@@ -93,10 +97,10 @@ def _at(field: str, names: tuple[str, ...]) -> Callable[[Plant, float, str], Pla
 
 def _opening(
     flow: str, opening: str, of_load: float, of_supply: float
-) -> Callable[[Plant, float, str], Plant]:
+) -> Callable[[SimulatedPlant, float, str], SimulatedPlant]:
     """A valve on a chamber: A opens at a share of the load's pressure, B at one of the supply."""
 
-    def apply(plant: Plant, strength: float, where: str) -> Plant:
+    def apply(plant: SimulatedPlant, strength: float, where: str) -> SimulatedPlant:
         c = plant.constants
         at_rest_pa = (c.gravity_n + 0.3 * plant.p_supply_pa * c.area_b_m2) / c.area_a_m2
         pressures = {"a": of_load * at_rest_pa, "b": of_supply * plant.p_supply_pa}
@@ -106,42 +110,42 @@ def _opening(
     return apply
 
 
-def _air(plant: Plant, strength: float, where: str) -> Plant:
+def _air(plant: SimulatedPlant, strength: float, where: str) -> SimulatedPlant:
     kappa, p_pa = flows.POLYTROPIC, MATERIAL_GAS_PA
     softer = (p_pa / flows.ATMOSPHERE_PA) ** (1.0 - 1.0 / kappa) / kappa
     return _extra(plant, air_share=strength / softer)
 
 
-def _line(plant: Plant, strength: float, where: str) -> Plant:
+def _line(plant: SimulatedPlant, strength: float, where: str) -> SimulatedPlant:
     return _at("line_m", CHAMBERS)(plant, strength / flows.INERTANCE_KGPM5, where)
 
 
-def _line_seen_at_valve(plant: Plant, strength: float, where: str) -> Plant:
+def _line_seen_at_valve(plant: SimulatedPlant, strength: float, where: str) -> SimulatedPlant:
     return _extra(_line(plant, strength, where), sensor_at_valve=1.0)
 
 
-def _spool(plant: Plant, strength: float, where: str) -> Plant:
+def _spool(plant: SimulatedPlant, strength: float, where: str) -> SimulatedPlant:
     return _extra(plant, spool_radps=strength, spool_damping=SPOOL_DAMPING, spool_order=2.0)
 
 
-def _second_lag(plant: Plant, strength: float, where: str) -> Plant:
+def _second_lag(plant: SimulatedPlant, strength: float, where: str) -> SimulatedPlant:
     return _extra(plant, spool_lag_s=strength, spool_order=1.0)
 
 
-def _deadbands(plant: Plant, strength: float, where: str) -> Plant:
+def _deadbands(plant: SimulatedPlant, strength: float, where: str) -> SimulatedPlant:
     shares = zip(plant.valves, (1.0, 1.1, 0.9, 1.05, 0.95), strict=True)
     wider = tuple(replace(v, deadband_v=v.deadband_v + share * strength) for v, share in shares)
     return replace(plant, valves=wider)
 
 
-def _measured_sag(plant: Plant, strength: float, where: str) -> Plant:
+def _measured_sag(plant: SimulatedPlant, strength: float, where: str) -> SimulatedPlant:
     return _extra(plant, sag_pasm3=strength, sag_measured=1.0)
 
 
-def _constant(field: str) -> Callable[[Plant, float, str], Plant]:
+def _constant(field: str) -> Callable[[SimulatedPlant, float, str], SimulatedPlant]:
     """More of one of the mechanical constants."""
 
-    def apply(plant: Plant, strength: float, where: str) -> Plant:
+    def apply(plant: SimulatedPlant, strength: float, where: str) -> SimulatedPlant:
         more = getattr(plant.constants, field) + strength
         return replace(plant, constants=plant.constants._replace(**{field: more}))
 
@@ -151,59 +155,59 @@ def _constant(field: str) -> Callable[[Plant, float, str], Plant]:
 # fmt: off
 _CATALOGUE = (
     ("internal_leakage_laminar", "gap past the piston that widens with pressure",
-     LAMINAR, (0.6e-12, 2e-12, 6e-12), ANYWHERE, _number("internal_laminar")),
+     (0.6e-12, 2e-12, 6e-12), ANYWHERE, _number("internal_laminar")),
     ("external_leakage_laminar", "gap to tank that widens with pressure",
-     LAMINAR, (0.3e-12, 1e-12, 3e-12), CHAMBERS, _at("external_laminar", CHAMBERS)),
+     (0.3e-12, 1e-12, 3e-12), CHAMBERS, _at("external_laminar", CHAMBERS)),
     ("valve_seat_leakage", "gap of the seat, at right angles to the opening, laminar foot 0.1 MPa",
-     TURBULENT, (0.5e-9, 1.5e-9, 4.5e-9), VALVES, _at("seat", EDGES)),
+     (0.5e-9, 1.5e-9, 4.5e-9), VALVES, _at("seat", EDGES)),
     ("entrained_air", "volume of a polytropic mixture; share as soft as isothermal air at 2.2 MPa",
-     "1", (0.01, 0.03, 0.09), ANYWHERE, _air),
+     (0.01, 0.03, 0.09), ANYWHERE, _air),
     ("extra_dead_volume", "blind volume behind a port, 2 ms late",
-     "m3", (1.3e-4, 4e-4, 1.2e-3), EITHER, _at("dead_volume_m3", CHAMBERS)),
+     (1.3e-4, 4e-4, 1.2e-3), EITHER, _at("dead_volume_m3", CHAMBERS)),
     ("line_dynamics", "pi section of a 13 mm hose, turbulent loss; sensor at the cylinder",
-     "Pa s2/m3", (0.8e7, 2.4e7, 7e7), EITHER, _line),
+     (0.8e7, 2.4e7, 7e7), EITHER, _line),
     ("spool_lag_second_order", "five spools of slightly different frequency, damping 0.9",
-     "rad/s", (600.0, 200.0, 65.0), ANYWHERE, _spool),
+     (600.0, 200.0, 65.0), ANYWHERE, _spool),
     ("input_delay", "the held command arrives late, also between samples",
-     "s", (1.5e-3, 5e-3, 15e-3), ANYWHERE, _number("delay_s")),
+     (1.5e-3, 5e-3, 15e-3), ANYWHERE, _number("delay_s")),
     ("valve_hysteresis", "eight plays in parallel, 0.65 to 1.35 of the full width: round corners",
-     "V", (0.03, 0.1, 0.3), ANYWHERE, _number("play_v")),
+     (0.03, 0.1, 0.3), ANYWHERE, _number("play_v")),
     ("supply_sag", "saturating pump, polytropic accumulator; the column holds the set pressure",
-     "Pa s/m3", (3.6e8, 1.1e9, 3.3e9), ANYWHERE, _number("sag_pasm3")),
+     (3.6e8, 1.1e9, 3.3e9), ANYWHERE, _number("sag_pasm3")),
     ("relief_valve", "poppet with a soft knee of 0.1 MPa",
-     LAMINAR, (3e-12, 9e-12, 27e-12), CHAMBERS, _opening("relief", "relief_open_pa", 1.3, 0.78)),
+     (3e-12, 9e-12, 27e-12), CHAMBERS, _opening("relief", "relief_open_pa", 1.3, 0.78)),
     ("valve_gain_drift", "all gains warm up exponentially, time constant 1.5 records",
-     "1", (0.01, 0.03, 0.09), ANYWHERE, _number("gain_drift")),
+     (0.01, 0.03, 0.09), ANYWHERE, _number("gain_drift")),
     ("internal_leakage_turbulent", "sharp edge past the piston, laminar below 30 kPa",
-     TURBULENT, (0.7e-9, 2e-9, 6e-9), ANYWHERE, _number("internal_turbulent")),
+     (0.7e-9, 2e-9, 6e-9), ANYWHERE, _number("internal_turbulent")),
     ("external_leakage_turbulent", "sharp edge to tank, laminar below 30 kPa",
-     TURBULENT, (0.4e-9, 1.2e-9, 3.6e-9), CHAMBERS, _at("external_turbulent", CHAMBERS)),
+     (0.4e-9, 1.2e-9, 3.6e-9), CHAMBERS, _at("external_turbulent", CHAMBERS)),
     ("hose_compliance", "hose wall, 1 ms late, half as soft at 12 MPa as at 4 MPa",
-     "m3/Pa", (1.6e-13, 5e-13, 1.5e-12), EITHER, _at("hose_m3ppa", CHAMBERS)),
+     (1.6e-13, 5e-13, 1.5e-12), EITHER, _at("hose_m3ppa", CHAMBERS)),
     ("spool_lag_first_order", "a second lag behind the spool's own 1.3 ms",
-     "s", (1.5e-3, 5e-3, 15e-3), ANYWHERE, _second_lag),
+     (1.5e-3, 5e-3, 15e-3), ANYWHERE, _second_lag),
     ("deadband_shift", "dead bands that are wider than before, each by 0.9 to 1.1 of it",
-     "V", (0.05, 0.15, 0.45), ANYWHERE, _deadbands),
+     (0.05, 0.15, 0.45), ANYWHERE, _deadbands),
     ("makeup_valve", "check valve with a soft knee of 0.1 MPa",
-     LAMINAR, (3e-12, 9e-12, 27e-12), CHAMBERS, _opening("makeup", "makeup_open_pa", 1.0, 0.18)),
+     (3e-12, 9e-12, 27e-12), CHAMBERS, _opening("makeup", "makeup_open_pa", 1.0, 0.18)),
     ("cavitation", "share of the volume that boils out, with the square of what lacks",
-     "1", (1.5e-3, 4.5e-3, 13e-3), ("b", "a"), _opening("released", "release_pa", 0.9, 0.25)),
+     (1.5e-3, 4.5e-3, 13e-3), ("b", "a"), _opening("released", "release_pa", 0.9, 0.25)),
     ("pressure_sensor_lag", "two equal lags of half the time one behind the other",
-     "s", (0.5e-3, 1.5e-3, 5e-3), EITHER, _at("pressure_lag_s", CHAMBERS)),
+     (0.5e-3, 1.5e-3, 5e-3), EITHER, _at("pressure_lag_s", CHAMBERS)),
     ("pressure_sensor_bias", "the sensor's zero is off",
-     "Pa", (0.1e6, 0.3e6, 0.6e6), CHAMBERS, _at("pressure_bias_pa", CHAMBERS)),
+     (0.1e6, 0.3e6, 0.6e6), CHAMBERS, _at("pressure_bias_pa", CHAMBERS)),
     ("position_sensor_delay", "the sensor is late, also for the controller",
-     "s", (0.5e-3, 1.5e-3, 5e-3), ANYWHERE, _number("position_delay_s")),
+     (0.5e-3, 1.5e-3, 5e-3), ANYWHERE, _number("position_delay_s")),
     ("velocity_scale", "the velocity's sensor reads too much",
-     "1", (0.02, 0.06, 0.2), ANYWHERE, _number("velocity_scale")),
+     (0.02, 0.06, 0.2), ANYWHERE, _number("velocity_scale")),
     ("position_dependent_leakage", "gap with a bell-shaped groove, 1 cm beyond mid-stroke",
-     LAMINAR, (2e-12, 6e-12, 18e-12), ANYWHERE, _number("groove")),
+     (2e-12, 6e-12, 18e-12), ANYWHERE, _number("groove")),
     ("load_compensated_valve", "the flow's share that saturates above 0.2 MPa, as at 2 MPa",
-     "1", (0.1, 0.3, 0.9), (*VALVES, ""), _at("compensated", EDGES)),
+     (0.1, 0.3, 0.9), (*VALVES, ""), _at("compensated", EDGES)),
 )
 _VARIANTS = (
     ("line_dynamics_seen_at_valve", "as line_dynamics; sensors at the valves' end",
-     "Pa s2/m3", (0.8e7, 2.4e7, 7e7), EITHER, _line_seen_at_valve, "line_dynamics"),
+     (0.8e7, 2.4e7, 7e7), EITHER, _line_seen_at_valve, "line_dynamics"),
 )
 _OUTSIDE = (
     ("groove_one_way", "groove 1 cm beyond mid-stroke whose lip opens while extending",
@@ -229,11 +233,20 @@ _MECHANICAL = (
 # fmt: on
 
 
-def _table(effects: Iterable[tuple[Any, ...]]) -> dict[str, Hidden]:
-    return {effect[0]: Hidden(*effect) for effect in effects}
+def _table(rows: Iterable[tuple[Any, ...]]) -> dict[str, Hidden]:
+    return {row[0]: Hidden(*row) for row in rows}
 
 
-SIGNED = ("valve_gain_drift", "deadband_shift", "pressure_sensor_bias", "velocity_scale")
-KNOWN = _table([*((*effect, effect[0], effect[0] in SIGNED) for effect in _CATALOGUE), *_VARIANTS])
-BEYOND = _table((*effect, "") for effect in _OUTSIDE)
-MECHANICS = _table((*effect, "") for effect in _MECHANICAL)
+def _of_page(row: tuple[Any, ...], name: str) -> Hidden:
+    """An effect of the catalogue: unit and sign are those of its page."""
+    hidden, form, strengths, places, apply = row
+    size = effect(name).size
+    unit = OTHER_UNITS.get(name, size.unit)
+    return Hidden(hidden, form, unit, strengths, places, apply, name, size.sign == 0)
+
+
+OTHER_UNITS = {"cavitation": "1"}  # of the volume: its page's compliance times where it begins
+KNOWN = {row[0]: _of_page(row, row[0]) for row in _CATALOGUE}
+KNOWN |= {row[0]: _of_page(row[:-1], row[-1]) for row in _VARIANTS}
+BEYOND = _table((*row, "") for row in _OUTSIDE)
+MECHANICS = _table((*row, "") for row in _MECHANICAL)

@@ -16,7 +16,7 @@ from shutil import copy
 import numpy as np
 
 from rtid.errors import RtidError
-from rtid.model import FloatArray
+from rtid.plain import FloatArray
 
 FINE = 20  # steps per sample
 PLANT_FILES = Path(__file__).parents[1] / "project" / "examples"
@@ -83,15 +83,15 @@ def write_example(name: str, table: Path, seed: int, hide: bool) -> tuple[Record
         raise RtidError(
             f"{table}: cannot be written", "name a .csv file in a folder that exists", 2
         )
-    found = EXAMPLES[name](np.random.default_rng(seed), hide)
-    values = np.column_stack(list(found.columns.values()))
-    np.savetxt(table, values, "%.9g", ",", header=",".join(found.columns), comments="")
+    recorded = EXAMPLES[name](np.random.default_rng(seed), hide)
+    values = np.column_stack(list(recorded.columns.values()))
+    np.savetxt(table, values, "%.9g", ",", header=",".join(recorded.columns), comments="")
     plant = Path(copy(PLANT_FILES / f"{name}.toml", table.with_suffix(".toml")))
-    return found, [table, plant]
+    return recorded, [table, plant]
 
 
 def steps(rng: np.random.Generator, low: float, high: float, each: int, n: int) -> FloatArray:
-    """An input (n,) that is drawn anew between low and high every so many samples."""
+    """An input (n,), any SI unit, that is drawn anew between low and high every so many samples."""
     return np.repeat(rng.uniform(low, high, n // each + 1), each)[:n]
 
 
@@ -103,9 +103,9 @@ def moved(
     fine: int = FINE,
 ) -> FloatArray:
     """States (n, states); step(x, k, h) makes one of the `fine` steps in interval k."""
-    x, found = start, np.empty((n, len(start)))
+    x, states = start, np.empty((n, len(start)))
     for k in range(n):
-        found[k] = x
+        states[k] = x
         for _ in range(fine):
             x = step(x, k, dt_s / fine)
-    return found
+    return states

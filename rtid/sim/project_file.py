@@ -1,6 +1,6 @@
 """The project file of a simulated machine, as its honest user would have written it.
 
-It serves the controller's frames (rtid's own DBC) and the table that `rtid.sim.log` writes.
+It serves the controller's frames (rtid's own DBC) and the table that `rtid.sim.run_files` writes.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from typing import Any
 
 import tomlkit
 
-from rtid.model import Edge, Model
+from rtid.model import Edge, Machine
 from rtid.sim.frames import CONTROLLER_ROUTES, VALVE_ROUTES, messages_of
 from rtid.units import LPM
 
@@ -17,7 +17,7 @@ ROUTES = CONTROLLER_ROUTES | VALVE_ROUTES
 HEAD = "Written by `rtid simulate`: what the user of this simulated machine would declare.\n"
 
 
-def project_text(model: Model, stroke_m: float, name: str) -> str:
+def project_text(model: Machine, stroke_m: float, name: str) -> str:
     """TOML text of the project; `model` as from `declared_model`."""
     document = tomlkit.document()
     for line in HEAD.splitlines():
@@ -27,7 +27,7 @@ def project_text(model: Model, stroke_m: float, name: str) -> str:
     return tomlkit.dumps(document)
 
 
-def _sections(model: Model, stroke_m: float, name: str) -> dict[str, Any]:
+def _sections(model: Machine, stroke_m: float, name: str) -> dict[str, Any]:
     low_pa, high_pa = model.beta_bounds_pa
     routes = {signal.name: ROUTES[signal.name] for signal in model.signals}
     lag = {"nominal_ms": model.lag.nominal_s * 1e3, "tolerance_ms": model.lag.tolerance_s * 1e3}
@@ -54,11 +54,11 @@ def _sections(model: Model, stroke_m: float, name: str) -> dict[str, Any]:
     }
 
 
-def _signals(model: Model) -> dict[str, Any]:
-    found = {}
+def _signals(model: Machine) -> dict[str, Any]:
+    sections = {}
     for signal in model.signals:
         route = ROUTES[signal.name]
-        found[signal.name] = {
+        sections[signal.name] = {
             "message": route.message,
             "signal": route.signal,
             "column": signal.name,
@@ -66,20 +66,20 @@ def _signals(model: Model) -> dict[str, Any]:
             "noise": signal.noise,
             "range": [signal.minimum, signal.maximum],
         } | ({"hold": "zero"} if route.held else {})
-    return found
+    return sections
 
 
-def _chambers(model: Model, stroke_m: float) -> dict[str, Any]:
-    found = {}
+def _chambers(model: Machine, stroke_m: float) -> dict[str, Any]:
+    sections = {}
     for chamber in model.chambers:
         swept_m3 = chamber.area_m2 * stroke_m if chamber.sign < 0 else 0.0
-        found[chamber.name] = {
+        sections[chamber.name] = {
             "pressure": chamber.pressure,
             "area_cm2": chamber.area_m2 * 1e4,
             "sign": chamber.sign,
             "dead_volume_l": (chamber.v0_m3 - swept_m3) * 1e3,
         }
-    return found
+    return sections
 
 
 def _edge(edge: Edge) -> dict[str, Any]:
@@ -96,7 +96,7 @@ def _edge(edge: Edge) -> dict[str, Any]:
     }
 
 
-def _modes(model: Model) -> dict[str, Any]:
+def _modes(model: Machine) -> dict[str, Any]:
     """What one command opens in either direction; nothing where each valve has its own."""
     if len({edge.command for edge in model.edges}) > 1:
         return {}

@@ -14,7 +14,18 @@ from dataclasses import replace
 import numpy as np
 
 from rtid.sim.hidden import hide, known
-from rtid.sim.plant import AB, AT, BT, EDGES, PA, PB, Constants, Controller, Plant, Valve
+from rtid.sim.simulated_plant import (
+    AB,
+    AT,
+    BT,
+    EDGES,
+    PA,
+    PB,
+    Constants,
+    Controller,
+    SimulatedPlant,
+    Valve,
+)
 
 SPREAD = 0.3  # of every constant
 TYPE = 0.2  # of a valve type's gain and dead band; with the scatter of its valves within SPREAD
@@ -22,10 +33,10 @@ GAIN_SCATTER, DEADBAND_SCATTER = 0.08, 0.05
 CROSS_PORT_SHARE = 0.3  # the cross-port valve is small, else it short-circuits the chambers
 
 
-def draw(seed: int, *, cross_port: bool = False) -> Plant:
+def draw(seed: int, *, cross_port: bool = False) -> SimulatedPlant:
     """The machine with this number; cross_port also opens A->B while retracting (u < 0)."""
     rng = np.random.default_rng([seed, 1])
-    nominal = Plant()
+    nominal = SimulatedPlant()
     constants = Constants(*(_vary(rng, value) for value in nominal.constants))
     size = constants.area_a_m2 / nominal.constants.area_a_m2
     constants = constants._replace(
@@ -37,7 +48,7 @@ def draw(seed: int, *, cross_port: bool = False) -> Plant:
     )
     small = replace(common, gain=CROSS_PORT_SHARE * common.gain)
     valves = _fill_first([*(_valve(rng, common) for _ in EDGES[:AB]), _valve(rng, small)])
-    return Plant(
+    return SimulatedPlant(
         constants=constants,
         controller=_controller(rng, valves, size),
         valves=valves,
@@ -46,7 +57,9 @@ def draw(seed: int, *, cross_port: bool = False) -> Plant:
     )
 
 
-def draw_hidden(seed: int, name: str, level: str = "middle", *, cross_port: bool = False) -> Plant:
+def draw_hidden(
+    seed: int, name: str, level: str = "middle", *, cross_port: bool = False
+) -> SimulatedPlant:
     """The machine with this number and an effect in it, varied +-30 %, in a random place.
 
     Effects that can have either sign get a random one.

@@ -5,18 +5,21 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from rtid.errors import door
 from rtid.sim.bus import run_frames
 from rtid.sim.declare import declared_model
-from rtid.sim.log import START_US, truth_of, write_log, write_table
-from rtid.sim.motion import parts_s
+from rtid.sim.demand import parts_s
 from rtid.sim.project_file import project_text
 from rtid.sim.run import Run
+from rtid.sim.run_files import START_US, truth_of, write_log, write_table
 
 TABLE_SUFFIX = ".parquet"
 
 
-def write_run(trace: Path, run: Run, seed: int, motion: str) -> list[Path]:
+@door
+def write_run(trace: str | Path, run: Run, seed: int, motion: str) -> list[Path]:
     """Write trace, truth (.truth.json) and project (.toml); their paths."""
+    trace = Path(trace)
     if trace.suffix == TABLE_SUFFIX:
         write_table(trace, run)
     else:

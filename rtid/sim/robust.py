@@ -20,18 +20,19 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from firmware_bridge.lookup import Table
-from rtid.sim.equations import flows
-from rtid.sim.extra import parts_of
+from rtid.plain import FloatArray
+from rtid.sim.closed_loop import LOAD, P_SUPPLY, P_TANK, PlainMachine, advance, new_spools, quantise
+from rtid.sim.compiled import compiled
+from rtid.sim.demand import DT_S
+from rtid.sim.dynamics import flows
 from rtid.sim.extra_flows import SUPPLY, extra_valve_flows
-from rtid.sim.loop import LOAD, P_SUPPLY, P_TANK, Machine, advance, new_spools, quantise
-from rtid.sim.motion import DT_S
-from rtid.sim.plant import EDGES, PA, PB, Constants, FloatArray, Plant, flow_gain
+from rtid.sim.extra_physics import parts_of
 from rtid.sim.run import at_rest, machine_of
 from rtid.sim.schedule import schedule
 from rtid.sim.sensing import P_A, P_B, P_S, P_T, Sensors, U, V, X
+from rtid.sim.simulated_plant import EDGES, PA, PB, Constants, SimulatedPlant, flow_gain
 from rtid.sim.working_modes import Maps, commands, regenerates
 
 GAIN_1PS = 16.0  # of the paper
@@ -112,9 +113,9 @@ def _maps(parts: Any) -> Maps:
     return Maps(tuple(w), tuple(s), tuple(rising))
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def wanted_flows(law: Law, seen: FloatArray, ref: FloatArray) -> tuple[float, float]:
-    """Q_A and Q_B for measured signals (7,) and the reference's x, v, a and jerk (4,)."""
+    """Q_A and Q_B, m3/s, for measured signals (7,) and the reference's x, v, a, jerk (4,), SI."""
     c, k = law.c, law.gain_1ps
     x, v, p_a, p_b = seen[X], seen[V], seen[P_A], seen[P_B]
     gravity = c.gravity_n + c.gravity_slope_npm * (x - 0.5 * c.stroke_m)
@@ -136,11 +137,11 @@ def wanted_flows(law: Law, seen: FloatArray, ref: FloatArray) -> tuple[float, fl
     return q_a, -c.area_b_m2 * soon + volume_b / c.beta_pa * off - leak
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def drawn_w(
     c: Constants, e: Any, gains: FloatArray, drive: FloatArray, y: FloatArray, q: FloatArray
 ) -> float:
-    """Power that the supply gives for the gains (5,), W; q (5,) is filled with the flows."""
+    """Power that the supply gives for the gains (5,), W; q (5,) becomes the flows, m3/s."""
     if e is None:
         flows(c, gains, y, drive[P_SUPPLY], drive[P_TANK], q)
         return drive[P_SUPPLY] * (q[PA] + q[PB])
@@ -149,9 +150,9 @@ def drawn_w(
     return power
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def track(
-    m: Machine,
+    m: PlainMachine,
     e: Any,
     law: Law,
     maps: Maps,
@@ -165,8 +166,8 @@ def track(
 ) -> float:
     """Run the loop; ref (n, 4), drive (n + 1, 8), noise (n, 7), y is changed in place.
 
-    e: as of `loop.run_loop`.  record (n, 15) is filled: error, P_A, P_B, seven measured signals,
-    five commands.  Returns the energy from the supply, J.
+    e: as of `loop.run_loop`.  record (n, 15), SI, is filled: error, P_A, P_B, seven measured
+    signals, five commands.  Returns the energy from the supply, J.
     """
     half_s = 0.5 * DT_S / SUBSTEPS
     spools = new_spools(e, m.lag_s, half_s, 1)
@@ -192,8 +193,8 @@ def track(
     return energy_j
 
 
-def run(plant: Plant, known: Knowledge, reference: FloatArray, seed: int = 0) -> Tracked:
-    """Follow a reference (n, 4); the same seed gives the same sensor noise.
+def run(plant: SimulatedPlant, known: Knowledge, reference: FloatArray, seed: int = 0) -> Tracked:
+    """Follow a reference (n, 4), SI; the same seed gives the same sensor noise.
 
     Of hidden physics only flows act here, not what changes commands or sensors.
     """

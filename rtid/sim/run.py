@@ -10,14 +10,15 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from firmware_bridge.samples import GAP, ROW, Samples
-from rtid.errors import RtidError
+from rtid.errors import RtidError, door
+from rtid.plain import FloatArray
 from rtid.sim import extra_flows as state
-from rtid.sim.extra import NONE, parts_of
-from rtid.sim.loop import P_SUPPLY, P_TANK, X_REF, Machine, Record, run_loop
-from rtid.sim.motion import DT_S, MOTIONS, Motion, usual_duration_s
-from rtid.sim.plant import EDGES, FloatArray, Plant
+from rtid.sim.closed_loop import P_SUPPLY, P_TANK, X_REF, LoopRecord, PlainMachine, run_loop
+from rtid.sim.demand import DT_S, MOTIONS, Motion, usual_duration_s
+from rtid.sim.extra_physics import NONE, parts_of
 from rtid.sim.schedule import schedule
 from rtid.sim.sensing import EXACT, NAMES, P_A, P_B, P_S, P_T, Sensors, U, V, X, see
+from rtid.sim.simulated_plant import EDGES, SimulatedPlant
 
 __all__ = [
     "EXACT",
@@ -26,7 +27,7 @@ __all__ = [
     "P_B",
     "P_S",
     "P_T",
-    "Change",
+    "PlantChange",
     "Run",
     "Sensors",
     "SimulationError",
@@ -68,31 +69,32 @@ class Truth:
 
 
 @dataclass(frozen=True)
-class Change:
+class PlantChange:
     """What a plant becomes at a time; the valves' spools start again from their middle."""
 
     at_s: float
-    plant: Plant
+    plant: SimulatedPlant
 
 
 @dataclass(frozen=True)
 class Run:
     """One simulated record; `plant` is that of its end."""
 
-    plant: Plant
+    plant: SimulatedPlant
     sensors: Sensors
     samples: Samples
     truth: Truth
 
 
+@door
 def simulate(
-    plant: Plant,
+    plant: SimulatedPlant,
     motion: str | Motion = "sweep",
     seed: int = 0,
     duration_s: float | None = None,
     sensors: Sensors | None = None,
     substeps: int = 10,
-    change: Change | None = None,
+    change: PlantChange | None = None,
 ) -> Run:
     """Run the closed loop for duration_s at 1 kHz; the same arguments give identical samples.
 
@@ -125,7 +127,7 @@ def simulate(
 
 
 def _part(
-    plant: Plant,
+    plant: SimulatedPlant,
     drive: FloatArray,
     noise: FloatArray,
     sensors: Sensors,
@@ -147,7 +149,7 @@ def _joined(parts: list[Truth]) -> Truth:
 
 
 def _integrate(
-    plant: Plant,
+    plant: SimulatedPlant,
     drive: FloatArray,
     x_noise_m: FloatArray,
     sensors: Sensors,
@@ -156,7 +158,7 @@ def _integrate(
 ) -> tuple[Truth, FloatArray]:
     n, steps = len(x_noise_m), sensors.resolution()
     five = np.empty((3, n, 5))
-    record = Record(
+    record = LoopRecord(
         five[0],
         np.empty(n),
         five[1],
@@ -181,29 +183,31 @@ def _integrate(
     return truth, record.x_measured_m
 
 
-def machine_of(plant: Plant) -> Machine:
+def machine_of(plant: SimulatedPlant) -> PlainMachine:
     """What the kernel needs of the plant."""
     directions = np.array(plant.directions, dtype=float)
-    return Machine(plant.constants, plant.controller, plant.valve_table(), directions, plant.lag_s)
+    return PlainMachine(
+        plant.constants, plant.controller, plant.valve_table(), directions, plant.lag_s
+    )
 
 
-def _started(plant: Plant, drive: FloatArray) -> FloatArray:
+def _started(plant: SimulatedPlant, drive: FloatArray) -> FloatArray:
     return at_rest(plant, drive, float(drive[X_REF]), START_SHARE * plant.p_supply_pa)
 
 
-def at_rest(plant: Plant, drive: FloatArray, x_m: float, p_b_pa: float) -> FloatArray:
-    """The state of a machine that holds its load, chamber B at this pressure; all nodes at rest."""
+def at_rest(plant: SimulatedPlant, drive: FloatArray, x_m: float, p_b_pa: float) -> FloatArray:
+    """The state (STATES,) of a machine that holds its load, chamber B at this pressure, at rest."""
     c = plant.constants
     p_a_pa = (plant.gravity_n(x_m) + p_b_pa * c.area_b_m2) / c.area_a_m2
     return _spread(plant, np.array([p_a_pa, p_b_pa, x_m, 0.0]), drive)
 
 
-def _taken_over(plant: Plant, before: FloatArray, drive: FloatArray) -> FloatArray:
+def _taken_over(plant: SimulatedPlant, before: FloatArray, drive: FloatArray) -> FloatArray:
     """The state of a machine that goes on as this plant: the piston and its chambers stay."""
     return _spread(plant, before[:4].copy(), drive)
 
 
-def _spread(plant: Plant, piston: FloatArray, drive: FloatArray) -> FloatArray:
+def _spread(plant: SimulatedPlant, piston: FloatArray, drive: FloatArray) -> FloatArray:
     """A whole state from P_A, P_B, x, v (4,): all nodes at the pressures of their chambers."""
     if plant.extra == NONE:
         return piston
@@ -216,7 +220,7 @@ def _spread(plant: Plant, piston: FloatArray, drive: FloatArray) -> FloatArray:
     return y
 
 
-def _check_sane(plant: Plant, truth: Truth, sensors: Sensors) -> None:
+def _check_sane(plant: SimulatedPlant, truth: Truth, sensors: Sensors) -> None:
     x, p = truth.signals[:, X], truth.signals[:, [P_A, P_B, P_S]]
     faults = {
         "leaves its stroke": ~((x > 0) & (x < plant.constants.stroke_m)),

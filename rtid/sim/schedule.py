@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from rtid.sim.extra import Extra
-from rtid.sim.plant import FloatArray
+from rtid.plain import FloatArray
+from rtid.sim.extra_physics import Extra
 
 SWING_S = 7.0
 WARM_UP = 1 / 1.5  # records per time constant

@@ -9,10 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
-from rtid.sim.extra import Extra
-from rtid.sim.plant import FloatArray
+from rtid.plain import FloatArray
+from rtid.sim.compiled import compiled
+from rtid.sim.extra_physics import Extra
 
 NAMES = ("u", "p_a", "p_b", "p_supply", "p_tank", "x", "v")
 U, P_A, P_B, P_S, P_T, X, V = range(7)  # columns of NAMES
@@ -34,18 +34,18 @@ class Sensors:
     quantised: bool = True
 
     def noise(self) -> FloatArray:
-        """1 sigma per column of NAMES, float64 (7,)."""
+        """1 sigma per column of NAMES, float64 (7,), SI."""
         p = self.p_noise_pa
         return np.array([0, p, p, p, self.p_tank_noise_pa, self.x_noise_m, self.v_noise_mps])
 
     def resolution(self) -> FloatArray:
-        """Quantisation step per column of NAMES, float64 (7,); 0: not quantised."""
+        """Quantisation step per column of NAMES, float64 (7,), SI; 0: not quantised."""
         p = self.p_range_pa
         ranges = np.array([self.u_range_v, p, p, p, p, self.x_range_m, self.v_range_mps])
         return ranges / COUNTS if self.quantised else np.zeros(7)
 
     def quantise(self, values: FloatArray) -> FloatArray:
-        """The values (n, 7) as the sensors' counts give them back."""
+        """The values (n, 7), SI, as the sensors' counts give them back."""
         steps = self.resolution()
         return np.floor(values / steps + 0.5) * steps if self.quantised else values
 
@@ -53,7 +53,7 @@ class Sensors:
 EXACT = Sensors(p_noise_pa=0, p_tank_noise_pa=0, x_noise_m=0, v_noise_mps=0, quantised=False)
 
 
-@njit(cache=True)
+@compiled
 def lag(values: FloatArray, tau_s: float, dt_s: float) -> None:
     """Send values (n,), taken as linear between samples, through a first-order lag in place."""
     keep = np.exp(-dt_s / tau_s)

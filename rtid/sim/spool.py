@@ -12,9 +12,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 
-from rtid.sim.plant import FloatArray
+from rtid.plain import FloatArray
+from rtid.sim.compiled import compiled
 
 PLAYS = 8
 PLAY_SPREAD = 0.35
@@ -23,7 +23,7 @@ PILOT_LAG = 0.1  # of the rate it feels, per sample
 EDGE_SPEED = (0.97, 1.03, 1.0, 0.98, 1.02)  # natural frequencies of the five spools of one type
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def play(u_v: float, width_v: float, plays: FloatArray) -> float:
     """Command behind the play, V; plays (PLAYS,) are moved in place."""
     total = 0.0
@@ -35,7 +35,7 @@ def play(u_v: float, width_v: float, plays: FloatArray) -> float:
     return total / PLAYS
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def sticking_pilot(u_v: float, stick_v: float, pilot: FloatArray) -> float:
     """Command behind the pilot, V; pilot (3,) = place, felt rate, 1 while free, in place."""
     pilot[1] += PILOT_LAG * (abs(u_v - pilot[0]) - pilot[1])
@@ -48,7 +48,7 @@ def sticking_pilot(u_v: float, stick_v: float, pilot: FloatArray) -> float:
     return pilot[0]
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def propagator(wn_radps: float, damping: float, h_s: float, p: FloatArray) -> None:
     """Fill p (4,) = (ww, wr, rw, rr) in place: deviation w - u and rate after h_s.
 
@@ -68,7 +68,7 @@ def propagator(wn_radps: float, damping: float, h_s: float, p: FloatArray) -> No
     p[2], p[3] = -decay * wn_radps * wn_radps * odd, decay * (even - drag)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def spool_table(e: Any, lag_s: float, h_s: float, table: FloatArray) -> None:
     """Fill table (5, 4) in place with the propagators of the five spools over h_s."""
     table[:] = 0.0
@@ -84,16 +84,16 @@ def spool_table(e: Any, lag_s: float, h_s: float, table: FloatArray) -> None:
             table[edge, 0] = math.exp(-h_s / (lag_s + e.whole.spool_lag_s))
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def move_spools(commands: FloatArray, table: FloatArray, w: FloatArray, rate: FloatArray) -> None:
-    """Let the spools w (5,) with their rates (5,) go towards held commands, in place."""
+    """Let the spools w (5,), V, with their rates (5,) go towards held commands (5,), in place."""
     for edge in range(5):
         off, r, p = w[edge] - commands[edge], rate[edge], table[edge]
         w[edge] = commands[edge] + p[0] * off + p[1] * r
         rate[edge] = p[2] * off + p[3] * r
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def travel(
     e: Any,
     lag_s: float,
@@ -105,7 +105,7 @@ def travel(
     w: FloatArray,
     rate: FloatArray,
 ) -> None:
-    """Move the spools over h_s, whose first until_s > 0 still see the commands `before`."""
+    """Move the spools w (5,), V, over h_s; the first until_s > 0 see the commands `before` (5,)."""
     if until_s >= h_s:
         move_spools(before, table, w, rate)
     else:
@@ -116,7 +116,7 @@ def travel(
         move_spools(after, part, w, rate)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def acting(pilot_v: FloatArray, i: int, late: int) -> float:
-    """Pilot command that was given `late` samples before sample i; the first one before it."""
+    """Pilot command of pilot_v (n,) given `late` samples before sample i, or the first."""
     return pilot_v[max(i - late, 0)]

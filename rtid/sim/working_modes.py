@@ -15,10 +15,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-from rtid.sim.plant import AB, AT, BT, PA, PB, FloatArray
+from rtid.plain import FloatArray
+from rtid.sim.compiled import compiled
 from rtid.sim.sensing import P_A, P_B, P_S, P_T
+from rtid.sim.simulated_plant import AB, AT, BT, PA, PB
 
 LEAST_FLOW_M3S = 5e-7
 REGENERATE_ABOVE_PA, REGENERATE_UNTIL_PA = 0.8e6, 0.5e6
@@ -36,15 +37,15 @@ class Maps(NamedTuple):
     flow_m3s: tuple[FloatArray, ...]
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def cell(nodes: FloatArray, x: float) -> tuple[int, float]:
-    """The interval of nodes (n,) that holds x, and where in it, 0 to 1; the ends hold beyond."""
+    """The interval of nodes (n,) that holds x, and the share of it, 0 to 1, ends beyond."""
     i = min(max(int(np.searchsorted(nodes, x)) - 1, 0), len(nodes) - 2)
     share: float = (x - nodes[i]) / (nodes[i + 1] - nodes[i])
     return i, min(max(share, 0.0), 1.0)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def flow_at(maps: Maps, edge: int, w_v: float, dp_pa: float) -> float:
     """Flow of one edge, m3/s."""
     flow = maps.flow_m3s[edge]
@@ -55,7 +56,7 @@ def flow_at(maps: Maps, edge: int, w_v: float, dp_pa: float) -> float:
     return low + a * (high - low)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def opening(maps: Maps, edge: int, q_m3s: float, dp_pa: float) -> float:
     """The command of one edge for a wanted flow > 0; its highest where it cannot carry that."""
     flow, w_v = maps.flow_m3s[edge], maps.w_v[edge]
@@ -74,9 +75,9 @@ def opening(maps: Maps, edge: int, q_m3s: float, dp_pa: float) -> float:
     return w
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def through_cross_port(maps: Maps, seen: FloatArray, q_a: float, q_b: float) -> float:
-    """What A gives to B directly, m3/s, for wanted flows of which A's is out and B's in."""
+    """What A gives to B, m3/s, for wanted flows out of A and into B; seen (7,): the sensors, SI."""
     if q_a >= 0.0 or q_b <= 0.0:
         return 0.0
     top_v = CROSS_SHARE * maps.w_v[AB][-1]
@@ -85,14 +86,14 @@ def through_cross_port(maps: Maps, seen: FloatArray, q_a: float, q_b: float) -> 
     return q if q > LEAST_FLOW_M3S else 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def regenerates(seen: FloatArray, before: bool) -> bool:
-    """Whether the cross-port valve may open, by the measured pressures."""
+    """Whether the cross-port valve may open, by the measured pressures of seen (7,), Pa."""
     dp: float = seen[P_A] - seen[P_B]
     return dp > (REGENERATE_UNTIL_PA if before else REGENERATE_ABOVE_PA)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def commands(
     maps: Maps, seen: FloatArray, q_a: float, q_b: float, regenerate: bool, w: FloatArray
 ) -> None:

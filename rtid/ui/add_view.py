@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from html import escape
 from math import isfinite
 
@@ -9,27 +10,29 @@ import numpy as np
 from bokeh.layouts import column, row
 from bokeh.models import UIElement
 
-from rtid.colours import BLUE, ORANGE
 from rtid.compare import FREE_RUN, BlockRow
 from rtid.diagnose.report import Value
-from rtid.diagnosed_text import title
+from rtid.effects.page import title
 from rtid.project.added import AddedSection
-from rtid.report_sizes import size
-from rtid.report_words import text
-from rtid.ui.blocks import LARGEST, ML_PER_MIN, Quantity, quantities, round_up
-from rtid.ui.compare_view import NAMES, flows_of, pressures_of
-from rtid.ui.fragments import button, error_bars, table
-from rtid.ui.lines import Lines
-from rtid.ui.look import Look
-from rtid.ui.session import Revision, Session
-from rtid.ui.theme import INK_TAG
-from rtid.ui.time_plots import TimePlots
+from rtid.study.look import Look
+from rtid.tell.charts.blocks import LARGEST, ML_PER_MIN, Quantity, quantities, round_up
+from rtid.tell.charts.flows import NAMES, flows_of, pressures_of
+from rtid.tell.charts.lines import Lines
+from rtid.tell.charts.theme import INK_TAG
+from rtid.tell.colours import BLUE, ORANGE
+from rtid.tell.html import button, error_bars, table, text
+from rtid.tell.words import quantity
+from rtid.ui.desk_views import Bench
+from rtid.ui.shared import Session, ShownRevision
+from rtid.ui.views import PageView
 
 
-class AddView:
+class AddView(PageView):
     """Simulated pressure and residual of the newest revision over those of the one before."""
 
-    def __init__(self, look: Look, plots: TimePlots) -> None:
+    def __init__(self, bench: Bench) -> None:
+        super().__init__(bench)
+        look, plots = bench.look, bench.time
         self.has_runs = any(part.runs for part in look.parts.values())
         self._before, self._after = _Revised(), _Revised()
         rows: list[UIElement] = []
@@ -43,14 +46,19 @@ class AddView:
                 self._after.pressures.add(made, f"model {c}", BLUE, 1.0)
                 rows.append(row(made, sizing_mode="stretch_both"))
             title = f"chamber {chamber.name}: residual of the flow"
-            left = plots.plot("add", "L/min", title, c == last)
-            self._before.flows.add(left, f"left {c}", ORANGE, 0.8)
-            self._after.flows.add(left, f"left {c}", BLUE, 0.8)
-            rows.append(row(left, sizing_mode="stretch_both"))
-        self.root = column(*rows, sizing_mode="stretch_both")
+            axis = plots.plot("add", "L/min", title, c == last)
+            self._before.flows.add(axis, f"left {c}", ORANGE, 0.8)
+            self._after.flows.add(axis, f"left {c}", BLUE, 0.8)
+            rows.append(row(axis, sizing_mode="stretch_both"))
+        self.roots = {"plot": column(*rows, sizing_mode="stretch_both")}
 
-    def show(self, revisions: list[Revision]) -> None:
+    def fragments(self) -> Mapping[str, str]:
+        """The bars on the left, the sentence below."""
+        return {"bars": bars(self.bench.session), "says": sentence(self.bench.session)}
+
+    def refresh(self) -> None:
         """The newest revision, and the one before it if there is one."""
+        revisions = self.bench.session.revisions
         after = revisions[-1].look if len(revisions) > 1 else None
         self._before.show(revisions[-2].look if after else revisions[-1].look)
         self._after.show(after)
@@ -75,24 +83,24 @@ def errors_of(session: Session) -> tuple[list[tuple[str, float, bool]], float]:
     bars: list[tuple[str, float, bool]] = []
     floor = float("nan")
     for k, revision in enumerate(session.revisions):
-        told, errors = revision.told, revision.section and revision.section.errors
+        ranked, errors = revision.told, revision.section and revision.section.errors
         value = float("nan")
-        if told is not None:
-            found = told.diagnosis
-            value = 100 * found.heldout_residual_before_m3s / found.rms_flow_m3s
-            floor = 100 * found.noise_floor_m3s / found.rms_flow_m3s
+        if ranked is not None:
+            diagnosis = ranked.diagnosis
+            value = 100 * diagnosis.heldout_residual_before_m3s / diagnosis.rms_flow_m3s
+            floor = 100 * diagnosis.noise_floor_m3s / diagnosis.rms_flow_m3s
         if errors and errors.heldout_pct.after is not None:
             value = errors.heldout_pct.after
             floor = errors.noise_floor_pct or floor
         bars.append((name_of(revision, k), value, False))
     if session.named is not None and session.last and session.last.told:
-        found = session.last.told.diagnosis
-        after = 100 * found.found[0].heldout_residual_after_m3s / found.rms_flow_m3s
-        bars.append((f"+ {title(found.found[0].effect)}, foretold", after, True))
+        diagnosis = session.last.told.diagnosis
+        after = 100 * diagnosis.found[0].heldout_residual_after_m3s / diagnosis.rms_flow_m3s
+        bars.append((f"+ {title(diagnosis.found[0].effect)}, foretold", after, True))
     return bars, floor
 
 
-def name_of(revision: Revision, number: int) -> str:
+def name_of(revision: ShownRevision, number: int) -> str:
     """What a revision is called."""
     if revision.section is None:
         return "model as it is" if not revision.sections else "model with what the project has"
@@ -114,8 +122,8 @@ def bars(session: Session) -> str:
 
 
 def _heading(session: Session) -> str:
-    told = [r.told for r in session.revisions if r.told]
-    if told and not told[0].diagnosis.held_out_judged:
+    ranked = [r.told for r in session.revisions if r.told]
+    if ranked and not ranked[0].diagnosis.held_out_judged:
         return "Error on the motion that taught the model"
     return "Error on motion that the model has not seen"
 
@@ -183,14 +191,14 @@ def _effects(session: Session) -> str:
         f"{button('Drop', 'drop', effect=s.effect, where=s.where)}</div>"
         for s in sections
     )
-    return f"<h3>In the model</h3>{items}"
+    return f"<h3>In the model, sizes ± 95 %</h3>{items}"
 
 
 def _sizes(section: AddedSection) -> str:
     return text(
         ", ".join(
             f"{name.replace('_', ' ')} "
-            f"{size(Value(p.value, p.sd if p.sd is not None else float('nan'), p.unit))}"
+            f"{quantity(Value(p.value, p.sd if p.sd is not None else float('nan'), p.unit))}"
             for name, p in section.parameters.items()
         )
     )

@@ -2,37 +2,45 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from bokeh.layouts import column, row
 from bokeh.models import Title, UIElement
 from bokeh.plotting import figure
 
-from rtid.colours import BLUE, ORANGE
-from rtid.compare import FREE_RUN, HORIZONS_S, Comparison, Simulation
-from rtid.model import FloatArray
-from rtid.ui.fragments import button, choice
-from rtid.ui.lines import Columns, Lines
-from rtid.ui.look import Look
-from rtid.ui.theme import INK_TAG
-from rtid.ui.time_plots import TimePlots
-from rtid.units import KPA, LPM, MPA
+from rtid.compare import FREE_RUN, HORIZONS_S, Comparison
+from rtid.tell.charts.flows import NAMES, flow_plots, flows_of, pressures_of
+from rtid.tell.charts.lines import Lines
+from rtid.tell.charts.theme import INK_TAG, beside
+from rtid.tell.colours import BLUE, ORANGE
+from rtid.tell.html import button, choice
+from rtid.ui.desk_views import Bench
+from rtid.ui.views import PageView
 
-NAMES = {"identification": "identification", "validation": "held-out"}
 RUNS = list(HORIZONS_S)
 
 
-class CompareView:
+class CompareView(PageView):
     """The first page: whether the model explains the record."""
 
-    def __init__(self, look: Look, plots: TimePlots) -> None:
-        self.look, self.run = look, FREE_RUN
-        self._time = plots
+    def __init__(self, bench: Bench) -> None:
+        super().__init__(bench)
+        look, self.run = bench.look, FREE_RUN
+        self._time = bench.time
         self._pressures, self._flows = Lines(), Lines()
         self._titles: list[Title] = []
         self.has_runs = any(part.runs for part in look.parts.values())
         columns = [self._column(c, chamber.name) for c, chamber in enumerate(look.model.chambers)]
-        self.root = row(*columns, sizing_mode="stretch_both")
-        self.show(look)
+        self.roots = {"plot": beside(*columns)}
+        self.actions = {
+            "run": lambda asked: self._show(asked.get("name", "")),
+            "next_run": lambda _: self._show(RUNS[(RUNS.index(self.run) + 1) % len(RUNS)]),
+        }
+
+    def refresh(self) -> None:
+        """Another revision."""
+        self._show(self.run)
 
     def _column(self, c: int, name: str) -> UIElement:
         """Pressure, its difference, flow and its difference of one chamber."""
@@ -52,10 +60,9 @@ class CompareView:
         ]
         return column(*parts, sizing_mode="stretch_both")
 
-    def show(self, look: Look, run: str | None = None) -> None:
-        """Another revision, or another horizon of the simulation."""
-        self.look, self.run = look, run if run in RUNS else self.run
-        parts = list(look.parts.values())
+    def _show(self, run: str) -> None:
+        self.run = run if run in RUNS else self.run
+        parts = list(self.look.parts.values())
         if self.has_runs:
             self._pressures.show(pressures_of(part.runs[self.run]) for part in parts if part.runs)
         self._flows.show(
@@ -76,7 +83,7 @@ class CompareView:
         )
         return f"chamber {name}: pressure, {self.run} - fit {fits}"
 
-    def fragments(self) -> dict[str, str]:
+    def fragments(self) -> Mapping[str, str]:
         """Tools above and the sentence below."""
         tools = choice("run", RUNS, self.run) if self.has_runs else ""
         tools += (
@@ -87,16 +94,16 @@ class CompareView:
             '<b style="color:var(--bar)">—</b> difference &nbsp; '
             "blue ground: taught the model, yellow: held out</span>"
         )
-        return {"compare_tools": tools, "compare_says": self._sentence()}
+        return {"tools": tools, "says": self._sentence()}
 
     def _sentence(self) -> str:
-        left = " and ".join(
+        rest = " and ".join(
             f"{_left(part.equation)} ({NAMES.get(title, title)})"
             for title, part in self.look.parts.items()
             if len(part.equation.t_s)
         )
         text = (
-            f"The learned map leaves <b>{left}</b> of the flow unexplained (lower plots), blocks "
+            f"The learned map leaves <b>{rest}</b> of the flow unexplained (lower plots), blocks "
             "without data included, which the verdict leaves out. "
         )
         if self.has_runs and self.run == FREE_RUN:
@@ -116,29 +123,3 @@ def _left(part: Comparison) -> str:
     flow = float(np.sqrt(np.mean(part.measured_m3s**2)))
     share = 100 * float(np.sqrt(np.mean(part.residual_m3s**2))) / flow if flow > 0 else np.nan
     return f"{share:.2g} %" if share < 99.5 else "all"
-
-
-def flow_plots(
-    time: TimePlots, view: str, lines: Lines, c: int, title: str, is_last: bool = True
-) -> list[figure]:
-    """Measured and modelled flow of a chamber, and what is left below."""
-    made = [time.plot(view, "L/min", title, False), time.plot(view, "L/min", "", is_last)]
-    lines.add(made[0], f"measured {c}", INK_TAG, 1.4)
-    lines.add(made[0], f"model {c}", ORANGE, 1.0)
-    lines.add(made[1], f"left {c}", BLUE, 0.8)
-    return made
-
-
-def flows_of(t_s: FloatArray, measured: FloatArray, left: FloatArray) -> tuple[FloatArray, Columns]:
-    """Times (n,) and, per chamber, measured, modelled and what is left, from (n, chambers) m3/s."""
-    columns = {"measured": measured, "model": measured - left, "left": left}
-    return t_s, {f"{k} {c}": v[:, c] * LPM for k, v in columns.items() for c in range(v.shape[1])}
-
-
-def pressures_of(run: Simulation) -> tuple[FloatArray, Columns]:
-    """The same of simulated pressures; the difference in kPa."""
-    model = np.where(run.predicted[:, None], run.simulated_pa, np.nan)
-    columns = {
-        "measured": run.measured_pa * MPA, "model": model * MPA, "left": run.error_pa * KPA
-    }  # fmt: skip
-    return run.t_s, {f"{k} {c}": v[:, c] for k, v in columns.items() for c in range(v.shape[1])}

@@ -2,72 +2,67 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
-from bokeh.models import Column, UIElement
+from bokeh.models import Column
 
 from rtid.compare import NoSuchBlockError
 from rtid.compare.places import blocks_in_span, spans_of_block
-from rtid.report_words import text
-from rtid.ui import add_view, why_view
-from rtid.ui.add_view import AddView
-from rtid.ui.blocks import Key
-from rtid.ui.compare_view import RUNS, CompareView
-from rtid.ui.look import Look
-from rtid.ui.map_view import MapView
-from rtid.ui.session import Session
-from rtid.ui.time_plots import TimePlots, spans_of
-from rtid.ui.where_view import WhereView
+from rtid.study.look import Look
+from rtid.tell.charts.blocks import Key
+from rtid.tell.charts.time_plots import TimePlots, spans_of
+from rtid.tell.html import text
+from rtid.ui.shared import Session
+from rtid.ui.views import Action, PageView, ViewRow, made
+from rtid.units import MPA
 
 Put = Callable[[dict[str, str]], None]
 
 
-class DeskViews:
-    """Compare, Where, Why, Add and Map of one page."""
+class Bench:
+    """What a page gives its views: the session, and plots over time that are zoomed together."""
 
-    def __init__(self, session: Session, roots: dict[str, Column], put: Put) -> None:
-        self.session, self._roots, self._put = session, roots, put
-        self._time = TimePlots(spans_of(self._look), self._mark_span)
-        self._compare: CompareView | None = None
-        self._where: WhereView | None = None
-        self._add: AddView | None = None
-        self._map: MapView | None = None
-        self._page = ""
+    def __init__(
+        self, session: Session, mark_block: Callable[[Key], None], mark_span: Callable[..., None]
+    ) -> None:
+        self.session, self.mark_block = session, mark_block
+        self.time = TimePlots(spans_of(self.look), mark_span)
 
     @property
-    def _look(self) -> Look:
+    def look(self) -> Look:
+        """The newest revision of the model, held against the record."""
         return self.session.revisions[-1].look
+
+
+class DeskViews:
+    """The views of one page that need a record."""
+
+    def __init__(
+        self, session: Session, rows: Mapping[str, ViewRow], roots: dict[str, Column], put: Put
+    ) -> None:
+        self._rows = {name: row for name, row in rows.items() if row.where}
+        self._roots, self._put = roots, put
+        self._bench = Bench(session, self._mark_block, self._mark_span)
+        self._views: dict[str, PageView] = {}
 
     def show(self, view: str) -> None:
         """Look at a view."""
         self._make(view)
-        self._time.look_at(view)
+        self._bench.time.look_at(view)
         self._tell()
 
-    def _make(self, view: str) -> None:
+    def _make(self, name: str) -> None:
         """Make a view that nobody has looked at before."""
-        if view == "compare" and self._compare is None:
-            self._compare = CompareView(self._look, self._time)
-            self._place("compare", self._compare.root)
-        elif view == "where" and self._where is None:
-            self._where = WhereView(self._look, self._time, self._mark_block)
-            self._show_revision(len(self.session.revisions) - 1)
-            self._place("where_maps", self._where.maps)
-            self._place("where_time", self._where.side)
-        elif view == "add" and self._add is None:
-            self._add = AddView(self._look, self._time)
-            self._add.show(self.session.revisions)
-            self._place("add", self._add.root)
-        elif view == "map" and self._map is None:
-            opened = self.session.opened
-            self._map = MapView(self._look.flowmap, opened.reference if opened else None)
-            self._map.show()
-            self._place("map", self._map.root)
+        if name in self._views or name not in self._rows:
+            return
+        self._views[name] = view = made(self._rows[name], self._bench)
+        view.refresh()
+        for word, root in view.roots.items():
+            self._roots[f"{name}_{word}"].children = [root]
 
     def prepare(self) -> bool:
         """Make one more view before it is looked at; False where all are made."""
-        made = {"where": self._where, "add": self._add, "map": self._map, "compare": self._compare}
-        missing = [name for name, view in made.items() if view is None]
+        missing = [name for name in self._rows if name not in self._views]
         if missing:
             self._make(missing[0])
         return len(missing) > 1
@@ -75,101 +70,70 @@ class DeskViews:
     def refresh(self, what: str) -> None:
         """Show what has changed in the session."""
         if what == "looks":
-            if self._compare:
-                self._compare.show(self._look)
             self._forget()
-            self._show_revision(len(self.session.revisions) - 1)
-            if self._add:
-                self._add.show(self.session.revisions)
-            if self._map:
-                self._map.show(self._look.flowmap)
+        for view in self._views.values():
+            if what in ("looks", "told"):
+                view.refresh()
         self._tell()
 
     def take(self, what: str, asked: dict[str, str]) -> None:
         """Do what a user asks of the pictures."""
-        name = asked.get("name", "")
-        if what in ("run", "next_run") and self._compare:
-            runs = self._compare.run
-            following = RUNS[(RUNS.index(runs) + 1) % len(RUNS)]
-            self._compare.show(self._look, name if what == "run" else following)
-        elif what in ("quantity", "part", "signal") and self._where:
-            self._where.choose(what, name)
-        elif what in ("edge", "beside", "along", "second") and self._map:
-            self._map.choose(what, name)
-        elif what == "revision" and self._where and name in self._where.revisions:
-            self._show_revision(self._where.revisions.index(name))
-        elif what == "page":
-            self._page = name
-        elif what == "worst" and self._where and self._where.worst:
-            worst = self._where.worst
-            self._mark_block((worst.edge, worst.i, worst.j))
-        elif what == "forget":
-            self._forget()
-        elif what == "drag":
-            self._time.set_drag(asked.get("mode", ""))
+        its_own: dict[str, Action] = {
+            "forget": lambda _: self._forget(),
+            "drag": lambda asked: self._bench.time.set_drag(asked.get("mode", "")),
+        }
+        every = [its_own, *(view.actions for view in self._views.values())]
+        action = next((actions[what] for actions in every if what in actions), None)
+        if action is not None:
+            action(asked)
         self._tell()
-
-    def _show_revision(self, number: int) -> None:
-        """Where the model fails, of one of the revisions."""
-        if self._where is None:
-            return
-        revisions = self.session.revisions
-        names = [f"{k} {add_view.name_of(r, k)}" for k, r in enumerate(revisions)]
-        self._where.revisions = names if len(names) > 1 else []
-        self._where.revision = names[number]
-        self._where.show(revisions[number].look)
 
     def _tell(self) -> None:
         """The words of all views."""
-        session = self.session
-        told = session.last.told if session.last else None
-        parts = why_view.fragments(told, self._page, may_add=True)
-        parts |= {"add_bars": add_view.bars(session), "add_says": add_view.sentence(session)}
-        for view in (self._compare, self._where, self._map):
-            parts |= view.fragments() if view else {}
+        parts: dict[str, str] = {}
+        for name, view in self._views.items():
+            parts |= {f"{name}_{word}": html for word, html in view.fragments().items()}
         self._put(parts)
 
-    def _place(self, root: str, made: UIElement) -> None:
-        self._roots[root].children = [made]
+    def _mark(self, keys: list[Key], words: str) -> None:
+        for view in self._views.values():
+            view.mark(keys, words)
 
     def _mark_block(self, key: Key) -> None:
         """A block was pointed at: its time spans light up."""
         edge, i, j = key
-        spans = []
+        look, spans = self._bench.look, []
         try:
-            for part in self._look.parts.values():
-                spans += spans_of_block(self._look.model, part.equation, edge, i, j)
+            for part in look.parts.values():
+                spans += spans_of_block(look.model, part.equation, edge, i, j)
         except NoSuchBlockError:
             return
-        self._time.light(spans)
+        self._bench.time.light(spans)
         total = sum(b - a for a, b in spans)
-        grid = next(e.grid for e in self._look.model.edges if e.name == edge)
+        grid = next(e.grid for e in look.model.edges if e.name == edge)
         where = f"{edge}, {grid.u_v[i]:g} to {grid.u_v[i + 1]:g} V, " + (
-            f"{grid.dp_pa[j] / 1e6:.3g} to {grid.dp_pa[j + 1] / 1e6:.3g} MPa"
+            f"{grid.dp_pa[j] * MPA:.3g} to {grid.dp_pa[j + 1] * MPA:.3g} MPa"
         )
-        if self._where:
-            words = (
-                f"Block <b>{text(where)}</b>: the valve was there {len(spans)} times, "
-                f"{total:.1f} s in all; these spans are marked in every plot over time."
-            )
-            self._where.mark(key, words)
+        words = (
+            f"Block <b>{text(where)}</b>: the valve was there {len(spans)} times, {total:.1f} s in "
+            "all; these spans are marked in every plot over time."
+        )
+        self._mark([key], words)
         self._tell()
 
     def _mark_span(self, low: float, high: float) -> None:
         """A time span was selected: its blocks are outlined."""
-        self._time.light([(low, high)])
-        found: dict[Key, float] = {}
-        for part in self._look.parts.values():
-            for visit in blocks_in_span(self._look.model, part.equation, low, high):
-                key = visit.edge, visit.i, visit.j
-                found[key] = found.get(key, 0.0) + visit.time_s
-        if self._where:
-            self._where.mark(None, f"From <b>{low:.2f} to {high:.2f} s</b> the valves were in "
-                             f"{len(found)} blocks, which are outlined.")  # fmt: skip
-            self._where.planes.light(list(found))
+        self._bench.time.light([(low, high)])
+        look = self._bench.look
+        keys = dict.fromkeys(
+            (visit.edge, visit.i, visit.j)
+            for part in look.parts.values()
+            for visit in blocks_in_span(look.model, part.equation, low, high)
+        )
+        self._mark(list(keys), f"From <b>{low:.2f} to {high:.2f} s</b> the valves were in "
+                   f"{len(keys)} blocks, which are outlined.")  # fmt: skip
         self._tell()
 
     def _forget(self) -> None:
-        self._time.light([])
-        if self._where:
-            self._where.mark(None, "")
+        self._bench.time.light([])
+        self._mark([], "")

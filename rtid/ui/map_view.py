@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
-from bokeh.layouts import row
-from bokeh.models import UIElement
 from bokeh.palettes import Cividis256, RdBu11
 
 from rtid.compare import PAPER_DP_PA, PAPER_U_V, LearnedReference, Reference, deviations
 from rtid.estimator.flowmap import VALID, EdgeMap, FlowMap
-from rtid.model import FloatArray
-from rtid.report_words import text
-from rtid.ui.blocks import YELLOWS
-from rtid.ui.fragments import button, choice, select, table
-from rtid.ui.map_plots import Z95, Plane, Slices
-from rtid.units import LPM, MPA
+from rtid.plain import FloatArray
+from rtid.tell.charts.blocks import YELLOWS
+from rtid.tell.charts.map_plots import Plane, Slices
+from rtid.tell.charts.theme import beside
+from rtid.tell.html import button, choice, select, table, text
+from rtid.ui.desk_views import Bench
+from rtid.ui.views import PageView
+from rtid.units import LPM, MPA, Z95
 
 LATTICE_U, LATTICE_P = 120, 96
 NOTHING = "nothing"
 ALONG = {"over the pressure drop": "dp", "over the command": "u"}
+CHOICES = ("edge", "beside", "along", "second")
 SECOND = ("95 % interval", "difference")
 
 
@@ -36,33 +39,42 @@ class _Other(LearnedReference):
         return self.flowmap.flow(self.edge, w_v, dp_pa)
 
 
-class MapView:
+class MapView(PageView):
     """Two planes, flow and its interval or difference, and the slices."""
 
-    def __init__(self, flowmap: FlowMap, reference: Reference | None) -> None:
-        self.flowmap, self._reference = flowmap, reference
-        self.edge = flowmap.edges[0].name
+    def __init__(self, bench: Bench) -> None:
+        super().__init__(bench)
+        opened = bench.session.opened
+        self._reference = reference = opened.reference if opened else None
+        self.edge = self.flowmap.edges[0].name
         self.along, self.second = next(iter(ALONG)), SECOND[0]
         self.beside = reference.name if reference else NOTHING
         self._planes = [Plane("", Cividis256), Plane("", YELLOWS)]
         self._slices = Slices()
         parts = [p.root for p in self._planes] + [self._slices.root]
-        self.root: UIElement = row(*parts, sizing_mode="stretch_both")
+        self.roots = {"plot": beside(*parts)}
+        self.actions = {what: partial(self.choose, what) for what in CHOICES}
+
+    @property
+    def flowmap(self) -> FlowMap:
+        """The map of the newest revision."""
+        return self.look.flowmap
 
     @property
     def others(self) -> dict[str, Reference]:
         """Everything that the map can be held beside, by name."""
-        found: dict[str, Reference] = (
+        references: dict[str, Reference] = (
             {self._reference.name: self._reference} if self._reference else {}
         )
         for edge in self.flowmap.edges:
             if edge.name != self.edge:
                 name = f"valve {edge.name}"
-                found[name] = _Other(name, self.flowmap, edge.name)
-        return found
+                references[name] = _Other(name, self.flowmap, edge.name)
+        return references
 
-    def choose(self, what: str, name: str) -> None:
+    def choose(self, what: str, asked: dict[str, str]) -> None:
         """Another valve, reference, direction of the slices, or second plane."""
+        name = asked.get("name", "")
         if what == "edge" and name in [e.name for e in self.flowmap.edges]:
             self.edge = name
         elif what == "beside":
@@ -71,11 +83,10 @@ class MapView:
             self.along = name
         elif what == "second" and name in SECOND:
             self.second = name
-        self.show()
+        self.refresh()
 
-    def show(self, flowmap: FlowMap | None = None) -> None:
+    def refresh(self) -> None:
         """Draw what is chosen."""
-        self.flowmap = flowmap or self.flowmap
         if self.beside not in self.others:
             self.beside = NOTHING
         edge, other = self.flowmap[self.edge], self.others.get(self.beside)
@@ -95,7 +106,7 @@ class MapView:
             self._planes[1].show(edge, sd, 0.0, 0.05 * max(top, 1e-9), YELLOWS, heading)
         self._slices.show(edge, ALONG[self.along], other)
 
-    def fragments(self) -> dict[str, str]:
+    def fragments(self) -> Mapping[str, str]:
         """Tools, and what the pictures say."""
         tools = (
             choice("edge", [e.name for e in self.flowmap.edges], self.edge)
@@ -113,7 +124,7 @@ class MapView:
             "follow the orifice law from these, and their interval says how far to trust them. "
             "Next: hold it beside a reference or another valve, or export it."
         )
-        return {"map_tools": tools, "map_says": says + self._table()}
+        return {"tools": tools, "says": says + self._table()}
 
     def _table(self) -> str:
         """Table 1 of the paper for this valve."""
@@ -124,8 +135,8 @@ class MapView:
         if not us or not ps:
             return ""
         reference = other or LearnedReference("itself", self.flowmap)
-        one = FlowMap((edge,))
-        points = deviations(one, reference, us, ps)[0]
+        single = FlowMap((edge,))
+        points = deviations(single, reference, us, ps)[0]
         cells = []
         for k in range(len(points.w_v)):
             words = f"{points.flow_m3s[k] * LPM:.2f} ± {Z95 * points.sd_m3s[k] * LPM:.2f}"
@@ -138,7 +149,7 @@ class MapView:
         ]
         head = ("flow in L/min ± 95 %" + (f" | {self.beside}" if other else ""),
                 *(f"{w:g} V" for w in us))  # fmt: skip
-        return table(head, rows)
+        return table(head, rows, "figures")
 
 
 def _lattice(edge: EdgeMap) -> tuple[FloatArray, FloatArray]:

@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import gc
+import re
 import secrets
+import signal
+import time
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -13,10 +18,13 @@ from typing import Any
 
 from bokeh.application import Application
 from bokeh.application.handlers.function import FunctionHandler
+from bokeh.embed.server import server_html_page_for_session
 from bokeh.resources import Resources
 from bokeh.server.server import BaseServer
 from bokeh.server.tornado import BokehTornado
+from bokeh.server.views.doc_handler import DocHandler
 from bokeh.server.views.static_handler import StaticHandler
+from bokeh.util.token import check_token_signature, get_session_id, get_token_payload
 from tornado.httpserver import HTTPServer
 from tornado.httputil import HTTPHeaders, HTTPMessageDelegate, HTTPServerRequest
 from tornado.ioloop import IOLoop
@@ -24,21 +32,37 @@ from tornado.netutil import bind_sockets
 from tornado.web import OutputTransform, RequestHandler
 
 from rtid.errors import RtidError
-from rtid.ui.live import Live
-from rtid.ui.page import build
-from rtid.ui.security import COOKIE, TOKEN, Door, Refusal
-from rtid.ui.session import Session
+from rtid.ui.browser_page import build
+from rtid.ui.live_page import Live
+from rtid.ui.security import TOKEN, Door, Refusal
+from rtid.ui.shared import Session
+from rtid.ui.turns import Turns
 from rtid.ui.worker import Worker
 
-MOST_PAGES = 8  # that are open at once
-MOST_SOCKETS = 2 * MOST_PAGES  # a page that comes back after a break has two for a moment
+MOST_PAGES = 24  # that are open at once
+MOST_SOCKETS = 2  # of one page: one that comes back after a break has two for a moment
 MOST_MESSAGE = 2**20  # bytes that a page may send at once
+BODY_S = 10.0  # that the body of a request may take; none is read
+CSP = "Content-Security-Policy"
+WELCOME = """<!DOCTYPE html><meta charset="utf-8"><link rel="icon" href="data:,"><title>rtid</title>
+<noscript><meta http-equiv="refresh" content="0;url=/"></noscript>
+<script nonce="{nonce}">location.replace("/" + location.hash)</script>"""
 PATHS = ("/", "/ws", "/alive")
-POLICY = (
-    "default-src 'self'; script-src 'self' 'unsafe-inline'; style-src 'self' 'unsafe-inline'; "
-    "img-src 'self' data: blob:; connect-src 'self' ws: wss:; frame-ancestors 'none'; "
-    "form-action 'none'; base-uri 'none'; object-src 'none'"
-)
+HOST = re.compile(r"[\w.\-\[\]:]+")  # what may stand in a policy
+
+
+def policy(host: str, nonce: str = "") -> str:
+    """The Content-Security-Policy of an answer: own files, own socket, own script and style alone.
+
+    nonce: of the page's own script and style; without one nothing inline counts.
+    """
+    inline = f" 'nonce-{nonce}'" if nonce else ""
+    socket = f" ws://{host}" if HOST.fullmatch(host) else ""  # for browsers whose 'self' is http
+    return (
+        f"default-src 'self'; script-src 'self'{inline}; style-src 'self'{inline}; "
+        f"img-src 'self' data: blob:; connect-src 'self'{socket}; frame-ancestors 'none'; "
+        "form-action 'none'; base-uri 'none'; object-src 'none'"
+    )
 
 
 class Refused(RequestHandler):
@@ -64,26 +88,71 @@ class Alive(RequestHandler):
 
 
 class Welcome(RequestHandler):
-    """Puts the token of the address into a cookie, and out of sight."""
+    """Gives the browser that has the token a secret of its own, and takes the token out of sight.
+
+    The browser is sent on by the page itself and not by a redirect: behind a link from elsewhere it
+    would not bring its new cookie along.
+    """
 
     def get(self) -> None:
-        """Go on to the page."""
-        token = self.get_argument(TOKEN)
-        self.set_cookie(COOKIE, token, httponly=True, samesite="Strict")
-        self.redirect("/")
+        """Go on to the page; the door has seen that the token is the right one."""
+        door: Door = self.application.door  # type: ignore[attr-defined]
+        secret = door.admit(self.request)
+        self.set_cookie(door.cookie, secret, httponly=True, samesite="Strict")
+        self.set_header("Cache-Control", "no-store")
+        nonce = secrets.token_urlsafe(18)
+        self.set_header(CSP, policy(self.request.headers.get("Host", ""), nonce))
+        self.finish(WELCOME.format(nonce=nonce))
+
+
+class Shown(DocHandler):  # type: ignore[misc]
+    """A page: what is inline in it has a nonce of its own."""
+
+    async def get(self, *args: Any, **kwargs: Any) -> None:
+        """Bokeh's page, by our policy."""
+        session = await self.get_session()
+        nonce = secrets.token_urlsafe(18)
+        variables = session.document.template_variables | {"nonce": nonce}
+        page = server_html_page_for_session(
+            session,
+            resources=self.application.resources(),
+            title=session.document.title,
+            template=session.document.template,
+            template_variables=variables,
+        )
+        self.set_header("Content-Type", "text/html")
+        self.set_header("Cache-Control", "no-store")
+        self.set_header(CSP, policy(self.request.headers.get("Host", ""), nonce))
+        self.write(page)
 
 
 class Policy(OutputTransform):
     """Tells the browser, with every answer, to load nothing from elsewhere and to frame nothing."""
 
+    def __init__(self, request: HTTPServerRequest) -> None:
+        super().__init__(request)
+        self._host = request.headers.get("Host", "")
+
     def transform_first_chunk(
         self, status_code: int, headers: HTTPHeaders, chunk: bytes, finishing: bool
     ) -> tuple[int, HTTPHeaders, bytes]:
         """Add the headers."""
-        headers["Content-Security-Policy"] = POLICY
+        headers.setdefault(CSP, policy(self._host))
         headers["X-Content-Type-Options"] = "nosniff"
         headers["Referrer-Policy"] = "no-referrer"
         return status_code, headers, chunk
+
+
+class Numbered(Application):  # type: ignore[misc]
+    """Tells each page which browser it is shown in."""
+
+    def __init__(self, door: Door, *handlers: Any) -> None:
+        super().__init__(*handlers)
+        self._door = door
+
+    def process_request(self, request: HTTPServerRequest) -> dict[str, Any]:
+        """What the page's signed session knows of the request."""
+        return {"browser": self._door.browser(request) or 0}
 
 
 class Guarded(BokehTornado):  # type: ignore[misc]
@@ -96,9 +165,20 @@ class Guarded(BokehTornado):  # type: ignore[misc]
 
     def find_handler(self, request: HTTPServerRequest, **kwargs: Any) -> HTTPMessageDelegate:
         """The handler of a request, or one that refuses it."""
-        refusal = self.door.refusal(request) or self._elsewhere(request) or self._full(request)
-        if refusal is None and request.path == "/" and TOKEN in request.arguments:
+        refusal = (
+            self.door.refusal(request)
+            or self._elsewhere(request)
+            or self._unknown(request)
+            or self._full(request)
+        )
+        if refusal is None and self.door.has_token(request):
             return self.get_handler_delegate(request, Welcome)
+        if refusal is None and request.path == "/":
+            context = {
+                "application_context": self._applications["/"],
+                "bokeh_websocket_path": "/ws",
+            }
+            return self.get_handler_delegate(request, Shown, context)
         if refusal is None:
             return super().find_handler(request, **kwargs)
         self.refused += 1
@@ -108,14 +188,32 @@ class Guarded(BokehTornado):  # type: ignore[misc]
         known = request.path in PATHS or request.path.startswith("/static/")
         return None if known else Refusal(404, "there is nothing here")
 
+    def _unknown(self, request: HTTPServerRequest) -> Refusal | None:
+        """A socket that has no token of a page of ours, or one that is too old."""
+        if request.path != "/ws":
+            return None
+        offered = request.headers.get("Sec-WebSocket-Protocol", "").split(",")
+        if len(offered) == 2 and offered[0].strip() == "bokeh" and self._is_ours(offered[1]):
+            return None
+        return Refusal(403, "a socket belongs to a page of ours: load the page again")
+
+    def _is_ours(self, token: str) -> bool:
+        try:
+            is_signed = check_token_signature(token.strip(), self.secret_key, self.sign_sessions)
+            return is_signed and get_token_payload(token.strip())["session_expiry"] > time.time()
+        except (ValueError, TypeError, LookupError, AttributeError, zlib.error):  # no token at all
+            return False
+
     def _full(self, request: HTTPServerRequest) -> Refusal | None:
-        sessions = list(self.get_sessions("/"))
-        sockets = sum(session.connection_count for session in sessions)
-        if request.path == "/" and len(sessions) >= MOST_PAGES:
-            said = f"{len(sessions)} pages are open already: close one and wait a moment"
+        pages = {session.id: session for session in self.get_sessions("/")}
+        if request.path == "/" and len(pages) >= MOST_PAGES:
+            said = f"{len(pages)} pages are open already: close one and wait a moment"
             return Refusal(503, said)
-        if request.path == "/ws" and sockets >= MOST_SOCKETS:
-            return Refusal(503, "too many sockets are open already")
+        if request.path == "/ws":
+            token = request.headers["Sec-WebSocket-Protocol"].split(",")[1].strip()
+            page = pages.get(get_session_id(token))
+            if page is not None and page.connection_count >= MOST_SOCKETS:
+                return Refusal(503, "too many sockets of this page are open already")
         return None
 
     def resources(self, absolute_url: str | bool | None = None) -> Resources:
@@ -135,11 +233,14 @@ class Workbench:
     app: Guarded
     session: Session
     url: str
+    turns: Turns
 
     def stop(self) -> None:
         """End server and worker; call from the loop's thread."""
         self.session.worker.stop()
         self.server.stop()
+        self.turns.stop()
+        gc.unfreeze()
 
 
 def start(
@@ -160,9 +261,18 @@ def start(
     loop = IOLoop.current()
     worker = Worker(loop.add_callback)
     session = Session(project, trace, worker, sheet)
-    door = Door(host, "" if Door(host).is_local else secrets.token_urlsafe(24))
-    live = Live(state)
-    app = Application(FunctionHandler(partial(build, session=session, live=live)))
+    try:
+        sockets = bind_sockets(port, host)
+    except OSError as error:
+        worker.stop()
+        remedy = "another `rtid ui` may be running; --port 0 takes any free port"
+        raise RtidError(f"{host}:{port}: {error.strerror}", remedy) from None
+    turns = Turns(loop.call_later)
+    door = Door(host, port=sockets[0].getsockname()[1])
+    app = Numbered(
+        door,
+        FunctionHandler(partial(build, session=session, live=Live(state), turns=turns)),
+    )
     guarded = Guarded(
         door,
         app,
@@ -179,23 +289,23 @@ def start(
         include_headers=[],
         include_cookies=[],
     )
-    try:
-        sockets = bind_sockets(port, host)
-    except OSError as error:
-        worker.stop()
-        remedy = "another `rtid ui` may be running; --port 0 takes any free port"
-        raise RtidError(f"{host}:{port}: {error.strerror}", remedy) from None
     http = HTTPServer(
-        guarded, max_header_size=2**14, max_body_size=2**16, idle_connection_timeout=60
+        guarded,
+        max_header_size=2**14,
+        max_body_size=2**16,
+        idle_connection_timeout=60,
+        body_timeout=BODY_S,
     )
     http.add_sockets(sockets)
     server = BaseServer(loop, guarded, http)
     server.start()
     session.open()
-    url = f"http://{_in_url(host)}:{sockets[0].getsockname()[1]}/"
-    return Workbench(
-        server, guarded, session, url + (f"?{TOKEN}={door.token}" if door.token else "")
-    )
+    # Bokeh collects all garbage twice for each page that goes, 0.14 s of the loop each time; what
+    # is here already is not looked at again.
+    gc.collect()
+    gc.freeze()
+    url = f"http://{_in_url(host)}:{door.port}/?{TOKEN}={door.token}"
+    return Workbench(server, guarded, session, url, turns)
 
 
 def _in_url(host: str) -> str:
@@ -203,17 +313,24 @@ def _in_url(host: str) -> str:
 
 
 def serve(ready: Callable[[Workbench], None], **where: Any) -> None:
-    """Serve until interrupted; `ready` is told once the page can be opened."""
+    """Serve until interrupted, SIGTERM or SIGHUP; call it in the main thread.
+
+    `ready` is told once the page can be opened.  A signal that is ignored, as by nohup, stays so.
+    """
 
     async def forever() -> None:
+        over = asyncio.Event()
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                asyncio.get_running_loop().add_signal_handler(number, over.set)
         bench = start(**where)
-        ready(bench)
         try:
-            await asyncio.Event().wait()
+            ready(bench)
+            await over.wait()
         finally:
             bench.stop()
 
     asyncio.run(forever())
 
 
-__all__ = ["COOKIE", "MOST_PAGES", "Guarded", "Workbench", "serve", "start"]
+__all__ = ["MOST_PAGES", "Guarded", "Workbench", "serve", "start"]

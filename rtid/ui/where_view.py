@@ -2,53 +2,78 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 from bokeh.layouts import column, row
 from bokeh.models import UIElement
 from bokeh.plotting import figure
 
-from rtid.colours import CHAMBERS
 from rtid.compare import BlockRow, Dependence
 from rtid.compare.tables import CAUSES, cause_of
-from rtid.report_words import text
-from rtid.ui.blocks import HATCHES, LARGEST, ML_PER_MIN, BlockPlots, Key, quantities, round_up
-from rtid.ui.compare_view import NAMES, flows_of
-from rtid.ui.dependence_plot import DependencePlot
-from rtid.ui.fragments import button, choice, select
-from rtid.ui.lines import Lines
-from rtid.ui.look import Look
-from rtid.ui.time_plots import TimePlots
+from rtid.study.look import Look
+from rtid.tell.charts.blocks import (
+    HATCHES,
+    LARGEST,
+    ML_PER_MIN,
+    BlockPlots,
+    Key,
+    quantities,
+    round_up,
+)
+from rtid.tell.charts.dependence import over_signal
+from rtid.tell.charts.flows import NAMES, flows_of
+from rtid.tell.charts.lines import Lines
+from rtid.tell.colours import CHAMBERS
+from rtid.tell.html import button, choice, select, text
+from rtid.tell.live import PanelPlot
+from rtid.tell.story import Panel
+from rtid.ui.add_view import name_of
+from rtid.ui.desk_views import Bench
+from rtid.ui.views import PageView
 from rtid.units import MPA
 
+CHOICES = ("quantity", "part", "signal", "revision")
 
-class WhereView:
+
+class WhereView(PageView):
     """Planes of all valves on the left; residual over time and over a signal on the right."""
 
-    def __init__(self, look: Look, plots: TimePlots, on_block: Callable[[Key], None]) -> None:
-        self.look = look
+    def __init__(self, bench: Bench) -> None:
+        super().__init__(bench)
+        self._shown = look = bench.look
         self.part = "validation" if "validation" in look.parts else next(iter(look.parts))
         self.quantity = "residual"
-        self._time = plots
+        self._time = bench.time
         every = [b for part in look.parts.values() for b in part.blocks]
         values = [b.residual_rms_m3s * ML_PER_MIN for b in every if np.isfinite(b.residual_rms_m3s)]
         top = round_up(float(np.quantile(values, LARGEST))) if values else 1.0
         self._quantities = quantities(top)
-        self.planes = BlockPlots(look.model, every, on_block)
-        self._over = DependencePlot([chamber.name for chamber in look.model.chambers])
+        self.planes = BlockPlots(look.model, every, bench.mark_block)
         self.signal = self._depends[0].signal if self._depends else ""
+        self._over = PanelPlot(self._panel)
         self._lines = Lines()
         self.side = self._side()
-        self.chosen: Key | None = None
         self.words = ""
+        self.roots = {"maps": self.planes.root, "time": self.side}
+        choices = {what: partial(self.choose, what) for what in CHOICES}
+        self.actions = choices | {"worst": lambda _: self._to_worst()}
         self.revisions: list[str] = []  # names, where there are several to choose from
         self.revision = ""
 
     @property
-    def maps(self) -> UIElement:
-        """The planes."""
-        return self.planes.root
+    def look(self) -> Look:
+        """The revision that is shown."""
+        return self._shown
+
+    def refresh(self) -> None:
+        """The newest revision, and the names of all."""
+        revisions = self.bench.session.revisions
+        names = [f"{k} {name_of(r, k)}" for k, r in enumerate(revisions)]
+        self.revisions = names if len(names) > 1 else []
+        self.revision, self._shown = names[-1], revisions[-1].look
+        self.show()
 
     @property
     def _depends(self) -> list[Dependence]:
@@ -70,29 +95,35 @@ class WhereView:
         parts = [row(s, sizing_mode="stretch_both") for s in (*strips, self._over.root)]
         return column(*parts, sizing_mode="stretch_both")
 
-    def show(self, look: Look | None = None) -> None:
-        """Draw what is chosen, of another revision if one is given."""
-        self.look = look or self.look
+    def show(self) -> None:
+        """Draw what is chosen."""
         parts = [p.equation for p in self.look.parts.values()]
         self._lines.show(flows_of(e.t_s, e.measured_m3s, e.residual_m3s) for e in parts)
         self.planes.show(self.blocks, self._quantities[self.quantity])
         self._show_signal()
 
-    def choose(self, what: str, name: str) -> None:
-        """Another quantity, part or signal."""
+    def choose(self, what: str, asked: dict[str, str]) -> None:
+        """Another quantity, part, signal or revision."""
+        name = asked.get("name", "")
         if what == "quantity" and name in self._quantities:
             self.quantity = name
         elif what == "part" and name in self.look.parts:
             self.part = name
         elif what == "signal" and name in [d.signal for d in self._depends]:
             self.signal = name
-        self.planes.show(self.blocks, self._quantities[self.quantity])
-        self._show_signal()
+        elif what == "revision" and name in self.revisions:
+            self.revision = name
+            self._shown = self.bench.session.revisions[self.revisions.index(name)].look
+        self.show()
 
-    def mark(self, key: Key | None, words: str) -> None:
-        """A block that was pointed at, and what to say of it."""
-        self.chosen, self.words = key, words
-        self.planes.light([key] if key else [])
+    def mark(self, keys: Sequence[Key], words: str) -> None:
+        """Blocks that were pointed at, and what to say of them."""
+        self.words = words
+        self.planes.light(keys)
+
+    def _to_worst(self) -> None:
+        if (worst := self.worst) is not None:
+            self.bench.mark_block((worst.edge, worst.i, worst.j))
 
     @property
     def worst(self) -> BlockRow | None:
@@ -100,11 +131,17 @@ class WhereView:
         return max(self.blocks, key=lambda b: b.residual_share, default=None)
 
     def _show_signal(self) -> None:
-        found = next((d for d in self._depends if d.signal == self.signal), None)
-        if found is not None:
-            self._over.show(found)
+        if self._depends:
+            self._over.show(self._panel)
 
-    def fragments(self) -> dict[str, str]:
+    @property
+    def _panel(self) -> Panel:
+        """The residual over the chosen signal; empty where this part has none."""
+        names = [chamber.name for chamber in self.look.model.chambers]
+        result = next((d for d in self._depends if d.signal == self.signal), None)
+        return over_signal(names, result) if result else Panel("")
+
+    def fragments(self) -> Mapping[str, str]:
         """Tools above, and what the picture says."""
         parts = {name: NAMES.get(name, name) for name in self.look.parts}
         signals = [d.signal for d in self._depends]
@@ -120,7 +157,7 @@ class WhereView:
             + button("largest error", "worst")
             + button("forget marks", "forget")
         )
-        return {"where_tools": tools, "where_says": self._sentence()}
+        return {"tools": tools, "says": self._sentence()}
 
     def _scale(self) -> str:
         q = self._quantities[self.quantity]

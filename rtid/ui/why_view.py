@@ -2,55 +2,114 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from re import sub
 
-from rtid.diagnose.report import Diagnosis, Effect, Unseen, Value
-from rtid.diagnosed_text import percent, title
+from bokeh.layouts import column
+from bokeh.models import UIElement
+
+from rtid.diagnose.report import Diagnosis, FoundEffect, Unseen, Value
 from rtid.effects import catalogue
 from rtid.effects import effect as page_of
 from rtid.effects.page import Effect as Page
-from rtid.effects.page import EffectError, readable
-from rtid.report_sizes import KEPT, limit, size
-from rtid.report_story import Ranked
-from rtid.report_tables import named
-from rtid.report_words import VERDICTS, text
-from rtid.ui.desk import Told
-from rtid.ui.fragments import button, clearness, table
-from rtid.ui.verdict_words import judged, said
-from rtid.units import PRACTICAL
+from rtid.effects.page import EffectError, readable, title
+from rtid.tell.charts.theme import NARROWEST_PX, beside
+from rtid.tell.diagnosed import heading, judged, percent, said
+from rtid.tell.html import button, clearness, table, text
+from rtid.tell.live import PanelPlot
+from rtid.tell.report_story import Ranked
+from rtid.tell.story import Chart
+from rtid.tell.words import named, quantity
+from rtid.ui.desk import RankedDiagnosis
+from rtid.ui.desk_views import Bench
+from rtid.ui.views import PageView
+from rtid.units import limit, range_of, scale_of
 
 MOST = 18  # candidates that are shown
 
 
-def fragments(told: Told | None, page: str, may_add: bool) -> dict[str, str]:
+class WhyView(PageView):
+    """The ranking on the left; the evidence and the page of the chosen effect on the right."""
+
+    def __init__(self, bench: Bench) -> None:
+        super().__init__(bench)
+        self._page = ""
+        self._place = column(sizing_mode="stretch_both")
+        self._chart: Chart | None = None
+        self.roots, self.actions = {"plot": self._place}, {"page": self._open}
+
+    @property
+    def told(self) -> RankedDiagnosis | None:
+        """What is missing in the newest revision; None until it has been diagnosed."""
+        return self.bench.session.revisions[-1].told
+
+    @property
+    def chart(self) -> Chart | None:
+        """The evidence for the effect whose page is open, or for the first that is named."""
+        words = self.told
+        charts = words.evidence if words else ()
+        names = [effect.effect for effect in words.diagnosis.found] if words else []
+        at = names.index(self._page) if self._page in names else 0
+        return charts[at] if charts else None
+
+    def _open(self, asked: dict[str, str]) -> None:
+        """The page of an effect."""
+        self._page = asked.get("name", "")
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Draw the evidence, where it is another."""
+        chart = self.chart
+        if chart is not self._chart:
+            self._chart = chart
+            self._place.children = [drawn(chart)] if chart else []
+
+    def fragments(self) -> Mapping[str, str]:
+        """Ranking, page, and what the evidence says."""
+        says = text(self.chart.caption) if self.chart else ""
+        return fragments(self.told, self._page, may_add=True) | {"says": says}
+
+
+def drawn(chart: Chart) -> UIElement:
+    """The panels of a chart side by side, on one scale; stacked where the page is narrow."""
+    panels = [panel for panels in chart.panels for panel in panels]
+    plots = [PanelPlot(panel) for panel in panels]
+    for plot, panel in zip(plots, panels, strict=True):
+        plot.show(panel, panels)
+    return beside(*(plot.root for plot in plots), stacked_below_px=NARROWEST_PX)
+
+
+def fragments(ranked: RankedDiagnosis | None, page: str, may_add: bool) -> dict[str, str]:
     """The ranking on the left, the page of the chosen effect on the right."""
-    if told is None:
+    if ranked is None:
         waiting = '<p class="says">Every known effect is being held beside the model.</p>'
-        return {"why_ranking": waiting, "why_page": effect_page(page)}
-    found = told.diagnosis
-    parts = [_found(found, e) for e in found.found]
-    if found.verdict != "insufficient_data":
-        parts.append(_ranking(told, may_add))
-    parts += _unseen(found)
-    if not found.found:
-        kind, heading = VERDICTS[found.verdict]
-        words = f"{said(found)}{_present(found)}"
-        parts.insert(0, f'<div class="card"><h2 class="{kind}">{heading}</h2>{text(words)}</div>')
-    chosen = page or next((e.effect for e in found.found), "")
-    return {"why_ranking": "".join(parts), "why_page": effect_page(chosen)}
+        return {"ranking": waiting, "page": effect_page(page)}
+    diagnosis = ranked.diagnosis
+    parts = [_found(diagnosis, e) for e in diagnosis.found]
+    if diagnosis.verdict != "insufficient_data":
+        parts.append(_ranking(ranked, may_add))
+    parts += _unseen(diagnosis)
+    if not diagnosis.found:
+        kind, head = heading(diagnosis)
+        words = f"{said(diagnosis)}{_present(diagnosis)}"
+        parts.insert(
+            0, f'<div class="card"><h2 class="{kind}">{text(head)}</h2>{text(words)}</div>'
+        )
+    chosen = page or next((e.effect for e in diagnosis.found), "")
+    return {"ranking": "".join(parts), "page": effect_page(chosen)}
 
 
 def _link(name: str, label: str) -> str:
     return button(label, "page", kind="link", name=name) if name in catalogue() else text(label)
 
 
-def _present(found: Diagnosis) -> str:
+def _present(diagnosis: Diagnosis) -> str:
     """What is there and changes next to nothing."""
-    names = ", ".join(named((s.effect, s.where)) for s in found.negligible)
+    names = ", ".join(named((s.effect, s.where)) for s in diagnosis.negligible)
     return f" Too small to matter, if there at all: {names}." if names else ""
 
 
-def _found(found: Diagnosis, effect: Effect) -> str:
+def _found(diagnosis: Diagnosis, effect: FoundEffect) -> str:
     """What was found: size with interval, held-out gain, what it may be confused with."""
     sizes = "".join(
         f"<dt>{text(name.replace('_', ' '))}</dt><dd>{text(_interval(value))}</dd>"
@@ -63,9 +122,10 @@ def _found(found: Diagnosis, effect: Effect) -> str:
     )
     return (
         f'<div class="card"><h2 class="found">{_link(effect.effect, title(effect.effect))} '
-        f"at {text(effect.where)}</h2><dl>{sizes}<dt>{judged(found)}</dt><dd>"
-        f"{percent(found, before)} → <b>{percent(found, after)}</b> of the rms flow; the sensors' "
-        f"floor is {percent(found, found.noise_floor_m3s)}</dd><dt>explains as much</dt>"
+        f"at {text(effect.where)}</h2><dl>{sizes}<dt>{judged(diagnosis)}</dt><dd>"
+        f"{percent(diagnosis, before)} → <b>{percent(diagnosis, after)}</b> of the rms flow; the "
+        f"sensors' "
+        f"floor is {percent(diagnosis, diagnosis.noise_floor_m3s)}</dd><dt>explains as much</dt>"
         f"<dd>{text(told_apart)}</dd><dt>by chance</dt><dd>"
         f"{_chance(effect.p_value)}</dd></dl>{_choices(effect)}</div>"
     )
@@ -75,7 +135,7 @@ def _chance(p: float) -> str:
     return f"p = {p:.1g}" if p > 0 else "p below 1e-300"
 
 
-def _choices(effect: Effect) -> str:
+def _choices(effect: FoundEffect) -> str:
     """A button for each of a set that the record does not tell apart."""
     if not effect.cannot_be_told_from:
         return ""
@@ -91,54 +151,54 @@ def _interval(value: Value) -> str:
     """With its 95 % interval; a coefficient in SI too, as the project file has it."""
     known = "" if value.std != value.std else " (95 %)"
     si = ""
-    if value.unit in PRACTICAL and value.unit not in KEPT:
+    if "/" in value.unit and scale_of(value.unit).name != value.unit:
         si = f", {value.value:.4g} {value.unit}"
-    return f"{size(value)}{known}{si}"
+    return f"{quantity(value)}{known}{si}"
 
 
-def _ranking(told: Told, may_add: bool) -> str:
+def _ranking(ranked: RankedDiagnosis, may_add: bool) -> str:
     """All candidates by how clearly the record shows each, with a button to add it."""
-    most = max((r.before or r.after or 0.0 for r in told.ranking), default=1.0) or 1.0
-    rows = [_rank(one, most, may_add) for one in told.ranking[:MOST]]
+    most = max((r.before or r.after or 0.0 for r in ranked.ranking), default=1.0) or 1.0
+    rows = [_rank(ranked, most, may_add) for ranked in ranked.ranking[:MOST]]
     head = ("effect", "how clearly|", "", "size ± 95 %", "")
     says = (
         "How clearly the record shows each effect when it is added alone: its coefficient in "
         "standard deviations (bar: logarithmic). "
     )
-    if told.diagnosis.found:
+    if ranked.diagnosis.found:
         says += (
             "While something large is missing, many effects imitate it; → is what is left of "
             "them once the orange one is in the model. Next: add what is found, or open a page."
         )
-    elif told.diagnosis.verdict == "matches":
+    elif ranked.diagnosis.verdict == "matches":
         says += (
             "None of them takes a material share of the error off unseen motion, however clear "
             "it is. "
         )
-        if told.diagnosis.negligible:
+        if ranked.diagnosis.negligible:
             says += "→ is what is left of them beside those that are too small to matter. "
         says += "An effect's name opens its page."
     else:
         says += "None of them explains the error. An effect's name opens its page."
-    return f'<h3>All candidates</h3><p class="says">{text(says)}</p>{table(head, rows)}'
+    return f'<h3>All candidates</h3><p class="says">{text(says)}</p>{table(head, rows, "ranking")}'
 
 
-def _rank(one: Ranked, most: float, may_add: bool) -> tuple[str, ...]:
-    words, bar = clearness(one.before, one.after, most)
-    big = size(Value(one.value, one.std, one.unit))
-    if one.per_shape is not None:
-        big += f" of {limit(*one.per_shape)}"
-    remark = "" if one.is_possible else ", not possible"
-    can = may_add and one.is_possible
-    add = button("Add", "add", effect=one.key[0], where=one.key[1]) if can else ""
-    return _link(one.key[0], named(one.key)), text(words), bar, text(big + remark), add
+def _rank(ranked: Ranked, most: float, may_add: bool) -> tuple[str, ...]:
+    words, bar = clearness(ranked.before, ranked.after, most)
+    big = quantity(Value(ranked.value, ranked.std, ranked.unit))
+    if ranked.per_shape is not None:
+        big += f" of {limit(*ranked.per_shape)}"
+    remark = "" if ranked.is_possible else ", not possible"
+    can = may_add and ranked.is_possible
+    add = button("Add", "add", effect=ranked.key[0], where=ranked.key[1]) if can else ""
+    return _link(ranked.key[0], named(ranked.key)), text(words), bar, text(big + remark), add
 
 
-def _unseen(found: Diagnosis) -> list[str]:
+def _unseen(diagnosis: Diagnosis) -> list[str]:
     """Detection limits, and what the record cannot show."""
-    listed = () if found.verdict == "insufficient_data" else found.not_found
+    listed = () if diagnosis.verdict == "insufficient_data" else diagnosis.not_found
     seen = [u for u in listed if u.visible and u.detection_limit is not None]
-    blind = [u for u in found.not_found if not u.visible]
+    blind = [u for u in diagnosis.not_found if not u.visible]
     head = ("effect", "where", "smallest size that would have shown", "remark")
     parts = []
     if seen:
@@ -147,8 +207,8 @@ def _unseen(found: Diagnosis) -> list[str]:
     if blind:
         hidden = [(*_place(u), text(u.reason)) for u in blind]
         parts.append("<h3>This record cannot show</h3>" + table(("effect", "where", "why"), hidden))
-    if found.advice:
-        items = "".join(f"<li>{text(_with_titles(a))}</li>" for a in found.advice)
+    if diagnosis.advice:
+        items = "".join(f"<li>{text(_with_titles(a))}</li>" for a in diagnosis.advice)
         parts.append(f"<h3>What motion would tell more</h3><ul>{items}</ul>")
     return parts
 
@@ -185,8 +245,8 @@ def _page(page: Page) -> str:
         for s in page.symbols
     )
     sizes = "".join(
-        f"<dt>{text(p.name.replace('_', ' '))}, {text(p.symbol)}</dt><dd>{p.low:g} to {p.high:g} "
-        f"{text('' if p.unit == '1' else p.unit)}. {text(p.meaning)}</dd>"
+        f"<dt>{text(p.name.replace('_', ' '))}, {text(p.symbol)}</dt><dd>"
+        f"{text(range_of(p.low, p.high, p.unit))}. {text(p.meaning)}</dd>"
         for p in page.parameters
     )
     invisible = "<p><b>Structurally invisible:</b> a free map swallows it.</p>"

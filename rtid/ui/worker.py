@@ -13,9 +13,9 @@ from multiprocessing.process import BaseProcess
 from typing import Any
 
 from rtid.errors import RtidError
+from rtid.plain import Progress
 
 Then = Callable[[Any], None]
-Progress = Callable[[str, float], None]
 OUR_PACKAGES = ("rtid", "firmware_bridge")  # their errors are meant for the user
 POLITE = 5
 ENDED = "the worker has ended", "start `rtid ui` again"
@@ -74,6 +74,7 @@ class Worker:
         self._jobs: list[Job] = []
         self._pipe: Connection | None = None
         self._process: BaseProcess | None = None
+        self._listener: threading.Thread | None = None
 
     @property
     def is_busy(self) -> bool:
@@ -94,10 +95,13 @@ class Worker:
             self._begin()
 
     def stop(self) -> None:
-        """End the process, whatever it does."""
-        if self._process is not None:
-            self._process.terminate()
-            self._process.join(5.0)
+        """End the process, whatever it does, and wait until nothing of it is left."""
+        if self._process is None or self._pipe is None or self._listener is None:
+            return
+        self._process.terminate()
+        self._process.join(5.0)
+        self._listener.join(5.0)
+        self._pipe.close()
 
     def _start(self) -> Connection:
         """The process, started with the first job: a page that only looks on needs none."""
@@ -106,7 +110,8 @@ class Worker:
         self._process = context.Process(target=serve, args=(theirs,), daemon=True)
         self._process.start()
         theirs.close()
-        threading.Thread(target=self._listen, args=(ours,), daemon=True).start()
+        self._listener = threading.Thread(target=self._listen, args=(ours,), daemon=True)
+        self._listener.start()
         return ours
 
     def _begin(self) -> None:

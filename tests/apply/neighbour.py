@@ -20,11 +20,11 @@ import numpy as np
 import tomlkit
 
 import rtid.project
-from rtid import offered
+from rtid.apply import offer as offered
+from rtid.apply.judge import KnownMap
+from rtid.apply.offer import Offer
 from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.published import publish
-from rtid.judging import Known
-from rtid.offered import Offer
 from rtid.project import Project, load
 from tests.bridge.controller import Controller
 from tests.flow_maps import orifice, solved
@@ -109,9 +109,11 @@ def learned(project: Project, seed: int = 0, factor: float = 1.0) -> FlowMap:
     return publish(solved(project.model, flow, np.random.default_rng(seed)))
 
 
-def offer(folder: Path, project: Project, flow_map: FlowMap, against: int | None = None) -> Known:
+def offer(
+    folder: Path, project: Project, flow_map: FlowMap, against: int | None = None
+) -> KnownMap:
     """What the daemon would have left in its folder."""
-    known = Known(flow_map, np.array([8.1e8, 8.3e8]))
+    known = KnownMap(flow_map, np.array([8.1e8, 8.3e8]))
     judgement = {
         "blocks": 25, "new_m3s": 1e-6, "held_m3s": 2e-6, "against": "held map",
         "gain_percent": 50.0, "t": 9.0,

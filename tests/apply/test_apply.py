@@ -13,21 +13,22 @@ import pytest
 from firmware_bridge import lookup
 from firmware_bridge.download import DownloadError, Image, Session, UnconfirmedError, download
 from firmware_bridge.lookup import crc32
-from firmware_bridge.protocol import Op, Reason
-from rtid import offered
-from rtid.applied import DONE, UNCONFIRMED, Applied, Row
-from rtid.apply_session import Plan, apply_map
-from rtid.applying import ApplyError
+from firmware_bridge.protocol import LAST_VERSION, Op, Reason
+from rtid.apply import offer as offered
+from rtid.apply.offer import NoOfferError
+from rtid.apply.plan import ApplyError
+from rtid.apply.session import Plan, apply_map
+from rtid.apply.versions import DONE, UNCONFIRMED, Applied, VersionRow
+from rtid.apply.wish import Wish
 from rtid.cli import main
 from rtid.cli.exits import Exit
 from rtid.estimator.flowmap import FlowMap
-from rtid.offered import NoOfferError
 from rtid.project import Project, load
-from rtid.wished import Wish
 from tests.apply.neighbour import Neighbour, learned, loaded, neighbour, offer, project_file
 from tests.bridge.controller import Controller, Line
 from tests.bridge.downloads import SPOILS, damaging, losing
 from tests.bridge.tables import a_table
+from tests.eighty import eighty  # noqa: F401
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +39,7 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> tuple[FlowMap, FlowMap]:
 
 def sent(
     path: Path, there: Neighbour, folder: Path, undo: bool = False, unknown: bool = False
-) -> tuple[Plan, Row | None]:
+) -> tuple[Plan, VersionRow | None]:
     wish = Wish(
         undo=undo, bus=f"virtual:{there.channel}", state=folder, test_bus=True,
         replace_unknown=unknown,
@@ -376,6 +377,7 @@ def ends(arguments: list[str]) -> int:
     return int(end.value.code or 0)
 
 
+@pytest.mark.usefixtures("eighty")
 def test_the_command(
     tmp_path: Path, maps: tuple[FlowMap, FlowMap], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -420,3 +422,27 @@ def test_the_project_file_must_declare_it(
     assert "publish.status_id" in capsys.readouterr().err
     assert ends(["apply", str(project_file(tmp_path, first_slot=12))]) == Exit.USAGE
     assert "publish.first_slot" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("dry_run", [False, True])
+def test_no_map_is_newer_than_the_last_version(
+    dry_run: bool, tmp_path: Path, maps: tuple[FlowMap, FlowMap], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The controller, or a folder of this machine, has come to the end of the numbers."""
+    path, folder = project_file(tmp_path), tmp_path / "state"
+    project, controller = load(path), Controller()
+    offer(folder, project, maps[0])
+    session = Session(Line(controller))
+    session.open()
+    foreign = Image(lookup.image(a_table(), 0))
+    download(session, {0: foreign}, LAST_VERSION)
+    session.close()
+    if dry_run:
+        (folder / "applied" / f"v{LAST_VERSION}").mkdir(parents=True)
+    with neighbour(controller) as there:
+        arguments = ["apply", str(path), "--bus", f"virtual:{there.channel}", "--state"]
+        arguments += [str(folder), "--test-bus", "--yes", "--replace-unknown"]
+        assert ends([*arguments, *["--dry-run"] * dry_run]) == 3
+    said = capsys.readouterr().err
+    assert f"version {LAST_VERSION}: no map can be newer" in said and "Traceback" not in said
+    assert controller.held(0) == (LAST_VERSION, foreign.crc)

@@ -11,25 +11,25 @@ import pytest
 import tomlkit
 
 from firmware_bridge.lookup import crc32
-from rtid import offered
-from rtid.applied import DONE, Applied, Row
-from rtid.apply_session import ANY_ROOM, Plan, apply_map
-from rtid.applying import ApplyError, prepare
+from rtid.apply import offer as offered
+from rtid.apply.judge import KnownMap, judge
+from rtid.apply.plan import ApplyError, prepare
+from rtid.apply.session import ANY_ROOM, Plan, apply_map
+from rtid.apply.versions import DONE, Applied, VersionRow
+from rtid.apply.wish import Wish
 from rtid.daemon.jobs import Publication
 from rtid.daemon.offering import Offering
 from rtid.errors import RtidError
 from rtid.estimator.estimator import to_chunk
 from rtid.estimator.published import publish
 from rtid.estimator.solution import Solution
-from rtid.judging import Known, judge
-from rtid.live import Learner, catalog_of
-from rtid.mapfiles import provenance, write_map
-from rtid.model import FloatArray
+from rtid.maps.files import provenance, write_map
+from rtid.plain import FloatArray
 from rtid.project import Project, load
-from rtid.sim.plant import Plant
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
-from rtid.wished import Wish
+from rtid.sim.simulated_plant import SimulatedPlant
+from rtid.trace.learner import Learner, catalog_of
 
 SECONDS, ROUGH_S, GOOD_S = 56.0, 8.0, 30.0
 
@@ -48,7 +48,7 @@ class Machine:
 @pytest.fixture(scope="module")
 def machine(tmp_path_factory: pytest.TempPathFactory) -> Machine:
     folder = tmp_path_factory.mktemp("machine")
-    run = simulate(Plant(), "rich", seed=4, duration_s=SECONDS)
+    run = simulate(SimulatedPlant(), "rich", seed=4, duration_s=SECONDS)
     write_run(folder / "m.parquet", run, 4, "rich")
     path = folder / "m.toml"
     document = tomlkit.parse(path.read_text("utf-8"))
@@ -68,8 +68,8 @@ def machine(tmp_path_factory: pytest.TempPathFactory) -> Machine:
     return Machine(project, rough, good, chunk[seen], chunk[~seen])
 
 
-def known(solution: Solution) -> Known:
-    return Known(publish(solution), solution.beta_pa)
+def known(solution: Solution) -> KnownMap:
+    return KnownMap(publish(solution), solution.beta_pa)
 
 
 def publication(solution: Solution) -> Publication:
@@ -84,7 +84,7 @@ def hold(folder: Path, version: int, project: Project, solution: Solution) -> No
     images = prepare(project, it, solution.beta_sd_pa, ANY_ROOM).images
     applied.keep(version, images, it.flow_map, {"beta_pa": it.beta_pa.tolist()})
     crcs = {slot: crc32(data) for slot, data in images.items()}
-    applied.note(Row(time.time(), version, version, "me", crcs, DONE, {}))
+    applied.note(VersionRow(time.time(), version, version, "me", crcs, DONE, {}))
 
 
 def pieces(chunk: FloatArray) -> list[FloatArray]:
@@ -123,7 +123,7 @@ def test_a_map_by_chance_as_good_is_rarely_offered(machine: Machine) -> None:
             replace(e, theta=e.theta * (1 + 1e-5 * rng.standard_normal(e.theta.shape)))
             for e in base.flow_map.edges
         )
-        other = Known(replace(base.flow_map, edges=edges), base.beta_pa)
+        other = KnownMap(replace(base.flow_map, edges=edges), base.beta_pa)
         assert not judge(machine.project.model, machine.unseen, base, other, 1.0).is_better
 
 
@@ -174,6 +174,7 @@ def test_without_a_way_to_the_controller_nothing_is_judged(
     assert not offered.exists(tmp_path)
 
 
+@pytest.mark.slow
 def test_a_map_from_a_file_is_judged_on_a_trace(machine: Machine, tmp_path: Path) -> None:
     """`rtid apply --map FILE --against TRACE`: a dry run, from the records."""
     trace, path = machine.project.path.with_suffix(".parquet"), machine.project.path

@@ -16,20 +16,22 @@ import can
 import numpy as np
 import pytest
 
+import rtid
 from firmware_bridge import frames as fr
 from firmware_bridge import protocol
 from firmware_bridge.protocol import Op
 from firmware_bridge.sources import serial_port
 from firmware_bridge.sources.live_bus import open_live
-from rtid import offered, reach
-from rtid.apply_session import apply_map
-from rtid.daemon.answers import Answers, answers_of
+from rtid.apply import offer as offered
+from rtid.apply import reach
+from rtid.apply.answers import Answers, answers_of
+from rtid.apply.session import apply_map
+from rtid.apply.wish import Wish
 from rtid.daemon.notices import frames_of, telling
-from rtid.daemon.status import Alarm, Chamber, EdgeHealth, Estimate, Verdict
+from rtid.daemon.status import Alarm, ChamberStatus, EdgeHealth, EstimateStatus, Verdict
 from rtid.errors import RtidError
 from rtid.estimator.flowmap import FlowMap
 from rtid.project import load
-from rtid.wished import Wish
 from tests.apply.neighbour import (
     REPLY_ID,
     STATUS_ID,
@@ -45,10 +47,14 @@ from tests.daemon.test_parts import full_status
 
 
 def test_notices_as_the_firmware_reads_them() -> None:
-    estimate = Estimate(
+    estimate = EstimateStatus(
         "held",
         stale=False,
-        chambers=(Chamber("a", 8.123e8, 2.6e6), Chamber("b", None), Chamber("c", float("inf"))),
+        chambers=(
+            ChamberStatus("a", 8.123e8, 2.6e6),
+            ChamberStatus("b", None),
+            ChamberStatus("c", float("inf")),
+        ),
         edges=(
             EdgeHealth("pa", {"valid": 6, "learning": 2}, {}, 0.5),
             EdgeHealth("pb", {"valid": 1, "stale": 1}, {}, 1.0),
@@ -86,7 +92,7 @@ def frames_with(can_ids: list[int]) -> fr.Frames:
 
 
 def test_answers_are_handed_on_to_whoever_waits(tmp_path: Path) -> None:
-    from rtid.daemon.answers import heard
+    from rtid.apply.answers import heard
 
     answers = Answers(tmp_path, REPLY_ID)
     answers.take(frames_with([REPLY_ID]))  # nobody waits
@@ -186,7 +192,7 @@ def test_an_adapter_that_the_daemon_only_listens_with(tmp_path: Path, flow_map: 
             apply_map(path, wish, lambda plan: True)
 
 
-RTID = Path(reach.__file__).parent
+RTID = Path(rtid.__file__).parent
 
 
 def test_only_one_module_of_rtid_arms_a_bus() -> None:
@@ -198,11 +204,11 @@ def test_only_one_module_of_rtid_arms_a_bus() -> None:
             arming.add(name)
         if re.search(r"\bcan\.(Bus|interface\.Bus|ThreadSafeBus)\(", text):
             opening.add(name)
-    assert arming == {"reach.py"}
-    assert opening <= {"live.py", "sim/bus.py"}  # `virtual_bus` and `open_test_bus`
+    assert arming == {"apply/reach.py"}
+    assert opening <= {"trace/learner.py", "sim/bus.py"}  # `virtual_bus` and `open_test_bus`
     users = {
         path.relative_to(RTID).as_posix()
         for path in RTID.rglob("*.py")
         if "reach.armed(" in path.read_text("utf-8")
     }
-    assert users == {"apply_session.py", "daemon/notices.py"}
+    assert users == {"apply/session.py", "daemon/notices.py"}

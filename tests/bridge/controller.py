@@ -10,7 +10,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from tempfile import mkdtemp
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 
 from firmware_bridge import c_tables
+from tests.left import shared_folder
 
 HERE = Path(__file__).parent
 SOURCES = Path(c_tables.HEADER).parent
@@ -31,7 +31,7 @@ def compiled(name: str, *options: str) -> Path:
     """controller.c with the receiver, built with more options; skips where there is no compiler."""
     if COMPILER is None:
         pytest.skip("no cc, gcc or clang on this machine: the controller's C is not tested")
-    built = Path(mkdtemp(prefix="rtid-controller-")) / name
+    built = shared_folder("rtid-controller-") / name
     sources = [str(HERE / "controller.c"), *(str(SOURCES / file) for file in FILES)]
     command = [COMPILER, *STRICT, *options, f"-I{SOURCES}", *sources, "-lm", "-o", str(built)]
     subprocess.run(command, check=True)

@@ -106,14 +106,14 @@ def read(path: Path, raw: bytes) -> Frames:
     return found
 
 
-def wrong_frames(found: Frames, whole: Frames, shift_us: int = 0) -> int:
+def wrong_frames(frames: Frames, whole: Frames, shift_us: int = 0) -> int:
     """How many frames are not among those of the whole log, stamps moved back by shift_us."""
-    if len(found) == len(whole):
-        same = (found.data == whole.data).all(axis=1) & (found.t_us - shift_us == whole.t_us)
+    if len(frames) == len(whole):
+        same = (frames.data == whole.data).all(axis=1) & (frames.t_us - shift_us == whole.t_us)
         for name in ("channel", "can_id", "length"):
-            same &= getattr(found, name) == getattr(whole, name)
+            same &= getattr(frames, name) == getattr(whole, name)
         return int((~same).sum())
-    return (rows(found, shift_us) - rows(whole)).total()
+    return (rows(frames, shift_us) - rows(whole)).total()
 
 
 def rows(frames: Frames, shift_us: int = 0) -> Counter[tuple[int, int, int, int, bytes]]:
@@ -195,10 +195,10 @@ def samples(frames: Frames) -> Samples:
     return Assembler(CATALOG, assembly()).push(frames)
 
 
-def judge(found: Samples, expected: Samples) -> Counter[str]:
+def judge(result: Samples, expected: Samples) -> Counter[str]:
     """How many samples hold values that never were, or good values at another time."""
-    values = np.isin(as_bytes(found.values), as_bytes(expected.values))
-    moved = values & ~np.isin(found.t_us, expected.t_us)
+    values = np.isin(as_bytes(result.values), as_bytes(expected.values))
+    moved = values & ~np.isin(result.t_us, expected.t_us)
     return Counter(wrong_value=int((~values).sum()), moved_stamp=int(moved.sum()))
 
 
@@ -221,3 +221,13 @@ def test_a_flip_anywhere_in_the_header_costs_no_frame(whole: Log, tmp_path: Path
         assert wrong_frames(found, whole.frames, shift_us) == 0
         moved += shift_us != 0
     print(f"{whole.suffix}: {len(places)} flips in the header, {moved} moved the origin of time")
+
+
+@pytest.mark.parametrize("year", ["0", "10000", "4294967296", "1" + 40 * "0"])
+def test_a_damaged_year_of_an_asc_costs_the_date_alone(tmp_path: Path, year: str) -> None:
+    path = tmp_path / "year.asc"
+    path.write_text(
+        f"date Sun Sep 13 12:26:40.0 {year}\nbase hex  timestamps absolute\n"
+        " 0.001000 1  120             Rx   d 8 EC A0 38 05 00 10 8D 02\n"
+    )
+    assert len(open_log(path)) == 1

@@ -91,6 +91,37 @@ def test_a_version_that_is_not_newer_is_refused(version: int) -> None:
     assert state(controller) == IS_OLD
 
 
+@pytest.mark.parametrize("version", [protocol.LAST_VERSION + 1, -1])
+def test_a_version_that_no_frame_holds_is_told(version: int) -> None:
+    controller = begun(protocol.LAST_VERSION)
+    session = Session(Line(controller))
+    session.open()
+    assert session.held(0).version == protocol.LAST_VERSION
+    with pytest.raises(protocol.FieldError, match=f"version {version} does not fit"):
+        download(session, NEW, version)
+    assert state(controller) == IS_OLD
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [(16, 1, 1, 4, 1, 1), (-1, 1, 1, 4, 1, 1), (0, 256, 1, 4, 1, 1), (0, 1, 1, 1 << 24, 1, 1)],
+)
+def test_a_number_beyond_its_field_is_told(fields: tuple[int, int, int, int, int, int]) -> None:
+    if fields[0] == 16:
+        with pytest.raises(protocol.FieldError, match="slots"):
+            protocol.commit_frame(1, [fields[0]], 1)
+        return
+    with pytest.raises(protocol.FieldError, match="does not fit"):
+        protocol.begin_frames(1, *fields)
+
+
+def test_a_status_of_any_numbers_is_eight_bytes() -> None:
+    told = protocol.status_frame(1, 2, 1000, -3, 100, 0, -1)
+    assert protocol.is_whole(0, told) and list(told[2:5]) == [255, 0, 100]
+    with pytest.raises(protocol.FieldError, match="chamber"):
+        protocol.beta_frame(256, 8e8, 1e6)
+
+
 def test_another_format_is_refused() -> None:
     controller, asked = begun(), bytearray(protocol.open_frame(9))
     asked[3] = protocol.FORMAT + 1

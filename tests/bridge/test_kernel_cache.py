@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -56,6 +57,7 @@ def test_a_full_one_that_is_closed_is_copied(
     copy = cache_folder("k", tmp_path, sources)
     assert copy is not None and copy != full
     assert (copy / "engine" / "advance.nbi").read_text() == "index"
+    shutil.rmtree(copy.parent)  # else it goes when the process ends
 
 
 def test_nowhere_is_told(

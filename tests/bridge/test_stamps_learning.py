@@ -10,18 +10,18 @@ from firmware_bridge.frames import Frames
 from firmware_bridge.stamps import StampModel
 from rtid.estimator.estimator import Estimator
 from rtid.estimator.solution import Solution
-from rtid.model import Model
+from rtid.model import Machine
 from rtid.sim.bus import run_frames
 from rtid.sim.declare import declared_model, uniform_grid
-from rtid.sim.plant import Plant
 from rtid.sim.run import simulate
+from rtid.sim.simulated_plant import SimulatedPlant
 
 START_US = 1_700_000_000_000_000
 HOUR_US = 3_600_000_000
 STEPS = ((10, HOUR_US), (20, -HOUR_US), (25, -200_000))
 
 
-def learned(frames: Frames, model: Model) -> tuple[Solution, dict[str, int]]:
+def learned(frames: Frames, model: Machine) -> tuple[Solution, dict[str, int]]:
     bridge, estimator = assembler(), Estimator(model)
     estimator.update(bridge.push(frames))
     estimator.update(bridge.finish())
@@ -38,8 +38,10 @@ def map_change(a: Solution, b: Solution) -> float:
 
 
 def test_the_maps_change_by_less_than_02_per_cent() -> None:
-    model = declared_model(Plant(), grid=uniform_grid((1.0, 10.0, 10), (-0.5e6, 9.5e6, 8)))
-    frames = run_frames(simulate(Plant(), "sweep", seed=1, duration_s=30.0), load(), START_US)
+    model = declared_model(SimulatedPlant(), grid=uniform_grid((1.0, 10.0, 10), (-0.5e6, 9.5e6, 8)))
+    frames = run_frames(
+        simulate(SimulatedPlant(), "sweep", seed=1, duration_s=30.0), load(), START_US
+    )
     true_us = frames.t_us.copy()
     without, _ = learned(frames, model)
     frames.t_us[:] = START_US + np.rint((true_us - START_US) * (1 - 200e-6)).astype(np.int64)

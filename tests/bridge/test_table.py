@@ -11,8 +11,8 @@ from scipy.io import savemat
 
 from firmware_bridge.config import Assembly, SignalSource
 from firmware_bridge.samples import GAP, ROW
-from firmware_bridge.sources import LogError
-from firmware_bridge.sources.table import read_table, to_samples
+from firmware_bridge.sources import LogError, read_table
+from firmware_bridge.sources.table import to_samples
 
 ROLES = Assembly(
     "cycle",
@@ -89,6 +89,7 @@ def test_clear_errors(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(b"\x00\x01garbage")
         with pytest.raises(LogError, match=name):
             read_table(tmp_path / name)
+    (tmp_path / "a.xlsx").write_bytes(b"x")
     with pytest.raises(LogError, match="unknown suffix"):
         read_table(tmp_path / "a.xlsx")
 
@@ -101,3 +102,13 @@ def test_rig_table(shared: Path) -> None:
     assert counts == {}
     assert (np.diff(samples.t_us) == 1000).all()
     assert 6.9e6 < samples.column("p_supply").mean() < 7.1e6
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_number_that_no_sensor_sends_is_a_missing_value(tmp_path: Path) -> None:
+    """1e308 was taken for a pressure, and its square ended the noise estimate in a warning."""
+    path = tmp_path / "t.csv"
+    path.write_text("t,u,p\n0,1,2\n0.001,1e308,2\n0.002,1,-1e200\n1e29,1,2\n0.003,1,2\n")
+    samples, counts = to_samples(read_table(path), ROLES)
+    assert samples.t_us.tolist() == [0, 3000]
+    assert counts == {"not_available": 2, "out_of_order": 1}

@@ -26,6 +26,8 @@ Begin Triggerblock Sam Sep 30 03:06:13.191 pm 2017
   17.876710 2  6F9             Rx   d 0
   18.000000 1  6F9             Rx   r 8
   18.100000 CANFD   3 Rx        167x  VehicleOperatingModes            1 0 3  3 73 80 0f   102187  133   323000 e000fb6c 46500250 4b140250 20011736 2001040d
+  18.150000 CANFD   3 Rx        167x  VehicleOperatingModes            0 0 3  3 73 80 0f   102187  133   200000 e000fb6c 46500250 4b140250 20011736 2001040d
+  18.160000 CANFD   3 Rx        167                                   0 0 1  1 73
   18.200000 CANFD   3 Tx        716                                   1 0 9 12 64 12 3b 36 01 7b 0a 20 20 20 20 22        0    0     3000        0        0        0        0        0
   18.300000 CANFD   3 Rx ErrorFrame  more
   18.400000 1  900             Rx   d 1 00
@@ -52,17 +54,20 @@ def test_asc_as_vector_writes_it(tmp_path: Path, ending: str) -> None:
     frames = read(tmp_path, "t.asc", VECTOR.replace("\n", ending))
     start_us = local_us(2017, 9, 30, 15, 6, 13, 191_000)
     assert (frames.t_us - start_us).tolist() == [
-        3_098_426, 17_876_708, 17_876_709, 17_876_710, 18_100_000,
+        3_098_426, 17_876_708, 17_876_709, 17_876_710, 18_100_000, 18_150_000, 18_160_000,
+        18_200_000,
     ]  # fmt: skip
-    assert frames.channel.tolist() == [0, 1, 1, 1, 2]
+    assert frames.channel.tolist() == [0, 1, 1, 1, 2, 2, 2, 2]
     assert frames.can_id.tolist() == [
-        0x18EBFF00 | EXTENDED, 0x6F9, 0x6F9, 0x6F9, 0x167 | EXTENDED,
+        0x18EBFF00 | EXTENDED, 0x6F9, 0x6F9, 0x6F9, 0x167 | EXTENDED, 0x167 | EXTENDED, 0x167,
+        0x716,
     ]  # fmt: skip
-    assert frames.length.tolist() == [8, 3, 8, 0, 3]
-    assert frames.data[0].tobytes().hex() == "01a00fa6603bd140"
-    assert frames.data[4].tobytes().hex() == "73800f0000000000"
+    assert frames.length.tolist() == [8, 3, 8, 0, 3, 3, 1, 12]
+    assert frames.data[0].tobytes().hex() == "01a00fa6603bd140" + 16 * "0"
+    assert frames.data[5, :8].tobytes().hex() == "73800f0000000000"
+    assert frames.data[7].tobytes().hex() == "64123b36017b0a2020202022" + 8 * "0"
     assert frames.refused == {
-        "other_event": 3, "error_frame": 2, "remote_frame": 1, "fd_frame": 1, "bad_line": 5,
+        "other_event": 3, "error_frame": 2, "remote_frame": 1, "bad_line": 5,
     }  # fmt: skip
 
 
@@ -129,7 +134,7 @@ TRC = {
     "      2      1842.000 ST          Rx    00 00 00 08\n"
     "      3      1843.000 ER          Rx 5  04 00 02 00 00\n"
     "      4      1844.000 RR     0100 Rx 3\n"
-    "      5      1845.000 FB 18FF0001 Rx 2  0A FF\n",
+    "      5      1845.000 DT 18FF0001 Rx 2  0A FF\n",
     "2.1": ";$FILEVERSION=2.1\n;$STARTTIME=44548.6028595139\n;$COLUMNS=N,O,T,B,I,d,R,L,D\n"
     "      1      1841.000 DT 1      0001 Tx -  8    00 00 00 00 00 00 00 00\n"
     "      2      1842.000 ST 1      -    Rx -  4    00 00 00 08\n"
@@ -170,11 +175,12 @@ def test_trc_counts_what_does_not_agree(tmp_path: Path) -> None:
         "1) 1.0 Rx 0001 1 0g",
         "1) 1.0 Rx 0001 12 00 00 00 00 00 00 00 00 00 00 00 00",
         "1) 2.0 Rx 0001 1 00",
+        *(f"1) 2.0 {kind} 0001 1 00" for kind in ("FD", "FB", "FE", "BI")),
     ]
     head = ";$FILEVERSION=1.1\n;$STARTTIME=0\n"
     frames = read(tmp_path, "t.trc", head + "\n".join(lines) + "\n")
     assert len(frames) == 1
-    assert frames.refused == {"bad_line": 6, "fd_frame": 1}
+    assert frames.refused == {"bad_line": 6, "fd_frame": 5}
 
 
 def test_csv_as_python_can_writes_it(tmp_path: Path) -> None:
@@ -192,10 +198,11 @@ def test_csv_as_python_can_writes_it(tmp_path: Path) -> None:
         "1483389946.2,0x1,0,2,0,1,/w==\n"
     )
     frames = read(tmp_path, "t.csv", text)
-    assert frames.t_us.tolist() == [0, 13, 1_483_389_946_197_000]
-    assert frames.can_id.tolist() == [0, 0x7FF, 0xDADADA | EXTENDED]
-    assert frames.data[2].tobytes() == b"[42, 9\0\0"
-    assert frames.refused == {"remote_frame": 1, "error_frame": 1, "fd_frame": 1, "bad_line": 4}
+    assert frames.t_us.tolist() == [0, 13, 1_483_389_946_197_000, 1_483_389_946_200_000]
+    assert frames.can_id.tolist() == [0, 0x7FF, 0xDADADA | EXTENDED, 1]
+    assert frames.length.tolist() == [0, 1, 6, 12]
+    assert frames.data[2, :8].tobytes() == b"[42, 9\0\0"
+    assert frames.refused == {"remote_frame": 1, "error_frame": 1, "bad_line": 4}
 
 
 def test_a_lone_stray_stamp_is_refused_a_step_of_the_clock_is_not(tmp_path: Path) -> None:
@@ -205,3 +212,41 @@ def test_a_lone_stray_stamp_is_refused_a_step_of_the_clock_is_not(tmp_path: Path
     kept = [1.0, 1.1, 1.2, 1.3, 1.4, 1.35, 7.0, 7.1, 8.1, 8.2]  # the step back is a gap of 1 s
     assert (frames.t_us * 1e-6).tolist() == pytest.approx(kept)
     assert frames.refused == {"stray_stamp": 4, "clock_step": 1}
+
+
+GVRET = {  # SavvyCAN since 2016, before, and loggers that know one bus
+    "Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8": "{t},{i},{x},Rx,{b},{d}",
+    "Time Stamp,ID,Extended,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8": "{t},{i},{x},{b},{d}",
+    "Time Stamp,ID,Extended,LEN,D1,D2,D3,D4,D5,D6,D7,D8": "{t},{i},{x},{d}",
+}
+
+
+@pytest.mark.parametrize("head", GVRET)
+@pytest.mark.parametrize("ending", ["\n", "\r\n"])
+def test_csv_as_savvycan_writes_it(tmp_path: Path, head: str, ending: str) -> None:
+    form = GVRET[head].format
+    lines = [
+        form(t=39747828, i="000005EB", x="false", b=0, d="8,E8,45,85,4B,4A,28,36,69,"),
+        form(t=39747829, i="1F334455", x="true", b=2, d="2,0A,0B,00,00,00,00,00,00,"),
+        form(t=39747830, i="18FF0001", x="false", b=1, d="0"),
+        form(t=39747831, i="123", x="False", b=1, d="1,5"),
+        form(t=39747832, i="123", x="false", b=0, d="12,01,02,03,04,05,06,07,08,"),
+        form(t=39747833, i="123", x="false", b=0, d="2,01"),
+        form(t=39747833, i="123", x="false", b=0, d="2,01,0g"),
+        form(t=39747833, i="12q", x="false", b=0, d="1,01"),
+        form(t=39747833, i="123", x="maybe", b=0, d="1,01"),
+        form(t=3.5, i="123", x="false", b=0, d="1,01"),
+        form(t=1_700_000_039_747_834, i="7FF", x="false", b=0, d="1,FF"),
+    ]
+    frames = read(tmp_path, "t.csv", ending.join([head, *lines, ""]))
+    assert frames.t_us.tolist()[:4] == [39747828, 39747829, 39747830, 39747831]
+    assert frames.t_us[4] == 1_700_000_039_747_834
+    assert frames.can_id.tolist() == [
+        0x5EB, 0x1F334455 | EXTENDED, 0x18FF0001 | EXTENDED, 0x123, 0x7FF,
+    ]  # fmt: skip
+    assert frames.channel.tolist() == ([0, 2, 1, 1, 0] if "Bus" in head else [0] * 5)
+    assert frames.length.tolist() == [8, 2, 0, 1, 1]
+    assert frames.data[0].tobytes().hex() == "e845854b4a283669"
+    assert frames.data[1].tobytes().hex() == "0a0b000000000000"
+    assert frames.data[3, 0] == 5
+    assert frames.refused == {"fd_frame": 1, "bad_line": 5}

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import shutil
+import threading
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -15,6 +17,8 @@ from rtid.sim.random_plants import draw
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from rtid.ui.server import Workbench
+from tests.browser.geometry import assert_clear
+from tests.left import PATIENCE_S
 from tests.ui.served import served
 
 if TYPE_CHECKING:
@@ -28,6 +32,18 @@ FLAGS = [
 SIZE = {"width": 1366, "height": 768}
 SEED, DURATION_S = 3, 40.0
 PATIENCE_MS = 120_000  # cold kernels on a loaded machine
+COOKIES: dict[str, list[Any]] = {}  # of the browser that has opened an address
+
+
+@pytest.fixture(autouse=True)
+def nothing_left() -> Iterator[None]:
+    """Fail the test that leaves a thread behind: its browser, and a module's daemon, live on."""
+    before = set(threading.enumerate())
+    yield
+    end_s = time.monotonic() + PATIENCE_S
+    while left := [t.name for t in set(threading.enumerate()) - before if t.is_alive()]:
+        assert time.monotonic() < end_s, f"left behind: {left}"
+        time.sleep(0.05)
 
 
 @dataclass
@@ -82,9 +98,14 @@ def opened(browser: Browser, bench: Workbench) -> Iterator[Opened]:
 
 
 def open_page(browser: Browser, bench: Workbench) -> Iterator[Opened]:
-    """A fresh context; at the end nothing may have been asked of other hosts, nothing failed."""
+    """A fresh context; at the end all of the page can be seen, at every width, light and dark.
+
+    Nothing may have been asked of other hosts, and nothing failed.  To the workbench it is the
+    browser of the tests before: another one would follow while their pages are still known.
+    """
     context = browser.new_context(viewport=SIZE, color_scheme="light")  # type: ignore[arg-type]
     context.set_default_timeout(PATIENCE_MS)
+    context.add_cookies(COOKIES.get(bench.url, []))
     own = bench.url.split("?")[0]
     one = Opened(context.new_page(), bench)
 
@@ -102,11 +123,13 @@ def open_page(browser: Browser, bench: Workbench) -> Iterator[Opened]:
     )
     one.page.on("websocket", lambda ws: _judge_socket(one, ws.url, own))
     yield one
+    COOKIES[bench.url] = context.cookies()
+    assert_clear(one.page)
     context.close()
     assert one.elsewhere == []
     assert one.errors == []
 
 
-def _judge_socket(one: Opened, url: str, own: str) -> None:
-    if not url.startswith(own.replace("http", "ws", 1)):
-        one.elsewhere.append(url)
+def _judge_socket(item: Opened, url: str, its_own: str) -> None:
+    if not url.startswith(its_own.replace("http", "ws", 1)):
+        item.elsewhere.append(url)

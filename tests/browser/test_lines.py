@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-import rtid.ui
+import rtid.tell
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
 BINS, N = 600, 110_000
-SCRIPT = Path(rtid.ui.__file__).parent / "static" / "plots.js"
+SCRIPT = Path(rtid.tell.__file__).parent / "static" / "plots.js"
 # a sine over 110 s at 1 kHz with other values at some indices; what is drawn of it
 DRAWN = """([changes, low, high]) => {
   const t = Float64Array.from({ length: COUNT }, (_, i) => i / 1000);

@@ -8,18 +8,22 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
 from benchmarks.live_page import growth, memory
+from rtid.daemon.status import Advice, ChamberStatus, EdgeHealth, Verdict, write
 from rtid.sim.random_plants import draw
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from rtid.ui.server import Workbench
 from tests.browser.conftest import Opened, open_page
+from tests.browser.geometry import assert_clear
 from tests.ui.served import served
+from tests.ui.test_live_page import status
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -31,6 +35,8 @@ MOST_MB = 20.0  # that a tab grows by in half an hour
 START_S = 90.0  # of a cold daemon on a loaded machine
 END_S = 60.0
 UPDATES = "() => Number(document.querySelector('#seen').textContent)"
+# what a page shows that gets no answer any more, without the line of the console about it
+GONE = """() => { window.fetch = () => Promise.reject(); }"""
 MEMORY = "() => performance.memory.usedJSHeapSize / 1e6"
 
 
@@ -124,3 +130,60 @@ def test_stale_is_shown_as_stale(
         for opened in open_page(browser, bench):
             opened.go("live")
             opened.page.wait_for_selector("#live_health .stale >> text=stale:")
+            assert_clear(opened.page, "#live_health")
+
+
+def test_words_from_outside_are_shown_as_they_are(
+    browser: Browser, project: Path, tmp_path: Path
+) -> None:
+    """Names of machine, channel, signals, messages, alarms and effects are never HTML."""
+    evil, known = (
+        "<img src=x onerror=alert(1)> [red]'\"&amp;</b><script>alert(1)</script>",
+        status(),
+    )
+    told = replace(
+        known,
+        name=evil,
+        now_unix_s=time.time() + 600.0,  # not stale while this is looked at
+        bus=replace(known.bus, interface=evil, channel=evil, refused={evil: 1}),
+        loop=replace(known.loop, causes={evil: 1}, scheduling=evil),
+        signals=tuple(replace(one, name=evil, unit=evil) for one in known.signals),
+        messages=tuple(replace(one, name=evil, refused={evil: 1}) for one in known.messages),
+        alarms=tuple(replace(one, name=evil, text=evil) for one in known.alarms),
+        store=replace(known.store, reason=evil),
+        advice=Advice(known.now_unix_s, evil),
+        verdict=Verdict(known.now_unix_s, evil, evil),
+        estimate=replace(
+            known.estimate,
+            reason=evil,
+            chambers=(ChamberStatus(evil, 1e9, 1e6),),
+            edges=(EdgeHealth(evil, {evil: 3}),),
+            refused={evil: 1},
+        ),
+    )
+    write(tmp_path, told)
+    with served(project=project, state=tmp_path) as bench:
+        for opened in open_page(browser, bench):
+            opened.go()
+            opened.page.wait_for_selector("#live_health h2")
+            words = opened.page.locator("#live").inner_text()
+            assert words.count("<script>alert(1)</script>") >= 15
+            assert opened.page.locator("#live img, #live script").count() == 0
+            assert_clear(opened.page, "#live_health h2")
+
+
+def test_the_page_of_a_machine_without_a_daemon_says_what_to_do(
+    browser: Browser, project: Path, tmp_path: Path
+) -> None:
+    """`rtid ui machine.toml` before `rtid run`: the page says so, and where to look."""
+    with served(project=project, state=tmp_path) as bench:
+        for opened in open_page(browser, bench):
+            opened.go()
+            opened.page.wait_for_selector("#live_health >> text=No daemon has been heard")
+            assert_clear(opened.page, "#live_health h2", "#live_health .key")
+            opened.page.keyboard.press("1")
+            opened.page.wait_for_selector("#cover >> text=No record is open")
+            assert_clear(opened.page, "#cover h2", "#cover p")
+            opened.page.evaluate(GONE)
+            opened.page.wait_for_selector("#lost >> text=The server has gone")
+            assert_clear(opened.page, "#lost", "#cover h2")

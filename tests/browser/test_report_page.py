@@ -9,8 +9,9 @@ import pytest
 from PIL import Image
 
 from rtid.project import load
-from rtid.reporting import Reported, report
+from rtid.tell.report_file import Reported, report
 from tests.browser.conftest import SIZE
+from tests.browser.geometry import SIZES, assert_clear
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -45,7 +46,7 @@ def test_it_opens_with_the_network_off(browser: Browser, written: Reported, sche
     assert all(width > 250 for width, *_ in plots)
     assert sum(max(lines) > 500 for _, *lines in plots) == 8
     assert page.locator(".bars .bar").count() == 2
-    assert page.evaluate("() => document.documentElement.scrollWidth <= innerWidth")
+    assert_clear(page, "h1", ".figures", sizes=SIZES, schemes=(scheme,))
     assert [url for url in asked if not url.startswith(("file:", "data:"))] == []
     assert errors == []
     context.close()
@@ -54,7 +55,7 @@ def test_it_opens_with_the_network_off(browser: Browser, written: Reported, sche
 @pytest.mark.slow
 def test_its_pictures_are_files_too(written: Reported) -> None:
     names = [path.name for path in written.pictures]
-    assert names == ["errors.png", "flows.png", "dependences.png", "ranking.png"]
+    assert names == ["errors.png", "evidence.png", "flows.png", "dependences.png", "ranking.png"]
     for path in written.pictures:
         image = Image.open(path)
         assert image.width >= 1200

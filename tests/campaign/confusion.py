@@ -13,10 +13,10 @@ from tests.campaign.diagnoses import SILENT, UNKNOWN, Outcome, truth
 from tests.campaign.report import FOLDER
 
 
-def keep(found: list[Outcome]) -> None:
+def keep(outcomes: list[Outcome]) -> None:
     """Append outcomes to out/campaign/diagnoses.csv."""
     FOLDER.mkdir(parents=True, exist_ok=True)
-    rows = [asdict(o.case) | {k: v for k, v in asdict(o).items() if k != "case"} for o in found]
+    rows = [asdict(o.case) | {k: v for k, v in asdict(o).items() if k != "case"} for o in outcomes]
     path = FOLDER / "diagnoses.csv"
     is_new = not path.exists()
     with path.open("a", newline="") as file:
@@ -34,10 +34,10 @@ def told(outcome: Outcome) -> str:
     return truth(outcome.case.effect) if is_right else outcome.named
 
 
-def confusion(found: list[Outcome], title: str) -> None:
+def confusion(outcomes: list[Outcome], title: str) -> None:
     """A picture of counts: hidden effects down, names across; on the diagonal they are right."""
-    counts = Counter((o.case.effect, told(o)) for o in found)
-    hidden = list(dict.fromkeys(o.case.effect for o in found))
+    counts = Counter((o.case.effect, told(o)) for o in outcomes)
+    hidden = list(dict.fromkeys(o.case.effect for o in outcomes))
     names = [*hidden, *sorted({n for _, n in counts} - set(hidden))]
     table = np.array([[counts[h, n] for n in names] for h in hidden])
     figure, axes = plt.subplots(figsize=(0.42 * len(names) + 3, 0.42 * len(hidden) + 2.6))

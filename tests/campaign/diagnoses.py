@@ -14,9 +14,9 @@ from rtid.diagnose.verdict import MATERIAL
 from rtid.estimator.estimator import to_chunk
 from rtid.sim.declare import declared_model
 from rtid.sim.hidden import HIDDEN, MECHANICAL, OUTSIDE, hide
-from rtid.sim.plant import Plant
 from rtid.sim.random_plants import draw, draw_hidden
 from rtid.sim.run import SimulationError, simulate
+from rtid.sim.simulated_plant import SimulatedPlant
 from tests.campaign.plants import WORKERS, grid
 
 RECORD_S, LEARN_S, TEST_S = 110.0, 80.0, 83.0
@@ -42,7 +42,7 @@ class Case:
     second: str = ""
 
     @property
-    def plant(self) -> Plant:
+    def plant(self) -> SimulatedPlant:
         """The machine."""
         if self.effect == NONE:
             return draw(self.seed)
@@ -98,11 +98,11 @@ def outcome(case: Case) -> Outcome | None:
     )  # fmt: skip
 
 
-def _size(plant: Plant, found: Diagnosis) -> float:
+def _size(plant: SimulatedPlant, diagnosed: Diagnosis) -> float:
     """What was found of the first effect over what was hidden, where one number is its size."""
-    if not found.found or not plant.hidden:
+    if not diagnosed.found or not plant.hidden:
         return float("nan")
-    own, true = found.found[0], plant.hidden[0]
+    own, true = diagnosed.found[0], plant.hidden[0]
     value, *shape = own.parameters.values()
     alike = not shape and own.effect == truth(true.name) and value.unit == HIDDEN[true.name].unit
     return abs(value.value / true.strength) if alike else float("nan")
@@ -115,24 +115,24 @@ def truth(effect: str) -> str:
     return HIDDEN[effect].catalogue or effect
 
 
-def judge(case: Case, found: Diagnosis) -> str:
+def judge(case: Case, diagnosed: Diagnosis) -> str:
     """What the diagnosis is worth."""
     true = truth(case.effect)
     if case.second:
-        return _judge_two({true, truth(case.second)}, found)
-    if not found.found:
-        if found.verdict == "unknown":
+        return _judge_two({true, truth(case.second)}, diagnosed)
+    if not diagnosed.found:
+        if diagnosed.verdict == "unknown":
             return UNKNOWN
-        return NEGLIGIBLE if case.effect != NONE and excess(found) < MATERIAL else SILENT
-    sets = [{e.effect, *(n.split(" ")[0] for n in e.cannot_be_told_from)} for e in found.found]
+        return NEGLIGIBLE if case.effect != NONE and excess(diagnosed) < MATERIAL else SILENT
+    sets = [{e.effect, *(n.split(" ")[0] for n in e.cannot_be_told_from)} for e in diagnosed.found]
     if not all(true in one for one in sets) or any(len(one) > LARGEST_SET for one in sets):
         return WRONG  # a false name beside the right one is as wrong as alone
     return RIGHT if all(len(one) == 1 for one in sets) else IN_SET
 
 
-def _judge_two(true: set[str], found: Diagnosis) -> str:
+def _judge_two(true: set[str], diagnosed: Diagnosis) -> str:
     """Both named, one of them, or neither; a third name is wrong."""
-    sets = [{e.effect, *(n.split(" ")[0] for n in e.cannot_be_told_from)} for e in found.found]
+    sets = [{e.effect, *(n.split(" ")[0] for n in e.cannot_be_told_from)} for e in diagnosed.found]
     if any(not one & true for one in sets):
         return WRONG
     if all(any(name in one for one in sets) for name in true):
@@ -140,10 +140,10 @@ def _judge_two(true: set[str], found: Diagnosis) -> str:
     return HALF if sets else UNKNOWN
 
 
-def excess(found: Diagnosis) -> float:
+def excess(diagnosed: Diagnosis) -> float:
     """What the model leaves of the held-out part beyond the sensors' noise, of the rms flow."""
-    left = found.heldout_residual_before_m3s**2 - found.noise_floor_m3s**2
-    return sqrt(max(0.0, left)) / max(found.rms_flow_m3s, 1e-12)
+    left = diagnosed.heldout_residual_before_m3s**2 - diagnosed.noise_floor_m3s**2
+    return sqrt(max(0.0, left)) / max(diagnosed.rms_flow_m3s, 1e-12)
 
 
 def wilson(hits: int, n: int, z: float = 1.96) -> tuple[float, float]:

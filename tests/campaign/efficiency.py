@@ -20,11 +20,12 @@ from rtid.estimator.record import fit_record
 from rtid.estimator.state import Weights, nominal_weights, variance
 from rtid.estimator.track import Track, follow
 from rtid.kernels.holds import second_order
-from rtid.model import FloatArray, Grid, Lag, Model
+from rtid.model import Grid, Lag, Machine
+from rtid.plain import FloatArray
 from rtid.sim.declare import declared_model
-from rtid.sim.plant import EDGES, Plant
 from rtid.sim.random_plants import draw
 from rtid.sim.run import Run, simulate
+from rtid.sim.simulated_plant import EDGES, SimulatedPlant
 
 RECORD_S, FIRST = 12.0, 6000
 GRID = Grid(np.array([1.0, 2.0, 3.0, 4.5, 10.5]), np.array([-1.0, 1.0, 2.5, 5.0, 10.0]) * 1e6)
@@ -39,7 +40,7 @@ class Problem:
     a pressure at one sample adds to z at that sample, and at all later ones.
     """
 
-    model: Model
+    model: Machine
     track: Track
     dt_s: float
     x_m: FloatArray
@@ -86,7 +87,7 @@ def _variances(values: FloatArray, cov: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("vi,ij,vj->v", values, cov, values))
 
 
-def pose(model: Model, plant: Plant, run: Run, n: int) -> Problem:
+def pose(model: Machine, plant: SimulatedPlant, run: Run, n: int) -> Problem:
     """The linearised problem of n samples in the middle of the record."""
     cut = slice(FIRST, FIRST + n)
     t_s = np.asarray(run.samples.t_us[cut] * 1e-6, np.float64)
@@ -123,7 +124,7 @@ def _map_values(track: Track, rates: FloatArray, blocks: Blocks) -> FloatArray:
 
 
 def _pressure_noise(
-    model: Model, plant: Plant, run: Run, cut: slice, dt: float
+    model: Machine, plant: SimulatedPlant, run: Run, cut: slice, dt: float
 ) -> tuple[FloatArray, FloatArray]:
     names = [s.name for s in model.signals if s.kind == "pressure"]
     values, opening = run.truth.signals[cut], run.truth.opening_v[cut]

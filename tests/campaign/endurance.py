@@ -11,7 +11,7 @@ from rtid.estimator.factor import factorize
 from rtid.estimator.solution import solve
 from rtid.estimator.state import build
 from rtid.estimator.sums import Normal, normal_equations
-from rtid.model import FloatArray
+from rtid.plain import FloatArray
 from tests.estimator.cases import plant_case
 
 PERIODS_PER_CALL = 10

@@ -17,18 +17,19 @@ import numpy as np
 from rtid.diagnose.diagnosis import search
 from rtid.diagnose.report import diagnosis
 from rtid.estimator.estimator import to_chunk
-from rtid.excite.limits import Limits
+from rtid.excite.exciting import excite
+from rtid.excite.motion_limits import Limits
 from rtid.excite.prediction import Prediction, assess, median_ratio
-from rtid.exciting import excite
 from rtid.kernels.engine import GAP_FLAG
-from rtid.model import FloatArray, Model
-from rtid.paper.boom import SWEEP_S, sweep
+from rtid.model import Machine
+from rtid.plain import FloatArray
 from rtid.project import load
+from rtid.sim.boom import SWEEP_S, sweep
 from rtid.sim.bus import run_frames
-from rtid.sim.log import START_US, write_log
-from rtid.sim.motion import Motion
-from rtid.sim.plant import Plant
+from rtid.sim.demand import Motion
 from rtid.sim.run import P_A, P_B, U, V, X, simulate
+from rtid.sim.run_files import START_US, write_log
+from rtid.sim.simulated_plant import SimulatedPlant
 from tests.excite.machines import machine, motion, write_project
 
 SEE = "external_leakage_laminar"
@@ -104,7 +105,7 @@ def _joined(first: FloatArray, second: FloatArray) -> FloatArray:
 
 
 def _run(
-    plant: Plant, model: Model, moved: Motion, seed: int, duration_s: float
+    plant: SimulatedPlant, model: Machine, moved: Motion, seed: int, duration_s: float
 ) -> tuple[FloatArray, FloatArray]:
     """Samples of the true machine, and its noise-free signals."""
     run = simulate(plant, moved, seed, duration_s)

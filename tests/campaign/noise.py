@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rtid.model import FloatArray
+from rtid.plain import FloatArray
 from tests.campaign.plants import Score
 
 IDENTIFIABLE = 0.05  # relative standard deviation
@@ -56,9 +56,9 @@ class Bias:
         return f"median {middle:+.2f} %, mean {mean:+.2f} %, covers {share:.0f} % of {len(self)}"
 
 
-def bias(found: Iterable[Score]) -> Bias:
+def bias(result: Iterable[Score]) -> Bias:
     """From errors of beta to those of theta_beta = 1 / beta, sd_theta = sd_beta / beta^2."""
-    scores = list(found)
+    scores = list(result)
     error = np.concatenate([s.beta_error for s in scores])
     z = np.concatenate([s.beta_z for s in scores])
     return Bias(1 / (1 + error) - 1, -z * (1 + error), np.abs(error / (z * (1 + error))))

@@ -11,13 +11,15 @@ import numpy as np
 
 from rtid.estimator.estimator import to_chunk
 from rtid.estimator.flowmap import VALID
-from rtid.estimator.record import RecordFit, fit_record
+from rtid.estimator.record import RecordFit
 from rtid.estimator.state import build
 from rtid.kernels.explain import explain
-from rtid.model import FloatArray, Grid, Model
+from rtid.model import Grid, Machine
+from rtid.plain import FloatArray
 from rtid.sim.declare import declared_model, default_grid
 from rtid.sim.random_plants import draw
 from rtid.sim.run import Run, Sensors, SimulationError, simulate
+from rtid.study.known_effects import learned
 
 WORKERS = 2
 
@@ -67,7 +69,7 @@ def score(trial: Trial) -> Score | None:
         return None
     model = declared_model(plant, sensors=sensors, seed=trial.seed, grid=grid(plant.p_supply_pa))
     chunk = to_chunk(model, run.samples, 0)
-    fit = fit_record(model, chunk)
+    fit = learned(model, chunk)
     solution = fit.solution
     z, error = block_errors(run, model, fit, chunk)
     return Score(
@@ -87,7 +89,7 @@ def grid(p_supply_pa: float) -> Grid:
 
 
 def block_errors(
-    run: Run, model: Model, fit: RecordFit, chunk: FloatArray
+    run: Run, model: Machine, fit: RecordFit, chunk: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Mean flow of every valid block beside the true flow averaged over the same intervals."""
     cells = assigned(model, fit, chunk)
@@ -105,7 +107,7 @@ def block_errors(
     return np.array(z), np.array(error)
 
 
-def assigned(model: Model, fit: RecordFit, chunk: FloatArray) -> np.ndarray:
+def assigned(model: Machine, fit: RecordFit, chunk: FloatArray) -> np.ndarray:
     """Grid cell of every edge over each interval, as the estimator assigned it (n - 1, edges)."""
     n, c = len(chunk), len(model.chambers)
     state = build(model, fit.weights)

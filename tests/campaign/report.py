@@ -1,6 +1,6 @@
-"""Figures of the campaigns: each one leaves a line, README's table shows them all.
+"""Figures of the campaigns: each one leaves a line, the table of docs/figures.md shows them all.
 
-python -m tests.campaign.report [README.md]   (`make campaign` does)
+python -m tests.campaign.report [docs/figures.md]   (`make campaign` does)
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ def table() -> str:
 
 
 def main(arguments: list[str]) -> None:
-    """Rewrite README's table."""
-    readme = Path(arguments[0] if arguments else "README.md")
+    """Rewrite the page's table."""
+    readme = Path(arguments[0] if arguments else "docs/figures.md")
     readme.write_text(replace_between(readme.read_text(), MARKER, table()))
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rtid.model import FloatArray
+from rtid.plain import FloatArray
 from tests.campaign.plants import Score, Trial, score, scores
 from tests.campaign.report import leave
 
@@ -17,8 +17,8 @@ FIRST_SEED = 1000  # not the plants that development looked at
 Z95 = 1.96
 
 
-def of(found: list[Score], name: str) -> FloatArray:
-    return np.concatenate([getattr(s, name) for s in found])
+def of(result: list[Score], name: str) -> FloatArray:
+    return np.concatenate([getattr(s, name) for s in result])
 
 
 def covered(z: FloatArray) -> float:

@@ -52,11 +52,11 @@ def drawn(
     return found
 
 
-def share(found: list[Outcome], *judgements: str) -> tuple[int, str]:
+def share(result: list[Outcome], *judgements: str) -> tuple[int, str]:
     """How many are judged so, and the words for it."""
-    hits = sum(o.judgement in judgements for o in found)
-    low, high = wilson(hits, len(found))
-    return hits, f"{hits} of {len(found)} ({100 * low:.0f} to {100 * high:.0f} %)"
+    hits = sum(o.judgement in judgements for o in result)
+    low, high = wilson(hits, len(result))
+    return hits, f"{hits} of {len(result)} ({100 * low:.0f} to {100 * high:.0f} %)"
 
 
 def test_nothing_is_named_where_nothing_is_hidden() -> None:

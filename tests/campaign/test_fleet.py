@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 from rtid.fleet.archive import Archive
-from rtid.fleet.jobs import Job, find
 from rtid.fleet.learning import Outcome
 from rtid.fleet.running import run
-from rtid.sim.plant import Plant
+from rtid.fleet.traces import TraceJob, find
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
+from rtid.sim.simulated_plant import SimulatedPlant
 from tests.campaign.report import leave
 
 TRACES = int(os.environ.get("RTID_FLEET", "100"))
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.campaign
 
 
 @pytest.fixture(scope="module")
-def jobs(tmp_path_factory: pytest.TempPathFactory) -> list[Job]:
+def jobs(tmp_path_factory: pytest.TempPathFactory) -> list[TraceJob]:
     """Traces of 20 s at 1 kHz, ten to a machine, one in a hundred of them broken."""
     folder = tmp_path_factory.mktemp("fleet")
     for k in range(TRACES):
@@ -38,7 +38,7 @@ def jobs(tmp_path_factory: pytest.TempPathFactory) -> list[Job]:
         place.mkdir(parents=True, exist_ok=True)
         path = place / f"{k:04d}.parquet"
         if k < RECORDS:
-            write_run(path, simulate(Plant(), "rich", k, 20.0), k, "rich")
+            write_run(path, simulate(SimulatedPlant(), "rich", k, 20.0), k, "rich")
             path.with_suffix(".truth.json").unlink()
             path.with_suffix(".toml").rename(folder / "project.toml")
         else:
@@ -61,7 +61,7 @@ def _other(path: Path, k: int) -> bytes:
     return bytes(memory.getvalue().to_pybytes())
 
 
-def timed(jobs: list[Job], folder: Path, workers: int) -> tuple[float, list[float]]:
+def timed(jobs: list[TraceJob], folder: Path, workers: int) -> tuple[float, list[float]]:
     """Seconds by the clock, without the start of the workers, and the time of each outcome."""
     at: list[float] = []
     run(jobs, Archive(folder), lambda n, of, last: at.append(time.perf_counter()), workers=workers,
@@ -71,7 +71,7 @@ def timed(jobs: list[Job], folder: Path, workers: int) -> tuple[float, list[floa
 
 
 def test_two_workers_are_nearly_twice_as_fast_and_memory_stays(
-    jobs: list[Job], tmp_path: Path
+    jobs: list[TraceJob], tmp_path: Path
 ) -> None:
     """At least 80 % of two; the driver does not grow with the number of traces."""
     one, _ = timed(jobs[: len(jobs) // 2], tmp_path / "one", 1)
@@ -92,7 +92,7 @@ def test_two_workers_are_nearly_twice_as_fast_and_memory_stays(
 
 
 def test_killed_half_way_nothing_is_missing_and_nothing_twice(
-    jobs: list[Job], tmp_path: Path
+    jobs: list[TraceJob], tmp_path: Path
 ) -> None:
     archive, done = Archive(tmp_path), list[str]()
 

@@ -17,12 +17,12 @@ import numpy as np
 import pytest
 
 from rtid.fleet.archive import Archive
-from rtid.fleet.jobs import find
+from rtid.fleet.traces import find
 from rtid.sim.hidden import hide_wish
-from rtid.sim.plant import Plant
 from rtid.sim.random_plants import draw
 from rtid.sim.recording import write_run
 from rtid.sim.run import SimulationError, simulate
+from rtid.sim.simulated_plant import SimulatedPlant
 from tests.campaign.report import leave
 
 pytestmark = pytest.mark.campaign
@@ -46,7 +46,7 @@ class Size:
 
 def record(folder: Path, number: int, seed: int) -> None:
     """One trace of a machine; the first one brings the project file."""
-    plant: Plant = draw(900 + number)
+    plant: SimulatedPlant = draw(900 + number)
     machine = hide_wish(plant, f"{LEAK}=middle") if number in WORN else plant
     path = folder / f"t{seed:04d}.parquet"
     run = simulate(machine, "rich" if seed % 2 else "rich_record", 1000 * number + seed, 20.0)

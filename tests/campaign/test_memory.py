@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from rtid.estimator.estimator import Estimator
-from rtid.model import Grid, Model, Term, Upkeep
+from rtid.model import Grid, Machine, Term, Upkeep
 from rtid.sim.declare import declared_model
-from rtid.sim.motion import moves
+from rtid.sim.demand import moves
 from rtid.sim.random_plants import draw
 from tests.campaign.report import leave
 from tests.estimator.aging import pieces
@@ -19,7 +19,7 @@ SEED = 8
 SHAPES = ("linear", "root", "hinge")
 
 
-def fine_model(recent_blocks: int) -> Model:
+def fine_model(recent_blocks: int) -> Machine:
     """The machine of the tracking tests with the finest grid that is asked for."""
     grid = Grid(np.linspace(0, 10, 101), np.linspace(-1e6, 9e6, 81))
     weights = [(("p_a", 1.0), ("p_b", -0.05 * k)) for k in range(20)]

@@ -11,7 +11,7 @@ import pytest
 
 from rtid.sim.hidden import hide_wish
 from rtid.sim.random_plants import draw
-from rtid.sim.run import Change
+from rtid.sim.run import PlantChange
 from tests.campaign.diagnoses import wilson
 from tests.campaign.report import leave
 from tests.campaign.watching import watched
@@ -46,7 +46,7 @@ def test_changes_that_the_plant_watch_notices(effect: str) -> None:
     found = []
     for k in range(max(2, PLANTS // 5)):
         plant = draw(FIRST + 100 + k)
-        change = Change(BEGINS_S, hide_wish(plant, f"{effect}=middle"))
+        change = PlantChange(BEGINS_S, hide_wish(plant, f"{effect}=middle"))
         found.append(watched(plant, k, SECONDS, change=change))
     after = [one.alarm_s - BEGINS_S for one in found if one.alarm_s is not None]
     noticed = [s for s in after if s >= 0]

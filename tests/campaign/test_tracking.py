@@ -10,12 +10,13 @@ import pytest
 
 from rtid.estimator.estimator import Estimator
 from rtid.estimator.published import publish
-from rtid.estimator.sums import IntArray, Sums
-from rtid.model import FloatArray, Grid, Model, Upkeep
+from rtid.estimator.sums import Sums
+from rtid.model import Grid, Machine, Upkeep
+from rtid.plain import FloatArray, IntArray
 from rtid.sim.declare import declared_model, default_grid
-from rtid.sim.motion import Motion, rich
-from rtid.sim.plant import Plant
+from rtid.sim.demand import Motion, rich
 from rtid.sim.random_plants import draw
+from rtid.sim.simulated_plant import SimulatedPlant
 from tests.campaign.report import leave
 from tests.estimator.aging import map_error, pieces, points_of, timid
 
@@ -42,7 +43,7 @@ def _times(sums: Sums, keep: float) -> Sums:
     return replace(sums, blocks=blocks, **small)
 
 
-def machine() -> tuple[Plant, Model]:
+def machine() -> tuple[SimulatedPlant, Machine]:
     """A random plant with a grid of some hundred visited blocks."""
     plant = draw(SEED)
     fine = default_grid(1.25 * plant.p_supply_pa)

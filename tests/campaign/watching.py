@@ -6,17 +6,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from rtid.daemon.core import twin
 from rtid.daemon.jobs import Handover
-from rtid.daemon.judge import Judge
-from rtid.daemon.plant import PlantWatch
-from rtid.live import Learner, catalog_of
+from rtid.daemon.map_check import Judge
+from rtid.daemon.plant_watch import PlantWatch
 from rtid.project import load
 from rtid.sim.bus import run_frames
-from rtid.sim.log import START_US
-from rtid.sim.plant import Plant
 from rtid.sim.recording import write_run
-from rtid.sim.run import Change, simulate
+from rtid.sim.run import PlantChange, simulate
+from rtid.sim.run_files import START_US
+from rtid.sim.simulated_plant import SimulatedPlant
+from rtid.trace.learner import Learner, catalog_of
 
 PUBLISH_S, PIECE = 10.0, 600  # frames: 0.2 s, as the loop hands them over
 
@@ -31,7 +30,11 @@ class Watched:
 
 
 def watched(
-    plant: Plant, seed: int, seconds: float, motion: str = "rich", change: Change | None = None
+    plant: SimulatedPlant,
+    seed: int,
+    seconds: float,
+    motion: str = "rich",
+    change: PlantChange | None = None,
 ) -> Watched:
     """A plant under the watch, until its first alarm or the end."""
     run = simulate(plant, motion, seed, seconds, change=change)
@@ -53,6 +56,8 @@ def watched(
                 return Watched(one.t_s, judged_s, worst)
         if len(chunk) and chunk[-1, 0] >= next_s:
             next_s, number = next_s + PUBLISH_S, number + 1
-            handover = Handover(number, twin(learner.estimator), publish=True, store=False)
+            handover = Handover(
+                number, learner.estimator.copy(with_history=False), publish=True, store=False
+            )
             judge = Judge(handover, handover.estimator.solution())
     return Watched(None, judged_s, worst)

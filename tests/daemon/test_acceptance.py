@@ -11,6 +11,7 @@ from rtid.daemon.acceptance import FILE, Acceptance, ask, taken, withdraw
 from rtid.daemon.analyst import Analyst
 from rtid.daemon.jobs import Answer, Handover, Recalled, Relearn
 from rtid.estimator.estimator import Estimator
+from rtid.trace.points import points_of
 from tests.faults.harness import machine
 
 REQUEST = Acceptance(1e9, "an engineer", "new hoses")
@@ -49,7 +50,9 @@ def test_the_analyst_learns_anew_and_keeps_what_was(tmp_path: Path) -> None:
     assert found.is_accepted and len(before)
     assert found.estimator.state.memory.tobytes() == alone.state.memory.tobytes()
     assert found.estimator.origin_us == learner.estimator.origin_us
-    assert {p.name for p in tmp_path.glob("state-*")} == {"state-1.before.npz", "state-0.npz"}
+    folder = tmp_path / machine().project.digest
+    assert {p.name for p in folder.glob("state-*")} == {"state-0.npz"}
+    assert [point.reason for point in points_of(folder)] == ["accept"]
     with sqlite3.connect(tmp_path / "history.sqlite") as history:
         rows = history.execute("SELECT who, reason FROM decision").fetchall()
     assert rows == [("an engineer", "new hoses")]

@@ -8,24 +8,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rtid.compare.acting import MAKERS
-from rtid.daemon.beside import load_for, on_board
+import rtid.effects
 from rtid.daemon.daemon import Bus, Daemon, DaemonError
-from rtid.diagnose.causes import causes
-from rtid.diagnose.fit import first_map
-from rtid.diagnose.view import View
-from rtid.effects import catalogue
+from rtid.effects import Effect, View, from_expression, names_of_model
+from rtid.effects.extra import VOLUME
+from rtid.effects.flow_sums import FlowSums
 from rtid.estimator.estimator import Estimator
-from rtid.estimator.state import nominal_weights
-from rtid.live import Learner, catalog_of
+from rtid.plain import FloatArray
 from rtid.project import Project
 from rtid.project.added import AddedSection, ParameterSection
 from rtid.sim.bus import run_frames
 from rtid.sim.hidden import hide_wish
-from rtid.sim.log import START_US
-from rtid.sim.plant import Plant
 from rtid.sim.run import simulate
-from rtid.store import SnapshotError, save
+from rtid.sim.run_files import START_US
+from rtid.sim.simulated_plant import SimulatedPlant
+from rtid.study.on_board import load_for, on_board
+from rtid.trace.learner import Learner, catalog_of
+from rtid.trace.snapshot import SnapshotError, save
 from tests.faults.harness import drift, machine
 
 LEAK, DELAY = "internal_leakage_laminar", "input_delay"
@@ -41,20 +40,21 @@ def with_added(*effects: AddedSection) -> Project:
     return replace(project, sections=replace(project.sections, added=effects))
 
 
-def learned(project: Project, plant: Plant) -> Estimator:
+def learned(project: Project, plant: SimulatedPlant) -> Estimator:
     """What a learner on board makes of 30 s of a plant."""
     frames = run_frames(simulate(plant, "rich", 1, 30.0), start_us=START_US)
-    learner = Learner(project.model, catalog_of(project), project.assembly)
+    learner = Learner(project.model, catalog_of(project), project.assembly, project.flows)
     learner.push(frames)
     return learner.estimator
 
 
+@pytest.mark.slow
 def test_a_leak_is_learned_beside_the_maps() -> None:
     """The maps are those of the machine without the leak; with the plain model they are not."""
-    worn = hide_wish(Plant(), f"{LEAK}=strong")
+    worn = hide_wish(SimulatedPlant(), f"{LEAK}=strong")
     (leak,) = (h.strength for h in worn.hidden)
     board = on_board(with_added(added(LEAK, "a-b", coefficient=1.2 * leak)), lambda _: None)
-    clean = learned(machine().project, Plant()).solution()
+    clean = learned(machine().project, SimulatedPlant()).solution()
     plain, beside = (learned(p, worn).solution() for p in (machine().project, board))
     found = beside.terms[0]
     print(f"leak {found / leak:.3f} of the true one; drift {drift(clean, beside):.4f} beside, "
@@ -69,6 +69,53 @@ def test_what_the_motion_does_not_show_stays_as_it_was_found() -> None:
     solution = Estimator(board.model).solution()
     assert solution.terms_theta[0] == pytest.approx(1.0, rel=1e-3)
     assert np.sqrt(solution.terms_cov[0, 0]) == pytest.approx(1e-12, rel=1e-3)
+
+
+FORMULA = "(p_a - p_b) * exp(0 * x)"  # a leak in a form that no kernel knows
+
+
+@rtid.effects.define("m3/s/Pa", chambers={"a": -1, "b": 1})
+def gap(view: View) -> FloatArray:
+    """The same in Python."""
+    return view.p["p_a"] - view.p["p_b"]
+
+
+def in_words(project: Project) -> Effect:
+    return from_expression(
+        "gap", FORMULA, "m3/s/Pa", names=names_of_model(project.model), chambers={"a": -1, "b": 1}
+    )
+
+
+def with_own(effect: Effect, leak: float) -> Project:
+    project = with_added(added("gap", "a-b", coefficient=leak))
+    return on_board(replace(project, effects=(effect,)), lambda _: None)
+
+
+def test_a_flow_that_no_kernel_knows_is_learned_as_well() -> None:
+    """Evaluated beside the kernels, it gives what the term of a leak gives, to the last percent."""
+    worn = hide_wish(SimulatedPlant(), f"{LEAK}=strong")
+    (leak,) = (h.strength for h in worn.hidden)
+    board = with_own(in_words(machine().project), 1.2 * leak)
+    assert [s.kind for s in board.model.signals][-1] == VOLUME
+    found = 1.2 * leak * learned(board, worn).solution().terms_theta[0]
+    print(f"leak {found / leak:.4f} of the true one")
+    assert found == pytest.approx(leak, rel=0.1)
+
+
+def test_live_flows_do_not_depend_on_how_samples_come() -> None:
+    """Bit for bit, and a function gives what a formula gives."""
+    project = machine().project
+    chunk = machine().learner().push(machine().frames[:3000])
+    flows = with_own(in_words(project), 5e-12).flows
+    whole, pieces = FlowSums(flows).with_flows(chunk), FlowSums(flows)
+    cuts = np.split(chunk, [0, 1, 2, 2, 7, 100, 101, 500])  # also none: a tick of the daemon
+    np.testing.assert_array_equal(np.concatenate([pieces.with_flows(c) for c in cuts]), whole)
+    drop = chunk[:, 2 + project.model.column("p_a")] - chunk[:, 2 + project.model.column("p_b")]
+    flowed = 5e-12 * 0.5 * (drop[1:] + drop[:-1]) * np.diff(chunk[:, 0])
+    np.testing.assert_allclose(np.diff(whole[:, -1]), flowed, atol=1e-9 * np.abs(flowed).max())
+    few = chunk[:300]
+    in_python = FlowSums(with_own(gap, 5e-12).flows).with_flows(few)
+    np.testing.assert_allclose(in_python[:, -1], whole[:300, -1], rtol=1e-9, atol=1e-18)
 
 
 def test_what_cannot_run_live_is_told(tmp_path: Path) -> None:
@@ -90,21 +137,6 @@ def test_a_snapshot_says_what_it_was_learned_beside(tmp_path: Path) -> None:
         assert len(effects) == live == len(estimator.model.terms)
     with pytest.raises(SnapshotError):
         load_for(path, machine().project)
-
-
-def test_parameters_of_the_catalogue_are_those_of_the_columns() -> None:
-    """Size first, then the shape in its order: what `on_board` takes them for."""
-    frames = machine().frames[:6000]
-    learner = machine().learner()
-    chunk = learner.push(frames)
-    model, weights = machine().project.model, nominal_weights(machine().project.model)
-    view = View.of(model, chunk, weights, first_map(model, chunk, weights))
-    pages = catalogue()
-    seen = {c.candidate.effect: c.candidate for c in causes(view) if c.candidate.effect in MAKERS}
-    assert len(seen) >= 8
-    for effect, candidate in seen.items():
-        names = [parameter.name for parameter in pages[effect].parameters]
-        assert names[1:] == list(candidate.shape_names)[: len(names) - 1], effect
 
 
 def test_noise_that_is_to_be_estimated_is_refused_at_the_start(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from rtid.estimator.estimator import Estimator
 from rtid.excite import library
 from rtid.project import Project, load
 from rtid.sim.run import simulate
-from rtid.store import Generations
+from rtid.trace.snapshot import Generations
 from tests.excite.machines import machine, write_project
 
 NUMBER, LEAK = 7, "external_leakage_laminar"
@@ -60,10 +60,11 @@ def test_the_coach_is_asked_once_there_is_a_snapshot_and_now_and_then(
     monkeypatch.setattr(coaching, "Helper", Remembering)
     made = list[Remembering]()
     monkeypatch.setattr(Remembering, "made", made)
-    coach, folder = Coaching(project, tmp_path, lambda _: None), tmp_path
+    folder = Generations(tmp_path, project.digest).folder
+    coach = Coaching(project, folder, lambda _: None)
     coach.look(Estimator(project.model))
     assert not made, "nothing is saved yet"
-    estimator = learned(project, folder, 4.0)
+    estimator = learned(project, tmp_path, 4.0)
     coach.look(estimator)
     coach.look(estimator)
     (helper,) = made
@@ -83,6 +84,7 @@ def test_the_coach_is_asked_once_there_is_a_snapshot_and_now_and_then(
     assert made[1].is_stopped and not coach.is_running, "it has taken too long"
 
 
+@pytest.mark.slow
 def test_the_coach_says_what_excite_after_the_same_snapshot_says(
     project: Project,
     tmp_path: Path,
@@ -95,7 +97,7 @@ def test_the_coach_says_what_excite_after_the_same_snapshot_says(
     monkeypatch.setattr(library, "PASS_STEPS", ((0.5, 0.07),))
     monkeypatch.setattr(library, "ZIGZAGS", (0.3,))
     learned(project, tmp_path, 4.0)
-    snapshot = next(tmp_path.glob("state-*.npz"))
+    snapshot = next(tmp_path.glob("*/state-*.npz"))
     told = answer(jobs.Coach(str(snapshot), np.empty((0, 0))), project)
     assert isinstance(told, jobs.Coached) and told.advice is not None, told
     advice = told.advice

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import time
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,15 +14,19 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rtid.apply.reach import is_running
+from rtid.cli import main
 from rtid.daemon import jobs
-from rtid.daemon.acceptance import Acceptance
+from rtid.daemon.acceptance import FILE, Acceptance, ask
+from rtid.daemon.daemon import _locked
 from rtid.daemon.health import Health
 from rtid.daemon.keeper import BEGINS_S, Keeper
-from rtid.daemon.lag import Lag
-from rtid.daemon.status import Advice
+from rtid.daemon.lag import LagMeter
+from rtid.daemon.loop import Loop
+from rtid.daemon.status import Advice, read, write
 from rtid.daemon.teller import Facts
 from rtid.estimator.estimator import Estimator
-from rtid.loop.loop import Loop
+from rtid.trace.snapshot import Generations
 from tests.faults.harness import machine
 
 REQUEST = Acceptance(1e9, "an engineer", "new hoses")
@@ -32,8 +39,8 @@ def keeper(tmp_path: Path) -> Keeper:
     chunk = learner.push(machine().frames[:30_000])
     core = SimpleNamespace(
         learner=learner, source=SimpleNamespace(is_down=False, is_over=False, queued=0),
-        health=Health(machine().project, learner), lag=Lag(), frames=30_000, samples=len(chunk),
-        newest_s=float(chunk[-1, 0]), busy=False, swap=None,
+        health=Health(machine().project, learner), lag=LagMeter(), frames=30_000,
+        samples=len(chunk), newest_s=float(chunk[-1, 0]), busy=False, swap=None, is_proving=False,
         notifier=SimpleNamespace(tell=lambda *_: None),
     )  # fmt: skip
     diagnosing = SimpleNamespace(
@@ -116,3 +123,113 @@ def test_the_coach_is_asked_while_the_machine_learns(keeper: Keeper) -> None:
     keeper._listen()
     keeper._tell()
     assert told in put and keeper.status.advice == Advice(1e9, "go on")
+
+
+def laid(path: Path, what: str) -> None:
+    """Something else in place of a file of the state folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if what == "fifo":
+        os.mkfifo(path)
+    elif what == "folder":
+        path.mkdir()
+    elif what == "dangling link":
+        path.symlink_to(path.with_name("nowhere"))
+    elif what == "loop":
+        path.symlink_to(path)
+    elif what == "link to a device":
+        path.symlink_to("/dev/zero")
+    else:  # not to be read, but by root, to whom it is no request
+        path.write_bytes(b"\0")
+        path.chmod(0)
+
+
+KINDS = ("fifo", "folder", "dangling link", "loop", "link to a device", "unreadable")
+
+
+@pytest.mark.timeout(30)
+@pytest.mark.parametrize("what", KINDS)
+@pytest.mark.parametrize("name", ["accept.json", "status.json", "status.json.part", "state-0.npz"])
+def test_nothing_that_lies_in_the_state_folder_stops_the_keeper(
+    name: str, what: str, keeper: Keeper, tmp_path: Path
+) -> None:
+    """It goes on to tell; a request of a person who clears up is heard."""
+    laid(tmp_path / name, what)
+    asked = list[Acceptance]()
+    vars(keeper)["_accept"] = asked.append
+    keeper.start()
+    try:
+        first = keeper.status
+        path = tmp_path / name
+        if name == "accept.json" and what == "folder":
+            wait_for(lambda: keeper._deaf != "")
+            path.rmdir()
+        acceptance_asked(tmp_path)
+        wait_for(lambda: asked == [REQUEST])
+        wait_for(lambda: keeper.status.now_unix_s > first.now_unix_s)
+    finally:
+        keeper.stop()
+    told = keeper.status.store.reason
+    assert told or read(tmp_path).pid == keeper.status.pid
+
+
+def acceptance_asked(folder: Path) -> None:
+    """As `rtid accept` does, once what lay there is gone."""
+    wait_for(lambda: not os.path.lexists(folder / FILE))
+    ask(folder, REQUEST)
+
+
+def wait_for(what: Callable[[], bool], limit_s: float = 10.0) -> None:
+    end_s = time.monotonic() + limit_s
+    while not what():
+        assert time.monotonic() < end_s, "not within the limit"
+        time.sleep(0.02)
+
+
+@pytest.mark.timeout(30)
+@pytest.mark.parametrize("what", KINDS)
+def test_nothing_in_place_of_a_snapshot_stops_a_start(what: str, tmp_path: Path) -> None:
+    project = machine().project
+    for name in ("state-0.npz", "state-1.npz.part"):
+        laid(tmp_path / project.digest / name, what)
+    generations = Generations(tmp_path, project.digest)
+    assert generations.restore(project.model).estimator is None
+    learner = machine().learner()
+    with contextlib.suppress(OSError):  # told as NOT SAVED
+        generations.save(learner.estimator)
+    assert not list(tmp_path.rglob("nowhere")), "written through a link"
+
+
+@pytest.mark.timeout(30)
+@pytest.mark.parametrize("what", [k for k in KINDS if k != "unreadable"])
+def test_no_lock_is_waited_for_or_written_through(what: str, tmp_path: Path) -> None:
+    laid(tmp_path / "lock", what)
+    with pytest.raises(OSError, match="lock"), _locked(tmp_path / "lock"):
+        pytest.fail("locked what is no file")
+    is_running(tmp_path)
+    assert not (tmp_path / "nowhere").exists()
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("what", KINDS)
+@pytest.mark.parametrize(
+    ("name", "command"),
+    [("status.json", "status"), ("offer.npz", "status"), ("history.sqlite", "apply --log")],
+)
+def test_the_commands_read_the_state_folder_or_say_why_not(
+    name: str, command: str, what: str, keeper: Keeper, tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    write(tmp_path, keeper.status)
+    (tmp_path / name).unlink(missing_ok=True)
+    laid(tmp_path / name, what)
+    words, extra = command.split(), []
+    if words[0] == "apply":
+        words.insert(1, str(machine().project.path))
+        extra = ["--state", str(tmp_path)]
+    else:
+        extra = [str(tmp_path)]
+    with pytest.raises(SystemExit) as end:
+        main.run([*words, *extra])
+    assert end.value.code in (0, 3, 4)
+    said = capsys.readouterr()
+    assert end.value.code != 3 or name in said.err

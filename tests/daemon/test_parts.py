@@ -23,13 +23,13 @@ from rtid.daemon.chronicle import Chronicle
 from rtid.daemon.collector import Collector
 from rtid.daemon.diagnosing import newest
 from rtid.daemon.helper import Helper
-from rtid.daemon.jobs import Answer, Batch, Judgement, Publication, Ready
-from rtid.daemon.lag import Lag
-from rtid.daemon.plant import PlantWatch
+from rtid.daemon.jobs import Answer, Batch, HandoverJudgement, Publication, Ready
+from rtid.daemon.lag import LagMeter
+from rtid.daemon.plant_watch import PlantWatch
 from rtid.daemon.recorder import Recorder
-from rtid.daemon.status import Alarm, BusHealth, Chamber, Estimate, LoopHealth, Status
+from rtid.daemon.status import Alarm, BusHealth, ChamberStatus, EstimateStatus, LoopHealth, Status
 from rtid.estimator.flowmap import FlowMap
-from rtid.estimator.history import History
+from rtid.estimator.ring import History
 
 START_US = 1_700_000_000_000_000
 
@@ -108,7 +108,7 @@ def test_a_clock_that_steps_begins_another_segment(tmp_path: Path) -> None:
 def watch(surprises: list[float]) -> list[tuple[float, bool]]:
     plant, events = PlantWatch(), []
     for k, surprise in enumerate(surprises):
-        if plant.push(Judgement(1 + k // 10, surprise, 1000, float(k))):
+        if plant.push(HandoverJudgement(1 + k // 10, surprise, 1000, float(k))):
             events.append((float(k), plant.changed))
     return events
 
@@ -128,16 +128,16 @@ def test_the_last_map_that_foretold_well_is_trusted() -> None:
     """A change 1 s after a handover: the map of the handover before is the safe one."""
     plant = PlantWatch()
     for k in range(30):
-        plant.push(Judgement(1 + k // 10, 1.5, 1000, float(k)))
+        plant.push(HandoverJudgement(1 + k // 10, 1.5, 1000, float(k)))
     assert plant.trusted == 3
     for k in range(30, 35):
-        plant.push(Judgement(4, 9.0, 1000, float(k)))
+        plant.push(HandoverJudgement(4, 9.0, 1000, float(k)))
     assert plant.changed and plant.trusted == 3
     assert plant.since_s == pytest.approx(29.0)
 
 
 def test_the_age_of_a_sample_is_that_beyond_the_shortest_way() -> None:
-    lag = Lag()
+    lag = LagMeter()
     assert lag.age_s(0) is None
     for k in range(2000):
         lag.note(5_000_000 + 10_000 * k, 10_000 * k + (200 if k % 3 else 900))
@@ -203,7 +203,9 @@ def test_the_history_forgets_old_estimates_and_keeps_alarms(
 def full_status() -> Status:
     return Status(
         "boom", 7, 1.0, 2.0, LoopHealth(1000.0, 10, 1, 0, {"late": 1}), BusHealth("virtual", "x"),
-        estimate=Estimate(chambers=(Chamber("a", float("nan")), Chamber("b", 9e8, 1e6))),
+        estimate=EstimateStatus(
+            chambers=(ChamberStatus("a", float("nan")), ChamberStatus("b", 9e8, 1e6))
+        ),
         alarms=(Alarm("x", 'a "quoted" text', 1.0),),
     )  # fmt: skip
 

@@ -7,7 +7,8 @@ from functools import cache
 import numpy as np
 
 from rtid.estimator.estimator import to_chunk
-from rtid.model import FloatArray, Model
+from rtid.model import Machine
+from rtid.plain import FloatArray
 from rtid.sim.declare import declared_model
 from rtid.sim.hidden import hide
 from rtid.sim.random_plants import draw
@@ -20,7 +21,7 @@ DURATION_S, HELD_OUT_S = 40.0, 30.0
 @cache
 def record(
     effect: str = "", strength: float = 0.0, seed: int = 3, motion: str = "rich"
-) -> tuple[Model, FloatArray, FloatArray]:
+) -> tuple[Machine, FloatArray, FloatArray]:
     """Model, identification and held-out part of a random machine with a hidden effect."""
     plant = draw(seed)
     if effect:

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from rtid.diagnose.candidates import Cause
-from rtid.diagnose.causes import causes
-from rtid.diagnose.causes.storage import softness
 from rtid.diagnose.fit import first_map, prepare
-from rtid.diagnose.view import View
-from rtid.model import FloatArray
+from rtid.effects.column import Cause
+from rtid.effects.laws import causes
+from rtid.effects.laws.storage import softness
+from rtid.effects.record_view import RecordView
+from rtid.plain import FloatArray
 from tests.diagnose.records import record
 
 STORAGE = ("entrained_air", "extra_dead_volume", "hose_compliance", "cavitation")
@@ -21,10 +21,10 @@ SMALL_PA = 200.0
 
 
 @cache
-def view() -> View:
+def view() -> RecordView:
     model, chunk, _ = record()
     weights = prepare(model, chunk)
-    return View.of(model, chunk, weights, first_map(model, chunk, weights))
+    return RecordView.of(model, chunk, weights, first_map(model, chunk, weights))
 
 
 def cause(effect: str, where: str = "a") -> Cause:
@@ -91,11 +91,11 @@ def test_softness_is_the_derivative_of_the_column_by_the_pressure(effect: str) -
             assert (changes[0] - changes[1]) / (2 * SMALL_PA) == pytest.approx(-taken[k], rel=0.02)
 
 
-def stored_at(own: Cause, shape: tuple[float, ...], k: int, c: int, more_pa: float) -> float:
+def stored_at(its_own: Cause, shape: tuple[float, ...], k: int, c: int, more_pa: float) -> float:
     """What the interval before sample k stores when the pressure of sample k is a little higher."""
     model, chunk, _ = record()
     changed = chunk[k - 2 : k + 3].copy()
     changed[2, 2 + model.column(model.chambers[c].pressure)] += more_pa
-    other = View.without_map(model, changed, view().compliance)
-    like = next(x for x in causes(other) if x.candidate == own.candidate)
+    other = RecordView.without_map(model, changed, view().compliance)
+    like = next(x for x in causes(other) if x.candidate == its_own.candidate)
     return float(like.column(shape)[c][1])

@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 
 from rtid.diagnose import contest as module
-from rtid.diagnose.candidates import Candidate
 from rtid.diagnose.contest import REFUTED, alike_ones, contest
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.trials import TIE, TIE_SHARE, Trial
+from rtid.effects.column import Candidate
 
 DOF = 4000.0
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from rtid.diagnose import evidence
-from rtid.diagnose.candidates import Volumes
 from rtid.diagnose.evidence import Rows, project, rows_of
+from rtid.effects.law import Volumes
 from rtid.estimator.factor import PRIOR_SD
 from rtid.estimator.record import run
 from rtid.estimator.state import build, nominal_weights
@@ -146,7 +146,7 @@ CODE = """
 import pickle, sys
 import numpy as np
 from numba import config
-from rtid.kernels import evidence, tables
+from rtid.kernels import housekeeping, record_rows
 from tests.diagnose import test_evidence as own
 
 def with_attributes(kernel):
@@ -154,7 +154,8 @@ def with_attributes(kernel):
         *(a.view((np.record, a.dtype)) for a in (engine, cells)), *rest)
 
 if config.DISABLE_JIT:  # interpreted, e.running needs a record type
-    tables.clear, evidence.integrate = map(with_attributes, (tables.clear, evidence.integrate))
+    for module, name in ((housekeeping, "clear"), (record_rows, "integrate")):
+        setattr(module, name, with_attributes(getattr(module, name)))
 with open(sys.argv[1], "rb") as file:
     model, chunk = pickle.load(file)
 gram = own.gram_of(own.rows_of(model, chunk, own.nominal_weights(model)))

@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 from rtid.diagnose import report
-from rtid.diagnose.causes.storage import ATMOSPHERE_PA
 from rtid.diagnose.diagnosis import search
-from rtid.diagnose.report import Diagnosis, Effect, diagnosis
-from rtid.diagnosed_text import sentences
+from rtid.diagnose.report import Diagnosis, FoundEffect, diagnosis
 from rtid.effects import from_expression, names_of_model
 from rtid.model import Lag
+from rtid.tell.diagnosed import sentences
 from tests.diagnose.records import record
 
 pytestmark = pytest.mark.hidden_effect
@@ -24,23 +23,23 @@ def diagnosed(effect: str = "", strength: float = 0.0, seed: int = 3) -> Diagnos
     return diagnosis(search(*record(effect, strength, seed)))
 
 
-def named(found: Diagnosis, effect: str) -> Effect:
+def named(result: Diagnosis, effect: str) -> FoundEffect:
     """The effect, or a set of at most three that holds it."""
-    for own in found.found:
+    for own in result.found:
         names = {name.split(" ")[0] for name in own.cannot_be_told_from}
         if effect == own.effect or effect in names:
             assert len(names) <= 2
             return own
-    raise AssertionError(f"{effect} is not among {found.found}, verdict {found.verdict}")
+    raise AssertionError(f"{effect} is not among {result.found}, verdict {result.verdict}")
 
 
-def size(own: Effect) -> float:
+def size(effect: FoundEffect) -> float:
     """The first parameter; of air, the isothermal share that is as soft at 2.2 MPa."""
-    value = abs(next(iter(own.parameters.values())).value)
-    kappa = own.parameters.get("polytropic_exponent")
+    value = abs(next(iter(effect.parameters.values())).value)
+    kappa = effect.parameters.get("polytropic_exponent")
     if kappa is None:
         return value
-    return float(value / kappa.value * (2.2e6 / ATMOSPHERE_PA) ** (1 - 1 / kappa.value))
+    return float(value / kappa.value * (2.2e6 / 101325.0) ** (1 - 1 / kappa.value))
 
 
 @pytest.mark.parametrize("seed", [3, 4, 5])
@@ -62,6 +61,7 @@ def test_a_lag_that_is_declared_as_anything_is_learned(seed: int) -> None:
     assert found.rho_before < 1.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("effect", "strength", "expected", "seed"),
     [
@@ -86,6 +86,7 @@ def test_an_effect_is_named_and_sized(
     assert found.heldout_residual_after_m3s < 0.3 * found.heldout_residual_before_m3s
 
 
+@pytest.mark.slow
 def test_a_late_command_is_found_from_afar() -> None:
     """12 ms: the derivative at zero delay points nowhere, exact refits do."""
     found = diagnosed("input_delay", 12e-3)
@@ -95,6 +96,7 @@ def test_a_late_command_is_found_from_afar() -> None:
     assert found.rho_before > 10 * found.rho_after
 
 
+@pytest.mark.slow
 def test_a_play_below_the_bank_is_found_from_its_first_order() -> None:
     """22 mV, where the search begins at 50: at 50 it explains nothing."""
     found = diagnosed("valve_hysteresis", 0.022)
@@ -128,6 +130,7 @@ def test_every_key_of_the_json_is_described() -> None:
         assert f"`{key}`" in described, key
 
 
+@pytest.mark.slow
 def test_an_effect_of_the_user_s_own_is_offered_and_found() -> None:
     """The same leak, unknown to the catalogue but written as a formula by the user."""
     model, chunk, held_out = record("internal_leakage_laminar", 4e-12)
@@ -139,7 +142,7 @@ def test_an_effect_of_the_user_s_own_is_offered_and_found() -> None:
         chambers={"a": -1, "b": 1},
         largest=1e-9,
     )
-    found = diagnosis(search(replace(model, own_effects=(own,)), chunk, held_out))
+    found = diagnosis(search(model, chunk, held_out, suspects=(own,)))
     names = {found.found[0].effect, *(n.split(" ")[0] for n in found.found[0].cannot_be_told_from)}
     assert names == {"gap_of_the_piston", "internal_leakage_laminar"}
 
@@ -151,4 +154,4 @@ def test_the_record_judges_where_little_of_the_held_out_part_is_known() -> None:
     assert not found.held_out_judged
     assert found.found[0].effect == "internal_leakage_laminar"
     assert np.isfinite(found.heldout_residual_after_m3s)
-    assert any("too little" in sentence for sentence in sentences(found))
+    assert any("moves too little" in sentence for sentence in sentences(found))

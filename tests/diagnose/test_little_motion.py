@@ -9,12 +9,13 @@ import pytest
 
 from rtid.diagnose.diagnosis import search
 from rtid.diagnose.report import Diagnosis, diagnosis
-from rtid.diagnosed_text import sentences
-from rtid.model import FloatArray, Model
+from rtid.model import Machine
+from rtid.plain import FloatArray
+from rtid.tell.diagnosed import sentences
 from tests.diagnose.records import record
 
 
-def judged(model: Model, chunk: FloatArray, held_out: FloatArray) -> Diagnosis:
+def judged(model: Machine, chunk: FloatArray, held_out: FloatArray) -> Diagnosis:
     return diagnosis(search(model, chunk, held_out))
 
 

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import pytest
 
-from rtid.diagnosing import diagnose_live
 from rtid.estimator.estimator import Estimator
-from rtid.model import Model, Upkeep
-from rtid.replay import NoSamplesError
+from rtid.model import Machine, Upkeep
+from rtid.study.study import diagnose_live
+from rtid.trace.reading import NoSamplesError
 from tests.diagnose.records import record
 
 
-def running(model: Model, history_s: float) -> Estimator:
+def running(model: Machine, history_s: float) -> Estimator:
     return Estimator(replace(model, upkeep=Upkeep(every_s=10.0, history_s=history_s)))
 
 

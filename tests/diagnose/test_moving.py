@@ -11,7 +11,7 @@ import pytest
 from rtid.diagnose.fit import Fit, fit, one_pass, prepare
 from rtid.diagnose.moving import REACH, Step, halfway, is_as_good, is_worse, moved
 from rtid.diagnose.revision import Revision
-from rtid.diagnose.timing import TIMINGS, Timing
+from rtid.effects.laws.timing import TIMINGS, TimingLaw
 from rtid.estimator.state import Weights
 from rtid.model import Lag
 from tests.diagnose.records import record
@@ -19,7 +19,7 @@ from tests.diagnose.records import record
 DELAY_S = 12e-3
 
 
-def timing(effect: str) -> Timing:
+def timing(effect: str) -> TimingLaw:
     return next(t for t in TIMINGS if t.effect == effect)
 
 

@@ -10,13 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from rtid.diagnose import pump
 from rtid.diagnose.experiment import varied_supply
 from rtid.diagnose.fit import one_pass, prepare
-from rtid.diagnose.pump import PUMP, demand, drawn_down
 from rtid.diagnose.revision import Revision
-from rtid.diagnose.view import View
-from rtid.model import MODE, FloatArray, Model, Signal
+from rtid.effects.laws import pump
+from rtid.effects.laws.pump import PUMP, demand, drawn_down
+from rtid.effects.record_view import RecordView
+from rtid.model import MODE, Machine, Signal
+from rtid.plain import FloatArray
 from tests.diagnose.records import record
 
 DT = 1e-3
@@ -71,7 +72,7 @@ def test_it_stays_finite_and_never_rises_above_the_set_pressure(
     assert d == pytest.approx(plain, rel=1e-9, abs=1e-6)
 
 
-def with_mode(model: Model, chunk: FloatArray, mode: FloatArray) -> tuple[Model, FloatArray]:
+def with_mode(model: Machine, chunk: FloatArray, mode: FloatArray) -> tuple[Machine, FloatArray]:
     """The same machine whose supply edges may open in mode 1 alone."""
     edges = tuple(
         replace(e, modes=(1,)) if e.source == "p_supply" else replace(e, modes=(0, 1))
@@ -84,9 +85,9 @@ def with_mode(model: Model, chunk: FloatArray, mode: FloatArray) -> tuple[Model,
 
 def test_edges_that_the_mode_keeps_shut_draw_nothing() -> None:
     model, chunk, _ = record()
-    free = demand(View.without_map(model, chunk))
+    free = demand(RecordView.without_map(model, chunk))
     mode = (np.arange(len(chunk)) % 400 < 200).astype(float)
-    held = demand(View.without_map(*with_mode(model, chunk, mode)))
+    held = demand(RecordView.without_map(*with_mode(model, chunk, mode)))
     assert free.max() > 0
     assert held == pytest.approx(np.where(mode == 1, free, 0.0))
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from rtid.diagnose.report import Diagnosis
-from rtid.diagnosing import diagnose_trace
 from rtid.project import load
+from rtid.study.study import diagnose_trace
 from tests import rig
 from tests.test_rig import real_bus_project
 
@@ -38,7 +38,9 @@ def diagnosed(shared: Path, run: int, folder: Path, project: Path = rig.PROJECT)
 
 
 @pytest.fixture(scope="module")
-def told(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], Diagnosis]:
+def diagnosis_of(
+    shared: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Callable[[int], Diagnosis]:
     """The diagnosis of a run with the one project file; each made once."""
     return cache(lambda run: diagnosed(shared, run, tmp_path_factory.mktemp(f"rig{run}")))
 
@@ -48,16 +50,20 @@ def missed(what: str) -> pytest.MarkDecorator:
     return pytest.mark.xfail(strict=True, reason=what)
 
 
-def test_the_rig_as_it_was_built_matches(told: Callable[[int], Diagnosis]) -> None:
-    found = told(CLEAN)
+@pytest.mark.slow
+def test_the_rig_as_it_was_built_matches(diagnosis_of: Callable[[int], Diagnosis]) -> None:
+    found = diagnosis_of(CLEAN)
     assert (found.verdict, found.found) == ("matches", ())
     assert found.heldout_residual_before_m3s < 1.1 * found.noise_floor_m3s
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("run", HIDDEN)
-def test_what_was_hidden_is_named_and_sized(told: Callable[[int], Diagnosis], run: int) -> None:
+def test_what_was_hidden_is_named_and_sized(
+    diagnosis_of: Callable[[int], Diagnosis], run: int
+) -> None:
     """One name, its size within 15 %, and the held-out error falls with it."""
-    found, (effect, parameter, true) = told(run), HIDDEN[run]
+    found, (effect, parameter, true) = diagnosis_of(run), HIDDEN[run]
     assert found.verdict == "missing"
     assert [own.effect for own in found.found] == [effect]
     if parameter:
@@ -73,24 +79,25 @@ TIMES_CLEAN = {5: "1.86", 8: "2.66", 10: "2.98", 11: "1.71", 13: "3.12", 14: "1.
     "run", [pytest.param(k, marks=[missed(REMAINS[k])] if k in REMAINS else []) for k in HIDDEN]
 )
 def test_the_residual_falls_to_the_sensors_noise(
-    told: Callable[[int], Diagnosis], run: int
+    diagnosis_of: Callable[[int], Diagnosis], run: int
 ) -> None:
     """The residual variance comes back to at most 1.1 times the noise."""
-    assert told(run).rho_after <= 1.1
+    assert diagnosis_of(run).rho_after <= 1.1
 
 
 @pytest.mark.parametrize(
     "run", [pytest.param(k, marks=missed(f"{t} times")) for k, t in TIMES_CLEAN.items()]
 )
 def test_the_error_falls_to_that_of_the_rig_as_it_was_built(
-    told: Callable[[int], Diagnosis], run: int
+    diagnosis_of: Callable[[int], Diagnosis], run: int
 ) -> None:
     """Held out: at most 1.15 times what the model leaves where nothing is hidden, of the flow."""
-    found, clean = told(run), told(CLEAN)
+    found, clean = diagnosis_of(run), diagnosis_of(CLEAN)
     left = found.heldout_residual_after_m3s / found.rms_flow_m3s
     assert left <= 1.15 * clean.heldout_residual_before_m3s / clean.rms_flow_m3s
 
 
+@pytest.mark.slow
 def test_an_undeclared_lag_is_found(shared: Path, tmp_path: Path) -> None:
     """1.3 +- 0.2 ms; that it is not a delay of as much cannot be told from this motion."""
     text = rig.PROJECT.read_text()
@@ -104,6 +111,7 @@ def test_an_undeclared_lag_is_found(shared: Path, tmp_path: Path) -> None:
     assert own.parameters["time_constant"].value == pytest.approx(1.3e-3, abs=0.2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("run", "effect"), [(1, ""), (5, "internal_leakage_laminar")])
 def test_a_real_bus_of_unknown_ages_tells_the_same(
     shared: Path, tmp_path: Path, run: int, effect: str

@@ -10,13 +10,13 @@ from rtid.diagnose.fit import one_pass, prepare
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.search import Search
 from rtid.diagnose.thinned import Thinning
-from rtid.diagnose.timing import TIMINGS, Timing
-from rtid.diagnose.view import View
+from rtid.effects.laws.timing import TIMINGS, TimingLaw
+from rtid.effects.record_view import RecordView
 from rtid.kernels.engine import GAP_FLAG
 from tests.diagnose.records import record
 
 
-def timing(effect: str) -> Timing:
+def timing(effect: str) -> TimingLaw:
     return next(t for t in TIMINGS if t.effect == effect)
 
 
@@ -77,7 +77,7 @@ def test_a_bank_ends_where_it_falls() -> None:
 def test_smooth_is_savitzky_and_golay_s(derivative: int) -> None:
     """Parabolas over the window, also at both ends."""
     model, chunk, _ = record()
-    view = View.without_map(model, chunk)
+    view = RecordView.without_map(model, chunk)
     p = view.pressure(0)
     half = round(0.02 / view.step_s)
     expected = savgol_filter(p, 2 * half + 1, 2, deriv=derivative, delta=view.step_s)

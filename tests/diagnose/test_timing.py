@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from rtid.diagnose import timing
-from rtid.diagnose.timing import TIMINGS, delayed, lagged, played, second_order
+from rtid.effects.laws import timing
+from rtid.effects.laws.timing import TIMINGS, delayed, lagged, played, second_order
 
 DT = 1e-3
 
@@ -69,7 +69,7 @@ def test_play_stays_within_half_its_width(seed: int, width: float) -> None:
 
 
 @pytest.mark.parametrize("effect", TIMINGS, ids=lambda t: f"{t.effect}{t.own_spools}")
-def test_nothing_is_left_of_the_command_s_steady_value(effect: timing.Timing) -> None:
+def test_nothing_is_left_of_the_command_s_steady_value(effect: timing.TimingLaw) -> None:
     """A constant command reaches the spool unchanged; valves of their own rest at zero."""
     u = np.full(300, 2.0)
     psi = effect.bank[0]
@@ -78,7 +78,7 @@ def test_nothing_is_left_of_the_command_s_steady_value(effect: timing.Timing) ->
 
 
 @pytest.mark.parametrize("effect", TIMINGS, ids=lambda t: f"{t.effect}{t.own_spools}")
-def test_derivatives_point_the_way(effect: timing.Timing) -> None:
+def test_derivatives_point_the_way(effect: timing.TimingLaw) -> None:
     """A small step of each parameter changes the command as its derivative says."""
     u, psi = np.cumsum(steps(5)) / 50, effect.bank[1]
     for k, value in enumerate(psi):

@@ -9,28 +9,29 @@ import numpy as np
 
 from rtid.estimator.estimator import to_chunk
 from rtid.estimator.flowmap import FlowMap
-from rtid.model import FloatArray, Model
-from rtid.sim.motion import Motion, rich, swept_sine
-from rtid.sim.plant import EDGES, Plant
+from rtid.model import Machine
+from rtid.plain import FloatArray
+from rtid.sim.demand import Motion, rich, swept_sine
 from rtid.sim.run import simulate
+from rtid.sim.simulated_plant import EDGES, SimulatedPlant
 
 PIECE_S = 10.0
 
 
-def with_gain(plant: Plant, factor: float) -> Plant:
+def with_gain(plant: SimulatedPlant, factor: float) -> SimulatedPlant:
     """The same machine with all valve gains times a factor."""
     valves = tuple(replace(v, gain=v.gain * factor) for v in plant.valves)
     return replace(plant, valves=valves)
 
 
-def timid(plant: Plant, rng: np.random.Generator, duration_s: float) -> FloatArray:
+def timid(plant: SimulatedPlant, rng: np.random.Generator, duration_s: float) -> FloatArray:
     """A small slow motion about the middle: few blocks are visited."""
     return swept_sine(plant, rng, duration_s, 0.02, (0.1, 0.2))
 
 
 def pieces(
-    plant: Plant,
-    model: Model,
+    plant: SimulatedPlant,
+    model: Machine,
     gain: Callable[[float], float],
     duration_s: float,
     start_s: float = 0.0,
@@ -46,7 +47,7 @@ def pieces(
         yield at_s + PIECE_S, chunk
 
 
-def points_of(plant: Plant, model: Model, duration_s: float = 60.0) -> list[FloatArray]:
+def points_of(plant: SimulatedPlant, model: Machine, duration_s: float = 60.0) -> list[FloatArray]:
     """Per edge: opening, pressure drop and true flow (n, 3) along a record of its own."""
     run = simulate(plant, rich, 9999, duration_s)
     value = {name: run.truth.signals[:, k] for k, name in enumerate(run.samples.names)}

@@ -16,14 +16,14 @@ from rtid.model import (
     Chamber,
     Edge,
     Filter,
-    FloatArray,
     Gates,
     Grid,
     Lag,
-    Model,
+    Machine,
     Signal,
     Term,
 )
+from rtid.plain import FloatArray
 from rtid.sim.declare import declared_model
 from rtid.sim.random_plants import draw
 from rtid.sim.run import simulate
@@ -38,11 +38,11 @@ ENDS = (
 NAMES = ("u", "p_a", "p_b", "p_s", "p_t", "x")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Case:
     """A declaration and a record for it."""
 
-    model: Model
+    model: Machine
     t_s: FloatArray
     values: FloatArray
     flags: FloatArray
@@ -104,7 +104,7 @@ def draw_case(
 
 def draw_model(
     rng: np.random.Generator, form: str, chambers: int, blocks: int, way: int = 1
-) -> Model:
+) -> Machine:
     """A declaration with grids of unequal spacing."""
     sizes = rng.uniform(0.7, 1.3, 4)
     ends = ENDS if chambers == 2 else ENDS[:2]
@@ -117,7 +117,7 @@ def draw_model(
         Chamber("a", "p_a", 2e-3 * sizes[1], way, 6e-4),
         Chamber("b", "p_b", 1e-3 * sizes[2], -way, 9e-4),
     )
-    return Model(
+    return Machine(
         signals=(
             Signal("u", COMMAND, "V"),
             *pressures,
@@ -135,7 +135,7 @@ def draw_model(
     )
 
 
-def with_modes(model: Model) -> Model:
+def with_modes(model: Machine) -> Machine:
     """Three modes: all edges, a regenerative one with the cross-port edge, one without it."""
     allowed = {"ab": (0, 1), "pb": (0, 2), "bt": (0, 2)}
     return replace(
@@ -146,7 +146,7 @@ def with_modes(model: Model) -> Model:
     )
 
 
-def draw_term(rng: np.random.Generator, model: Model, k: int) -> Term:
+def draw_term(rng: np.random.Generator, model: Machine, k: int) -> Term:
     """A shared flow of the pressures and the position; every shape and kind of rate in turn."""
     weights = tuple((name, float(rng.normal())) for name in NAMES[1:5])
     position = ("x", float(1e7 * rng.normal()))

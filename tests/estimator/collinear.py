@@ -14,13 +14,14 @@ from dataclasses import replace
 import numpy as np
 
 from rtid.estimator.estimator import to_chunk
-from rtid.model import Filter, FloatArray, Grid
+from rtid.model import Filter, Grid
+from rtid.plain import FloatArray
+from rtid.sim.closed_loop import DITHER, LOAD, V_REF, X_REF
 from rtid.sim.declare import declared_model
-from rtid.sim.loop import DITHER, LOAD, V_REF, X_REF
-from rtid.sim.motion import DT_S, rich
-from rtid.sim.plant import Plant
+from rtid.sim.demand import DT_S, rich
 from rtid.sim.random_plants import draw
 from rtid.sim.run import simulate
+from rtid.sim.simulated_plant import SimulatedPlant
 from tests.estimator.cases import Case
 from tests.estimator.rivals import Recursion, unknown
 
@@ -28,7 +29,9 @@ SETTLE_S, CREEP_S, CREEP_MPS = 1.0, 2.0, 0.02
 GRID = Grid(np.array([1.0, 2.0, 3.0, 4.5, 10.0]), np.array([-1.0, 1.0, 2.5, 4.0, 6.0, 10.0]) * 1e6)
 
 
-def creeping_start(plant: Plant, rng: np.random.Generator, duration_s: float) -> FloatArray:
+def creeping_start(
+    plant: SimulatedPlant, rng: np.random.Generator, duration_s: float
+) -> FloatArray:
     """Steady stroke at constant supply and load, then the rich motion from where it is."""
     drive = rich(plant, rng, duration_s)
     first = round((SETTLE_S + CREEP_S) / DT_S)

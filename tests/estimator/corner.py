@@ -12,12 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rtid.estimator.estimator import to_chunk
-from rtid.estimator.record import fit_record
-from rtid.model import FloatArray, Grid
+from rtid.model import Grid
+from rtid.plain import FloatArray
 from rtid.sim.declare import declared_model, default_grid
-from rtid.sim.plant import Plant
 from rtid.sim.random_plants import draw
 from rtid.sim.run import SimulationError, simulate
+from rtid.sim.simulated_plant import SimulatedPlant
+from rtid.study.known_effects import learned
 
 FIRST_SEED, RECORD_S, CORNER_V = 200, 15.0, 0.01
 IDENTIFIABLE = 0.05  # relative standard deviation of beta
@@ -58,7 +59,7 @@ class Corner:
         )
 
 
-def sharp(seed: int) -> Plant:
+def sharp(seed: int) -> SimulatedPlant:
     """A random machine whose valves open abruptly."""
     plant = draw(seed)
     return replace(plant, valves=tuple(replace(v, corner_v=CORNER_V) for v in plant.valves))
@@ -80,7 +81,7 @@ def fits(seeds: Iterable[int], motion: str) -> Corner:
         except SimulationError:
             continue
         model = declared_model(plant, grid=coarse_grid(plant.p_supply_pa), seed=seed)
-        fit = fit_record(model, to_chunk(model, run.samples, 0))
+        fit = learned(model, to_chunk(model, run.samples, 0))
         miss = fit.solution.beta_pa - plant.beta_pa
         error.append(miss / plant.beta_pa)
         z.append(miss / fit.solution.beta_sd_pa)

@@ -17,7 +17,8 @@ from padasip.filters import FilterRLS
 
 from benchmarks.rls import START, WN_RAD_S, ZETA, Front, N
 from rtid.kernels.holds import second_order
-from rtid.model import FloatArray, Model
+from rtid.model import Machine
+from rtid.plain import FloatArray
 
 
 class Recursion(Protocol):
@@ -110,7 +111,9 @@ def unknown() -> tuple[FloatArray, FloatArray]:
 class OneBlock:
     """Rows of chamber a, whose supply edge is one block over u and dp; filter at any rate."""
 
-    def __init__(self, model: Model, u_v: tuple[float, float], dp_pa: tuple[float, float]) -> None:
+    def __init__(
+        self, model: Machine, u_v: tuple[float, float], dp_pa: tuple[float, float]
+    ) -> None:
         self.model, self.u_v, self.dp_pa = model, u_v, dp_pa
 
     def rows(self, chunk: FloatArray) -> FloatArray:

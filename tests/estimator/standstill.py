@@ -17,11 +17,12 @@ from rtid.estimator.flowmap import VALID, FlowMap
 from rtid.estimator.published import publish
 from rtid.estimator.solution import Solution
 from rtid.kernels.layout import TERMS
-from rtid.model import FloatArray, Grid, Model, Upkeep
+from rtid.model import Grid, Machine, Upkeep
+from rtid.plain import FloatArray
 from rtid.sim.declare import declared_model
-from rtid.sim.plant import PA
 from rtid.sim.random_plants import draw
 from rtid.sim.run import P_A, P_B, P_S, P_T, Run, U, V, simulate
+from rtid.sim.simulated_plant import PA
 from tests.estimator.rivals import OneBlock, Recursion, unknown
 
 WAYS = ("shut", "in the overlap", "against the stop")
@@ -64,7 +65,7 @@ def motion() -> Run:
     return simulate(draw(SEED), "rich", SEED, MOTION_S)
 
 
-def forgetful(grid: Grid | None, forget_s: float) -> Model:
+def forgetful(grid: Grid | None, forget_s: float) -> Machine:
     """The declaration, with the time constant of blocks and shared unknowns; grid: the default."""
     upkeep = Upkeep(every_s=60.0, forget_s=forget_s, shared_forget_s=forget_s)
     return replace(declared_model(motion().plant, grid=grid), upkeep=upkeep)

@@ -8,17 +8,8 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rtid.model import (
-    BASES,
-    BOTH,
-    COMMAND_ONLY,
-    DROP_ONLY,
-    TAYLOR,
-    Edge,
-    FloatArray,
-    Grid,
-    Model,
-)
+from rtid.model import BASES, BOTH, COMMAND_ONLY, DROP_ONLY, TAYLOR, Edge, Grid, Machine
+from rtid.plain import FloatArray
 from tests.estimator.cases import Case, draw_case
 from tests.estimator.test_batch import SUMS_LIMIT, differences
 
@@ -68,7 +59,7 @@ def _ends(border: FloatArray) -> FloatArray:
     return border[[0, -1]]
 
 
-def text(model: Model) -> str:
+def text(model: Machine) -> str:
     """What a failure is about."""
     edges = [
         f"{e.name} {e.basis} {e.terms} {e.grid.shape} {e.safe_band_v:.2g}" for e in model.edges

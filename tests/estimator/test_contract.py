@@ -83,7 +83,7 @@ def test_settling_twice_is_settling_once() -> None:
 UNCOMPILED = """
 import pathlib, sys
 import numba, numpy as np
-from rtid.kernels import engine, layout, tables
+from rtid.kernels import engine, housekeeping, layout
 from tests.estimator.cases import draw_case
 from tests.estimator.test_contract import learned
 
@@ -93,11 +93,11 @@ if numba.config.DISABLE_JIT:  # interpreted, e.running needs a record type
     def with_attributes(kernel):
         return lambda *arrays: kernel(*(a.view((np.record, a.dtype)) for a in arrays))
     for name in ("settle", "clear"):
-        setattr(tables, name, with_attributes(getattr(tables, name)))
+        setattr(housekeeping, name, with_attributes(getattr(housekeeping, name)))
 for form in ("integral", "carry"):
     case = draw_case(11, form, n=300, faults=1, chatter_pa=5e4)
     state = learned(case, 4096)
-    tables.settle(state.engine, state.closed, state.blocks, state.pairs)
+    housekeeping.settle(state.engine, state.closed, state.blocks, state.pairs)
     np.savez(pathlib.Path(sys.argv[1]) / form, shared=state.engine[0]["shared"],
              own=state.blocks["gram"], cross=state.blocks["shared"], pairs=state.pairs["gram"],
              counters=state.engine[0]["counters"], cov=state.engine[0]["cov"])

@@ -10,7 +10,7 @@ import pytest
 from rtid.estimator.factor import Factor, factorize
 from rtid.estimator.sums import Normal
 from rtid.kernels.normal import residual
-from rtid.model import FloatArray
+from rtid.plain import FloatArray
 
 
 def nearly_alike(seed: int, n: int, spread: float) -> tuple[FloatArray, FloatArray]:

@@ -20,7 +20,8 @@ from numba import njit
 from numpy.typing import DTypeLike, NDArray
 
 from rtid.estimator.batch import fit_batch
-from rtid.model import FloatArray, Grid
+from rtid.model import Grid
+from rtid.plain import FloatArray
 from tests.estimator.cases import plant_case
 
 WRONG_AFTER, INDEFINITE_AFTER = 10_000, 2_000_000  # rows

@@ -9,7 +9,7 @@ import numpy as np
 from rtid.estimator.forgetting import CHANGED, _lose, faded
 from rtid.estimator.state import build
 from rtid.estimator.sums import Normal, Sums
-from rtid.model import FloatArray
+from rtid.plain import FloatArray
 from tests.estimator.cases import draw_case
 
 NOTHING_CHANGED = np.zeros(0, np.int64)

@@ -20,7 +20,7 @@ from rtid.model import (
     Edge,
     Gates,
     Grid,
-    Model,
+    Machine,
     Signal,
     Term,
 )
@@ -91,7 +91,7 @@ def drive_case(form: str, basis: str) -> Case:
         "amplifier", NONE, NONE, "u", 1, grid, -np.inf, 500.0, 1.0,
         basis=basis, terms=COMMAND_ONLY, signs=(("speed", 1),),
     )  # fmt: skip
-    model = Model(
+    model = Machine(
         signals=(
             Signal("u", COMMAND),
             Signal("load", POSITION, noise=0.01),

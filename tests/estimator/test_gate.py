@@ -23,13 +23,13 @@ from rtid.model import (
     PRESSURE,
     Chamber,
     Edge,
-    FloatArray,
     Gates,
     Grid,
-    Model,
+    Machine,
     Signal,
     Upkeep,
 )
+from rtid.plain import FloatArray
 from rtid.sim.declare import declared_model
 from rtid.sim.random_plants import draw
 from rtid.sim.run import simulate
@@ -42,11 +42,11 @@ OPEN = replace(UPKEEP, innovation_sd=0.0)
 LEARNED, RATE = 30_000, 1000  # samples before the gate is used, samples per second
 
 
-def exact_model(upkeep: Upkeep, gates: Gates | None = None) -> Model:
+def exact_model(upkeep: Upkeep, gates: Gates | None = None) -> Machine:
     """Two edges in and out of one chamber on a grid of 3 x 4 blocks each."""
     ends = (("pa", "p_s", "p_a", 1), ("at", "p_a", "p_t", -1))
     grid = Grid(U_V, DP_PA)
-    return Model(
+    return Machine(
         signals=(
             Signal("u", COMMAND),
             *(Signal(p, PRESSURE, "Pa", 5e3, 0.0, -1e6, 1e8) for p in ("p_a", "p_s", "p_t")),

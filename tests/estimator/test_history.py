@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rtid.estimator.history import History, HistoryError
-from rtid.model import FloatArray
+from rtid.estimator.ring import History, HistoryError
+from rtid.plain import FloatArray
 
 SIGNALS = 3
 

@@ -46,23 +46,25 @@ def test_filter_step_is_the_matrix_exponential(
     np.testing.assert_allclose(b.sum(axis=1), exact[:2, 2], rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("held", [True, False])
-def test_filter_follows_held_and_linear_inputs(held: bool) -> None:
+@pytest.mark.parametrize("is_held", [True, False])
+def test_filter_follows_held_and_linear_inputs(is_held: bool) -> None:
     rng, wn, zeta, dt = np.random.default_rng(3), 2 * np.pi * 10, 0.8, 2e-3
     u = rng.standard_normal(60)
     a, b = np.empty((2, 2)), np.empty((2, 2))
     second_order(wn, zeta, dt, a, b)
     x, out = np.zeros(2), []
-    for start, end in zip(u[:-1], u[:-1] if held else u[1:], strict=True):
+    for start, end in zip(u[:-1], u[:-1] if is_held else u[1:], strict=True):
         x = a @ x + b @ [start, end]
         out.append(x.copy())
-    fine = 200 if held else 1
+    fine = 200 if is_held else 1
     t = np.arange(59 * fine + 1) * dt / fine
-    given = np.repeat(u[:-1], fine) if held else u
-    if held:
+    given = np.repeat(u[:-1], fine) if is_held else u
+    if is_held:
         given = np.append(given, given[-1])
     big_a, big_b = system(wn, zeta)
-    exact = lsim((big_a, big_b[:, None], np.eye(2), np.zeros((2, 1))), given, t, interp=not held)[1]
+    exact = lsim(
+        (big_a, big_b[:, None], np.eye(2), np.zeros((2, 1))), given, t, interp=not is_held
+    )[1]
     np.testing.assert_allclose(np.array(out), exact[fine::fine], atol=1e-11)
 
 

@@ -11,18 +11,18 @@ from rtid.estimator.limits import most_open
 from rtid.estimator.record import fit_record
 from rtid.estimator.solution import solve
 from rtid.estimator.state import build
-from rtid.model import LAPPED, Filter, Grid, Model, Signal
+from rtid.model import LAPPED, Filter, Grid, Machine, Signal
 from rtid.sim.declare import declared_model, uniform_grid
-from rtid.sim.plant import Plant
 from rtid.sim.run import Sensors, simulate
+from rtid.sim.simulated_plant import SimulatedPlant
 from tests.estimator.cases import Case, draw_case
 from tests.estimator.test_batch import check
 
 WIDE = uniform_grid((-11, 11, 6), (-9e6, 9e6, 4))
 
 
-def five_edges(safe_band_v: float) -> Model:
-    plant = replace(Plant(), directions=(1, -1, -1, 1, -1))
+def five_edges(safe_band_v: float) -> Machine:
+    plant = replace(SimulatedPlant(), directions=(1, -1, -1, 1, -1))
     return declared_model(plant, grid=WIDE, safe_band_v=safe_band_v)
 
 
@@ -33,7 +33,7 @@ def test_too_many_blocks_open_at_once_are_refused() -> None:
     model = five_edges(-np.inf)
     six = [*model.edges, replace(model.edges[0], name="sixth")]
     lapped = replace(model, edges=tuple(replace(e, basis=LAPPED) for e in six))
-    with pytest.raises(ValueError, match="24 blocks that are open at once, at most 20"):
+    with pytest.raises(ValueError, match="24 blocks that are open at once; at most 20"):
         build(lapped)
 
 
@@ -41,10 +41,10 @@ def test_too_many_blocks_open_at_once_are_refused() -> None:
     ("change", "message"),
     [
         ({"filter": Filter(zeta=1.0)}, "damping 1: must lie between 0 and 1"),
-        ({"signals": 30}, "30 signals, at most 24"),
-        ({"grid": Grid(np.linspace(0, 1, 131), np.array([0.0, 1.0]))}, "edge pa: 131 borders"),
-        ({"noise": "x"}, "signal x: noise and resolution are zero"),
-        ({"noise": "p_b"}, "signal p_b: noise and resolution are zero"),
+        ({"signals": 30}, "30 signals; at most 24"),
+        ({"grid": Grid(np.linspace(0, 1, 131), np.array([0.0, 1.0]))}, "edges.pa: 131 borders"),
+        ({"noise": "x"}, "signals.x: noise and resolution are zero"),
+        ({"noise": "p_b"}, "signals.p_b: noise and resolution are zero"),
     ],
 )
 def test_what_the_kernels_cannot_hold_is_refused(change: dict[str, object], message: str) -> None:
@@ -78,7 +78,7 @@ def test_a_reversal_within_one_sample_changes_all_edges_at_once(form: str) -> No
     check(Case(model, case.t_s, values, case.flags))
 
 
-def sensible(model: Model, chunk: np.ndarray) -> None:
+def sensible(model: Machine, chunk: np.ndarray) -> None:
     state = build(model)
     state.advance(np.ascontiguousarray(chunk))
     solution = solve(model, state)
@@ -103,7 +103,7 @@ def test_no_row_at_all() -> None:
 
 def standing_still(noise: float, seed: int) -> np.ndarray:
     """20 s with the valves shut; sensor noise in units of the declared one."""
-    run = simulate(Plant(), "standstill", 1, 0.1)
+    run = simulate(SimulatedPlant(), "standstill", 1, 0.1)
     rng = np.random.default_rng(seed)
     values = np.tile(run.truth.signals[-1], (20000, 1))
     values += noise * rng.standard_normal(values.shape) * Sensors().noise()
@@ -114,12 +114,12 @@ def standing_still(noise: float, seed: int) -> np.ndarray:
 @pytest.mark.parametrize("noise", [1.0, 0.5, 0.0])
 def test_standing_still_breaks_nothing(noise: float) -> None:
     for seed in range(5):
-        sensible(declared_model(Plant()), standing_still(noise, seed))
+        sensible(declared_model(SimulatedPlant()), standing_still(noise, seed))
 
 
 def test_standing_still_tells_nothing_of_beta() -> None:
-    model = declared_model(Plant())
+    model = declared_model(SimulatedPlant())
     for seed in range(5):
         solution = fit_record(model, standing_still(1.0, seed)).solution
-        error = np.abs(solution.compliance - 1 / Plant().beta_pa)
+        error = np.abs(solution.compliance - 1 / SimulatedPlant().beta_pa)
         assert (error < 2 * np.sqrt(np.diag(solution.compliance_cov))).all()

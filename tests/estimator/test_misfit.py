@@ -11,15 +11,16 @@ from rtid.estimator.misfit import count_misfit
 from rtid.estimator.record import run
 from rtid.estimator.solution import Solution, solve
 from rtid.estimator.state import nominal_weights
-from rtid.model import FloatArray, Lag, Model
+from rtid.model import Lag, Machine
+from rtid.plain import FloatArray
 from rtid.sim.declare import declared_model, uniform_grid
-from rtid.sim.plant import smooth_plant
 from rtid.sim.run import simulate
+from rtid.sim.simulated_plant import smooth_plant
 
 PLANT = replace(smooth_plant(), lag_s=0.0)
 
 
-def fitted(n_u: int, n_dp: int) -> tuple[Model, FloatArray, Solution]:
+def fitted(n_u: int, n_dp: int) -> tuple[Machine, FloatArray, Solution]:
     """A smooth plant on blocks of the given number."""
     record = simulate(PLANT, "rich", 1, 12.0)
     grid = uniform_grid((0.0, 8.0, n_u), (-0.5e6, 8e6, n_dp))

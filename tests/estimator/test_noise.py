@@ -6,12 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rtid.estimator.noise import estimate_noise, measurements, resolution_of
-from rtid.model import FloatArray
+from rtid.plain import FloatArray
 from rtid.sim.random_plants import draw
 from rtid.sim.run import NAMES, Run, Sensors, simulate
 
@@ -66,9 +67,7 @@ def test_the_stated_uncertainty_holds() -> None:
 @pytest.mark.parametrize("run", ["rig_01", "rig_09", "rig_16"])
 def test_rig(shared: Path, run: str) -> None:
     """Declared there: pressures 5 kPa (tank 1 kPa), x 10 um, v 1 mm/s, all of 16 bit."""
-    table = pytest.importorskip("pyarrow.parquet").read_table(
-        shared / "data" / "rig" / "measured" / f"{run}.parquet"
-    )
+    table = pq.read_table(shared / "data" / "rig" / "measured" / f"{run}.parquet")
     t = table["t"].to_numpy()
     declared = {"p_A": (5e3, 1e7), "p_tank": (1e3, 1e7), "x": (1e-5, 0.5), "v": (1e-3, 1.0)}
     for name, (sd, full_range) in declared.items():

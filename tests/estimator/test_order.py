@@ -12,14 +12,14 @@ from rtid.estimator.solution import Solution, solve
 from rtid.kernels.basis import taylor
 from rtid.model import Gates, Lag
 from rtid.sim.declare import declared_model, uniform_grid
-from rtid.sim.plant import Plant, smooth_plant
 from rtid.sim.run import EXACT, Sensors, simulate
+from rtid.sim.simulated_plant import SimulatedPlant, smooth_plant
 
 SLIGHT = Sensors(p_noise_pa=20.0, p_tank_noise_pa=4.0, x_noise_m=4e-8, quantised=False)
 POINTS = [(xi, eta) for xi in (-0.5, 0.0, 0.5) for eta in (-0.5, 0.0, 0.5)]
 
 
-def learned(plant: Plant, chunk: np.ndarray, nu: int, nd: int) -> Solution:
+def learned(plant: SimulatedPlant, chunk: np.ndarray, nu: int, nd: int) -> Solution:
     """The estimate on a grid of nu x nd blocks over 0..8 V and -1..9 MPa."""
     grid = uniform_grid((0.0, 8.0, nu), (-1e6, 9e6, nd))
     model = declared_model(plant, grid=grid, sensors=SLIGHT, safe_band_v=0.0)
@@ -28,7 +28,7 @@ def learned(plant: Plant, chunk: np.ndarray, nu: int, nd: int) -> Solution:
     return solve(model, state)
 
 
-def map_error(plant: Plant, solution: Solution) -> float:
+def map_error(plant: SimulatedPlant, solution: Solution) -> float:
     """Rms error inside the well visited blocks above 2 MPa and 1 V, share of their rms flow."""
     errors, flows, terms = [], [], np.empty(6)
     for block in solution.blocks:

@@ -28,7 +28,7 @@ from rtid.estimator.projectors import (
     window,
 )
 from rtid.estimator.windows import overlaps, profile, rising
-from rtid.model import FloatArray
+from rtid.plain import FloatArray
 
 BORDER = np.array([0.0, 1.0, 1.25, 1.5, 3.0, 7.0])
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(60)

@@ -8,14 +8,15 @@ import pytest
 from rtid.estimator.estimator import to_chunk
 from rtid.estimator.record import fit_record
 from rtid.estimator.refine import refine
-from rtid.model import FloatArray, Grid, Model
+from rtid.model import Grid, Machine
+from rtid.plain import FloatArray
 from rtid.sim.declare import declared_model, default_grid
-from rtid.sim.plant import Plant
 from rtid.sim.random_plants import draw
 from rtid.sim.run import simulate
+from rtid.sim.simulated_plant import SimulatedPlant
 
 
-def machine(seed: int, coarse: bool) -> tuple[Plant, Model, FloatArray]:
+def machine(seed: int, coarse: bool) -> tuple[SimulatedPlant, Machine, FloatArray]:
     """A random plant on the default grid, or with one block up to 4 V."""
     plant = draw(seed)
     grid = default_grid(1.25 * plant.p_supply_pa)
@@ -26,6 +27,7 @@ def machine(seed: int, coarse: bool) -> tuple[Plant, Model, FloatArray]:
     return plant, model, to_chunk(model, simulate(plant, "rich", seed, 30.0).samples, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [4, 7])
 def test_a_coarse_grid_is_refined_where_the_dead_band_ends(seed: int) -> None:
     plant, model, chunk = machine(seed, coarse=True)
@@ -43,6 +45,7 @@ def test_a_coarse_grid_is_refined_where_the_dead_band_ends(seed: int) -> None:
     assert error.max() < 0.005
 
 
+@pytest.mark.slow
 def test_a_grid_that_is_fine_enough_stays() -> None:
     _, model, chunk = machine(5, coarse=False)
     finer, _ = refine(model, chunk)

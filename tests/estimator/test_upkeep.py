@@ -10,12 +10,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 
+from firmware_bridge.samples import Samples
 from rtid.estimator.blocks import INVALID, LEARNING, STALE, VALID
 from rtid.estimator.estimator import Estimator
 from rtid.estimator.sums import Sums
-from rtid.model import FloatArray, Gates, Upkeep
-from rtid.store import load, save
+from rtid.model import Gates, Upkeep
+from rtid.plain import FloatArray
+from rtid.trace.snapshot import load, save
 from tests.estimator.test_gate import LEARNED, UPKEEP, X, exact_model, exact_record
 
 BUSY = Upkeep(0.5, forget_s=20.0, shared_forget_s=60.0, innovation_sd=8.0, folds=3)
@@ -232,3 +236,57 @@ def test_what_was_learned_while_all_was_shut_counts() -> None:
     chunk[:, 2] = 0.0
     est = learned(chunk, upkeep=Upkeep(2.0))
     assert est.sums.rows == est.counters["rows"]
+
+
+def at_stamps(t_us: list[int], size: int, every_s: float) -> Estimator:
+    """What is learned from samples of a machine at rest at these stamps, `size` at a time."""
+    est = Estimator(exact_model(Upkeep(every_s)))
+    t, names = np.array(t_us, np.int64), tuple(signal.name for signal in est.model.signals)
+    rest = np.tile([0.0, 4e6, 8e6, 1e5, 0.25], (len(t), 1))
+    flags = np.full(len(t), 1, np.uint8)
+    for k in range(0, len(t), size):
+        part = slice(k, k + size)
+        est.update(Samples(names, t[part], rest[part], flags[part]))
+    return est
+
+
+def turns_of(t_us: list[int], every_us: int) -> int:
+    """How often house is kept: in whole numbers, one stamp after the other."""
+    due_us, turns = t_us[0], 0
+    for now_us in t_us:
+        if not due_us - every_us <= now_us < due_us:
+            due_us, turns = now_us + every_us, turns + 1
+    return turns
+
+
+STEPS_US = st.lists(st.integers(-20_000_000, 20_000_000), min_size=1, max_size=40)
+
+
+@given(STEPS_US, st.integers(1, 30_000_000), st.integers(1, 50))
+@example([4_999_999, 9_300_000, 1], 10_000_000, 50)
+@settings(deadline=None, max_examples=150)
+def test_upkeep_comes_when_it_is_due_at_any_stamp_and_period(
+    steps_us: list[int], every_us: int, size: int
+) -> None:
+    """It ends, too: in seconds a stamp minus a period, plus that period, is another stamp."""
+    t_us = [int(t) for t in 1_700_000_000_000_000 + np.cumsum([0, *steps_us])]
+    est = at_stamps(t_us, size, every_us * 1e-6)
+    assert est.turns == turns_of(t_us, every_us)
+
+
+@pytest.mark.parametrize("every_s", [1e-9, 1e-6, 1e300])
+def test_no_period_is_too_short_or_too_long(every_s: float) -> None:
+    est = at_stamps([0, 1, 7, 1_000_000], 2, every_s)
+    assert est.turns == (1 if every_s > 1 else 4)
+
+
+def test_a_stamp_that_is_no_number_does_not_hold_up_the_rest() -> None:
+    chunk = exact_record(90_000)[:3000].copy()
+    chunk[[700, 1500], 0] = np.nan, np.inf
+    assert learned(chunk, upkeep=Upkeep(0.1)).turns >= 29
+
+
+def test_ten_minutes_with_upkeep_every_tenth_of_a_second() -> None:
+    t_us = [1_700_000_000_000_000 + 1001 * k for k in range(600_000)]
+    est = at_stamps(t_us, 10_000, 0.1)
+    assert est.turns == turns_of(t_us, 100_000) > 5900

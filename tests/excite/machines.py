@@ -16,16 +16,16 @@ from pathlib import Path
 import numpy as np
 
 from rtid.excite.driving import OFFSET, SHUT, SUPPLY, V_REF, X_REF
-from rtid.exciting import read_csv
-from rtid.model import FloatArray
-from rtid.paper.boom import SWEEP_S, boom, grid, sweep
-from rtid.paper.commissioning import manufacturer
-from rtid.sim import loop
+from rtid.excite.exciting import read_csv
+from rtid.plain import FloatArray
+from rtid.sim import closed_loop
+from rtid.sim.boom import SWEEP_S, boom, grid, sweep
 from rtid.sim.declare import declared_model
-from rtid.sim.motion import Motion
-from rtid.sim.plant import Plant
+from rtid.sim.demand import Motion
+from rtid.sim.programmable import manufacturer
 from rtid.sim.project_file import project_text
 from rtid.sim.run import EXACT, P_A, P_B, U, V, X, simulate
+from rtid.sim.simulated_plant import SimulatedPlant
 
 GRID_END_V = 9.0
 LEAST_SUPPLY = 0.6  # of the usual one
@@ -39,17 +39,17 @@ def swept(number: int) -> FloatArray:
     return simulate(_cut(boom(number), GRID_END_V), sweep, number, SWEEP_S, EXACT).truth.signals
 
 
-def machine(number: int) -> Plant:
+def machine(number: int) -> SimulatedPlant:
     """A random boom whose controller cuts the command at the sweep's largest."""
     return _cut(boom(number), float(np.abs(swept(number)[:, U]).max()))
 
 
-def _cut(plant: Plant, limit_v: float) -> Plant:
+def _cut(plant: SimulatedPlant, limit_v: float) -> SimulatedPlant:
     return replace(plant, controller=plant.controller._replace(limit_v=limit_v))
 
 
 def write_project(
-    folder: Path, plant: Plant, number: int, *, safe_v: float = 1.0, **more: object
+    folder: Path, plant: SimulatedPlant, number: int, *, safe_v: float = 1.0, **more: object
 ) -> Path:
     """The owner's project file with its data sheet beside it; more: lines of [excite].
 
@@ -69,7 +69,7 @@ def write_project(
     return path
 
 
-def _sheet(plant: Plant, number: int) -> str:
+def _sheet(plant: SimulatedPlant, number: int) -> str:
     """K of every valve over the command: the manufacturer's of Fig. 6."""
     flow, u, dp_pa = manufacturer(plant, number), np.linspace(0.0, 10.0, 101), 1e6
     k = [flow(edge, u, np.full_like(u, dp_pa)) / np.sqrt(dp_pa) for edge in plant.edges]
@@ -78,7 +78,7 @@ def _sheet(plant: Plant, number: int) -> str:
     return "\n".join([head, *rows]) + "\n"
 
 
-def _section(plant: Plant, number: int) -> dict[str, object]:
+def _section(plant: SimulatedPlant, number: int) -> dict[str, object]:
     """Limits: what the sweep takes; steps and supply as allowed here."""
     c, k, usual = plant.constants, plant.controller, plant.p_supply_pa * 1e-6
     taken, rng = swept(number), np.random.default_rng([number, 91])
@@ -107,12 +107,15 @@ def _section(plant: Plant, number: int) -> dict[str, object]:
 def motion(reference: FloatArray) -> Motion:
     """A designed reference (n, 5) as the simulated machine takes it."""
 
-    def drive(plant: Plant, rng: np.random.Generator, duration_s: float) -> FloatArray:
+    def drive(plant: SimulatedPlant, rng: np.random.Generator, duration_s: float) -> FloatArray:
         rows = np.vstack([reference, reference[-1:]])
         found = np.zeros((len(rows), 6))
-        found[:, loop.X_REF] = np.where(rows[:, SHUT] > 0, np.nan, rows[:, X_REF])
-        found[:, loop.V_REF], found[:, loop.DITHER] = rows[:, V_REF], rows[:, OFFSET]
-        found[:, loop.P_SUPPLY], found[:, loop.P_TANK] = rows[:, SUPPLY], plant.p_tank_pa
+        found[:, closed_loop.X_REF] = np.where(rows[:, SHUT] > 0, np.nan, rows[:, X_REF])
+        found[:, closed_loop.V_REF], found[:, closed_loop.DITHER] = rows[:, V_REF], rows[:, OFFSET]
+        found[:, closed_loop.P_SUPPLY], found[:, closed_loop.P_TANK] = (
+            rows[:, SUPPLY],
+            plant.p_tank_pa,
+        )
         return found
 
     return drive

@@ -9,25 +9,25 @@ import pytest
 
 from rtid.estimator.estimator import Estimator
 from rtid.estimator.flowmap import FlowMap
-from rtid.excitable import machine_of, section_of, start
 from rtid.excite import library
+from rtid.excite.excitable import machine_of, section_of, start
+from rtid.excite.exciting import NothingMissingError, excite
 from rtid.excite.information import PRIOR
 from rtid.excite.known import known_from, prior_cells, take_prior
-from rtid.excite.selection import D_OPTIMAL, ENOUGH_ROWS, Known, standard_errors
-from rtid.exciting import NothingMissingError, excite
-from rtid.mapfiles import write_map
-from rtid.model import FloatArray
-from rtid.priors import find_prior, of_flow
+from rtid.excite.selection import D_OPTIMAL, ENOUGH_ROWS, KnownCells, standard_errors
+from rtid.maps.files import write_map
+from rtid.maps.prior_map import find_prior, of_flow
+from rtid.plain import FloatArray
 from rtid.project import Project, load
-from rtid.sim.plant import EDGES, Plant, flow_points
 from rtid.sim.run import simulate
-from rtid.store import save
+from rtid.sim.simulated_plant import EDGES, SimulatedPlant, flow_points
+from rtid.trace.snapshot import save
 from tests.excite.machines import machine, write_project
 
 NUMBER = 7
 
 
-def true_map(project: Project, plant: Plant, scale: float = 1.0) -> FlowMap:
+def true_map(project: Project, plant: SimulatedPlant, scale: float = 1.0) -> FlowMap:
     """What the valves do, all gains off by a factor."""
 
     def flow(edge: str, w_v: FloatArray, dp_pa: FloatArray) -> FloatArray:
@@ -52,8 +52,8 @@ def with_map(folder: Path, scale: float, error_percent: float, *edges: str) -> P
     return load(path)
 
 
-def known_before(project: Project) -> Known:
-    prior, known = find_prior(project), Known.nothing(project.model.n_cells)
+def known_before(project: Project) -> KnownCells:
+    prior, known = find_prior(project), KnownCells.nothing(project.model.n_cells)
     assert prior is not None
     take_prior(known, project.model, prior)
     return known
@@ -117,13 +117,14 @@ def few_segments(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(library, "ZIGZAGS", (0.3,))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_segments")
 def test_a_segment_tells_less_where_a_prior_knows(tmp_path: Path) -> None:
     """By the determinant; the map's error may fall more where a prior adds what is lacking."""
     project = with_map(tmp_path, 1.0, 10.0, "pa", "at")
     begun, model = start(project), project.model
     assert begun.known is not None and begun.taught_by == "the prior before"
-    weights, nothing = np.ones(model.n_cells), Known.nothing(model.n_cells)
+    weights, nothing = np.ones(model.n_cells), KnownCells.nothing(model.n_cells)
     for c in begun.pool:
         alone = nothing.gain(c.told, D_OPTIMAL, weights)
         assert begun.known.gain(c.told, D_OPTIMAL, weights) < 0.95 * alone

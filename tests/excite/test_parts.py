@@ -10,22 +10,22 @@ import numpy as np
 import pytest
 
 from rtid.excite import design as designing
-from rtid.excite.design import Candidate, design, missing, stitched
+from rtid.excite.design import CandidateSegment, design, missing, stitched
 from rtid.excite.driving import SHUT, STEP_S, SUPPLY, V_REF, X_REF
 from rtid.excite.information import Information
 from rtid.excite.library import Segment, library
-from rtid.excite.limits import Extremes, LimitError, Limits, extremes, require_kept
-from rtid.excite.machine import Machine
+from rtid.excite.machine import DrivenMachine
+from rtid.excite.motion_limits import Extremes, LimitError, Limits, extremes, require_kept
 from rtid.excite.selection import (
     BOUNDED,
     MOMENTS,
-    Known,
-    Problem,
+    KnownCells,
+    SelectionProblem,
     choose,
     standard_errors,
     value,
 )
-from rtid.model import FloatArray
+from rtid.plain import FloatArray
 
 LIMITS = Limits(
     20.0, (0.08, 0.42), 0.3, 9.0, (1e5, 1e7), (5e6, 8.5e6), supply_rate_paps=5e6, offset_v=0.6
@@ -75,7 +75,7 @@ def test_a_segment_that_breaks_a_limit_beside_the_others_is_left_out(
     """One goes 5 mm beyond the stroke; one stays within it, but not within half of the margin."""
 
     def position(
-        _machine: Machine, limits: Limits, r: FloatArray, _run: FloatArray
+        _machine: DrivenMachine, limits: Limits, r: FloatArray, _run: FloatArray
     ) -> list[Extremes]:
         x = r[:, X_REF]
         return [Extremes("position", "m", x.min(), x.max(), *limits.stroke_m, 0.0)]
@@ -88,12 +88,12 @@ def test_a_segment_that_breaks_a_limit_beside_the_others_is_left_out(
     for cell, (name, way) in enumerate(names.items()):
         reference = rest.copy()
         reference[1000:2000, X_REF] += way
-        pool.append(Candidate(Segment(name, reference), _told(cell, 1e6)))
+        pool.append(CandidateSegment(Segment(name, reference), _told(cell, 1e6)))
     machine = SimpleNamespace(model=SimpleNamespace(n_cells=3), run=lambda reference: reference)
-    found = design(cast("Machine", machine), LIMITS, None, pool)
+    found = design(cast("DrivenMachine", machine), LIMITS, None, pool)
     assert {c.segment.name for c in found.segments} == {"within"}
     with pytest.raises(LimitError, match="no segment"):
-        design(cast("Machine", machine), LIMITS, None, pool[2:])
+        design(cast("DrivenMachine", machine), LIMITS, None, pool[2:])
 
 
 def test_what_is_known_well_enough_gains_nothing() -> None:
@@ -112,7 +112,7 @@ def test_what_is_not_allowed_is_not_in_the_library() -> None:
 
 
 def test_a_row_of_segments_keeps_the_supplys_rate_and_the_time() -> None:
-    pool = [Candidate(s, _told(0, 1.0)) for s in library(LIMITS)[::9]]
+    pool = [CandidateSegment(s, _told(0, 1.0)) for s in library(LIMITS)[::9]]
     kept, reference, playing = stitched(pool, LIMITS)
     assert len(playing) == len(reference)
     assert (np.diff(playing) >= 0).all()
@@ -128,8 +128,8 @@ def _told(cell: int, size: float) -> Information:
 
 def test_the_choice_prefers_what_is_new_and_keeps_the_time() -> None:
     told = [_told(0, 1e6), _told(0, 9e5), _told(1, 1e5)]
-    problem = Problem(told, np.array([4.0, 4.0, 4.0]), np.ones(2))
-    chosen = choose(problem, Known.nothing(2), 9.0)
+    problem = SelectionProblem(told, np.array([4.0, 4.0, 4.0]), np.ones(2))
+    chosen = choose(problem, KnownCells.nothing(2), 9.0)
     assert sorted(chosen) == [0, 2]
 
 
@@ -137,17 +137,17 @@ def test_an_exchange_repairs_a_greedy_choice() -> None:
     """The first in sight takes the time of two that tell more together."""
     both = Information(np.array([0, 1]), np.full((2, 1, 1), 1e3) * np.eye(6), np.full(2, 60.0))
     told = [both, _told(0, 1e7), _told(1, 1e7)]
-    problem = Problem(told, np.array([5.0, 5.0, 5.0]), np.ones(2))
-    chosen = choose(problem, Known.nothing(2), 10.0)
-    assert value(problem, Known.nothing(2), chosen) == pytest.approx(
-        value(problem, Known.nothing(2), [1, 2])
+    problem = SelectionProblem(told, np.array([5.0, 5.0, 5.0]), np.ones(2))
+    chosen = choose(problem, KnownCells.nothing(2), 10.0)
+    assert value(problem, KnownCells.nothing(2), chosen) == pytest.approx(
+        value(problem, KnownCells.nothing(2), [1, 2])
     )
 
 
 def test_what_is_learned_is_not_missing() -> None:
     segment = Segment("", np.zeros((10, 5)))
-    pool = [Candidate(segment, _told(0, 1e6)), Candidate(segment, _told(1, 1e6))]
-    known = Known.nothing(2)
+    pool = [CandidateSegment(segment, _told(0, 1e6)), CandidateSegment(segment, _told(1, 1e6))]
+    known = KnownCells.nothing(2)
     assert missing(pool, known, np.ones(2)).cells.tolist() == [0, 1]
     known.add(_told(0, 1e9))
     left = missing(pool, known, np.ones(2))
@@ -159,7 +159,7 @@ def test_what_is_learned_is_not_missing() -> None:
 def test_an_effect_is_missing_until_it_can_be_seen_well() -> None:
     leak = "external_leakage_laminar", "a"
     told = replace(_told(0, 1e6), effects={leak: 1.0})
-    pool, known = [Candidate(Segment("", np.zeros((10, 5))), told)], Known.nothing(1)
+    pool, known = [CandidateSegment(Segment("", np.zeros((10, 5))), told)], KnownCells.nothing(1)
     known.add(_told(0, 1e9))
     assert missing(pool, known, np.ones(1)).effects == (leak,)
     known.effects[leak] = 100.0
@@ -169,8 +169,8 @@ def test_an_effect_is_missing_until_it_can_be_seen_well() -> None:
 def test_the_pieces_that_tell_most_do_not_tell_the_same() -> None:
     both = Information(np.array([0, 1]), 1e6 * np.stack([np.eye(6)] * 2), np.full(2, 60.0))
     told = [_told(0, 1e6), both, _told(1, 1e6), _told(2, 1e6)]
-    pool = [Candidate(Segment(str(k), np.zeros((10, 5))), t) for k, t in enumerate(told)]
-    pieces = missing(pool, Known.nothing(3), np.ones(3)).pieces(3)
+    pool = [CandidateSegment(Segment(str(k), np.zeros((10, 5))), t) for k, t in enumerate(told)]
+    pieces = missing(pool, KnownCells.nothing(3), np.ones(3)).pieces(3)
     assert [(c.segment.name, n) for c, n in pieces] == [("1", 2), ("3", 1)]
 
 
@@ -192,6 +192,6 @@ def test_limits_that_leave_no_motion_are_refused() -> None:
 
 
 def test_value_counts_no_segment_twice() -> None:
-    problem = Problem([_told(0, 1e6)], np.array([1.0]), np.ones(1), BOUNDED)
-    once, twice = (value(problem, Known.nothing(1), [0] * n) for n in (1, 2))
+    problem = SelectionProblem([_told(0, 1e6)], np.array([1.0]), np.ones(1), BOUNDED)
+    once, twice = (value(problem, KnownCells.nothing(1), [0] * n) for n in (1, 2))
     assert once < twice < 2 * once

@@ -26,6 +26,7 @@ def figure(request: pytest.FixtureRequest) -> Figure:
         unit: str = "",
         least: float | None = None,
     ) -> None:
+        value = float(value)  # numpy's numbers are no JSON
         met = (most is None or value <= most) and (least is None or value >= least)
         wanted = f"<= {most:g}" if most is not None else ""
         wanted += f">= {least:g}" if least is not None else ""

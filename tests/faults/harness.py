@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from tempfile import mkdtemp
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,15 +15,16 @@ from rtid.estimator.estimator import Estimator
 from rtid.estimator.flowmap import VALID, EdgeMap, FlowMap
 from rtid.estimator.published import publish
 from rtid.estimator.solution import Solution
-from rtid.live import Learner, catalog_of
-from rtid.model import FloatArray
+from rtid.plain import FloatArray
 from rtid.project import Project, load
 from rtid.sim.bus import run_frames
-from rtid.sim.log import START_US
-from rtid.sim.plant import Plant
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
+from rtid.sim.run_files import START_US
+from rtid.sim.simulated_plant import SimulatedPlant
+from rtid.trace.learner import Learner, catalog_of
 from tests.faults.sender import PAUSE_S
+from tests.left import shared_folder
 
 SECONDS = 60.0
 FRAMES_PER_CYCLE = 3
@@ -55,8 +55,8 @@ class Machine:
 @cache
 def machine() -> Machine:
     """The one that all tests of a session share."""
-    run = simulate(Plant(), "rich", seed=1, duration_s=SECONDS)
-    trace = Path(mkdtemp(prefix="rtid-faults-")) / "machine.blf"
+    run = simulate(SimulatedPlant(), "rich", seed=1, duration_s=SECONDS)
+    trace = shared_folder("rtid-faults-") / "machine.blf"
     write_run(trace, run, 1, "rich")
     project = load(trace.with_suffix(".toml"))
     return Machine(trace, project, catalog_of(project), run_frames(run, start_us=START_US))
@@ -87,11 +87,19 @@ def uninterrupted(learned: Estimator) -> Solution:
 def drift(clean: Solution, faulty: Solution) -> float:
     """Relative L2 change of the published flow map over the blocks that `clean` has identified.
 
-    |Q' - Q| / |Q| with |Q|^2 the integral of Q(u, dp)^2 over those blocks of all edges (Gauss, 4 by
-    4 points each); where `faulty` has not identified one of them, what it publishes there counts.
+    Where `faulty` has not identified one of them, what it publishes there counts.
+    """
+    return map_drift(_published(clean), publish(faulty))
+
+
+def map_drift(clean: FlowMap, other_map: FlowMap) -> float:
+    """The same of two published maps.
+
+    |Q' - Q| / |Q| with |Q|^2 the integral of Q(u, dp)^2 over the identified blocks of all edges
+    (Gauss, 4 by 4 points each).
     """
     change = total = cells = 0.0
-    for mine, other in zip(_published(clean).edges, publish(faulty).edges, strict=True):
+    for mine, other in zip(clean.edges, other_map.edges, strict=True):
         w_v, dp_pa, area = _points(mine)
         before = mine.flow(w_v, dp_pa)
         change += float((area * (other.flow(w_v, dp_pa) - before) ** 2).sum())

@@ -1,13 +1,15 @@
 """Frames of a trace over udp_multicast, from a process of its own: `python -m tests.faults.sender`.
 
 Arguments: TRACE GROUP SECONDS SPEED LOOPS FLOOD_HZ.  Datagrams are those of python-can, made
-beforehand; stamps are the trace's, and the next loop comes a second later.  FLOOD_HZ frames per
-second of other identifiers come with them.  Prints the number of the trace's frames that were sent.
+beforehand, and given a later stamp in each loop; the next loop comes a second later.  FLOOD_HZ
+frames per second of other identifiers come with them.  Prints the number of the trace's frames that
+were sent.
 """
 
 from __future__ import annotations
 
 import socket
+import struct
 import sys
 import time
 from pathlib import Path
@@ -20,9 +22,11 @@ from firmware_bridge.sources.udp import PORT
 
 PAUSE_S = 1.0  # between two loops: the machine does not jump back to its start
 PIECE_S = 0.002  # what is due is sent so often
+STAMP = struct.Struct(">d")
+STAMP_AT = 12  # bytes of a datagram that come before: a map's head, its first key, a float's head
 
 
-def datagrams(frames: Frames, shift_s: float) -> list[bytes]:
+def datagrams(frames: Frames) -> list[bytes]:
     """What python-can would send."""
     fixed = {
         "is_extended_id": False, "is_remote_frame": False, "is_error_frame": False,
@@ -35,7 +39,7 @@ def datagrams(frames: Frames, shift_s: float) -> list[bytes]:
     return [
         msgpack.packb(
             {
-                "timestamp": t_us * 1e-6 + shift_s,
+                "timestamp": t_us * 1e-6,
                 "arbitration_id": can_id,
                 "dlc": length,
                 "data": data[:length].tobytes(),
@@ -44,6 +48,12 @@ def datagrams(frames: Frames, shift_s: float) -> list[bytes]:
         )
         for t_us, can_id, length, data in rows
     ]
+
+
+def later(datagram: bytes, shift_s: float) -> bytes:
+    """The same frame, so much later."""
+    (t_s,) = STAMP.unpack_from(datagram, STAMP_AT)
+    return datagram[:STAMP_AT] + STAMP.pack(t_s + shift_s) + datagram[STAMP_AT + STAMP.size :]
 
 
 def _foreign(frames: Frames) -> Frames:
@@ -58,17 +68,17 @@ def main() -> None:
     frames = open_log(Path(trace))
     at_s = (frames.t_us - frames.t_us[0]) * 1e-6
     frames, at_s = frames[at_s < float(seconds)], at_s[at_s < float(seconds)]
-    pieces = [datagrams(frames, k * (float(seconds) + PAUSE_S)) for k in range(int(loops))]
+    made = datagrams(frames)
     out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)  # on this machine only
-    foreign, flooded = datagrams(_foreign(frames[:100]), 0.0), 0
+    foreign, flooded = datagrams(_foreign(frames[:100])), 0
     start_s, sent = time.monotonic(), 0
-    for k, piece in enumerate(pieces):
-        n = 0
-        while n < len(piece):
-            now_s = (time.monotonic() - start_s) * float(speed) - k * (float(seconds) + PAUSE_S)
-            while n < len(piece) and at_s[n] <= now_s:
-                out.sendto(piece[n], (group, PORT))
+    for k in range(int(loops)):
+        n, shift_s = 0, k * (float(seconds) + PAUSE_S)
+        while n < len(made):
+            now_s = (time.monotonic() - start_s) * float(speed) - shift_s
+            while n < len(made) and at_s[n] <= now_s:
+                out.sendto(later(made[n], shift_s), (group, PORT))
                 n += 1
             while flooded < float(flood_hz) * (time.monotonic() - start_s):
                 out.sendto(foreign[flooded % len(foreign)], (group, PORT))

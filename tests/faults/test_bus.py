@@ -10,14 +10,16 @@ from collections import deque
 from dataclasses import replace
 from pathlib import Path
 
+import can
 import pytest
 
 from firmware_bridge import frames as fr
 from firmware_bridge.frames import Frames
+from firmware_bridge.sources.can_bus import CanBus
 from firmware_bridge.sources.live import LiveSource, SourceError
 from rtid.daemon.daemon import Bus, Daemon, DaemonError
 from rtid.daemon.status import Status
-from rtid.project import Project
+from rtid.project import Project, load
 from tests.faults.conftest import Figure
 from tests.faults.harness import at_s, drift, machine, without
 
@@ -44,6 +46,11 @@ class Scripted(LiveSource[Frames]):
         self._down_s, self._hang_s, self._speed = down_s, hang_s, speed
         self._start_s = time.monotonic()
         self.hung: tuple[float, float] | None = None
+
+    def begun(self) -> Scripted:
+        """It, once the daemon has compiled everything and opens its bus: time begins here."""
+        self._start_s = time.monotonic()
+        return self
 
     def now_s(self) -> float:
         return time.monotonic() - self._start_s
@@ -91,7 +98,7 @@ def quick() -> Project:
 
 def run(source: Scripted, folder: Path, for_s: float) -> tuple[Daemon, list[Status], Status]:
     """Run a daemon here; it, its statuses, and the last one."""
-    daemon = Daemon(quick(), Bus("scripted", "x", lambda: source), folder)
+    daemon = Daemon(quick(), Bus("scripted", "x", source.begun), folder)
     seen: list[Status] = []
 
     def look() -> None:
@@ -103,12 +110,15 @@ def run(source: Scripted, folder: Path, for_s: float) -> tuple[Daemon, list[Stat
     watching = [True]
     thread = threading.Thread(target=look, daemon=True)
     thread.start()
-    last = daemon.run(for_s)
-    watching.clear()
-    thread.join()
+    try:
+        last = daemon.run(for_s)
+    finally:
+        watching.clear()
+        thread.join()
     return daemon, seen, last
 
 
+@pytest.mark.faults
 def test_row_11_bus_off(tmp_path: Path, figure: Figure) -> None:
     frames, speed = machine().frames, 4.0
     source = Scripted(frames, (4.0, 9.0), speed=speed)
@@ -126,7 +136,7 @@ def test_row_11_bus_off(tmp_path: Path, figure: Figure) -> None:
     t_s = at_s(frames)
     gone = (t_s >= 4.0 * speed) & (t_s < 9.0 * speed)
     clean = machine().learned(without(frames, gone)).estimator.solution()
-    from rtid.store import Generations
+    from rtid.trace.snapshot import Generations
 
     found = Generations(tmp_path, quick().digest).restore(quick().model)
     assert found.estimator is not None
@@ -134,6 +144,7 @@ def test_row_11_bus_off(tmp_path: Path, figure: Figure) -> None:
            drift(clean, found.estimator.solution()), 0.001)  # fmt: skip
 
 
+@pytest.mark.faults
 def test_row_22_a_loop_that_hangs_feeds_no_watchdog(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, figure: Figure
 ) -> None:
@@ -146,17 +157,18 @@ def test_row_22_a_loop_that_hangs_feeds_no_watchdog(
         monkeypatch.setenv("WATCHDOG_PID", str(os.getpid()))
 
         def listen() -> None:
-            while True:
-                try:
-                    text = manager.recv(4096)
-                except OSError:
-                    return
+            while text := manager.recv(4096):
                 if b"WATCHDOG=1" in text:
                     beats.append(time.monotonic())
 
-        threading.Thread(target=listen, daemon=True).start()
+        thread = threading.Thread(target=listen)
+        thread.start()
         source = Scripted(machine().frames[:30_000], (1e9, 1e9), hang_s=3.0)
-        _, seen, _ = run(source, tmp_path / "state", 9.0)
+        try:
+            _, seen, _ = run(source, tmp_path / "state", 9.0)
+        finally:
+            manager.shutdown(socket.SHUT_RD)  # wakes it with nothing; to close the socket does not
+            thread.join()
     assert source.hung is not None
     begin_s, end_s = source.hung
     inside = [b for b in beats if begin_s + 0.1 < b < end_s]
@@ -168,12 +180,12 @@ def test_row_22_a_loop_that_hangs_feeds_no_watchdog(
 
 def test_only_one_daemon_per_folder(tmp_path: Path) -> None:
     source = Scripted(machine().frames[:3000], (1e9, 1e9))
-    daemon = Daemon(quick(), Bus("scripted", "x", lambda: source), tmp_path)
+    daemon = Daemon(quick(), Bus("scripted", "x", source.begun), tmp_path)
     thread = threading.Thread(target=daemon.run, args=(6.0,))
     thread.start()
     while daemon.status is None:
         time.sleep(0.05)
-    other = Daemon(quick(), Bus("scripted", "x", lambda: source), tmp_path)
+    other = Daemon(quick(), Bus("scripted", "x", source.begun), tmp_path)
     with pytest.raises(DaemonError, match="another daemon"):
         other.run(1.0)
     daemon.stop()
@@ -195,3 +207,36 @@ def test_a_failure_leaves_the_last_frames_behind(tmp_path: Path) -> None:
     (dump,) = tmp_path.glob("failure-*.log")
     assert 1900 <= len(open_log(dump)) <= 2300
     assert "a defect" in next(tmp_path.glob("failure-*.txt")).read_text()
+
+
+def send_in_time(daemon: Daemon, channel: str, seconds: float) -> None:
+    """The machine's frames with their own stamps, as they come, once the daemon hears them."""
+    frames = machine().frames
+    frames = frames[at_s(frames) < seconds]
+    while daemon.status is None or daemon.status.bus.state != "open":
+        time.sleep(0.01)
+    start_s, t_s = time.monotonic(), at_s(frames)
+    with can.Bus(interface="virtual", channel=channel, preserve_timestamps=True) as bus:
+        for due_s, message in zip(t_s, fr.to_messages(frames), strict=True):
+            if due_s > time.monotonic() - start_s:
+                time.sleep(0.005)
+            bus.send(message)
+
+
+@pytest.mark.parametrize(
+    ("every_s", "seconds"), [(0.1, 2.5), pytest.param(10.0, 20.5, marks=pytest.mark.soak)]
+)
+def test_upkeep_of_any_period_ends(every_s: float, seconds: float, tmp_path: Path) -> None:
+    """In seconds of floating point it went round for ever at about every third upkeep."""
+    written = tmp_path / "machine.toml"
+    source = machine().trace.with_suffix(".toml").read_text("utf-8")
+    settings = f"[upkeep]\nevery_s = {every_s}\n[daemon]\nrate_hz = 200.0\nrecord_mb = 0\n"
+    written.write_text(f"{source}\n{settings}", "utf-8")
+    channel = f"upkeep {every_s}"
+    bus = Bus("virtual", channel, lambda: CanBus("virtual", channel))
+    daemon = Daemon(load(written), bus, tmp_path / "state")
+    thread = threading.Thread(target=send_in_time, args=(daemon, channel, seconds))
+    thread.start()
+    last = daemon.run(seconds + 1.0)
+    thread.join()
+    assert last.estimate.samples > 900 * seconds and not last.has("message_silent")

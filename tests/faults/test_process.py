@@ -14,23 +14,27 @@ from pathlib import Path
 
 import pytest
 
-from rtid.daemon.status import Status
+from rtid.cli.exits import Exit
+from rtid.daemon.status import Status, from_json
 from rtid.sim.bus import run_frames
 from rtid.sim.hidden import hide_wish
-from rtid.sim.log import START_US, write_log
-from rtid.sim.plant import Plant
-from rtid.sim.run import Change, simulate
+from rtid.sim.run import PlantChange, simulate
+from rtid.sim.run_files import START_US, write_log
+from rtid.sim.simulated_plant import SimulatedPlant
+from tests.daemon.disk import fill, mounted
 from tests.faults.conftest import Figure
 from tests.faults.harness import FRAMES_PER_CYCLE, SECONDS, drift, machine, uninterrupted
 from tests.faults.process import Daemon, a_group, daemon, recorded, sender, stored
 
-pytestmark = pytest.mark.slow
+real_time = pytest.mark.faults
 
 QUICK = "publish_s = 2\nstore_s = 2\n"
+STATES = ("state-0.npz", "state-1.npz", "shadow.npz")  # gone on with after a kill
 SPEED = 3.0
 DAY_S = 22.0
 
 
+@pytest.mark.slow
 def test_a_run_from_start_to_end(tmp_path: Path, figure: Figure) -> None:
     """READY with the first sample, all frames taken and recorded, the state as from the log."""
     with daemon(tmp_path, settings=QUICK) as running:
@@ -161,6 +165,7 @@ def learns(running: Daemon, more: int) -> None:
     running.wait(lambda s: s.estimate.samples > enough)
 
 
+@real_time
 def test_row_9_and_10_stalled_for_two_seconds(day: Day, figure: Figure) -> None:
     """Through all of that day nothing is lost but time."""
     figure(9, "frames lost in a stall of 2 s", day.sent - day.last.bus.frames, 0)
@@ -171,6 +176,7 @@ def test_row_9_and_10_stalled_for_two_seconds(day: Day, figure: Figure) -> None:
     figure(10, "estimate differs from that without a stall", 0 if same else 1, 0)
 
 
+@real_time
 def test_row_10_stale_while_old(day: Day, figure: Figure) -> None:
     """When the sender is silent, what is published says that it is old, and an alarm who is."""
     figure(10, "stale after the last frame", day.stale_s, 2.5, "s")
@@ -180,6 +186,7 @@ def test_row_10_stale_while_old(day: Day, figure: Figure) -> None:
     assert all(m.name in silent.text for m in day.last.messages)
 
 
+@real_time
 def test_row_18_disk_full(day: Day, figure: Figure) -> None:
     assert day.full.has("not_saved")
     figure(18, "alarm after the disk is full (save interval 2 s)", day.full_s, 2.0, "s")
@@ -187,17 +194,20 @@ def test_row_18_disk_full(day: Day, figure: Figure) -> None:
     assert day.last.bus.refused.get("overrun", 0) == 0
 
 
+@real_time
 def test_row_18_slow_disk_does_not_reach_the_loop(day: Day, figure: Figure) -> None:
     """Frames are taken, the loop ticks, learning goes on."""
     figure(18, "samples learned while the disk hangs for 5 s", day.learned, least=3500)
 
 
+@real_time
 def test_row_22_hang(day: Day, figure: Figure) -> None:
     """No WATCHDOG while the process stands still, and again when it goes on."""
     figure(22, "WATCHDOG while hung", day.beats, 0)
     figure(22, "WATCHDOG per second otherwise", day.beats_hz, least=2.0)
 
 
+@real_time
 def test_row_17_kill_9_while_it_runs(tmp_path: Path, figure: Figure) -> None:
     """Killed twice while the machine moves: it goes on from the newest snapshot (50 times: soak).
 
@@ -212,7 +222,7 @@ def test_row_17_kill_9_while_it_runs(tmp_path: Path, figure: Figure) -> None:
                 running.wait(lambda s: s.store.state == "saved" and s.estimate.version > 0)
                 found = running.status()
                 assert found is not None
-                assert k == 0 or found.store.restored in ("state-0.npz", "state-1.npz")
+                assert k == 0 or found.store.restored in STATES
                 lost.append(found.store.age_s or 0.0)
                 if k < 2:
                     running.process.kill()
@@ -226,11 +236,38 @@ def test_row_17_kill_9_while_it_runs(tmp_path: Path, figure: Figure) -> None:
            drift(uninterrupted(learned), learned.solution()), 0.01)  # fmt: skip
 
 
+def test_row_33_a_disk_that_is_really_full(tmp_path: Path, figure: Figure) -> None:
+    """The status, on that very disk, says so at once; the end says it by its exit code."""
+    settings = "publish_s = 60\nstore_s = 30\n"  # the next save is half a minute away
+    with (
+        mounted(tmp_path / "state", 128 << 20) as disk,
+        daemon(tmp_path, settings=settings) as running,
+    ):
+        running.wait(lambda s: s.pid > 0)
+        with sender(running.group, 60.0):
+            running.wait(lambda s: s.estimate.samples > 1000 and s.store.state == "saved")
+            fill(disk)
+            full_s = running.wait(lambda s: s.store.state == "NOT SAVED" and s.has("not_saved"))
+            segments = len(list((disk / "recording").glob("*.blf")))
+            time.sleep(3.0)
+            more = len(list((disk / "recording").glob("*.blf"))) - segments
+            running.process.send_signal(signal.SIGTERM)
+            out, _ = running.process.communicate(timeout=60.0)
+    figure(33, "NOT SAVED after the disk is really full (saved every 30 s)", full_s, 2.0, "s")
+    figure(33, "files that the recorder makes on a full disk in 3 s", more, 0)
+    assert running.process.returncode == Exit.NEGATIVE
+    last = from_json(out)
+    assert last.store.state == "NOT SAVED" and "last state" in last.store.reason
+
+
 @pytest.mark.soak
 def test_a_changed_machine_is_accepted(tmp_path: Path) -> None:
     """A leak begins; learning stops, until the engineer says that this is how it is to be."""
-    worn, trace = hide_wish(Plant(), "internal_leakage_laminar=strong"), tmp_path / "worn.blf"
-    run = simulate(Plant(), "rich", 1, SECONDS, change=Change(40.0, worn))
+    worn, trace = (
+        hide_wish(SimulatedPlant(), "internal_leakage_laminar=strong"),
+        tmp_path / "worn.blf",
+    )
+    run = simulate(SimulatedPlant(), "rich", 1, SECONDS, change=PlantChange(40.0, worn))
     write_log(trace, run_frames(run, start_us=START_US))
     accept = [sys.executable, "-m", "rtid", "accept", str(tmp_path / "state"), "--reason", "test"]
     with daemon(tmp_path, settings=QUICK) as running:
@@ -244,7 +281,7 @@ def test_a_changed_machine_is_accepted(tmp_path: Path) -> None:
         running.stop()
     assert said.returncode == 0 and "accepted" in said.stdout, said.stderr
     assert again.returncode == 4 and "nothing to accept" in again.stdout
-    assert list(running.folder.glob("state-?.before.npz"))
+    assert list(running.folder.glob("*/points/*-accept.npz"))
     with sqlite3.connect(running.folder / "history.sqlite") as history:
         assert history.execute("SELECT reason FROM decision").fetchall() == [("test",)]
     taken = stored(running.folder, machine().project).estimator.counters["samples"]

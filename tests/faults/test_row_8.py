@@ -13,7 +13,7 @@ import pytest
 from tests.faults.conftest import Figure
 from tests.faults.process import daemon, sender
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.faults
 
 
 def in_kpa(text: str) -> str:

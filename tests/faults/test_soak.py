@@ -16,15 +16,15 @@ from pathlib import Path
 import pytest
 
 from rtid.daemon.status import Status
-from rtid.live import Learner, catalog_of
 from rtid.project import load
 from rtid.sim.bus import run_frames
 from rtid.sim.hidden import hide_wish
-from rtid.sim.log import START_US, write_log
 from rtid.sim.random_plants import draw
 from rtid.sim.recording import write_run
-from rtid.sim.run import Change, simulate
-from rtid.store import Generations
+from rtid.sim.run import PlantChange, simulate
+from rtid.sim.run_files import START_US, write_log
+from rtid.trace.learner import Learner, catalog_of
+from rtid.trace.snapshot import Generations
 from tests.faults.conftest import Figure
 from tests.faults.harness import SECONDS, drift, loop, machine, uninterrupted
 from tests.faults.process import a_group, daemon, replayed, sender, stored
@@ -105,7 +105,12 @@ def test_row_17_killed_50_times(tmp_path: Path, figure: Figure) -> None:
                     running.process.wait()
                 else:
                     running.stop()
-    figure(17, f"of {kills} restarts that began anew", sum(r == "fresh" for r in restored[1:]), 0)
+    figure(
+        17,
+        f"of {kills} restarts that began anew",
+        sum(r.startswith("fresh") for r in restored[1:]),
+        0,
+    )
     learned = stored(running.folder, machine().project).estimator
     figure(17, f"drift after {kills} kills against no kill",
            drift(uninterrupted(learned), learned.solution()), 0.01)  # fmt: skip
@@ -180,7 +185,7 @@ def test_an_effect_that_begins_is_named(
 ) -> None:
     """Real time, two processes; after 60 s something breaks."""
     plant = draw(number)
-    run = simulate(plant, "rich", 0, 130.0, change=Change(60.0, hide_wish(plant, effect)))
+    run = simulate(plant, "rich", 0, 130.0, change=PlantChange(60.0, hide_wish(plant, effect)))
     frames = run_frames(run, start_us=START_US)
     healthy = simulate(plant, "rich", 0, 10.0)
     trace = tmp_path / "machine.blf"

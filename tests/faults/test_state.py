@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rtid import store
 from rtid.estimator.estimator import Estimator
-from rtid.store import Generations
+from rtid.trace import snapshot as store
+from rtid.trace.snapshot import Generations
 from tests.faults.conftest import Figure
 from tests.faults.harness import drift, machine
 
@@ -40,10 +40,10 @@ def restored(folder: Path) -> store.Restored:
     return Generations(folder, machine().project.digest).restore(machine().project.model)
 
 
-def same(found: store.Restored) -> bool:
+def same(result: store.Restored) -> bool:
     return (
-        found.estimator is not None
-        and found.estimator.state.memory.tobytes() == learned().state.memory.tobytes()
+        result.estimator is not None
+        and result.estimator.state.memory.tobytes() == learned().state.memory.tobytes()
     )
 
 
@@ -91,6 +91,7 @@ def test_row_17_flipped_bytes(tmp_path: Path, figure: Figure) -> None:
     figure(17, "of 500 flipped bytes taken for whole", taken, 0)
 
 
+@pytest.mark.faults
 def test_row_17_killed_while_saving(tmp_path: Path, figure: Figure) -> None:
     """200 times: a child saves as fast as it can and is killed at random."""
     generations, _ = fill(tmp_path)
@@ -127,7 +128,8 @@ def test_row_19_state_of_another(
 ) -> None:
     """Nothing is taken silently: the refusal has a reason, and the file is kept aside."""
     model, digest = machine().project.model, machine().project.digest
-    path = tmp_path / SLOTS[1]
+    path = Generations(tmp_path, digest).path(1)
+    path.parent.mkdir()
     if other == "schema":
         monkeypatch.setattr(store, "SCHEMA", store.SCHEMA + 1)
         store.save(path, learned(), digest, 1)

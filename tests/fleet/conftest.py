@@ -7,19 +7,19 @@ from pathlib import Path
 
 import pytest
 
-from rtid.sim.plant import Plant
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
+from rtid.sim.simulated_plant import SimulatedPlant
 
 WORN = "m4"
 MACHINES = ("m1", "m2", "m3", WORN)
 GAINS = dict(zip(MACHINES, (0.99, 1.0, 1.01, 1.15), strict=True))
 
 
-def plant(machine: str) -> Plant:
+def plant(machine: str) -> SimulatedPlant:
     """The default machine with all gains scaled: the same declaration fits."""
-    valves = tuple(replace(v, gain=v.gain * GAINS[machine]) for v in Plant().valves)
-    return replace(Plant(), valves=valves)
+    valves = tuple(replace(v, gain=v.gain * GAINS[machine]) for v in SimulatedPlant().valves)
+    return replace(SimulatedPlant(), valves=valves)
 
 
 @pytest.fixture(scope="session")

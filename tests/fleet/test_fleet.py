@@ -15,23 +15,24 @@ import pytest
 from rtid.cli import main
 from rtid.cli.exits import Exit
 from rtid.compare.reference import ReferenceMap
-from rtid.datasheet import read_reference
 from rtid.errors import RtidError
 from rtid.estimator.estimator import Estimator
 from rtid.estimator.flowmap import VALID
 from rtid.estimator.solution import solve
 from rtid.estimator.sums import Sums
-from rtid.fleet import learning
 from rtid.fleet.archive import Archive
-from rtid.fleet.jobs import find
 from rtid.fleet.learning import Outcome, outcome, packed, unpacked
 from rtid.fleet.merging import FEWEST, deviation, machines, ranked, typical
 from rtid.fleet.running import run
-from rtid.mapfiles import read_map
-from rtid.model import FloatArray
-from rtid.priors import SHARE_OF_TYPICAL, find_prior, with_prior
+from rtid.fleet.traces import find
+from rtid.maps.datasheet import read_reference
+from rtid.maps.files import read_map
+from rtid.maps.prior_map import SHARE_OF_TYPICAL, find_prior, with_prior
+from rtid.plain import FloatArray
 from rtid.project import load
-from rtid.replay import join, read_trace
+from rtid.tell.fleet import tell
+from rtid.trace.reading import join, read_trace
+from tests.eighty import eighty  # noqa: F401
 from tests.fleet.conftest import MACHINES, WORN
 
 pytest.importorskip("distributed", reason="pip install 'rtid[fleet]'")
@@ -124,7 +125,7 @@ def test_the_worn_machine_stands_out_and_the_typical_map_is_a_reference(
     project: Path, learned: Archive, tmp_path: Path
 ) -> None:
     loaded = load(project)
-    found = machines(learned, {loaded.digest: loaded.model})
+    found = machines(learned, {loaded.machine_digest: loaded.model})
     assert [m.name for m in found] == list(MACHINES)
     (typ,) = typical(found)
     assert typ.machines == len(MACHINES) >= FEWEST
@@ -172,7 +173,7 @@ def test_a_defect_is_a_row_too(
     def broken(*_: object) -> None:
         raise ZeroDivisionError("boom")
 
-    monkeypatch.setattr(learning, "read_trace", broken)
+    monkeypatch.setattr("rtid.study.study.read_trace", broken)
     found = outcome(find([traces / "traces"], project)[0][0], True)
     assert found.row["error"] == "ZeroDivisionError: boom" and "report" in found.row["remedy"]
 
@@ -205,6 +206,7 @@ def test_a_run_goes_on_where_it_was_stopped(traces: Path, project: Path, tmp_pat
     assert run(jobs, archive, count, workers=2, with_diagnosis=False) == 0
 
 
+@pytest.mark.usefixtures("eighty")
 def test_the_command_ranks_the_machines_and_writes_what_others_read(
     traces: Path,
     project: Path,
@@ -221,8 +223,10 @@ def test_the_command_ranks_the_machines_and_writes_what_others_read(
         main.run(["fleet", str(traces / "traces"), "-p", str(project), "-o", str(out), "--json"])
     assert not end.value.code
     told = json.loads(capsys.readouterr().out)
+    tell(told, out)
+    assert "beta, MPa" in capsys.readouterr().out
     assert told["traces"] == 8 and told["errors"] == []
-    assert told["verdicts"] == {"not diagnosed": 7, "matches": 1}
+    assert told["verdicts"] == {"not diagnosed": 7, "insufficient_data": 1}  # so short a record
     assert {m["machine"]: m["traces"] for m in told["machines"]} == dict.fromkeys(MACHINES, 2)
     assert pq.read_table(out / "machines.parquet").num_rows == len(MACHINES)
     table = pq.read_table(out / "runs", partitioning="hive")

@@ -13,27 +13,17 @@ import pytest
 from firmware_bridge.samples import GAP, ROW
 from rtid.estimator.state import State, build
 from rtid.kernels import layout
-from rtid.model import (
-    COMMAND,
-    POSITION,
-    PRESSURE,
-    Chamber,
-    Edge,
-    FloatArray,
-    Gates,
-    Grid,
-    Model,
-    Signal,
-)
+from rtid.model import COMMAND, POSITION, PRESSURE, Chamber, Edge, Gates, Grid, Machine, Signal
+from rtid.plain import FloatArray
 
 DT, AREA, V0, Q, SD = 0.01, 2e-3, 6e-4, 1e-4, 6.0
 GRID = Grid(np.array([1.0, 4.0]), np.array([0.0, 10e6]))
 
 
-def model(chambers: int = 1, recovery_s: float = 0.0) -> Model:
+def model(chambers: int = 1, recovery_s: float = 0.0) -> Machine:
     ends = (("pa", "p_s", "p_a", 1), ("bt", "p_b", "p_t", 1))[:chambers]
     both = (Chamber("a", "p_a", AREA, 1, V0), Chamber("b", "p_b", AREA, -1, V0))[:chambers]
-    return Model(
+    return Machine(
         signals=(
             Signal("u", COMMAND, "V", 0.0, 0.0, -5.0, 5.0),
             *(Signal(p, PRESSURE, "Pa", 1e3, 0.0, 0.0, 20e6) for p in ("p_a", "p_b", "p_s", "p_t")),

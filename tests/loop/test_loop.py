@@ -9,8 +9,8 @@ import sys
 import numpy as np
 import pytest
 
-from rtid.loop.histogram import Histogram
-from rtid.loop.loop import Loop
+from rtid.daemon.histogram import Histogram
+from rtid.daemon.loop import Loop
 
 MS = 1_000_000
 
@@ -99,7 +99,7 @@ def test_only_the_calling_thread_is_promoted() -> None:
     """In a process of its own: the promotion would stay with the tests."""
     script = """
 import os, threading
-from rtid.loop.realtime import promote, sharpen_timer, lock_memory
+from rtid.daemon.realtime import promote, sharpen_timer, lock_memory
 granted = promote(5)
 seen = []
 thread = threading.Thread(target=lambda: seen.append(os.sched_getscheduler(0)))

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 import firmware_bridge
 from rtid.estimator.state import Weights
+from rtid.mcu.c_tables import sizes_of, tables
 from rtid.mcu.memory import COUNTS, Layout
-from rtid.mcu.tables import sizes_of, tables
-from rtid.model import FloatArray, Model
+from rtid.model import Machine
+from rtid.plain import FloatArray
 
 HERE = Path(__file__).parent
 SOURCES = Path(firmware_bridge.__file__).parent / "c"
@@ -57,7 +58,7 @@ class Program:
 
     def __init__(
         self,
-        model: Model,
+        model: Machine,
         folder: Path,
         blocks: int = 0,
         single: bool = False,

@@ -14,7 +14,8 @@ from rtid.estimator.solution import Solution, solve
 from rtid.estimator.state import State, Weights, build
 from rtid.estimator.sums import Normal, normal_equations
 from rtid.mcu.valve import one_valve
-from rtid.model import FloatArray, Grid, Model
+from rtid.model import Grid, Machine
+from rtid.plain import FloatArray
 from rtid.project import load
 from tests.mcu.compiled import Outcome
 from tests.rig import PROJECT
@@ -46,12 +47,12 @@ class Record:
         return np.column_stack([self.t_us * 1e-6, self.flags, self.values])
 
 
-def full_valve(chamber: str = "a") -> Model:
+def full_valve(chamber: str = "a") -> Machine:
     """A chamber of the packaged example project, on its fine grid."""
     return one_valve(load(PROJECT).model, chamber)
 
 
-def small_valve(chamber: str = "a") -> Model:
+def small_valve(chamber: str = "a") -> Machine:
     """The same with blocks as a controller has room for."""
     full = full_valve(chamber)
     return replace(full, edges=tuple(replace(edge, grid=SMALL) for edge in full.edges))
@@ -63,7 +64,7 @@ def rig_table(shared: Path, run: int) -> dict[str, FloatArray]:
     return read_table(shared / "data" / "rig" / "measured" / f"rig_{run:02}.parquet")
 
 
-def rig_record(shared: Path, run: int, model: Model) -> Record:
+def rig_record(shared: Path, run: int, model: Machine) -> Record:
     """A run of the rig as the samples of a model; its clock starts at zero."""
     table = rig_table(shared, run)
     t_us = np.rint((table["t"] - table["t"][0]) * 1e6).astype(np.int64)
@@ -80,7 +81,7 @@ class Reference:
     solution: Solution
 
     @classmethod
-    def of(cls, model: Model, record: Record, weights: Weights | None = None) -> Reference:
+    def of(cls, model: Machine, record: Record, weights: Weights | None = None) -> Reference:
         """All samples in one call."""
         state = build(model, weights)
         state.advance(record.chunk)

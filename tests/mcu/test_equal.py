@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from rtid.mcu.valve import one_valve
-from rtid.model import COMMAND_ONLY, DROP_ONLY, Model
+from rtid.model import COMMAND_ONLY, DROP_ONLY, Machine
 from tests.estimator.cases import Case, draw_case
 from tests.mcu.compiled import SANITISED, Program
 from tests.mcu.machine import (
@@ -105,7 +105,7 @@ def test_on_a_fine_grid_whose_memory_overflows(tmp_path: Path, shared: Path) -> 
     assert max(apart.beta, apart.beta_sd, apart.flows, *apart.terms) <= EQUAL
 
 
-def drawn(seed: int) -> tuple[Model, Record]:
+def drawn(seed: int) -> tuple[Machine, Record]:
     """A random declaration of one chamber with faults in its record; two edges open at once."""
     case: Case = draw_case(
         seed, faults=4, terms=seed % 7, jitter=0.3, row_every=1 + seed % 3, recovery_s=0.0205

@@ -16,9 +16,9 @@ import pytest
 
 from rtid.cli.main import run
 from rtid.estimator.state import Weights, nominal_weights
+from rtid.mcu.c_tables import sizes_of, tables
 from rtid.mcu.errors import ValveError
 from rtid.mcu.memory import Layout
-from rtid.mcu.tables import sizes_of, tables
 from rtid.mcu.valve import one_valve
 from rtid.mcu.write import write_sources
 from rtid.model import LAPPED, Term, Upkeep
@@ -27,7 +27,18 @@ from tests.mcu.compiled import COMPILER, STRICT, Program
 from tests.mcu.machine import BLOCKS, Record, Reference, small_valve, sums_apart
 from tests.rig import PROJECT
 
-ARM = shutil.which("arm-none-eabi-gcc")
+
+def arm_compiler() -> str | None:
+    """The cross compiler; None where it, or the headers of its library, are not there."""
+    found = shutil.which("arm-none-eabi-gcc")
+    if found is None:
+        return None
+    trial = [found, "-fsyntax-only", "-xc", "-include", "math.h", "/dev/null"]
+    done = subprocess.run(trial, capture_output=True, check=False)
+    return found if done.returncode == 0 else None
+
+
+ARM = arm_compiler()
 # Bytes of flash for code and tables of the small grid: more than, less than
 TARGETS = {
     "Cortex-M4, float32": (
@@ -157,7 +168,8 @@ def compiled(
 ) -> tuple[str, dict[str, int], dict[str, int]]:
     """Name of the target; bytes of text, data and bss; stack of each source's functions."""
     if ARM is None:
-        pytest.skip("no arm-none-eabi-gcc (Debian: gcc-arm-none-eabi): sizes are not measured")
+        needed = "gcc-arm-none-eabi and libnewlib-arm-none-eabi (Debian)"
+        pytest.skip(f"needs {needed}: sizes are not measured")
     folder = tmp_path_factory.mktemp("arm")
     write_sources(folder, small_valve(), BLOCKS)
     cpu = (*TARGETS[request.param][0], "-mfloat-abi=hard", "-mthumb")

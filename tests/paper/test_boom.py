@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rtid.paper.boom import Learned, boom, learn
-from rtid.paper.fig4 import even, near_error
-from rtid.paper.slices import one_dimensional
-from rtid.paper.table1 import (
+from benchmarks.paper.fig4 import even, near_error
+from benchmarks.paper.learning import Learned, learn
+from benchmarks.paper.slices import one_dimensional
+from benchmarks.paper.table1 import (
     PAPER_CALIBRATED,
     PAPER_CELLS,
     PAPER_ESTIMATED,
@@ -18,10 +18,11 @@ from rtid.paper.table1 import (
     random_nodes,
     table_cells,
 )
+from rtid.sim.boom import boom
 
 
 @pytest.fixture(scope="module")
-def found() -> Learned:
+def learned() -> Learned:
     return learn(boom(), seed=3)
 
 
@@ -33,33 +34,33 @@ def test_the_paper_s_own_errors() -> None:
     assert np.isfinite(error).mean() == PAPER_CELLS
 
 
-def test_table_1(found: Learned) -> None:
+def test_table_1(learned: Learned) -> None:
     """Mean error at most 0.5 %, largest 1.5 %, as many cells on data as in the paper."""
-    cells = table_cells(found)
+    cells = table_cells(learned)
     assert cells.error.mean() < 0.005
     assert cells.error.max() < 0.015
     assert cells.valid.mean() >= PAPER_CELLS
 
 
-def test_corners_between_valid_blocks(found: Learned) -> None:
-    corners = nodes(found)
+def test_corners_between_valid_blocks(learned: Learned) -> None:
+    corners = nodes(learned)
     assert len(corners.error) > 30
     assert corners.error.mean() < 0.005
     assert corners.error.max() < 0.015
     assert corners.covered.mean() >= 0.93
 
 
-def test_the_condition_threshold_keeps_wild_blocks_out(found: Learned) -> None:
+def test_the_condition_threshold_keeps_wild_blocks_out(learned: Learned) -> None:
     """Beyond it a block's own terms miss by a multiple; the published map does not follow them."""
-    blocks = block_errors(found)
+    blocks = block_errors(learned)
     wild = blocks.condition > 1e8
     assert wild.sum() >= 3
     assert np.median(blocks.own[wild]) > 5 * np.median(blocks.own[~wild])
     assert blocks.published[~wild].max() < 0.01
 
 
-def test_fine_blocks_near_the_dead_band_pay(found: Learned) -> None:
-    near = near_error(found)
+def test_fine_blocks_near_the_dead_band_pay(learned: Learned) -> None:
+    near = near_error(learned)
     assert near < 0.005
     assert near < near_error(learn(boom(), seed=3, blocks=even()))
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rtid.model import BASES, LAPPED, TAYLOR, FloatArray
-from rtid.paper.fig3 import FINE
-from rtid.paper.function import THETA, declared, grid, record, true_value
-from rtid.paper.surface import Estimate, errors, excess, full_scale, jumps, learn, rms
+from benchmarks.paper.fig3 import FINE
+from benchmarks.paper.function import THETA, declared, grid, record, true_value
+from benchmarks.paper.surface import Estimate, errors, excess, full_scale, jumps, learn, rms
+from rtid.model import BASES, LAPPED, TAYLOR
+from rtid.plain import FloatArray
 
 
 @pytest.fixture(scope="module")
@@ -17,7 +18,7 @@ def chunk() -> FloatArray:
 
 
 @pytest.fixture(scope="module")
-def found(chunk: FloatArray) -> dict[str, Estimate]:
+def estimates(chunk: FloatArray) -> dict[str, Estimate]:
     return {basis: learn(chunk, grid(FINE), basis) for basis in BASES}
 
 
@@ -41,13 +42,13 @@ def test_frames_carry_the_record(chunk: FloatArray) -> None:
 
 
 @pytest.mark.parametrize("basis", BASES)
-def test_rms_error_is_at_most_one_percent(found: dict[str, Estimate], basis: str) -> None:
-    assert found[basis].valid_share > 0.9
-    assert rms(errors(found[basis])) < 0.01
+def test_rms_error_is_at_most_one_percent(estimates: dict[str, Estimate], basis: str) -> None:
+    assert estimates[basis].valid_share > 0.9
+    assert rms(errors(estimates[basis])) < 0.01
 
 
-def test_windows_leave_a_tenth_of_the_jump(found: dict[str, Estimate]) -> None:
-    taylor, lapped = found[TAYLOR], found[LAPPED]
+def test_windows_leave_a_tenth_of_the_jump(estimates: dict[str, Estimate]) -> None:
+    taylor, lapped = estimates[TAYLOR], estimates[LAPPED]
     without = rms(jumps(taylor.grid, taylor.unwindowed))
     assert without > 0.001
     assert rms(jumps(taylor.grid, taylor.published.flow)) < 0.1 * without
@@ -59,10 +60,10 @@ def test_windows_leave_a_tenth_of_the_jump(found: dict[str, Estimate]) -> None:
     [TAYLOR, pytest.param(LAPPED, marks=pytest.mark.xfail(strict=True, reason="10.3 % here"))],
 )
 def test_windows_leave_a_tenth_of_the_change_over_a_border(
-    found: dict[str, Estimate], basis: str
+    estimates: dict[str, Estimate], basis: str
 ) -> None:
     """The plain count: all change beyond the truth's, that of a steep estimate too."""
-    own, taylor = found[basis], found[TAYLOR]
+    own, taylor = estimates[basis], estimates[TAYLOR]
     surface = own.published.flow if basis == TAYLOR else own.windowed
     assert rms(excess(own.grid, surface)) < 0.1 * rms(excess(taylor.grid, taylor.unwindowed))
 
@@ -75,15 +76,15 @@ def test_a_corner_is_no_jump_and_a_step_is_one() -> None:
     assert np.unique(np.abs(step).round(6)).tolist() == [0.0, round(1 / full_scale(), 6)]
 
 
-def test_the_parameter_is_found_beside_the_function(found: dict[str, Estimate]) -> None:
-    solution = found[TAYLOR].solution
+def test_the_parameter_is_found_beside_the_function(estimates: dict[str, Estimate]) -> None:
+    solution = estimates[TAYLOR].solution
     sd = float(np.sqrt(solution.terms_cov[0, 0]))
     assert abs(solution.terms[0] - THETA) < 4 * sd
     assert sd < 1e-3
 
 
 def test_fine_spacing_where_the_dead_band_may_end_halves_the_error(
-    chunk: FloatArray, found: dict[str, Estimate]
+    chunk: FloatArray, estimates: dict[str, Estimate]
 ) -> None:
     coarse = learn(chunk, grid(1.0), TAYLOR)
-    assert rms(errors(found[TAYLOR])) < 0.5 * rms(errors(coarse))
+    assert rms(errors(estimates[TAYLOR])) < 0.5 * rms(errors(coarse))

@@ -10,31 +10,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.paper import commissioning, hidden
+from benchmarks.paper.commissioning import Commissioned, commission, machines, over_the_bridge
+from benchmarks.paper.fig6 import compare, repeated
+from benchmarks.paper.fig6_picture import CALIBRATED, ESTIMATED, MANUFACTURER, Compared, rms_m
 from firmware_bridge.download import Image, Session, download
 from firmware_bridge.lookup import image
 from rtid.cli.main import run as main_run
-from rtid.paper import commissioning, hidden
-from rtid.paper.commissioning import (
-    DEADBAND_ERROR_V,
-    Commissioned,
-    commission,
-    five_valves,
-    lost,
-    machines,
-    manufacturer,
-    over_the_bridge,
-)
-from rtid.paper.fig6 import compare, repeated
-from rtid.paper.fig6_picture import CALIBRATED, ESTIMATED, MANUFACTURER, Compared, rms_m
-from rtid.paper.references import amplitude_m, point_to_point, swept
+from rtid.plain import FloatArray
 from rtid.project import load
-from rtid.replay import read_trace
-from rtid.sim.plant import AB, AT, EDGES, PB, FloatArray, Plant
+from rtid.sim.boom_references import amplitude_m, point_to_point, swept
+from rtid.sim.programmable import DEADBAND_ERROR_V, five_valves, lost, manufacturer
 from rtid.sim.robust import Knowledge, Tracked, received, run, sampled
 from rtid.sim.run import SimulationError
+from rtid.sim.simulated_plant import AB, AT, EDGES, PB, SimulatedPlant
 from rtid.sim.working_modes import REGENERATE_UNTIL_PA
+from rtid.trace.reading import read_trace
 from tests.bridge.controller import Controller, Line
 from tests.campaign.report import leave
+
+pytestmark = pytest.mark.slow
 
 NUMBER = 2003
 CHANGING = 2000  # its load becomes too small to regenerate while it is lowered
@@ -42,16 +37,16 @@ OPEN_V = 1.0  # the declared safe band
 
 
 @pytest.fixture(scope="module")
-def plant() -> Plant:
+def plant() -> SimulatedPlant:
     return five_valves(NUMBER)
 
 
 @pytest.fixture(scope="module")
-def done(plant: Plant) -> Commissioned:
+def done(plant: SimulatedPlant) -> Commissioned:
     return commission(plant, NUMBER)
 
 
-def drops(plant: Plant, tracked: Tracked) -> dict[str, FloatArray]:
+def drops(plant: SimulatedPlant, tracked: Tracked) -> dict[str, FloatArray]:
     """True pressure drop of each edge."""
     p_a, p_b = tracked.true_pa.T
     s, t = plant.p_supply_pa, plant.p_tank_pa
@@ -60,7 +55,7 @@ def drops(plant: Plant, tracked: Tracked) -> dict[str, FloatArray]:
 
 @pytest.mark.parametrize("reference", [point_to_point, swept])
 def test_references_are_consistent_and_inside_the_stroke(
-    plant: Plant, reference: Callable[[Plant], FloatArray]
+    plant: SimulatedPlant, reference: Callable[[SimulatedPlant], FloatArray]
 ) -> None:
     rows = reference(plant)
     assert 0 < rows[:, 0].min() < rows[:, 0].max() < plant.constants.stroke_m
@@ -72,7 +67,7 @@ def test_references_are_consistent_and_inside_the_stroke(
     assert np.ptp(point_to_point(plant)[:, 0]) < 2 * amplitude_m(plant)
 
 
-def test_the_controller_follows_with_the_true_map(plant: Plant) -> None:
+def test_the_controller_follows_with_the_true_map(plant: SimulatedPlant) -> None:
     reference, known = point_to_point(plant), Knowledge(sampled(plant.flow))
     tracked = run(plant, known, reference, 1)
     assert tracked.rms_m < 2e-3 * np.ptp(reference[:, 0])
@@ -96,7 +91,7 @@ def test_regeneration_spares_the_supply_and_changes_with_the_pressures() -> None
     assert (~crossing & lowering & (tracked.commands_v[:, PB] > 0)).sum() > 100
 
 
-def test_the_data_sheet_is_wrong_within_its_bounds(plant: Plant) -> None:
+def test_the_data_sheet_is_wrong_within_its_bounds(plant: SimulatedPlant) -> None:
     sheet = manufacturer(plant, NUMBER)
     w, dp = np.linspace(0, 9, 901), np.full(901, 1e6)
     for edge, valve in zip(plant.edges, plant.valves, strict=True):
@@ -105,7 +100,7 @@ def test_the_data_sheet_is_wrong_within_its_bounds(plant: Plant) -> None:
 
 
 def test_all_five_valves_are_identified_in_normal_operation(
-    plant: Plant, done: Commissioned
+    plant: SimulatedPlant, done: Commissioned
 ) -> None:
     """At the working points of the last sweep, in per cent of that valve's largest flow."""
     last = done.rounds[-1]
@@ -123,7 +118,7 @@ def test_all_five_valves_are_identified_in_normal_operation(
 
 @pytest.mark.parametrize("turn", [0, 1])
 def test_only_a_boom_lost_under_its_data_sheet_is_left_out(
-    plant: Plant, turn: int, monkeypatch: pytest.MonkeyPatch
+    plant: SimulatedPlant, turn: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One lost under a learned map is judged by that map: else failures would hide."""
     faults = iter(["", "the boom cavitates"][1 - turn :])
@@ -135,7 +130,7 @@ def test_only_a_boom_lost_under_its_data_sheet_is_left_out(
         assert len(commission(plant, NUMBER).rounds) == 1
 
 
-def test_a_boom_that_leaves_its_stroke_or_cavitates_is_lost(plant: Plant) -> None:
+def test_a_boom_that_leaves_its_stroke_or_cavitates_is_lost(plant: SimulatedPlant) -> None:
     reference = point_to_point(plant)
     tracked = run(plant, Knowledge(sampled(plant.flow)), reference)
     assert lost(plant, tracked, reference) == ""
@@ -157,7 +152,7 @@ def test_the_example_is_a_log_and_a_project_of_five_valves(tmp_path: Path) -> No
         assert (samples.column(edge.command) > OPEN_V).mean() > 0.05, edge.name
 
 
-def test_the_controller_in_c_holds_the_same_map(plant: Plant, done: Commissioned) -> None:
+def test_the_controller_in_c_holds_the_same_map(plant: SimulatedPlant, done: Commissioned) -> None:
     """The images, taken by the firmware's receiver, give the flows that Fig. 6 is driven with."""
     tables = over_the_bridge(done.model, done.rounds[-1].learned.flowmap)
     controller = Controller()
@@ -172,7 +167,7 @@ def test_the_controller_in_c_holds_the_same_map(plant: Plant, done: Commissioned
         np.testing.assert_allclose(flow, wanted, atol=2e-6 * np.abs(wanted).max(), err_msg=edge)
 
 
-def test_estimated_is_as_good_as_calibrated(plant: Plant, done: Commissioned) -> None:
+def test_estimated_is_as_good_as_calibrated(plant: SimulatedPlant, done: Commissioned) -> None:
     reference = point_to_point(plant)
     calibrated, estimated, sheet = (
         rms_m(repeated(plant, Knowledge(maps), reference, NUMBER))

@@ -1,4 +1,4 @@
-"""The summary of `rtid paper`, and its command."""
+"""The summary of the reproduced paper, and its command."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
+from benchmarks.paper import parts
+from benchmarks.paper.__main__ import main
+from benchmarks.paper.result import Measure, Part, Table, all_met, at_least, at_most
 from rtid.cli.exits import Exit
-from rtid.cli.main import run
-from rtid.paper import parts
-from rtid.paper.result import Measure, Part, Table, all_met, at_least, at_most
 
 
 def part(limit: float = 2.0) -> Part:
@@ -43,7 +43,7 @@ def test_command(
 ) -> None:
     monkeypatch.setitem(parts.PARTS, "fig3", lambda seed, plants: part())
     with pytest.raises(SystemExit) as end:
-        run(["paper", "--out", str(tmp_path), "--only", "fig3", "--json"])
+        main(["--out", str(tmp_path), "--only", "fig3", "--json"])
     assert end.value.code == Exit.OK
     told = json.loads(capsys.readouterr().out)
     assert told["all_met"]
@@ -57,13 +57,13 @@ def test_a_goal_that_is_missed_is_a_negative_result(
 ) -> None:
     monkeypatch.setitem(parts.PARTS, "fig3", lambda seed, plants: part(limit=1.0))
     with pytest.raises(SystemExit) as end:
-        run(["paper", "--out", str(tmp_path), "--only", "fig3"])
+        main(["--out", str(tmp_path), "--only", "fig3"])
     assert end.value.code == Exit.NEGATIVE
     assert "at most 1 %: MISSED" in capsys.readouterr().out
 
 
 def test_unknown_part(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as end:
-        run(["paper", "--only", "fig17"])
+        main(["--only", "fig17"])
     assert end.value.code == Exit.USAGE
     assert "fig3" in capsys.readouterr().err

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -9,17 +11,18 @@ import pytest
 
 from firmware_bridge.sources.errors import LogError
 from rtid.errors import RtidError
-from rtid.mapfiles import read_map
+from rtid.maps.files import read_map
 from rtid.project import load
 from rtid.project.history import ADD, read
-from rtid.revising import undo
 from rtid.sim.hidden import hide_wish
 from rtid.sim.random_plants import draw
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
+from rtid.study.look import Look
+from rtid.study.revisions import undo
 from rtid.ui.desk import Desk
-from rtid.ui.look import Look
 from rtid.ui.worker import in_words
+from tests.replays import shared_replays  # noqa: F401
 
 pytestmark = pytest.mark.slow
 SEED, DURATION_S = 3, 40.0
@@ -32,7 +35,7 @@ def silent(_text: str, _share: float) -> None:
 
 @pytest.fixture(scope="module")
 def worn(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    folder = tmp_path_factory.mktemp("desk")
+    folder = tmp_path_factory.mktemp("my desk")
     machine = hide_wish(draw(SEED), "internal_leakage_laminar=strong")
     run = simulate(machine, "rich", SEED, DURATION_S)
     trace, _, project = write_run(folder / "worn.parquet", run, SEED, "rich")
@@ -76,7 +79,13 @@ def test_the_whole_way_of_an_effect(worn: tuple[Path, Path]) -> None:
     assert dropped.sections == ()
     desk.back()
     assert project.read_bytes() == untouched
-    desk.save()
+    (line,) = re.findall(r"`(rtid undo[^`]*)` takes", desk.save().note)
+    assert shlex.split(line) == [
+        "rtid",
+        "undo",
+        "-p",
+        str(project),
+    ]
     assert [a.key for a in load(project).sections.added] == [LEAK]
     assert [change.change for change in read(project)] == [ADD]
     desk.export("npz")

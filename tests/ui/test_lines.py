@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from bokeh.plotting import figure
 
-from rtid.ui.lines import Lines, joined
+from rtid.tell.charts.lines import Lines, joined
 
 
 def test_parts_and_gaps_are_not_joined_by_a_line() -> None:

@@ -11,10 +11,10 @@ from rtid.daemon.status import (
     Advice,
     Alarm,
     BusHealth,
-    Chamber,
+    ChamberStatus,
     Distribution,
     EdgeHealth,
-    Estimate,
+    EstimateStatus,
     LoopHealth,
     MessageHealth,
     SignalHealth,
@@ -23,7 +23,7 @@ from rtid.daemon.status import (
     Verdict,
     write,
 )
-from rtid.ui.live import Live
+from rtid.ui.live_page import Live
 
 NOW = 1_800_000_000.0
 
@@ -34,12 +34,12 @@ def status() -> Status:
     pressure = SignalHealth("p_a", "pressure", "Pa", "Pressures", 2.5e6, 1e6, 3e6, 998.0)
     position = SignalHealth("x", "position", "m", "Motion", 0.1, 0.1, 0.1, verdict="frozen")
     message = MessageHealth("Pressures", 0x101, 1000.0, **timing, verdict="ok", refused={"crc": 7})
-    estimate = Estimate(
+    estimate = EstimateStatus(
         state="learning",
         stale=False,
         samples=60_000,
         rho=1.05,
-        chambers=(Chamber("a", 1.06e9, 1e6),),
+        chambers=(ChamberStatus("a", 1.06e9, 1e6),),
         edges=(EdgeHealth("pa", {"valid": 30, "learning": 12}, {}, 0.7),),
         refused={"range": 3, "samples": 60_000},
     )
@@ -71,7 +71,7 @@ def test_everything_that_the_daemon_says_is_there(tmp_path: Path) -> None:
     for words in (
         *("press &lt;1&gt;", "can0 is open", "3000 frames/s", "error frame 2", "NOT SAVED"),
         *("disk full", "1000 Hz", "3 overruns (late 3)", "2.5 MPa", "frozen", "crc 7", "0x101"),
-        *("998 /s", "1060 ± 2.0 MPa", "30 of 42 visited blocks valid", "range 3"),
+        *("998 /s", "1060.0 ± 2.0 MPa", "30 of 42 visited blocks valid", "range 3"),
         *("Internal leakage at a-b", "x does not move", "To learn more", "Valve &lt;pa&gt;"),
     ):
         assert words in html, words

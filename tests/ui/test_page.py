@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
+import threading
+from collections.abc import Callable
 from pathlib import Path
 
 from bokeh.document import Document
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtid.ui.fragments import button, changed, cover, parsed, select, table
-from rtid.ui.page import Page
-from rtid.ui.session import Session
+from rtid.tell.html import button, changed, cover, parsed, select, table
+from rtid.ui.browser_page import Page
+from rtid.ui.shared import Session
+from rtid.ui.turns import PAUSE_S, Turns
 from tests.ui.test_session import FakeWorker
 
 EVIL = "<img src=x onerror=\"alert('1')\">&"
@@ -32,7 +36,9 @@ def page() -> tuple[Page, Ticking]:
     session = Session(Path("m.toml"), None, FakeWorker())  # type: ignore[arg-type]
     session.open()
     live = Ticking()
-    return Page(Document(), session, live), live  # type: ignore[arg-type]
+    turns = Turns(lambda _, do: do())
+    turns.stop()
+    return Page(Document(), session, live, turns), live  # type: ignore[arg-type]
 
 
 def test_a_page_that_has_not_drawn_the_last_update_gets_no_other() -> None:
@@ -94,3 +100,63 @@ def test_only_what_has_changed_is_sent() -> None:
     old = {"a": "1", "b": "2"}
     assert changed(old, {"a": "1", "b": "3", "c": "4"}) == {"b": "3", "c": "4"}
     assert old == {"a": "1", "b": "3", "c": "4"}
+
+
+def test_pages_take_turns_and_the_loop_is_free_between() -> None:
+    later, done = list[tuple[float, Callable[[], None]]](), list[int]()
+    turns = Turns(lambda seconds, do: later.append((seconds, do)))
+    turns.stop()
+    for k in range(3):
+        turns.take(lambda k=k: done.append(k))  # type: ignore[misc]
+    for k in range(3):
+        ((seconds, do),) = later  # one at a time, and nothing else is asked for
+        later.clear()
+        assert done == list(range(k)) and seconds == (PAUSE_S if k else 0.0)
+        do()
+    assert done == [0, 1, 2] and not later
+    turns.is_working = True
+    turns.take(lambda: done.append(9))
+    later.pop()[1]()
+    assert 9 not in done, "what goes on beside the loop is waited for"
+    turns.is_working = False
+    later.pop()[1]()
+    assert done.pop() == 9
+    turns.take(lambda: done.append(3))
+    later.pop()[1]()
+    assert done[-1] == 3
+
+
+def test_what_is_done_apart_leaves_the_loop_free_and_holds_the_next_step_back() -> None:
+    looked, waited = list[bool](), list[bool]()
+
+    async def main() -> None:
+        turns = Turns(asyncio.get_running_loop().call_later)
+        go_on = threading.Event()
+        apart = asyncio.ensure_future(turns.apart(lambda: waited.append(go_on.wait(10.0))))
+        await asyncio.sleep(0)
+        turns.take(lambda: looked.append(turns.is_working))
+        await asyncio.sleep(5 * PAUSE_S)  # the loop is free, and the step waits
+        assert not looked
+        go_on.set()
+        await apart
+        while not looked:
+            await asyncio.sleep(PAUSE_S)
+        turns.stop()
+
+    asyncio.run(asyncio.wait_for(main(), 10.0))
+    assert (looked, waited) == ([False], [True])
+
+
+def test_a_follower_changes_nothing_until_it_takes_over() -> None:
+    shown, _ = page()
+    session = shown.session
+    session.join(7)
+    session.take_over(7)
+    jobs = session.worker.jobs  # type: ignore[attr-defined]
+    for what in ("add", "drop", "undo", "save", "export"):
+        shown._take({"do": what, "effect": "leak", "where": "a-b"})
+    assert not jobs and "following another browser" in shown._channel.parts["work"]
+    shown._take({"do": "take_over"})
+    shown._take({"do": "save"})
+    assert [job[0] for job in jobs] == ["save"]
+    assert "1 following" in shown._channel.parts["work"]

@@ -7,11 +7,11 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from rtid.diagnose.report import Diagnosis, Effect, Value
+from rtid.diagnose.report import Diagnosis, FoundEffect, Value
 from rtid.errors import RtidError
 from rtid.project.added import AddedSection, ParameterSection
-from rtid.ui.session import FAILED, LOADING, READY, Session
-from rtid.ui.verdict import strip
+from rtid.ui.headline import strip
+from rtid.ui.shared import FAILED, LOADING, READY, ROLE, Session
 
 KEY = "internal_leakage_laminar", "a-b"
 NAN = float("nan")
@@ -46,7 +46,9 @@ def section() -> AddedSection:
 
 def told(*named: tuple[str, str], alike: tuple[str, ...] = ()) -> Any:
     found = tuple(
-        Effect(e, w, alike, {"coefficient": Value(2e-12, 1e-14, "m3/s/Pa")}, 0.0, 90.0, 2e-6, 2e-7)
+        FoundEffect(
+            e, w, alike, {"coefficient": Value(2e-12, 1e-14, "m3/s/Pa")}, 0.0, 90.0, 2e-6, 2e-7
+        )
         for e, w in named
     )
     said = Diagnosis(
@@ -201,3 +203,23 @@ def test_the_strip_says_what_to_do_next() -> None:
     worker.answer(told())
     assert "The model matches" in strip(session)
     assert 'data-do="save"' in strip(session)
+
+
+def writer(session: Session) -> int | None:
+    return session.writer
+
+
+def test_one_browser_works_and_the_others_follow() -> None:
+    session, _, heard = begun()
+    assert writer(session) is None
+    for browser in (1, 2, 2):
+        session.join(browser)
+    assert (writer(session), len(session.pages)) == (1, 2)
+    session.take_over(2)
+    assert writer(session) == 2 and heard[-1] == ROLE
+    session.leave(2)
+    assert writer(session) == 2, "it has another page"
+    session.leave(2)
+    assert writer(session) == 1, "who followed works on"
+    session.leave(1)
+    assert writer(session) is None and not session.pages

@@ -7,9 +7,10 @@ from dataclasses import replace
 import pytest
 
 from rtid.diagnose.report import Value
-from rtid.report_sizes import limit, size
-from rtid.ui.fragments import clearness, error_bars
-from rtid.ui.verdict_words import said
+from rtid.tell.diagnosed import said
+from rtid.tell.html import clearness, error_bars
+from rtid.tell.words import quantity
+from rtid.units import limit
 from tests.ui.test_session import KEY, told
 
 NAN = float("nan")
@@ -18,11 +19,11 @@ NAN = float("nan")
 @pytest.mark.parametrize(
     ("value", "words"),
     [
-        (Value(2e-12, 1e-14, "m3/s/Pa"), "0.12 +- 0.0012 L/min/MPa"),
+        (Value(2e-12, 1e-14, "m3/s/Pa"), "0.12 ± 0.0012 L/min/MPa"),
         (Value(1e-9, NAN, "m3/s/sqrt(Pa)"), "0.06 L/min/sqrt(MPa)"),
         (Value(1e-12, NAN, "m3/Pa"), "1 cm3/MPa"),
         (Value(1.2e9, NAN, "Pa s/m3"), "0.02 MPa/(L/min)"),
-        (Value(5e-3, 1e-5, "s"), "5 +- 0.02 ms"),
+        (Value(5e-3, 1e-5, "s"), "5 ± 0.02 ms"),
         (Value(5.2e6, NAN, "Pa"), "5.2 MPa"),
         (Value(0.02, NAN, "1"), "0.02"),
     ],
@@ -30,7 +31,7 @@ NAN = float("nan")
 def test_sizes_are_in_the_units_of_the_workshop_with_their_interval(
     value: Value, words: str
 ) -> None:
-    assert size(value) == words
+    assert quantity(value) == words
 
 
 def test_a_limit_has_two_digits() -> None:
@@ -41,8 +42,9 @@ def test_a_limit_has_two_digits() -> None:
 def test_what_was_found_is_named_with_its_size_and_the_fall_of_the_error() -> None:
     words = said(told(KEY).diagnosis)
     assert words == (
-        "Internal leakage, laminar at a-b, 0.12 +- 0.0012 L/min/MPa (95 %). Adding it lowers the "
-        "held-out error from 2.00 % to 0.20 %; the sensors' floor is 0.10 %."
+        "Internal leakage, laminar at a-b, 0.12 ± 0.0012 L/min/MPa (95 %). Adding it lowers the "
+        "held-out error from 2.00 % to 0.20 %; the sensors' floor is 0.10 %. What remains is the "
+        "sensors' noise: no model could be much better."
     )
 
 

@@ -1,0 +1,74 @@
+"""MATLAB .mat files up to version 7: their vectors, after a look at what they unpack to.
+
+A file tells the shapes of its variables, and how many bytes follow: the two need not agree.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_bridge.sources.unpacked import Budget
+
+HEAD_BYTES, NUMBER_BYTES, STEP_BYTES = 128, 8, 1 << 20
+COMPRESSED = 15  # type of an element
+NO_NUMBERS = ("cell", "struct", "object", "char", "sparse", "function", "opaque", "unknown")
+
+
+class Variable(NamedTuple):
+    """What a file says about one of its variables."""
+
+    name: str
+    shape: tuple[int, ...]
+    kind: str
+
+    @property
+    def is_vector(self) -> bool:
+        """Whether exactly one of its sides is longer than 1, and it holds numbers."""
+        return sum(n != 1 for n in self.shape) == 1 and self.kind not in NO_NUMBERS
+
+
+def vectors(path: Path) -> dict[str, NDArray[np.float64]]:
+    """Every vector (n,) of real numbers, float64, in the file's units.
+
+    Raises LogError if they unpack to too much, what scipy raises for a damaged file,
+    NotImplementedError for one of MATLAB 7.3.
+    """
+    from scipy.io import loadmat, whosmat  # noqa: PLC0415  only this format needs them
+    from scipy.io.matlab import matfile_version  # noqa: PLC0415
+
+    listed = [Variable(*fields) for fields in whosmat(path)]
+    wanted = [variable for variable in listed if variable.is_vector]
+    Budget(path).take(NUMBER_BYTES * sum(math.prod(variable.shape) for variable in wanted))
+    if matfile_version(path)[0] == 1:
+        _check_elements(path, listed)
+    content: dict[str, Any] = loadmat(
+        path, squeeze_me=True, variable_names=[variable.name for variable in wanted]
+    )
+    return {
+        name: np.asarray(value, np.float64)
+        for name, value in content.items()
+        if isinstance(value, np.ndarray) and value.ndim == 1 and value.dtype.kind in "iufb"
+    }
+
+
+def _check_elements(path: Path, listed: list[Variable]) -> None:
+    """LogError if the elements of the vectors inflate to too much, whatever their shapes say."""
+    budget = Budget(path)
+    with path.open("rb") as file:
+        order = "<" if file.read(HEAD_BYTES)[-2:] == b"IM" else ">"
+        for variable in listed:
+            kind, size = struct.unpack(order + "II", file.read(8))
+            if kind != COMPRESSED or not variable.is_vector:
+                file.seek(size, 1)
+                continue
+            engine, packed = zlib.decompressobj(), file.read(size)
+            while packed and not engine.eof:
+                budget.take(len(engine.decompress(packed, STEP_BYTES)))
+                packed = engine.unconsumed_tail

@@ -1,0 +1,1 @@
+"""Maps to the controller, all or nothing: the wish, the plan, the session, and what was sent."""

@@ -1,0 +1,371 @@
+"""The law of an effect, read from its equation: what a unit of it adds to every chamber.
+
+    q_a = -C * (p_a - p_b), q_b = ...    between the two chambers
+    q_c = term                           into each chamber, or into both alike
+    q_c = sigma * term                   by an edge, or by all of them
+    q_c = outer * ddt(inner)             of what is stored; "G = ..." may stand before it
+
+The column that a diagnosis scores, the term that runs live and in free runs, and what a unit takes
+up per Pa follow from these.  What an equation cannot say is a law by name in `rtid.effects.laws`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from types import MappingProxyType
+
+import numpy as np
+
+from rtid.effects.expression import Expression
+from rtid.effects.page import FUNCTION, Effect, EffectError
+from rtid.effects.record_view import RecordView, supply_of, tank_of
+from rtid.effects.tree import NAME, ZERO, Node, derivative, evaluate, names_of, number, substituted
+from rtid.effects.view import View as Seen
+from rtid.model import Chamber, Edge, Machine
+from rtid.plain import FloatArray
+
+MODULUS, LENGTH, BEGIN = "beta", "t_r", "t_m"  # what only a fit knows: oil, length of the record
+BOTH, ALL_EDGES, EACH_EDGE = "both", "all valves", "edge"
+MAP = "Q of "  # before an edge's name: its flow by the fitted map
+NO_SHAPE: Mapping[str, float] = MappingProxyType({})
+Nodes = Mapping[str, Node]
+Volumes = dict[int, FloatArray]  # chamber -> (n - 1,) m3
+Shape = tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class LawLine:
+    """One line of an equation for a coefficient of 1: q_left = outer, or outer * d(inner)/dt."""
+
+    left: str
+    outer: Node
+    inner: Node | None
+
+    def put(self, by: Nodes) -> LawLine:
+        """The line with names replaced by trees."""
+        inner = substituted(self.inner, by) if self.inner is not None else None
+        return replace(self, outer=substituted(self.outer, by), inner=inner)
+
+    @property
+    def names(self) -> set[str]:
+        """All names in it."""
+        return {n for node in (self.outer, self.inner) if node is not None for n in names_of(node)}
+
+
+@dataclass(frozen=True)
+class Placed:
+    """An effect at one place of a machine: its lines by chamber, in the names of the machine.
+
+    Names that no record has are the symbols of nonlinear parameters.
+    """
+
+    effect: Effect
+    where: str
+    lines: tuple[tuple[int, LawLine], ...]
+
+    def volumes(self, view: RecordView, shape: Shape) -> Volumes:
+        """Volume per interval (n - 1,) and chamber that a coefficient of 1 adds, m3."""
+        values, result = self._values(view, shape), dict[int, FloatArray]()
+        for c, line in self.lines:
+            volume = values.volume(line)
+            _refuse_endless(self.effect, view.t_s, volume, values.values)
+            result[c] = result[c] + volume if c in result else volume
+        return result
+
+    def softness(self, view: RecordView, shape: Shape) -> Volumes:
+        """What a coefficient of 1 takes up per Pa of the chamber's pressure (n,), m3/Pa."""
+        values, result = self._values(view, shape), dict[int, FloatArray]()
+        for c, line in self.lines:
+            if line.inner is not None:
+                slope = derivative(line.inner, view.model.chambers[c].pressure)
+                result[c] = -values.at_samples(line.outer) * values.at_samples(slope)
+        return result
+
+    def _values(self, view: RecordView, shape: Shape) -> Values:
+        pairs = zip(self.effect.shapes, shape, strict=True)
+        return Values(self.effect, view, {p.symbol: value for p, value in pairs})
+
+
+@cache
+def lines_of(effect: Effect) -> tuple[LawLine, ...]:
+    """The lines of an effect's equation that say what flows into chambers, for a coefficient of 1.
+
+    Empty where the equation says something else.  One line a side: a second one of the same left
+    side describes more than a flow of the present (a poppet with a state).
+    """
+    known: dict[str, Node] = {
+        p.symbol: number(p.start[0]) for p in effect.parameters[1:] if p.is_held
+    }
+    known |= {s.name: number(s.value) for s in effect.symbols if s.value is not None}
+    result: dict[str, LawLine] = {}
+    for text in effect.equation:
+        left, _, right = (part.strip() for part in text.partition(" = "))
+        is_flow = left.startswith("q_") and (left != "q_e" or bool(effect.into))
+        if is_flow and left not in result:
+            line = _line(left, right, effect.size.symbol, known)
+            if line is not None:
+                result[left] = line
+        elif not is_flow and left.isidentifier() and "ddt(" not in right and _is_plain(right):
+            known[left] = substituted(Expression.parse(right).root, known)
+    return tuple(result.values())
+
+
+def _is_plain(text: str) -> bool:
+    return not any(word in text for word in ("play(", "delay(", "Q("))
+
+
+def _line(rest: str, right: str, coefficient: str, known: Nodes) -> LawLine | None:
+    """One line; None where it has notations that are no law, or is not linear in the size."""
+    if not _is_plain(right):
+        return None
+    outer, has_rate, inner = right.partition("ddt(")
+    if has_rate:
+        outer = outer.strip().removesuffix("*")
+        if not inner.endswith(")") or "ddt(" in inner:
+            return None
+        inner = inner[:-1]
+    line = LawLine(rest, _tree(outer), _tree(inner) if has_rate else None).put(known)
+    if line.inner is not None and coefficient in names_of(line.inner):
+        line = replace(line, inner=derivative(line.inner, coefficient))
+    else:
+        line = replace(line, outer=derivative(line.outer, coefficient))
+    return None if line.outer == ZERO or coefficient in line.names else line
+
+
+def _tree(text: str) -> Node:
+    return Expression.parse(text.strip()).root
+
+
+def places_of(effect: Effect, model: Machine, compliance: FloatArray) -> Iterator[Placed]:
+    """An effect wherever its equation can act on a machine; compliance (chambers,): 1/Pa.
+
+    Empty where its equation is no law.  EffectError for a name that no record has.
+    """
+    lines = lines_of(effect)
+    for where, meant in _places(effect, model, lines):
+        at = tuple(meant)
+        oil = float(np.mean(compliance[[c for c, _, _ in at]])) if len(compliance) else 0.0
+        oils = {MODULUS: number(1.0 / oil if oil else np.inf)}
+        fixed = oils | {LENGTH: number(1.0), BEGIN: number(0.0)} if not effect.into else {}
+        placed = tuple((c, line.put(by).put(fixed)) for c, line, by in at)
+        _refuse_unknown(effect, model, placed)
+        yield Placed(effect, where, placed)
+
+
+Meant = Iterator[tuple[int, LawLine, dict[str, Node]]]  # chamber, line, meaning of its symbols
+
+
+def _places(
+    effect: Effect, model: Machine, lines: tuple[LawLine, ...]
+) -> Iterator[tuple[str, Meant]]:
+    """Places by name; at each the lines by chamber, with what their symbols mean there."""
+    chambers, by_left = model.chambers, {line.left: line for line in lines}
+    if not lines:
+        return
+    if effect.into:
+        names = [c.name for c in chambers]
+        if all(name in names for name, _ in effect.into):
+            yield place_of(effect.into, names), _users(effect, model, lines)
+    elif by_left.keys() == {"q_a", "q_b"}:
+        if len(chambers) == 2:
+            yield f"{chambers[0].name}-{chambers[1].name}", _across(model, lines)
+    elif "sigma" in lines[0].names:
+        line = lines[0]
+        if EACH_EDGE in effect.places:
+            for edge in model.edges:
+                yield edge.name, _through(model, line, (edge,))
+        else:
+            yield ALL_EDGES, _through(model, line, model.edges)
+    else:
+        for where, at in chambers_by_place(model).items():
+            if ("both chambers" if where == BOTH else "chamber") in effect.places:
+                yield where, _alone(model, lines[0], at)
+
+
+def chambers_by_place(model: Machine) -> dict[str, tuple[int, ...]]:
+    """The chambers by name, and both where there are two."""
+    result = {chamber.name: (c,) for c, chamber in enumerate(model.chambers)}
+    return result | ({BOTH: (0, 1)} if len(result) == 2 else {})
+
+
+def place_of(into: tuple[tuple[str, int], ...], chambers: list[str]) -> str:
+    """The place of a flow by the chambers that it enters and leaves: "a", "a-b" or "both"."""
+    names, signs = [name for name, _ in into], {sign for _, sign in into}
+    return BOTH if len(names) == len(chambers) == 2 and len(signs) == 1 else "-".join(names)
+
+
+def _users(effect: Effect, model: Machine, lines: tuple[LawLine, ...]) -> Meant:
+    names = [c.name for c in model.chambers]
+    for (name, _), line in zip(effect.into, lines, strict=True):
+        yield names.index(name), line, {}
+
+
+def _across(model: Machine, lines: tuple[LawLine, ...]) -> Meant:
+    item, two = model.chambers
+    both = _of_chamber(item, "a") | _of_chamber(two, "b") | _of_machine(model)
+    for line in lines:
+        yield int(line.left == "q_b"), line, both
+
+
+def _alone(model: Machine, line: LawLine, at: tuple[int, ...]) -> Meant:
+    for c in at:
+        yield c, line, _of_chamber(model.chambers[c], "c") | _of_machine(model)
+
+
+def _through(model: Machine, line: LawLine, edges: tuple[Edge, ...]) -> Meant:
+    """Into every chamber that an edge feeds or drains."""
+    for c, chamber in enumerate(model.chambers):
+        for edge in edges:
+            if sign := edge.sign(chamber):
+                drop = Node("-", (_signal(edge.source), _signal(edge.sink)))
+                of_edge = {
+                    "sigma": number(float(sign)), "dp": drop, "u": _signal(edge.command),
+                    "Q": Node(NAME, name=MAP + edge.name),
+                    "w": Node("*", (number(float(edge.direction)), _signal(edge.command))),
+                }  # fmt: skip
+                yield c, line, _of_chamber(chamber, "c") | _of_machine(model) | of_edge
+
+
+def _of_chamber(chamber: Chamber, letter: str) -> dict[str, Node]:
+    return {
+        f"p_{letter}": _signal(chamber.pressure),
+        f"V_{letter}": _signal(f"V_{chamber.name}"),
+        f"A_{letter}": _signal(f"A_{chamber.name}"),
+    }
+
+
+def _of_machine(model: Machine) -> dict[str, Node]:
+    command = next((edge.command for edge in model.edges), "")
+    return {
+        "p_tank": _signal(tank_of(model)), "p_supply": _signal(supply_of(model)),
+        "u": _signal(command), "x": _signal(model.position),
+    }  # fmt: skip
+
+
+def _signal(name: str) -> Node:
+    """A name of the machine; "" is a pressure of zero."""
+    return Node(NAME, name=name) if name else ZERO
+
+
+def _refuse_unknown(
+    effect: Effect, model: Machine, placed: tuple[tuple[int, LawLine], ...]
+) -> None:
+    known = {s.name for s in model.signals} | {"t", "x", "v"} | {p.symbol for p in effect.shapes}
+    known |= {f"{letter}_{c.name}" for c in model.chambers for letter in "VA"}
+    known |= {MAP + edge.name for edge in model.edges} | ({FUNCTION} if effect.function else set())
+    unknown = sorted({name for _, line in placed for name in line.names} - known)
+    if unknown:
+        raise EffectError(
+            f"the equation of {effect.name} uses {', '.join(unknown)}, which no record has",
+            "write it in p_a, p_b, p_c, p_tank, p_supply, x, v, t, u, V_c, dp, sigma and Q, or "
+            "name a law: law = ...",
+        )
+
+
+def _evaluated(node: Node, value: Callable[[str], FloatArray]) -> FloatArray:
+    with np.errstate(all="ignore"):
+        arrays = {name: value(name) for name in names_of(node)}
+        return np.asarray(evaluate(node, arrays), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class Values:
+    """What the names in a line are worth on a record, with nonlinear parameters of these values."""
+
+    effect: Effect
+    view: RecordView
+    values: Mapping[str, float]
+
+    def at_samples(self, node: Node) -> FloatArray:
+        """A tree at every sample (n,), SI."""
+        return np.broadcast_to(_evaluated(node, self._here), self.view.t_s.shape)
+
+    def _here(self, name: str) -> FloatArray:
+        if name in self.values:
+            return np.asarray(self.values[name])
+        if self.effect.function is not None and name == FUNCTION:
+            return flow_in_python(self.effect, self.view.seen, self.values)
+        return self.view.seen.value(name)
+
+    def volume(self, line: LawLine) -> FloatArray:
+        """Over each interval (n - 1,), m3: the command is held, all else linear between samples."""
+        if line.inner is not None:
+            outer = self.at_samples(line.outer)
+            return np.asarray(0.5 * (outer[1:] + outer[:-1]) * np.diff(self.at_samples(line.inner)))
+        names, view = names_of(line.outer), self.view
+        if FUNCTION not in names and not any(n in view.held or n.startswith(MAP) for n in names):
+            return view.over_intervals(self.at_samples(line.outer))
+        start, end = (_evaluated(line.outer, at) for at in (self._at_start, self._at_end))
+        return np.asarray(np.broadcast_to(0.5 * (start + end), view.dt_s.shape) * view.dt_s)
+
+    def _at_start(self, name: str) -> FloatArray:
+        if name.startswith(MAP):
+            return self._mapped(name)
+        here = self._here(name)
+        return here[:-1] if here.ndim else here
+
+    def _at_end(self, name: str) -> FloatArray:
+        view = self.view
+        if name.startswith(MAP):
+            return self._mapped(name)
+        if self.effect.function is not None and name == FUNCTION:
+            return flow_in_python(self.effect, view.seen.before_the_next_command, self.values)
+        here = self._here(name)
+        return here if not here.ndim else here[:-1] if name in view.held else here[1:]
+
+    def _mapped(self, name: str) -> FloatArray:
+        edges = [edge.name for edge in self.view.model.edges]
+        return self.view.flow(edges.index(name.removeprefix(MAP)))
+
+
+def flow_in_python(effect: Effect, seen: Seen, shape: Mapping[str, float]) -> FloatArray:
+    """What the function of an effect gives (n,), m3/s per unit; EffectError where it fails."""
+    assert effect.function is not None
+    kept = {p.name: p.start[0] for p in effect.parameters[1:] if p.is_held}
+    try:
+        flow = np.asarray(effect.function(seen, **(kept | dict(shape))), dtype=np.float64)
+        return np.broadcast_to(flow, seen.t_s.shape)
+    except EffectError:
+        raise
+    except Exception as error:
+        reason = f"effect {effect.name!r} fails: {type(error).__name__}: {error}"
+        raise EffectError(reason, f"correct {effect.reference or 'its function'}") from error
+
+
+def flow(effect: Effect, seen: Seen, shape: Mapping[str, float] = NO_SHAPE) -> FloatArray:
+    """Flow of a user's effect for a coefficient of 1 (n,), m3/s, before the chambers' signs.
+
+    Raises EffectError unless it is finite.
+    """
+    if effect.function is not None:
+        values = flow_in_python(effect, seen, shape)
+    else:
+        (name, sign), *_ = effect.into
+        line = next(line for line in lines_of(effect) if line.left == f"q_{name}")
+        values = _evaluated(
+            line.outer, lambda n: np.asarray(shape[n]) if n in shape else seen.value(n)
+        )
+        values = sign * np.broadcast_to(values, seen.t_s.shape)
+    _refuse_endless(effect, seen.t_s, values, shape)
+    return values
+
+
+def _refuse_endless(
+    effect: Effect, t_s: FloatArray, values: FloatArray, shape: Mapping[str, float]
+) -> None:
+    wrong = np.flatnonzero(~np.isfinite(values))
+    if len(wrong):
+        reason = f"effect {effect.name!r} is not finite in {len(wrong)} of {len(values)} samples"
+        at = f"the first at {t_s[wrong[0]]:g} s" + (f", with {dict(shape)}" * bool(shape))
+        raise EffectError(f"{reason}, {at}", "guard roots, logarithms and quotients")
+
+
+def fitted_names(effect: Effect) -> frozenset[str]:
+    """Which of MODULUS and LENGTH multiply the coefficient: a fit knows them better than a column.
+
+    Empty for a law by name.
+    """
+    lines = () if effect.law or effect.into else lines_of(effect)
+    return frozenset(n for line in lines for n in line.names) & {MODULUS, LENGTH}

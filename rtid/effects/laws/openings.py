@@ -1,0 +1,51 @@
+"""Valves that open at a pressure: a poppet with its own time constant and hysteresis.
+
+Q = K max(0, P* - P_r),  P* the pressure behind a play of the width of the hysteresis
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from rtid.effects.column import Cause, of_page
+from rtid.effects.law import Shape, Volumes
+from rtid.effects.laws.common import lagged
+from rtid.effects.laws.timing import played
+from rtid.effects.page import Effect
+from rtid.effects.record_view import RecordView
+
+OPENINGS = 8  # opening pressures that are tried, over the range
+OWN_TIMES_S = (0.0, 0.02, 0.06)
+SHUT, RARE = 0.1, 0.998  # quantiles of the pressure: one that never shuts is a leak
+MAKEUP_PA = 1.5e6  # a make-up valve feeds from the tank line: it opens at low pressure
+HYSTERESIS = 0.04  # of the highest pressure: where the search begins
+
+
+def opening(view: RecordView, effect: Effect, sign: float) -> Iterator[Cause]:
+    """On each chamber, a valve that lets out (sign +1) above its opening pressure, or in below."""
+    for c in range(len(view.model.chambers)):
+        yield _opening(view, effect, c, sign)
+
+
+def _opening(view: RecordView, effect: Effect, c: int, sign: float) -> Cause:
+    p, smooth = view.pressure(c), view.smooth(view.pressure(c))
+    shares = (SHUT, RARE) if sign > 0 else (1.0 - RARE, 1.0 - SHUT)
+    low, high = (float(v) for v in np.quantile(p, shares))
+    is_possible = sign > 0 or low < MAKEUP_PA
+    if sign < 0 and is_possible:
+        high = min(high, MAKEUP_PA)
+    pressures = tuple(float(v) for v in np.linspace(low, high, OPENINGS + 2)[1:-1])
+
+    def make(shape: Shape) -> Volumes:
+        opening, own_time_s, hysteresis = shape
+        # a play follows extremes: those of the noise would widen it
+        poppet = played(smooth, view.step_s, (hysteresis,)) if hysteresis > 0.0 else p
+        flow = -sign * np.maximum(0.0, sign * (poppet - opening))
+        return {c: view.over_intervals(lagged(flow, view.step_s, own_time_s))}
+
+    shape_names = ("opening_pressure", "own_time_constant", "hysteresis")
+    candidate = of_page(effect, view.model.chambers[c].name, shape=shape_names)
+    times_s = OWN_TIMES_S if sign > 0 else (0.0,)  # a check valve is quick
+    return Cause(candidate, make, (pressures, times_s, (0.0, HYSTERESIS * high)), 2, is_possible)

@@ -1,0 +1,63 @@
+"""The echoes of the pressures' noise in whatever a chamber stores beside its oil."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import partial
+
+import numpy as np
+
+from rtid.effects.column import Candidate, Cause, Columns
+from rtid.effects.law import Shape, Volumes, places_of
+from rtid.effects.laws.common import stored
+from rtid.effects.record_view import RecordView
+from rtid.estimator.state import variance
+from rtid.plain import FloatArray
+
+SEED = 20051005  # of the noise that stands for the sensors' own
+
+
+def add_echoes(
+    view: RecordView, columns: Columns, first: int, slopes: list[tuple[Cause, Shape, int]]
+) -> None:
+    """Echoes of theta_beta and of every storage column: the same columns of noise alone.
+
+    first: number of given columns before the slopes and the candidates; slopes: cause, shape and
+    parameter of each derivative column.
+    """
+    rng = np.random.default_rng(SEED)
+    n_c, noise = len(view.model.chambers), {}
+    for c, chamber in enumerate(view.model.chambers):
+        sd = np.sqrt(variance(view.model, chamber.pressure) * view.model.pressure_share)
+        noise[c] = sd * rng.standard_normal(view.n)
+        echo = columns.add({c: view.compliance[c] * stored(view, c, noise[c])})
+        columns.echo_of[1 + c] = 1 + n_c + echo
+
+    def soft(cause: Cause, shape: Shape) -> Volumes:
+        return softness(view, cause.at(shape))
+
+    taken_up = [cause.slope_of(partial(soft, cause), shape, k) for cause, shape, k in slopes]
+    taken_up += [softness(view, candidate) for candidate in columns.candidates]
+    for k, by_chamber in enumerate(taken_up):
+        if by_chamber:
+            echo = columns.add({c: -np.diff(m * noise[c]) for c, m in by_chamber.items()})
+            columns.echo_of[1 + n_c + first + k] = 1 + n_c + echo
+
+
+def softness(view: RecordView, candidate: Candidate) -> Volumes:
+    """What one unit of a storage effect takes up per Pa, by chamber (n,), m3/Pa; {} for others."""
+    if candidate.law.law:
+        return {}
+    for placed in places_of(candidate.law, view.model, view.compliance):
+        if placed.where == candidate.where:
+            return placed.softness(view, candidate.shape)
+    return {}
+
+
+def total_softness(view: RecordView, sizes: Iterable[tuple[Candidate, float]]) -> FloatArray:
+    """What effects of these sizes take up per Pa (n, chambers), m3/Pa."""
+    total = np.zeros((view.n, len(view.model.chambers)))
+    for candidate, size in sizes:
+        for c, taken in softness(view, candidate).items():
+            total[:, c] += size * taken
+    return total

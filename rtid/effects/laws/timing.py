@@ -1,0 +1,159 @@
+"""Effects between the command and the spool: the command that the map should have been given.
+
+A command u_k is held over [t_k, t_k+1]; a transformed one is the mean over that interval of what
+reaches the spool, and is held in its place.  Edges that open with u > 0 and with u < 0 may be parts
+of one spool, which follows the signed command, or valves of their own, each of which follows its
+part of the command and rests at zero meanwhile: so there is one command for either direction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from rtid.effects.page import catalogue
+from rtid.kernels.jit import kernel
+from rtid.plain import FloatArray
+
+Psi = tuple[float, ...]
+COMMAND, SUPPLY = "command", "supply"  # what a timing transforms
+RATE = "rad/s"  # unit of a parameter that does the more the smaller it is
+
+
+@dataclass(frozen=True)
+class TimingLaw:
+    """A transformation of the command with parameters psi; `bank`: where a search starts.
+
+    apply(u (n,), dt_s, psi) -> (n,); low, high: bounds of psi; replaces_lag: it stands for the
+    declared lag of the spools instead of coming before it; is_linear: in the command;
+    own_spools: each direction follows its own part of the command; where: a command, or the
+    demand on the supply, from which `apply` makes what the supply gives way; is_rate: psi[0] is a
+    rate, so that a smaller one does more.
+    """
+
+    effect: str
+    parameters: tuple[str, ...]
+    units: tuple[str, ...]
+    bank: tuple[Psi, ...]
+    low: Psi
+    high: Psi
+    apply: Callable[[FloatArray, float, Psi], FloatArray]
+    replaces_lag: bool = False
+    is_linear: bool = True
+    own_spools: bool = False
+    where: str = COMMAND
+    is_rate: bool = False
+
+    def strength(self, psi: Psi) -> float:
+        """How much a command is changed, 0 for not at all."""
+        return 1.0 / psi[0] if self.is_rate else psi[0]
+
+    def at(self, strength: float) -> Psi:
+        """The parameters of that strength, within their bounds, the others as in the bank."""
+        value = 1.0 / strength if self.is_rate else strength
+        return (float(np.clip(value, self.low[0], self.high[0])), *self.bank[0][1:])
+
+    def on(self, command: FloatArray, direction: int, dt_s: float, psi: Psi) -> FloatArray:
+        """What reaches the spool of the edges of one direction (+1, -1)."""
+        if self.own_spools:
+            command = direction * np.maximum(0.0, direction * command)
+        return self.apply(command, dt_s, psi)
+
+    def change(
+        self, command: FloatArray, direction: int, dt_s: float, psi: Psi, k: int
+    ) -> FloatArray:
+        """Derivative (n,) of the transformed command with respect to psi[k], by differences."""
+        step = 0.02 * max(abs(psi[k]), 0.02 * abs(self.bank[0][k]))
+        above, below = list(psi), list(psi)
+        above[k], below[k] = min(psi[k] + step, self.high[k]), max(psi[k] - step, self.low[k])
+        wide = above[k] - below[k]
+        rise = self.on(command, direction, dt_s, tuple(above))
+        rise -= self.on(command, direction, dt_s, tuple(below))
+        return np.asarray(rise / wide)
+
+
+def delayed(u: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
+    """u(t - psi) (n,), mean over each interval, in the unit of u."""
+    steps = max(0.0, psi[0]) / dt_s
+    whole = int(steps)
+    part = steps - whole
+    padded = np.concatenate([np.full(whole + 1, u[0]), u])
+    n = len(u)
+    return np.asarray((1.0 - part) * padded[1 : n + 1] + part * padded[:n])
+
+
+def lagged(u: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
+    """First-order lag of time constant psi, mean over each interval (n,), exact where u is held."""
+    tau = max(psi[0], 1e-9)
+    fade = float(np.exp(-dt_s / tau))
+    from scipy.signal import lfilter  # noqa: PLC0415 - takes long to import
+
+    start = lfilter([0.0, 1.0 - fade], [1.0, -fade], u - u[0]) + u[0]
+    return np.asarray(u + (start - u) * tau / dt_s * (1.0 - fade))
+
+
+def second_order(u: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
+    """Spool of natural frequency psi[0] rad/s and damping psi[1], mean over each interval (n,)."""
+    wn, zeta = psi
+    from scipy.signal import cont2discrete, lfilter  # noqa: PLC0415 - takes long to import
+
+    b, a, _ = cont2discrete(
+        (np.array([wn * wn]), np.array([1.0, 2.0 * zeta * wn, wn * wn])), dt_s, method="zoh"
+    )
+    start = lfilter(np.ravel(b), a, u - u[0]) + u[0]
+    return np.asarray(0.5 * (start + np.append(start[1:], start[-1])))
+
+
+def played(u: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
+    """u (n,) behind a play of full width psi: the spool follows once the play is taken up."""
+    out = np.empty(len(u))
+    _play(np.ascontiguousarray(u), 0.5 * psi[0], out)
+    return out
+
+
+@kernel
+def _play(u: FloatArray, half: float, out: FloatArray) -> None:
+    at = u[0]
+    for k in range(len(u)):
+        at = min(max(at, u[k] - half), u[k] + half)
+        out[k] = at
+
+
+def of_law(
+    law: str, apply: Callable[[FloatArray, float, Psi], FloatArray], names: tuple[str, ...] = (),
+    **keys: Any,
+) -> TimingLaw:  # fmt: skip
+    """The timing of the page that names this law, with its parameters; names: in another order.
+
+    apply: (n,) to (n,), both in V, or of a demand in m3/s to Pa.
+    """
+    (page,) = (page for page in catalogue().values() if page.law == law)
+    known = {p.name: p for p in page.parameters}
+    parameters = tuple(known[name] for name in names or known)
+    return TimingLaw(
+        page.name,
+        tuple(p.name for p in parameters),
+        tuple(p.unit for p in parameters),
+        tuple(product(*(p.start for p in parameters))),
+        tuple(p.low for p in parameters),
+        tuple(p.high for p in parameters),
+        apply,
+        is_rate=parameters[0].unit == RATE,
+        **keys,
+    )
+
+
+COMMAND_LAWS: dict[str, tuple[TimingLaw, ...]] = {
+    "delay": (of_law("delay", delayed),),
+    "lag": tuple(of_law("lag", lagged, own_spools=its_own) for its_own in (False, True)),
+    "second_order": tuple(
+        of_law("second_order", second_order, replaces_lag=True, own_spools=its_own)
+        for its_own in (False, True)
+    ),
+    "play": (of_law("play", played, is_linear=False),),
+}
+TIMINGS = tuple(timing for timings in COMMAND_LAWS.values() for timing in timings)

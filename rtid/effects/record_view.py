@@ -1,0 +1,238 @@
+"""A record as effects see it: signals by role, volumes, and the flows of the fitted map.
+
+Values at samples have n entries, means and volumes over intervals n - 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache, cached_property
+
+import numpy as np
+
+from rtid.effects.view import View as Seen
+from rtid.estimator.state import Weights, build
+from rtid.kernels.following import follow_map
+from rtid.kernels.layout import TERMS
+from rtid.kernels.smoothing import correlate
+from rtid.model import COMMAND, MODE, PRESSURE, Edge, Machine
+from rtid.plain import BoolArray, FloatArray, IntArray
+
+TURNS = 0.05  # share of changes that reverse the one before: 2/3 for noise, next to 0 for motion
+UNKNOWN = 10.0  # standard deviation of the flow in a block that was never visited, rated flows
+NONE = np.zeros(0)
+SMOOTH_S = 0.02  # half width of the window for derivatives of pressures, without delay
+
+
+def has_noise(values: FloatArray) -> bool:
+    """False for computed values (n,): a measurement turns back at a fair share of its changes.
+
+    Repeats do not count, so that held and interpolated measurements are told as well.
+    """
+    change = np.diff(values)
+    change = change[change != 0.0]
+    return len(change) > 2 and bool(np.mean(change[1:] * change[:-1] < 0.0) > TURNS)
+
+
+@cache
+def _parabolas(
+    half: int, derivative: int, step_s: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Weights (2 half + 1) of a parabola's value: at the first points, the middle, the last."""
+    from scipy.signal import savgol_coeffs  # noqa: PLC0415 - takes long to import
+
+    m = 2 * half + 1
+    at = [
+        savgol_coeffs(m, 2, derivative, step_s, pos=k, use="dot").astype(np.float64)
+        for k in range(m)
+    ]
+    return np.array(at[:half]), at[half], np.array(at[half + 1 :])
+
+
+def tank_of(model: Machine) -> str:
+    """Name of the tank's signal, "" where no edge names one."""
+    return min({e.sink for e in model.edges} - {c.pressure for c in model.chambers}, default="")
+
+
+def supply_of(model: Machine) -> str:
+    """Name of the supply's signal, "" where no edge names one."""
+    chambers = {chamber.pressure for chamber in model.chambers}
+    return next((e.source for e in model.edges if e.source not in chambers), "")
+
+
+@dataclass(frozen=True)
+class MapTerms:
+    """Terms (V, 6) of the blocks of the grid cells (V,), in units of the rated flows.
+
+    cov (V, 6, 6): their covariance; empty where nobody asked for it, and deviations are 0 then.
+    """
+
+    cells: IntArray
+    terms: FloatArray
+    cov: FloatArray
+
+
+@dataclass(frozen=True)
+class RecordView:
+    """chunk (n, 2 + signals); compliance (chambers,) 1/Pa; along as from `follow_map`, 0 for NaN.
+
+    inside (n - 1,): every open edge is on its grid, and the record has no gap.
+    """
+
+    model: Machine
+    chunk: FloatArray
+    compliance: FloatArray
+    along: FloatArray
+    inside: BoolArray
+
+    @classmethod
+    def of(
+        cls, model: Machine, chunk: FloatArray, weights: Weights, flowmap: MapTerms
+    ) -> RecordView:
+        """The record beside a fitted map; chunk (n, 2 + signals), SI."""
+        rated = np.repeat(
+            [e.rated_q_m3s for e in model.edges],
+            [e.grid.shape[0] * e.grid.shape[1] for e in model.edges],
+        )
+        theta, cov = np.zeros((model.n_cells, TERMS)), np.zeros((0, TERMS, TERMS))
+        theta[flowmap.cells] = flowmap.terms * rated[flowmap.cells, None]
+        if len(flowmap.cov):
+            cov = np.eye(TERMS) * (UNKNOWN * rated[:, None, None]) ** 2
+            cov[flowmap.cells] = flowmap.cov * rated[flowmap.cells, None, None] ** 2
+        state = build(model, weights)
+        along = np.empty((5, len(model.edges), len(chunk) - 1)).transpose(2, 1, 0)
+        cell = np.empty(along.shape[:2], np.int64)
+        follow_map(state.engine, state.cells, theta, cov, chunk, along, cell)
+        return cls(
+            model, chunk, weights.compliance, np.nan_to_num(along), np.isfinite(along[:, 0, 0])
+        )
+
+    @classmethod
+    def without_map(
+        cls, model: Machine, chunk: FloatArray, compliance: FloatArray = NONE
+    ) -> RecordView:
+        """The record's signals and volumes alone; chunk (n, 2 + signals), compliance 1/Pa."""
+        return cls(model, chunk, compliance, np.zeros((0, 0, 5)), np.zeros(0, bool))
+
+    @property
+    def n(self) -> int:
+        """Number of samples."""
+        return len(self.chunk)
+
+    @cached_property
+    def t_s(self) -> FloatArray:
+        """Instants of the samples (n,)."""
+        return np.ascontiguousarray(self.chunk[:, 0])
+
+    @cached_property
+    def dt_s(self) -> FloatArray:
+        """Lengths of the intervals (n - 1,)."""
+        return np.diff(self.t_s)
+
+    @cached_property
+    def step_s(self) -> float:
+        """The usual length of an interval."""
+        return float(np.median(self.dt_s))
+
+    def signal(self, name: str) -> FloatArray:
+        """A signal by its name (n,), SI."""
+        if name not in self._signals:
+            column = 2 + self.model.column(name)
+            self._signals[name] = np.ascontiguousarray(self.chunk[:, column])
+        return self._signals[name]
+
+    @cached_property
+    def _signals(self) -> dict[str, FloatArray]:
+        """Those that were asked for: next to one another, they are read much faster."""
+        return {}
+
+    @cached_property
+    def x_m(self) -> FloatArray:
+        """Measured position (n,)."""
+        return self.signal(self.model.position)
+
+    def pressure(self, c: int) -> FloatArray:
+        """Pressure of chamber c (n,), Pa."""
+        return self.signal(self.model.chambers[c].pressure)
+
+    def volume(self, c: int) -> FloatArray:
+        """Volume of chamber c (n,), m3."""
+        chamber = self.model.chambers[c]
+        return chamber.v0_m3 + chamber.sign * chamber.area_m2 * self.x_m
+
+    @cached_property
+    def seen(self) -> Seen:
+        """The record as formulas and functions see it: everything by its name."""
+        return Seen(self.model, self.t_s, self.chunk[:, 2:])
+
+    @cached_property
+    def held(self) -> frozenset[str]:
+        """Signals that are held between their samples, and not linear."""
+        return frozenset(s.name for s in self.model.signals if s.kind in (COMMAND, MODE))
+
+    @property
+    def supply_name(self) -> str:
+        """Name of the supply's signal, "" where no edge names one."""
+        return supply_of(self.model)
+
+    @cached_property
+    def supply_is_measured(self) -> bool:
+        """False where the supply's signal has no noise: a nominal value, not a measurement."""
+        return bool(self.supply_name) and has_noise(self.signal(self.supply_name))
+
+    def may_open(self, edge: Edge) -> BoolArray:
+        """True (n,) where the working mode lets an edge open."""
+        if not (self.model.mode and edge.modes):
+            return np.ones(self.n, bool)
+        return np.isin(self.signal(self.model.mode), edge.modes)
+
+    def over_intervals(self, flow: FloatArray) -> FloatArray:
+        """Volume (n - 1,), m3, of a flow at the samples (n,), linear between them."""
+        return np.asarray(0.5 * (flow[1:] + flow[:-1]) * self.dt_s)
+
+    def flow(self, i: int) -> FloatArray:
+        """Flow of edge i by the fitted map (n - 1,), m3/s."""
+        return np.asarray(self.along[:, i, 1])
+
+    def slope_u(self, i: int) -> FloatArray:
+        """dQ/dw of edge i (n - 1,), m3/s/V."""
+        return np.asarray(self.along[:, i, 2])
+
+    def slope_dp(self, i: int) -> FloatArray:
+        """dQ/ddp of edge i (n - 1,), m3/s/Pa."""
+        return np.asarray(self.along[:, i, 3])
+
+    def flow_sd(self) -> FloatArray:
+        """Largest standard deviation of open edges (n - 1,), as a share of the rated flow."""
+        rated = np.array([edge.rated_q_m3s for edge in self.model.edges])
+        return np.asarray((self.along[:, :, 4] / rated).max(axis=1))
+
+    def smooth(self, values: FloatArray, derivative: int = 0) -> FloatArray:
+        """Values (n,) without most of their noise and delay, or their rate; any unit."""
+        half = max(2, round(SMOOTH_S / self.step_s))
+        if len(values) <= 2 * half:
+            return np.zeros(len(values))
+        means, m = np.empty(len(values)), 2 * half + 1
+        first, middle, last = _parabolas(half, derivative, self.step_s)
+        means[:half], means[-half:] = first @ values[:m], last @ values[-m:]
+        correlate(np.ascontiguousarray(values), middle, means[half : len(values) - half])
+        return means
+
+    def into_chamber(self, c: int, per_edge: list[FloatArray]) -> FloatArray:
+        """Sum of per_edge (n - 1,), m3/s, with the sign with which each feeds chamber c."""
+        signs = [edge.sign(self.model.chambers[c]) for edge in self.model.edges]
+        total = np.zeros(self.n - 1)
+        for sign, values in zip(signs, per_edge, strict=True):
+            if sign:
+                total += sign * values
+        return total
+
+    def chamber_flow(self, c: int) -> FloatArray:
+        """Flow of all valves into chamber c by the fitted map (n - 1,), m3/s."""
+        return self.into_chamber(c, [self.flow(i) for i in range(len(self.model.edges))])
+
+    @cached_property
+    def has_pressures(self) -> bool:
+        """True where every chamber's pressure is measured."""
+        kinds = {s.name: s.kind for s in self.model.signals}
+        return all(kinds.get(c.pressure) == PRESSURE for c in self.model.chambers)

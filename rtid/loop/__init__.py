@@ -1,1 +1,0 @@
-"""The fixed-rate loop: absolute deadlines, real-time scheduling where allowed, its statistics."""

@@ -1,0 +1,159 @@
+"""Propose roles for the signals of a DBC or a table, by unit and by the words in their names."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from firmware_bridge.catalog import Catalog
+from firmware_bridge.sources.table import Table, is_time
+from rtid.project.references import KIND_DIMENSIONS
+from rtid.units import find_unit, said, split_name, units_of, words_of
+
+_PRESSURE = {"p", "pressure", "press", "druck"}
+_WANTED_NOT_MEASURED = {"ref", "reference", "set", "setpoint", "target", "desired", "demand", "des"}
+
+
+@dataclass(frozen=True)
+class RoleCandidate:
+    """A signal that could play a role; `message` is empty for a column of a table."""
+
+    name: str
+    message: str
+    unit: str  # as the file or the name says, "" if neither says anything
+    low: float
+    high: float
+    guessed_unit: bool = False
+
+    @property
+    def stem(self) -> str:
+        """The name without its unit."""
+        return split_name(self.name)[0]
+
+    @property
+    def full_name(self) -> str:
+        """Message and signal, or the column."""
+        return f"{self.message}.{self.name}".lstrip(".")
+
+
+@dataclass(frozen=True)
+class Role:
+    """A role and the words that speak for it; `alone` are whole names."""
+
+    name: str
+    kind: str
+    words: frozenset[str]
+    alone: frozenset[str]
+
+
+def _role(name: str, kind: str, words: str, alone: str) -> Role:
+    return Role(name, kind, frozenset(words.split()), frozenset(alone.split()))
+
+
+ROLES = (
+    _role("p_supply", "pressure", "supply pump system line sup", "ps p0 pp psys"),
+    _role("p_tank", "pressure", "tank return reservoir drain", "pt pr pret"),
+    _role("p_a", "pressure", "a cap bore head piston 1 bottom", "pa p1 pcap"),
+    _role("p_b", "pressure", "b rod ring annulus 2 top", "pb p2 prod"),
+    _role("x", "position", "x pos position stroke displacement length angle", "x s y"),
+    _role("v", "velocity", "v vel velocity speed", "v xdot"),
+    _role("u", "command", "u cmd command valve spool current pwm duty out", "u i uv"),
+)
+
+
+def from_catalog(catalog: Catalog) -> list[RoleCandidate]:
+    """Every signal of a DBC."""
+    return [
+        RoleCandidate(
+            s.name, name, unit_said(s.name, s.unit), _number(s.minimum, 0), _number(s.maximum, 0)
+        )
+        for name in catalog.names
+        for s in catalog.message(name).signals
+    ]
+
+
+def from_table(table: Table) -> list[RoleCandidate]:
+    """Every column of a table but time, with the range of its values."""
+    candidates = []
+    for name, column in table.columns.items():
+        known = column[np.isfinite(column)]
+        if not is_time(name) and len(known):
+            low, high = float(known.min()), float(known.max())
+            candidates.append(
+                RoleCandidate(name, "", unit_said(name, table.units.get(name)), low, high)
+            )
+    return candidates
+
+
+def unit_said(name: str, given: str | None) -> str:
+    """Unit of a signal as its file gives it, else as its name tells; "" if neither does."""
+    return said(given or "") or split_name(name)[1]
+
+
+def propose(candidates: list[RoleCandidate]) -> dict[str, RoleCandidate]:
+    """The best candidate for each role; a signal plays one role, and a role may stay empty."""
+    pairs = [
+        (_score(role, c), -k, -len(c.name), -j)
+        for k, role in enumerate(ROLES)
+        for j, c in enumerate(candidates)
+    ]
+    chosen: dict[int, int] = {}  # role -> candidate, the surest pair first
+    for score, k, _, j in sorted(pairs, reverse=True):
+        if score > 0 and -k not in chosen and -j not in chosen.values():
+            chosen[-k] = -j
+    return {ROLES[k].name: _with_unit(candidates[chosen[k]], ROLES[k]) for k in sorted(chosen)}
+
+
+def unused(candidates: list[RoleCandidate], roles: dict[str, RoleCandidate]) -> list[RoleCandidate]:
+    """The candidates that play no role."""
+    used = {(c.message, c.name) for c in roles.values()}
+    return [c for c in candidates if (c.message, c.name) not in used]
+
+
+def _score(role: Role, candidate: RoleCandidate) -> float:
+    """Positive if the candidate may play the role."""
+    words = words_of(candidate.stem)
+    unit = find_unit(candidate.unit)
+    fits = unit is not None and unit.dimension in KIND_DIMENSIONS[role.kind]
+    if (candidate.unit and not fits) or (words & _WANTED_NOT_MEASURED and role.kind != "command"):
+        return 0.0
+    known = role.words
+    if role.kind == "pressure" and not (fits or words & _PRESSURE):
+        known = frozenset(word for word in known if len(word) > 1)  # motor_1 is no chamber
+    matched = len(words & known) + 2 * ("".join(sorted(words)) in role.alone)
+    matched += 2 * (candidate.stem.lower().replace("_", "") in role.alone)
+    only_kind = fits and role.kind in ("position", "velocity", "command")
+    if not matched and not only_kind:
+        return 0.0
+    foreign = len(words - role.words - _PRESSURE - {"sensor"})
+    return max(2 * matched + 2 * fits - 0.5 * foreign, 0.1)
+
+
+def _with_unit(candidate: RoleCandidate, role: Role) -> RoleCandidate:
+    """The candidate with a unit guessed from its range, if the file gives none."""
+    if candidate.unit:
+        return candidate
+    size = max(abs(candidate.low), abs(candidate.high))
+    limits = {"pressure": (1e5, 50e6), "position": (0.02, 5.0), "velocity": (0.005, 5.0)}
+    if role.kind == "command":
+        return replace(candidate, unit="V" if size <= 12 else "%", guessed_unit=True)
+    low, high = limits[role.kind]
+    dimension = KIND_DIMENSIONS[role.kind][0]
+    fitting = [u.name for u in units_of(dimension) if low <= size * u.factor <= high]
+    preferred = [n for n in ("Pa", "bar", "m", "mm", "m/s", "mm/s", "MPa") if n in fitting]
+    unit = (preferred or fitting or [units_of(dimension)[0].name])[0]
+    return replace(candidate, unit=unit, guessed_unit=True)
+
+
+def _number(value: object, otherwise: float) -> float:
+    return float(value) if isinstance(value, int | float) else otherwise
+
+
+def relative(path: Path, folder: Path) -> str:
+    """The path as the project file names it: relative to its folder where that is simple."""
+    try:
+        return path.resolve().relative_to(folder.resolve()).as_posix()
+    except ValueError:
+        return path.resolve().as_posix()

@@ -1,0 +1,1 @@
+"""One trace under one project: learned from, compared, diagnosed, added to and taken back."""

@@ -1,0 +1,161 @@
+"""The effects that a project has added, on board: shared columns beside the maps.
+
+An effect that is a function of the signals at one instant is a term of (14) with theta = 1 for the
+value in [[added]]; how sure that is counts as a row, (theta - 1) / sd, so that what the motion does
+not show stays as it was found.  One whose flow the kernels cannot compute, a user's in Python or of
+any other form, is evaluated beside them (`rtid.effects.live`).  Timings, and effects that act on
+the valves' flows or have a state of their own, need a record: replay and diagnosis know them; on
+board the maps take up what they can of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rtid.effects import Effect, catalogue
+from rtid.effects.page import title
+from rtid.errors import RtidError
+from rtid.estimator.estimator import Estimator
+from rtid.estimator.limits import refuse_unfit
+from rtid.model import PRESSURE, Term
+from rtid.project import Project
+from rtid.project.added import AddedSection, ParameterSection
+from rtid.project.build import digest
+from rtid.trace.snapshot import SnapshotError, load
+
+if TYPE_CHECKING:
+    from rtid.effects.column import Candidate
+    from rtid.effects.live import LiveFlow
+
+LEAST_SD, USUAL_SD = 0.01, 0.1  # relative: an oil warms, a seal wears
+
+
+class NoRoomOnBoardError(RtidError):
+    """More effects than the kernels have room for."""
+
+
+def on_board(project: Project, tell: Callable[[str], None]) -> Project:
+    """The project whose model holds its added effects, as far as they can run live.
+
+    tell: hears one sentence per effect.  Another model has another digest: what was learned without
+    an effect is not gone on with.  Raises NoRoomOnBoardError.
+    """
+    model, flows = project.model, project.flows
+    for added in project.sections.added:
+        (terms, more), name = _live(project, added), f"{title(added.effect)} at {added.where}"
+        signals = tuple(flow.signal for flow in more)
+        model = replace(model, terms=(*model.terms, *terms), signals=(*model.signals, *signals))
+        flows = (*flows, *more)
+        if terms:
+            how = ", its flow computed sample by sample" if more else ""
+            tell(f"{name} is learned beside the maps{how}")
+        else:
+            tell(
+                f"{name} is not in the model on board, {_why_not(project, added)}: the maps take "
+                "up what they can of it; replay and diagnosis know it"
+            )
+    if len(model.terms) == len(project.model.terms):
+        return project
+    try:
+        refuse_unfit(model)
+    except ValueError as error:
+        raise NoRoomOnBoardError(f"{project.path}: {error}", "drop an effect: rtid drop") from None
+    beside = tuple((flow.placed.effect.equation, flow.size, flow.shape) for flow in flows)
+    key, alone = digest((project.digest, model.terms, *beside)), digest(model)
+    return replace(project, model=model, digest=key, machine_digest=alone, flows=flows)
+
+
+def load_for(path: Path, project: Project) -> tuple[Estimator, tuple[AddedSection, ...]]:
+    """A snapshot of this project, from replay or from on board; the effects that are in its model.
+
+    Raises SnapshotError.
+    """
+    board = on_board(project, lambda _: None)
+    try:
+        return load(path, project.model, project.digest), ()
+    except SnapshotError:
+        if board is project:
+            raise
+        live = tuple(a for a in project.sections.added if _live(project, a)[0])
+        return load(path, board.model, board.digest), live
+
+
+def _live(project: Project, added: AddedSection) -> tuple[tuple[Term, ...], tuple[LiveFlow, ...]]:
+    """What of an added effect runs live: its terms, and flows where the kernels lack its form."""
+    terms = _terms(project, added)
+    flows = () if terms else _flows(project, added)
+    if flows:
+        size = added.parameters[flows[0].placed.effect.size.name]
+        terms = tuple(_known(flow.term, size) for flow in flows)
+    return terms, flows
+
+
+def _why_not(project: Project, added: AddedSection) -> str:
+    if _column(project, added) is None:
+        trusted = (
+            "" if project.untrusted is None else f" unless {project.untrusted.name} is trusted"
+        )
+        return f"because this project knows no such effect{trusted}"
+    above_zero = tuple(
+        replace(s, minimum=max(s.minimum, 1.0)) if s.kind == PRESSURE else s
+        for s in project.model.signals
+    )
+    if _terms(replace(project, model=replace(project.model, signals=above_zero)), added):
+        return "where the declared range of a chamber's pressure does not begin above zero"
+    return "because it needs a record"
+
+
+def _terms(project: Project, added: AddedSection) -> tuple[Term, ...]:
+    """The terms of an added effect; () where it is no function of signals that the kernels know."""
+    # scipy.signal: a second of the start of a daemon that has no effects
+    from rtid.effects.terms import terms_of  # noqa: PLC0415
+
+    model, candidate = project.model, _column(project, added)
+    if candidate is None:
+        return ()
+    size = added.parameters[candidate.parameter]
+    compliance = np.full(len(model.chambers), 1.0 / model.beta_nominal_pa)
+    return tuple(_known(t, size) for t in terms_of(model, compliance, candidate, size.value))
+
+
+def _flows(project: Project, added: AddedSection) -> tuple[LiveFlow, ...]:
+    """The flows of an added effect that are evaluated beside the kernels; () where they cannot."""
+    from rtid.effects.live import live_flows  # noqa: PLC0415
+
+    model, candidate = project.model, _column(project, added)
+    if candidate is None:
+        return ()
+    compliance = np.full(len(model.chambers), 1.0 / model.beta_nominal_pa)
+    size = added.parameters[candidate.parameter]
+    return live_flows(model, compliance, candidate, size.value)
+
+
+def _column(project: Project, added: AddedSection) -> Candidate | None:
+    """The column that an added effect was found with; None for one that is no effect here."""
+    from rtid.effects.column import of_page  # noqa: PLC0415
+
+    effect = _effect(project, added)
+    if effect is None or effect.size.name not in added.parameters:
+        return None
+    names = tuple(p.name for p in effect.shapes)
+    given = added.parameters
+    shape = tuple(given[name].value if name in given else 0.0 for name in names)
+    return replace(of_page(effect, added.where, shape=names), shape=shape)
+
+
+def _effect(project: Project, added: AddedSection) -> Effect | None:
+    """The effect of that name, of the user's or of the catalogue."""
+    named = {effect.name: effect for effect in project.effects}
+    return named.get(added.effect) or catalogue().get(added.effect)
+
+
+def _known(term: Term, size: ParameterSection) -> Term:
+    """A term that is known as well as the size of its effect."""
+    sd = size.sd
+    relative = max(LEAST_SD, sd / abs(size.value) if sd is not None else USUAL_SD)
+    return replace(term, sd=relative)

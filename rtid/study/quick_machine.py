@@ -1,0 +1,235 @@
+"""A machine of which nobody has said anything: given sizes, stated assumptions, grids of the data.
+
+What nobody has said is assumed, and every assumption is kept with what would change if it is wrong.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from firmware_bridge.samples import ROW, Samples
+from rtid.plain import FloatArray
+from rtid.project.guess import RoleCandidate
+from rtid.project.template import EDGES, nice
+from rtid.trace.quick_source import unit_of
+
+BORE_M, ROD_SHARE, DEAD_SHARE = 0.05, 0.7, 0.2  # a usual cylinder
+SUPPLY_PA = 7e6
+U_STEPS, DP_STEPS = 16, 12
+WINDOW_S = 0.02  # over which the speed is taken
+MOVES = 0.02  # of the top speed: below, the machine stands
+SPEED_BINS = 80
+LAG_MS, LAG_TOLERANCE_MS = 2.0, 5.0  # of a spool: every real one has some lag
+MOST_S = 120.0  # of a record: a diagnosis of more takes longer than a minute
+
+
+@dataclass(frozen=True)
+class Given:
+    """What the user has said, SI; None: nothing."""
+
+    bore_m: float | None = None
+    rod_m: float | None = None
+    stroke_m: float | None = None
+    dead_volume_m3: float | None = None
+
+
+@dataclass(frozen=True)
+class Assumption:
+    """Something that nobody has said, and what it would change if it is wrong."""
+
+    what: str
+    if_wrong: str
+
+
+@dataclass(frozen=True)
+class MachineSizes:
+    """Sizes and grids, SI; areas_m2 of the chambers a and b; reversed: roles to be turned round.
+
+    span_s: the part of the record that is looked at.
+    """
+
+    areas_m2: tuple[float, float]
+    stroke_m: float
+    dead_volume_m3: float
+    dead_is_fitted: bool
+    x_zero_m: float
+    u_grid: FloatArray
+    dp_grid_pa: FloatArray
+    safe_band: float
+    rated_flow_m3s: float
+    rated_dp_pa: float
+    span_s: tuple[float, float] | None = None
+    reversed: frozenset[str] = frozenset()
+    assumptions: tuple[Assumption, ...] = field(default=())
+
+
+def first_machine(roles: dict[str, RoleCandidate], given: Given) -> MachineSizes:
+    """The machine from the ranges of its signals alone, as far as it takes to read the samples."""
+    bore = given.bore_m or BORE_M
+    rod = given.rod_m if given.rod_m is not None else ROD_SHARE * bore
+    x, u = roles["x"], roles["u"]
+    low, high = (unit_of(x).si(end) for end in (x.low, x.high))
+    zero = min(low, 0.0)
+    stroke = given.stroke_m or nice(high - zero, 1.0)
+    areas = math.pi / 4 * bore**2, math.pi / 4 * (bore**2 - rod**2)
+    u_max = nice(max(abs(u.low), abs(u.high)) * unit_of(u).factor, 10.0)
+    highest = max(unit_of(c).si(c.high) for r, c in roles.items() if r.startswith("p_"))
+    top = nice(highest, SUPPLY_PA)
+    return MachineSizes(
+        areas,
+        stroke,
+        given.dead_volume_m3 or DEAD_SHARE * areas[0] * stroke,
+        given.dead_volume_m3 is None,
+        zero,
+        np.linspace(0.0, u_max, U_STEPS + 1),
+        top * np.linspace(-1.0, 1.0, DP_STEPS + 1),
+        0.0,
+        1e-3,
+        0.5e6,
+        assumptions=tuple(_of_geometry(given, bore, rod, stroke, zero)),
+    )
+
+
+def _of_geometry(
+    given: Given, bore: float, rod: float, stroke: float, zero: float
+) -> list[Assumption]:
+    assumptions = []
+    if given.bore_m is None:
+        assumptions.append(Assumption(
+            f"the bore is {1e3 * bore:.0f} mm (--bore)",
+            "every flow, leak and map is scaled by the true area over this one; the verdict stays",
+        ))  # fmt: skip
+    if given.rod_m is None:
+        assumptions.append(Assumption(
+            f"the rod is {1e3 * rod:.0f} mm (--rod)",
+            "flows of chamber b are scaled against those of a: an internal leak would look partly "
+            "like an external one",
+        ))  # fmt: skip
+    fitted = given.dead_volume_m3 is None
+    volumes = (
+        "the volume of b is off by a constant, which is fitted with it"
+        if fitted
+        else "the volume of b is off: as if it had extra dead volume"
+    )
+    if given.stroke_m is None:
+        assumptions.append(Assumption(
+            f"the stroke is {1e3 * stroke:.0f} mm, from the largest position (--stroke)",
+            volumes,
+        ))  # fmt: skip
+    if zero < 0.0:
+        assumptions.append(Assumption(
+            f"the piston is fully retracted at x = {1e3 * zero:.0f} mm, the lowest seen",
+            volumes.replace("volume of b is", "volumes are"),
+        ))  # fmt: skip
+    if fitted:
+        assumptions.append(Assumption(
+            "the dead volumes are whatever explains the record best (--dead-volume)",
+            "extra dead volume and hoses cannot be told from it, and are not judged",
+        ))  # fmt: skip
+    return assumptions
+
+
+def fitted_machine(machine: MachineSizes, samples: Samples) -> MachineSizes:
+    """The machine with grids, dead band, flow and span from the samples, as its signs are."""
+    u, x = samples.column("u"), samples.column("x")
+    speed = _speed(samples)
+    span = _span(samples, x)
+    band = shut_band(u, speed)
+    top = float(np.abs(u).max())
+    drops = [
+        samples.column(source)[w > band] - samples.column(sink)[w > band]
+        for source, sink, way in EDGES.values()
+        for w in [way * u]
+    ]
+    dp = np.concatenate(drops) if any(len(d) for d in drops) else np.zeros(1)
+    low, high = float(dp.min()), float(dp.max())
+    flow = 1.2 * machine.areas_m2[0] * float(np.quantile(speed, 0.999))
+    usual = float(np.median(dp[dp > 0])) if (dp > 0).any() else 0.5e6
+    return replace(
+        machine,
+        u_grid=np.linspace(band, max(top, band + 1e-6) * 1.001, U_STEPS + 1),
+        dp_grid_pa=dp_grid(low, high),
+        safe_band=band,
+        rated_flow_m3s=max(flow, 1e-7),
+        rated_dp_pa=usual,
+        span_s=span,
+        assumptions=machine.assumptions + tuple(_of_samples(samples, band, span)),
+    )
+
+
+def _of_samples(
+    samples: Samples, band: float, span: tuple[float, float] | None
+) -> list[Assumption]:
+    assumptions = [Assumption(
+        f"the valves are shut up to |u| = {band:.3g}, half of what it takes to move",
+        "a valve that opens earlier passes for a leak; give safe_band in the project file",
+    ), Assumption(
+        f"the spools lag {LAG_MS:g} ms, give or take {LAG_TOLERANCE_MS:g}: nothing missing",
+        "a smaller delay is counted as the spools' own; give dynamics.spool_lag",
+    )]  # fmt: skip
+    if span is not None:
+        whole = float(samples.t_us[-1] - samples.t_us[0]) * 1e-6
+        assumptions.append(Assumption(
+            f"of {whole:.0f} s the {MOST_S:.0f} s with the most motion are looked at, "
+            f"{span[0]:.0f} to {span[1]:.0f} s",
+            "what happens elsewhere in the record is not seen",
+        ))  # fmt: skip
+    return assumptions
+
+
+def _speed(samples: Samples) -> FloatArray:
+    """|dx/dt| at every sample (n,), over WINDOW_S."""
+    t, x = samples.t_us * 1e-6, samples.column("x")
+    rows = np.flatnonzero(samples.flags & ROW)
+    if len(rows) < 3:
+        return np.zeros(len(t))
+    step = max(1, round(WINDOW_S / max(float(np.median(np.diff(t[rows]))), 1e-9)))
+    at = rows[::step]
+    if len(at) < 2:
+        return np.zeros(len(t))
+    speed = np.abs(np.diff(x[at])) / np.maximum(np.diff(t[at]), 1e-9)
+    return np.asarray(speed[np.clip(np.searchsorted(at, np.arange(len(t))) - 1, 0, len(speed) - 1)])
+
+
+def shut_band(u: FloatArray, speed: FloatArray) -> float:
+    """Half of the |u| from which on the machine moves, for u > 0 and for u < 0 alike.
+
+    u (n,) in the unit that it was recorded in; speed (n,) in m/s.
+    """
+    top, fast = float(np.abs(u).max()), MOVES * float(np.quantile(speed, 0.99))
+    if top == 0.0 or fast == 0.0:
+        return 0.0
+    bands = []
+    for way in (1, -1):
+        mine = way * u > 0
+        place = np.minimum((way * u[mine] / top * SPEED_BINS).astype(int), SPEED_BINS - 1)
+        shut = speed[mine]
+        moving = [k for k in np.unique(place) if np.median(shut[place == k]) > fast]
+        bands.append(0.5 * top * moving[0] / SPEED_BINS if moving else 0.0)
+    return float(min(bands))
+
+
+def dp_grid(low: float, high: float) -> FloatArray:
+    """Borders (n,), Pa, from below `low` to above `high`: narrow near 0, where flow bends most."""
+    top = nice(max(high, 1e5), SUPPLY_PA)
+    up = top * np.linspace(0.0, 1.0, DP_STEPS + 1) ** 2
+    if low >= -0.02 * top:
+        return np.concatenate([[low - 1e4], up[1:]]) if low < 0.0 else up
+    down = -nice(-low, SUPPLY_PA) * np.linspace(1.0, 0.0, DP_STEPS // 2 + 1) ** 2
+    return np.concatenate([down, up[1:]])
+
+
+def _span(samples: Samples, x: FloatArray) -> tuple[float, float] | None:
+    """The MOST_S with the longest way; None for a record that is no longer."""
+    t = (samples.t_us - samples.t_us[0]) * 1e-6
+    if t[-1] <= MOST_S:
+        return None
+    seconds = np.arange(int(t[-1]) + 1)
+    smooth = np.interp(seconds, t, x)
+    way = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(smooth)))])
+    last = len(way) - int(MOST_S) - 1
+    start = float(np.argmax(way[int(MOST_S) :][: last + 1] - way[: last + 1]))
+    return start, start + MOST_S

@@ -1,0 +1,116 @@
+"""What a fit can be made again from in one pass, and the classes of all that is kept."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from rtid.compare.dependence import Dependence
+from rtid.diagnose.fit import NO_COV, Fit, one_pass
+from rtid.diagnose.partial import AddedVariable, Exhibit, Rise
+from rtid.diagnose.report import Diagnosis, FittedEffect, FoundEffect, Small, Unseen, Value
+from rtid.diagnose.revision import Revision
+from rtid.effects.column import Candidate
+from rtid.effects.laws.pump import PUMP
+from rtid.effects.laws.timing import TIMINGS, Psi
+from rtid.effects.page import Effect as Page
+from rtid.effects.record_view import MapTerms
+from rtid.estimator.blocks import Block
+from rtid.estimator.flowmap import EdgeMap
+from rtid.estimator.flowmap import FlowMap as PublishedMap
+from rtid.estimator.record import RecordFit
+from rtid.estimator.solution import Solution
+from rtid.estimator.state import Weights
+from rtid.estimator.validity import Doubt
+from rtid.model import Chamber, Edge, Filter, Gates, Grid, Lag, Machine, Signal, Term, Upkeep
+from rtid.plain import FloatArray, IntArray
+from rtid.study.known_effects import KnownEffect
+
+
+@dataclass(frozen=True)
+class Seed:
+    """Weights and revision of a fit, and the map (cells, terms) that gave its columns.
+
+    timings: (effect, whether the spools are apart, parameters).  Pages of effects are not kept.
+    """
+
+    weights: Weights
+    effects: tuple[Candidate, ...]
+    timings: tuple[tuple[str, bool, Psi], ...]
+    sizes: tuple[tuple[Candidate, float], ...]
+    cells: IntArray
+    terms: FloatArray
+
+    @classmethod
+    def of(cls, fit: Fit) -> Seed:
+        """The seed of a fit."""
+        revision = fit.revision
+        timings = tuple((t.effect, t.own_spools, psi) for t, psi in revision.timings)
+        map_ = fit.before
+        effects = tuple(replace(effect, page=None) for effect in revision.effects)
+        sizes = tuple((replace(effect, page=None), size) for effect, size in revision.sizes)
+        return cls(fit.weights, effects, timings, sizes, map_.cells, map_.terms)
+
+    def fit(self, model: Machine, chunk: FloatArray, own_effects: tuple[Page, ...] = ()) -> Fit:
+        """The fit of the usable record that it was taken from, light.
+
+        chunk (n, 2 + signals), SI: that record.  own_effects: pages of the user's effects, which
+        the catalogue does not have.
+        """
+        pages = {effect.name: effect for effect in own_effects}
+
+        def with_page(effect: Candidate) -> Candidate:
+            return replace(effect, page=pages.get(effect.effect))
+
+        kinds = {(t.effect, t.own_spools): t for t in (*TIMINGS, PUMP)}
+        timings = tuple((kinds[effect, apart], psi) for effect, apart, psi in self.timings)
+        effects = tuple(map(with_page, self.effects))
+        sizes = tuple((with_page(effect), size) for effect, size in self.sizes)
+        revision = Revision(effects, timings, sizes)
+        before = MapTerms(self.cells, self.terms, NO_COV)
+        return one_pass(
+            model, chunk, self.weights, revision, None, bank=False, before=before
+        ).light()
+
+
+@dataclass(frozen=True)
+class Learned:
+    """A record's fit with its maps, from the fit of `seed` and the steady one.
+
+    counters: what was refused of the trace.
+    """
+
+    record: RecordFit
+    added: tuple[KnownEffect, ...]
+    steady: Seed
+    counters: dict[str, int]
+
+    @classmethod
+    def of(
+        cls,
+        record: RecordFit,
+        added: tuple[KnownEffect, ...],
+        steady: Fit,
+        counters: dict[str, int],
+    ) -> Learned:
+        """What is kept of a record's fit."""
+        return cls(record, added, Seed.of(steady), counters)
+
+
+@dataclass(frozen=True)
+class Said:
+    """A diagnosis, and what was refused of its trace."""
+
+    diagnosis: Diagnosis
+    counters: dict[str, int]
+
+
+FIT, LEARNED, FLOWS, SAID, EVIDENCE = "fit", "record", "map", "diagnosis", "evidence"
+_SEED = (Seed, Weights, Candidate)
+_MODEL = (Machine, Signal, Chamber, Edge, Grid, Term, Lag, Filter, Gates, Upkeep)
+CLASSES: dict[str, tuple[type, ...]] = {
+    FIT: _SEED,
+    LEARNED: (Learned, RecordFit, Solution, Block, KnownEffect, Value, *_SEED, *_MODEL),
+    FLOWS: (PublishedMap, EdgeMap, Grid),
+    SAID: (Said, Diagnosis, FittedEffect, FoundEffect, Unseen, Small, Value, Doubt),
+    EVIDENCE: (Exhibit, AddedVariable, Rise, Dependence),
+}

@@ -1,0 +1,1 @@
+"""Charts: what each of them shows, as data (`rtid.tell.story`), and the pictures of flow maps."""

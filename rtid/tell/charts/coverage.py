@@ -1,0 +1,65 @@
+"""Fig. 4: where the data lie in the u-dp plane, and what became of each block."""
+
+from __future__ import annotations
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from rtid.estimator.flowmap import EdgeMap, FlowMap
+from rtid.model import Edge, Machine
+from rtid.plain import FloatArray
+from rtid.tell.colours import GREY, INK, LINE
+from rtid.tell.stills import FILL, LABELS, STYLE, label_outer, panels
+from rtid.units import MPA
+
+DOTS = 6000  # samples drawn per edge
+
+
+def coverage(model: Machine, flowmap: FlowMap, chunk: FloatArray) -> Figure:
+    """Blocks by status and the samples in them; chunk (n, 2 + signals), SI."""
+    with mpl.rc_context(STYLE):
+        figure, axes = panels(len(model.edges))
+        for axis, edge, learned in zip(axes, model.edges, flowmap.edges, strict=True):
+            _blocks(axis, learned)
+            w_v, dp_pa = working_points(model, edge, chunk)
+            step = max(1, len(w_v) // DOTS)
+            axis.plot(w_v[::step], dp_pa[::step] * MPA, ".", color=INK, ms=1.8, alpha=0.45, mew=0)
+            axis.set_title(f"{edge.name}: {edge.source} → {edge.sink}")
+        label_outer(axes, "opening command w in V", "pressure drop in MPa")
+        _legend(figure, flowmap)
+    return figure
+
+
+def working_points(model: Machine, edge: Edge, chunk: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Opening command, V, and pressure drop, Pa, (m,) of the samples with the edge open.
+
+    chunk (n, 2 + signals), SI.
+    """
+    w_v = edge.direction * chunk[:, 2 + model.column(edge.command)]
+    dp_pa = chunk[:, 2 + model.column(edge.source)] - chunk[:, 2 + model.column(edge.sink)]
+    is_open = w_v > max(edge.safe_band_v, float(edge.grid.u_v[0]))
+    return w_v[is_open], dp_pa[is_open]
+
+
+def _blocks(axis: Axes, edge: EdgeMap) -> None:
+    u, p = edge.grid.u_v, edge.grid.dp_pa * MPA
+    words = list(FILL)
+    code = np.searchsorted(sorted(words), edge.status)
+    fills = mpl.colors.ListedColormap([FILL[word] for word in sorted(words)])
+    mesh = axis.pcolormesh(u, p, code.T, cmap=fills, edgecolors=LINE, linewidth=0.35)
+    mesh.set_clim(0, len(words) - 1)
+    axis.set_xlim(u[0], u[-1])
+    axis.set_ylim(p[0], p[-1])
+
+
+def _legend(figure: Figure, flowmap: FlowMap) -> None:
+    present = {word for edge in flowmap.edges for word in np.unique(edge.status).tolist()}
+    handles = [
+        Patch(facecolor=colour, edgecolor=GREY, linewidth=0.5, label=LABELS[word])
+        for word, colour in FILL.items()
+        if word in present
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))

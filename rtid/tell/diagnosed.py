@@ -1,0 +1,224 @@
+"""A diagnosis as an engineer reads it: sentences first, then the tables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rtid.diagnose.report import Diagnosis, FoundEffect, Unseen, Value
+from rtid.diagnose.trials import MATCH_RHO
+from rtid.diagnose.verdict import INSUFFICIENT, MATCHES, MATERIAL, UNKNOWN
+from rtid.effects.page import title
+from rtid.tell.story import Chart, Story, Table
+from rtid.tell.words import VERDICTS, quantity
+from rtid.units import CONVENTION, limit
+
+SHOWN = 14  # rows of the table of what was not found
+
+
+def story(diagnosis: Diagnosis, evidence: Sequence[Chart] = ()) -> Story:
+    """Everything that a diagnosis says; evidence: a chart for each effect that is named."""
+    said = with_convention(sentences(diagnosis))
+    return Story("", (*said, _found_table(diagnosis), *evidence, _unseen_table(diagnosis)))
+
+
+def with_convention(lines: list[str]) -> list[str]:
+    """The same lines, and what ± means behind them where one has it."""
+    return [*lines, CONVENTION] if any("±" in line for line in lines) else lines
+
+
+def sentences(diagnosis: Diagnosis) -> list[str]:
+    """The verdict in plain words."""
+    lines = [*_added(diagnosis), _head(diagnosis)]
+    if not diagnosis.held_out_judged:
+        lines.append(
+            "The machine moves too little in the held-out part, or where the map is not known: the "
+            "errors are those of the record that taught the model."
+        )
+    lines += [_one(diagnosis, effect) for effect in diagnosis.found]
+    if rest := remains(diagnosis):
+        lines.append(rest)
+    if diagnosis.negligible:
+        names = ", ".join(f"{title(s.effect)} ({s.where})" for s in diagnosis.negligible)
+        lines.append(
+            f"Seen, but too small on this motion to be sized: {names}."
+            if diagnosis.verdict == "insufficient_data"
+            else f"Too small to matter, if there at all: {names}."
+        )
+    doubts = [f"{doubt.text[0].upper()}{doubt.text[1:]}" for doubt in diagnosis.doubts]
+    return lines + doubts + [f"{text}" for text in diagnosis.advice[:4]]
+
+
+def remains(diagnosis: Diagnosis) -> str:
+    """What the model with everything found leaves: the words of terminal, page and report.
+
+    The remainder is judged like that of a model which matches, so that the same residual is
+    called the same before an effect is added and after it.
+    """
+    is_open = diagnosis.verdict in (UNKNOWN, INSUFFICIENT)
+    if not diagnosis.something_remains:
+        return (
+            "" if is_open else "What remains is the sensors' noise: no model could be much better."
+        )
+    if diagnosis.is_slight:
+        return (
+            "What remains beyond the noise is immaterial: less than "
+            f"{100 * MATERIAL:g} % of the rms flow (residual variance {diagnosis.rho_after:.2f} "
+            f"times "
+            "the noise's)."
+        )
+    if is_open:
+        return ""
+    return (
+        f"Something else remains: residual variance still {diagnosis.rho_after:.2f} times "
+        f"the noise's."
+    )
+
+
+def _added(diagnosis: Diagnosis) -> list[str]:
+    names = ", ".join(f"{title(a.effect)} at {a.where}" for a in diagnosis.added)
+    return [f"The model has {names}, added before."] if names else []
+
+
+def heading(diagnosis: Diagnosis) -> tuple[str, str]:
+    """Of terminal, page and report alike: a kind, for the colour, and the heading itself."""
+    if diagnosis.verdict == UNKNOWN and diagnosis.doubts:
+        return "bad", "The model cannot be right, and no known effect says why"
+    if diagnosis.verdict == UNKNOWN and diagnosis.is_slight:
+        share = f"{100 * MATERIAL:g} %"
+        return "open", f"The model is right to {share} of the rms flow; more than noise is left"
+    return VERDICTS[diagnosis.verdict]
+
+
+def _head(diagnosis: Diagnosis) -> str:
+    share = percent(diagnosis, diagnosis.heldout_residual_before_m3s)
+    floor = percent(diagnosis, diagnosis.noise_floor_m3s)
+    words = heading(diagnosis)[1]
+    if diagnosis.verdict == INSUFFICIENT:
+        return f"{words}{_left(diagnosis)}."
+    if diagnosis.verdict in (MATCHES, UNKNOWN):
+        rho = (
+            f"{diagnosis.rho_after:.2f}"
+            if diagnosis.verdict == MATCHES
+            else f"{diagnosis.rho_after:.3g}"
+        )
+        return (
+            f"{words}: held-out error {share} of the rms flow, the sensors' floor is {floor}; "
+            f"residual variance {rho} times the noise's."
+        )
+    return (
+        f"{words}: residual variance {diagnosis.rho_before:.3g} times the noise's, "
+        f"{diagnosis.rho_after:.2f} with what was found."
+    )
+
+
+def _left(diagnosis: Diagnosis) -> str:
+    """What speaks against the model where nothing can be named."""
+    if not diagnosis.rho_before > MATCH_RHO:
+        return ""
+    return (
+        f", but the model misses something: residual variance {diagnosis.rho_before:.3g} times "
+        "the noise's, most of which the maps may have taken in"
+    )
+
+
+def _one(diagnosis: Diagnosis, effect: FoundEffect) -> str:
+    sizes = ", ".join(
+        f"{name.replace('_', ' ')} {quantity(v)}" for name, v in effect.parameters.items()
+    )
+    before = percent(diagnosis, effect.heldout_residual_before_m3s)
+    after = percent(diagnosis, effect.heldout_residual_after_m3s)
+    text = (
+        f"{title(effect.effect)} at {effect.where}: {sizes}. Adding it lowers the held-out error "
+        f"from {before} to {after}; the sensors' floor is "
+        f"{percent(diagnosis, diagnosis.noise_floor_m3s)}."
+    )
+    if effect.cannot_be_told_from:
+        others = ", ".join(name.replace("_", " ") for name in effect.cannot_be_told_from)
+        text += f" It cannot be told apart from {others} in this record."
+    return text
+
+
+def percent(diagnosis: Diagnosis, residual_m3s: float) -> str:
+    """A residual as a share of the rms flow, in L/min where nothing has moved."""
+    if not diagnosis.rms_flow_m3s > 0.0:
+        return quantity(Value(residual_m3s, float("nan"), "m3/s"))
+    return f"{100 * residual_m3s / diagnosis.rms_flow_m3s:.2f} %"
+
+
+def _found_table(diagnosis: Diagnosis) -> Table:
+    rows = []
+    for effect in diagnosis.found:
+        for k, (name, value) in enumerate(effect.parameters.items()):
+            first = (effect.effect, effect.where) if k == 0 else ("", "")
+            last = (
+                (f"{effect.heldout_gain_pct:.1f} %", f"{effect.p_value:.1g}")
+                if k == 0
+                else ("", "")
+            )
+            rows.append((*first, name, quantity(value), *last))
+    heads = ("effect", "where", "parameter", "value", "held-out gain|", "p|")
+    return Table("found", heads, rows, keys=2)
+
+
+def _unseen_table(diagnosis: Diagnosis) -> Table:
+    listed: list[Unseen] = sorted(diagnosis.not_found, key=lambda u: not u.visible)
+    rows = [
+        (u.effect, u.where,
+         limit(u.detection_limit or 0.0, u.unit) if u.visible else "cannot be seen", u.reason)
+        for u in listed
+        if u.examined
+    ]  # fmt: skip
+    title = "not found, and the smallest size that this record would have shown"
+    heads = ("effect", "where", "detection limit", "remark~")
+    return Table(title, heads, rows[: 3 * SHOWN], keys=2)
+
+
+def judged(diagnosis: Diagnosis) -> str:
+    """Which part of the record the errors are of."""
+    return "held-out error" if diagnosis.held_out_judged else "error on the motion it was taught by"
+
+
+def said(diagnosis: Diagnosis) -> str:
+    """The verdict and the next step."""
+    rest = percent(diagnosis, diagnosis.heldout_residual_before_m3s)
+    floor = f"the sensors' floor is {percent(diagnosis, diagnosis.noise_floor_m3s)}"
+    match diagnosis.verdict:
+        case "insufficient_data":
+            known = remains(diagnosis) or "Nothing can be said about what is missing."
+            return (
+                f"{known} Next: record a minute or more in which "
+                "every valve opens over its range, under changing load or supply pressure; Why "
+                "says which motion would tell more."
+            )
+        case "matches":
+            here = "With what was added, the" if diagnosis.added else "The"
+            return (
+                f"{here} {judged(diagnosis)} is {rest} of the rms flow; {floor}. "
+                f"{remains(diagnosis)}"
+            )
+        case "unknown":
+            return (
+                f"No known effect explains the {judged(diagnosis)} of {rest}; {floor}. Next: Where "
+                "shows which signals it follows; an effect of your own goes into the project file "
+                "as a formula."
+            )
+    return _first(diagnosis, diagnosis.found[0], floor)
+
+
+def _first(diagnosis: Diagnosis, first: FoundEffect, floor: str) -> str:
+    sizes = list(first.parameters.values())
+    big = f", {quantity(sizes[0])} (95 %)" if len(sizes) == 1 else ""
+    before = percent(diagnosis, first.heldout_residual_before_m3s)
+    after = percent(diagnosis, first.heldout_residual_after_m3s)
+    words = (
+        f"{title(first.effect)} at {first.where}{big}. Adding it lowers the {judged(diagnosis)} "
+        f"from "
+        f"{before} to {after}; {floor}. {remains(diagnosis)}"
+    ).rstrip()
+    if first.cannot_be_told_from:
+        others = ", ".join(
+            title(name.partition(" (")[0]).lower() for name in first.cannot_be_told_from
+        )
+        words += f" This record cannot tell it from {others}: the choice is yours."
+    rest = len(diagnosis.found) - 1
+    return words + (f" {rest} more after it." if rest else "")

@@ -1,0 +1,202 @@
+"""What a report tells: diagnosis, residuals before and after, ranking, history."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+
+from rtid.compare import Dependence, against_signals, over_time
+from rtid.diagnose.clean import usable
+from rtid.diagnose.diagnosis import Result
+from rtid.diagnose.fit import Fit
+from rtid.diagnose.regression import Score
+from rtid.diagnose.remains import filtered
+from rtid.diagnose.report import Diagnosis, parameters
+from rtid.diagnose.residual import Residual, residual
+from rtid.diagnose.trials import physical, scored
+from rtid.diagnose.verdict import LEAST_ROWS
+from rtid.effects.column import Candidate
+from rtid.model import Machine
+from rtid.plain import FloatArray, Key, Progress, silent
+from rtid.project import Project
+from rtid.project.history import Change, read
+from rtid.study.study import Diagnosed, Study
+from rtid.tell.charts.evidence import charts_of
+from rtid.tell.story import Chart
+
+SIGNALS = 5  # against which the residual is shown
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """A candidate: effect and place, clarity in standard deviations before and after (None: found).
+
+    value, std, unit: its coefficient beside the last model, or as fitted; is_possible: of a sign
+    and size that physics allows; per_shape: the value of a
+    timing of which the coefficient is a share, "" where it is none; limit: detection limit, SI.
+    """
+
+    key: Key
+    before: float | None
+    after: float | None
+    value: float
+    std: float
+    unit: str
+    is_possible: bool = True
+    per_shape: tuple[float, str] | None = None
+    limit: float | None = None
+    limit_unit: str = ""
+
+
+@dataclass(frozen=True)
+class ReportStory:
+    """What a report tells: the diagnosis, the residual of both parts before and after, the ranking.
+
+    after is None, depends_after and evidence are empty where nothing was found.
+    """
+
+    diagnosed: Diagnosed
+    chambers: tuple[str, ...]
+    before: tuple[Residual, Residual]
+    after: tuple[Residual, Residual] | None
+    depends_before: tuple[Dependence, ...]
+    depends_after: tuple[Dependence, ...]
+    ranking: tuple[Ranked, ...]
+    evidence: tuple[Chart, ...]
+    history: tuple[Change, ...]
+    trace_sha256: str
+    date: str
+
+    @property
+    def judges(self) -> int:
+        """The part that judges: the held-out one, or 0, the record, where too little is known."""
+        return 1 if len(self.before[1].t_s) >= LEAST_ROWS else 0
+
+
+def tell(project: Project, trace: Path, progress: Progress = silent) -> ReportStory:
+    """Diagnose a trace once and gather what its report shows."""
+    study = Study(project, trace, progress)
+    diagnosed = study.diagnosed
+    first, last = diagnosed.result.first, diagnosed.result.last
+    chunks = [usable(first.declared, part) for part in study.spans]
+    before = _both(first, chunks)
+    after = _both(last, chunks) if diagnosed.diagnosis.found else None
+    depends = _telling(
+        first.declared,
+        _depends(first.declared, before, chunks),
+        _depends(first.declared, after, chunks) if after else (),
+    )
+    return ReportStory(
+        diagnosed,
+        tuple(chamber.name for chamber in diagnosed.model.chambers),
+        before,
+        after,
+        *depends,
+        ranked(diagnosed.result, diagnosed.diagnosis),
+        charts_of(study.evidence),
+        tuple(read(project.path)),
+        _sha256(trace),
+        datetime.now().astimezone().isoformat(" ", "seconds"),
+    )
+
+
+def _both(fit: Fit, chunks: list[FloatArray]) -> tuple[Residual, Residual]:
+    return residual(fit, chunks[0]), residual(fit, chunks[1])
+
+
+def _depends(
+    model: Machine, both: tuple[Residual, Residual], chunks: list[FloatArray]
+) -> tuple[Dependence, ...]:
+    """The residual of both parts against every signal that varies, and time; () without."""
+    t_s = np.concatenate([part.t_s for part in both])
+    if not len(t_s):
+        return ()
+    measured, rest = (
+        np.concatenate([getattr(part, name) for part in both]) for name in ("measured", "left")
+    )
+    chunk = np.concatenate(chunks)
+    chunk = chunk[np.argsort(chunk[:, 0], kind="stable")]
+    part = filtered(model, Residual(t_s, measured, rest, np.zeros_like(rest)), chunk)
+    return (*against_signals(model, part), over_time(part))
+
+
+def _telling(
+    model: Machine, before: tuple[Dependence, ...], after: tuple[Dependence, ...]
+) -> tuple[tuple[Dependence, ...], tuple[Dependence, ...]]:
+    """Of both: position, chamber pressures, the signals on which the first depends most, time."""
+    always = {model.position, *(c.pressure for c in model.chambers)}
+    by_share = sorted(
+        before[:-1], key=lambda d: (d.signal not in always, -float(d.explained.max()))
+    )
+    shown = {d.signal for d in [*by_share[:SIGNALS], *before[-1:]]}
+    first, second = (
+        tuple(d for d in dependences if d.signal in shown) for dependences in (before, after)
+    )
+    return first, second
+
+
+def ranked(result: Result, diagnosis: Diagnosis) -> tuple[Ranked, ...]:
+    """The clearest candidates of the first model, and what became of them."""
+    before = {key: np.sqrt(score.gain) for key, (_, score) in _best(result.first).items()}
+    last = _best(result.last)
+    inside = {(e.effect, e.where) for e in diagnosis.found}
+    limits = {(u.effect, u.where): u for u in diagnosis.not_found if u.visible}
+    ranked = []
+    for key in {**before, **last, **dict.fromkeys(inside)}:
+        last_rank = (
+            _fitted(result.last, key) if key in inside else _scored(result.last, last.get(key))
+        )
+        if last_rank is None:
+            continue
+        limit, sd = limits.get(key), before.get(key)
+        rank = replace(last_rank, key=key, before=None if sd is None else float(sd))
+        if limit is not None:
+            rank = replace(rank, limit=limit.detection_limit, limit_unit=limit.unit)
+        ranked.append(rank)
+    ranked.sort(key=lambda r: (r.key not in inside, -(r.before or r.after or 0.0)))
+    return tuple(ranked)
+
+
+def _best(fit: Fit) -> dict[Key, tuple[Candidate, Score]]:
+    """The clearest column of every cause beside a fit."""
+    best: dict[Key, tuple[Candidate, Score]] = {}
+    for candidate, score in scored(fit):
+        known = best.get(candidate.key)
+        if score.gain > 0 and (known is None or score.gain > known[1].gain):
+            best[candidate.key] = candidate, score
+    return best
+
+
+def _scored(fit: Fit, scores: tuple[Candidate, Score] | None) -> Ranked | None:
+    """A candidate beside the last model; None where the record does not hold it."""
+    if scores is None:
+        return None
+    candidate, score = scores
+    value, std = (physical(fit, candidate, v) for v in (score.value, score.sd))
+    timing = candidate.parameter == "share" and bool(candidate.shape)
+    per = (candidate.shape[0], candidate.shape_units[0]) if timing else None
+    return Ranked(
+        candidate.key,
+        None,
+        float(np.sqrt(score.gain)),
+        value,
+        std,
+        candidate.unit,
+        candidate.is_possible(score.value),
+        per,
+    )
+
+
+def _fitted(fit: Fit, key: Key) -> Ranked | None:
+    """An effect that is part of the last model, by its first parameter."""
+    first = next(iter(parameters(fit, key).values()), None)
+    return None if first is None else Ranked(key, None, None, first.value, first.std, first.unit)
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,313 @@
+"""Judge a project against a trace: arrays in, `Report` out, ending in sentences with remedies."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from firmware_bridge.config import Assembly
+from firmware_bridge.samples import Samples
+from rtid.model import Machine, Signal
+from rtid.trace.arrivals import GAP_PERIODS, Timing, timing
+from rtid.trace.coverage import Coverage, coverage
+from rtid.trace.plausible import Motion, looks_like, motion
+from rtid.trace.series import Series, SignalReport, describe
+from rtid.units import limit, units_of, with_unit
+
+PERIOD_TOLERANCE = 0.1
+NOISE_FACTOR = 1.5
+GAP_SHARE = 1e-3
+OUT_OF_RANGE_SHARE = 1e-3
+OUTSIDE_GRID_SHARE = 0.02
+MIN_T = 8.0  # of the rough bulk modulus, before its sign is believed
+MIN_CORRELATION = 0.2
+BETA_DECADE = 30.0  # a rough bulk modulus this far outside the bounds is a wrong unit
+FEWEST_BLOCKS = 4  # of a map that is worth its name
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One sentence: level "error" (it would be learnt wrongly) or "warning", and the remedy."""
+
+    level: str
+    subject: str
+    text: str
+    remedy: str
+
+
+@dataclass(frozen=True)
+class Report:
+    """All that a check found; SI, times in seconds."""
+
+    duration_s: float
+    samples: Timing
+    messages: dict[str, Timing]
+    signals: tuple[SignalReport, ...]
+    motion: Motion
+    coverage: tuple[Coverage, ...]
+    refused: dict[str, int]
+    findings: tuple[Finding, ...]
+    learned: dict[str, int] | None = None  # blocks that become valid, by edge; None: not tried
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing stands against learning from this trace."""
+        return not any(finding.level == "error" for finding in self.findings)
+
+
+def judge(
+    model: Machine,
+    assembly: Assembly,
+    samples: Samples,
+    series: tuple[Series, ...],
+    messages: dict[str, Timing],
+    refused: dict[str, int],
+    stroke_m: float,
+) -> Report:
+    """Judge samples and raw series (each signal at its own instants) against the declaration."""
+    signals = tuple(describe(series) for series in series)
+    moved, covered = motion(model, samples), coverage(model, samples)
+    findings = list(_timing(assembly, messages, samples))
+    timed = not any(finding.level == "error" for finding in findings)
+    findings += _signals(model, series, signals)
+    findings += _units(model, assembly, stroke_m, signals)
+    if timed:  # samples put together with wrong periods say nothing about the machine
+        findings += [*against_motion(model, moved), *_coverage(covered)]
+    t_us = samples.t_us
+    return Report(
+        duration_s=float(t_us[-1] - t_us[0]) * 1e-6 if len(t_us) else 0.0,
+        samples=timing(t_us),
+        messages=messages,
+        signals=signals,
+        motion=moved,
+        coverage=covered,
+        refused=refused,
+        findings=tuple(findings),
+    )
+
+
+def with_learned(report: Report, learned: dict[str, int]) -> Report:
+    """The report with the valid blocks of each edge that a replay learned, and what they mean.
+
+    A count of rows does not tell them: rows may stand at one place of a block, or along one line.
+    """
+    findings = list(report.findings)
+    for covered in report.coverage:
+        if covered.enough > 0 and learned.get(covered.edge, 0) < min(FEWEST_BLOCKS, covered.enough):
+            findings.append(_few_learned(covered, learned.get(covered.edge, 0)))
+    if not any(learned.values()):
+        remedy = "record motion both ways at many commands, or give a coarser grid"
+        findings.append(_error("maps", "replay learns no block of any valve", remedy))
+    return replace(report, learned=learned, findings=tuple(findings))
+
+
+def _few_learned(covered: Coverage, learned: int) -> Finding:
+    """Few blocks in spite of many rows: a grid as wide as the motion, or a record too short."""
+    subject = f"edges.{covered.edge}"
+    text = (
+        f"{covered.enough} blocks get {covered.min_rows} rows, but replay learns {learned} of them"
+    )
+    if covered.enough < FEWEST_BLOCKS:
+        text += ": the grid is too coarse for the valve"
+        return _warning(subject, text, f"give u_grid and dp_grid of {subject} narrower steps")
+    remedy = "record longer, and at more commands and loads; see the blocks with rtid replay"
+    return _warning(subject, text, remedy)
+
+
+def _error(subject: str, text: str, remedy: str) -> Finding:
+    return Finding("error", subject, text, remedy)
+
+
+def _warning(subject: str, text: str, remedy: str) -> Finding:
+    return Finding("warning", subject, text, remedy)
+
+
+def _timing(assembly: Assembly, messages: dict[str, Timing], samples: Samples) -> Iterator[Finding]:
+    periods = {message.name: message.period_s for message in assembly.messages}
+    for name, arrivals in messages.items():
+        period_s = periods.get(name, arrivals.median_s)
+        if arrivals.count == 0:
+            yield _error(name, "does not occur in the trace", "check the DBC, id and channel")
+        elif abs(arrivals.median_s - period_s) > PERIOD_TOLERANCE * period_s:
+            text = f"arrives every {_ms(arrivals.median_s)}, declared {_ms(period_s)}"
+            yield _error(
+                name, text, f"set messages.{name}.period_ms = {1e3 * arrivals.median_s:.4g}"
+            )
+        if arrivals.gaps > GAP_SHARE * arrivals.count:
+            text = f"{arrivals.gaps} of {arrivals.count} steps exceed {GAP_PERIODS} periods"
+            text += f", at worst {_ms(arrivals.worst_s)}"
+            yield _warning(name, text, "look for lost frames: bus load, logger, wiring")
+        if arrivals.backward:
+            text = f"{arrivals.backward} time stamps go back"
+            yield _warning(name, text, "sort the log, or record with one clock")
+    if len(samples) == 0:
+        remedy = "see the counters of refused frames; check counter, crc and data_id"
+        yield _error("samples", "no complete sample could be made", remedy)
+
+
+def _signals(
+    model: Machine, series: tuple[Series, ...], reports: tuple[SignalReport, ...]
+) -> Iterator[Finding]:
+    for item, report in zip(series, reports, strict=True):
+        signal = model.signals[model.column(item.name)]
+        if report.count == 0:
+            yield _error(item.name, "has no value at all", "check the signal's place in the DBC")
+            continue
+        yield from _values(signal, item, report)
+        yield from _noise(signal, report)
+
+
+def _values(signal: Signal, series: Series, report: SignalReport) -> Iterator[Finding]:
+    x = series.value[np.isfinite(series.value)]
+    outside = float(((x < signal.minimum) | (x > signal.maximum)).mean())
+    if outside > 0:
+        text = f"{100 * outside:.2g} % of its values lie outside the declared range"
+        text += f" ({_shown(report.minimum, signal)} to {_shown(report.maximum, signal)})"
+        remedy = f"correct unit or range of signals.{signal.name}"
+        level = _error if outside > OUT_OF_RANGE_SHARE else _warning
+        yield level(signal.name, text, remedy)
+    if report.missing:
+        text = f"{report.missing} values are marked not available"
+        yield _warning(signal.name, text, "these samples are left out; check the sensor")
+    if report.step == 0.0:
+        text = f"never changes: {_shown(report.minimum, signal)} all the time"
+        yield _warning(signal.name, text, "declare constant = ..., or check the sensor")
+    elif signal.kind != "command" and report.frozen_s > 0 and report.noise > report.step:
+        text = f"is frozen for {report.frozen_s:.3g} s from {report.frozen_from_s:.3g} s on"
+        yield _error(signal.name, text, "leave this part out of [record]; check the sensor")
+
+
+def _shown(value: float, signal: Signal) -> str:
+    return with_unit(value, signal.unit)
+
+
+def _noise(signal: Signal, report: SignalReport) -> Iterator[Finding]:
+    """Declared against estimated noise; below the resolution nothing can be told."""
+    expected = math.hypot(signal.noise, report.step / math.sqrt(12))
+    if signal.noise == 0.0 or not report.noise > report.step / 2:
+        return
+    ratio = report.noise / expected
+    if not 1 / NOISE_FACTOR < ratio < NOISE_FACTOR:
+        text = (
+            f"noise is {_shown(report.noise, signal)} rms, declared {_shown(signal.noise, signal)}"
+        )
+        remedy = f'set signals.{signal.name}.noise, or noise = "estimate"'
+        yield _warning(signal.name, text, remedy)
+
+
+def _units(
+    model: Machine, assembly: Assembly, stroke_m: float, reports: tuple[SignalReport, ...]
+) -> Iterator[Finding]:
+    """Pressures against the grids, the position against the stroke: as if in another unit."""
+    factors = {source.name: abs(source.factor) for source in assembly.signals}
+    top_pa = max(float(edge.grid.dp_pa[-1]) for edge in model.edges)
+    chambers = {chamber.pressure for chamber in model.chambers}
+    sources = {edge.source for edge in model.edges}
+    for report in reports:
+        largest = max(abs(report.minimum), abs(report.maximum))
+        if report.name == model.position:
+            limits, dimension = (0.003 * stroke_m, 1.2 * stroke_m), "length"
+        elif report.name in chambers:
+            limits, dimension = (0.03 * top_pa, 2.5 * top_pa), "pressure"
+        elif report.name in sources:
+            limits, dimension = (0.1 * top_pa, 2.5 * top_pa), "pressure"
+        elif model.signals[model.column(report.name)].kind == "pressure":
+            limits, dimension = (1e3, 0.3 * top_pa), "pressure"
+        else:
+            continue
+        declared = next(
+            (u for u in units_of(dimension) if math.isclose(u.factor, factors[report.name])), None
+        )
+        meant = declared and looks_like(largest, *limits, declared)
+        if declared and meant:
+            text = (
+                f"reaches {largest / declared.factor:.4g} {declared.name}: looks like {meant.name}"
+            )
+            yield _error(report.name, text, f'set signals.{report.name}.unit = "{meant.name}"')
+
+
+def against_motion(model: Machine, result: Motion) -> Iterator[Finding]:
+    """Signs, swapped pressures, stiffness and velocity that cannot be as declared."""
+    yield from against_signs(model, result)
+    yield from _stiffness(model, result)
+    yield from _velocity(model, result)
+
+
+def against_signs(model: Machine, result: Motion) -> Iterator[Finding]:
+    """Signs and swapped pressures that cannot be as declared."""
+    known = [s for s in result.springs.values() if abs(s.t) > MIN_T]
+    soft = [s for s in known if s.t < 0]
+    against = result.u_to_v < -MIN_CORRELATION
+    x = model.position
+    if known and len(soft) == len(known):
+        if against:
+            text = f"{x} runs against command and pressures: its sign is reversed"
+            yield _error(x, text, f"set signals.{x}.scale = -1 and offset = stroke")
+        else:
+            text = "pressure falls where the oil is compressed: the chambers' pressures are swapped"
+            both = " and ".join(c.pressure for c in model.chambers)
+            yield _error("chambers", text, f"swap {both}, or reverse command and position both")
+    elif against:
+        command = next(s.name for s in model.signals if s.kind == "command")
+        text = f"the machine moves against {command}: its sign is reversed"
+        if not known:
+            text = f"the machine moves against {command}: the sign of {command} or {x} is reversed"
+        yield _error(command, text, f"set signals.{command}.scale = -1, or turn the directions")
+    elif soft:
+        names = [name for name, s in result.springs.items() if s.t < -MIN_T]
+        text = "pressure falls where the oil is compressed"
+        yield _error(f"chambers.{names[0]}", text, "check its sign and its pressure signal")
+
+
+def _stiffness(model: Machine, moves: Motion) -> Iterator[Finding]:
+    low, high = model.beta_bounds_pa
+    for name, spring in moves.springs.items():
+        is_seen = spring.t >= MIN_T  # NaN where nothing has moved
+        if not is_seen or low / BETA_DECADE < spring.beta_pa < high * BETA_DECADE:
+            continue
+        text = f"a bulk modulus of about {limit(spring.beta_pa, 'Pa')} is impossible"
+        remedy = "check the units of its pressure, of the position, and its area and volume"
+        yield _error(f"chambers.{name}", text, remedy)
+
+
+def _velocity(model: Machine, moves: Motion) -> Iterator[Finding]:
+    names = [s.name for s in model.signals if s.kind == "velocity"]
+    if not names or not math.isfinite(moves.v_slope) or abs(moves.v_slope - 1) < 0.1:
+        return
+    reversed_x = moves.u_to_v < -MIN_CORRELATION and moves.v_slope < 0
+    text = f"is {moves.v_slope:.3g} times the derivative of {model.position}"
+    remedy = f"check unit and sign of signals.{model.position if reversed_x else names[0]}"
+    yield _error(names[0], text, remedy)
+
+
+def _coverage(coverages: tuple[Coverage, ...]) -> Iterator[Finding]:
+    for covered in coverages:
+        subject = f"edges.{covered.edge}"
+        if covered.open_s == 0:
+            remedy = "check direction and command, or record motion both ways"
+            yield _error(subject, "never opens in this trace", remedy)
+        elif covered.enough == 0:
+            remedy = "coarser grid, longer record, or borders where the machine works"
+            yield _error(subject, f"no block gets {covered.min_rows} rows", remedy)
+        if covered.reverse > 0.5:
+            text = f"dp is negative {100 * covered.reverse:.0f} % of the open time"
+            yield _error(subject, text, "swap source and sink, or check both pressures")
+        elif covered.outside > OUTSIDE_GRID_SHARE:
+            text = f"{100 * covered.outside:.0f} % of its open time lies outside the grid: command"
+            low, high = (with_unit(dp, "Pa") for dp in covered.dp_pa)
+            text += f" {covered.w_v[0]:.3g} to {covered.w_v[1]:.3g}, dp {low} to {high}"
+            yield _warning(subject, text, f"widen u_grid or dp_grid of {subject}")
+        if covered.below > OUTSIDE_GRID_SHARE:
+            text = (
+                f"the command is below its grid for {100 * covered.below:.0f} % of the "
+                f"record, and no"
+            )
+            text += " safe_band says that the valve is shut there: nothing is learned meanwhile"
+            yield _warning(subject, text, f"give {subject}.safe_band, or a u_grid down to there")
+
+
+def _ms(seconds: float) -> str:
+    return f"{1e3 * seconds:.4g} ms"

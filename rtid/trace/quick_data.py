@@ -1,0 +1,153 @@
+"""Is this record good enough?  Rates, gaps, saturation, coverage and excitation, in sentences.
+
+`rtid.trace` judges the declaration against the record; here the record is judged for what it can
+teach: something that stands against it blocks the verdict, a reservation only weakens it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from firmware_bridge.samples import ROW
+from rtid.model import Machine
+from rtid.plain import FloatArray
+from rtid.trace import Report
+from rtid.trace.quick_source import NEEDED
+from rtid.trace.signals import Recording
+
+LEAST_S, FEW_S = 10.0, 30.0
+LEAST_HZ, FEW_HZ = 10.0, 200.0  # rows per second
+ENOUGH = "a minute or two, every signal as often as the controller has it"
+FEW_BLOCKS = 10  # of one valve, with enough rows
+AT_END = 0.01  # share of the samples at one and the same extreme value
+HELD_STILL = 0.05  # share of the time with shut valves that tells leaks from maps
+VARIED = 0.05  # of its mean: from which on a supply is said to vary
+STEP_SHARE, STEP_S = 0.1, 0.02  # a step: so much of the command's range within so long
+FEW_STEPS = 5
+
+GOOD, FAIR, BAD = "good", "fair", "bad"
+
+
+@dataclass(frozen=True)
+class Point:
+    """One point of the judgement: its level, what was found, and what to record instead."""
+
+    level: str
+    text: str
+    remedy: str = ""
+
+
+def points(model: Machine, trace: Recording, report: Report) -> list[Point]:
+    """Everything that speaks for or against a record, in the order of reading."""
+    return [
+        *_size(trace, report),
+        *_frozen(trace),
+        *_objections(report),
+        *_ends(model, trace),
+        *_coverage(report),
+        *_excitation(model, trace),
+    ]
+
+
+def level_of(saids: list[Point]) -> str:
+    """The level of the whole: that of the worst point."""
+    levels = [point.level for point in saids]
+    return BAD if BAD in levels else FAIR if FAIR in levels else GOOD
+
+
+def _size(trace: Recording, report: Report) -> Iterator[Point]:
+    rows = int(((trace.samples.flags & ROW) != 0).sum())
+    rate = rows / report.duration_s if report.duration_s > 0 else 0.0
+    text = f"{report.duration_s:.1f} s with {rate:.0f} positions per second"
+    if report.duration_s < LEAST_S or rate < LEAST_HZ:
+        yield Point(BAD, f"{text}: too little", f"record {ENOUGH}")
+    elif report.duration_s < FEW_S or rate < FEW_HZ:
+        yield Point(FAIR, f"{text}: stiffness and timing show coarsely", f"record {ENOUGH}")
+    else:
+        yield Point(GOOD, text)
+    worst = max((t for t in trace.messages.values()), key=lambda t: t.gaps, default=None)
+    if worst is not None and worst.gaps == 0 and worst.backward == 0:
+        yield Point(GOOD, "no gaps")
+
+
+def _frozen(trace: Recording) -> Iterator[Point]:
+    """Signals without which nothing can be learned, and which never change."""
+    for name in NEEDED:
+        if len(trace.samples) and np.ptp(trace.samples.column(name)) == 0.0:
+            yield Point(BAD, f"{name} never changes", "check its sensor, and what was taken for it")
+
+
+def _objections(report: Report) -> Iterator[Point]:
+    """What `rtid check` finds, less what is the grid's fault, said above, or said of nothing."""
+    apart = ("outside the grid", "never changes", "of about nan")
+    for finding in report.findings:
+        if not any(known in finding.text for known in apart):
+            level = BAD if finding.level == "error" else FAIR
+            yield Point(level, f"{finding.subject}: {finding.text}", finding.remedy)
+
+
+def _ends(model: Machine, trace: Recording) -> Iterator[Point]:
+    """Sensors and commands that stand at the end of their range."""
+    for signal in model.signals:
+        if signal.kind not in ("command", "pressure"):
+            continue
+        values = trace.samples.column(signal.name)
+        shares = [float((values == end).mean()) for end in (values.min(), values.max())]
+        if np.ptp(values) > 0 and max(shares) > AT_END and _rests_at_end(values, max(shares)):
+            text = f"{signal.name} stands at its end value {100 * max(shares):.1f} % of the time"
+            what = "command less" if signal.kind == "command" else "is the sensor's range enough?"
+            yield Point(FAIR, text, what)
+
+
+def _rests_at_end(values: FloatArray, share: float) -> bool:
+    """True where the end is no usual value, as zero is for a command that rests."""
+    usual = float(np.median(values))
+    return usual not in (values.min(), values.max()) and share > AT_END
+
+
+def _coverage(report: Report) -> Iterator[Point]:
+    counts = {coverage.edge: coverage.enough for coverage in report.coverage}
+    text = ", ".join(f"{edge} {count}" for edge, count in counts.items())
+    few = [edge for edge, count in counts.items() if count < FEW_BLOCKS]
+    if few:
+        remedy = f"move {' and '.join(few)} at small and large openings, with changing load"
+        yield Point(FAIR, f"blocks with enough data, by valve: {text}", remedy)
+    else:
+        yield Point(GOOD, f"blocks with enough data, by valve: {text}")
+
+
+def _excitation(model: Machine, trace: Recording) -> Iterator[Point]:
+    samples = trace.samples
+    u = samples.column("u")
+    band = model.edges[0].safe_band_v
+    shut = float((np.abs(u) <= band).mean())
+    if shut < HELD_STILL:
+        text = f"the valves are shut {100 * shut:.1f} % of the time: leaks may hide in the maps"
+        yield Point(FAIR, text, "hold still under load for a few seconds now and then")
+    else:
+        yield Point(GOOD, f"the valves are shut {100 * shut:.0f} % of the time: leaks can show")
+    steps = _steps(np.asarray(samples.t_us * 1e-6, np.float64), u)
+    if steps < FEW_STEPS:
+        text = f"{steps} steps of the command: stiffness and timing show little"
+        yield Point(FAIR, text, "add steps of the command, some ten per minute")
+    else:
+        yield Point(GOOD, f"{steps} steps of the command")
+    supply = samples.column("p_supply")
+    swing = float(np.ptp(np.quantile(supply, [0.01, 0.99]))) / max(float(np.mean(supply)), 1.0)
+    if swing < VARIED:
+        text = f"the supply stays within {100 * swing:.1f} %: external leaks may hide in the maps"
+        yield Point(FAIR, text, "record part of the motion at another supply pressure")
+    else:
+        yield Point(GOOD, f"the supply varies by {100 * swing:.0f} %")
+
+
+def _steps(t_s: FloatArray, u: FloatArray) -> int:
+    """Number of quick changes of the command."""
+    if len(u) < 3 or np.ptp(u) == 0:
+        return 0
+    n = max(1, round(STEP_S / max(float(np.median(np.diff(t_s))), 1e-9)))
+    quick = np.abs(u[n:] - u[:-n]) > STEP_SHARE * np.ptp(u)
+    return int((quick[1:] & ~quick[:-1]).sum() + quick[:1].sum())

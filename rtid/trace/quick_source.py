@@ -1,0 +1,152 @@
+"""Open a file of which nobody has said anything: its signals, with units and ranges of the data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from firmware_bridge import catalog as catalogs
+from firmware_bridge.catalog import Catalog
+from firmware_bridge.frames import Frames
+from firmware_bridge.j1939 import Network
+from firmware_bridge.sources import open_file
+from firmware_bridge.sources.table import Table
+from rtid.errors import RtidError
+from rtid.project import guess as proposal
+from rtid.project.guess import RoleCandidate
+from rtid.project.loading import BUILTIN
+from rtid.trace.table import time_of
+from rtid.units import Unit, find_unit
+
+NEEDED = {
+    "u": "the command of the valves",
+    "x": "the position of the piston",
+    "p_a": "the pressure of the chamber that grows with x",
+    "p_b": "the pressure of the other chamber",
+}
+LEAST_STEP = 1e-6  # of a signal's range: computed values have no noise of their own
+
+
+@dataclass(frozen=True)
+class Source:
+    """What a file offers: keys of [source], all signals, messages with their period in ms.
+
+    steps: smallest change of a column of a table, in its unit; step_ms: its usual step in time.
+    Of a bus the DBC and the periods tell both.
+    """
+
+    keys: dict[str, str]
+    signals: list[RoleCandidate]
+    periods_ms: dict[str, float]
+    steps: dict[str, float]
+    step_ms: float = 0.0
+
+
+def open_source(path: Path, dbc: Path | None) -> Source:
+    """Open a table or a CAN log.  Raises RtidError, and the readers' errors."""
+    if not path.is_file():
+        raise RtidError(f"{path}: no such file", "name a table or a CAN log", 2)
+    content = open_file(path)
+    if isinstance(content, Table):
+        return _of_table(content)
+    return log_source(path, content, dbc)
+
+
+def _of_table(table: Table) -> Source:
+    from rtid.trace.series import smallest_step  # noqa: PLC0415 - it brings the estimator with it
+
+    time, unit = time_of(table)
+    signals = proposal.from_table(table)
+    steps = {}
+    for candidate in signals:
+        values = table.columns[candidate.name]
+        span = candidate.high - candidate.low
+        steps[candidate.name] = max(smallest_step(values[np.isfinite(values)]), LEAST_STEP * span)
+    t_us = table.t_us()
+    step_ms = 1e-3 * float(np.median(np.diff(t_us))) if len(t_us) > 1 else 0.0
+    return Source({"time_column": time, "time_unit": unit}, signals, {}, steps, step_ms)
+
+
+def log_source(path: Path, frames: Frames, dbc: Path | None) -> Source:
+    """What a log offers by a DBC, rtid's own if none is named.  RtidError if it describes none."""
+    catalog = catalogs.load(dbc) if dbc else catalogs.load()
+    messages = {n: f for n, f in by_message(frames, catalog).items() if len(f) > 1}
+    if not messages:
+        ids = sorted({int(i) & 0x1FFFFFFF for i in np.unique(frames.can_id)})
+        shown = ", ".join(f"0x{i:X}" for i in ids[:8]) + (", ..." if len(ids) > 8 else "")
+        of = f"{dbc} describes" if dbc else "the built-in DBC describes"
+        raise RtidError(
+            f"{path}: none of its {len(frames)} frames is what {of}; ids: {shown or 'none'}",
+            "name the DBC of this bus: --dbc FILE" if dbc is None else "is it the right DBC?",
+        )
+    signals = [c for name, mine in messages.items() for c in _signals(mine, name, catalog)]
+    periods = {name: 1e-3 * float(np.median(np.diff(f.t_us))) for name, f in messages.items()}
+    name = str(dbc.resolve()) if dbc else f"{BUILTIN}controller.dbc"
+    return Source({"dbc": name}, signals, periods, {})
+
+
+def by_message(frames: Frames, catalog: Catalog) -> dict[str, Frames]:
+    """The frames of each message that the DBC describes, none left out; J1939 by its groups."""
+    sources = [catalog.message_source(name) for name in catalog.names]
+    matched = Network(catalog, sources).push(frames)
+    return {name: _frames_of(matched, name, catalog) for name in catalog.names}
+
+
+def _frames_of(frames: Frames, name: str, catalog: Catalog) -> Frames:
+    mine = (frames.can_id == catalog.can_id(name)) & (frames.length == catalog.message(name).length)
+    return frames[mine]
+
+
+def _signals(frames: Frames, name: str, catalog: Catalog) -> list[RoleCandidate]:
+    """The signals of a message with the range of what was sent."""
+    layouts = catalog.layouts(name)
+    values, candidates = layouts.decode(frames.data), []
+    for k, signal in enumerate(layouts.names):
+        known = values[np.isfinite(values[:, k]), k]
+        if len(known):
+            unit = proposal.unit_said(signal, catalog.signal(name, signal).unit)
+            candidates.append(
+                RoleCandidate(signal, name, unit, float(known.min()), float(known.max()))
+            )
+    return candidates
+
+
+def roles_of(path: Path, source: Source) -> dict[str, RoleCandidate]:
+    """Who plays which role, all pressures of unknown unit in the same one.
+
+    Raises RtidError naming what is missing and what there is.
+    """
+    roles = proposal.propose(source.signals)
+    missing = [f"{what} ({role})" for role, what in NEEDED.items() if role not in roles]
+    if missing:
+        there = ", ".join(f"{c.name} [{c.unit or '?'}]" for c in source.signals[:20]) or "nothing"
+        raise RtidError(
+            f"{path}: found no signal that could be {'; nor '.join(missing)}. It has: {there}",
+            'call the columns u, x, p_a, p_b, with units as in "p_a [bar]", or say what is what '
+            "in a project file: rtid init",
+        )
+    unit = find_unit(roles["x"].unit)
+    if unit is not None and unit.dimension == "angle":
+        raise RtidError(
+            f"{path}: {roles['x'].name} is an angle, and only you know what position it means",
+            "write a project file with its table: rtid init",
+        )
+    return _alike(roles)
+
+
+def _alike(roles: dict[str, RoleCandidate]) -> dict[str, RoleCandidate]:
+    """Pressures whose unit was guessed in the unit of the largest of them."""
+    guessed = {r: c for r, c in roles.items() if r.startswith("p_") and c.guessed_unit}
+    if not guessed:
+        return roles
+    unit = max(guessed.values(), key=lambda c: abs(c.high)).unit
+    return roles | {role: replace(c, unit=unit) for role, c in guessed.items()}
+
+
+def unit_of(candidate: RoleCandidate) -> Unit:
+    """The unit of a role's signal, which is known or guessed."""
+    unit = find_unit(candidate.unit)
+    assert unit is not None, "roles have units that are known, or guessed ones"
+    return unit

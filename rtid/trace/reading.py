@@ -1,0 +1,88 @@
+"""A trace as complete samples: from a CAN log's frames, or from the rows of a table."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from firmware_bridge.assemble import Assembler
+from firmware_bridge.catalog import Catalog
+from firmware_bridge.config import Assembly
+from firmware_bridge.frames import Frames
+from firmware_bridge.j1939 import Network
+from firmware_bridge.samples import Samples
+from firmware_bridge.sources import open_file
+from firmware_bridge.sources.table import Table, to_samples
+from rtid.errors import RtidError, door
+from rtid.project import Project
+from rtid.trace.learner import catalog_of
+from rtid.trace.table import declared
+
+
+class NoSamplesError(RtidError):
+    """The trace holds nothing that the project can use; the text says what it does hold."""
+
+
+@dataclass(frozen=True)
+class Trace:
+    """What a trace yields: complete samples, refusals by reason, and the frames (None: a table)."""
+
+    path: Path
+    samples: Samples
+    counters: dict[str, int]
+    frames: Frames | None
+
+    @property
+    def duration_s(self) -> float:
+        """From the first to the last sample."""
+        return float(self.samples.t_us[-1] - self.samples.t_us[0]) * 1e-6
+
+
+@door
+def read_trace(project: Project, path: str | Path) -> Trace:
+    """All samples of a CAN log or a table.  Raises NoSamplesError, and the readers' errors."""
+    path = Path(path)
+    content = open_file(path)
+    if isinstance(content, Table):
+        samples, counters = to_samples(*declared(project, content))
+        return _not_empty(Trace(path, samples, counters, None), project)
+    samples, counters = assemble(catalog_of(project), project.assembly, content)
+    return _not_empty(Trace(path, samples, counters, content), project)
+
+
+def assemble(
+    catalog: Catalog, assembly: Assembly, frames: Frames
+) -> tuple[Samples, dict[str, int]]:
+    """Samples of a batch of frames, and the refusals by reason."""
+    assembler = Assembler(catalog, assembly)
+    matched = Network(catalog, assembly.messages).push(frames)
+    parts = [assembler.push(matched), assembler.finish()]
+    return join(parts), assembler.counters
+
+
+def join(parts: list[Samples]) -> Samples:
+    """Runs of samples, one after the other."""
+    return Samples(
+        parts[0].names,
+        np.concatenate([p.t_us for p in parts]),
+        np.concatenate([p.values for p in parts]),
+        np.concatenate([p.flags for p in parts]),
+    )
+
+
+def _not_empty(trace: Trace, project: Project) -> Trace:
+    if len(trace.samples):
+        return trace
+    wanted = ", ".join(m.name for m in project.assembly.messages)
+    if trace.frames is None:
+        raise NoSamplesError(f"{trace.path}: the table has no complete row")
+    ids, counts = np.unique(trace.frames.can_id & 0x7FFFFFFF, return_counts=True)
+    common = ", ".join(f"0x{i:X} ({n})" for n, i in sorted(zip(counts, ids, strict=True))[:-6:-1])
+    refused = ", ".join(f"{reason} {n}" for reason, n in trace.counters.items()) or "nothing"
+    raise NoSamplesError(
+        f"{trace.path}: no complete sample in {len(trace.frames)} frames. "
+        f"Wanted: {wanted}. Refused: {refused}. Most frequent ids: {common or 'none'}",
+        f"does {project.dbc} describe this bus? `rtid check` shows what the trace holds",
+    )

@@ -1,0 +1,104 @@
+"""The lines above every view: which record, what goes on, and the verdict with the next step."""
+
+from __future__ import annotations
+
+from math import isfinite
+
+from rtid.project.history import ADD
+from rtid.tell.html import button, text
+from rtid.ui.shared import FAILED, Session, ShownRevision
+
+
+def record_line(session: Session) -> str:
+    """The machine, the record and what it holds."""
+    opened = session.opened
+    if opened is None:
+        return _in_full(session.trace.name if session.trace else session.project.name)
+    size = f"{opened.duration_s:.0f} s, {opened.samples:,} samples"
+    return _in_full(f"{opened.project} · {opened.trace} · {size}")
+
+
+def _in_full(words: str) -> str:
+    """Words that a narrow page may cut, with all of them to be had by pointing at them."""
+    return f'<span title="{text(words)}">{text(words)}</span>'
+
+
+def work_line(session: Session) -> str:
+    """What is being done, or what came of it."""
+    if session.trouble[0]:
+        message, remedy = session.trouble
+        words = text(f"{message} {remedy}".strip())
+        return (
+            f'<span title="{words}"><span class="bad">{text(message)}</span> {text(remedy)}</span>'
+        )
+    if session.doing:
+        return (
+            f'{text(session.doing)} ...<progress max="1" value="{session.share:.2f}" '
+            f'aria-label="progress"></progress>'
+        )
+    return _in_full(session.note) if session.note else ""
+
+
+def strip(session: Session) -> str:
+    """The verdict in one sentence, and the button that follows from it."""
+    last = session.last
+    if session.state == FAILED or session.trace is None:
+        return ""
+    if last is not None and last.section is not None and (last.told is None or last.note):
+        return _changed(session, last)
+    if last is not None and last.told is None and session.trouble[0] and not session.doing:
+        message, remedy = session.trouble
+        words = f"{message}. {remedy}" if remedy else message
+        return f'<h1 class="bad">Not diagnosed</h1><p>{text(words)}</p>'
+    if last is None or last.told is None:
+        heading = "Looking for what is missing" if last else "Opening the record"
+        return f"<h1>{heading}</h1><p>{_waiting(session)}</p>"
+    from rtid.effects.page import title  # noqa: PLC0415 - the live page needs none
+    from rtid.tell.diagnosed import heading as heading_of  # noqa: PLC0415
+    from rtid.tell.diagnosed import said  # noqa: PLC0415
+
+    diagnosis = last.told.diagnosis
+    kind, heading = heading_of(diagnosis)
+    words = said(diagnosis)
+    offer = ""
+    if session.named is not None:
+        effect, where = session.named
+        label = f"Add {title(effect).lower()}"
+        offer = button(label, "add", kind="main", effect=effect, where=where)
+    elif diagnosis.found and diagnosis.found[0].cannot_be_told_from:
+        offer = button("Choose", "go", name="why")
+    elif len(session.revisions) > 1 and not last.is_saved:
+        offer = button("Save to project", "save", kind="main") + button("Undo", "undo")
+        words += " Next: save it, or undo." if diagnosis.verdict == "matches" else ""
+    elif diagnosis.verdict == "matches":
+        words += " Next: Map, to take the valves' maps along."
+    return f'<h1 class="{kind}">{text(heading)}</h1><p>{text(words)}</p>{offer}'
+
+
+def _changed(session: Session, last: ShownRevision) -> str:
+    """The change, before the new model is diagnosed, and where something speaks against it."""
+    from rtid.effects.page import title  # noqa: PLC0415 - the live page needs none
+    from rtid.ui.add_view import errors_of  # noqa: PLC0415
+
+    section = last.section
+    errors = [value for _, value, is_foretold in errors_of(session)[0] if not is_foretold]
+    heading = "Added" if last.change == ADD else "Dropped"
+    words = f"{title(section.effect)} at {section.where}. " if section else ""
+    if isfinite(errors[-2]) and isfinite(errors[-1]):
+        words += f"The error went from {errors[-2]:.2f} % to {errors[-1]:.2f} %. "
+    if last.note:
+        undo = "" if last.is_saved else button("Undo", "undo", kind="main")
+        return (
+            f'<h1 class="open">{heading}, against the evidence</h1><p>{text(last.note)}</p>{undo}'
+        )
+    words += "Looking whether anything else is missing ..."
+    return f'<h1 class="good">{heading}</h1><p>{text(words)}</p>{button("Undo", "undo")}'
+
+
+def _waiting(session: Session) -> str:
+    if session.last is None:
+        return "Reading, learning the maps, simulating the pressures: some seconds."
+    return (
+        "Every known effect is held beside the model. Meanwhile: how well does it explain the "
+        "record, and where does it fail?"
+    )

@@ -1,0 +1,230 @@
+"""What all pages show: the record, the stack of revisions, what was diagnosed, what is going on.
+
+Pages listen; the worker's answers arrive here.  Nothing is written to the project file until the
+user asks for it.  Of several browsers one works on the record, the others follow what it does.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rtid.errors import RtidError
+from rtid.plain import Key
+from rtid.project.added import AddedSection
+from rtid.ui.worker import Worker
+
+if TYPE_CHECKING:
+    from rtid.study.look import Look
+    from rtid.ui.desk import Addition, Opened, RankedDiagnosis, Saved
+
+Listener = Callable[[str], None]
+LOADING, READY, FAILED = "loading", "ready", "failed"
+ROLE = "role"  # what pages hear when another browser comes, goes or takes over
+
+
+@dataclass
+class ShownRevision:
+    """A model of the stack; change: what led to it, "" for the first."""
+
+    look: Look
+    sections: tuple[AddedSection, ...]
+    change: str = ""
+    section: AddedSection | None = None
+    told: RankedDiagnosis | None = None
+    note: str = ""  # what speaks against the change
+    is_saved: bool = False
+
+
+@dataclass
+class Session:
+    """One record on one desk; every method returns at once."""
+
+    project: Path
+    trace: Path | None
+    worker: Worker
+    sheet: Path | None = None
+    state: str = LOADING
+    doing: str = "starting"
+    share: float = 0.0
+    trouble: tuple[str, str] = ("", "")
+    note: str = ""
+    opened: Opened | None = None
+    revisions: list[ShownRevision] = field(default_factory=list)
+    listeners: list[Listener] = field(default_factory=list)
+    prepared: set[tuple[int, Key]] = field(default_factory=set)
+    pages: Counter[int] = field(default_factory=Counter)  # open ones by browser
+    writer: int | None = None  # the browser that works on the record
+    _is_adding: bool = False
+
+    def open(self) -> None:
+        """Read the record."""
+        if self.trace is None:
+            self.state, self.doing = READY, ""
+            return
+        self._ask(
+            "open", self.project, self.trace, self.sheet, then=self._opened, failed=self._not_opened
+        )
+
+    def join(self, browser: int) -> None:
+        """A page was opened; the first browser works, the others follow."""
+        is_new = browser not in self.pages
+        self.pages[browser] += 1
+        if self.writer is None:
+            self.writer = browser
+        if is_new:
+            self.tell(ROLE)
+
+    def leave(self, browser: int) -> None:
+        """A page was closed; with the last one of the writer another browser takes its place."""
+        self.pages[browser] -= 1
+        self.pages = +self.pages
+        if browser in self.pages:
+            return
+        if self.writer == browser:
+            self.writer = min(self.pages, default=None)
+        self.tell(ROLE)
+
+    def take_over(self, browser: int) -> None:
+        """Work from this browser from now on."""
+        self.writer = browser
+        self.tell(ROLE)
+
+    @property
+    def last(self) -> ShownRevision | None:
+        """The newest revision."""
+        return self.revisions[-1] if self.revisions else None
+
+    @property
+    def named(self) -> Key | None:
+        """The one effect that the newest diagnosis names first; None: none, or a set."""
+        ranked = self.last.told if self.last else None
+        effects = ranked.diagnosis.found if ranked else ()
+        if not effects or effects[0].cannot_be_told_from or self._is_adding:
+            return None
+        return effects[0].effect, effects[0].where
+
+    def add(self, effect: str, where: str) -> None:
+        """Make an effect part of the model."""
+        if self.worker.is_busy and not self.is_prepared((effect, where)):
+            self.doing = "finishing what was begun"
+        last = self.last
+        named = last.told.diagnosis.found if last and last.told else ()
+        chosen = (effect, where) in [(f.effect, f.where) for f in named]
+        reason = "named by the diagnosis" if chosen else "chosen by name"
+        self._is_adding = True
+        self._ask("add", effect, where, reason, then=self._added("add"))
+
+    def drop(self, effect: str, where: str) -> None:
+        """Take an effect out of the model."""
+        self._ask("drop", effect, where, then=self._added("drop"))
+
+    def undo(self) -> None:
+        """Take the last change of this session back."""
+        if len(self.revisions) > 1 and not self.revisions[-1].is_saved:
+            self._ask("back", then=self._taken_back)
+
+    def save(self) -> None:
+        """Write the changes of this session to the project file."""
+        self._ask("save", then=self._saved)
+
+    def export(self, what: str) -> None:
+        """Write a map, a table or a report beside the record."""
+        self._ask("export", what, then=self._noted)
+
+    def is_prepared(self, key: Key) -> bool:
+        """True where adding it takes no time."""
+        return (len(self.revisions), key) in self.prepared
+
+    def tell(self, what: str) -> None:
+        """Let all pages know that something has changed: "state", "looks", "told", ROLE."""
+        for listener in list(self.listeners):
+            listener(what)
+
+    def _ask(
+        self,
+        method: str,
+        *arguments: object,
+        then: Callable[..., None],
+        failed: Callable[[RtidError], None] | None = None,
+    ) -> None:
+        def done(result: object) -> None:
+            self.doing, self.share, self.trouble = "", 0.0, ("", "")
+            then(result)
+
+        self.note, self.trouble = "", ("", "")
+        self.doing, self.share = self.doing or "working", 0.0
+        self.worker.ask(
+            method, *arguments, then=done, failed=failed or self._failed, progress=self._progress
+        )
+        self.tell("state")
+
+    def _progress(self, text: str, share: float) -> None:
+        self.doing, self.share = text, share
+        self.tell("state")
+
+    def _failed(self, error: RtidError) -> None:
+        self.doing, self.trouble, self._is_adding = "", (str(error), error.remedy), False
+        self.tell("state")
+
+    def _not_opened(self, error: RtidError) -> None:
+        self.state = FAILED
+        self._failed(error)
+
+    def _opened(self, opened: Opened) -> None:
+        self.state, self.opened = READY, opened
+        self.revisions = [ShownRevision(opened.look, opened.added, is_saved=True)]
+        self.tell("looks")
+        self._diagnose()
+
+    def _diagnose(self) -> None:
+        revision = self.last
+        if revision is None or revision.told is not None:
+            return
+
+        def words(result: RankedDiagnosis) -> None:
+            revision.told = result
+            self.tell("told")
+            self._prepare(revision)
+
+        self._ask("diagnose", then=words)
+
+    def _prepare(self, revision: ShownRevision) -> None:
+        """Have the next revision ready before the user asks for it."""
+        effects = revision.told.diagnosis.found if revision.told else ()
+        if effects and revision is self.last:
+            key, number = (effects[0].effect, effects[0].where), len(self.revisions)
+
+            def ready(_: None) -> None:
+                self.prepared.add((number, key))
+                self.tell("state")
+
+            self.worker.ask("prepare", *key, then=ready, failed=lambda _: None)
+
+    def _added(self, change: str) -> Callable[[Addition], None]:
+        def added(result: Addition) -> None:
+            revision = ShownRevision(
+                result.look, result.sections, change, result.section, note=result.note
+            )
+            self.revisions.append(revision)
+            self._is_adding = False
+            self.tell("looks")
+            self._diagnose()
+
+        return added
+
+    def _taken_back(self, _: None) -> None:
+        self.revisions.pop()
+        self.tell("looks")
+
+    def _saved(self, saved: Saved) -> None:
+        for revision in self.revisions:
+            revision.is_saved = True
+        self._noted(saved.note)
+
+    def _noted(self, note: str) -> None:
+        self.note = note
+        self.tell("state")

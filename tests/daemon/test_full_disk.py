@@ -1,0 +1,207 @@
+"""A disk that is really full: a small file system, mounted for the test."""
+
+from __future__ import annotations
+
+import subprocess
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware_bridge.sources import open_log
+from rtid.daemon import jobs
+from rtid.daemon import status as st
+from rtid.daemon.analyst import Waiting, _receive
+from rtid.daemon.helper import Helper
+from rtid.daemon.recorder import MOST_SEGMENTS, RETRY_S, Recorder
+from rtid.daemon.teller import Saving
+from rtid.trace import state_files
+from tests.daemon.disk import fill, mounted
+from tests.daemon.test_parts import Clock, frames
+
+ROOM = 1 << 20
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of ROOM bytes."""
+    with mounted(tmp_path / "disk", ROOM) as folder:
+        yield folder
+
+
+def status(text: str = "") -> st.Status:
+    loop, bus = st.LoopHealth(1000.0), st.BusHealth("virtual", "none")
+    store = st.Store("NOT SAVED" if text else "saved", text)
+    return st.Status("machine", 1, 0.0, 0.0, loop, bus, store=store)
+
+
+def test_the_status_has_its_room_on_a_full_disk(disk: Path) -> None:
+    for _ in range(2):
+        st.write(disk, status())
+    fill(disk)
+    for k in range(50):
+        fill(disk)  # others take whatever becomes free
+        text = f"NOT SAVED: no room, {k} " + "and more of it " * k
+        st.write(disk, status(text))
+        assert st.read(disk).store.reason == text
+
+
+def test_a_status_that_outgrows_its_room_leaves_the_old_one_whole(disk: Path) -> None:
+    for _ in range(2):
+        st.write(disk, status("small"))
+    fill(disk)
+    with pytest.raises(OSError, match="No space"):
+        st.write(disk, status("x" * 100_000))
+    assert st.read(disk).store.reason == "small"
+    (disk / "filler").unlink()
+    st.write(disk, status("x" * 100_000))
+    assert len(st.read(disk).store.reason) == 100_000
+
+
+def test_a_reader_never_sees_half_a_status(tmp_path: Path) -> None:
+    st.write(tmp_path, status())
+    stop, wrong = threading.Event(), list[str]()
+
+    def look() -> None:
+        while not stop.is_set():
+            reason = st.read(tmp_path).store.reason
+            if len(set(reason)) > 1:
+                wrong.append(reason)
+
+    reader = threading.Thread(target=look)
+    reader.start()
+    for k in range(300):
+        st.write(tmp_path, status("ab"[k % 2] * (20 + 37 * k % 5000)))
+    stop.set()
+    reader.join()
+    assert not wrong
+
+
+def test_where_names_cannot_be_exchanged_the_new_file_replaces_the_old(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(state_files, "_libc", lambda: None)
+    for text in ("one", "two", "three"):
+        st.write(tmp_path, status(text))
+        assert st.read(tmp_path).store.reason == text
+    assert [path.name for path in tmp_path.iterdir()] == [st.STATUS_FILE]
+
+
+def test_a_disk_without_room_is_told_before_a_save_fails(disk: Path) -> None:
+    saving = Saving(30.0, disk)
+    snapshot = disk / "state.npz"
+    snapshot.write_bytes(bytes(300_000))
+    saving.hear(jobs.SavedSnapshot(1, str(snapshot)))
+    assert saving.why_not(True) == ""
+    (disk / "other").write_bytes(bytes(600_000))
+    assert "a snapshot needs 292 KB" in saving.why_not(True)
+    assert saving.store(saving.why_not(True), "", "", 0).state == "NOT SAVED"
+    assert saving.why_not(False) == "", "nothing is learned that could be lost"
+    (disk / "other").unlink()
+    assert saving.why_not(True) == ""
+    subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
+    assert "is read-only" in saving.why_not(True)
+
+
+def test_the_recorder_makes_no_files_on_a_full_disk(disk: Path) -> None:
+    """Five batches a second for a minute: it tries again now and then, and leaves nothing."""
+    clock = Clock()
+    recorder = Recorder(disk, 100 << 20, clock)
+    recorder.write(frames(0.2, 0.0))
+    folder = Path(recorder.keep("alarm", clock.now_s))
+    fill(disk)
+    refused = 0
+    for k in range(300):
+        clock.now_s += 0.2
+        fill(disk)
+        try:
+            recorder.write(frames(0.2, 1.0 + 0.2 * k))
+        except OSError:
+            refused += 1
+    assert refused >= 299  # the last page of the segment may have room for one more
+    ring = list((disk / "recording").glob("*.blf"))
+    assert len(ring) == 1 and len(list(folder.iterdir())) == 1
+    assert all(path.stat().st_size > 1000 for path in ring)
+    (disk / "filler").unlink()
+    clock.now_s += RETRY_S
+    recorder.write(frames(0.2, 100.0))
+    recorder.close()
+    assert len(open_log(Path(ring[0]))) >= 200
+
+
+def test_a_batch_that_the_disk_takes_a_part_of_is_refused(disk: Path) -> None:
+    recorder = Recorder(disk, 100 << 20, Clock())
+    with pytest.raises(OSError, match="No space"):
+        for k in range(1000):
+            recorder.write(frames(1.0, float(k)))
+
+
+def test_the_ring_is_limited_in_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A clock that steps begins a segment each time; small ones never reach the limit of bytes."""
+    assert MOST_SEGMENTS <= 10_000
+    monkeypatch.setattr("rtid.daemon.recorder.MOST_SEGMENTS", 20)
+    recorder = Recorder(tmp_path, 100 << 20, Clock())
+    for k in range(50):
+        recorder.write(frames(0.01, 1000.0 * k))
+    recorder.close()
+    assert len(list((tmp_path / "recording").glob("*.blf"))) == 20
+
+
+def batch(seconds: float = 0.2) -> jobs.Batch:
+    return jobs.Batch(np.zeros((round(1000 * seconds), 10)), None)
+
+
+def test_a_snapshot_passes_a_queue_behind_a_solve() -> None:
+    """The helper takes two minutes of batches from its pipe, and saves, while nothing is done."""
+    handover = jobs.Handover(7, None, publish=False, store=True)  # type: ignore[arg-type]
+    items: list[jobs.Job | None] = [*(batch() for _ in range(600)), handover, None]
+    saved, waiting = list[int](), Waiting(16 << 20)
+
+    class FromPipe:
+        def receive(self) -> jobs.Job | None:
+            return items.pop(0)
+
+    class Saver:
+        def save(self, job: jobs.Handover) -> None:
+            saved.append(job.number)
+
+    thread = threading.Thread(
+        target=_receive,
+        args=(FromPipe(), Saver(), waiting),
+        daemon=True,
+    )
+    thread.start()
+    thread.join(10.0)
+    assert saved == [7] and not thread.is_alive()
+    taken = 0
+    while waiting.get() is not None:
+        taken += 1
+    assert taken == 601 and waiting.empty()
+
+
+def test_what_waits_in_the_helper_is_bounded_in_bytes() -> None:
+    waiting = Waiting(3 * batch().size_bytes)
+    for _ in range(3):
+        waiting.put(batch(), timeout=0.1)
+    assert waiting.full()
+    waiting.get()
+    assert not waiting.full()
+
+
+def test_what_must_be_on_the_disk_goes_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Helper, "_run", lambda self: None)
+    helper = Helper("none", [], lambda answer: None)
+    for _ in range(100):
+        helper.put(batch())
+    urgent = jobs.Handover(3, None, publish=False, store=True)  # type: ignore[arg-type]
+    helper.put(urgent, first=True)
+    assert helper._next() is urgent and helper.queued == 100
+
+
+def test_a_status_keeps_its_meaning_with_room_behind_it(tmp_path: Path) -> None:
+    st.write(tmp_path, status())
+    text = (tmp_path / st.STATUS_FILE).read_text()
+    assert len(text) % st.ROOM_BYTES == 0 and st.from_json(text) == replace(status())

@@ -1,0 +1,65 @@
+"""What a verdict may stand beside, and that looking back at an effect never fails."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rtid.cli import main
+from rtid.diagnose.diagnosis import search
+from rtid.diagnose.report import Diagnosis, diagnosis
+from rtid.sim.hidden import hide
+from rtid.sim.random_plants import draw
+from rtid.sim.recording import write_run
+from rtid.sim.run import simulate
+from rtid.tell.diagnosed import sentences
+from tests.diagnose.records import record
+
+
+@pytest.mark.slow
+def test_a_strong_turbulent_leak_is_diagnosed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An effect is dropped, and the one behind it moves: looking back went on with the old one."""
+    trace = tmp_path / "leak.parquet"
+    plant = hide(draw(21), "internal_leakage_turbulent", 5e-7)
+    write_run(trace, simulate(plant, "sweep_record", 21, 110.0), 21, "sweep_record")
+    words = ["diagnose", str(trace), "--project", str(trace.with_suffix(".toml")), "--json"]
+    with pytest.raises(SystemExit):
+        main.run(words)
+    told = json.loads(capsys.readouterr().out)
+    assert told["rho_before"] > 10.0 and told["verdict"] != "matches"
+
+
+@pytest.fixture(scope="module")
+def unexplained() -> Diagnosis:
+    """A position with a slow wave that no effect of the catalogue has."""
+    model, chunk, held_out = record()
+    x = 2 + model.column(model.position)
+    parts = []
+    for whole in (chunk, held_out):
+        part = whole.copy()
+        part[:, x] += 6e-5 * np.sin(2 * np.pi * 1.7 * part[:, 0])
+        parts.append(part)
+    return diagnosis(search(model, parts[0], parts[1]))
+
+
+def test_unknown_says_what_remains_and_what_to_do(unexplained: Diagnosis) -> None:
+    assert unexplained.verdict == "unknown" and unexplained.found == ()
+    assert unexplained.something_remains and unexplained.rho_after > 1.1
+    assert any("Most is left in chamber" in text for text in unexplained.advice)
+    assert any(text.startswith("Next: ") for text in unexplained.advice)
+    assert any("Most is left in chamber" in text for text in sentences(unexplained))
+
+
+def test_what_is_slight_and_more_than_noise_is_no_match(unexplained: Diagnosis) -> None:
+    """The flow that is left is below 0.3 % of what moves: unknown all the same, and said so."""
+    slight = replace(
+        unexplained, heldout_residual_after_m3s=1.2 * unexplained.noise_floor_m3s,
+    )  # fmt: skip
+    assert slight.is_slight
+    assert any("The model is right to 0.3 %" in text for text in sentences(slight))

@@ -1,0 +1,47 @@
+"""The table of `make faults` has all rows, and no row is silent."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from tests.faults.elsewhere import ELSEWHERE, IN_SOAK, NOT_TESTED, files
+from tests.faults.table import NAMES, table
+
+ROOT = Path(__file__).parents[1]
+
+
+def rows_with_a_figure() -> set[int]:
+    """Rows that some test of `make faults` or `make soak` notes a figure of."""
+    texts = (path.read_text("utf-8") for path in (ROOT / "tests" / "faults").glob("test_*.py"))
+    return {int(row) for text in texts for row in re.findall(r"figure\(\s*(\d+),", text)}
+
+
+def test_every_row_is_tested_somewhere_or_says_why_not() -> None:
+    assert list(NAMES) == list(range(1, 41))
+    known = rows_with_a_figure() | set(ELSEWHERE) | set(IN_SOAK) | set(NOT_TESTED)
+    assert not set(NAMES) - known
+    assert not set(NOT_TESTED) & (rows_with_a_figure() | set(ELSEWHERE)), "it is tested now"
+
+
+def test_what_stands_elsewhere_is_there() -> None:
+    assert all((ROOT / file).is_file() for file in files())
+
+
+def test_every_row_has_a_line_whatever_ran() -> None:
+    for figures in ([], [{"row": 1, "what": "drift", "value": 0.5, "wanted": "<= 1", "unit": "%",
+                          "met": True, "test": "tests/faults/test_frames.py::a"}]):  # fmt: skip
+        lines = table(figures).splitlines()[2:]
+        assert {int(line.split("|")[1]) for line in lines} == set(NAMES)
+        assert all(line.count("|") == 7 for line in lines)
+
+
+def test_a_test_that_failed_elsewhere_is_seen() -> None:
+    file = ELSEWHERE[31][1][0]
+    figures: list[dict[str, object]] = [
+        {"test": f"{file}::a", "passed": True}, {"test": f"{file}::b", "passed": False},
+    ]  # fmt: skip
+    line = next(t for t in table(figures).splitlines() if t.startswith("| 31 "))
+    assert "1 of 2 tests pass" in line and "NOT MET" in line
+    line = next(t for t in table(figures[:1]).splitlines() if t.startswith("| 31 "))
+    assert "1 of 1 tests pass" in line and line.endswith("| ok |")
