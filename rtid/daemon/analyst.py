@@ -29,6 +29,7 @@ from rtid.daemon.map_check import Judge
 from rtid.daemon.offering import Offering
 from rtid.daemon.pipe import Pipe
 from rtid.daemon.recorder import Recorder
+from rtid.daemon.shadow import Shadow
 from rtid.daemon.status import EdgeHealth
 from rtid.errors import RtidError
 from rtid.estimator.estimator import Estimator
@@ -97,6 +98,7 @@ class Analyst:
         self._judge: Judge | None = None
         self._segment = ""
         self._told: dict[str, float] = {}
+        self._well: set[str] = set()  # what the disk has taken since it has last refused it
         self._handed: deque[jobs.Handover] = deque(maxlen=KEPT)
         self._offering = Offering(project, folder)
         self._guard: Guard | None = None
@@ -108,12 +110,13 @@ class Analyst:
             None  # with `Guard.judged` then
         )
         self._first: deque[FloatArray] = deque()  # samples of a first map
+        self._shadow: Shadow | None = None  # of a baseline that is lost
 
     def begin(self) -> None:
         """Publish the baseline of before, which has to foretell the motion first."""
         result = self._generations.baseline(self._project.model)
         for reason in result.refused:
-            self._answer(jobs.NotSaved("baseline", reason))
+            self._refused("baseline", reason)
         self._guarded("points", lambda: self._generations.keep("start"))
         if result.estimator is None:
             return
@@ -130,12 +133,19 @@ class Analyst:
         self._answer(jobs.Foretold("proving"))
 
     def take(self, job: jobs.Job) -> None:
-        """Do one job; what is to be saved of it is for `save`."""
+        """Do one job; what is to be saved of it is for `save`.  What cannot be done is told."""
+        try:
+            self._do(job)
+        except RtidError as error:
+            self._refused("analysis", str(error))
+
+    def _do(self, job: jobs.Job) -> None:
         if isinstance(job, jobs.Batch):
             self._batch(job)
         elif isinstance(job, jobs.Handover) and job.publish:
             try:
                 self._publish(job)
+                self._took("analysis")
             finally:
                 self._answer(jobs.Ready(to_save=False))
         elif isinstance(job, jobs.Note):
@@ -206,11 +216,15 @@ class Analyst:
                 self._first.popleft()
             return
         had_level = guard.level is not None
+        if self._shadow is not None and self._lead(guard, self._shadow, chunk):
+            return
         if guard.push(chunk):
             self._judged(guard)
-        elif not self._is_named and (causes := guard.later_causes()):
-            self._is_named = True
-            self._answer(_foretold("named", guard, causes))
+        elif not self._is_named and (causes := guard.later_causes()) is not None:
+            words = _foretold("named", guard, causes)
+            if words.text:
+                self._is_named = True
+                self._answer(words)
         if guard.level is not None and not had_level:
             self._store_baseline()
         if self._next is not None and guard.is_calm and guard.judged - self._next[2] >= PROOF:
@@ -220,6 +234,26 @@ class Analyst:
             if guard.judged - self._stored >= self._pause:
                 self._pause = min(2 * self._pause, LONGEST_PAUSE)
                 self._store_baseline()
+
+    def _lead(self, guard: Guard, shadow: Shadow, chunk: FloatArray) -> bool:
+        """Whether what was learned in the shadow takes the place of a baseline that is lost."""
+        stands = shadow.push(chunk)
+        if stands or not guard.is_lost:
+            self._shadow = None
+        if not (stands and guard.is_lost):
+            return False
+        self._guard, self._baseline = shadow.guard, shadow.job.estimator
+        self._judged(shadow.guard)
+        self._store_baseline()
+        return True
+
+    def _cast(self, job: jobs.Handover, guard: Guard) -> None:
+        """Try what was learned without proof, where the baseline cannot say anything."""
+        if guard.is_lost and not (self._shadow is not None and self._shadow.is_of_use):
+            with np.errstate(divide="ignore"):
+                solution = job.estimator.solution()
+                candidate = candidate_of(solution, published(solution, self._prior))
+            self._shadow = Shadow(job, solution, candidate, guard.level)
 
     def _judged(self, guard: Guard) -> None:
         """The baseline has foretold the motion, or does not."""
@@ -278,7 +312,7 @@ class Analyst:
         estimator.history, estimator.origin_us = None, job.origin_us
         estimator.advance(job.chunk)
         self._handed.clear()
-        self._guard = self._baseline = self._next = None
+        self._guard = self._baseline = self._next = self._shadow = None
         self._answer(jobs.Recalled(estimator, is_accepted=True))
         with self._disk:
             self._guarded("snapshot", lambda: self._generations.set_aside("accept"))
@@ -287,6 +321,9 @@ class Analyst:
 
     def _publish(self, job: jobs.Handover) -> None:
         if not len(job.estimator.sums.blocks):
+            return
+        if job.is_proving and self._guard is not None and self._guard.state != "proven":
+            self._cast(job, self._guard)
             return
         self._handed.append(job)
         candidate = self._tell(job)
@@ -358,20 +395,33 @@ class Analyst:
     def _guarded(self, what: str, action: Callable[[], T]) -> T | None:
         """Do something with the disk; a refusal is told, and tried again with the next job."""
         try:
-            return action()
+            result = action()
         except (OSError, sqlite3.Error) as error:
-            now_s = time.monotonic()
-            if now_s >= self._told.get(what, 0.0):
-                self._told[what] = now_s + FLOOD_S
-                self._answer(jobs.NotSaved(what, str(error)))
-        return None
+            self._refused(what, str(error))
+            return None
+        self._took(what)
+        return result
+
+    def _refused(self, what: str, reason: str) -> None:
+        now_s = time.monotonic()
+        if what in self._well or now_s >= self._told.get(what, 0.0):
+            self._told[what] = now_s + FLOOD_S
+            self._answer(jobs.NotSaved(what, reason))
+        self._well.discard(what)
+
+    def _took(self, what: str) -> None:
+        """Told once: also by a process that knows nothing of what the one before was refused."""
+        if what not in self._well:
+            self._well.add(what)
+            self._answer(jobs.SavedAgain(what))
 
 
 def _foretold(
     state: Literal["contradicted", "named"], guard: Guard, causes: list[LikelyCause]
 ) -> jobs.Foretold:
     """A contradiction in words: what would mend it, else what speaks against the samples."""
-    text = ", or ".join(cause.text for cause in causes) or "; ".join(guard.against)
+    mended = ", or ".join(cause.text for cause in causes)
+    text = f"It would do so again with: {mended}" if mended else "; ".join(guard.against)
     of_sensor = bool(text) and all(cause.of_sensor for cause in causes)
     return jobs.Foretold(state, guard.since_s, text, of_sensor)
 
@@ -413,10 +463,7 @@ def main() -> None:
         answer(jobs.Ready())
         receiver.start()
         while (job := waiting.get()) is not None:
-            try:
-                analyst.take(job)
-            except RtidError as error:
-                answer(jobs.NotSaved("analysis", str(error)))
+            analyst.take(job)
     except OSError:
         pass  # the daemon is gone; what it had was stored by the last job
     analyst.close()

@@ -12,7 +12,7 @@ from rtid.estimator.blocks import VALID
 from rtid.estimator.solution import Solution
 from rtid.model import Machine
 from rtid.plain import FloatArray
-from rtid.trace.check import against_motion, against_signs
+from rtid.trace.check import MIN_CORRELATION, against_motion, against_signs
 from rtid.trace.plausible import Motion, motion
 from rtid.units import limit
 
@@ -31,6 +31,11 @@ def against_first(model: Machine, chunk: FloatArray, solution: Solution) -> tupl
 def wrong_signs(model: Machine, chunk: FloatArray) -> tuple[str, ...]:
     """Signs that samples (n, 2 + signals), SI, without a gap speak against, whatever the map."""
     return tuple(f"{f.subject}: {f.text}" for f in against_signs(model, _motion(model, chunk)))
+
+
+def follows_command(model: Machine, chunk: FloatArray) -> bool:
+    """Whether samples (n, 2 + signals), SI, without a gap show that the machine obeys."""
+    return _motion(model, chunk).u_to_v > MIN_CORRELATION
 
 
 def _motion(model: Machine, chunk: FloatArray) -> Motion:

@@ -78,7 +78,7 @@ class Guard:
         self.level, self.state, self._usual_share = level, state, usual_share
         self.since_s = 0.0  # sample time at which the contradiction began
         self.against: tuple[str, ...] = ()  # what speaks against the samples themselves
-        self._alarm_s, self._due = 0.0, 0  # of the contradiction; `judged` to look for causes again
+        self._alarm_s, self._due = 0.0, 0  # of the contradiction; `_moved` to look for causes again
         self._is_sure = False  # there is motion enough for that
         self.has_foretold = False  # and was not merely known too little
         self.judged = 0  # seconds of motion since the beginning that the map was known for
@@ -141,15 +141,25 @@ class Guard:
 
         A suspicion may begin before the fault, and healthy samples hide what would mend the others.
         """
-        if self.state != "contradicted" or self.judged < self._due:
+        if self.state != "contradicted" or self._moved < self._due:
             return None
-        self._due = self.judged + AGAIN
+        self._due = self._moved + AGAIN
         return self._causes(self._alarm_s)
 
     def _causes(self, since_s: float) -> list[LikelyCause]:
         recent = np.concatenate(self._recent)
         chunk = recent[recent[:, 0] >= since_s - WARM_S]
         return causes(self._model, self._candidate, chunk, self._level)
+
+    @property
+    def has_seen_much(self) -> bool:
+        """Whether there was motion enough to be proven or contradicted by."""
+        return self._moved >= ENOUGH
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether it can say nothing of all that motion, for it or against it."""
+        return self.state == "proving" and self.has_seen_much and not self._window().cusum[0]
 
     @property
     def is_calm(self) -> bool:
@@ -171,7 +181,7 @@ class Guard:
         every = moving(self._model, residuals(self._model, self._candidate, piece))
         self._moved += len(np.unique(np.floor(every.t_s)))
         self._counts.append((len(every.t_s), int(every.known.sum())))
-        recent = self._without_gap()
+        recent = self.newest
         moved = sum(count > 0 for count, _ in [*self._counts][-len(self._recent) :])
         self._is_sure = min(moved * PIECE_S, recent[-1, 0] - recent[0, 0]) >= SURE
         self.against = wrong_signs(self._model, recent) if self._is_sure else ()
@@ -185,7 +195,8 @@ class Guard:
             self.level = self._measured()
         return self._decide(window)
 
-    def _without_gap(self) -> FloatArray:
+    @property
+    def newest(self) -> FloatArray:
         """The newest samples behind the last gap: what moved meanwhile followed no command."""
         recent = np.concatenate(self._recent)
         gaps = np.flatnonzero(np.diff(recent[:, 0]) > GAP_S)
@@ -198,7 +209,7 @@ class Guard:
                 rises = window.cusum[0] > 0.0
                 self.since_s = window.cusum[1] if rises else float(self._recent[0][0, 0])
                 self.state = "contradicted"
-                self._alarm_s, self._due = float(self._recent[-1][-1, 0]), self.judged + AGAIN
+                self._alarm_s, self._due = float(self._recent[-1][-1, 0]), self._moved + AGAIN
                 self._rows = None  # a way back needs new motion
                 return True
             if self.state == "proven":
@@ -216,7 +227,7 @@ class Guard:
         One whose command is reversed keeps out of nearly all that was ever visited.
         """
         usual = self.known_share >= LEAST_SHARE * self._usual_share
-        return self._is_sure and self._moved >= ENOUGH and len(window.t_s) < PROOF and usual
+        return self._is_sure and self.has_seen_much and len(window.t_s) < PROOF and usual
 
     def _window(self) -> Seconds:
         if self._rows is None:

@@ -176,6 +176,13 @@ class NotSaved:
 
 
 @dataclass(frozen=True)
+class SavedAgain:
+    """The disk takes this now: what it has refused of it is over, and nothing else is."""
+
+    what: str
+
+
+@dataclass(frozen=True)
 class RecorderState:
     """Where frames go now, and the folder in which an alarm's trace was kept."""
 
@@ -217,6 +224,7 @@ Answer = (
     | Foretold
     | SavedSnapshot
     | NotSaved
+    | SavedAgain
     | RecorderState
     | VerdictAnswer
     | Coached

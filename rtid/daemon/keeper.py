@@ -107,7 +107,7 @@ class Keeper:
             elif isinstance(answer, jobs.HandoverJudgement):
                 if self.plant.push(answer):
                     self._plant_changed()
-            elif isinstance(answer, jobs.SavedSnapshot | jobs.NotSaved):
+            elif isinstance(answer, jobs.SavedSnapshot | jobs.NotSaved | jobs.SavedAgain):
                 self._saving.hear(answer)
             elif isinstance(answer, jobs.RecorderState):
                 self._recording = answer.path

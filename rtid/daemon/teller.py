@@ -12,7 +12,7 @@ from rtid.daemon import status as st
 from rtid.daemon.alarms import Alarms
 from rtid.daemon.core import Core
 from rtid.daemon.diagnosing import Diagnosing
-from rtid.daemon.jobs import NotSaved, Publication, SavedSnapshot
+from rtid.daemon.jobs import NotSaved, Publication, SavedAgain, SavedSnapshot
 from rtid.daemon.loop import Loop
 from rtid.daemon.story import loop_health, resident_mb
 from rtid.project import Project
@@ -50,10 +50,12 @@ class Saving:
     saved_s: float | None = None
     refused: dict[str, str] = field(default_factory=dict)
 
-    def hear(self, answer: SavedSnapshot | NotSaved) -> None:
-        """The analyst has saved, or could not."""
-        if isinstance(answer, SavedSnapshot):
-            self.saved_s, self.refused = time.monotonic(), {}
+    def hear(self, answer: SavedSnapshot | NotSaved | SavedAgain) -> None:
+        """The analyst has saved, could not, or can again: a snapshot says nothing of the others."""
+        if isinstance(answer, SavedAgain):
+            self.refused.pop(answer.what, None)
+        elif isinstance(answer, SavedSnapshot):
+            self.saved_s = time.monotonic()
             with contextlib.suppress(OSError):
                 self.needed = max(LEAST_FREE, os.stat(answer.path).st_size)
         else:

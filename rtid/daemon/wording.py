@@ -85,14 +85,11 @@ def _signal(health: SignalHealth) -> str:
 def plant_changed(verdict: Verdict | None, cause: str = "") -> str:
     """The map no longer foretells the motion.
 
-    cause: what would make it do so again; verdict: of the change, as far as there is one.
+    cause: a sentence on it without its full stop; verdict: of the change, as far as there is one.
     """
     text = "the machine no longer does what the map says; learning is suspended"
     if cause:
-        return (
-            f"{text}. It would do so again with: {cause}. If the machine is to stay as it is now: "
-            "rtid accept"
-        )
+        return f"{text}. {cause}. If the machine is to stay as it is now: rtid accept"
     if verdict is None:
         return f"{text}, a diagnosis follows"
     return f"{text}. {verdict.text} If the machine is to stay as it is now: rtid accept"

@@ -95,8 +95,12 @@ FAULTS = {
     "leak of 10 %": Fault(("leak",), _leak(0.1)),
     "air, 2 %": Fault(("air",), _air),
     "pressures swapped": Fault(("p_a and p_b are swapped",), spoil=_swapped),
-    "u reversed": Fault(("u has the wrong sign",), spoil=_scaled(U, -1.0)),
-    "x reversed": Fault(("x has the wrong sign",), spoil=_turned),
+    "u reversed": Fault(
+        ("u has the wrong sign", "the machine moves against u:"), spoil=_scaled(U, -1.0)
+    ),
+    "x reversed": Fault(
+        ("x has the wrong sign", "x runs against command and pressures:"), spoil=_turned
+    ),
     "p_b 10 % too much": Fault(("p_b reads",), spoil=_scaled(P_B, 1.1)),
     "p_a 2 bar too much": Fault(("p_a reads",), spoil=_scaled(P_A, 1.0, 2e5)),
     "p_supply stuck": Fault(("p_supply",), spoil=lambda values: _stuck(values, P_S)),

@@ -14,13 +14,14 @@ import pytest
 from firmware_bridge.sources import open_log
 from rtid.daemon import jobs
 from rtid.daemon import status as st
-from rtid.daemon.analyst import Waiting, _receive
+from rtid.daemon.analyst import Analyst, Waiting, _receive
 from rtid.daemon.helper import Helper
 from rtid.daemon.recorder import MOST_SEGMENTS, RETRY_S, Recorder
 from rtid.daemon.teller import Saving
 from rtid.trace import state_files
 from tests.daemon.disk import fill, mounted
 from tests.daemon.test_parts import Clock, frames
+from tests.faults.harness import machine
 
 ROOM = 1 << 20
 
@@ -205,3 +206,28 @@ def test_a_status_keeps_its_meaning_with_room_behind_it(tmp_path: Path) -> None:
     st.write(tmp_path, status())
     text = (tmp_path / st.STATUS_FILE).read_text()
     assert len(text) % st.ROOM_BYTES == 0 and st.from_json(text) == replace(status())
+
+
+def test_a_snapshot_on_the_disk_says_nothing_of_the_history(tmp_path: Path) -> None:
+    """Each refusal stands until the disk has taken that very thing."""
+    heard: list[jobs.Answer] = []
+    analyst = Analyst(machine().project, tmp_path, heard.append)
+    saving = Saving(30.0, tmp_path)
+    (tmp_path / "history.sqlite").mkdir()  # nothing can be written there
+    note = jobs.Note(st.Alarm("x", "y", 1e9, None, "bus"), keep=False)
+    estimator = machine().learned(machine().frames[:3000]).estimator
+
+    def done() -> set[str]:
+        analyst.take(note)
+        analyst.save(jobs.Handover(1, estimator.copy(with_history=False), False, True))
+        for answer in heard:
+            if isinstance(answer, jobs.SavedSnapshot | jobs.NotSaved | jobs.SavedAgain):
+                saving.hear(answer)
+        heard.clear()
+        return set(saving.refused)
+
+    assert done() == {"history"} and saving.saved_s is not None
+    assert "NOT SAVED: history" in saving.why_not(True)
+    (tmp_path / "history.sqlite").rmdir()
+    assert done() == set() and saving.why_not(True) == ""
+    analyst.close()

@@ -228,3 +228,40 @@ def test_a_cause_that_healthy_samples_hide_is_named_later(
         guard.push(piece)
     causes = guard.later_causes()
     assert causes and "a leak from a to b" in causes[0].text
+
+
+def test_a_command_that_turns_its_sign_in_a_run_is_named(bench: Bench) -> None:
+    """The machine keeps out of all that the map knows: the causes must not wait for it."""
+    model, solution = machine().project.model, fault_free()
+    candidate = candidate_of(solution, publish(solution))
+    guard = Guard(model, candidate, np.full(2, 0.003 * rated_m3s(model)), "proven")
+    chunk = chunk_of(bench.faulty(FAULTS["u reversed"], 8.0, 32.0, 3))
+    named: list[str] = []
+    for piece in np.array_split(chunk, 16):
+        if guard.push(piece) and guard.state == "contradicted":
+            named = [*(cause.text for cause in guard.causes()), *guard.against]
+        elif not named and (causes := guard.later_causes()) is not None:
+            named = [*(cause.text for cause in causes), *guard.against]
+    assert any(words in text for text in named for words in FAULTS["u reversed"].names), named
+
+
+def test_a_lost_baseline_yields_to_a_shadow_that_foretells(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A healthy machine works where nothing is known: it is not kept in the shadow for ever."""
+    monkeypatch.setattr(guards, "ENOUGH", 24)
+    monkeypatch.setattr(guards, "PROOF", 7)
+    project = machine().project
+    corner = Estimator(project.model)  # knows next to nothing, and says that this is unusual
+    corner.history = None
+    corner.origin_us, chunk = 0, chunk_of(bench.run(3.0, 8, "dither"))
+    corner.advance(chunk)
+    generations = Generations(tmp_path, project.digest)
+    generations.save(corner)
+    level = [0.003 * rated_m3s(project.model)] * 2
+    generations.save_baseline(corner, {"level_m3s": level, "known_share": 0.9})
+    daemon = Simulated(bench, tmp_path, 100.0)
+    daemon.hear(bench.run(40.0, 3))
+    assert daemon.learning_s <= 40.0 and not np.isfinite(daemon.alarm_s)
+    daemon.stop()
+    assert generations.baseline(project.model).notes["known_share"] > 0.1
