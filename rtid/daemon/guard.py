@@ -197,7 +197,7 @@ class Guard:
 
     @property
     def newest(self) -> FloatArray:
-        """The newest samples behind the last gap: what moved meanwhile followed no command."""
+        """Samples (n, 2 + signals), SI, behind the last gap: what moved in it had no command."""
         recent = np.concatenate(self._recent)
         gaps = np.flatnonzero(np.diff(recent[:, 0]) > GAP_S)
         return recent[gaps[-1] + 1 :] if len(gaps) else recent
