@@ -75,8 +75,8 @@ def chunk(n: int = 500) -> np.ndarray:
 def drawings(model: Machine, flowmap: FlowMap) -> dict[str, Figure]:
     return {
         "coverage": coverage(model, flowmap, chunk()),
-        "maps": maps(flowmap),
-        "slices": slices(flowmap, flowmap, reference_name="sheet"),
+        "maps": draw(maps(flowmap)),
+        "slices": draw(slices(flowmap, flowmap, reference_name="sheet")),
         "residual": draw(residual(model, {"identification": part(), "validation": part(300)})),
         **examined(model),
     }
@@ -185,24 +185,24 @@ def test_every_picture_is_written(
 
 
 def test_same_map_same_bytes(flowmap: FlowMap, tmp_path: Path) -> None:
-    one, two = (save(maps(flowmap), tmp_path / f"{k}.svg").read_bytes() for k in (1, 2))
+    one, two = (save(draw(maps(flowmap)), tmp_path / f"{k}.svg").read_bytes() for k in (1, 2))
     assert one == two
 
 
 def test_everything_that_is_not_valid_is_hatched(flowmap: FlowMap) -> None:
-    for axis, edge in zip(maps(flowmap).axes, flowmap.edges, strict=False):
+    for axis, edge in zip(draw(maps(flowmap)).axes, flowmap.edges, strict=False):
         veils = [c for c in axis.collections if isinstance(c, PatchCollection)]
         assert [v.get_hatch() for v in veils] == ["////"]
         assert len(veils[0].get_paths()) == (edge.status != VALID).sum()
 
 
 def test_slices_show_the_reference_as_dots(flowmap: FlowMap) -> None:
-    axis = slices(flowmap, flowmap, u_v=[3.0, 5.0]).axes[0]
-    dots = [line for line in axis.lines if line.get_marker() == "o"]
-    assert len(dots) == 2
-    dp = np.asarray(dots[1].get_xdata(), float) * 1e6
-    q_lpm = np.asarray(dots[1].get_ydata(), float)
-    np.testing.assert_allclose(q_lpm, flowmap.flow("e0", 5.0, dp) * 6e4)
+    axis = draw(slices(flowmap, flowmap, u_v=[3.0, 5.0])).axes[0]
+    (dots,) = [line for line in axis.lines if line.get_marker() == "o"]
+    dp = np.asarray(dots.get_xdata(), float).reshape(2, -1) * 1e6
+    q_lpm = np.asarray(dots.get_ydata(), float).reshape(2, -1)
+    for k, w_v in enumerate((3.0, 5.0)):
+        np.testing.assert_allclose(q_lpm[k], flowmap.flow("e0", w_v, dp[k]) * 6e4)
 
 
 def test_a_spike_of_one_row_is_drawn(model: Machine) -> None:

@@ -122,8 +122,8 @@ def test_every_picture_has_a_sentence_below(leaking: Reported) -> None:
     text = leaking.path.read_text("utf-8")
     captions = re.findall(r"(?s)<figure>.+?<figcaption>(.+?)</figcaption></figure>", text)
     _, words = read(leaking.path)
-    assert len(captions) == 5
-    assert text.count("data-root-id=") == 3  # drawn by Bokeh; the other two are HTML
+    assert len(captions) == 7
+    assert text.count("data-root-id=") == 5  # drawn by Bokeh; the other two are HTML
     assert all(unescape(c).strip().endswith(".") for c in captions)
     for heading in ("not found", "cannot show", "negligible", "Where this comes from"):
         assert heading in words

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from rtid.study.compared import IDENTIFICATION, Held, TraceComparison
 from rtid.tell.charts.correlation import correlogram, cusum
 from rtid.tell.charts.dependence import dependences
+from rtid.tell.charts.maps import maps, slices
 from rtid.tell.charts.over_time import beside, pressures, residual
 from rtid.tell.story import Chart
 
@@ -37,16 +38,17 @@ def draw(studies: Sequence[TraceComparison], folder: Path, suffix: str) -> list[
 
 
 def _of_study(comparison: TraceComparison, ending: str) -> dict[str, Figure]:
-    from rtid.tell.charts.maps import maps, slices  # noqa: PLC0415
+    from rtid.tell import stills  # noqa: PLC0415
     from rtid.tell.charts.where import residual_map  # noqa: PLC0415
 
     model = comparison.replay.model
     drawn: dict[str, Figure] = {}
     for title, rows in comparison.blocks_of.items():
         drawn[f"where_{title}{ending}"] = residual_map(model, rows)
-    drawn[f"maps{ending}"] = maps(comparison.flowmap)
+    drawn[f"maps{ending}"] = stills.draw(maps(comparison.flowmap))
     name = comparison.reference.name if comparison.reference else ""
-    drawn[f"slices{ending}"] = slices(comparison.flowmap, comparison.reference, reference_name=name)
+    cut = slices(comparison.flowmap, comparison.reference, reference_name=name)
+    drawn[f"slices{ending}"] = stills.draw(cut)
     return drawn
 
 

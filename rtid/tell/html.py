@@ -11,7 +11,7 @@ from html import escape
 from math import isfinite, log10
 from pathlib import Path
 
-from rtid.tell.story import Bars, Chart, Story, StoryPart, Table
+from rtid.tell.story import Bars, Story, StoryPart, Table
 
 INSIDE = 25.0  # % of the track from which a bar has its figure inside
 TENS = 99.5  # standard deviations from which no decimals are told
@@ -36,7 +36,7 @@ def _part(part: StoryPart, charts: Mapping[str, str]) -> str:
     if isinstance(part, Table):
         heading = f"<h3>{text(part.title)}</h3>" if part.title else ""
         return heading + table(part.heads, ([text(c) for c in row] for row in part.rows))
-    drawn = charts[part.name] if isinstance(part, Chart) else bars(part)
+    drawn = bars(part) if isinstance(part, Bars) else charts[part.name]
     return f"<figure>{drawn}<figcaption>{text(part.caption)}</figcaption></figure>"
 
 

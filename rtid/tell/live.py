@@ -6,7 +6,16 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 from bokeh.layouts import column
-from bokeh.models import ColumnDataSource, Range1d, Title, UIElement, Whisker
+from bokeh.models import (
+    ColorBar,
+    ColumnDataSource,
+    LinearColorMapper,
+    Range1d,
+    Title,
+    UIElement,
+    Whisker,
+)
+from bokeh.palettes import Cividis256, RdBu11, YlOrBr9, interp_palette
 from bokeh.plotting import figure
 
 from rtid.plain import FloatArray
@@ -14,29 +23,52 @@ from rtid.tell.charts.lines import Lines
 from rtid.tell.charts.theme import INK_TAG, NARROWEST_PX, NOTE_TAG, beside, plot, styled
 from rtid.tell.charts.time_plots import TimePlots
 from rtid.tell.colours import GREY, INK
-from rtid.tell.story import Chart, Dots, Panel
+from rtid.tell.story import Chart, Dots, Line, Panel, Plane, Planes, Strip
 
 ROOM = 0.06  # of the span, free at either end
 INCH_PX = 90.0  # of a chart's heights
-MARKERS = {"o": "circle", "s": "square"}
+PLANE_PX = 280.0  # height of a plane
+MARKERS = {"o": "circle", "s": "square", "c": "circle"}
+YELLOWS = list(interp_palette(tuple(reversed(YlOrBr9)), 256))[8:232]
+PALETTES = {"flow": list(Cividis256), "doubt": YELLOWS, "change": list(RdBu11)}
+LABELS = 1.14  # of the span of x, where words stand behind points
 
 
 class PanelPlot:
-    """One panel of points and straight lines, which can be shown others of the same kind."""
+    """One panel of points and lines, which can be shown others of the same kind."""
 
     def __init__(self, panel: Panel) -> None:
         self._x, self._y = Range1d(0, 1), Range1d(0, 1)
         self.root: figure = plot("", x_range=self._x, y_range=self._y)
-        self.root.hspan(0.0, line_color=GREY, line_width=0.6)
-        self._lines = [self._line(line.colour) for line in panel.lines]
+        if panel.has_zero:
+            self.root.hspan(0.0, line_color=GREY, line_width=0.6)
+        self._strips = [self._strip(strip) for strip in panel.strips]
+        self._lines = [self._line(line) for line in panel.lines]
         noted = [self._note(points) for points in reversed(panel.points) if points.note]
         self._notes = noted[::-1]  # the first one is added last, and stands highest
         self._points = [self._series(points) for points in panel.points]
+        self._remarks = self._words()
         self.show(panel)
 
-    def _line(self, colour: str) -> ColumnDataSource:
+    def _strip(self, strip: Strip) -> ColumnDataSource:
+        source = ColumnDataSource({"xs": [], "ys": []})
+        look = {"fill_color": strip.colour, "fill_alpha": 0.2, "line_color": None}
+        self.root.patches("xs", "ys", source=source, **look)
+        return source
+
+    def _line(self, line: Line) -> ColumnDataSource:
         source = ColumnDataSource({"x": [], "y": []})
-        self.root.line("x", "y", source=source, line_color=colour, line_dash=[5, 4])
+        dash = [5, 4] if line.is_dashed else "solid"
+        look = {"line_color": line.colour, "line_width": line.width, "line_dash": dash}
+        self.root.line("x", "y", source=source, **look)
+        return source
+
+    def _words(self) -> ColumnDataSource:
+        """Of remarks, behind their points."""
+        source = ColumnDataSource({"x": [], "y": [], "text": []})
+        look = {"text_font_size": "10px", "text_baseline": "middle", "text_color": GREY}
+        label = self.root.text("x", "y", "text", source=source, x_offset=3, **look)
+        label.glyph.tags = [INK_TAG]
         return source
 
     def _note(self, points: Dots) -> Title:
@@ -49,7 +81,9 @@ class PanelPlot:
     def _series(self, points: Dots) -> ColumnDataSource:
         source = ColumnDataSource({"x": [], "mean": [], "low": [], "high": []})
         marker, colour = MARKERS[points.marker], points.colour
-        self.root.scatter("x", "mean", source=source, marker=marker, color=colour, size=6)
+        fill = None if points.marker == "c" else colour
+        look = {"marker": marker, "line_color": colour, "fill_color": fill, "size": 6}
+        self.root.scatter("x", "mean", source=source, **look)
         if points.is_joined:
             self.root.line("x", "mean", source=source, color=colour, line_width=0.8)
         whisker = Whisker(base="x", lower="low", upper="high", source=source)
@@ -64,17 +98,43 @@ class PanelPlot:
             source.data = {"x": points.x, "mean": points.y, "low": low, "high": high}
         for source, line in zip(self._lines, panel.lines, strict=True):
             source.data = {"x": line.x, "y": line.y}
+        for source, strip in zip(self._strips, panel.strips, strict=True):
+            source.data = _around(strip)
+        labels = [r for r in panel.remarks if r.y is not None]
+        self._remarks.data = {k: [getattr(r, k) for r in labels] for k in ("x", "y", "text")}
         for note, points in zip(self._notes, panel.points, strict=False):
             note.text = f"{points.name}: {points.note}"
-        self._x.update(**_reach(points.x for points in panel.points))
+        self._x.update(**_across(panel))
         self._y.update(**_reach(_ends([panel, *on_scale])))
         self.root.title.text = panel.title
         self.root.xaxis.axis_label, self.root.yaxis.axis_label = panel.x_label, panel.y_label
 
 
+def _around(strip: Strip) -> dict[str, list[FloatArray]]:
+    """The outlines of a strip's pieces."""
+    ends = np.flatnonzero(~np.isfinite(strip.x))
+    pieces = [k[np.isfinite(strip.x[k])] for k in np.split(np.arange(len(strip.x)), ends)]
+    there = [k for k in pieces if len(k)]
+    return {
+        "xs": [np.concatenate([strip.x[k], strip.x[k][::-1]]) for k in there],
+        "ys": [np.concatenate([strip.low[k], strip.high[k][::-1]]) for k in there],
+    }
+
+
+def _across(panel: Panel) -> dict[str, float]:
+    """Of x: its points, or its lines from end to end with room for words behind them."""
+    if not panel.strips:
+        return _reach(points.x for points in panel.points)
+    every = np.concatenate([strip.x for strip in panel.strips])
+    low, high = float(np.nanmin(every)), float(np.nanmax(every))
+    return {"start": low, "end": low + LABELS * (high - low)}
+
+
 def _ends(panels: Sequence[Panel]) -> Iterable[FloatArray]:
     for points in (p for panel in panels for p in panel.points):
         yield from _interval(points)
+    for strip in (s for panel in panels for s in panel.strips):
+        yield from (np.minimum(strip.low, 0.0), strip.high)
 
 
 def _interval(points: Dots) -> tuple[FloatArray, FloatArray]:
@@ -91,9 +151,51 @@ def _reach(values: Iterable[FloatArray]) -> dict[str, float]:
     return {"start": low - room, "end": high + room}
 
 
-def draw(chart: Chart) -> UIElement:
+class PlanePlot:
+    """An image over two quantities with lines on it, which can be shown others."""
+
+    def __init__(self, plane: Plane, x_label: str, y_label: str) -> None:
+        self._x, self._y = Range1d(0, 1), Range1d(0, 1)
+        self.root: figure = plot(y_label, x_label, self._x, y_range=self._y)
+        self.root.grid.visible = False
+        self._mapper = LinearColorMapper(palette=PALETTES["flow"], nan_color="#dddddd")
+        self._image = ColumnDataSource({"image": [], "x": [], "y": [], "dw": [], "dh": []})
+        self.root.image(
+            "image", "x", "y", "dw", "dh", source=self._image, color_mapper=self._mapper
+        )
+        self._outline = ColumnDataSource({"x0": [], "y0": [], "x1": [], "y1": []})
+        for look in ({"line_color": "#ffffff", "line_width": 2.4}, {"line_color": "#22272b"}):
+            self.root.segment("x0", "y0", "x1", "y1", source=self._outline, **look)
+        bar = ColorBar(color_mapper=self._mapper, width=9, padding=4, label_standoff=4)
+        bar.major_label_text_font_size, bar.bar_line_color = "10px", None
+        self.root.add_layout(bar, "right")
+        self.show(plane)
+
+    def show(self, plane: Plane) -> None:
+        """Draw a plane."""
+        (x, x_end), (y, y_end) = plane.x, plane.y
+        self._mapper.update(palette=PALETTES[plane.palette], low=plane.low, high=plane.high)
+        place = {"x": [x], "y": [y], "dw": [x_end - x], "dh": [y_end - y]}
+        self._image.data = {"image": [plane.values.astype(np.float32)], **place}
+        names = ("x0", "y0", "x1", "y1")
+        self._outline.data = dict(zip(names, plane.outline.T.tolist(), strict=True))
+        self.root.title.text = plane.title
+        self._x.update(start=x, end=x_end)
+        self._y.update(start=y, end=y_end)
+
+
+def draw(chart: Chart | Planes) -> UIElement:
     """All panels of a chart; one below the other where the page is narrow."""
+    if isinstance(chart, Planes):
+        return _planes(chart)
     return _over_time(chart) if chart.is_timed else _of_points(chart)
+
+
+def _planes(chart: Planes) -> UIElement:
+    made = [PlanePlot(plane, chart.x_label, chart.y_label).root for plane in chart.planes]
+    pairs = [made[k : k + 2] for k in range(0, len(made), 2)]
+    rows = [_framed(pair, PLANE_PX) for pair in pairs]
+    return column(*rows, sizing_mode="stretch_width")
 
 
 def _of_points(chart: Chart) -> UIElement:

@@ -20,6 +20,7 @@ from rtid.plain import plain
 from rtid.study.compared import TraceComparison
 from rtid.study.compared import as_json as compared_json
 from rtid.study.kept_record import Replay
+from rtid.tell.charts.maps import maps, slices
 from rtid.tell.charts.over_time import residual
 from rtid.tell.story import FAINT, Story, Table
 from rtid.units import CONVENTION, Scale, range_of, scale_of, with_unit
@@ -102,7 +103,6 @@ class LearnedStory:
         # matplotlib only where a picture is wanted
         from rtid.tell import stills  # noqa: PLC0415
         from rtid.tell.charts.coverage import coverage  # noqa: PLC0415
-        from rtid.tell.charts.maps import maps, slices  # noqa: PLC0415
 
         folder.mkdir(parents=True, exist_ok=True)
         chunk = self.result.part(self.result.identification_s)
@@ -110,8 +110,8 @@ class LearnedStory:
         name = reference.name if reference else ""
         figures = {
             "coverage": coverage(self.result.model, flowmap, chunk),
-            "maps": maps(flowmap),
-            "slices": slices(flowmap, reference, reference_name=name),
+            "maps": stills.draw(maps(flowmap)),
+            "slices": stills.draw(slices(flowmap, reference, reference_name=name)),
             "residual": stills.draw(residual(self.result.model, self.compared.held[0].parts)),
         }
         return [stills.save(f, folder / f"{name}.{suffix}") for name, f in figures.items()]

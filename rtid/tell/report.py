@@ -17,13 +17,14 @@ from rtid.effects.page import title
 from rtid.project.history import Change
 from rtid.tell import stills as still_pictures
 from rtid.tell.charts.dependence import before_and_after
+from rtid.tell.charts.maps import maps, slices
 from rtid.tell.charts.over_time import flows
 from rtid.tell.diagnosed import heading, sentences
 from rtid.tell.history import history_table
 from rtid.tell.html import rendered
 from rtid.tell.report_page import embedded, key_figures, page_of
 from rtid.tell.report_story import Ranked, ReportStory
-from rtid.tell.story import Bar, Bars, Chart, Story, StoryPart, Table
+from rtid.tell.story import Bar, Bars, Chart, Planes, Story, StoryPart, Table
 from rtid.tell.words import named, quantity
 from rtid.units import CONVENTION, LPM, MPA, limit
 
@@ -55,7 +56,7 @@ def page(report_story: ReportStory) -> str:
 def stills(report_story: ReportStory) -> dict[str, Figure]:
     """The pictures of the page by name, for `rtid report --png`: no browser is needed."""
     parts = [part for story in sections(report_story) for part in story.parts]
-    shown = [part for part in parts if isinstance(part, (Chart, Bars))]
+    shown = [part for part in parts if isinstance(part, (Chart, Planes, Bars))]
     return {part.name: still_pictures.draw(part) for part in shown}
 
 
@@ -67,6 +68,7 @@ def sections(story: ReportStory) -> tuple[Story, ...]:
         *(Story(chart.title, (chart,)) for chart in story.evidence),
         _flows(story),
         _dependences(story),
+        Story("Flow maps", (maps(story.flowmap), slices(story.flowmap))),
         _ranking(story),
         *_not_found(result.not_found, story.ranking),
         _negligible(story),

@@ -17,7 +17,7 @@ from bokeh.resources import INLINE
 
 from rtid.tell.html import static, text
 from rtid.tell.live import draw
-from rtid.tell.story import Chart, StoryPart
+from rtid.tell.story import Chart, Planes, StoryPart
 
 
 def page_of(**places: str) -> str:
@@ -35,7 +35,7 @@ def key_figures(figures: Mapping[str, str]) -> str:
 
 def embedded(parts: Iterable[StoryPart]) -> tuple[str, dict[str, str]]:
     """What the head of the file needs, and the place of every chart; always the same text."""
-    figures = {part.name: draw(part) for part in parts if isinstance(part, Chart)}
+    figures = {part.name: draw(part) for part in parts if isinstance(part, (Chart, Planes))}
     if not figures:
         return f"<style>{static('plots.css')}</style>", {}
     script, places = components(figures)

@@ -20,6 +20,7 @@ from rtid.diagnose.residual import Residual, residual
 from rtid.diagnose.trials import physical, scored
 from rtid.diagnose.verdict import LEAST_ROWS
 from rtid.effects.column import Candidate
+from rtid.estimator.flowmap import FlowMap
 from rtid.model import Machine
 from rtid.plain import FloatArray, Key, Progress, silent
 from rtid.project import Project
@@ -67,6 +68,7 @@ class ReportStory:
     depends_after: tuple[Dependence, ...]
     ranking: tuple[Ranked, ...]
     evidence: tuple[Chart, ...]
+    flowmap: FlowMap
     history: tuple[Change, ...]
     trace_sha256: str
     date: str
@@ -98,6 +100,7 @@ def tell(project: Project, trace: Path, progress: Progress = silent) -> ReportSt
         *depends,
         ranked(diagnosed.result, diagnosed.diagnosis),
         charts_of(study.evidence),
+        study.map,
         tuple(read(project.path)),
         _sha256(trace),
         datetime.now().astimezone().isoformat(" ", "seconds"),

@@ -9,13 +9,15 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PatchCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch
+from matplotlib.image import AxesImage
+from matplotlib.patches import Patch, Rectangle
 
 from rtid.estimator.flowmap import EXTRAPOLATED, LEARNING, PRIOR, SHUT, VALID
 from rtid.plain import FloatArray
 from rtid.tell.colours import BLUE, GREY, INK, LINE, ORANGE, PALE
-from rtid.tell.story import Bar, Bars, Chart, Dots, Panel, Remark
+from rtid.tell.story import Bar, Bars, Chart, Dots, Panel, Plane, Planes, Remark
 
 FILL = {VALID: "#b9d9ec", LEARNING: "#f6e3b4", EXTRAPOLATED: "white", PRIOR: "white", SHUT: PALE}
 LABELS = {
@@ -28,6 +30,9 @@ LABELS = {
 GAP = 5.0  # usual steps: no line across a longer one
 INSIDE = 0.25  # of the axis: a longer bar has its figure inside
 WEAKEST = 0.1  # left end of a logarithmic scale
+PALETTES = {"flow": "cividis", "doubt": "YlOrBr", "change": "RdBu_r"}
+LEVELS = 12  # of a plane's colours
+VEIL, HATCH = (1.0, 1.0, 1.0, 0.35), (1.0, 1.0, 1.0, 0.75)
 BAR_COLOURS = {"first": ORANGE, "found": ORANGE, "rival": LINE}
 
 STYLE: dict[Any, Any] = {
@@ -103,10 +108,51 @@ def thin(t: FloatArray, y: FloatArray, bins: int = 1500) -> tuple[FloatArray, Fl
     return t[chosen], y[chosen]
 
 
-def draw(chart: Chart | Bars) -> Figure:
+def draw(chart: Chart | Planes | Bars) -> Figure:
     """A chart as a still."""
     with mpl.rc_context(STYLE):
+        if isinstance(chart, Planes):
+            return _planes(chart)
         return _bars(chart) if isinstance(chart, Bars) else _panels(chart)
+
+
+def _planes(chart: Planes) -> Figure:
+    figure, axes = panels(len(chart.planes))
+    for axis, plane in zip(axes, chart.planes, strict=True):
+        drawn = _plane(axis, plane)
+    label_outer(axes, chart.x_label, chart.y_label)
+    bar = figure.colorbar(drawn, ax=axes, label=chart.value_label, pad=0.015, aspect=40)
+    bar.outline.set_visible(False)
+    sure = Patch(facecolor="#7c7b78", edgecolor=INK, linewidth=1.0)
+    unsure = Patch(facecolor="#b8b8b4", edgecolor="white", hatch="////", linewidth=0.0)
+    words = [chart.outline_name, chart.veil_name]
+    figure.legend([sure, unsure], words, loc="outside lower center", ncols=2)
+    return figure
+
+
+def _plane(axis: Axes, plane: Plane) -> AxesImage:
+    """Steps of colour with pale lines between them, the veil over what has no data of its own."""
+    levels = mpl.ticker.MaxNLocator(LEVELS).tick_values(plane.low, plane.high)
+    norm = mpl.colors.BoundaryNorm(levels, 256, extend="both")
+    extent = (*plane.x, *plane.y)
+    place: dict[str, Any] = {"extent": extent, "origin": "lower"}
+    values = np.maximum(plane.values, plane.low)  # a shut valve's noise is no colour of its own
+    drawn = axis.imshow(
+        values,
+        PALETTES[plane.palette],
+        norm,
+        aspect="auto",
+        interpolation="bilinear",
+        **place,
+    )
+    axis.contour(values, levels[1:], colors="white", linewidths=0.5, alpha=0.8, **place)
+    cells = [Rectangle((x, y), width, height) for x, y, width, height in plane.veiled]
+    style: dict[str, Any] = {"facecolor": VEIL, "edgecolor": HATCH, "hatch": "////"}
+    axis.add_collection(PatchCollection(cells, linewidth=0.0, **style))
+    ends = plane.outline.reshape(-1, 2, 2)
+    axis.add_collection(LineCollection(list(ends), colors=INK, linewidths=1.0, capstyle="round"))
+    axis.set_title(plane.title)
+    return drawn
 
 
 def _panels(chart: Chart) -> Figure:
@@ -143,6 +189,10 @@ def _panel(axis: Axes, panel: Panel, chart: Chart) -> None:
         axis.axhspan(-panel.band, panel.band, color=PALE, lw=0, zorder=0, label=chart.band_name)
     if panel.has_zero:
         axis.axhline(0.0, color=GREY, lw=0.6, zorder=0.5)
+    for strip in panel.strips:
+        axis.fill_between(
+            strip.x, strip.low, strip.high, color=strip.colour, alpha=0.2, lw=0, label=strip.name
+        )
     for line in panel.lines:
         (drawn,) = axis.plot(*broken(line.x, line.y), color=line.colour, lw=line.width)
         drawn.set(linestyle=(0, (5, 3)) if line.is_dashed else "-", label=line.name)
@@ -160,8 +210,10 @@ def _panel(axis: Axes, panel: Panel, chart: Chart) -> None:
 
 def _points(axis: Axes, points: Dots, k: int) -> None:
     axis.errorbar(
-        points.x, points.y, points.error, color=points.colour, marker=points.marker, ms=3.5,
+        points.x, points.y, points.error, color=points.colour, ms=3.5,
         elinewidth=1.0, capsize=1.5, lw=0.7, ls="-" if points.is_joined else "",
+        marker="o" if points.marker == "c" else points.marker,
+        mfc="white" if points.marker == "c" else points.colour,
         label=points.name if points.error is None else f"{points.name}, mean ± 95 %",
     )  # fmt: skip
     if not points.note:
@@ -174,7 +226,10 @@ def _points(axis: Axes, points: Dots, k: int) -> None:
 def _remark(axis: Axes, remark: Remark) -> None:
     place: dict[str, Any] = {"transform": axis.get_xaxis_transform(), "fontsize": 8}
     colour = remark.colour or INK
-    if remark.is_mark:
+    if remark.y is not None:
+        style: dict[str, Any] = {"textcoords": "offset points", "annotation_clip": False}
+        axis.annotate(remark.text, (remark.x, remark.y), (3, 0), va="center", fontsize=7.5, **style)
+    elif remark.is_mark:
         axis.axvline(remark.x, color=colour, lw=1.6)
         axis.text(remark.x, 0.98, f" {remark.text}", color=colour, va="top", **place)
     else:

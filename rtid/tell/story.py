@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from rtid.plain import FloatArray
 
 Common = Literal["all", "row", "none"]
+Palette = Literal["flow", "doubt", "change"]
 FAINT = "~"  # begins a cell that is not known well yet
 
 
@@ -59,7 +60,7 @@ class Dots:
     y: FloatArray
     error: FloatArray | None
     colour: str
-    marker: str = "o"  # or "s"
+    marker: str = "o"  # or "s", a square, or "c", a circle that is not filled
     is_joined: bool = True
     note: str = ""
 
@@ -75,13 +76,25 @@ class Shade:
 
 
 @dataclass(frozen=True)
+class Strip:
+    """The pale ground from low to high over x, each (n,); broken at NaN."""
+
+    name: str
+    x: FloatArray
+    low: FloatArray
+    high: FloatArray
+    colour: str
+
+
+@dataclass(frozen=True)
 class Remark:
-    """Words at x, above the panel; is_mark: with an upright line there."""
+    """Words at x, above the panel, or behind the point (x, y); is_mark: with an upright line."""
 
     x: float
     text: str
     colour: str = ""
     is_mark: bool = False
+    y: float | None = None
 
 
 @dataclass(frozen=True)
@@ -100,6 +113,7 @@ class Panel:
     points: tuple[Dots, ...] = ()
     shades: tuple[Shade, ...] = ()
     remarks: tuple[Remark, ...] = ()
+    strips: tuple[Strip, ...] = ()
     band: float = 0.0
     has_zero: bool = True
     ticks: tuple[str, ...] = ()
@@ -124,6 +138,40 @@ class Chart:
     band_name: str = ""
     size_in: tuple[float, float] = (5.0, 2.4)
     is_timed: bool = False
+
+
+@dataclass(frozen=True)
+class Plane:
+    """Values (rows, columns) over y and x as colours, each in the middle of its own small field.
+
+    x, y: both ends of an axis; low, high: ends of the scale; outline (m, 4): lines, from x, y to
+    x, y; veiled (k, 4): fields, x, y, width and height, that do not stand on data of their own.
+    """
+
+    title: str
+    x: tuple[float, float]
+    y: tuple[float, float]
+    values: FloatArray
+    low: float
+    high: float
+    palette: Palette
+    outline: FloatArray
+    veiled: FloatArray
+
+
+@dataclass(frozen=True)
+class Planes:
+    """Planes over the same quantities and on one scale; its caption says what is seen."""
+
+    name: str
+    title: str
+    planes: tuple[Plane, ...]
+    x_label: str
+    y_label: str
+    value_label: str
+    caption: str = ""
+    outline_name: str = ""
+    veil_name: str = ""
 
 
 @dataclass(frozen=True)
@@ -153,7 +201,7 @@ class Bars:
     is_log: bool = False
 
 
-StoryPart = str | Table | Chart | Bars
+StoryPart = str | Table | Chart | Planes | Bars
 
 
 @dataclass(frozen=True)

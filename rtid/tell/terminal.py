@@ -14,7 +14,7 @@ from rich.console import Console, ConsoleOptions, Group, RenderResult
 from rich.table import Table as Grid
 from rich.text import Text
 
-from rtid.tell.story import FAINT, Bars, Chart, Dots, Story, Table
+from rtid.tell.story import FAINT, Bars, Chart, Dots, Planes, Story, Table
 
 WIDTH = 110  # where the output is no terminal and COLUMNS says nothing
 GAP = 2  # blanks between two columns
@@ -127,6 +127,8 @@ def _drawn(part: Any) -> Any:
         part = table_of(part)
     if isinstance(part, Bars):
         return Text("\n".join(bars(part)))
+    if isinstance(part, Planes):
+        return Text(part.caption)
     if isinstance(part, Table) and not isinstance(part, Printed):
         return Printed(part.title, part.heads, part.rows, part.keys)
     return part

@@ -8,20 +8,26 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from bokeh.palettes import Cividis256, RdBu11
 
 from rtid.compare import PAPER_DP_PA, PAPER_U_V, LearnedReference, Reference, deviations
 from rtid.estimator.flowmap import VALID, EdgeMap, FlowMap
 from rtid.plain import FloatArray
-from rtid.tell.charts.blocks import YELLOWS
-from rtid.tell.charts.map_plots import Plane, Slices
+from rtid.tell.charts.maps import (
+    COMMAND,
+    DROP,
+    change_plane,
+    flow_plane,
+    interval_plane,
+    slice_panel,
+)
 from rtid.tell.charts.theme import beside
 from rtid.tell.html import button, choice, select, table, text
+from rtid.tell.live import PanelPlot, PlanePlot
+from rtid.tell.story import Panel
 from rtid.ui.desk_views import Bench
 from rtid.ui.views import PageView
 from rtid.units import LPM, MPA, Z95
 
-LATTICE_U, LATTICE_P = 120, 96
 NOTHING = "nothing"
 ALONG = {"over the pressure drop": "dp", "over the command": "u"}
 CHOICES = ("edge", "beside", "along", "second")
@@ -49,10 +55,12 @@ class MapView(PageView):
         self.edge = self.flowmap.edges[0].name
         self.along, self.second = next(iter(ALONG)), SECOND[0]
         self.beside = reference.name if reference else NOTHING
-        self._planes = [Plane("", Cividis256), Plane("", YELLOWS)]
-        self._slices = Slices()
-        parts = [p.root for p in self._planes] + [self._slices.root]
-        self.roots = {"plot": beside(*parts)}
+        edge = self.flowmap[self.edge]
+        self._flow, self._second = (
+            PlanePlot(plane, COMMAND, DROP) for plane in (flow_plane(edge), interval_plane(edge))
+        )
+        self._slices = PanelPlot(self._cut(edge, None))
+        self.roots = {"plot": beside(self._flow.root, self._second.root, self._slices.root)}
         self.actions = {what: partial(self.choose, what) for what in CHOICES}
 
     @property
@@ -90,21 +98,18 @@ class MapView(PageView):
         if self.beside not in self.others:
             self.beside = NOTHING
         edge, other = self.flowmap[self.edge], self.others.get(self.beside)
-        w, dp = _lattice(edge)
-        q = edge.flow(w[None, :], dp[:, None]) * LPM
-        top = float(np.nanmax(q)) if np.isfinite(q).any() else 1.0
-        self._planes[0].show(edge, q, 0.0, max(top, 1e-9), Cividis256, "flow in L/min")
+        self._flow.show(flow_plane(edge))
         if self.second == SECOND[1] and other is not None:
-            change = q - other.flow(edge.name, *np.broadcast_arrays(w[None, :], dp[:, None])) * LPM
-            known = np.abs(change[np.isfinite(change)])
-            most = float(np.quantile(known, 0.98)) if len(known) else 1.0
-            heading = f"flow less {self.beside}, L/min"
-            self._planes[1].show(edge, change, -most, most, RdBu11, heading)
+            self._second.show(change_plane(edge, other, self.beside))
         else:
-            sd = Z95 * edge.sd(w[None, :], dp[:, None]) * LPM
-            heading = "± 95 % interval in L/min"
-            self._planes[1].show(edge, sd, 0.0, 0.05 * max(top, 1e-9), YELLOWS, heading)
-        self._slices.show(edge, ALONG[self.along], other)
+            self._second.show(interval_plane(edge))
+        self._slices.show(self._cut(edge, other))
+
+    def _cut(self, edge: EdgeMap, other: Reference | None) -> Panel:
+        """Slices, beside a reference; without one its points are none."""
+        dots = f", dots: {other.name}" if other else ""
+        title = f"{edge.name}: slices with 95 % band{dots}"
+        return slice_panel(edge, title, ALONG[self.along], None, other, self.beside)
 
     def fragments(self) -> Mapping[str, str]:
         """Tools, and what the pictures say."""
@@ -150,11 +155,3 @@ class MapView(PageView):
         head = ("flow in L/min ± 95 %" + (f" | {self.beside}" if other else ""),
                 *(f"{w:g} V" for w in us))  # fmt: skip
         return table(head, rows, "figures")
-
-
-def _lattice(edge: EdgeMap) -> tuple[FloatArray, FloatArray]:
-    u, p = edge.grid.u_v, edge.grid.dp_pa
-    return (
-        np.linspace(u[0], u[-1], LATTICE_U + 1)[:-1] + 0.5 * (u[-1] - u[0]) / LATTICE_U,
-        np.linspace(p[0], p[-1], LATTICE_P + 1)[:-1] + 0.5 * (p[-1] - p[0]) / LATTICE_P,
-    )

@@ -20,7 +20,7 @@ from bokeh.models import (
     TapTool,
     UIElement,
 )
-from bokeh.palettes import Blues9, YlOrBr9, interp_palette
+from bokeh.palettes import Blues9, interp_palette
 from bokeh.plotting import figure
 
 from rtid.compare import BlockRow
@@ -28,6 +28,7 @@ from rtid.compare.tables import CAUSES, cause_of
 from rtid.model import Edge, Machine
 from rtid.tell.charts.theme import FIGURES_TAG, LIT, NARROWEST_PX, beside, plot
 from rtid.tell.colours import GREY
+from rtid.tell.live import YELLOWS
 from rtid.units import LPM, MPA, Z95
 
 Key = tuple[str, int, int]
@@ -83,7 +84,6 @@ class Quantity:
         return f"{value:{self.digits}}".replace("0.", ".", 1 if value < 1 else 0)
 
 
-YELLOWS = list(interp_palette(tuple(reversed(YlOrBr9)), 256))[8:232]
 BLUES = list(interp_palette(tuple(reversed(Blues9)), 256))[8:220]
 
 

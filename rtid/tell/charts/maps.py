@@ -3,84 +3,107 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.collections import PatchCollection
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch, Rectangle
 
 from rtid.compare.tables import AnyMap
 from rtid.estimator.flowmap import VALID, EdgeMap, FlowMap
-from rtid.plain import FloatArray
+from rtid.plain import BoolArray, FloatArray
 from rtid.tell.colours import BLUE, INK
-from rtid.tell.stills import STYLE, label_outer, panels
+from rtid.tell.story import Chart, Dots, Line, Palette, Panel, Plane, Planes, Remark, Strip
 from rtid.units import LPM, MPA, Z95
 
-LATTICE = 160  # points per axis of a contour
+FIELDS = 96, 120  # of a plane: over the pressure drop, over the command
 SLICES = 5
-VEIL, HATCH = (1.0, 1.0, 1.0, 0.35), (1.0, 1.0, 1.0, 0.75)
-DOT: dict[str, Any] = {"marker": "o", "ms": 2.8, "mfc": "white", "mec": INK, "mew": 0.6}
+POINTS, DOTS = 200, 25  # of a slice, and of a reference beside it
+LEAST_FLOW = 0.02  # of the largest: what a row of blocks passes that is worth a slice
+SURE = 0.98  # quantile of what two maps differ by at which its scale ends
+DOUBT = 0.05  # of the largest flow: end of the scale of its interval
+COMMAND, DROP, FLOW = "opening command in V", "pressure drop in MPa", "flow in L/min"
 
 
-def maps(flowmap: FlowMap) -> Figure:
-    """Q in L/min as filled contours, one scale for all edges; hatched where a cell is not valid."""
-    with mpl.rc_context(STYLE):
-        figure, axes = panels(len(flowmap.edges))
-        levels = _levels(flowmap)
-        for axis, edge in zip(axes, flowmap.edges, strict=True):
-            drawn = _contour(axis, edge, levels)
-            axis.set_title(edge.name)
-        label_outer(axes, "opening command w in V", "pressure drop in MPa")
-        bar = figure.colorbar(drawn, ax=axes, label="flow in L/min", pad=0.015, aspect=40)
-        bar.outline.set_visible(False)
-        sure = Patch(facecolor="#7c7b78", edgecolor=INK, linewidth=1.0)
-        unsure = Patch(facecolor="#b8b8b4", edgecolor="white", hatch="////", linewidth=0.0)
-        words = ["valid", "not valid: from the orifice law"]
-        figure.legend([sure, unsure], words, loc="outside lower center", ncols=2)
-    return figure
-
-
-def _levels(flowmap: FlowMap) -> FloatArray:
-    """Round levels up to the largest flow at a valid cell."""
+def maps(flowmap: FlowMap) -> Planes:
+    """Q in L/min, one scale for all valves; veiled where a block is not valid."""
     largest = max((np.nan_to_num(edge.q_max_m3s) for edge in flowmap.edges), default=0.0) * LPM
-    return np.asarray(mpl.ticker.MaxNLocator(12).tick_values(0.0, 1.25 * max(largest, 1e-3)))
+    top = 1.25 * max(largest, 1e-3)
+    planes = tuple(
+        _plane(edge, edge.name, _flow_on(edge), (0.0, top), "flow") for edge in flowmap.edges
+    )
+    caption = (
+        "Learned flow over opening command and pressure drop. Outlined blocks stand on their own "
+        "data, the others follow the valve's law from these."
+    )
+    words = "valid", "not valid: from the orifice law"
+    return Planes("maps", "Flow maps", planes, COMMAND, DROP, FLOW, caption, *words)
 
 
-def _contour(axis: Axes, edge: EdgeMap, levels: FloatArray) -> mpl.contour.QuadContourSet:
-    u, p = edge.grid.u_v, edge.grid.dp_pa
-    w, dp = np.linspace(u[0], u[-1], LATTICE), np.linspace(p[0], p[-1], LATTICE)
-    q = edge.flow(w[None, :], dp[:, None]) * LPM
-    q[np.abs(q) < 0.005 * levels[-1]] = 1e-9  # a shut valve's noise has no contour
-    drawn = axis.contourf(w, dp * MPA, q, levels, cmap="cividis", extend="both")
-    axis.contour(w, dp * MPA, q, levels[1:], colors="white", linewidths=0.5, alpha=0.8)
-    _veil(axis, edge)
-    _outline(axis, edge)
-    return drawn
+def flow_plane(edge: EdgeMap) -> Plane:
+    """The flow of a valve on its own scale."""
+    return _plane(edge, f"{edge.name}: {FLOW}", _flow_on(edge), (0.0, _top(edge)), "flow")
 
 
-def _veil(axis: Axes, edge: EdgeMap) -> None:
-    """Pale and hatched wherever a cell does not stand on its own data."""
-    u, p = edge.grid.u_v, edge.grid.dp_pa * MPA
-    cells = [
-        Rectangle((u[i], p[j]), u[i + 1] - u[i], p[j + 1] - p[j])
-        for i, j in np.argwhere(edge.status != VALID)
-    ]
-    style: dict[str, Any] = {"facecolor": VEIL, "edgecolor": HATCH, "hatch": "////"}
-    axis.add_collection(PatchCollection(cells, linewidth=0.0, **style))
+def interval_plane(edge: EdgeMap) -> Plane:
+    """Half the 95 % interval of a valve's flow."""
+    sd = Z95 * edge.sd(*_lattice(edge)) * LPM
+    title = f"{edge.name}: ± 95 % interval in L/min"
+    return _plane(edge, title, sd, (0.0, DOUBT * _top(edge)), "doubt")
 
 
-def _outline(axis: Axes, edge: EdgeMap) -> None:
-    """The border between valid cells and others."""
+def change_plane(edge: EdgeMap, other: AnyMap, name: str) -> Plane:
+    """The flow of a valve less that of another map, `name`."""
+    w, dp = np.broadcast_arrays(*_lattice(edge))
+    change = _flow_on(edge) - other.flow(edge.name, w, dp) * LPM
+    known = np.abs(change[np.isfinite(change)])
+    most = float(np.quantile(known, SURE)) if len(known) else 1.0
+    title = f"{edge.name}: flow less {name}, L/min"
+    return _plane(edge, title, change, (-most, most), "change")
+
+
+def _flow_on(edge: EdgeMap) -> FloatArray:
+    """Flow in the middle of every field of a plane (rows, columns), L/min."""
+    return np.asarray(edge.flow(*_lattice(edge)) * LPM)
+
+
+def _top(edge: EdgeMap) -> float:
+    q = _flow_on(edge)
+    return max(float(np.nanmax(q)) if np.isfinite(q).any() else 1.0, 1e-9)
+
+
+def _lattice(edge: EdgeMap) -> tuple[FloatArray, FloatArray]:
+    """Middles of the fields: commands (1, columns), V, and pressure drops (rows, 1), Pa."""
+    rows, columns = FIELDS
+    return _middles(edge.grid.u_v, columns)[None, :], _middles(edge.grid.dp_pa, rows)[:, None]
+
+
+def _middles(borders: FloatArray, count: int) -> FloatArray:
+    low, high = float(borders[0]), float(borders[-1])
+    return low + (high - low) * (np.arange(count) + 0.5) / count
+
+
+def _plane(
+    edge: EdgeMap, title: str, values: FloatArray, scale: tuple[float, float], palette: Palette
+) -> Plane:
     u, p, valid = edge.grid.u_v, edge.grid.dp_pa * MPA, edge.status == VALID
+    ends = (float(u[0]), float(u[-1])), (float(p[0]), float(p[-1]))
+    return Plane(
+        title, *ends, values, *scale, palette, _outline(u, p, valid), _fields(u, p, ~valid)
+    )
+
+
+def _outline(u: FloatArray, p: FloatArray, valid: BoolArray) -> FloatArray:
+    """Lines (m, 4) between blocks that are valid and others, from x, y to x, y."""
     framed = np.pad(valid, 1)
-    for i, j in np.argwhere(framed[1:, 1:-1] != framed[:-1, 1:-1]):
-        axis.plot([u[i], u[i]], p[j : j + 2], color=INK, lw=1.0, solid_capstyle="round")
-    for i, j in np.argwhere(framed[1:-1, 1:] != framed[1:-1, :-1]):
-        axis.plot(u[i : i + 2], [p[j], p[j]], color=INK, lw=1.0, solid_capstyle="round")
+    upright = np.argwhere(framed[1:, 1:-1] != framed[:-1, 1:-1])
+    level = np.argwhere(framed[1:-1, 1:] != framed[1:-1, :-1])
+    lines = [(u[i], p[j], u[i], p[j + 1]) for i, j in upright]
+    lines += [(u[i], p[j], u[i + 1], p[j]) for i, j in level]
+    return np.array(lines, np.float64).reshape(-1, 4)
+
+
+def _fields(u: FloatArray, p: FloatArray, chosen: BoolArray) -> FloatArray:
+    """Blocks as x, y, width and height (k, 4)."""
+    fields = [(u[i], p[j], u[i + 1] - u[i], p[j + 1] - p[j]) for i, j in np.argwhere(chosen)]
+    return np.array(fields, np.float64).reshape(-1, 4)
 
 
 def slices(
@@ -88,72 +111,93 @@ def slices(
     reference: AnyMap | None = None,
     u_v: Sequence[float] | None = None,
     reference_name: str = "reference",
-) -> Figure:
-    """Q(dp) at fixed commands with the 95 % band, beside a reference; dashed where not valid.
+) -> Chart:
+    """Q(dp) at fixed commands, V, with the 95 % band, beside a reference; dashed where not valid.
 
-    u_v: the commands; evenly spread over the valid range of each edge if not given.
+    u_v: the commands; evenly spread over the valid range of each valve if not given.
     """
-    with mpl.rc_context(STYLE):
-        figure, axes = panels(len(flowmap.edges))
-        for axis, edge in zip(axes, flowmap.edges, strict=True):
-            chosen = _commands(edge) if u_v is None else np.asarray(u_v, float)
-            for w_v in chosen:
-                _slice(axis, edge, float(w_v))
-                if reference is not None:
-                    _reference(axis, edge, float(w_v), reference)
-            axis.set_title(edge.name)
-        axes[0].set_ylim(bottom=0.0)
-        label_outer(axes, "pressure drop in MPa", "flow in L/min")
-        _slice_legend(figure, reference_name if reference is not None else "")
-    return figure
-
-
-def _commands(edge: EdgeMap) -> FloatArray:
-    """Centres of blocks, evenly spread over those that are valid somewhere and pass a flow."""
-    u = edge.grid.u_v
-    centre = 0.5 * (u[1:] + u[:-1])
-    some = np.nonzero((edge.status == VALID).any(axis=1))[0]
-    flow = np.array([edge.theta[i, edge.status[i] == VALID, 0].mean() for i in some])
-    some = some[flow > 0.02 * flow.max(initial=0.0)] if len(some) else some
-    if len(some) == 0:
-        return centre[:: max(1, len(centre) // SLICES)]
-    pick = np.unique(np.round(np.linspace(0, len(some) - 1, SLICES)).astype(int))
-    return centre[some[pick]]
-
-
-def _slice(axis: Axes, edge: EdgeMap, w_v: float) -> None:
-    p = edge.grid.dp_pa
-    dp = np.linspace(max(p[0], 0.0), p[-1], 300)
-    q, sd = edge.flow(w_v, dp) * LPM, edge.sd(w_v, dp) * LPM
-    valid = edge.status_at(w_v, dp) == VALID
-    axis.fill_between(dp * MPA, q - Z95 * sd, q + Z95 * sd, color=BLUE, alpha=0.2, lw=0)
-    axis.plot(dp * MPA, q, color=BLUE, lw=0.9, ls=(0, (4, 3)))
-    axis.plot(dp * MPA, np.where(valid, q, np.nan), color=BLUE, lw=1.8)
-    axis.annotate(
-        f"{w_v:.3g} V",
-        (dp[-1] * MPA, q[-1]),
-        xytext=(3, 0),
-        textcoords="offset points",
-        va="center",
-        fontsize=7.5,
-        color=INK,
-        annotation_clip=False,
-    )
-
-
-def _reference(axis: Axes, edge: EdgeMap, w_v: float, reference: AnyMap) -> None:
-    p = edge.grid.dp_pa
-    dp = np.linspace(max(p[0], 0.0), p[-1], 25)
-    q = reference.flow(edge.name, np.full(len(dp), w_v), dp) * LPM
-    axis.plot(dp * MPA, q, ls="", **DOT)
-
-
-def _slice_legend(figure: Figure, reference_name: str) -> None:
-    handles: list[Line2D | Patch] = [
-        Line2D([], [], color=BLUE, lw=1.8, label="learned, valid"),
-        Line2D([], [], color=BLUE, lw=0.9, ls=(0, (4, 3)), label="extrapolated"),
-        Patch(color=BLUE, alpha=0.2, lw=0, label="95 % band"),
+    panels = [
+        slice_panel(edge, edge.name, "dp", u_v, reference, reference_name) for edge in flowmap.edges
     ]
-    if reference_name:
-        handles.append(Line2D([], [], ls="", label=reference_name, **DOT))
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+    rows = tuple(tuple(panels[k : k + 2]) for k in range(0, len(panels), 2))
+    caption = (
+        "Slices through the maps with their 95 % band; dashed where a block does not stand on its "
+        "own data."
+    )
+    return Chart("slices", "Slices through the maps", rows, caption, "all", "", (4.5, 3.2))
+
+
+def slice_panel(
+    edge: EdgeMap,
+    title: str,
+    along: str = "dp",
+    at: Sequence[float] | None = None,
+    reference: AnyMap | None = None,
+    reference_name: str = "",
+) -> Panel:
+    """Flow over the pressure drop ("dp") at fixed commands `at`, V, or over "u" at drops, Pa."""
+    over_drop = along == "dp"
+    fixed, free = (edge.grid.u_v, edge.grid.dp_pa)[:: 1 if over_drop else -1]
+    fixed_at = _spread(edge, fixed, over_drop) if at is None else np.asarray(at, np.float64)
+    unit, scale = ("V", MPA) if over_drop else ("MPa", 1.0)
+    cut = _Cut(edge, over_drop, scale, fixed_at, max(float(free[0]), 0.0), float(free[-1]))
+    x, q, sd, valid = cut.flow()
+    ends = [
+        Remark(float(x[k, -1]), f"{value if over_drop else value * MPA:.3g} {unit}", INK,
+               y=float(q[k, -1]))
+        for k, value in enumerate(fixed_at)
+    ]  # fmt: skip
+    lines = (
+        Line("extrapolated", _joined(x), _joined(q), BLUE, 0.9, is_dashed=True),
+        Line("learned, valid", _joined(x), _joined(np.where(valid, q, np.nan)), BLUE, 2.0),
+    )
+    strip = Strip("95 % band", _joined(x), _joined(np.maximum(q - sd, 0.0)), _joined(q + sd), BLUE)
+    dots = cut.dots(reference, reference_name)
+    x_label = DROP if over_drop else COMMAND
+    return Panel(title, x_label, FLOW, lines, (dots,), (), tuple(ends), (strip,), has_zero=False)
+
+
+class _Cut:
+    """Straight cuts through the map of a valve."""
+
+    def __init__(
+        self, edge: EdgeMap, over_drop: bool, scale: float, fixed: FloatArray, low: float,
+        high: float,
+    ) -> None:  # fmt: skip
+        self._edge, self._over_drop, self._scale = edge, over_drop, scale
+        self._fixed, self._ends = fixed, (low, high)
+
+    def _points(self, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """x as it is shown, command, V, and pressure drop, Pa, each (cuts, count)."""
+        along, fixed = np.broadcast_arrays(np.linspace(*self._ends, count), self._fixed[:, None])
+        w, dp = (fixed, along) if self._over_drop else (along, fixed)
+        return along * self._scale, w, dp
+
+    def flow(self) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+        """x, flow and half its 95 % interval, L/min, and where it is valid, each (cuts, n)."""
+        x, w, dp = self._points(POINTS)
+        valid = np.asarray(self._edge.status_at(w, dp) == VALID)
+        return x, self._edge.flow(w, dp) * LPM, Z95 * self._edge.sd(w, dp) * LPM, valid
+
+    def dots(self, reference: AnyMap | None, name: str) -> Dots:
+        """Another map on the same cuts; no points without one."""
+        if reference is None:
+            return Dots("", np.empty(0), np.empty(0), None, INK, "c", is_joined=False)
+        x, w, dp = self._points(DOTS)
+        q = reference.flow(self._edge.name, w.ravel(), dp.ravel()) * LPM
+        return Dots(name, x.ravel(), np.asarray(q), None, INK, "c", is_joined=False)
+
+
+def _joined(rows: FloatArray) -> FloatArray:
+    """Rows (k, n) behind each other, with NaN between them."""
+    return np.pad(rows, ((0, 0), (0, 1)), constant_values=np.nan).ravel()
+
+
+def _spread(edge: EdgeMap, borders: FloatArray, over_drop: bool) -> FloatArray:
+    """Centres of some rows of blocks that are valid somewhere and pass a flow."""
+    centre = 0.5 * (borders[1:] + borders[:-1])
+    valid = (edge.status == VALID).any(axis=1 if over_drop else 0)
+    flow = np.abs(edge.theta[:, :, 0]).max(axis=1 if over_drop else 0)
+    some = np.flatnonzero(valid & (flow > LEAST_FLOW * flow.max(initial=1e-30)))
+    some = some if len(some) else np.arange(len(centre))
+    return centre[some[np.unique(np.linspace(0, len(some) - 1, SLICES).round().astype(int))]]
