@@ -161,26 +161,25 @@ def _in_time(u: Any, first_order: Any, k: int, share: float, h: float, w: Any) -
 
 
 @part
-def _rates(code: Any, rates: Any, r: Any, x: Any, w: Any, slope: Any) -> None:
-    """Slope (states, lanes) at states x and inputs w."""
-    n = len(rates)
-    r[:n] = x
-    r[n : n + len(w)] = w
-    _execute(code, r)
-    for s in range(n):
-        slope[s] = r[rates[s]]
+def _step(code: Any, rates: Any, r: Any, x: Any, w: Any, moves: bool, h: float, slope: Any) -> None:
+    """One step of Runge-Kutta; x (states, lanes) is moved on.
 
-
-@part
-def _step(code: Any, rates: Any, r: Any, x: Any, w: Any, h: float, slope: Any, at: Any) -> None:
-    """One step of Runge-Kutta; x (states, lanes) is moved on."""
+    The inputs w are taken where one moves within a sample: else they stand in the registers r.
+    """
     n, lanes = x.shape
     for stage in range(4):
         reach = 0.0 if stage == 0 else (h if stage == 3 else 0.5 * h)
         for s in range(n):
             for j in range(lanes):
-                at[s, j] = x[s, j] + (reach * slope[stage - 1, s, j] if stage else 0.0)
-        _rates(code, rates, r, at, w[(stage + 1) // 2], slope[stage])
+                r[s, j] = x[s, j] + (reach * slope[stage - 1, s, j] if stage else 0.0)
+        if moves:
+            for i in range(w.shape[1]):
+                for j in range(lanes):
+                    r[n + i, j] = w[(stage + 1) // 2, i, j]
+        _execute(code, r)
+        for s in range(n):
+            for j in range(lanes):
+                slope[stage, s, j] = r[rates[s], j]
     for s in range(n):
         for j in range(lanes):
             middle = slope[1, s, j] + slope[2, s, j]
@@ -215,16 +214,19 @@ def free_run(
     w = np.zeros((3, n_inputs, lanes))
     at = np.zeros((n_inputs, lanes), np.int64)
     late = np.any(delay > 0.0)
-    slope, between = np.empty((4, n_states, lanes)), np.empty((n_states, lanes))
+    moves = late or np.any(first_order > 0.0)
+    slope = np.empty((4, n_states, lanes))
     for k in range(len(t)):
         for i in range(n_inputs):
             for j in range(lanes):  # at a sample a held input is what acts from here on
                 r[n_states + i, j] = u[k, i]
-        r[:n_states] = x
+        for s in range(n_states):
+            for j in range(lanes):
+                r[s, j] = states[k, s, j] = x[s, j]
         _execute(output_code, r)
         for o in range(len(outputs)):
-            y[k, o] = r[outputs[o]]
-        states[k] = x
+            for j in range(lanes):
+                y[k, o, j] = r[outputs[o], j]
         if k + 1 == len(t):
             break
         sub_steps = max(1, int(np.ceil((t[k + 1] - t[k]) / step_s - 1e-6)))
@@ -232,9 +234,9 @@ def free_run(
         for m in range(sub_steps):
             if late:
                 _late(t, u, total, first_order, delay, at, t[k] + m * h, h, w)
-            else:
+            elif moves:
                 _in_time(u, first_order, k, m / sub_steps, 1.0 / sub_steps, w)
-            _step(rate_code, rates, r, x, w, h, slope, between)
+            _step(rate_code, rates, r, x, w, moves, h, slope)
         for s in range(n_states):
             for j in range(lanes):
                 if not abs(x[s, j]) < BEYOND:
