@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from rtid.estimator.flowmap import LEARNING, VALID, EdgeMap
 from rtid.estimator.windows import foot, overlaps
 from rtid.kernels.layout import TERMS
+from rtid.kernels.nearest import shortest
 from rtid.plain import BoolArray, FloatArray
 
 KNOWN = (VALID, LEARNING)
@@ -57,14 +57,12 @@ class Slopes:
         terms = theta.reshape(-1, TERMS)[self.cells]
         return np.asarray(np.einsum("kci,kci->k", self.by_term, terms))
 
-    def rows(self, root: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
-        """Rows (k, cells, 6) of unit norm on z, theta + root z in m3/s; their norms; the cells."""
-        cells, where = np.unique(self.cells, return_inverse=True)
-        moved = self.by_term[:, :, None, :] @ root[self.cells]
-        rows = np.zeros((len(self.dp), len(cells), TERMS))
-        np.add.at(rows, (np.arange(len(rows))[:, None], where.reshape(-1, 4)), moved[:, :, 0])
-        sd = np.linalg.norm(rows, axis=(1, 2))
-        return rows / sd[:, None, None], sd, cells
+    def rows(self, root: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Rows (k, 4, 6) of unit norm on the cells' z, theta + root z in m3/s, and their norms."""
+        moved = (self.by_term[:, :, None, :] @ root[self.cells])[:, :, 0]
+        same = self.cells[:, :, None] == self.cells[:, None, :]
+        sd = np.sqrt(np.einsum("kai,kbi,kab->k", moved, moved, same))
+        return moved / sd[:, None, None], sd
 
 
 def monotone(edge: EdgeMap, spread: FloatArray) -> EdgeMap:
@@ -124,9 +122,9 @@ def _by_the_worst_row(edge: EdgeMap, root: FloatArray, slopes: Slopes) -> FloatA
     needed, slope = np.zeros(len(root)), slopes.of(edge.theta)
     falls = slope < 0
     if falls.any():
-        rows, sd, cells = slopes[falls].rows(root)
+        rows, sd = slopes[falls].rows(root)
         alone = (-slope[falls] / sd)[:, None] * np.linalg.norm(rows, axis=2)
-        needed[cells] = alone.max(axis=0)
+        np.maximum.at(needed, slopes.cells[falls], alone)
     return needed
 
 
@@ -138,27 +136,19 @@ def _least_change(edge: EdgeMap, root: FloatArray, slopes: Slopes) -> tuple[Floa
     line = np.stack([slopes.parts[:, 0], slopes.dp], axis=1)
     start = slope = slopes.of(edge.theta)
     theta, needed = edge.theta, np.zeros(len(root))
-    demanded = np.zeros(0, np.intp)
+    demanded, u = np.zeros(0, np.intp), np.zeros(0)
     for _ in range(ROUNDS):
         falls = np.setdiff1d(np.flatnonzero(slope < 0), demanded)
         if not len(falls):
             break
         falls = falls[np.argsort(slope[falls])]
         demanded = np.append(demanded, falls[np.unique(line[falls], axis=0, return_index=True)[1]])
-        rows, sd, cells = slopes[demanded].rows(root)
-        z = _least_distance(rows.reshape(len(rows), -1), MARGIN - start[demanded] / sd)
-        z = z.reshape(-1, TERMS)
-        needed = np.zeros(len(root))
-        needed[cells] = np.linalg.norm(z, axis=1)
+        rows, sd = slopes[demanded].rows(root)
+        z, u = np.zeros((len(root), TERMS)), np.append(u, np.zeros(len(demanded) - len(u)))
+        shortest(rows, slopes.cells[demanded], MARGIN - start[demanded] / sd, u, z)
+        needed = np.linalg.norm(z, axis=1)
+        moved = needed > 0
         theta = edge.theta.copy()
-        theta.reshape(-1, TERMS)[cells] += (root[cells] @ z[:, :, None])[:, :, 0]
+        theta.reshape(-1, TERMS)[moved] += (root[moved] @ z[moved, :, None])[:, :, 0]
         slope = slopes.of(theta)
     return theta, needed
-
-
-def _least_distance(rows: FloatArray, least: FloatArray) -> FloatArray:
-    """The shortest z with rows z >= least (Lawson and Hanson's LDP)."""
-    dense = np.vstack([rows.T, least])
-    u, _ = nnls(dense, np.append(np.zeros(rows.shape[1]), 1.0), maxiter=50 * len(least))
-    rest = dense @ u
-    return np.asarray(rest[:-1] / (1.0 - rest[-1]))

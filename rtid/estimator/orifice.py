@@ -120,22 +120,38 @@ class OrificeLaw:
         return mean * unit, cov * unit[:, :, None] * unit[:, None, :]
 
     def _kernel(self, a: KernelPoints, b: KernelPoints) -> FloatArray:
-        return kernel(a, b, *self.strength[:3])
+        return KernelShapes.between(a, b).covariance(*self.strength[:3])
 
 
-def kernel(
-    a: KernelPoints, b: KernelPoints, rough: float, exponent: float, deviation: float
-) -> FloatArray:
-    """Covariance (...) of Q / s(dp) between broadcast points; in squares of the rated gain."""
-    low, high = np.minimum(a.opening, b.opening), np.maximum(a.opening, b.opening)
-    both = np.abs(a.log_dp), np.abs(b.log_dp)
-    smooth = SLOPE_SD**2 * low * high + rough * wiener(low, high)
-    shared = a.log_dp * b.log_dp + np.where(
-        a.log_dp * b.log_dp > 0.0, wiener(np.minimum(*both), np.maximum(*both)), 0.0
-    )
-    far = (high - low) / REACH_W + np.abs(a.log_dp - b.log_dp) / REACH_LOG_DP
-    deviations = exponent**2 * shared + deviation**2 * np.exp(-far) + a.laminar * b.laminar
-    return np.asarray(smooth + a.size * b.size * deviations)
+@dataclass(frozen=True)
+class KernelShapes:
+    """What the covariance of two sets of points consists of, arrays of one shape; sizes: of e."""
+
+    known: FloatArray
+    rough: FloatArray
+    exponent: FloatArray
+    deviation: FloatArray
+    laminar: FloatArray
+    sizes: FloatArray
+
+    @classmethod
+    def between(cls, a: KernelPoints, b: KernelPoints) -> KernelShapes:
+        """Of broadcast points."""
+        low, high = np.minimum(a.opening, b.opening), np.maximum(a.opening, b.opening)
+        both = np.abs(a.log_dp), np.abs(b.log_dp)
+        shared = a.log_dp * b.log_dp + np.where(
+            a.log_dp * b.log_dp > 0.0, wiener(np.minimum(*both), np.maximum(*both)), 0.0
+        )
+        far = (high - low) / REACH_W + np.abs(a.log_dp - b.log_dp) / REACH_LOG_DP
+        known, rough = SLOPE_SD**2 * low * high, wiener(low, high)
+        laminar, sizes = a.laminar * b.laminar, a.size * b.size
+        return cls(known, rough, shared, np.exp(-far), laminar, sizes)
+
+    def covariance(self, rough: float, exponent: float, deviation: float) -> FloatArray:
+        """Of Q / s(dp) between the points (...), in squares of the rated gain."""
+        smooth = self.known + rough * self.rough
+        deviations = exponent**2 * self.exponent + deviation**2 * self.deviation + self.laminar
+        return np.asarray(smooth + self.sizes * deviations)
 
 
 def _descend(
@@ -163,23 +179,17 @@ def fit_law(edge: Edge, data: GainData) -> OrificeLaw:
     """The law of one edge from the flow gains of its blocks (n >= 0 of them)."""
     scale = scale_of(edge, data)
     knots = np.linspace(0.0, 1.0, 65)
-    first = _condition(scale, data, knots, np.full(65, 0.3), (10.0, 0.01, 0.1, 0.0))
+    first = _Conditioned(scale, data, knots, np.full(65, 0.3)).law((10.0, 0.01, 0.1, 0.0))
     gain, _ = first.gains(scale.foot_v + scale.range_v * knots[:, None], np.full((65, 1), 1e6))
     sizes = np.maximum(gain[:, 0] / scale.gain, LEAST_SIZE)
     if len(data.gain) < 3:
         return replace(first, sizes=sizes)
-
-    def surprise(x: FloatArray) -> float:
-        law = _condition(scale, data, knots, sizes, _strength(x))
-        tilt = np.exp(-law.strength[3] * law.points.log_dp)
-        y = tilt * data.gain / scale.gain - law.points.opening
-        return float(0.5 * y @ law.alpha + np.log(np.diag(law.lower)).sum() - np.log(tilt).sum())
-
-    orifice = _descend(lambda x: surprise(np.append(x, 0.0)), ORIFICE[:3], SEARCH[:3])
-    other = _descend(surprise, OTHER_LAW, SEARCH)
+    conditioned = _Conditioned(scale, data, knots, sizes)
+    orifice = _descend(lambda x: conditioned.surprise(np.append(x, 0.0)), ORIFICE[:3], SEARCH[:3])
+    other = _descend(conditioned.surprise, OTHER_LAW, SEARCH)
     clear = other.fun < orifice.fun - CLEARLY
     best = other.x if clear else np.append(orifice.x, 0.0)
-    return _condition(scale, data, knots, sizes, _strength(best))
+    return conditioned.law(_strength(best))
 
 
 def scale_of(edge: Edge, data: GainData) -> RatedScale:
@@ -202,18 +212,35 @@ def _strength(x: FloatArray) -> Strength:
     return float(rough), float(exponent), float(deviation), float(x[3])
 
 
-def _condition(
-    scale: RatedScale,
-    data: GainData,
-    knots: FloatArray,
-    sizes: FloatArray,
-    strength: Strength,
-) -> OrificeLaw:
-    opening = np.maximum((data.w_v - scale.foot_v) / scale.range_v, 0.0)
-    points = scale.points(data.w_v, data.dp_pa, np.interp(opening, knots, sizes))
-    cov = kernel(points.rows(), points, *strength[:3])
-    tilt = np.exp(-strength[3] * points.log_dp) / scale.gain
-    cov[np.diag_indices_from(cov)] += (tilt * data.sd) ** 2 + (BLOCK_ERROR * points.size) ** 2
-    lower = cholesky(cov, lower=True)
-    alpha = cho_solve((lower, True), tilt * data.gain - opening)
-    return OrificeLaw(scale, strength, sizes, knots, points, alpha, lower)
+class _Conditioned:
+    """The process of one edge on its data, for any strength: what no strength changes, once."""
+
+    def __init__(
+        self, scale: RatedScale, data: GainData, knots: FloatArray, sizes: FloatArray
+    ) -> None:
+        self._scale, self._data, self._knots, self._sizes = scale, data, knots, sizes
+        opening = np.maximum((data.w_v - scale.foot_v) / scale.range_v, 0.0)
+        self._points = scale.points(data.w_v, data.dp_pa, np.interp(opening, knots, sizes))
+        self._shapes = KernelShapes.between(self._points.rows(), self._points)
+        self._missed = (BLOCK_ERROR * self._points.size) ** 2
+
+    def law(self, strength: Strength) -> OrificeLaw:
+        """The law."""
+        lower, alpha, _, _ = self._solved(strength)
+        scale, sizes, knots = self._scale, self._sizes, self._knots
+        return OrificeLaw(scale, strength, sizes, knots, self._points, alpha, lower)
+
+    def surprise(self, x: FloatArray) -> float:
+        """Minus the log likelihood of logarithms of the strengths, and delta (4,)."""
+        lower, alpha, y, tilt = self._solved(_strength(x))
+        return float(0.5 * y @ alpha + np.log(np.diag(lower)).sum() - np.log(tilt).sum())
+
+    def _solved(self, strength: Strength) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Cholesky factor (n, n) of the data's covariance, its solution, data and tilt (n,)."""
+        tilt = np.exp(-strength[3] * self._points.log_dp)
+        cov = self._shapes.covariance(*strength[:3])
+        unit = tilt / self._scale.gain
+        cov[np.diag_indices_from(cov)] += (unit * self._data.sd) ** 2 + self._missed
+        lower = cholesky(cov.T, lower=True, overwrite_a=True, check_finite=False)
+        y = unit * self._data.gain - self._points.opening
+        return lower, cho_solve((lower, True), y, check_finite=False), y, tilt
