@@ -108,11 +108,11 @@ def shortest(rows: Any, cells: Any, least: Any, u: Any, z: Any) -> None:
     m = len(least)
     L, c, s = np.zeros((m, m)), np.zeros(m), np.zeros(m)
     used, n, tried = np.zeros(m, np.int64), 0, np.zeros(m, np.bool_)
-    for j in np.flatnonzero(u):
-        if _appended(rows, cells, least, used, n, j, L, c):
+    for start in np.flatnonzero(u):
+        if _appended(rows, cells, least, used, n, start, L, c):
             n += 1
         else:
-            u[j] = 0.0
+            u[start] = 0.0
     n = _moved(used, n, L, c, s, u)
     for _ in range(MOST * m):
         z[:] = 0.0
