@@ -4,22 +4,30 @@ numba's cache looks at the file of the function that is called, not at those of 
 binary would survive a change of them.  So the cache lies in a folder named by the digest of all
 sources.  And numba wants to write where it reads: kernels that were compiled at installation into a
 folder that is closed by now are taken from a copy.
+
+Who starts while another process compiles the same kernel, as the daemon's helpers do, waits for it.
 """
 
 from __future__ import annotations
 
 import atexit
 import contextlib
+import fcntl
 import hashlib
 import os
 import shutil
 import tempfile
+import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from numba import config, njit
+from numba.core.compiler_lock import global_compiler_lock
+from numba.extending import is_jitted
+
+WAIT_S = 120.0  # for another process that compiles the same: it may have been stopped
 
 
 def cache_folder(name: str, beside: Path, sources: Iterable[Path]) -> Path | None:
@@ -48,9 +56,49 @@ def cached(folder: Path | None, function: Callable[..., Any], **options: Any) ->
         return njit(**options)(function)
     before, config.CACHE_DIR = config.CACHE_DIR, str(folder)
     try:
-        return njit(cache=True, **options)(function)
+        kernel = njit(cache=True, **options)(function)
     finally:
         config.CACHE_DIR = before
+    if is_jitted(kernel):  # not where NUMBA_DISABLE_JIT is set
+        _compile_once(kernel, lock_of(folder, function))
+    return kernel
+
+
+def lock_of(folder: Path, function: Callable[..., Any]) -> Path:
+    """The file that a process holds while it compiles the function or loads it."""
+    return folder / f"{function.__module__}.{function.__qualname__}.lock"
+
+
+def _compile_once(kernel: Any, lock: Path) -> None:
+    """Let a kernel be compiled by one process at a time: who comes second loads it."""
+    compiled = kernel.compile
+
+    def compile_alone(signature: Any) -> Any:
+        if isinstance(signature, tuple) and signature in kernel.overloads:
+            return compiled(signature)
+        with global_compiler_lock, alone(lock):  # numba's first, in every thread
+            return compiled(signature)
+
+    kernel.compile = compile_alone
+
+
+@contextlib.contextmanager
+def alone(lock: Path) -> Iterator[None]:
+    """Hold a file that no other process holds; without it after WAIT_S, or where none can be."""
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):
+            file, end_s = stack.enter_context(lock.open("ab")), time.monotonic() + WAIT_S
+            while not _held(file.fileno()) and time.monotonic() < end_s:
+                time.sleep(0.05)
+        yield
+
+
+def _held(handle: int) -> bool:
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 def _digest(sources: Iterable[Path]) -> str:

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import shutil
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -74,3 +78,39 @@ def test_the_setting_comes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "set"))
     found = cache_folder("k", tmp_path, [source(tmp_path, "")])
     assert found is not None and found.parent == tmp_path / "set"
+
+
+def added(x: float) -> float:
+    return x + 1.0
+
+
+@contextmanager
+def compiling(folder: Path) -> Iterator[tuple[threading.Thread, list[float]]]:
+    """A thread that needs the kernel while somebody else holds it."""
+    result: list[float] = []
+    kernel = kernel_cache.cached(folder, added)
+    needs = threading.Thread(target=lambda: result.append(kernel(1.0)))
+    with kernel_cache.alone(kernel_cache.lock_of(folder, added)):
+        needs.start()
+        yield needs, result
+    needs.join(60.0)
+
+
+def test_a_kernel_waits_for_who_compiles_it(tmp_path: Path) -> None:
+    with compiling(tmp_path) as (needs, result):
+        time.sleep(1.0)
+        assert needs.is_alive() and not list(tmp_path.rglob("*.nbc"))
+    assert result == [2.0] and len(list(tmp_path.rglob("*.nbc"))) == 1
+
+
+def test_a_kernel_does_not_wait_for_ever(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kernel_cache, "WAIT_S", 0.1)
+    with compiling(tmp_path) as (needs, result):
+        needs.join(60.0)
+        assert result == [2.0]
+
+
+def test_who_comes_second_compiles_nothing(tmp_path: Path) -> None:
+    first, second = (kernel_cache.cached(tmp_path, added) for _ in range(2))
+    assert first(1.0) == second(1.0) == 2.0
+    assert (first.stats.cache_misses, second.stats.cache_misses) == ({first.signatures[0]: 1}, {})
