@@ -148,6 +148,8 @@ class Analyst:
                 self._took("analysis")
             finally:
                 self._answer(jobs.Ready(to_save=False))
+        elif isinstance(job, jobs.Handover) and job.is_proving and self._guard is not None:
+            self._cast(job, self._guard)
         elif isinstance(job, jobs.Note):
             self._note(job)
         elif isinstance(job, jobs.Recall):
@@ -188,10 +190,9 @@ class Analyst:
     def _recall(self, job: jobs.Recall) -> None:
         """Give back what was learned before, and publish it again."""
         older = [handover for handover in self._handed if handover.number <= job.number]
-        if job.before_s is None:
-            older = older or [*self._handed][:1]
-        elif self._baseline is not None:
+        if self._baseline is not None:
             older = self._before(older, job.before_s)
+        older = older if older or self._baseline is not None else [*self._handed][:1]
         estimator = older[-1].estimator if older else self._baseline
         self._next = None
         if estimator is not None:
@@ -321,9 +322,6 @@ class Analyst:
 
     def _publish(self, job: jobs.Handover) -> None:
         if not len(job.estimator.sums.blocks):
-            return
-        if job.is_proving and self._guard is not None and self._guard.state != "proven":
-            self._cast(job, self._guard)
             return
         self._handed.append(job)
         candidate = self._tell(job)

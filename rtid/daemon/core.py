@@ -146,7 +146,8 @@ class Core:
             self._kept -= len(self.last.popleft())
 
     def _hand_over_if_due(self, now_ns: int) -> str:
-        publish = not self.is_solving and now_ns >= self._due_publish_ns
+        free = not self.is_solving and not self.is_proving
+        publish = free and now_ns >= self._due_publish_ns
         store = not self.is_saving and now_ns >= self._due_store_ns
         if not (publish or store) or not self.samples:
             return ""

@@ -55,12 +55,12 @@ class Note:
 class Recall:
     """Give back the newest estimator that is no younger than this handover.
 
-    before_s: it must be older than this sample time as well, else it is the baseline; None where
-    that does not matter, and the oldest one there is would do.
+    before_s: it must be older than this sample time as well, else it is the baseline; the oldest
+    one there is where there is no baseline yet.
     """
 
     number: int
-    before_s: float | None = None
+    before_s: float
 
 
 @dataclass(frozen=True)

@@ -147,7 +147,7 @@ class Keeper:
         elif answer.state == "contradicted":
             self._cause = answer
             self.plant.contradict(answer.since_s)
-            self._plant_changed(before_s=answer.since_s)
+            self._plant_changed()
         elif answer.state == "named":
             if self.plant.contradicted:
                 self._cause = answer
@@ -155,7 +155,7 @@ class Keeper:
         else:
             self._refused = answer.text
 
-    def _plant_changed(self, before_s: float | None = None) -> None:
+    def _plant_changed(self) -> None:
         """Stop learning and go back to what was learned before, or go on."""
         self._core.learner.learns = not (self.plant.changed or self._is_quarantined)
         if not self.plant.changed:
@@ -164,7 +164,7 @@ class Keeper:
         if self.plant.changed:
             logger.warning("plant changed: learning is suspended, surprise=%.1f level=%.1f",
                            self.plant.surprise or 0.0, self.plant.level)  # fmt: skip
-            self._analyst.put(jobs.Recall(self.plant.trusted, before_s))
+            self._analyst.put(jobs.Recall(self.plant.trusted, self.plant.since_s))
             self._diagnosing.begin(self.plant.since_s)
         else:
             logger.info("plant as before: learning goes on")

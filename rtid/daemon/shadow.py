@@ -24,11 +24,13 @@ class Shadow:
         self, job: Handover, solution: Solution, candidate: CandidateMap, level: FloatArray | None
     ) -> None:
         self.job, self.candidate, self._solution = job, candidate, solution
+        self._newest_s = float(job.estimator.state.engine[0]["t_s"])
         # a share that no machine reaches: it is proven by what it has foretold alone
         self.guard = Guard(solution.model, candidate, level, "proving", math.inf)
 
     def push(self, chunk: FloatArray) -> bool:
         """Take samples (n, 2 + signals), SI, that it has not learned; whether it stands now."""
+        chunk = chunk[chunk[:, 0] > self._newest_s]  # it may have overtaken some
         if not self.guard.push(chunk) or self.guard.state != "proven":
             return False
         model, newest = self._solution.model, self.guard.newest

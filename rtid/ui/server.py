@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bokeh.application import Application
 from bokeh.application.handlers.function import FunctionHandler
@@ -34,10 +34,18 @@ from tornado.web import OutputTransform, RequestHandler
 from rtid.errors import RtidError
 from rtid.ui.browser_page import build
 from rtid.ui.live_page import Live
+from rtid.ui.packing import Packed, Packing
 from rtid.ui.security import TOKEN, Door, Refusal
 from rtid.ui.shared import Session
 from rtid.ui.turns import Turns
 from rtid.ui.worker import Worker
+
+if TYPE_CHECKING:
+    from bokeh.protocol import Protocol
+    from bokeh.server.connection import ServerConnection
+    from bokeh.server.contexts import ApplicationContext
+    from bokeh.server.session import ServerSession
+    from bokeh.server.views.ws import WSHandler
 
 MOST_PAGES = 24  # that are open at once
 MOST_SOCKETS = 2  # of one page: one that comes back after a break has two for a moment
@@ -158,8 +166,8 @@ class Numbered(Application):  # type: ignore[misc]
 class Guarded(BokehTornado):  # type: ignore[misc]
     """Bokeh's application, with the door in front of every request, sockets included."""
 
-    def __init__(self, door: Door, app: Application, **options: Any) -> None:
-        self.door = door
+    def __init__(self, door: Door, app: Application, turns: Turns, **options: Any) -> None:
+        self.door, self._turns = door, turns
         self.refused = 0
         super().__init__({"/": app}, transforms=[Policy], **options)
 
@@ -215,6 +223,18 @@ class Guarded(BokehTornado):  # type: ignore[misc]
             if page is not None and page.connection_count >= MOST_SOCKETS:
                 return Refusal(503, "too many sockets of this page are open already")
         return None
+
+    def new_connection(
+        self,
+        protocol: Protocol,
+        socket: WSHandler,
+        context: ApplicationContext,
+        page: ServerSession,
+    ) -> ServerConnection:
+        """A socket of a page has come."""
+        connection = Packed(Packing(self._turns), socket, context, page)
+        self._clients.add(connection)
+        return connection
 
     def resources(self, absolute_url: str | bool | None = None) -> Resources:
         """Bokeh's scripts from this server, and of these only the one that our pages need."""
@@ -276,6 +296,7 @@ def start(
     guarded = Guarded(
         door,
         app,
+        turns,
         extra_patterns=[("/alive", Alive)],
         extra_websocket_origins=["*"],  # the door is stricter
         secret_key=secrets.token_bytes(32),

@@ -10,9 +10,11 @@ import asyncio
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
 PAUSE_S = 0.01  # for everybody else
 Do = Callable[[], None]
+T = TypeVar("T")
 
 
 class Turns:
@@ -40,6 +42,10 @@ class Turns:
             await asyncio.get_running_loop().run_in_executor(self._studio, do)
         finally:
             self.is_working = False
+
+    async def packed(self, pack: Callable[[], T]) -> T:
+        """The same for a message: behind what is drawn, and no step waits for it."""
+        return await asyncio.get_running_loop().run_in_executor(self._studio, pack)
 
     def stop(self) -> None:
         """End the thread."""

@@ -97,15 +97,16 @@ def opened(browser: Browser, bench: Workbench) -> Iterator[Opened]:
     yield from open_page(browser, bench)
 
 
-def open_page(browser: Browser, bench: Workbench) -> Iterator[Opened]:
+def open_page(browser: Browser, bench: Workbench, is_another: bool = False) -> Iterator[Opened]:
     """A fresh context; at the end all of the page can be seen, at every width, light and dark.
 
     Nothing may have been asked of other hosts, and nothing failed.  To the workbench it is the
-    browser of the tests before: another one would follow while their pages are still known.
+    browser of the tests before, unless it is another: that one follows while their pages are known.
     """
     context = browser.new_context(viewport=SIZE, color_scheme="light")  # type: ignore[arg-type]
     context.set_default_timeout(PATIENCE_MS)
-    context.add_cookies(COOKIES.get(bench.url, []))
+    if not is_another:
+        context.add_cookies(COOKIES.get(bench.url, []))
     own = bench.url.split("?")[0]
     one = Opened(context.new_page(), bench)
 
@@ -123,7 +124,8 @@ def open_page(browser: Browser, bench: Workbench) -> Iterator[Opened]:
     )
     one.page.on("websocket", lambda ws: _judge_socket(one, ws.url, own))
     yield one
-    COOKIES[bench.url] = context.cookies()
+    if not is_another:
+        COOKIES[bench.url] = context.cookies()
     assert_clear(one.page)
     context.close()
     assert one.elsewhere == []

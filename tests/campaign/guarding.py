@@ -5,6 +5,9 @@ No bus, no process and no clock: frames come in pieces of 0.2 s, every job is do
 
 from __future__ import annotations
 
+import math
+import os
+import shutil
 import time
 from collections import deque
 from collections.abc import Callable
@@ -240,8 +243,8 @@ class Simulated:
         self.keeper._listen()
 
     def killed(self) -> Simulated:
-        """The next start, 100 s after a kill."""
-        return Simulated(self._bench, self._folder, self.begin_s)
+        """The next start, after a kill."""
+        return Simulated(self._bench, self._folder, self.begin_s + 100.0)
 
     @property
     def is_held(self) -> bool:
@@ -254,24 +257,29 @@ class Simulated:
         assert self.keeper.teller.publication is not None
         return self.keeper.teller.publication.flow_map
 
-    def hear(self, run: Run, note_s: float = 0.0) -> FlowMap:
-        """The frames of a run, from begin_s of the machine's time on; the map published at note_s.
+    def branched(self, folder: Path) -> None:
+        """In a process that was forked: go on with a copy of the state, the working folder's."""
+        shutil.copytree(".", folder)
+        os.chdir(folder)
+        self.analyst._chronicle = self.analyst._recorder = None  # their files are the parent's
 
-        note_s = 0: at its end.  The next run would begin 100 s later.
+    def hear(self, run: Run, from_s: float = 0.0, to_s: float = math.inf) -> None:
+        """The frames of a run, or of a part of it, from begin_s of the machine's time on.
+
+        Behind a whole run the next one would begin 100 s later.
         """
-        before = None
         frames = run_frames(run, start_us=START_US + round(1e6 * self.begin_s))
         for k, piece in enumerate(frames.chunks(PIECE)):
+            if not from_s <= 0.2 * k < to_s - 0.1:
+                continue
             self._source.waiting = piece
             self._now_ns += PIECE_NS
             self.core.tick(self._now_ns)
             self.keeper._listen()
             self.keeper._look()
             self._note(0.2 * (k + 1))
-            if before is None and 0.0 < note_s <= 0.2 * (k + 1):
-                before = self.published
-        self.begin_s += len(run.samples) * 1e-3 + 100.0
-        return before or self.published
+        if math.isinf(to_s):
+            self.begin_s += len(run.samples) * 1e-3 + 100.0
 
     def stop(self) -> None:
         """End in good order; without it the daemon was killed."""

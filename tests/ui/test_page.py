@@ -16,6 +16,7 @@ from rtid.tell.html import button, changed, cover, parsed, select, table
 from rtid.ui.browser_page import Page
 from rtid.ui.shared import Session
 from rtid.ui.turns import PAUSE_S, Turns
+from tests.ui.test_security import done
 from tests.ui.test_session import FakeWorker
 
 EVIL = "<img src=x onerror=\"alert('1')\">&"
@@ -143,7 +144,7 @@ def test_what_is_done_apart_leaves_the_loop_free_and_holds_the_next_step_back() 
             await asyncio.sleep(PAUSE_S)
         turns.stop()
 
-    asyncio.run(asyncio.wait_for(main(), 10.0))
+    done(main())
     assert (looked, waited) == ([False], [True])
 
 
