@@ -6,13 +6,16 @@ pushing frames one by one (live) or a whole log at once (replay) yields bit-iden
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge import checks, cycle, multirate
 from firmware_bridge.catalog import Catalog, Layouts, words_of
 from firmware_bridge.config import CYCLE, MULTIRATE, Assembly, MessageSource, SignalSource
-from firmware_bridge.frames import Frames, add_counts
+from firmware_bridge.frames import EXTENDED, Frames, add_counts
+from firmware_bridge.j1939 import known_as
 from firmware_bridge.jit import Record, Records
 from firmware_bridge.samples import Samples
 
@@ -189,6 +192,7 @@ def _multirate_state(plan: checks.Plan, constants: NDArray[np.float64]) -> multi
 def _plan(catalog: Catalog, assembly: Assembly) -> checks.Plan:
     """The constant part of the state machine; raises AssemblyError or CatalogError."""
     _check_assembly(assembly)
+    _refuse_twins(catalog, assembly)
     messages = np.zeros(len(assembly.messages), checks.MESSAGE)
     roles: list[Record] = []
     layouts, codes, tables = [], [], []
@@ -227,10 +231,10 @@ def _layouts(catalog: Catalog, assembly: Assembly, source: MessageSource) -> Lay
 
 def _long_messages(catalog: Catalog, assembly: Assembly) -> list[tuple[int, int, Layouts]]:
     """Identifier, length and layouts of messages of which more than the first 8 bytes is read."""
-    known = [(source.name, _layouts(catalog, assembly, source)) for source in assembly.messages]
+    known = [(source, _layouts(catalog, assembly, source)) for source in assembly.messages]
     return [
-        (catalog.can_id(name), catalog.message(name).length, layouts)
-        for name, layouts in known
+        (known_as(catalog, source), catalog.message(source.name).length, layouts)
+        for source, layouts in known
         if layouts.is_long
     ]
 
@@ -265,6 +269,18 @@ def _check_assembly(assembly: Assembly) -> None:
         raise AssemblyError("mode 'cycle': declare a counter for all messages or for none")
 
 
+def _refuse_twins(catalog: Catalog, assembly: Assembly) -> None:
+    """AssemblyError for two messages that one frame could be."""
+    for first, second in itertools.combinations(assembly.messages, 2):
+        can_id = known_as(catalog, first)
+        apart = None not in (first.channel, second.channel) and first.channel != second.channel
+        if can_id == known_as(catalog, second) and not apart:
+            raise AssemblyError(
+                f"messages {first.name!r} and {second.name!r} are both 0x{can_id & ~EXTENDED:X}; "
+                "give each its channel, or in J1939 its address"
+            )
+
+
 def _fill_message(
     row: Record, catalog: Catalog, source: MessageSource, assembly: Assembly,
     layouts: Records,
@@ -272,7 +288,7 @@ def _fill_message(
     """Set one MESSAGE row (changed in place)."""
     if not source.period_s > 0:
         raise AssemblyError(f"message {source.name!r}: period_s must be > 0")
-    row["can_id"] = catalog.can_id(source.name)
+    row["can_id"] = known_as(catalog, source)
     row["channel"] = -1 if source.channel is None else source.channel
     row["length"] = catalog.message(source.name).length
     row["crc_byte"] = -1 if source.crc is None else catalog.byte_of(source.name, source.crc)

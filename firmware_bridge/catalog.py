@@ -6,24 +6,27 @@ import difflib
 import itertools
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from typing import NamedTuple, Self, cast
 
 import cantools
 import numpy as np
 from cantools.database.can import Database, Message, Signal
 from numpy.typing import NDArray
 
-from firmware_bridge import bits
+from firmware_bridge import bits, eds
 from firmware_bridge.config import MessageSource
 from firmware_bridge.frames import EXTENDED, MAX_LENGTH, WORD
 from firmware_bridge.jit import Record, Records
 
+BUILTIN = "builtin:"
 CONTROLLER_DBC = Path(__file__).with_name("controller.dbc")
 MAX_FILE_BYTES = 16 << 20  # a hostile file must not cost minutes or gigabytes
 MAX_SIGNALS = 200_000
+MOST_NODE = 127  # of CANopen
 
 _ABSENT = re.compile(r"(sna|n/?a|not[ _-]?avail\w*|signal[ _-]?not[ _-]?avail\w*|invalid)", re.I)
 
@@ -105,17 +108,44 @@ def words_of(data: NDArray[np.uint8], first: int = 0) -> NDArray[np.uint64]:
     return words
 
 
+class Place(NamedTuple):
+    """Where a database is, and of which CANopen node it is (None: of none, or a DCF says it)."""
+
+    file: Path
+    node: int | None = None
+
+    def named(self, file: str) -> str:
+        """The same place by another name of its file, with the node: valve.eds:5."""
+        return file if self.node is None else f"{file}:{self.node}"
+
+
 class Catalog:
-    """The messages and signals of one DBC.
+    """The messages and signals of the databases of a bus.
 
     Messages that share a name are told apart by their identifier: `Valve-064`, `Valve-18FF0001`.
+    files: a name for each database.
     """
 
-    def __init__(self, database: Database) -> None:
-        n_signals = sum(len(message.signals) for message in database.messages)
+    def __init__(self, *databases: Database, files: Sequence[str] = ("",)) -> None:
+        messages = [message for database in databases for message in database.messages]
+        n_signals = sum(len(message.signals) for message in messages)
         if n_signals > MAX_SIGNALS:
             raise CatalogError(f"the DBC has {n_signals} signals; the limit is {MAX_SIGNALS}")
-        self._messages = _by_name(database.messages)
+        self._messages = _by_name(messages)
+        counts = [len(database.messages) for database in databases]
+        origins = [name for name, n in zip(files, counts, strict=True) for _ in range(n)]
+        self._files = dict(zip(self._messages, origins, strict=True))
+
+    def with_aliases(self, aliases: Mapping[str, str]) -> Self:
+        """The same, where messages go by further names: alias -> name.  CatalogError if unknown."""
+        other = copy(self)
+        other._messages = self._messages | {a: self.message(n) for a, n in aliases.items()}
+        other._files = self._files | {a: self._files[n] for a, n in aliases.items()}
+        return other
+
+    def file_of(self, message: str) -> str:
+        """Name of the file that describes a message."""
+        return self._files[message]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -200,23 +230,55 @@ class Catalog:
         )
 
 
-def load(path: str | Path = CONTROLLER_DBC) -> Catalog:
-    """Read a DBC (or any other database that cantools knows); CatalogError if it cannot be."""
-    path = Path(path)
+def places(named: str | Path = CONTROLLER_DBC, folder: Path = Path()) -> tuple[Place, ...]:
+    """The databases of "pump.dbc, valve.eds:5", relative to a folder; "builtin:" is ours."""
+    if (folder / named).is_file():  # a comma or colon in its name
+        return (Place(folder / named),)
+    return tuple(_place_of(name.strip(), folder) for name in str(named).split(","))
+
+
+def _place_of(name: str, folder: Path) -> Place:
+    if name.startswith(BUILTIN):
+        return Place(CONTROLLER_DBC.with_name(name.removeprefix(BUILTIN)))
+    file, _, node = name.rpartition(":")
+    if not file.lower().endswith(eds.SUFFIXES):
+        return Place(folder / name)
+    if not (node.isdecimal() and 1 <= int(node) <= MOST_NODE):
+        raise CatalogError(f"{name}: {node!r} is no node id; give 1 to {MOST_NODE}")
+    return Place(folder / file, int(node))
+
+
+def load(named: str | Path | Sequence[Place] = CONTROLLER_DBC) -> Catalog:
+    """Read databases: DBC and what else cantools knows, EDS and DCF, see `places`.
+
+    CatalogError if one cannot be read.
+    """
+    wanted = places(named) if isinstance(named, str | Path) else named
+    databases = [_database(place) for place in wanted]
+    shown = ", ".join(str(place.file) for place in wanted)
+    try:
+        return Catalog(*databases, files=[place.named(place.file.name) for place in wanted])
+    except CatalogError as error:
+        raise CatalogError(f"{shown}: {error}") from None
+
+
+def _database(place: Place) -> Database:
+    path = place.file
     if not path.is_file():
         raise CatalogError(f"{path}: no such file; name an existing DBC")
     if path.stat().st_size > MAX_FILE_BYTES:
         raise CatalogError(f"{path}: larger than {MAX_FILE_BYTES >> 20} MiB; is this a DBC?")
     try:
+        if path.suffix.lower() in eds.SUFFIXES:
+            return eds.load(path, place.node)
         database = cantools.database.load_file(str(path), strict=False)
+    except eds.EdsError as error:
+        raise CatalogError(f"{path}: {error}") from error
     except Exception as error:  # cantools' parsers raise whatever their grammar trips over
         raise CatalogError(f"{path}: not a readable DBC: {error}") from error
     if not isinstance(database, Database):
         raise CatalogError(f"{path}: a diagnostics database, not a CAN database; name a DBC")
-    try:
-        return Catalog(database)
-    except CatalogError as error:
-        raise CatalogError(f"{path}: {error}") from None
+    return database
 
 
 def _by_name(messages: Sequence[Message]) -> dict[str, Message]:

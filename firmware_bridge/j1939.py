@@ -59,6 +59,11 @@ class Target:
     source: int | None
     is_any: bool
 
+    def meets(self, other: Target) -> bool:
+        """Whether a frame may be of either, but for who sends it."""
+        apart = None not in (self.channel, other.channel) and self.channel != other.channel
+        return self.pgn == other.pgn and not apart
+
     def fits(self, frames: Frames, pgn: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Which frames are of its group and channel, bool (n,), whoever sends them."""
         fitting = pgn == self.pgn
@@ -129,7 +134,8 @@ class Network:
     ) -> None:  # fmt: skip
         """Give a message's frames its identifier, and drop those of others (in place)."""
         fitting = target.fits(frames, pgn)
-        given = {t.source for t in self._targets if t.pgn == target.pgn and t is not target}
+        rivals = [t for t in self._targets if t is not target and target.meets(t)]
+        given = {t.source for t in rivals}
         sources = frames.can_id & 0xFF
         fitting &= ~np.isin(sources, [s for s in given if s is not None])
         if not fitting.any():
@@ -223,6 +229,15 @@ class Network:
         return None
 
 
+def known_as(catalog: Catalog, message: MessageSource) -> int:
+    """The identifier that a message has behind the `Network`: with its address, where it is given.
+
+    So one message of a DBC may be taken from several senders.
+    """
+    can_id = catalog.can_id(message.name)
+    return can_id & ~0xFF | message.address if isinstance(message.address, int) else can_id
+
+
 def is_group(catalog: Catalog, message: MessageSource) -> bool:
     """Whether a message is matched by its group: the DBC says J1939, or its address is given."""
     return message.address is not None or catalog.is_j1939(message.name)
@@ -240,7 +255,8 @@ def _target(catalog: Catalog, message: MessageSource) -> Target:
         source = written
     is_any = message.address == ANY
     assert is_any or message.address in (None, FOUND) or source is not None
-    return Target(pgn_of(can_id), can_id, length, message.channel, source, is_any)
+    known = known_as(catalog, message)
+    return Target(pgn_of(can_id), known, length, message.channel, source, is_any)
 
 
 def _merged(

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import typer
 
-from firmware_bridge import checks, j1939, stamps
+from firmware_bridge import checks, j1939, mended, stamps
 from firmware_bridge.sources import blf_objects, slcan_lines, text
 from firmware_bridge.sources.formats import suffixes
 from rtid.cli import main
@@ -61,12 +61,15 @@ def alarms() -> set[str]:
     "codes",
     [
         checks.REASONS, stamps.REASONS, j1939.REASONS, slcan_lines.REASONS, text.REASONS,
-        blf_objects.REASONS, layout.COUNTERS,
+        blf_objects.REASONS, mended.REASONS, layout.COUNTERS,
         (blocks.EMPTY, blocks.LEARNING, blocks.VALID, blocks.STALE, blocks.INVALID),
         (verdict.MATCHES, verdict.MISSING, verdict.AMBIGUOUS, verdict.UNKNOWN,
          verdict.INSUFFICIENT),
     ],
-    ids=["bridge", "stamps", "j1939", "slcan", "text", "blf", "estimator", "blocks", "verdicts"],
+    ids=[
+        *("bridge", "stamps", "j1939", "slcan", "text", "blf", "mended", "estimator"),
+        *("blocks", "verdicts"),
+    ],
 )  # fmt: skip
 def test_every_code_stands_in_operations(codes: tuple[str, ...]) -> None:
     assert set(codes) <= words("operations.md")

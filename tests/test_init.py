@@ -90,6 +90,28 @@ def test_dbc_without_a_machine_says_what_is_missing(shared: Path, tmp_path: Path
     assert "signals.p_a.message: missing" in done.stdout
 
 
+SPNS = {  # an excavator's signals by names of their SPNs, with those of its engine and cab
+    "EngOilPress": "kPa", "EngIntakeManifold1Prs": "kPa", "FuelDeliveryPress": "kPa",
+    "TransOilPress": "kPa", "BrakePrimaryPress": "kPa", "AccelPedalPos1": "%",
+    "EngPercentLoadAtCurrentSpeed": "%", "WheelBasedVehicleSpeed": "km/h", "EngSpeed": "rpm",
+    "HydPmpOutletPress": "kPa", "HydReturnLinePress": "kPa",
+    "ArmCylHeadEndPress": "kPa", "ArmCylRodEndPress": "kPa", "ArmCylExtension": "mm",
+    "ArmVlvSpoolCmd": "%",
+    "BoomCylHeadEndPress": "kPa", "BoomCylRodEndPress": "kPa", "BoomCylExtension": "mm",
+    "BoomVlvSpoolCmd": "%", "SwingVlvCmd": "%",
+}  # fmt: skip
+TOLD = {"p_supply": "HydPmpOutletPress", "p_tank": "HydReturnLinePress", "u": "{}VlvSpoolCmd"}
+TOLD |= {"p_a": "{}CylHeadEndPress", "p_b": "{}CylRodEndPress", "x": "{}CylExtension"}
+
+
+@pytest.mark.parametrize("cylinder", ["Arm", "Boom"])
+def test_roles_are_proposed_from_the_names_of_spns_and_of_one_cylinder(cylinder: str) -> None:
+    other = {"Arm": "Boom", "Boom": "Arm"}[cylinder] + "CylHeadEndPress"
+    signals = [RoleCandidate(n, "M", unit, 0, 1) for n, unit in SPNS.items() if n != other]
+    roles = {role: candidate.name for role, candidate in propose(signals).items()}
+    assert roles == {role: name.format(cylinder) for role, name in TOLD.items()}
+
+
 def test_unreadable_source_is_refused(tmp_path: Path) -> None:
     (tmp_path / "broken.dbc").write_text("this is no DBC")
     done = init(tmp_path / "broken.dbc", "-o", tmp_path / "p.toml")

@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.frames import Frames, add_counts
+from firmware_bridge.mended import mend
 from firmware_bridge.sources import asc, bags, blf, can_csv, candump, gvret, mf4, trc
 from firmware_bridge.sources import table as tables
 from firmware_bridge.sources.errors import LogError
@@ -86,8 +87,8 @@ FORMATS = [
 ]
 
 
-def open_file(path: str | Path) -> Content:
-    """What a file holds: the frames of a log in file order, or a table.
+def open_file(path: str | Path, *, mended: bool = True) -> Content:
+    """What a file holds: the frames of a log, their stamps mended where that can be, or a table.
 
     "truncated" in a log's `refused`: the file ends within a line, container or block, or before its
     end mark; "clock_step": the recorder's clock was set back, which became a gap.  Raises LogError
@@ -100,12 +101,13 @@ def open_file(path: str | Path) -> Content:
             content = _read(_known(inner), inner.file, path)
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror}") from error
-    return _with_loss(content, inner)
+    content = _with_loss(content, inner)
+    return mend(content).frames if mended and isinstance(content, Frames) else content
 
 
-def open_log(path: str | Path) -> Frames:
+def open_log(path: str | Path, *, mended: bool = True) -> Frames:
     """All data frames of a log, see `open_file`; LogError also for a table."""
-    content = open_file(path)
+    content = open_file(path, mended=mended)
     if isinstance(content, Table):
         raise LogError(f"{path}: a table of samples is no log of frames; name a log")
     return content

@@ -17,11 +17,14 @@ from rtid.units import System, scale_of, with_unit
 if TYPE_CHECKING:
     from firmware_bridge.catalog import Catalog
     from firmware_bridge.frames import Frames
+    from firmware_bridge.mended import Mended
     from rtid.project import Project
     from rtid.tell.story import Table
     from rtid.trace import IdTiming, Report, Stamps, Timing
+    from rtid.trace.described import Described
 
 SCHEMA = 1
+MOST_SHOWN = 8  # identifiers in a line
 TIMING_HEADS = ("count|", "median|", "1 %|", "99 %|", "worst|", "gaps|")
 
 
@@ -91,23 +94,33 @@ def _judged(project: Project, path: Path, progress: Progress) -> Report:
 
 def _check_bus(log: Path, dbc: Path | None, as_json: bool) -> None:
     from firmware_bridge import catalog
+    from firmware_bridge.mended import mend
     from firmware_bridge.sources import open_log
     from rtid.trace import bus, stamps
+    from rtid.trace.described import described, match, on_channels
 
-    frames = open_log(log)
-    described = catalog.load(dbc) if dbc else None
+    raw = open_log(log, mended=False)
+    mended = mend(raw)
+    frames = mended.frames
+    known = catalog.load(dbc) if dbc else None
     timings = bus(frames)
-    names = [_name(described, timed) for timed in timings]
-    signals = _signals(frames, described) if described else []
+    names = [_name(known, timed) for timed in timings]
+    matched = match(frames, known) if known else None
+    signals = _signals(matched.by_name, known) if known and matched else []
+    taken = described(matched, known) if known and matched else None
+    channels = on_channels(frames)
     if as_json:
         ids = [plain(t) | {"name": name or None} for t, name in zip(timings, names, strict=True)]
         counts = {"frames": len(frames), "ids": len(timings), "refused": frames.refused}
-        odd = {"stamps": plain(stamps(frames))}
+        odd = {"stamps": plain(stamps(raw)) | _mending(mended), "on_channels": channels}
+        odd |= {"described": plain(taken) if taken else None}
         print(json.dumps({"schema": SCHEMA} | counts | {"timing": ids, "signals": signals} | odd))
     else:
         _print_bus(timings, names, len(frames), frames.refused)
-        _print_stamps(stamps(frames))
+        _print_stamps(stamps(raw), mended)
+        _print_channels(channels)
         _print_signals(signals)
+        _print_described(taken)
     refuse_truncated(log, frames.refused)
 
 
@@ -126,7 +139,7 @@ def _name(catalog: Catalog | None, timed: IdTiming) -> str:
     return ""
 
 
-def _signals(frames: Frames, catalog: Catalog) -> list[dict[str, Any]]:
+def _signals(by_name: dict[str, Frames], catalog: Catalog) -> list[dict[str, Any]]:
     """Every signal that the log holds by the DBC: its unit, values and range."""
     from rtid.trace.series import describe
     from rtid.trace.signals import series_of
@@ -134,22 +147,65 @@ def _signals(frames: Frames, catalog: Catalog) -> list[dict[str, Any]]:
     wanted = ("name", "count", "missing", "minimum", "maximum")
     return [
         {key: plain(getattr(report, key)) for key in wanted} | {"unit": unit}
-        for unit, report in ((u, describe(series)) for u, series in series_of(frames, catalog))
+        for unit, report in ((u, describe(series)) for u, series in series_of(by_name, catalog))
     ]
 
 
-def _print_stamps(odd: Stamps) -> None:
+def _mending(mended: Mended) -> dict[str, float | None]:
+    """How late the mended stamps were, and within how much they are known now; seconds."""
+    mean_s, most_s = mended.late_s
+    known_s = max(mended.known_s.values(), default=None)
+    return {"mended_mean_s": mean_s, "mended_most_s": most_s, "known_s": known_s}
+
+
+def _print_stamps(odd: Stamps, mended: Mended) -> None:
     """What is odd about the time stamps, and what it means for the lag; nothing if all is well."""
+    from firmware_bridge.mended import MENDED, REORDERED
+
     if odd.backward:
-        print(f"{odd.backward} time stamps go back: such frames are refused as out_of_order.")
+        is_sorted = REORDERED in mended.frames.refused
+        done = (
+            "the frames are sorted by" if is_sorted else "such frames are refused as out_of_order"
+        )
+        print(f"{odd.backward} time stamps go back: {done}{' their stamps' * is_sorted}.")
     if odd.repeated:
-        print(f"{odd.repeated} frames are the one before once more, with its stamp.")
+        print(f"{odd.repeated} frames are the one before once more, with its stamp: refused.")
     if odd.in_bursts:
         print(
             f"{odd.in_bursts} frames came in bursts with one stamp, behind up to "
             f"{with_unit(odd.late_s, 's')} of silence: the adapter's stamps are late by up to "
-            "that, and so is the lag that is learned from them."
+            "that, and so would be the lag that is learned from them."
         )
+    if mended.known_s:
+        mean, most = (with_unit(late_s, "s") for late_s in mended.late_s)
+        best, worst = (with_unit(f(mended.known_s.values()), "s") for f in (min, max))
+        print(
+            f"{mended.frames.refused[MENDED]} of them are put back to the steady periods of their "
+            f"messages, by {mean}, at most {most}; they are known to {best} .. {worst} by message. "
+            'A lag is uncertain by that: offset_ms = "estimate" under [messages.NAME] tells more.'
+        )
+
+
+def _print_channels(channels: dict[str, tuple[int, ...]]) -> None:
+    for can_id, several in channels.items():
+        on = ", ".join(map(str, several))
+        print(f"{can_id} comes on channels {on}: a project names one, channel = {several[0]}.")
+
+
+def _print_described(by: Described | None) -> None:
+    """What each database takes and all of them leave, in a line each."""
+    if by is None:
+        return
+    for taken in by.taken:
+        print(
+            f"{taken.file}: {taken.present} of its {taken.messages} messages are here, "
+            f"{taken.frames} frames."
+        )
+    if by.left:
+        few = ", ".join(list(by.left)[:MOST_SHOWN]) + (", ..." * (len(by.left) > MOST_SHOWN))
+        print(f"Not described: {sum(by.left.values())} frames of {len(by.left)} ids: {few}.")
+    for can_id, names in by.twice.items():
+        print(f"{can_id} is {' and '.join(names)}: a project names which, and on which channel.")
 
 
 def _print_signals(signals: list[dict[str, Any]]) -> None:

@@ -64,8 +64,10 @@ def _read(source: str, folder: Path) -> tuple[dict[str, str], list[RoleCandidate
     if source == BUILTIN:
         return {"dbc": BUILTIN}, proposal.from_catalog(catalog.load())
     if format_of(path) is None:
-        candidates = proposal.from_catalog(catalog.load(path))
-        return {"dbc": proposal.relative(path, folder)}, candidates
+        places = catalog.places(source)
+        candidates = proposal.from_catalog(catalog.load(places))
+        names = [place.named(proposal.relative(place.file, folder)) for place in places]
+        return {"dbc": ", ".join(names)}, candidates
     table = read_table(path)
     time, unit = time_of(table)
     return {"time_column": time, "time_unit": unit}, proposal.from_table(table)

@@ -131,12 +131,11 @@ def _refuse_untrusted(interface: str, project: Path, test_bus: bool) -> None:
 
 def _opener(loaded: Project, interface: str, channel: str) -> Callable[[], Source]:
     """How to open the bus, listening only, with the frames of the project alone."""
-    from firmware_bridge.catalog import load as load_catalog
     from firmware_bridge.j1939 import Network
     from firmware_bridge.sources.live_bus import open_live
+    from rtid.trace.learner import catalog_of
 
-    assert loaded.dbc is not None
-    catalog = load_catalog(loaded.dbc)
+    catalog = catalog_of(loaded)
     messages = loaded.assembly.messages
     can_ids = [catalog.can_id(message.name) for message in messages]
     takes_all = interface in ("serial", "slcan") or Network(catalog, messages).is_needed

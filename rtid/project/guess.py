@@ -12,8 +12,16 @@ from firmware_bridge.sources.table import Table, is_time
 from rtid.project.references import KIND_DIMENSIONS
 from rtid.units import find_unit, said, split_name, units_of, words_of
 
-_PRESSURE = {"p", "pressure", "press", "druck"}
+_PRESSURE = {"p", "pressure", "press", "pres", "prs", "druck"}
 _WANTED_NOT_MEASURED = {"ref", "reference", "set", "setpoint", "target", "desired", "demand", "des"}
+# What the messages of an engine, a gearbox and a cab speak of, and no cylinder
+_ELSEWHERE = {
+    *("engine", "eng", "vehicle", "wheel", "fuel", "coolant", "brake", "tire", "tyre", "intake"),
+    *("exhaust", "turbo", "turbocharger", "boost", "manifold", "rail", "crankcase", "air", "fan"),
+    *("transmission", "trans", "clutch", "gear", "retarder", "battery", "ambient", "barometric"),
+    *("accelerator", "accel", "pedal", "steering", "def", "scr", "filter", "cruise"),
+}
+_KIN = 0.25  # for each word that two signals of one cylinder share
 
 
 @dataclass(frozen=True)
@@ -53,13 +61,18 @@ def _role(name: str, kind: str, words: str, alone: str) -> Role:
 
 
 ROLES = (
-    _role("p_supply", "pressure", "supply pump system line sup", "ps p0 pp psys"),
+    _role("p_supply", "pressure", "supply pump pmp system main line sup outlet", "ps p0 pp psys"),
     _role("p_tank", "pressure", "tank return reservoir drain", "pt pr pret"),
-    _role("p_a", "pressure", "a cap bore head piston 1 bottom", "pa p1 pcap"),
-    _role("p_b", "pressure", "b rod ring annulus 2 top", "pb p2 prod"),
-    _role("x", "position", "x pos position stroke displacement length angle", "x s y"),
+    _role("p_a", "pressure", "a cap bore head piston 1 bottom base extend", "pa p1 pcap"),
+    _role("p_b", "pressure", "b rod ring annulus 2 top retract", "pb p2 prod"),
+    _role("x", "position", "x pos position stroke displacement length extension angle", "x s y"),
     _role("v", "velocity", "v vel velocity speed", "v xdot"),
-    _role("u", "command", "u cmd command valve spool current pwm duty out", "u i uv"),
+    _role(
+        "u",
+        "command",
+        "u cmd command valve vlv vpoc spool coil solenoid current pwm duty out",
+        "u i uv",
+    ),
 )
 
 
@@ -93,9 +106,22 @@ def unit_said(name: str, given: str | None) -> str:
 
 
 def propose(candidates: list[RoleCandidate]) -> dict[str, RoleCandidate]:
-    """The best candidate for each role; a signal plays one role, and a role may stay empty."""
+    """The best candidate for each role; a signal plays one role, and a role may stay empty.
+
+    Of several cylinders on a bus one is taken: with what its surest signal shares words.
+    """
+    roles = _chosen(candidates, None)
+    anchor = next((roles[name] for name in ("p_a", "p_b", "x") if name in roles), None)
+    kin = _chosen(candidates, anchor)
+    return {role.name: _with_unit(kin[role.name], role) for role in ROLES if role.name in kin}
+
+
+def _chosen(
+    candidates: list[RoleCandidate], anchor: RoleCandidate | None
+) -> dict[str, RoleCandidate]:
+    """The candidates by role, the surest pair first; anchor: a signal of the cylinder."""
     pairs = [
-        (_score(role, c), -k, -len(c.name), -j)
+        (_score(role, c) and _score(role, c) + _kinship(c, anchor), -k, -len(c.name), -j)
         for k, role in enumerate(ROLES)
         for j, c in enumerate(candidates)
     ]
@@ -103,7 +129,15 @@ def propose(candidates: list[RoleCandidate]) -> dict[str, RoleCandidate]:
     for score, k, _, j in sorted(pairs, reverse=True):
         if score > 0 and -k not in chosen and -j not in chosen.values():
             chosen[-k] = -j
-    return {ROLES[k].name: _with_unit(candidates[chosen[k]], ROLES[k]) for k in sorted(chosen)}
+    return {ROLES[k].name: candidates[j] for k, j in chosen.items()}
+
+
+def _kinship(candidate: RoleCandidate, anchor: RoleCandidate | None) -> float:
+    """How much a signal looks like one of the same cylinder."""
+    if anchor is None:
+        return 0.0
+    shared = words_of(candidate.stem) & words_of(anchor.stem) - _PRESSURE
+    return _KIN * (len(shared) + (candidate.message == anchor.message))
 
 
 def unused(candidates: list[RoleCandidate], roles: dict[str, RoleCandidate]) -> list[RoleCandidate]:
@@ -118,6 +152,8 @@ def _score(role: Role, candidate: RoleCandidate) -> float:
     unit = find_unit(candidate.unit)
     fits = unit is not None and unit.dimension in KIND_DIMENSIONS[role.kind]
     if (candidate.unit and not fits) or (words & _WANTED_NOT_MEASURED and role.kind != "command"):
+        return 0.0
+    if words & _ELSEWHERE:
         return 0.0
     known = role.words
     if role.kind == "pressure" and not (fits or words & _PRESSURE):

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from firmware_bridge import catalog as catalogs
-from firmware_bridge.catalog import Catalog
+from firmware_bridge.catalog import Catalog, Place
 from rtid.effects import Effect
 from rtid.errors import door
 from rtid.estimator.limits import unfit
@@ -18,7 +18,6 @@ from rtid.project.project import Project, Sections
 from rtid.project.sections import Raw, read_section
 from rtid.units import find_unit, nearest, units_of
 
-BUILTIN = "builtin:"
 MAX_FILE_BYTES = 4 << 20
 SINGLE: dict[str, type[schema.Section]] = {
     "project": schema.ProjectSection,
@@ -53,7 +52,7 @@ def load(path: str | Path) -> Project:
     path = Path(path)
     raw = _parse(path)
     parts, problems = _read_sections(raw)
-    dbc, catalog = _open_dbc(raw, path.parent, problems)
+    databases, catalog = _open_dbc(raw, path.parent, problems)
     problems += references.check(raw, catalog, path.parent)
     problems += _across(parts)
     user_effects, more = effects.build(parts, raw, catalog, path.parent)
@@ -61,7 +60,7 @@ def load(path: str | Path) -> Project:
     if problems:
         first = {problem.path: problem for problem in reversed(problems)}  # one per place
         raise ProjectError(path, [p for p in problems if first[p.path] is p])
-    return _assemble(path, Sections(**parts), dbc, catalog, user_effects)
+    return _assemble(path, Sections(**parts), databases, catalog, user_effects)
 
 
 def _parse(path: Path) -> Raw:
@@ -129,24 +128,28 @@ def _read_named(
 
 def _open_dbc(
     raw: Raw, folder: Path, problems: list[Problem]
-) -> tuple[Path | None, Catalog | None]:
-    """The DBC of [source]; what is wrong with it joins `problems` (changed in place)."""
+) -> tuple[tuple[Place, ...], Catalog | None]:
+    """The databases of [source] and what they say; what is wrong joins `problems` (in place)."""
     source = raw.get("source")
     name = source.get("dbc") if isinstance(source, dict) else None
     if not isinstance(name, str):
         if isinstance(source, dict) and "dbc" not in source and "time_column" not in source:
             remedy = 'add dbc = "machine.dbc" for CAN, or time_column = "t" for a table'
             problems.append(Problem("source.dbc", "missing", remedy))
-        return None, None
-    path = folder / name
-    if name.startswith(BUILTIN):
-        path = catalogs.CONTROLLER_DBC.with_name(name.removeprefix(BUILTIN))
+        return (), None
     try:
-        return path, catalogs.load(path)
+        places = catalogs.places(name, folder)
+        return places, catalogs.load(places).with_aliases(_aliases(raw))
     except catalogs.CatalogError as error:
-        remedy = f'name a DBC relative to this file, or "{BUILTIN}controller.dbc"'
+        remedy = f'name a DBC relative to this file, or "{catalogs.BUILTIN}controller.dbc"'
         problems.append(Problem("source.dbc", str(error), remedy))
-        return None, None
+        return (), None
+
+
+def _aliases(raw: Raw) -> dict[str, str]:
+    """Messages of the file that are messages of the DBC by another name."""
+    named = references.tables(raw, "messages").items()
+    return {name: str(message["of"]) for name, message in named if "of" in message}
 
 
 def _across(parts: dict[str, Any]) -> list[Problem]:
@@ -196,7 +199,7 @@ def _publish(section: schema.PublishSection, parts: dict[str, Any]) -> list[Prob
 def _assemble(
     path: Path,
     sections: Sections,
-    dbc: Path | None,
+    databases: tuple[Place, ...],
     catalog: Catalog | None,
     user_effects: tuple[Effect, ...],
 ) -> Project:
@@ -216,7 +219,7 @@ def _assemble(
         model=model,
         assembly=assembly,
         table_assembly=table,
-        dbc=dbc,
+        databases=databases,
         reference_maps={n: path.parent / e.reference_map for n, e in edges if e.reference_map},
         noise_unknown=unknown,
         offset_tolerance_s={

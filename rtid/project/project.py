@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from firmware_bridge.catalog import Place
 from firmware_bridge.config import Assembly
 from rtid.effects import Effect
 from rtid.model import Machine
@@ -86,7 +87,7 @@ class Project:
     model: Machine
     assembly: Assembly
     table_assembly: Assembly | None
-    dbc: Path | None
+    databases: tuple[Place, ...]
     reference_maps: dict[str, Path]
     noise_unknown: tuple[str, ...]
     offset_tolerance_s: dict[str, float]

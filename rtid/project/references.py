@@ -35,7 +35,7 @@ REFERENCES = {
     ("edges", "command"): "command",
 }
 TEXT_KEYS = {
-    *("dbc", "message", "signal", "column", "unit", "kind", "counter", "crc"),
+    *("dbc", "message", "signal", "column", "unit", "kind", "counter", "crc", "of"),
     *("pressure", "position", "source", "sink", "command", "reference_map"),
 }
 EDGE_NEEDS = {

@@ -139,8 +139,12 @@ class SourceSection(Section):
 
 
 class MessageSection(Section):
-    """[messages.NAME]: period and age of a CAN message, its end-to-end protection."""
+    """[messages.NAME]: period and age of a CAN message, its end-to-end protection.
 
+    `of`: which message of the DBC it is, where one comes from two senders or on two channels.
+    """
+
+    of: str | None = None
     period_s: Annotated[float | None, TIME] = Field(default=None, gt=0)
     offset_s: Annotated[Estimable, TIME] = 0.0
     tolerance_s: Annotated[float | None, TIME] = Field(default=None, gt=0)

@@ -132,7 +132,7 @@ def _of_project(project: Project) -> str:
     """What the fit depends on: declaration, spans, added effects, bit layouts, the program."""
     sections = project.sections
     words = {f.name: getattr(sections, f.name) for f in fields(sections) if f.name not in ASIDE}
-    layouts = _of_file(project.dbc) if project.dbc is not None else ""
+    layouts = [(_of_file(place.file), place.node) for place in project.databases]
     text = f"{project.digest} {sorted(words.items())!r} {layouts} {_of_program()}"
     return _hash(text.encode()).hexdigest()
 

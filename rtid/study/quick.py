@@ -28,7 +28,7 @@ from rtid.study.quick_machine import (
     first_machine,
     fitted_machine,
 )
-from rtid.study.quick_project import DEAD_VOLUME, of_missing, project_text
+from rtid.study.quick_project import DEAD_VOLUME, of_channels, of_missing, project_text
 from rtid.study.study import diagnose_trace
 from rtid.trace import Report, judge
 from rtid.trace.quick_data import BAD, Point, level_of, points
@@ -113,7 +113,11 @@ def quick(
         source.keys.get("dbc", ""),
         arranged.roles,
         tuple(candidate.full_name for candidate in unused(source.signals, arranged.roles)),
-        (*of_missing(arranged.roles), *arranged.machine.assumptions),
+        (
+            *of_missing(arranged.roles),
+            *of_channels(source, arranged.roles),
+            *arranged.machine.assumptions,
+        ),
         tuple(judged),
         level,
         diagnosis,

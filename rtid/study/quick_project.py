@@ -27,7 +27,7 @@ def project_text(
     key = next(unit.key for unit in units_of(u.dimension) if unit.factor == 1.0)
     raw: dict[str, Any] = {"project": {"name": name}, "source": dict(source.keys)}
     raw["messages"] = {
-        message: {"period_ms": period}
+        message: {"period_ms": period, **_channel(source, message)}
         for message, period in source.periods_ms.items()
         if any(c.message == message for c in roles.values())
     }
@@ -63,6 +63,10 @@ def project_text(
         split = end - HELD_OUT * (end - begin)
         raw["record"] = {"identification_s": [begin, split], "validation_s": [split, end]}
     return tomlkit.dumps({name: part for name, part in raw.items() if part})
+
+
+def _channel(source: Source, message: str) -> dict[str, int]:
+    return {"channel": source.channels[message]} if message in source.channels else {}
 
 
 def _signals(
@@ -107,6 +111,18 @@ def of_missing(roles: dict[str, RoleCandidate]) -> list[Assumption]:
             f"the tank is at {TANK_PA / 1e5:.0f} bar", "maps to the tank are off at small drops",
         ))  # fmt: skip
     return assumptions
+
+
+def of_channels(source: Source, roles: dict[str, RoleCandidate]) -> list[Assumption]:
+    """Which channel is taken of a message that comes on several."""
+    messages = sorted({c.message for c in roles.values()} & set(source.channels))
+    return [
+        Assumption(
+            f"{message} comes on several channels, and channel {source.channels[message]} is meant",
+            f"the other channel is another machine: name it under [messages.{message}]",
+        )
+        for message in messages
+    ]
 
 
 def _supply_pa(roles: dict[str, RoleCandidate]) -> float:

@@ -115,7 +115,7 @@ def _project(machine: Project | Machine | str | Path) -> Project:
     )
     nothing = Assembly(CYCLE, (), (), machine.position)
     key = digest(machine)
-    return Project(Path("machine"), sections, machine, nothing, None, None, {}, (), {}, key, key)
+    return Project(Path("machine"), sections, machine, nothing, None, (), {}, (), {}, key, key)
 
 
 def _times(t: ArrayLike) -> FloatArray:

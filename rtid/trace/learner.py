@@ -44,12 +44,13 @@ QUIET_READS = 5  # the bus is over when its sender has ended and so many reads f
 
 
 def catalog_of(project: Project) -> Catalog:
-    """The bit layouts of the project's DBC.  RtidError if it names none."""
-    if project.dbc is None:
+    """The bit layouts of the project's databases.  RtidError if it names none."""
+    if not project.databases:
         raise RtidError(
             f"{project.path}: source.dbc is missing", "name the DBC of the CAN trace", 2
         )
-    return load(project.dbc)
+    named = project.sections.messages.items()
+    return load(project.databases).with_aliases({n: m.of for n, m in named if m.of is not None})
 
 
 class Learner:

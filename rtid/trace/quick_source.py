@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,13 +10,12 @@ import numpy as np
 from firmware_bridge import catalog as catalogs
 from firmware_bridge.catalog import Catalog
 from firmware_bridge.frames import Frames
-from firmware_bridge.j1939 import Network
 from firmware_bridge.sources import open_file
 from firmware_bridge.sources.table import Table
 from rtid.errors import RtidError
 from rtid.project import guess as proposal
 from rtid.project.guess import RoleCandidate
-from rtid.project.loading import BUILTIN
+from rtid.trace.described import by_message
 from rtid.trace.table import time_of
 from rtid.units import Unit, find_unit
 
@@ -34,7 +33,8 @@ class Source:
     """What a file offers: keys of [source], all signals, messages with their period in ms.
 
     steps: smallest change of a column of a table, in its unit; step_ms: its usual step in time.
-    Of a bus the DBC and the periods tell both.
+    Of a bus the DBC and the periods tell both.  channels: which one is taken of messages that come
+    on several.
     """
 
     keys: dict[str, str]
@@ -42,6 +42,7 @@ class Source:
     periods_ms: dict[str, float]
     steps: dict[str, float]
     step_ms: float = 0.0
+    channels: dict[str, int] = field(default_factory=dict)
 
 
 def open_source(path: Path, dbc: Path | None) -> Source:
@@ -71,8 +72,12 @@ def _of_table(table: Table) -> Source:
 
 def log_source(path: Path, frames: Frames, dbc: Path | None) -> Source:
     """What a log offers by a DBC, rtid's own if none is named.  RtidError if it describes none."""
-    catalog = catalogs.load(dbc) if dbc else catalogs.load()
-    messages = {n: f for n, f in by_message(frames, catalog).items() if len(f) > 1}
+    places = catalogs.places(dbc) if dbc else catalogs.places()
+    catalog = catalogs.load(places)
+    every = {n: f for n, f in by_message(frames, catalog).items() if len(f) > 1}
+    chosen = {n: int(np.bincount(f.channel).argmax()) for n, f in every.items()}
+    messages = {n: f[f.channel == chosen[n]] for n, f in every.items()}
+    several = {n: c for n, c in chosen.items() if len(messages[n]) < len(every[n])}
     if not messages:
         ids = sorted({int(i) & 0x1FFFFFFF for i in np.unique(frames.can_id)})
         shown = ", ".join(f"0x{i:X}" for i in ids[:8]) + (", ..." if len(ids) > 8 else "")
@@ -83,20 +88,9 @@ def log_source(path: Path, frames: Frames, dbc: Path | None) -> Source:
         )
     signals = [c for name, mine in messages.items() for c in _signals(mine, name, catalog)]
     periods = {name: 1e-3 * float(np.median(np.diff(f.t_us))) for name, f in messages.items()}
-    name = str(dbc.resolve()) if dbc else f"{BUILTIN}controller.dbc"
-    return Source({"dbc": name}, signals, periods, {})
-
-
-def by_message(frames: Frames, catalog: Catalog) -> dict[str, Frames]:
-    """The frames of each message that the DBC describes, none left out; J1939 by its groups."""
-    sources = [catalog.message_source(name) for name in catalog.names]
-    matched = Network(catalog, sources).push(frames)
-    return {name: _frames_of(matched, name, catalog) for name in catalog.names}
-
-
-def _frames_of(frames: Frames, name: str, catalog: Catalog) -> Frames:
-    mine = (frames.can_id == catalog.can_id(name)) & (frames.length == catalog.message(name).length)
-    return frames[mine]
+    name = ", ".join(place.named(str(place.file.resolve())) for place in places)
+    keys = {"dbc": name if dbc else f"{catalogs.BUILTIN}controller.dbc"}
+    return Source(keys, signals, periods, {}, channels=several)
 
 
 def _signals(frames: Frames, name: str, catalog: Catalog) -> list[RoleCandidate]:

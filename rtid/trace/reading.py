@@ -11,7 +11,7 @@ from firmware_bridge.assemble import Assembler
 from firmware_bridge.catalog import Catalog
 from firmware_bridge.config import Assembly
 from firmware_bridge.frames import Frames
-from firmware_bridge.j1939 import Network
+from firmware_bridge.j1939 import Network, known_as
 from firmware_bridge.samples import Samples
 from firmware_bridge.sources import open_file
 from firmware_bridge.sources.table import Table, to_samples
@@ -58,8 +58,23 @@ def assemble(
     """Samples of a batch of frames, and the refusals by reason."""
     assembler = Assembler(catalog, assembly)
     matched = Network(catalog, assembly.messages).push(frames)
+    _refuse_mixed(matched, catalog, assembly)
     parts = [assembler.push(matched), assembler.finish()]
     return join(parts), assembler.counters
+
+
+def _refuse_mixed(frames: Frames, catalog: Catalog, assembly: Assembly) -> None:
+    """RtidError for a message that comes on several channels where none is named."""
+    for message in assembly.messages:
+        mine = frames.channel[frames.can_id == known_as(catalog, message)]
+        channels, counts = np.unique(mine, return_counts=True)
+        if message.channel is None and len(channels) > 1:
+            each = ", ".join(f"{c} ({n} frames)" for c, n in zip(channels, counts, strict=True))
+            raise RtidError(
+                f"{message.name} comes on several channels: {each}",
+                f"name one, channel = {channels[counts.argmax()]} under [messages.{message.name}]; "
+                f'another may be a message of its own, with of = "{message.name}"',
+            )
 
 
 def join(parts: list[Samples]) -> Samples:
@@ -81,8 +96,9 @@ def _not_empty(trace: Trace, project: Project) -> Trace:
     ids, counts = np.unique(trace.frames.can_id & 0x7FFFFFFF, return_counts=True)
     common = ", ".join(f"0x{i:X} ({n})" for n, i in sorted(zip(counts, ids, strict=True))[:-6:-1])
     refused = ", ".join(f"{reason} {n}" for reason, n in trace.counters.items()) or "nothing"
+    described = ", ".join(str(place.file) for place in project.databases)
     raise NoSamplesError(
         f"{trace.path}: no complete sample in {len(trace.frames)} frames. "
         f"Wanted: {wanted}. Refused: {refused}. Most frequent ids: {common or 'none'}",
-        f"does {project.dbc} describe this bus? `rtid check` shows what the trace holds",
+        f"does {described} describe this bus? `rtid check` shows what the trace holds",
     )

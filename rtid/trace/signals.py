@@ -11,7 +11,7 @@ import numpy as np
 from firmware_bridge.catalog import Catalog
 from firmware_bridge.config import Assembly, MessageSource, SignalSource
 from firmware_bridge.frames import Frames
-from firmware_bridge.j1939 import Network
+from firmware_bridge.j1939 import Network, known_as
 from firmware_bridge.samples import Samples
 from firmware_bridge.sources import open_file
 from firmware_bridge.sources.table import Table, to_samples
@@ -20,7 +20,6 @@ from rtid.plain import FloatArray
 from rtid.project import Project
 from rtid.trace.arrivals import Timing, timing
 from rtid.trace.learner import catalog_of
-from rtid.trace.quick_source import by_message
 from rtid.trace.reading import assemble
 from rtid.trace.series import Series
 from rtid.trace.table import declared
@@ -49,9 +48,9 @@ def read_recording(project: Project, path: Path) -> Recording:
     return _from_log(project, path, content)
 
 
-def series_of(frames: Frames, catalog: Catalog) -> Iterator[tuple[str, Series]]:
-    """Unit and values, in this unit, of every signal of a DBC that a log holds."""
-    for name, mine in by_message(frames, catalog).items():
+def series_of(by_name: dict[str, Frames], catalog: Catalog) -> Iterator[tuple[str, Series]]:
+    """Unit and values, in this unit, of every signal in the frames of the messages of a catalog."""
+    for name, mine in by_name.items():
         layouts = catalog.layouts(name)
         values = layouts.decode(mine.data)
         for k, signal in enumerate(layouts.names if len(mine) else ()):
@@ -85,7 +84,7 @@ def _from_log(project: Project, path: Path, frames: Frames) -> Recording:
 
 
 def _frames_of(frames: Frames, message: MessageSource, catalog: Catalog) -> Frames:
-    wanted = frames.can_id == catalog.can_id(message.name)
+    wanted = frames.can_id == known_as(catalog, message)
     if message.channel is not None:
         wanted &= frames.channel == message.channel
     return frames[wanted & (frames.length == catalog.message(message.name).length)]

@@ -14,7 +14,7 @@ from firmware_bridge import frames as fr
 from firmware_bridge.catalog import Catalog, CatalogError
 from firmware_bridge.config import ANY, FOUND, MessageSource
 from firmware_bridge.frames import EXTENDED, Frames
-from firmware_bridge.j1939 import Network
+from firmware_bridge.j1939 import Network, known_as
 from firmware_bridge.sources import blf, open_log
 from rtid.cli import main
 from rtid.estimator.flowmap import VALID, FlowMap
@@ -148,7 +148,8 @@ def test_priority_and_destination_say_nothing_and_the_source_is_given_found_or_a
     frames.can_id[4] = 0x7FF
     for address, count, others in ((None, 2, 2), (FOUND, 2, 2), (OTHER, 2, 2), (ANY, 4, 0)):
         out = network(catalog, Motion=address).push(frames)
-        assert (out.can_id == catalog.can_id("Motion")).sum() == count
+        known = known_as(catalog, MessageSource("Motion", 0.01, address=address))
+        assert (out.can_id == known).sum() == count
         assert out.refused == ({"other_source": others} if others else {})
         assert out.can_id[-1] == 0x7FF
     assert network(catalog, Motion=OTHER).push(frames).t_us[0] == 1000
