@@ -233,6 +233,7 @@ def read(path: Path) -> Frames:
     frames = tx.read(path, text, LIKE, parse, _base(head, text), head.is_relative)
     frames.t_us[:] += head.start_us
     add_counts(frames.refused, {"bad_date": int(head.has_bad_date)})
+    add_counts(frames.refused, {"bad_line": int(head.has_bad_base)})
     if head.has_end_mark and b"end triggerblock" not in text[-TAIL_BYTES:].tobytes().lower():
         frames.refused.setdefault("truncated", 1)  # cut between two lines
     return frames

@@ -31,6 +31,7 @@ class Header(NamedTuple):
 
     start_us: int
     has_bad_date: bool
+    has_bad_base: bool
     base: int
     is_relative: bool
     has_end_mark: bool
@@ -47,6 +48,7 @@ def header(raw: bytes) -> Header:
     return Header(
         start_us or 0,
         start_us is None,
+        stated is None and bool(get_close_matches("base", words, 1, 0.7)),
         {"hex": 16, "dec": 10}[stated[1].lower()] if stated else 0,
         bool(get_close_matches("relative", words, 1, 0.8)),  # one letter may be damaged
         block is not None,

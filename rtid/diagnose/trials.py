@@ -6,6 +6,7 @@ exactly where something large is left, because a bent map misleads their derivat
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -132,7 +133,8 @@ def physical(fit_: Fit, candidate: Candidate, value: float) -> float:
         value *= float(fit_.view.t_s[-1] - fit_.view.t_s[0])
     if MODULUS in by_fit:
         at = list(chambers_by_place(fit_.model)[candidate.where])
-        value *= float(np.mean(fit_.weights.compliance[at]) / np.mean(fit_.compliance[at]))
+        fitted = float(np.mean(fit_.compliance[at]))  # none: an oil that cannot be compressed
+        value *= float(np.mean(fit_.weights.compliance[at])) / fitted if fitted else math.inf
     return value
 
 

@@ -65,7 +65,7 @@ def _numbers(model: Machine) -> Iterator[Unfit]:
     needed = [model.position, *(chamber.pressure for chamber in model.chambers if chamber.pressure)]
     for name in needed:
         signal = model.signals[model.column(name)]
-        if not signal.noise**2 + signal.resolution**2 > 0:
+        if not signal.noise * signal.noise + signal.resolution * signal.resolution > 0:
             yield Unfit(
                 f"signals.{name}", "noise and resolution are zero", "declare the sensor's noise"
             )

@@ -23,6 +23,7 @@ WINDOW_S = 0.02  # over which the speed is taken
 MOVES = 0.02  # of the top speed: below, the machine stands
 SPEED_BINS = 80
 LAG_MS, LAG_TOLERANCE_MS = 2.0, 5.0  # of a spool: every real one has some lag
+LONGEST_S = 1e6  # of a record, seconds: behind a damaged stamp nothing is looked for
 MOST_S = 120.0  # of a record: a diagnosis of more takes longer than a minute
 
 
@@ -227,7 +228,7 @@ def _span(samples: Samples, x: FloatArray) -> tuple[float, float] | None:
     t = (samples.t_us - samples.t_us[0]) * 1e-6
     if t[-1] <= MOST_S:
         return None
-    seconds = np.arange(int(t[-1]) + 1)
+    seconds = np.arange(int(min(t[-1], LONGEST_S)) + 1)
     smooth = np.interp(seconds, t, x)
     way = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(smooth)))])
     last = len(way) - int(MOST_S) - 1

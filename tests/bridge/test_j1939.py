@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import json
 import re
+import threading
+import time
 from pathlib import Path
 
+import can
 import numpy as np
 import pytest
+from can.interfaces import virtual
 
 from firmware_bridge import catalog as catalogs
 from firmware_bridge import frames as fr
@@ -261,6 +265,22 @@ def foreign(until_ms: float, n: int) -> list[tuple[float, int, bytes]]:
     return rows
 
 
+def project_text(folder: Path, seconds: float) -> tuple[str, dict[str, np.ndarray]]:
+    """A project of the simulated machine on such a bus, and its signals every 10 ms."""
+    run = simulate(SimulatedPlant(), "rich", 0, seconds)
+    columns = {name: run.samples.column(name)[::10] for name in COLUMNS.values()}
+    write_run(folder / "run.parquet", run, 0, "rich")
+    text = (folder / "run.toml").read_text().replace("builtin:controller.dbc", "machine.dbc")
+    text = re.sub(r"(?m)^mode = .*", 'mode = "multirate"', text)
+    for name, period in (("ValveCommand", 10), ("Motion", 10), ("Pressures", 20)):
+        text = re.sub(
+            rf"(?m)(^\[messages\.{name}\]\n(?:(?!\[).*\n)*)",
+            f"[messages.{name}]\nperiod_ms = {period}\n\n",
+            text,
+        )
+    return text, columns
+
+
 def learned(folder: Path, columns: dict[str, np.ndarray], text: str, plain: bool) -> FlowMap:
     dbc(folder / "machine.dbc", plain)
     blf.write(folder / "run.blf", as_bus(columns, plain))
@@ -271,17 +291,7 @@ def learned(folder: Path, columns: dict[str, np.ndarray], text: str, plain: bool
 def test_a_machine_on_j1939_gives_the_maps_of_the_same_samples_on_plain_can(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run = simulate(SimulatedPlant(), "rich", 0, 40.0)
-    columns = {name: run.samples.column(name)[::10] for name in COLUMNS.values()}
-    write_run(tmp_path / "run.parquet", run, 0, "rich")
-    text = (tmp_path / "run.toml").read_text().replace("builtin:controller.dbc", "machine.dbc")
-    text = re.sub(r"(?m)^mode = .*", 'mode = "multirate"', text)
-    for name, period in (("ValveCommand", 10), ("Motion", 10), ("Pressures", 20)):
-        text = re.sub(
-            rf"(?m)(^\[messages\.{name}\]\n(?:(?!\[).*\n)*)",
-            f"[messages.{name}]\nperiod_ms = {period}\n\n",
-            text,
-        )
+    text, columns = project_text(tmp_path, 40.0)
     folders = tmp_path / "plain", tmp_path / "j1939"
     for folder in folders:
         folder.mkdir()
@@ -303,3 +313,42 @@ def test_a_machine_on_j1939_gives_the_maps_of_the_same_samples_on_plain_can(
     assert code in (0, 4), err
     assert "PSupply" in out
     assert len(open_log(folders[1] / "run.blf")) > len(columns["u"]) * 3
+
+
+@pytest.mark.slow  # it waits for the bus
+def test_the_daemon_learns_from_j1939_as_it_comes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`rtid run` on a virtual bus: long messages in packets, among others' traffic."""
+    text, columns = project_text(tmp_path, 8.0)
+    dbc(tmp_path / "machine.dbc")
+    (tmp_path / "machine.toml").write_text(f"{text}\n[daemon]\nrate_hz = 100.0\nrecord_mb = 0\n")
+    frames, is_over = as_bus(columns, plain=False), threading.Event()
+
+    def send_in_time() -> None:
+        """The frames with their own stamps, at the bus's pace, until the daemon has ended."""
+        with can.Bus(interface="virtual", channel="j1939", preserve_timestamps=True) as bus:
+            while len(virtual.channels["j1939"]) < 2 and not is_over.wait(0.05):
+                pass  # nobody hears yet
+            start_s = time.monotonic()
+            for t_us, message in zip(frames.t_us, fr.to_messages(frames), strict=True):
+                while 1e-6 * t_us > time.monotonic() - start_s and not is_over.wait(0.005):
+                    pass
+                if is_over.is_set():
+                    return
+                bus.send(message)
+
+    sender = threading.Thread(target=send_in_time)
+    sender.start()
+    words = tmp_path / "machine.toml", "--bus", "virtual:j1939", "--test-bus", "--for", 3, "--json"
+    try:
+        code, out, err = rtid(capsys, "run", *words, "--state", tmp_path / "state")
+    finally:
+        is_over.set()
+        sender.join()
+    assert code in (0, 4), err  # 4: the last state was not saved in time, on a busy computer
+    status = json.loads(out.splitlines()[-1])
+    assert status["estimate"]["samples"] > 100, status["estimate"]
+    counts = status["estimate"]["refused"]
+    assert counts["transport_foreign"] > 3 and counts["other_source"] > 20, counts
+    assert not counts.get("silent") and not counts.get("transport_broken", 0) > 1, counts

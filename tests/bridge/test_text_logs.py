@@ -214,6 +214,14 @@ def test_a_lone_stray_stamp_is_refused_a_step_of_the_clock_is_not(tmp_path: Path
     assert frames.refused == {"stray_stamp": 4, "clock_step": 1}
 
 
+def test_a_header_whose_base_cannot_be_read_is_counted(tmp_path: Path) -> None:
+    text = "date Sun Sep 13 12:26:40.0 2020\nbase {}  timestamps absolute\n"
+    text += "".join(f" 0.{k:03d}000 1  120  Rx   d 8 EC A0 38 05 00 10 8D 02\n" for k in range(99))
+    for base, refused in (("hex", {}), ("hdx", {"bad_line": 1})):
+        frames = read(tmp_path, "t.asc", text.format(base))
+        assert len(frames) == 99 and frames.refused == refused
+
+
 GVRET = {  # SavvyCAN since 2016, before, and loggers that know one bus
     "Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8": "{t},{i},{x},Rx,{b},{d}",
     "Time Stamp,ID,Extended,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8": "{t},{i},{x},{b},{d}",
