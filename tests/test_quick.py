@@ -23,6 +23,7 @@ from rtid.sim.hidden import hide_wish
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import SimulatedPlant
+from rtid.study import quick_machine
 from rtid.study.quick_machine import (
     MOST_S,
     Given,
@@ -239,6 +240,14 @@ def test_a_foreign_bus_needs_its_dbc(folder: Path, tmp_path: Path) -> None:
     assert "0x6AB" in done.stderr and "--dbc" in done.stderr
     assert quick(log, "--dbc", folder / "none.dbc").returncode == Exit.INPUT
     assert quick(folder / "leak.blf", "--bore", 30, "--rod", 40).returncode == Exit.USAGE
+
+
+def test_a_stamp_years_ahead_costs_no_memory() -> None:
+    t_us = np.append(np.arange(0, 300_000_000, 100_000), 2**52).astype(np.int64)
+    x = np.sin(1e-7 * t_us)
+    samples = Samples(("x",), t_us, x[:, None], np.full(len(x), ROW, np.uint8))
+    span = quick_machine._span(samples, x)
+    assert span is not None and span[1] - span[0] == quick_machine.MOST_S
 
 
 def test_the_dead_band_is_half_of_where_motion_begins() -> None:

@@ -139,7 +139,9 @@ def read_parquet(path: Path) -> Table:
         numbers = _numbers(file.read([field.name]).column(field.name))
         meta = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
         scale, offset = float(meta.get("scale", 1.0)), float(meta.get("offset", 0.0))
-        result.append((field.name, offset + scale * numbers, meta.get("unit", "")))
+        with np.errstate(over="ignore", invalid="ignore"):  # damaged ones: missing values
+            values = offset + scale * numbers
+        result.append((field.name, values, meta.get("unit", "")))
     return named_columns(path, result)
 
 

@@ -112,3 +112,6 @@ def test_a_number_that_no_sensor_sends_is_a_missing_value(tmp_path: Path) -> Non
     samples, counts = to_samples(read_table(path), ROLES)
     assert samples.t_us.tolist() == [0, 3000]
     assert counts == {"not_available": 2, "out_of_order": 1}
+    field = pa.field("p", pa.float64(), metadata={"scale": "1e300", "offset": "nan"})
+    pq.write_table(pa.table([[1e300, 2.0]], pa.schema([field])), tmp_path / "t.parquet")
+    assert np.isnan(read_table(tmp_path / "t.parquet").columns["p"]).all()

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rtid.estimator.limits import most_open
+from rtid.estimator.limits import most_open, unfit
 from rtid.estimator.record import fit_record
 from rtid.estimator.solution import solve
 from rtid.estimator.state import build
@@ -65,6 +65,11 @@ def test_what_the_kernels_cannot_hold_is_refused(change: dict[str, object], mess
         model = replace(model, signals=signals)
     with pytest.raises(ValueError, match=message):
         build(model)
+
+
+def test_a_noise_beyond_all_measure_is_no_crash() -> None:
+    model = draw_case(0).model
+    assert unfit(model.with_noise({model.position: 1e200})) == unfit(model)
 
 
 @pytest.mark.parametrize("form", ["integral", "carry"])
