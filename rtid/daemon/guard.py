@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -29,7 +30,7 @@ from rtid.compare.foretelling import (
     sigma_m3s,
 )
 from rtid.compare.suspects import MOST_S, LikelyCause, causes
-from rtid.daemon.first import wrong_signs
+from rtid.daemon.first import follows_command, wrong_signs
 from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.solution import Solution
 from rtid.estimator.state import nominal_weights
@@ -207,7 +208,7 @@ class Guard:
             is_judge = self.level is not None or self.state == "proving"
             if self.against or (is_judge and window.contradicts):
                 rises = window.cusum[0] > 0.0
-                self.since_s = window.cusum[1] if rises else float(self._recent[0][0, 0])
+                self.since_s = window.cusum[1] if rises else self._disobeys_since_s()
                 self.state = "contradicted"
                 self._alarm_s, self._due = float(self._recent[-1][-1, 0]), self._moved + AGAIN
                 self._rows = None  # a way back needs new motion
@@ -220,6 +221,15 @@ class Guard:
             return False
         self.state, self.has_foretold = "proven", is_enough
         return True
+
+    def _disobeys_since_s(self) -> float:
+        """Begin of the newest samples, without which the machine follows its command."""
+        pairs = [*pairwise(self._recent)]
+        obeys = [follows_command(self._model, np.concatenate(pair)) for pair in pairs]
+        if not any(obeys) or obeys[-1]:  # what is wrong is not the command's sign
+            return float(self._recent[0][0, 0])
+        last = max(k for k, does in enumerate(obeys) if does)
+        return float(pairs[last][1][0, 0])
 
     def _is_elsewhere(self, window: Seconds) -> bool:
         """Whether the machine works where the map knows little, as a healthy one may.

@@ -243,6 +243,8 @@ def test_a_command_that_turns_its_sign_in_a_run_is_named(bench: Bench) -> None:
         elif not named and (causes := guard.later_causes()) is not None:
             named = [*(cause.text for cause in causes), *guard.against]
     assert any(words in text for text in named for words in FAULTS["u reversed"].names), named
+    begin_s = chunk[0, 0] + 8.0
+    assert begin_s - 6.0 <= guard.since_s <= begin_s + 1.0, "what was learned before is kept"
 
 
 def test_a_lost_baseline_yields_to_a_shadow_that_foretells(

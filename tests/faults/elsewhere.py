@@ -80,7 +80,7 @@ ELSEWHERE: dict[int, tuple[str, tuple[str, ...]]] = {
 IN_SOAK = {  # also, or alone, in `make soak`
     6: "changes of the plant, live",
     14: "a full bus for minutes",
-    17: "50 kills",
+    17: "50 kills, or RTID_SOAK_KILLS",
     21: "overload by four busy processes",
     28: "hours in minutes",
     37: "the loop beside an open page under load",
