@@ -59,6 +59,9 @@ def test_learned_map_explains_what_the_fit_has_not_seen(machine: Learned) -> Non
     assert sum(new.shares.values()) == pytest.approx(1.0)
     assert seen.shares["extrapolated"] == 0.0
     assert new.shares["extrapolated"] > 0.0
+    still = replace(new, measured_m3s=np.zeros_like(new.measured_m3s))
+    with np.errstate(all="raise"):
+        assert np.isnan(still.residual_share).all()
 
 
 def test_comparison_needs_no_whole_second(machine: Learned) -> None:

@@ -84,8 +84,11 @@ class Comparison:
 
     @property
     def residual_share(self) -> FloatArray:
-        """The residual's share of the flow, root mean squares (chambers,); NaN without rows."""
-        return self.residual_rms_m3s / self.flow_rms_m3s
+        """The residual's share of the flow, root mean squares (chambers,); NaN without a flow."""
+        flow = self.flow_rms_m3s
+        return np.divide(
+            self.residual_rms_m3s, flow, out=np.full_like(flow, np.nan), where=flow > 0
+        )
 
 
 def refitted(
