@@ -100,6 +100,7 @@ class Plain(ast.NodeTransformer):
         plain = {
             "ddt": "({0}) / second",
             "delay": "({0}) * ({1}) / second",
+            "lag": "({0}) * ({1}) / second",
             "play": "({0}) + ({1})",
             "Q": "Q * (({0}) / volt) * (({1}) / pascal)",
         }

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from rtid.diagnose.consequence import Consequence, consequence, is_stable
 from rtid.diagnose.contest import contest, trials_of
 from rtid.diagnose.exact import carried_on
 from rtid.diagnose.excuse import few_excused
@@ -28,7 +29,7 @@ from rtid.diagnose.trials import (
     physical,
     scored,
 )
-from rtid.diagnose.verdict import MATERIAL, NAMED, UNKNOWN, can_judge, verdict
+from rtid.diagnose.verdict import MATERIAL, NAMED, UNKNOWN, can_judge, most_rho, verdict
 from rtid.effects.column import Candidate
 from rtid.effects.page import Effect
 from rtid.model import Machine
@@ -123,8 +124,9 @@ def _bare(state: TrialState, first: Fit) -> Fit:
 def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Residual] | None:
     """Add the best cause that is significant and material; None when there is none.
 
-    One that is significant but changes next to nothing is only listed, unless it explains a part of
-    the misfit that would be found in another guise.
+    Material is what the held-out residual shows, or what the maps have taken in (`consequence`).
+    One that changes next to nothing is only listed, unless it explains a part of the misfit that
+    would be found in another guise.
     """
     least = LATER_GAIN if state.found or state.given else GAIN
     trials = [t for t in trials_of(state, present) if t.gain > least]
@@ -136,13 +138,14 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
         trial, alike = contest(state, present, best, trials)
         now = with_covariances(carried_on(state, present, trial), like=present)
         after = residual(now, state.held_out)
-        limit = BENT * own_share(now, trial, state.held_out)
-        share = min(material_share(last, after), limit)
-        if share >= MATERIAL:
+        own = own_share(now, trial, state.held_out)
+        share = min(material_share(last, after), BENT * own)
+        is_shown = share >= MATERIAL
+        does = None if is_shown else taken_in(present, now, trial, own, last, after)
+        if is_shown or does is not None:
             kept, after = _with_bank(state, now)
-            state.found.append(
-                AcceptedEffect(trial.key, alike, trial.gain, trial.n_parameters, last, after)
-            )
+            what = trial.key, alike, trial.gain, trial.n_parameters
+            state.found.append(AcceptedEffect(*what, last, after, does))
             return kept, after
         state.negligible[trial.key] = share
         if _is_noticed(present, trial) and after.rms_m3s <= WORSE * last.rms_m3s:
@@ -150,6 +153,22 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
             return _with_bank(state, now)
         del now  # its rows are large
     return None
+
+
+def taken_in(
+    present: Fit, now: Fit, trial: Trial, own_flow: float, last: Residual, after: Residual
+) -> Consequence | None:
+    """What leaving out an effect that the residual hardly shows does; None where that is nothing.
+
+    own_flow: of the rms flow; last, after: residuals without and with it.  One that
+    explains most of a misfit beyond the noise's is no matter of taste.
+    """
+    if after.rms_m3s > WORSE * last.rms_m3s:
+        return None
+    does = consequence(present, now, own_flow)
+    misfit = present.held.sse - present.regression.dof
+    is_needed = present.rho >= most_rho(present) and trial.gain > SHARE * misfit
+    return does if (does.is_material or is_needed) and is_stable(now, trial) else None
 
 
 def _with_bank(state: TrialState, now: Fit) -> tuple[Fit, Residual]:

@@ -9,6 +9,8 @@ made anew, and the standard deviations follow without simulating a machine.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from rtid.diagnose.fit import Fit, one_pass
@@ -19,6 +21,10 @@ from rtid.plain import FloatArray
 SWING, RATES_HZ = 0.2, (0.03, 0.11)  # of the supply
 STEEP = 0.05  # of the largest dQ/du: a command that hardly opens its valve is left alone
 MOST_V = 2.0  # that the command is moved by
+
+FLOW = "flow"  # kind of an effect
+AT_REST_S = 1.0  # with all valves shut: enough to tell a leak from a map
+STEADY = 0.05  # of its mean: a supply that varies less is constant
 
 Limits = dict[Candidate, tuple[float, float]]
 
@@ -66,3 +72,28 @@ def limits(fit: Fit) -> Limits:
         after = other.regression.score(other.estimate.used, column).sd
         limits_of[candidate] = LIMIT_SD * before, LIMIT_SD * after
     return limits_of
+
+
+def would_separate(fit: Fit, kind: str) -> Iterator[str]:
+    """Motions that would keep an effect out of the maps, but for those that the record has.
+
+    kind: of its page; only a flow goes on while the valves are shut.
+    """
+    edges = fit.declared.edges
+    if kind == FLOW and not any(edge.safe_band_v > 0.0 for edge in edges):
+        yield "declare the command below which each valve is surely shut (safe_band)"
+    elif kind == FLOW and _shut_s(fit) < AT_REST_S:
+        yield "rest under load for some seconds with all valves shut"
+    if fit.view.supply_name:
+        supply = fit.view.signal(fit.view.supply_name)
+        if float(np.std(supply)) < STEADY * abs(float(np.mean(supply))):
+            yield f"vary the supply's pressure by {100 * SWING:.0f} % in the same motion"
+
+
+def _shut_s(fit: Fit) -> float:
+    """How long all valves are surely shut in a record."""
+    shut = np.ones(fit.view.n - 1, bool)
+    for edge in fit.declared.edges:
+        command = edge.direction * fit.chunk[:-1, 2 + fit.declared.column(edge.command)]
+        shut &= command <= edge.safe_band_v
+    return float(np.sum(fit.view.dt_s[shut]))

@@ -207,6 +207,7 @@ def one_pass(
     weak = slice(first - len(shapes) - sum(len(psi) for _, psi in revision.timings), first)
     regression.prior[weak] = RIDGE * regression.own[weak] + (regression.own[weak] == 0.0)
     at = [first + columns.candidates.index(e) for e in revision.effects]
+    regression.prior[at] += regression.own[at] == 0.0  # what never acts here is held at nothing
     estimate = regression.fit((*range(1, first), *at))
     fixed = regression.fit((*range(1, 1 + len(model.chambers)), *at))
     flowmap = MapTerms(rows.cells, projected.terms(list(fixed.used), fixed.theta), NO_COV)

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtrc
 
+from rtid.diagnose.consequence import Consequence
 from rtid.diagnose.diagnosis import Result
 from rtid.diagnose.excuse import steady
-from rtid.diagnose.experiment import limits
+from rtid.diagnose.experiment import limits, would_separate
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.regression import Score
 from rtid.diagnose.remains import described
@@ -43,8 +44,26 @@ class Value:
 
 
 @dataclass(frozen=True)
+class HiddenInMap:
+    """What leaving an effect out bends where the residual hardly shows it: shares, 1.
+
+    own_flow: of the rms flow, None for a timing; maps: root mean square over the visits, of an
+    edge's largest flow; beta: relative, of the chambers whose modulus leaves its interval;
+    separates: what would keep it out of the maps.
+    """
+
+    own_flow: float | None
+    maps: dict[str, float]
+    beta: dict[str, float]
+    separates: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class FoundEffect:
-    """An effect that was found, in the order of addition."""
+    """An effect that was found, in the order of addition.
+
+    hidden_in_map: None where the residual shows it.
+    """
 
     effect: str
     where: str
@@ -54,6 +73,7 @@ class FoundEffect:
     heldout_gain_pct: float
     heldout_residual_before_m3s: float
     heldout_residual_after_m3s: float
+    hidden_in_map: HiddenInMap | None = None
 
     @property
     def alike(self) -> tuple[Key, ...]:
@@ -169,7 +189,17 @@ def _effect(result: Result, accepted: AcceptedEffect) -> FoundEffect:
         heldout_gain_pct=100.0 * (1.0 - after / before),
         heldout_residual_before_m3s=before,
         heldout_residual_after_m3s=after,
+        hidden_in_map=_hidden(result.last, accepted.key[0], accepted.hidden),
     )
+
+
+def _hidden(fit: Fit, effect: str, does: Consequence | None) -> HiddenInMap | None:
+    if does is None:
+        return None
+    pages = dict(catalogue()) | {s.name: s for s in fit.suspects}
+    own = does.own_share if np.isfinite(does.own_share) else None
+    separates = would_separate(fit, pages[effect].kind)
+    return HiddenInMap(own, dict(does.maps), dict(does.beta), tuple(separates))
 
 
 def _named(result: Result, best: Key, other: Key) -> str:

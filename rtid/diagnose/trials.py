@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,6 +24,9 @@ from rtid.effects.laws import cause_of
 from rtid.effects.page import Effect
 from rtid.model import Machine
 from rtid.plain import FloatArray, Key, Progress
+
+if TYPE_CHECKING:
+    from rtid.diagnose.consequence import Consequence
 
 GAIN = 16.0  # chi2 of the first effect: 60 candidates, 0.4 % for all of them together
 TIE, TIE_SHARE = 12.0, 0.03  # causes within so much of the best gain are not told apart
@@ -60,7 +64,11 @@ class Trial:
 
 @dataclass(frozen=True)
 class AcceptedEffect:
-    """An effect that was added: by how much chi2 fell, with how many parameters; residuals."""
+    """An effect that was added: by how much chi2 fell, with how many parameters; residuals.
+
+    hidden: what leaving it out does, where the maps had taken it in and the residual does not show
+    it.
+    """
 
     key: Key
     alike: tuple[Key, ...]
@@ -68,6 +76,7 @@ class AcceptedEffect:
     n_parameters: int
     before: Residual
     after: Residual
+    hidden: Consequence | None = None
 
 
 @dataclass

@@ -4,6 +4,7 @@
     q_c = term                           into each chamber, or into both alike
     q_c = sigma * term                   by an edge, or by all of them
     q_c = outer * ddt(inner)             of what is stored; "G = ..." may stand before it
+    q_c = outer * ddt(lag(inner, tau))   of what is stored behind a narrow port
 
 The column that a diagnosis scores, the term that runs live and in free runs, and what a unit takes
 up per Pa follow from these.  What an equation cannot say is a law by name in `rtid.effects.laws`.
@@ -29,6 +30,7 @@ from rtid.plain import FloatArray
 MODULUS, LENGTH, BEGIN = "beta", "t_r", "t_m"  # what only a fit knows: oil, length of the record
 BOTH, ALL_EDGES, EACH_EDGE = "both", "all valves", "edge"
 MAP = "Q of "  # before an edge's name: its flow by the fitted map
+LAGGED = "lag("  # before what is stored behind a port
 NO_SHAPE: Mapping[str, float] = MappingProxyType({})
 Nodes = Mapping[str, Node]
 Volumes = dict[int, FloatArray]  # chamber -> (n - 1,) m3
@@ -37,11 +39,15 @@ Shape = tuple[float, ...]
 
 @dataclass(frozen=True)
 class LawLine:
-    """One line of an equation for a coefficient of 1: q_left = outer, or outer * d(inner)/dt."""
+    """One line of an equation for a coefficient of 1: q_left = outer, or outer * d(inner)/dt.
+
+    late: the symbol of the time constant that the inner follows itself with, "" for none.
+    """
 
     left: str
     outer: Node
     inner: Node | None
+    late: str = ""
 
     def put(self, by: Nodes) -> LawLine:
         """The line with names replaced by trees."""
@@ -82,6 +88,11 @@ class Placed:
                 slope = derivative(line.inner, view.model.chambers[c].pressure)
                 result[c] = -values.at_samples(line.outer) * values.at_samples(slope)
         return result
+
+    def lag_s(self, shape: Shape) -> float:
+        """The time constant that what is stored follows itself with; 0 where there is none."""
+        values = {p.symbol: value for p, value in zip(self.effect.shapes, shape, strict=True)}
+        return max((values.get(line.late, 0.0) for _, line in self.lines), default=0.0)
 
     def _values(self, view: RecordView, shape: Shape) -> Values:
         pairs = zip(self.effect.shapes, shape, strict=True)
@@ -126,7 +137,10 @@ def _line(rest: str, right: str, coefficient: str, known: Nodes) -> LawLine | No
         if not inner.endswith(")") or "ddt(" in inner:
             return None
         inner = inner[:-1]
-    line = LawLine(rest, _tree(outer), _tree(inner) if has_rate else None).put(known)
+    late = ""
+    if inner.startswith(LAGGED):
+        inner, _, late = inner.removeprefix(LAGGED).removesuffix(")").rpartition(",")
+    line = LawLine(rest, _tree(outer), _tree(inner) if has_rate else None, late.strip()).put(known)
     if line.inner is not None and coefficient in names_of(line.inner):
         line = replace(line, inner=derivative(line.inner, coefficient))
     else:
@@ -292,8 +306,9 @@ class Values:
     def volume(self, line: LawLine) -> FloatArray:
         """Over each interval (n - 1,), m3: the command is held, all else linear between samples."""
         if line.inner is not None:
-            outer = self.at_samples(line.outer)
-            return np.asarray(0.5 * (outer[1:] + outer[:-1]) * np.diff(self.at_samples(line.inner)))
+            outer, lag_s = self.at_samples(line.outer), self.values.get(line.late, 0.0)
+            inside = lagged(self.at_samples(line.inner), self.view.step_s, lag_s)
+            return np.asarray(0.5 * (outer[1:] + outer[:-1]) * np.diff(inside))
         names, view = names_of(line.outer), self.view
         if FUNCTION not in names and not any(n in view.held or n.startswith(MAP) for n in names):
             return view.over_intervals(self.at_samples(line.outer))
@@ -318,6 +333,16 @@ class Values:
     def _mapped(self, name: str) -> FloatArray:
         edges = [edge.name for edge in self.view.model.edges]
         return self.view.flow(edges.index(name.removeprefix(MAP)))
+
+
+def lagged(values: FloatArray, step_s: float, lag_s: float) -> FloatArray:
+    """First-order lag of values (n,), SI, started at the first value; none for 0."""
+    if lag_s <= 0.0:
+        return values
+    fade = float(np.exp(-step_s / lag_s))
+    from scipy.signal import lfilter  # noqa: PLC0415 - takes long to import
+
+    return np.asarray(lfilter([1 - fade], [1, -fade], values - values[0]) + values[0])
 
 
 def flow_in_python(effect: Effect, seen: Seen, shape: Mapping[str, float]) -> FloatArray:

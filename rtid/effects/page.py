@@ -97,10 +97,11 @@ class Effect:
     """One effect: what its page says.
 
     equation: lines "left = right" in the language of `rtid.effects.expression`, with the notations
-    ddt(z), delay(z, tau) and play(z, width) besides; symbols: all quantities in them that are not
-    parameters.  places: where it may act.  signals: what must be measured.  confounders: names of
-    effects that look alike.  separates: the motion that tells them apart.  visible_when: under
-    which conditions it can be seen at all; `invisible` if a free map swallows it always.
+    ddt(z), lag(z, tau), delay(z, tau) and play(z, width) besides; symbols: all quantities in them
+    that are not parameters.  places: where it may act.  signals: what must be measured.
+    confounders: names of effects that look alike.  separates: the motion that tells them apart.
+    visible_when: under which conditions it can be seen at all; `invisible` if a free map swallows
+    it always.
 
     law: name of a law in `rtid.effects.laws` where the equation cannot be one; no_law: why it has
     none.  quantities, spills: of the states of a plant by equations on which it may act, and if
@@ -273,7 +274,7 @@ def _tidy(value: Any) -> Any:
     return " ".join(value.split()) if isinstance(value, str) else value
 
 
-NOTATION = ("ddt", "delay", "play")  # of an equation, besides the functions of an expression
+NOTATION = ("ddt", "lag", "delay", "play")  # of an equation, besides the functions of an expression
 
 
 def words_of(equation: tuple[str, ...]) -> tuple[str, ...]:

@@ -7,7 +7,15 @@ from dataclasses import dataclass, replace
 from rtid.compare.dependence import Dependence
 from rtid.diagnose.fit import NO_COV, Fit, one_pass
 from rtid.diagnose.partial import AddedVariable, Exhibit, Rise
-from rtid.diagnose.report import Diagnosis, FittedEffect, FoundEffect, Small, Unseen, Value
+from rtid.diagnose.report import (
+    Diagnosis,
+    FittedEffect,
+    FoundEffect,
+    HiddenInMap,
+    Small,
+    Unseen,
+    Value,
+)
 from rtid.diagnose.revision import Revision
 from rtid.effects.column import Candidate
 from rtid.effects.laws.pump import PUMP
@@ -111,6 +119,6 @@ CLASSES: dict[str, tuple[type, ...]] = {
     FIT: _SEED,
     LEARNED: (Learned, RecordFit, Solution, Block, KnownEffect, Value, *_SEED, *_MODEL),
     FLOWS: (PublishedMap, EdgeMap, Grid),
-    SAID: (Said, Diagnosis, FittedEffect, FoundEffect, Unseen, Small, Value, Doubt),
+    SAID: (Said, Diagnosis, FittedEffect, FoundEffect, HiddenInMap, Unseen, Small, Value, Doubt),
     EVIDENCE: (Exhibit, AddedVariable, Rise, Dependence),
 }

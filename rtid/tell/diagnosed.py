@@ -12,6 +12,7 @@ from rtid.tell.story import Chart, Story, Table
 from rtid.tell.words import VERDICTS, quantity
 from rtid.units import CONVENTION, limit
 
+MOST_BENDS = 2  # maps that a sentence names
 SHOWN = 14  # rows of the table of what was not found
 
 
@@ -127,15 +128,38 @@ def _one(diagnosis: Diagnosis, effect: FoundEffect) -> str:
     )
     before = percent(diagnosis, effect.heldout_residual_before_m3s)
     after = percent(diagnosis, effect.heldout_residual_after_m3s)
-    text = (
-        f"{title(effect.effect)} at {effect.where}: {sizes}. Adding it lowers the held-out error "
-        f"from {before} to {after}; the sensors' floor is "
+    does = hidden(effect) or (
+        f"Adding it lowers the held-out error from {before} to {after}; the sensors' floor is "
         f"{percent(diagnosis, diagnosis.noise_floor_m3s)}."
     )
+    text = f"{title(effect.effect)} at {effect.where}: {sizes}. {does}"
     if effect.cannot_be_told_from:
         others = ", ".join(name.replace("_", " ") for name in effect.cannot_be_told_from)
         text += f" It cannot be told apart from {others} in this record."
     return text
+
+
+def hidden(effect: FoundEffect) -> str:
+    """What an effect bends that the maps have taken in; "" where the residual shows it."""
+    if effect.hidden_in_map is None:
+        return ""
+    does = effect.hidden_in_map
+    bends = sorted(does.maps.items(), key=lambda bend: -bend[1])[:MOST_BENDS]
+    parts = [f"the map {name} {_share(bend)} of its largest flow" for name, bend in bends]
+    parts += [f"beta {name} {_share(abs(move))}" for name, move in does.beta.items()]
+    own = f"; its own flow is {_share(does.own_flow)} of the rms flow" if does.own_flow else ""
+    text = f"The maps hide it: the error hardly shows it, yet without it {_and(parts)} off{own}."
+    return f"{text} To separate it: {_and(list(does.separates))}." if does.separates else text
+
+
+def _share(share: float) -> str:
+    return f"{100 * share:.2g} %"
+
+
+def _and(parts: list[str]) -> str:
+    """A list in words."""
+    *first, last = parts
+    return f"{', '.join(first)} and {last}" if first else last
 
 
 def percent(diagnosis: Diagnosis, residual_m3s: float) -> str:
@@ -210,11 +234,10 @@ def _first(diagnosis: Diagnosis, first: FoundEffect, floor: str) -> str:
     big = f", {quantity(sizes[0])} (95 %)" if len(sizes) == 1 else ""
     before = percent(diagnosis, first.heldout_residual_before_m3s)
     after = percent(diagnosis, first.heldout_residual_after_m3s)
-    words = (
-        f"{title(first.effect)} at {first.where}{big}. Adding it lowers the {judged(diagnosis)} "
-        f"from "
-        f"{before} to {after}; {floor}. {remains(diagnosis)}"
-    ).rstrip()
+    does = hidden(first) or (
+        f"Adding it lowers the {judged(diagnosis)} from {before} to {after}; {floor}."
+    )
+    words = f"{title(first.effect)} at {first.where}{big}. {does} {remains(diagnosis)}".rstrip()
     if first.cannot_be_told_from:
         others = ", ".join(
             title(name.partition(" (")[0]).lower() for name in first.cannot_be_told_from

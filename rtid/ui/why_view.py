@@ -14,7 +14,7 @@ from rtid.effects import effect as page_of
 from rtid.effects.page import Effect as Page
 from rtid.effects.page import EffectError, readable, title
 from rtid.tell.charts.theme import NARROWEST_PX, beside
-from rtid.tell.diagnosed import heading, judged, percent, said
+from rtid.tell.diagnosed import heading, hidden, judged, percent, said
 from rtid.tell.html import button, clearness, table, text
 from rtid.tell.live import PanelPlot
 from rtid.tell.report_story import Ranked
@@ -127,7 +127,7 @@ def _found(diagnosis: Diagnosis, effect: FoundEffect) -> str:
         f"sensors' "
         f"floor is {percent(diagnosis, diagnosis.noise_floor_m3s)}</dd><dt>explains as much</dt>"
         f"<dd>{text(told_apart)}</dd><dt>by chance</dt><dd>"
-        f"{_chance(effect.p_value)}</dd></dl>{_choices(effect)}</div>"
+        f"{_chance(effect.p_value)}</dd></dl>{text(hidden(effect))}{_choices(effect)}</div>"
     )
 
 

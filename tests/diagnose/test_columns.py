@@ -83,7 +83,9 @@ def test_softness_is_the_derivative_of_the_column_by_the_pressure(effect: str) -
     """A single sample's pressure taken up: what the column stores more, per Pa."""
     own = next((c for c in causes(view()) if c.candidate.effect == effect), None)
     assert own is not None
-    shape = own.shapes[len(own.shapes) // 2]
+    middle = own.shapes[len(own.shapes) // 2]  # behind a port, a single sample is not seen
+    names = zip(own.candidate.shape_names, middle, strict=True)
+    shape = tuple(0.0 if name == "port_lag" else value for name, value in names)
     soft = softness(view(), own.at(shape))
     for k in (500, 9000, 21000):
         for c, taken in soft.items():

@@ -9,16 +9,6 @@ from rtid.effects.record_view import RecordView
 from rtid.plain import FloatArray
 
 
-def lagged(values: FloatArray, step_s: float, lag_s: float) -> FloatArray:
-    """First-order lag of values (n,), SI, started at the first value; none for 0."""
-    if lag_s <= 0.0:
-        return values
-    fade = float(np.exp(-step_s / lag_s))
-    from scipy.signal import lfilter  # noqa: PLC0415 - takes long to import
-
-    return np.asarray(lfilter([1 - fade], [1, -fade], values - values[0]) + values[0])
-
-
 def stored(view: RecordView, c: int, what: FloatArray) -> FloatArray:
     """- V d(what) over each interval (n - 1,), V in the middle of it."""
     v = view.volume(c)

@@ -10,8 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from rtid.effects.column import Cause, of_page
-from rtid.effects.law import Shape, Volumes
-from rtid.effects.laws.common import lagged
+from rtid.effects.law import Shape, Volumes, lagged
 from rtid.effects.laws.timing import played
 from rtid.effects.page import Effect
 from rtid.effects.record_view import RecordView

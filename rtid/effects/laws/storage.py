@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from rtid.effects.column import Candidate, Cause, Columns
-from rtid.effects.law import Shape, Volumes, places_of
+from rtid.effects.law import Placed, Shape, Volumes, lagged, places_of
 from rtid.effects.laws.common import stored
 from rtid.effects.record_view import RecordView
 from rtid.estimator.state import variance
@@ -33,25 +33,37 @@ def add_echoes(
         echo = columns.add({c: view.compliance[c] * stored(view, c, noise[c])})
         columns.echo_of[1 + c] = 1 + n_c + echo
 
-    def soft(cause: Cause, shape: Shape) -> Volumes:
-        return softness(view, cause.at(shape))
+    def echo_of(cause: Cause, shape: Shape) -> Volumes:
+        return _echo(view, cause.at(shape), noise)
 
-    taken_up = [cause.slope_of(partial(soft, cause), shape, k) for cause, shape, k in slopes]
-    taken_up += [softness(view, candidate) for candidate in columns.candidates]
-    for k, by_chamber in enumerate(taken_up):
+    echoes = [cause.slope_of(partial(echo_of, cause), shape, k) for cause, shape, k in slopes]
+    echoes += [_echo(view, candidate, noise) for candidate in columns.candidates]
+    for k, by_chamber in enumerate(echoes):
         if by_chamber:
-            echo = columns.add({c: -np.diff(m * noise[c]) for c, m in by_chamber.items()})
-            columns.echo_of[1 + n_c + first + k] = 1 + n_c + echo
+            columns.echo_of[1 + n_c + first + k] = 1 + n_c + columns.add(by_chamber)
+
+
+def _echo(view: RecordView, candidate: Candidate, noise: Volumes) -> Volumes:
+    """What a storage effect makes of the pressures' noise alone, chamber -> (n,) Pa; {} else."""
+    placed = _placed(view, candidate)
+    if placed is None:
+        return {}
+    taken_up, lag_s = placed.softness(view, candidate.shape), placed.lag_s(candidate.shape)
+    return {c: -np.diff(lagged(m * noise[c], view.step_s, lag_s)) for c, m in taken_up.items()}
 
 
 def softness(view: RecordView, candidate: Candidate) -> Volumes:
     """What one unit of a storage effect takes up per Pa, by chamber (n,), m3/Pa; {} for others."""
+    placed = _placed(view, candidate)
+    return placed.softness(view, candidate.shape) if placed is not None else {}
+
+
+def _placed(view: RecordView, candidate: Candidate) -> Placed | None:
+    """An effect by its equation where it sits; None for a law by name."""
     if candidate.law.law:
-        return {}
-    for placed in places_of(candidate.law, view.model, view.compliance):
-        if placed.where == candidate.where:
-            return placed.softness(view, candidate.shape)
-    return {}
+        return None
+    places = places_of(candidate.law, view.model, view.compliance)
+    return next((placed for placed in places if placed.where == candidate.where), None)
 
 
 def total_softness(view: RecordView, sizes: Iterable[tuple[Candidate, float]]) -> FloatArray:

@@ -1,0 +1,149 @@
+"""What leaving an effect out does: to the published maps, to the moduli, and by its own flow.
+
+A free map swallows what is nearly a function of (u, dp): a leak of a tenth of the flow may leave a
+held-out residual at the sensors' floor, and a map that is as much wrong.  So an effect matters by
+its consequence.  It is believed where it is *stable*: the sizes from two halves of the record, and
+from a grid of half the spacing, agree with the size from all of it.
+
+    bend of a map = rms(Q_without - Q_with) / largest Q_with,  over the intervals of the record
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rtid.diagnose.fit import Fit, one_pass
+from rtid.diagnose.residual import KNOWN
+from rtid.diagnose.trials import Trial
+from rtid.effects.record_view import RecordView
+from rtid.model import Grid, Machine
+from rtid.plain import FloatArray
+from rtid.units import Z95
+
+OWN = 0.01  # of the rms flow: an effect's own flow from which it matters
+BEND = 0.01  # of its largest flow: a map's move
+SOFTER = 0.01  # of the modulus: its move, if beyond its 95 % interval without the effect
+ALIKE = 0.1  # of the size: within so much, two sizes agree whatever their intervals say
+PART = 0.5  # of the record, each of the two
+
+
+@dataclass(frozen=True)
+class Consequence:
+    """What leaving one effect out does.
+
+    own_share: its own flow, of the rms flow, NaN for a timing; maps: edge and bend, of its largest
+    flow; beta: chamber and relative move of its modulus, where that is beyond its 95 % interval.
+    """
+
+    own_share: float
+    maps: tuple[tuple[str, float], ...]
+    beta: tuple[tuple[str, float], ...]
+
+    @property
+    def is_material(self) -> bool:
+        """True where at least one of them matters."""
+        bent = max((bend for _, bend in self.maps), default=0.0)
+        softer = max((abs(move) for _, move in self.beta), default=0.0)
+        return self.own_share >= OWN or bent >= BEND or softer >= SOFTER
+
+
+def consequence(present: Fit, now: Fit, own_share: float) -> Consequence:
+    """Of leaving out what `now` has and `present` has not; own_share: of its flow, inf if none."""
+    return Consequence(
+        own_share if np.isfinite(own_share) else float("nan"),
+        tuple(_bends(present, now)),
+        tuple(_softer(present, now)),
+    )
+
+
+def _bends(present: Fit, now: Fit) -> Iterator[tuple[str, float]]:
+    """Edge by edge, over the intervals in which it is open and both maps are known."""
+    record = now.model, now.sent, now.weights
+    with_it, without = (RecordView.of(*record, fit.map) for fit in (now, present))
+    known = with_it.inside & without.inside
+    known &= (with_it.flow_sd() < KNOWN) & (without.flow_sd() < KNOWN)
+    for i, edge in enumerate(now.model.edges):
+        flow, other = with_it.flow(i), without.flow(i)
+        open_ = known & ((flow != 0.0) | (other != 0.0))
+        if open_.any():
+            largest = max(float(np.abs(flow[open_]).max()), 1e-300)
+            yield edge.name, float(np.sqrt(np.mean((flow - other)[open_] ** 2))) / largest
+
+
+def _softer(present: Fit, now: Fit) -> Iterator[tuple[str, float]]:
+    half = Z95 * np.sqrt(np.maximum(np.diag(present.compliance_cov), 0.0))
+    moves = now.compliance - present.compliance
+    for chamber, was, move, within in zip(
+        now.model.chambers, present.compliance, moves, half, strict=True
+    ):
+        if abs(move) > within and was != 0.0:
+            yield chamber.name, float(was / (was + move) - 1.0) if was + move else float("inf")
+
+
+def is_stable(now: Fit, trial: Trial) -> bool:
+    """True where the halves of the record, and a finer grid, give the size that all of it gives.
+
+    Halves that could not tell the size from nothing confirm nothing.
+    """
+    whole = _size(now, trial)
+    middle = int(PART * len(now.chunk))
+    parts = now.chunk[:middle], now.chunk[middle:]
+    first, last = (_size(_again(now, now.declared, part), trial) for part in parts)
+    tells = Z95 * float(np.hypot(first[1], last[1])) < abs(whole[0])
+    if not tells or not _agree(first, last):
+        return False
+    return _agree(whole, _size(_again(now, finer(now.declared), now.chunk), trial))
+
+
+def _again(now: Fit, machine: Machine, chunk: FloatArray) -> Fit:
+    """The same revision on another grid or part, chunk (n, 2 + signals), SI; one pass is near."""
+    weights = now.weights
+    if machine is not now.declared:
+        slopes, missed = (_spread(now.declared, w) for w in (weights.slopes, weights.missed))
+        weights = replace(weights, slopes=slopes, missed=missed)
+    return one_pass(machine, chunk, weights, now.revision, None, False, thorough=False)
+
+
+def _size(fit: Fit, trial: Trial) -> tuple[float, float]:
+    """The first parameter of the effect that was tried last, and its standard deviation."""
+    spread = float(np.sqrt(max(1.0, fit.rho)))
+    if trial.is_timing:
+        k = len(fit.revision.timings) - 1
+        column = fit.timing_columns(k)[0]
+        value = fit.revision.timings[k][1][0] + fit.estimate.value(column)
+    else:
+        column = fit.column(fit.revision.effects[-1])
+        value = fit.held.value(column)
+    return value, spread * fit.estimate.sd(column)
+
+
+def _agree(a: tuple[float, float], b: tuple[float, float]) -> bool:
+    (value, sd), (other, other_sd) = a, b
+    apart = abs(value - other)
+    return apart <= max(Z95 * float(np.hypot(sd, other_sd)), ALIKE * abs(value))
+
+
+def finer(machine: Machine) -> Machine:
+    """The same machine with every block cut into four."""
+    edges = []
+    for edge in machine.edges:
+        u, dp = (_halved(border) for border in (edge.grid.u_v, edge.grid.dp_pa))
+        edges.append(replace(edge, grid=Grid(u, dp)))
+    return replace(machine, edges=tuple(edges))
+
+
+def _halved(border: FloatArray) -> FloatArray:
+    return np.sort(np.concatenate([border, 0.5 * (border[1:] + border[:-1])]))
+
+
+def _spread(machine: Machine, of_cells: FloatArray) -> FloatArray:
+    """What every cell has (cells,), given to the four that it is cut into."""
+    parts = []
+    for edge, first in zip(machine.edges, machine.first_cells, strict=True):
+        nu, nd = edge.grid.shape
+        here = of_cells[first : first + nu * nd].reshape(nu, nd)
+        parts.append(here.repeat(2, axis=0).repeat(2, axis=1).ravel())
+    return np.concatenate(parts)

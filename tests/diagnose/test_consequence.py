@@ -1,0 +1,106 @@
+"""What the maps have taken in: found by its consequence, sized, and quiet where nothing is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rtid.diagnose import consequence as evidence
+from rtid.diagnose.consequence import Consequence, finer, is_stable
+from rtid.diagnose.diagnosis import Result, search
+from rtid.diagnose.experiment import FLOW, would_separate
+from rtid.diagnose.report import Diagnosis, diagnosis
+from rtid.diagnose.trials import Trial
+from rtid.diagnose.verdict import MATERIAL
+from rtid.tell.diagnosed import sentences
+from tests.diagnose.records import record
+
+LEAK = "external_leakage_laminar", 1e-12, 4, "sweep"
+
+
+@pytest.fixture(scope="module")
+def result() -> Result:
+    return search(*record(*LEAK))
+
+
+@pytest.fixture(scope="module")
+def told(result: Result) -> Diagnosis:
+    return diagnosis(result)
+
+
+def test_a_leak_that_only_the_maps_show_is_named_with_its_size(told: Diagnosis) -> None:
+    """The residual falls by less than 0.3 % of the flow: it was "too small to matter"."""
+    (own,) = told.found
+    names = {own.effect, *(name.split(" ")[0] for name in own.cannot_be_told_from)}
+    assert told.verdict in ("missing", "ambiguous") and LEAK[0] in names
+    fall = own.heldout_residual_before_m3s**2 - own.heldout_residual_after_m3s**2
+    assert fall < (MATERIAL * told.rms_flow_m3s) ** 2
+    does = own.hidden_in_map
+    assert does is not None
+    assert max([*does.maps.values(), *map(abs, does.beta.values())]) >= 0.01
+    value = next(iter(own.parameters.values()))
+    if own.effect == LEAK[0]:
+        assert abs(value.value - LEAK[1]) < max(3 * value.std, 0.1 * LEAK[1])
+
+
+def test_it_is_said_with_what_it_bends(told: Diagnosis) -> None:
+    text = " ".join(sentences(told))
+    assert "The maps hide it" in text and "of its largest flow" in text
+    assert "vary the supply's pressure" in text
+    json = told.as_json()["found"][0]["hidden_in_map"]
+    assert set(json) == {"own_flow", "maps", "beta", "separates"}
+
+
+def test_advice_never_asks_for_what_the_record_has(result: Result) -> None:
+    asked = list(would_separate(result.last, FLOW))
+    assert any("rest under load" in text for text in asked)
+    assert any("supply" in text for text in asked)
+    still = result.last.chunk.copy()
+    still[:3000, 2 + result.last.declared.column("u")] = 0.0
+    supply = 2 + result.last.declared.column("p_supply")
+    still[:, supply] *= 1.0 + 0.2 * np.sin(np.arange(len(still)) / 3000)
+    has_both = replace(result.last, chunk=still)
+    view = replace(result.last.view, chunk=has_both.sent)
+    vars(has_both)["view"] = view
+    assert not list(would_separate(has_both, FLOW))
+
+
+Sizes = list[tuple[float, float]]  # value and sd: of all, of both halves, on the finer grid
+
+
+@pytest.mark.parametrize(
+    ("sizes", "is_believed"),
+    [
+        ([(1.0, 0.02), (1.01, 0.03), (0.98, 0.03), (1.0, 0.03)], True),
+        ([(1.0, 0.02), (1.4, 0.03), (0.7, 0.03), (1.0, 0.03)], False),  # ends half-way
+        ([(1.0, 0.02), (1.4, 0.90), (0.7, 0.90), (1.0, 0.03)], False),  # halves tell nothing
+        ([(1.0, 0.02), (1.01, 0.03), (0.98, 0.03), (0.5, 0.03)], False),  # the grid made it
+    ],
+)
+def test_a_size_must_be_that_of_both_halves_and_of_a_finer_grid(
+    result: Result, monkeypatch: pytest.MonkeyPatch, sizes: Sizes, is_believed: bool
+) -> None:
+    told = iter(sizes)
+    monkeypatch.setattr(evidence, "_size", lambda *_: next(told))
+    last, accepted = result.last, result.found[0]
+    assert is_stable(last, Trial(accepted.key, accepted.gain, last.revision)) == is_believed
+
+
+@pytest.mark.parametrize("seed", [3, 4, 5])
+def test_a_clean_sweep_stays_quiet(seed: int) -> None:
+    said = diagnosis(search(*record("", 0.0, seed, "sweep")))
+    assert (said.verdict, said.found) == ("matches", ())
+
+
+def test_each_limb_alone_is_material() -> None:
+    assert Consequence(0.02, (), ()).is_material
+    assert Consequence(float("nan"), (("pa", 0.02),), ()).is_material
+    assert Consequence(0.0, (), (("a", -0.02),)).is_material
+    assert not Consequence(0.009, (("pa", 0.009),), (("a", 0.009),)).is_material
+
+
+def test_every_block_is_cut_into_four() -> None:
+    model, _, _ = record()
+    assert finer(model).n_cells == 4 * model.n_cells
