@@ -13,6 +13,7 @@ from rtid.effects.law import Shape, Volumes
 from rtid.effects.laws import cause_of, causes
 from rtid.effects.laws.common import supply_change
 from rtid.effects.laws.pump import demand
+from rtid.effects.laws.sensors import late
 from rtid.effects.laws.timing import COMMAND, SUPPLY, TIMINGS
 from rtid.effects.laws.timing import lagged as lagged_command
 from rtid.effects.page import Effect
@@ -45,6 +46,8 @@ def add_timing(
         for j in range(len(psi)):
             if timing.where == SUPPLY:
                 columns.add(supply_change(view, -timing.change(demand(view), 1, dt_s, psi, j)))
+            elif timing.of_sensor:
+                columns.add(late(view, timing))
             else:
                 change = {
                     name: change_of(u, d, dt_s, revision.timings, k, j)

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from rtid.effects.laws.pump import demand
+from rtid.effects.laws.sensors import sensor_of
 from rtid.effects.laws.timing import COMMAND, SUPPLY, Psi, TimingLaw
 from rtid.effects.record_view import RecordView
 from rtid.model import Machine
@@ -53,14 +54,19 @@ def transformed(model: Machine, chunk: FloatArray, timings: Timings) -> FloatArr
     """
     dt_s = float(np.median(np.diff(chunk[:, 0])))
     sent = [through(u, d, dt_s, timings) for d, u in commands(model, chunk).values()]
-    return lowered(split(model), np.column_stack([chunk, *sent]), timings)
+    return _put_right(split(model), np.column_stack([chunk, *sent]), timings)
 
 
-def lowered(model: Machine, chunk: FloatArray, timings: Timings) -> FloatArray:
-    """The record of the split machine, its supply lowered as a timing of the supply says.
+def _put_right(model: Machine, chunk: FloatArray, timings: Timings) -> FloatArray:
+    """The record of the split machine, its sensors and its supply as the timings have them.
 
     chunk (n, 2 + signals), SI: changed in place.
     """
+    dt_s = float(np.median(np.diff(chunk[:, 0])))
+    for timing, psi in timings:
+        if timing.of_sensor:
+            column = 2 + model.column(sensor_of(model, timing))
+            chunk[:, column] = timing.apply(chunk[:, column].copy(), dt_s, psi)
     for timing, psi in timings:
         if timing.where == SUPPLY:
             view = RecordView.without_map(model, chunk)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from rtid.diagnose.exact import carried_on, timing_trials, with_pump
+from rtid.diagnose.exact import carried_on, key_of, timing_trials, with_pump
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.trials import (
     TIE,
@@ -16,6 +16,7 @@ from rtid.diagnose.trials import (
     scored,
     with_effect,
 )
+from rtid.effects.laws.sensors import sensor_timings
 from rtid.effects.laws.timing import COMMAND
 from rtid.plain import Key
 
@@ -25,13 +26,15 @@ REFUTED, WITHIN = 3.0, 0.05  # times the best cause's misfit; least misfit, of d
 def trials_of(state: TrialState, present: Fit) -> list[Trial]:
     """Every possible cause with its best shape: fixed columns, and timings where they matter."""
     best = best_by_key(present, scored(present))
+    timed = {key for key in best if key[1] == COMMAND}
+    timed |= {key_of(timing) for timing in sensor_timings(state.model)}
     trials = []
     for key, (candidate, score) in best.items():
-        if key[1] == COMMAND:
+        if key in timed:
             continue
         trials.append(Trial(key, score.gain, with_effect(present, candidate)))
     trials = with_pump(state, present, refined(state, present, trials))
-    scored_timings = {key[0]: scores for key, scores in best.items() if key[1] == COMMAND}
+    scored_timings = {key: scores for key, scores in best.items() if key in timed}
     other = max((t.gain for t in trials if t.key not in state.negligible), default=0.0)
     return trials + timing_trials(state, present, scored_timings, other)
 

@@ -14,12 +14,13 @@ from rtid.diagnose.search import Beside
 from rtid.diagnose.trials import GAIN, Trial, TrialState, scored
 from rtid.effects.column import Candidate
 from rtid.effects.laws.pump import PUMP, demand
-from rtid.effects.laws.timing import COMMAND, TIMINGS, Psi, TimingLaw
+from rtid.effects.laws.sensors import sensor_timings
+from rtid.effects.laws.timing import TIMINGS, Psi, TimingLaw
 from rtid.plain import Key
 
 LARGE = 1.5  # rho above which timing effects are refitted whatever their score
 CLOSE = 0.9  # timings whose coarse gain is this share of the best are refitted finely
-NO_HINTS: Mapping[str, float] = MappingProxyType({})
+NO_HINTS: Mapping[Key, float] = MappingProxyType({})
 PROMISING = 0.3  # share of the best gain that a timing's bank must reach to be closed in on
 # pumps to begin with: droops as shares of that seen, quantiles of the demand, stiffness in Pa/m3
 DROOPS, PUMP_LIMITS, STIFFNESSES = (0.1, 0.7), (0.8, 0.93, 0.98), (1e9, 1e10, 1e11, 1e12)
@@ -29,7 +30,10 @@ def with_pump(state: TrialState, present: Fit, trials: list[Trial]) -> list[Tria
     """A supply that sags is refitted exactly, from where its first-order forms point."""
     first = [t for t in trials if t.effect.effect == PUMP.effect]
     rest = [t for t in trials if t.effect.effect != PUMP.effect]
-    if not first or first[0].gain < PROMISING * max((t.gain for t in rest), default=0.0):
+    if not first:
+        return rest
+    bar = PROMISING * max((t.gain for t in rest), default=0.0)
+    if first[0].gain < bar and not _sags(state, present, bar):
         return rest
     psi = state.coarse.beside(present).polished(PUMP, _pumps(present))
     timings = (*present.revision.timings, (PUMP, psi))
@@ -37,6 +41,18 @@ def with_pump(state: TrialState, present: Fit, trials: list[Trial]) -> list[Tria
     now = fit(state.model, state.chunk, present.weights, revision, bank=False)
     gain = present.held.sse - now.held.sse
     return [*rest, Trial(first[0].key, gain, now.revision, now.light(), True)]
+
+
+def _sags(state: TrialState, present: Fit, bar: float) -> bool:
+    """True where the supply is declared constant, and a pump explains more than a bar from afar.
+
+    A sag that is not small bends the maps: its first-order forms say little of it.
+    """
+    view = present.view
+    if present.rho < LARGE or np.ptp(view.signal(view.supply_name)) > 0.0:
+        return False
+    beside = state.coarse.beside(present)
+    return max(beside.gain(PUMP, psi) for psi in _pumps(present)) >= bar
 
 
 def _pumps(present: Fit) -> list[Psi]:
@@ -53,21 +69,27 @@ def _pumps(present: Fit) -> list[Psi]:
 
 
 def timing_trials(
-    state: TrialState, present: Fit, scores: dict[str, tuple[Candidate, Score]], other: float
+    state: TrialState, present: Fit, scores: dict[Key, tuple[Candidate, Score]], other: float
 ) -> list[Trial]:
     """Exact refits with one timing more, of those that may matter; scores: of the first order."""
-    open_ = [t for t in TIMINGS if not present.revision.has((t.effect, COMMAND))]
+    timings = (*TIMINGS, *sensor_timings(state.model))
+    open_ = [t for t in timings if not present.revision.has(key_of(t))]
     if present.rho < LARGE:
-        open_ = [t for t in open_ if t.effect in scores and scores[t.effect][1].gain > GAIN]
+        open_ = [t for t in open_ if key_of(t) in scores and scores[key_of(t)][1].gain > GAIN]
     if not open_ or not present.view.has_pressures:
         return []
-    hints = {t.effect: _strength(t, *scores[t.effect]) for t in open_ if t.effect in scores}
+    hints = {key_of(t): _strength(t, *scores[key_of(t)]) for t in open_ if key_of(t) in scores}
     return exact_trials(state, present, open_, other, hints)
 
 
 def _strength(timing: TimingLaw, candidate: Candidate, score: Score) -> float:
     """How strong the first order takes a timing to be: so many times that of its column."""
-    return score.value * timing.strength(candidate.shape)
+    return score.value * (timing.strength(candidate.shape) if candidate.shape else 1.0)
+
+
+def key_of(timing: TimingLaw) -> Key:
+    """Name and place of a timing, as of a candidate."""
+    return timing.effect, timing.where
 
 
 def exact_trials(
@@ -75,7 +97,7 @@ def exact_trials(
     present: Fit,
     timings: list[TimingLaw],
     other: float = 0.0,
-    hints: Mapping[str, float] = NO_HINTS,
+    hints: Mapping[Key, float] = NO_HINTS,
 ) -> list[Trial]:
     """Refits with one of these timings more, the best of each name.
 
@@ -92,7 +114,7 @@ def exact_trials(
         now = tried(state.model, state.chunk, present.weights, revision)
         if not _is_inside(now):
             continue
-        exact, key = present.held.sse - now.estimate.sse, (timing.effect, COMMAND)
+        exact, key = present.held.sse - now.estimate.sse, key_of(timing)
         if key not in trials or exact > trials[key].gain:
             trials[key] = Trial(key, exact, now.revision, now, True)
     return list(trials.values())
@@ -107,18 +129,18 @@ def carried_on(state: TrialState, present: Fit, trial: Trial) -> Fit:
 
 
 def _from_afar(
-    coarse: Beside, timings: list[TimingLaw], other: float, hints: Mapping[str, float]
+    coarse: Beside, timings: list[TimingLaw], other: float, hints: Mapping[Key, float]
 ) -> list[tuple[float, TimingLaw, Psi]]:
     """Gain and parameters of every promising timing on the coarse map; one of each name."""
-    banks = {timing: coarse.bank(timing, hints.get(timing.effect, 0.0)) for timing in timings}
+    banks = {timing: coarse.bank(timing, hints.get(key_of(timing), 0.0)) for timing in timings}
     bar = PROMISING * max([other, *(max(bank.values()) for bank in banks.values())])
-    best: dict[str, tuple[float, TimingLaw, Psi]] = {}
+    best: dict[Key, tuple[float, TimingLaw, Psi]] = {}
     for timing, bank in banks.items():
         if max(bank.values()) < bar or max(bank.values()) <= 0.0:
             continue
         psi, gain = coarse.closed_in(timing, bank)
-        if timing.effect not in best or gain > best[timing.effect][0]:
-            best[timing.effect] = gain, timing, psi
+        if key_of(timing) not in best or gain > best[key_of(timing)][0]:
+            best[key_of(timing)] = gain, timing, psi
     return list(best.values())
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from rtid.diagnose.contest import alike_ones
 from rtid.diagnose.diagnosis import LEAST_SHARE, taken_in
-from rtid.diagnose.exact import carried_on, exact_trials, with_pump
+from rtid.diagnose.exact import carried_on, exact_trials, key_of, with_pump
 from rtid.diagnose.excuse import few_excused
 from rtid.diagnose.standing import Standing, with_bank
 from rtid.diagnose.trials import (
@@ -31,6 +31,7 @@ from rtid.diagnose.trials import (
 )
 from rtid.diagnose.verdict import MATERIAL
 from rtid.effects.laws.pump import PUMP
+from rtid.effects.laws.sensors import sensor_timings
 from rtid.effects.laws.timing import COMMAND, TIMINGS
 from rtid.errors import RtidError
 from rtid.plain import Key
@@ -83,16 +84,19 @@ def extend(present: Standing, effect: str, where: str = "") -> Extension:
 
 def _timings(present: Standing, effect: str, where: str) -> list[Trial]:
     """Refits with a timing of that name; none if there is no such timing."""
-    timings = [t for t in TIMINGS if t.effect == effect]
+    all_timings = (*TIMINGS, *sensor_timings(present.state.model))
+    timings = [t for t in all_timings if t.effect == effect]
     if not timings:
         return []
-    _refuse_place(effect, where, [COMMAND])
-    if present.fit.revision.has((effect, COMMAND)):
-        raise _already(effect, COMMAND)
+    _refuse_place(effect, where, [t.where for t in timings])
+    taken = [t.where for t in timings if present.fit.revision.has(key_of(t))]
+    timings = [t for t in timings if t.where not in taken and where in ("", t.where)]
+    if not timings:
+        raise _already(effect, taken[0])
     trials = exact_trials(present.state, present.fit, timings)
     if not trials:
         raise RefusedError(
-            f"{effect} at {COMMAND}: the fit ends at nothing, or at a bound of its parameters",
+            f"{effect} at {timings[0].where}: the fit ends at nothing, or at a bound",
             "`rtid diagnose` says what this record would have shown",
         )
     return trials

@@ -31,6 +31,7 @@ from rtid.effects.law import Volumes
 from rtid.effects.laws import cause_of
 from rtid.effects.laws.common import supply_change
 from rtid.effects.laws.pump import demand
+from rtid.effects.laws.sensors import late
 from rtid.effects.laws.timing import SUPPLY, lagged
 from rtid.effects.record_view import MapTerms, RecordView
 from rtid.plain import FloatArray, Key
@@ -225,6 +226,8 @@ def _changed(fit: Fit, k: int) -> Volumes:
     view, timings = fit.view, fit.revision.timings
     if timing.where == SUPPLY:
         return supply_change(view, -timing.apply(demand(view), view.step_s, psi))
+    if timing.of_sensor:
+        return {c: psi[0] * series for c, series in late(view, timing).items()}
     others = timings[:k] + timings[k + 1 :]
     change = {}
     for name, (direction, u) in commands(fit.declared, fit.chunk).items():

@@ -15,6 +15,7 @@ from rtid.diagnose.revision import Revision
 from rtid.effects.column import Candidate, Cause
 from rtid.effects.laws import causes
 from rtid.effects.laws.pump import PUMP
+from rtid.effects.laws.sensors import sensor_timings
 from rtid.effects.laws.timing import COMMAND, TIMINGS, Psi, TimingLaw
 from rtid.effects.page import Effect
 from rtid.effects.record_view import RecordView
@@ -56,8 +57,9 @@ def recall(
 
     Raises PartError where a part fits no effect of this machine and record.
     """
-    timings = tuple((t, psi) for p in parts if (timing := _timing(p)) for t, psi in [timing])
-    fixed = [p for p in parts if _timing(p) is None]
+    told = [(part, _timing(model, part)) for part in parts]
+    timings = tuple(timing for _, timing in told if timing is not None)
+    fixed = [part for part, timing in told if timing is None]
     if not fixed:
         return Revision((), timings)
     sent, whole = transformed(model, chunk, timings), split(model)
@@ -66,9 +68,9 @@ def recall(
     return Revision(tuple(_candidate(p, offered) for p in fixed), timings)
 
 
-def _timing(part: AddedEffect) -> tuple[TimingLaw, Psi] | None:
-    for timing in (*TIMINGS, PUMP):
-        if (timing.effect, timing.own_spools) == (part.effect, part.own_spools):
+def _timing(model: Machine, part: AddedEffect) -> tuple[TimingLaw, Psi] | None:
+    for timing in (*TIMINGS, PUMP, *sensor_timings(model)):
+        if timing.is_at(*part.key) and timing.own_spools == part.own_spools:
             return timing, tuple(_value(part, name) for name in timing.parameters)
     if part.where == COMMAND:
         raise _unfit(part, "is no effect on a command")

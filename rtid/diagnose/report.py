@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtrc
 
+from rtid.diagnose.clean import Cut, cuts
 from rtid.diagnose.consequence import Consequence
 from rtid.diagnose.diagnosis import Result
 from rtid.diagnose.excuse import steady
@@ -137,6 +138,7 @@ class Diagnosis:
     negligible: tuple[Small, ...]
     advice: tuple[str, ...]
     doubts: tuple[Doubt, ...] = ()
+    cut: tuple[Cut, ...] = ()
 
     @property
     def is_slight(self) -> bool:
@@ -174,6 +176,7 @@ def diagnosis(result: Result) -> Diagnosis:
         ),
         advice=advice(result, unseen),
         doubts=doubts_about(last),
+        cut=cuts(last.declared, last.chunk),
     )
 
 
@@ -212,7 +215,7 @@ def parameters(fit: Fit, key: Key) -> dict[str, Value]:
     values: dict[str, Value] = {}
     spread = np.sqrt(max(1.0, fit.rho))
     for k, (timing, psi) in enumerate(fit.revision.timings):
-        if timing.effect == key[0]:
+        if timing.is_at(*key):
             for name, unit, value, j in zip(
                 timing.parameters, timing.units, psi, fit.timing_columns(k), strict=True
             ):

@@ -31,5 +31,4 @@ class Revision:
 
     def has(self, key: tuple[str, str]) -> bool:
         """True where a cause is part of it."""
-        names = [t.effect for t, _ in self.timings]
-        return key in [e.key for e in self.effects] or key[0] in names
+        return key in [e.key for e in self.effects] or any(t.is_at(*key) for t, _ in self.timings)

@@ -18,7 +18,7 @@ from rtid.diagnose.fit import Fit, columns_of_effects, prepare
 from rtid.diagnose.thinned import Thinning
 from rtid.effects.column import Columns
 from rtid.effects.law import Volumes
-from rtid.effects.laws.timing import SUPPLY, Psi, TimingLaw
+from rtid.effects.laws.timing import COMMAND, Psi, TimingLaw
 from rtid.estimator.state import Weights
 from rtid.model import Grid, Machine
 from rtid.plain import FloatArray
@@ -64,7 +64,7 @@ class Search:
 
     def sent(self, timings: Timings) -> FloatArray:
         """The thinned record (n // m, 2 + signals), SI, of the split machine."""
-        if any(timing.where == SUPPLY for timing, _ in timings):
+        if any(timing.where != COMMAND for timing, _ in timings):
             whole = transformed(self.declared, self.chunk, timings)
             return self.thinning.record(self.split, whole)
         sent = [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from rtid.diagnose.clean import saturated
 from rtid.diagnose.excuse import rho_of_all
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.residual import Residual
@@ -12,6 +13,7 @@ from rtid.estimator.validity import Doubt, doubts
 
 MATERIAL = 0.003  # of the rms flow: what an effect must change of the held-out residual
 NAMED = 0.8  # of the misfit that effects must explain to be named where something else remains
+MOST_CUT = 0.5  # of the record, that may be lost to pressures at an end of their range
 LEAST_ROWS = 50  # filtered rows that a part must have to be judged by
 LEAST_EVIDENCE = 1000  # scalar rows of the record
 MOVES = 5.0  # times the sensors' floor that the measured flow of a part must reach to judge by it
@@ -50,7 +52,8 @@ def verdict(
     is_unseen: the part is not the one that taught the maps, which may have taken an effect in.
     """
     has_moved = last.regression.rows >= LEAST_EVIDENCE and len(last.map.cells) > 0
-    if not has_moved or not can_judge(after):
+    is_whole = float(np.mean(saturated(last.declared, last.chunk))) <= MOST_CUT
+    if not (has_moved and is_whole and can_judge(after)):
         return INSUFFICIENT
     if not state.found:
         # what was seen and is too small in a record that judges itself may matter on other motion,

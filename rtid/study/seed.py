@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from rtid.compare.dependence import Dependence
+from rtid.diagnose.clean import Cut
 from rtid.diagnose.fit import NO_COV, Fit, one_pass
 from rtid.diagnose.partial import AddedVariable, Exhibit, Rise
 from rtid.diagnose.report import (
@@ -19,6 +20,7 @@ from rtid.diagnose.report import (
 from rtid.diagnose.revision import Revision
 from rtid.effects.column import Candidate
 from rtid.effects.laws.pump import PUMP
+from rtid.effects.laws.sensors import sensor_timings
 from rtid.effects.laws.timing import TIMINGS, Psi
 from rtid.effects.page import Effect as Page
 from rtid.effects.record_view import MapTerms
@@ -38,12 +40,13 @@ from rtid.study.known_effects import KnownEffect
 class Seed:
     """Weights and revision of a fit, and the map (cells, terms) that gave its columns.
 
-    timings: (effect, whether the spools are apart, parameters).  Pages of effects are not kept.
+    timings: (effect, place, whether the spools are apart, parameters).  Pages of effects are not
+    kept.
     """
 
     weights: Weights
     effects: tuple[Candidate, ...]
-    timings: tuple[tuple[str, bool, Psi], ...]
+    timings: tuple[tuple[str, str, bool, Psi], ...]
     sizes: tuple[tuple[Candidate, float], ...]
     cells: IntArray
     terms: FloatArray
@@ -52,7 +55,7 @@ class Seed:
     def of(cls, fit: Fit) -> Seed:
         """The seed of a fit."""
         revision = fit.revision
-        timings = tuple((t.effect, t.own_spools, psi) for t, psi in revision.timings)
+        timings = tuple((t.effect, t.where, t.own_spools, psi) for t, psi in revision.timings)
         map_ = fit.before
         effects = tuple(replace(effect, page=None) for effect in revision.effects)
         sizes = tuple((replace(effect, page=None), size) for effect, size in revision.sizes)
@@ -69,8 +72,9 @@ class Seed:
         def with_page(effect: Candidate) -> Candidate:
             return replace(effect, page=pages.get(effect.effect))
 
-        kinds = {(t.effect, t.own_spools): t for t in (*TIMINGS, PUMP)}
-        timings = tuple((kinds[effect, apart], psi) for effect, apart, psi in self.timings)
+        laws = (*TIMINGS, PUMP, *sensor_timings(model))
+        kinds = {(t.effect, t.where, t.own_spools): t for t in laws}
+        timings = tuple((kinds[effect, at, apart], psi) for effect, at, apart, psi in self.timings)
         effects = tuple(map(with_page, self.effects))
         sizes = tuple((with_page(effect), size) for effect, size in self.sizes)
         revision = Revision(effects, timings, sizes)
@@ -119,6 +123,17 @@ CLASSES: dict[str, tuple[type, ...]] = {
     FIT: _SEED,
     LEARNED: (Learned, RecordFit, Solution, Block, KnownEffect, Value, *_SEED, *_MODEL),
     FLOWS: (PublishedMap, EdgeMap, Grid),
-    SAID: (Said, Diagnosis, FittedEffect, FoundEffect, HiddenInMap, Unseen, Small, Value, Doubt),
+    SAID: (
+        Said,
+        Diagnosis,
+        FittedEffect,
+        FoundEffect,
+        HiddenInMap,
+        Unseen,
+        Small,
+        Value,
+        Doubt,
+        Cut,
+    ),
     EVIDENCE: (Exhibit, AddedVariable, Rise, Dependence),
 }

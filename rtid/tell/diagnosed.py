@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from rtid.diagnose.clean import Cut
 from rtid.diagnose.report import Diagnosis, FoundEffect, Unseen, Value
 from rtid.diagnose.trials import MATCH_RHO
 from rtid.diagnose.verdict import INSUFFICIENT, MATCHES, MATERIAL, UNKNOWN
@@ -12,6 +13,7 @@ from rtid.tell.story import Chart, Story, Table
 from rtid.tell.words import VERDICTS, quantity
 from rtid.units import CONVENTION, limit
 
+SLIGHTLY_CUT = 1e-3  # of a record: less is not worth a sentence
 MOST_BENDS = 2  # maps that a sentence names
 SHOWN = 14  # rows of the table of what was not found
 
@@ -35,6 +37,7 @@ def sentences(diagnosis: Diagnosis) -> list[str]:
             "The machine moves too little in the held-out part, or where the map is not known: the "
             "errors are those of the record that taught the model."
         )
+    lines += [_not_judged(cut) for cut in diagnosis.cut if cut.share > SLIGHTLY_CUT]
     lines += [_one(diagnosis, effect) for effect in diagnosis.found]
     if rest := remains(diagnosis):
         lines.append(rest)
@@ -47,6 +50,21 @@ def sentences(diagnosis: Diagnosis) -> list[str]:
         )
     doubts = [f"{doubt.text[0].upper()}{doubt.text[1:]}" for doubt in diagnosis.doubts]
     return lines + doubts + [f"{text}" for text in diagnosis.advice[:4]]
+
+
+def _not_judged(cut: Cut) -> str:
+    """What a pressure at an end of its range has cut, and what that may mean."""
+    begin, end = max(cut.spans_s, key=lambda span: span[1] - span[0])
+    limit = quantity(Value(cut.limit_pa, float("nan"), "Pa"))
+    why = (
+        "the chamber cavitates, a make-up valve feeds it, or the sensor's range is too short"
+        if cut.is_low
+        else "a relief valve holds it, or the sensor's range is too short"
+    )
+    return (
+        f"{_share(cut.share)} of the record was not judged: {cut.signal} stood at {limit}, the end "
+        f"of its range, the longest from {begin:.2f} to {end:.2f} s: {why}."
+    )
 
 
 def remains(diagnosis: Diagnosis) -> str:
@@ -145,10 +163,12 @@ def hidden(effect: FoundEffect) -> str:
         return ""
     does = effect.hidden_in_map
     bends = sorted(does.maps.items(), key=lambda bend: -bend[1])[:MOST_BENDS]
-    parts = [f"the map {name} {_share(bend)} of its largest flow" for name, bend in bends]
-    parts += [f"beta {name} {_share(abs(move))}" for name, move in does.beta.items()]
+    parts = [f"the map {name} ({_share(bend)} of its largest flow)" for name, bend in bends]
+    parts += [f"beta {name} ({_share(abs(move))})" for name, move in does.beta.items()]
     own = f"; its own flow is {_share(does.own_flow)} of the rms flow" if does.own_flow else ""
-    text = f"The maps hide it: the error hardly shows it, yet without it {_and(parts)} off{own}."
+    text = (
+        f"The maps hide it: the error hardly shows it, yet without it {_and(parts)} are off{own}."
+    )
     return f"{text} To separate it: {_and(list(does.separates))}." if does.separates else text
 
 

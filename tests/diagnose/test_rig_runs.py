@@ -29,6 +29,7 @@ HIDDEN = {
     13: ("relief_valve", "opening_pressure", 3.6e6),
     14: ("supply_sag", "", 0.0),
 }
+ONE_COLUMN = {11: ("hose_compliance",)}  # a dead volume is what a hose that does not stiffen is
 
 
 def diagnosed(shared: Path, run: int, folder: Path, project: Path = rig.PROJECT) -> Diagnosis:
@@ -64,8 +65,9 @@ def test_what_was_hidden_is_named_and_sized(
 ) -> None:
     """One name, its size within 15 %, and the held-out error falls with it."""
     found, (effect, parameter, true) = diagnosis_of(run), HIDDEN[run]
-    assert found.verdict == "missing"
+    assert found.verdict == ("ambiguous" if run in ONE_COLUMN else "missing")
     assert [own.effect for own in found.found] == [effect]
+    assert found.found[0].cannot_be_told_from == ONE_COLUMN.get(run, ())
     if parameter:
         assert found.found[0].parameters[parameter].value == pytest.approx(true, rel=0.15)
     assert found.heldout_residual_after_m3s < 0.5 * found.heldout_residual_before_m3s

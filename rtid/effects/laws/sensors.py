@@ -1,16 +1,27 @@
-"""Slow pressure sensors, and a position that comes late."""
+"""Sensors that come late, put right in the record: exact, as delays of a command are.
+
+    x(t) = x_meas(t + T),        P(t) = P_meas(t) + tau dP_meas/dt
+
+The columns are the derivatives: what a unit more of T or tau would change, to first order.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
 from rtid.effects.column import Cause, fixed, of_page
 from rtid.effects.law import Volumes
 from rtid.effects.laws.common import slope_to, stored
+from rtid.effects.laws.timing import Psi, TimingLaw, of_law
 from rtid.effects.page import Effect
 from rtid.effects.record_view import RecordView
+from rtid.model import Machine
+from rtid.plain import FloatArray
+
+QUICK_S = 5e-3  # half width of the window for the rate of a slow sensor's pressure
 
 
 def late_pressure(view: RecordView, effect: Effect) -> Iterator[Cause]:
@@ -39,3 +50,45 @@ def _late_position(view: RecordView) -> Volumes:
         swept = view.chamber_flow(c) - view.compliance[c] * view.volume(c)[:-1] * rate
         late[c] = -np.diff(swept, prepend=swept[:1])
     return late
+
+
+def ahead(values: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
+    """What a sensor that is psi late would have shown (n,), linear between samples, any unit."""
+    at = np.arange(len(values))
+    return np.interp(at + psi[0] / dt_s, at, values)
+
+
+def quickened(values: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
+    """What a sensor of time constant psi has seen (n,), by the rate of a parabola, any unit."""
+    from scipy.signal import savgol_filter  # noqa: PLC0415 - takes long to import
+
+    width = 2 * max(2, round(QUICK_S / dt_s)) + 1
+    if len(values) < width:
+        return values
+    return np.asarray(values + psi[0] * savgol_filter(values, width, 2, deriv=1, delta=dt_s))
+
+
+LATE_POSITION = of_law("late_position", ahead, where="")
+LATE_PRESSURE = of_law("late_pressure", quickened, where="")
+
+
+def sensor_timings(model: Machine) -> tuple[TimingLaw, ...]:
+    """The timings of a machine's sensors, each at its place."""
+    if not model.position:
+        return ()
+    slow = (replace(LATE_PRESSURE, where=chamber.name) for chamber in model.chambers)
+    return replace(LATE_POSITION, where=model.position), *slow
+
+
+def sensor_of(model: Machine, timing: TimingLaw) -> str:
+    """The signal that a timing of a sensor puts right."""
+    pressures = {chamber.name: chamber.pressure for chamber in model.chambers}
+    return pressures.get(timing.where, timing.where)
+
+
+def late(view: RecordView, timing: TimingLaw) -> Volumes:
+    """Volumes per interval and chamber of a unit more of what a sensor is late by."""
+    chambers = [chamber.name for chamber in view.model.chambers]
+    if timing.where in chambers:
+        return _slow_pressure(view, chambers.index(timing.where))
+    return _late_position(view)

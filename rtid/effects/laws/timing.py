@@ -20,7 +20,7 @@ from rtid.kernels.jit import kernel
 from rtid.plain import FloatArray
 
 Psi = tuple[float, ...]
-COMMAND, SUPPLY = "command", "supply"  # what a timing transforms
+COMMAND, SUPPLY = "command", "supply"  # what a timing transforms; else a sensor at its place
 RATE = "rad/s"  # unit of a parameter that does the more the smaller it is
 
 
@@ -30,8 +30,9 @@ class TimingLaw:
 
     apply(u (n,), dt_s, psi) -> (n,); low, high: bounds of psi; replaces_lag: it stands for the
     declared lag of the spools instead of coming before it; is_linear: in the command;
-    own_spools: each direction follows its own part of the command; where: a command, or the
-    demand on the supply, from which `apply` makes what the supply gives way; is_rate: psi[0] is a
+    own_spools: each direction follows its own part of the command; where: a command, the
+    demand on the supply, from which `apply` makes what the supply gives way, or the place of a
+    sensor; is_rate: psi[0] is a
     rate, so that a smaller one does more.
     """
 
@@ -47,6 +48,15 @@ class TimingLaw:
     own_spools: bool = False
     where: str = COMMAND
     is_rate: bool = False
+
+    def is_at(self, effect: str, where: str) -> bool:
+        """True for the timing of that name and place."""
+        return self.effect == effect and self.where in (COMMAND, SUPPLY, where)
+
+    @property
+    def of_sensor(self) -> bool:
+        """True where it puts a measurement right."""
+        return self.where not in (COMMAND, SUPPLY)
 
     def strength(self, psi: Psi) -> float:
         """How much a command is changed, 0 for not at all."""

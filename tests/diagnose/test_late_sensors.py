@@ -1,0 +1,60 @@
+"""Sensors that come late are put right exactly, as delays of a command are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rtid.diagnose.diagnosis import search
+from rtid.diagnose.parts import AddedEffect, recall
+from rtid.diagnose.report import Diagnosis, diagnosis
+from rtid.diagnose.standing import fitted
+from rtid.effects.laws.sensors import ahead, quickened, sensor_timings
+from rtid.study.seed import Seed
+from tests.diagnose.records import record
+
+DT_S = 1e-3
+T_S = DT_S * np.arange(4000)
+
+
+def test_a_late_signal_is_put_right_between_samples() -> None:
+    wave = np.sin(2 * np.pi * 3 * T_S)
+    late = np.sin(2 * np.pi * 3 * (T_S - 2.3e-3))
+    assert np.abs(ahead(late, DT_S, (2.3e-3,)) - wave)[:-5].max() < 1e-3
+    assert ahead(late, DT_S, (0.0,)) == pytest.approx(late)
+
+
+def test_a_slow_signal_is_put_right_up_to_the_window() -> None:
+    tau_s, wn = 4e-3, 2 * np.pi * 5
+    wave, phase = np.sin(wn * T_S), np.arctan(wn * tau_s)
+    slow = np.cos(phase) * np.sin(wn * T_S - phase)
+    assert np.abs(quickened(slow, DT_S, (tau_s,)) - wave)[20:-20].max() < 5e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("effect", "strength"), [("position_sensor_delay", 1.5e-3), ("pressure_sensor_lag", 2e-3)]
+)
+def test_a_late_sensor_is_named_and_sized(effect: str, strength: float) -> None:
+    """It was "spool lag", or nothing: its derivative alone is no measure of it."""
+    said: Diagnosis = diagnosis(search(*record(effect, strength)))
+    assert {own.effect for own in said.found} == {effect}
+    assert said.rho_before > 5.0 > 3.0 * said.rho_after
+    for own in said.found:
+        (value,) = own.parameters.values()
+        assert value.value == pytest.approx(strength, rel=0.1)
+
+
+def test_a_sensor_of_the_project_is_put_right_and_kept() -> None:
+    """As `rtid add` leaves it in the project file, and as a later command takes it from `.rtid`."""
+    model, chunk, _ = record()
+    part = AddedEffect("position_sensor_delay", model.position, {"delay": 2e-3})
+    laws = {timing.where: timing for timing in sensor_timings(model)}
+    assert set(laws) == {model.position, *(chamber.name for chamber in model.chambers)}
+    made = fitted(model, chunk[:15_000], (part,))
+    ((timing, psi),) = made.revision.timings
+    assert timing == laws[model.position] and 0.0 < psi[0] < 2e-3  # a sensor that is not late
+    assert recall(model, chunk, made.weights, (part,)).timings == ((timing, (2e-3,)),)
+    again = Seed.of(made).fit(made.declared, made.chunk)
+    assert again.revision.timings == made.revision.timings
+    assert again.rho == pytest.approx(made.rho, rel=1e-9)
