@@ -24,7 +24,7 @@ X_REF, V_REF, DITHER, P_SUPPLY, P_TANK, LOAD, FACTOR, BURST = range(8)
 
 
 class PlainMachine(NamedTuple):
-    """What the kernel knows of a plain plant: valves (5, 7), directions (5,)."""
+    """What the kernel knows of a plain plant: valves (5, columns), directions (5,)."""
 
     c: Constants
     k: Controller
@@ -130,7 +130,7 @@ def advance(
                 gains[half, edge] = flow_gain(valves[edge], w[edge])
                 if e is not None:
                     gains[half, edge] *= inputs[half, FACTOR - P_SUPPLY]
-        runge_kutta(m.c, e, gains, inputs, h_s, y, slopes, trial, q, net)
+        runge_kutta(m.c, e, valves, gains, inputs, h_s, y, slopes, trial, q, net)
 
 
 @compiled
@@ -170,20 +170,24 @@ def seen_position(e: Any, x: FloatArray, i: int, dt_s: float) -> float:
 def note_flows(
     c: Constants,
     e: Any,
+    valves: FloatArray,
     gains: FloatArray,
     drive: FloatArray,
     y: FloatArray,
     i: int,
     record: LoopRecord,
 ) -> None:
-    """Write flows, m3/s, and pressures at the valves, Pa, at sample i for the gains (5,)."""
+    """Write flows, m3/s, and pressures at the valves, Pa, at sample i.
+
+    valves (5, columns) have the gains (5,), m3/s/sqrt(Pa).
+    """
     nodes = record.nodes_pa[i]
     if e is None:
         nodes[0], nodes[1], nodes[2] = drive[P_SUPPLY], y[0], y[1]
-        flows(c, gains, y, drive[P_SUPPLY], drive[P_TANK], record.flow_m3s[i])
+        flows(c, valves, gains, y, drive[P_SUPPLY], drive[P_TANK], record.flow_m3s[i])
     else:
         inputs = drive[P_SUPPLY:]
-        extra_valve_flows(c, e, gains, inputs, y, record.flow_m3s[i])
+        extra_valve_flows(c, e, valves, gains, inputs, y, record.flow_m3s[i])
         extra_flows(c, e, inputs, y, record.extra_m3s[i])
         nodes[0], nodes[1], nodes[2] = y[SUPPLY], y[PORT_A], y[PORT_B]
 
@@ -241,5 +245,5 @@ def run_loop(
             gains[edge] = flow_gain(m.valves[edge], spools.w[edge])
         if e is not None:
             gains *= drive[i, FACTOR]
-        note_flows(m.c, e, gains, drive[i], y, i, record)
+        note_flows(m.c, e, m.valves, gains, drive[i], y, i, record)
         advance(m, e, gains, drive[i : i + 2], decay, change_s, h_s, spools, y, substeps)

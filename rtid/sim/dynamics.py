@@ -17,14 +17,20 @@ from rtid.sim.simulated_plant import AB, AT, BT, PA, PB, Constants, metered_flow
 
 @compiled
 def flows(
-    c: Constants, gains: FloatArray, y: FloatArray, p_s: float, p_t: float, q: FloatArray
+    c: Constants,
+    valves: FloatArray,
+    gains: FloatArray,
+    y: FloatArray,
+    p_s: float,
+    p_t: float,
+    q: FloatArray,
 ) -> None:
-    """Fill q (5,) in place with the flow of each edge."""
-    q[PA] = metered_flow(gains[PA], p_s - y[0], c.dp_laminar_pa)
-    q[AT] = metered_flow(gains[AT], y[0] - p_t, c.dp_laminar_pa)
-    q[PB] = metered_flow(gains[PB], p_s - y[1], c.dp_laminar_pa)
-    q[BT] = metered_flow(gains[BT], y[1] - p_t, c.dp_laminar_pa)
-    q[AB] = metered_flow(gains[AB], y[0] - y[1], c.dp_laminar_pa)
+    """Fill q (5,) in place with the flow of valves (5, columns), whose gains are (5,)."""
+    q[PA] = metered_flow(valves[PA], gains[PA], p_s - y[0], c.dp_laminar_pa)
+    q[AT] = metered_flow(valves[AT], gains[AT], y[0] - p_t, c.dp_laminar_pa)
+    q[PB] = metered_flow(valves[PB], gains[PB], p_s - y[1], c.dp_laminar_pa)
+    q[BT] = metered_flow(valves[BT], gains[BT], y[1] - p_t, c.dp_laminar_pa)
+    q[AB] = metered_flow(valves[AB], gains[AB], y[0] - y[1], c.dp_laminar_pa)
 
 
 @compiled
@@ -46,6 +52,7 @@ def rates(c: Constants, q: FloatArray, y: FloatArray, load_n: float, dy: FloatAr
 def runge_kutta(
     c: Constants,
     e: Any,
+    valves: FloatArray,
     gains: FloatArray,
     inputs: FloatArray,
     h_s: float,
@@ -57,8 +64,8 @@ def runge_kutta(
 ) -> None:
     """One step of the classical fourth-order rule; y (s,) is changed in place.
 
-    gains (3, 5) and inputs (3, 5) hold at the start, middle and end of the step; slopes (4, s),
-    trial (s,), q (5,) and net (2,) are work space.
+    valves (5, columns); gains (3, 5) and inputs (3, 5) hold at the start, middle and end of the
+    step; slopes (4, s), trial (s,), q (5,) and net (2,) are work space.
     """
     for stage in range(4):
         at = (stage + 1) // 2
@@ -67,10 +74,10 @@ def runge_kutta(
             trial[i] = y[i] + reach * slopes[stage - 1, i] if stage > 0 else y[i]
         now, dy = inputs[at], slopes[stage]
         if e is None:
-            flows(c, gains[at], trial, now[0], now[1], q)
+            flows(c, valves, gains[at], trial, now[0], now[1], q)
             rates(c, q, trial, now[2], dy)
         else:
-            extra_valve_flows(c, e, gains[at], now, trial, q)
+            extra_valve_flows(c, e, valves, gains[at], now, trial, q)
             rates(c, q, trial, now[2], dy)
             extra_rates(c, e, now, trial, q, net, dy)
     for i in range(len(y)):

@@ -18,6 +18,7 @@ from typing import Any
 from rtid.plain import FloatArray
 from rtid.sim.compiled import compiled
 from rtid.sim.simulated_plant import AB, AT, BT, PA, PB, Constants, metered_flow
+from rtid.sim.valve_laws import root_flow
 
 # the state of a machine with extra physics; the first four are the plain machine's
 P_A, P_B, X, V, PORT_A, PORT_B, LINE_A, LINE_B, DEAD_A, DEAD_B, HOSE_A, HOSE_B = range(12)
@@ -106,17 +107,24 @@ def extra_flows(c: Constants, e: Any, inputs: FloatArray, y: FloatArray, net: Fl
 
 
 @compiled
-def edge_flow(c: Constants, seat: float, compensated: float, gain: float, dp_pa: float) -> float:
-    """Flow of a metering edge with its seat leak and its pressure compensator, m3/s.
+def edge_flow(
+    c: Constants,
+    valve: FloatArray,
+    seat: float,
+    compensated: float,
+    gain: float,
+    dp_pa: float,
+) -> float:
+    """Flow of valve (columns,) with its seat leak and its pressure compensator, m3/s.
 
     The seat's gap adds to the opening like two sides of a right angle: K = hypot(K(w), K_seat).
     """
-    q: float = metered_flow(gain, dp_pa, c.dp_laminar_pa)
+    q: float = metered_flow(valve, gain, dp_pa, c.dp_laminar_pa)
     if compensated > 0.0:
         flat = math.sqrt(COMPENSATED_PA) * math.tanh(dp_pa / COMPENSATED_CORNER_PA)
         q = (1.0 - compensated) * q + compensated * gain * flat
     if seat > 0.0:
-        q += metered_flow(math.hypot(gain, seat) - gain, dp_pa, SEAT_LAMINAR_PA)
+        q += root_flow(math.hypot(gain, seat) - gain, dp_pa, SEAT_LAMINAR_PA)
     return q
 
 
@@ -134,17 +142,23 @@ def tie_nodes(e: Any, p_supply_pa: float, y: FloatArray) -> None:
 
 @compiled
 def extra_valve_flows(
-    c: Constants, e: Any, gains: FloatArray, inputs: FloatArray, y: FloatArray, q: FloatArray
+    c: Constants,
+    e: Any,
+    valves: FloatArray,
+    gains: FloatArray,
+    inputs: FloatArray,
+    y: FloatArray,
+    q: FloatArray,
 ) -> None:
-    """Fill q (5,), m3/s, with the flow of each edge; y's pressures at the valves are tied."""
+    """Fill q (5,), m3/s, of valves (5, columns) for gains (5,); ties y's pressures."""
     tie_nodes(e, inputs[SUPPLY_IN], y)
     w, p_tank_pa = e.whole, inputs[TANK_IN]
     port_a, port_b, p_s = y[PORT_A], y[PORT_B], y[SUPPLY]
-    q[PA] = edge_flow(c, w.seat_pa, w.compensated_pa, gains[PA], y[BRANCH] - port_a)
-    q[AT] = edge_flow(c, w.seat_at, w.compensated_at, gains[AT], port_a - p_tank_pa)
-    q[PB] = edge_flow(c, w.seat_pb, w.compensated_pb, gains[PB], p_s - port_b)
-    q[BT] = edge_flow(c, w.seat_bt, w.compensated_bt, gains[BT], port_b - p_tank_pa)
-    q[AB] = edge_flow(c, w.seat_ab, w.compensated_ab, gains[AB], port_a - port_b)
+    q[PA] = edge_flow(c, valves[PA], w.seat_pa, w.compensated_pa, gains[PA], y[BRANCH] - port_a)
+    q[AT] = edge_flow(c, valves[AT], w.seat_at, w.compensated_at, gains[AT], port_a - p_tank_pa)
+    q[PB] = edge_flow(c, valves[PB], w.seat_pb, w.compensated_pb, gains[PB], p_s - port_b)
+    q[BT] = edge_flow(c, valves[BT], w.seat_bt, w.compensated_bt, gains[BT], port_b - p_tank_pa)
+    q[AB] = edge_flow(c, valves[AB], w.seat_ab, w.compensated_ab, gains[AB], port_a - port_b)
 
 
 @compiled

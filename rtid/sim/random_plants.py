@@ -26,6 +26,7 @@ from rtid.sim.simulated_plant import (
     SimulatedPlant,
     Valve,
 )
+from rtid.sim.valve_laws import numbers
 
 SPREAD = 0.3  # of every constant
 TYPE = 0.2  # of a valve type's gain and dead band; with the scatter of its valves within SPREAD
@@ -33,8 +34,11 @@ GAIN_SCATTER, DEADBAND_SCATTER = 0.08, 0.05
 CROSS_PORT_SHARE = 0.3  # the cross-port valve is small, else it short-circuits the chambers
 
 
-def draw(seed: int, *, cross_port: bool = False) -> SimulatedPlant:
-    """The machine with this number; cross_port also opens A->B while retracting (u < 0)."""
+def draw(seed: int, *, cross_port: bool = False, law: str = "orifice") -> SimulatedPlant:
+    """The machine with this number, its valves of a law in `rtid.sim.valve_laws`.
+
+    cross_port also opens A->B while retracting (u < 0).
+    """
     rng = np.random.default_rng([seed, 1])
     nominal = SimulatedPlant()
     constants = Constants(*(_vary(rng, value) for value in nominal.constants))
@@ -48,6 +52,8 @@ def draw(seed: int, *, cross_port: bool = False) -> SimulatedPlant:
     )
     small = replace(common, gain=CROSS_PORT_SHARE * common.gain)
     valves = _fill_first([*(_valve(rng, common) for _ in EDGES[:AB]), _valve(rng, small)])
+    if law != "orifice":
+        valves = _of_law(seed, valves, law)
     return SimulatedPlant(
         constants=constants,
         controller=_controller(rng, valves, size),
@@ -57,8 +63,22 @@ def draw(seed: int, *, cross_port: bool = False) -> SimulatedPlant:
     )
 
 
+def _of_law(seed: int, valves: tuple[Valve, ...], law: str) -> tuple[Valve, ...]:
+    """The same valves by another law, each with numbers of its own."""
+    rng = np.random.default_rng([seed, 8])
+    own = [numbers(rng, law) for _ in valves]
+    return tuple(
+        replace(v, law=law, law_a=a, law_b=b) for v, (a, b) in zip(valves, own, strict=True)
+    )
+
+
 def draw_hidden(
-    seed: int, name: str, level: str = "middle", *, cross_port: bool = False
+    seed: int,
+    name: str,
+    level: str = "middle",
+    *,
+    cross_port: bool = False,
+    law: str = "orifice",
 ) -> SimulatedPlant:
     """The machine with this number and an effect in it, varied +-30 %, in a random place.
 
@@ -72,7 +92,7 @@ def draw_hidden(
     where = effect.places[int(rng.integers(len(effect.places)))]
     if effect.signed:
         strength *= float(rng.choice([-1.0, 1.0]))
-    return hide(draw(seed, cross_port=cross_port), name, strength, where)
+    return hide(draw(seed, cross_port=cross_port, law=law), name, strength, where)
 
 
 def _vary(rng: np.random.Generator, value: float, spread: float = SPREAD) -> float:

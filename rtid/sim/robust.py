@@ -139,13 +139,13 @@ def wanted_flows(law: Law, seen: FloatArray, ref: FloatArray) -> tuple[float, fl
 
 @compiled
 def drawn_w(
-    c: Constants, e: Any, gains: FloatArray, drive: FloatArray, y: FloatArray, q: FloatArray
+    m: PlainMachine, e: Any, gains: FloatArray, drive: FloatArray, y: FloatArray, q: FloatArray
 ) -> float:
     """Power that the supply gives for the gains (5,), W; q (5,) becomes the flows, m3/s."""
     if e is None:
-        flows(c, gains, y, drive[P_SUPPLY], drive[P_TANK], q)
+        flows(m.c, m.valves, gains, y, drive[P_SUPPLY], drive[P_TANK], q)
         return drive[P_SUPPLY] * (q[PA] + q[PB])
-    extra_valve_flows(c, e, gains, drive[P_SUPPLY:], y, q)
+    extra_valve_flows(m.c, e, m.valves, gains, drive[P_SUPPLY:], y, q)
     power: float = y[SUPPLY] * (q[PA] + q[PB])
     return power
 
@@ -188,7 +188,7 @@ def track(
         record[i, 0], record[i, 1], record[i, 2] = y[2] - ref[i, 0], y[0], y[1]
         for j in range(5):
             record[i, 10 + j] = w[j]
-        energy_j += drawn_w(m.c, e, gains, drive[i], y, q) * DT_S
+        energy_j += drawn_w(m, e, gains, drive[i], y, q) * DT_S
         advance(m, e, gains, drive[i : i + 2], decay, 0.0, DT_S / SUBSTEPS, spools, y, SUBSTEPS)
     return energy_j
 

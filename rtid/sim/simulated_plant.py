@@ -8,13 +8,14 @@
 
 w is the opening voltage of a valve behind its first-order lag, r(w) the voltage above the dead
 band with a corner that is rounded over `corner_v` (twice continuously differentiable).  K is
-strictly increasing above the dead band while |ripple| < 1 and curve >= 0.
+strictly increasing above the dead band while |ripple| < 1 and curve >= 0.  That is an orifice;
+other laws are in `rtid.sim.valve_laws`.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import astuple, dataclass, field
+from dataclasses import astuple, dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -23,11 +24,12 @@ from numpy.typing import ArrayLike
 from rtid.plain import FloatArray
 from rtid.sim.compiled import compiled
 from rtid.sim.extra_physics import NONE, Extra, Planted
+from rtid.sim.valve_laws import JUMP, LAWS, NOTCH, OVERLAP, law_flow
 
 EDGES = ("pa", "at", "pb", "bt", "ab")  # supply->A, A->tank, supply->B, B->tank, A->B
 PA, AT, PB, BT, AB = range(5)
-GAIN, DEADBAND, CORNER, CURVE, RIPPLE, RATE, PHASE = range(
-    7
+GAIN, DEADBAND, CORNER, CURVE, RIPPLE, RATE, PHASE, LAW, LAW_A, LAW_B = range(
+    10
 )  # columns of `SimulatedPlant.valve_table`
 
 
@@ -70,6 +72,13 @@ class Valve:
     ripple: float = 0.0
     ripple_rate_radpv: float = 1.5
     ripple_phase_rad: float = 0.0
+    law: str = "orifice"  # and its numbers, see `rtid.sim.valve_laws`
+    law_a: float = 0.0
+    law_b: float = 0.0
+
+    def row(self) -> tuple[float, ...]:
+        """Its row of the valve table."""
+        return astuple(replace(self, law=LAWS.index(self.law)))  # type: ignore[arg-type]
 
 
 DEFAULT_VALVES = (  # in the order of EDGES; one type, with the scatter of a series
@@ -98,23 +107,43 @@ def above_deadband(valve: FloatArray, w_v: float) -> float:
 
 
 @compiled
+def overlapped_gain(valve: FloatArray, w_v: float) -> float:
+    """K(w) of valve (columns,) whose overlap leaks before it ends, m3/s/sqrt(Pa)."""
+    open_ = 1.0 + (w_v - valve[DEADBAND]) / valve[LAW_B]
+    if open_ <= 0.0:
+        return 0.0
+    r = above_deadband(valve, w_v)
+    k: float = valve[GAIN] * (valve[LAW_A] * min(open_, 1.0) ** 2 + r + valve[CURVE] * r * r)
+    return k
+
+
+@compiled
 def flow_gain(valve: FloatArray, w_v: float) -> float:
     """K(w) in m3/s/sqrt(Pa) of valve (columns,), a row of the valve table."""
+    if valve[LAW] == OVERLAP:
+        return overlapped_gain(valve, w_v)
     r = above_deadband(valve, w_v)
     if r == 0.0:
         return 0.0
     phase, rate = valve[PHASE], valve[RATE]
     wave: float = valve[RIPPLE] * (math.cos(phase) - math.cos(rate * r + phase)) / rate
-    k: float = valve[GAIN] * (r + valve[CURVE] * r * r + wave)
+    rise: float = r + valve[CURVE] * r * r + wave
+    if valve[LAW] == NOTCH:
+        end = valve[LAW_A]
+        rise *= 0.5 * r / end if r < end else (valve[LAW_B] * (r - end) + 0.5 * end) / r
+    elif valve[LAW] == JUMP:
+        rise += valve[LAW_A]
+    k: float = valve[GAIN] * rise
     return k
 
 
 @compiled
-def metered_flow(gain: float, dp_pa: float, dp_laminar_pa: float) -> float:
-    """Q = K g(dp) in m3/s; a shut valve costs no root."""
-    if gain == 0.0:
-        return 0.0
-    return gain * dp_pa / math.sqrt(math.sqrt(dp_pa * dp_pa + dp_laminar_pa * dp_laminar_pa))
+def metered_flow(valve: FloatArray, gain: float, dp_pa: float, dp_laminar_pa: float) -> float:
+    """Q in m3/s of a flow gain K by the law of valve (columns,), a row of the valve table."""
+    q: float = law_flow(
+        valve[LAW], valve[LAW_A], valve[LAW_B], valve[GAIN], gain, dp_pa, dp_laminar_pa
+    )
+    return q
 
 
 @compiled
@@ -123,7 +152,7 @@ def flow_points(
 ) -> None:
     """Fill q_m3s (n,) in place with the flow at the points w_v (n,), dp_pa (n,)."""
     for i in range(len(q_m3s)):
-        q_m3s[i] = metered_flow(flow_gain(valve, w_v[i]), dp_pa[i], dp_laminar_pa)
+        q_m3s[i] = metered_flow(valve, flow_gain(valve, w_v[i]), dp_pa[i], dp_laminar_pa)
 
 
 @dataclass(frozen=True)
@@ -154,8 +183,8 @@ class SimulatedPlant:
         return tuple(e for e, direction in zip(EDGES, self.directions, strict=True) if direction)
 
     def valve_table(self) -> FloatArray:
-        """The five valves as rows, float64 (5, 7), SI."""
-        return np.array([astuple(valve) for valve in self.valves])
+        """The five valves as rows, float64 (5, columns), SI."""
+        return np.array([valve.row() for valve in self.valves])
 
     def flow(self, edge: str, w_v: ArrayLike, dp_pa: ArrayLike) -> FloatArray:
         """True Q(w, dp) of an edge in m3/s; w_v and dp_pa broadcast against each other."""

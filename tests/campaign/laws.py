@@ -1,0 +1,209 @@
+"""A clean machine whose valves follow any law, judged as its user would see it.
+
+Drawn at random: the law's numbers, areas and spools, the sensors' noise, the motion, and the grid:
+the simulator's own, equal steps that somebody has thought of, or the file of `rtid init`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
+
+import numpy as np
+
+from rtid.diagnose.diagnosis import searched
+from rtid.diagnose.excuse import steady
+from rtid.diagnose.report import diagnosis
+from rtid.diagnose.standing import fitted, stand
+from rtid.estimator.estimator import to_chunk
+from rtid.estimator.flowmap import EXTRAPOLATED, VALID, EdgeMap
+from rtid.estimator.published import publish
+from rtid.model import Edge, Grid, Lag, Machine
+from rtid.plain import FloatArray
+from rtid.project.template import U_STEPS, nice
+from rtid.sim.declare import declared_model, default_grid
+from rtid.sim.demand import IDENTIFICATION, VALIDATION
+from rtid.sim.hidden import hide
+from rtid.sim.random_plants import draw
+from rtid.sim.run import Run, Sensors, SimulationError, simulate
+from rtid.sim.simulated_plant import EDGES, SimulatedPlant
+from rtid.study.known_effects import acting, learn_beside
+
+WORKERS = 2
+RECORD_S = 44.0  # of which 32 s teach
+NEAR = 0.25  # of the visited span: how far off the data a map still gives a number
+DEFAULT, EQUAL, INIT = "default", "equal", "init"
+GRIDS = (DEFAULT, EQUAL, INIT)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One machine: its number, its valves' law and its motion; what is hidden in it, "" for none.
+
+    size: of what is hidden, SI.
+    """
+
+    seed: int
+    law: str
+    motion: str = "rich_record"
+    hidden: str = ""
+    size: float = 0.0
+
+    @property
+    def plant(self) -> SimulatedPlant:
+        """The machine."""
+        plant = draw(self.seed, law=self.law)
+        return hide(plant, self.hidden, self.size) if self.hidden else plant
+
+    @property
+    def sensors(self) -> Sensors:
+        """Its sensors' noise: three times worse or better than usual."""
+        p, x = np.exp(np.random.default_rng([self.seed, 9]).uniform(-1.0, 1.0, 2))
+        usual = Sensors()
+        return replace(usual, p_noise_pa=p * usual.p_noise_pa, x_noise_m=x * usual.x_noise_m)
+
+    @property
+    def grid(self) -> str:
+        """Who has written its grid."""
+        return GRIDS[self.seed % len(GRIDS)]
+
+
+@dataclass(frozen=True)
+class Points:
+    """Errors of the map at points, in standard deviations and as shares of the largest flow.
+
+    half: of the 95 % interval, as such a share; all (n,).
+    """
+
+    z: FloatArray
+    error: FloatArray
+    half: FloatArray
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What was said of a machine, beside the truth.
+
+    beta_z, beta_half (chambers,): error in standard deviations, half-width as a share; names: of
+    all that was found and what it cannot be told from; limits: (effect, where) -> detection limit.
+    """
+
+    case: Case
+    verdict: str
+    names: tuple[str, ...]
+    rho: float
+    dof: float
+    beta_z: FloatArray
+    beta_half: FloatArray
+    valid: Points
+    near: Points
+    limits: dict[tuple[str, str], float]
+    seconds: float
+
+    @property
+    def band(self) -> float:
+        """How far rho may be off 1: 3 sqrt(2 / dof)."""
+        return 3.0 * float(np.sqrt(2.0 / self.dof))
+
+
+def outcomes(cases: Iterable[Case]) -> Iterator[Outcome]:
+    """Outcomes of all machines that could be simulated, on WORKERS processes."""
+    with ProcessPoolExecutor(WORKERS, get_context("spawn")) as pool:
+        for found in pool.map(outcome, cases, chunksize=2):
+            if found is not None:
+                yield found
+
+
+def outcome(case: Case) -> Outcome | None:
+    """One case; None where the drawn machine leaves its stroke or cavitates."""
+    plant = case.plant
+    try:
+        run = simulate(plant, case.motion, case.seed, RECORD_S, case.sensors)
+    except SimulationError:
+        return None
+    model = declared(case, run)
+    chunk = to_chunk(model, run.samples, 0)
+    t_s, began = chunk[:, 0], time.process_time()
+    taught = chunk[t_s < IDENTIFICATION * RECORD_S]
+    present = fitted(model, taught)
+    standing = stand(model, taught, chunk[t_s >= VALIDATION * RECORD_S], known=present)
+    said = diagnosis(searched(standing))
+    words = steady(present)
+    acts = acting(words, words.chunk)
+    solution = learn_beside(words, acts, acts.chunk).solution
+    flowmap, n = publish(solution), len(taught)
+    of = [
+        _points(e, m, plant, run, n)
+        for e, m in zip(solution.model.edges, flowmap.edges, strict=True)
+    ]
+    return Outcome(
+        case,
+        said.verdict,
+        tuple(name for f in said.found for name in (f.effect, *f.cannot_be_told_from)),
+        present.rho,
+        present.freedom,
+        (solution.beta_pa - plant.beta_pa) / solution.beta_sd_pa,
+        1.96 * solution.beta_sd_pa / plant.beta_pa,
+        _joined([valid for valid, _ in of]),
+        _joined([near for _, near in of]),
+        {(u.effect, u.where): u.detection_limit or np.inf for u in said.not_found},
+        time.process_time() - began,
+    )
+
+
+def declared(case: Case, run: Run) -> Machine:
+    """The machine as its user declares it."""
+    plant, rng = case.plant, np.random.default_rng([case.seed, 10])
+    if case.grid == INIT:
+        top = nice(float(run.samples.column("p_supply").max()) * 1e-6, 10.0) * 1e6
+        grid = Grid(np.linspace(0.0, 10.0, U_STEPS + 1), np.linspace(0.0, top, 21))
+        model = declared_model(plant, grid=grid, sensors=case.sensors, seed=case.seed)
+        edges = tuple(replace(edge, safe_band_v=0.0) for edge in model.edges)
+        return replace(model, edges=edges, lag=Lag(0.0, 5e-3))
+    grid = default_grid(1.25 * plant.p_supply_pa)
+    if case.grid == EQUAL:
+        u_v = np.linspace(1.0, 10.0, int(rng.integers(24, 46)))
+        top = 1.25 * plant.p_supply_pa
+        grid = Grid(u_v, np.linspace(-0.5e6, top, int(rng.integers(12, 24))))
+    return declared_model(plant, grid=grid, sensors=case.sensors, seed=case.seed)
+
+
+def _points(
+    edge: Edge, learned: EdgeMap, plant: SimulatedPlant, run: Run, n: int
+) -> tuple[Points, Points]:
+    """The map of an edge at four points per cell: valid ones, and extrapolated ones near the data.
+
+    The first n samples have taught it.
+    """
+    s, names = run.truth.signals[:n], run.samples.names
+    w = run.truth.opening_v[:n, EDGES.index(edge.name)]
+    dp = s[:, names.index(edge.source)] - s[:, names.index(edge.sink)]
+    dp, largest = dp[w > edge.safe_band_v], float(np.abs(run.truth.flow(edge.name)[:n]).max())
+    at_w, at_dp = (_inner(b) for b in (learned.grid.u_v, learned.grid.dp_pa))
+    at_w, at_dp = (a.ravel() for a in np.meshgrid(at_w, at_dp, indexing="ij"))
+    error = learned.flow(at_w, at_dp) - plant.flow(edge.name, at_w, at_dp)
+    sd, status = learned.sd(at_w, at_dp), learned.status_at(at_w, at_dp)
+    z = error / np.maximum(sd, 1e-15)
+    close = _near(at_w, w[w > edge.safe_band_v]) & _near(at_dp, dp)
+    of = (status == VALID), (status == EXTRAPOLATED) & close
+    first, second = (Points(z[k], error[k] / largest, 1.96 * sd[k] / largest) for k in of)
+    return first, second
+
+
+def _inner(border: FloatArray) -> FloatArray:
+    """Two points in each interval."""
+    return np.sort(np.concatenate([border[:-1] + s * np.diff(border) for s in (0.25, 0.75)]))
+
+
+def _near(at: FloatArray, visited: FloatArray) -> np.ndarray:
+    low, high = visited.min(), visited.max()
+    reach = NEAR * (high - low)
+    return (at >= low - reach) & (at <= high + reach)
+
+
+def _joined(parts: list[Points]) -> Points:
+    columns = (np.concatenate([getattr(p, n) for p in parts]) for n in ("z", "error", "half"))
+    return Points(*columns)
