@@ -101,6 +101,8 @@ def _known(base: Comparison, candidate: CandidateMap) -> BoolArray:
     valid = np.isin(candidate.status, (SHUT, VALID))
     shut_or_known = (base.cell < 0) | valid[base.cell]
     good = np.all(shut_or_known, axis=1) & np.isfinite(base.residual_m3s).all(axis=1)
+    if not len(good):
+        return good
     reach = np.ones(2 * AROUND + 1)
     near = np.convolve(~good, reach)[AROUND : AROUND + len(good)]
     return np.asarray(near < 0.5)

@@ -267,3 +267,14 @@ def test_a_lost_baseline_yields_to_a_shadow_that_foretells(
     assert daemon.learning_s <= 52.0 and not np.isfinite(daemon.alarm_s)
     daemon.stop()
     assert generations.baseline(project.model).notes["known_share"] > 0.1
+
+
+def test_samples_without_a_row_are_no_motion(bench: Bench) -> None:
+    """A suspect may turn all volumes negative: then it says nothing, and nothing fails."""
+    model, solution = machine().project.model, fault_free()
+    candidate = candidate_of(solution, publish(solution))
+    chunk = chunk_of(bench.run(2.0, 3))
+    chunk[:, 2 + model.column(model.position)] -= 10.0
+    for piece in (chunk[:2], chunk):
+        rows = in_motion(model, residuals(model, candidate, piece))
+        assert not len(rows.t_s) and not len(seconds(model, rows, np.ones(2)).t_s)
