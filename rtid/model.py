@@ -24,6 +24,7 @@ from rtid.plain import FloatArray
 
 COMMAND, PRESSURE, POSITION, VELOCITY = "command", "pressure", "position", "velocity"
 MODE = "mode"  # kind of the signal that carries the number of the working mode
+OTHER = "other"  # kind of a signal of any other quantity: a force, a temperature
 TAYLOR, LAPPED, BLENDED = BASES = "taylor", "lapped", "blended"
 BOTH, COMMAND_ONLY, DROP_ONLY = "both", "command", "drop"
 MOST_MODE = 62  # a set of modes is kept as bits of one integer
@@ -61,7 +62,7 @@ class Chamber:
     """One pressure equation: `pressure` names its signal, V(x) = v0_m3 + sign * area_m2 * x.
 
     Without a pressure (NONE) it is xdot = ..., times area_m2.  disturbance: intensity of unmodelled
-    flow, m3/s per sqrt(Hz), a white noise that the rows are weighed for.
+    flow, m3/s per sqrt(Hz), a white noise that the rows are weighed for.  unit: of the equation.
     """
 
     name: str
@@ -70,6 +71,7 @@ class Chamber:
     sign: int  # +1: the volume grows with x, -1: it shrinks
     v0_m3: float
     disturbance: float = 0.0
+    unit: str = "m3/s"
 
 
 @dataclass(frozen=True)
@@ -212,6 +214,11 @@ class Machine:
     # where a block is coupled to all that were visited within its memory, and cost information.
     recent_blocks: int = 64
     mode: str = NONE  # the signal that carries the number of the working mode
+
+    @property
+    def has_pressures(self) -> bool:
+        """False for a plant that is xdot = phi(x)' theta + f(u, x) of something else."""
+        return any(chamber.pressure for chamber in self.chambers)
 
     @property
     def n_cells(self) -> int:

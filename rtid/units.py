@@ -177,6 +177,25 @@ _OF_DIMENSION = {
 _WORD = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 
 
+FLOW = "m3/s"  # of what the equations of a machine with pressures are in
+_rates = {FLOW: FLOW}
+
+
+def show_flow_as(unit: str) -> None:
+    """From now on flows are shown as what they are on this plant, of this SI unit: a speed, m/s."""
+    _rates[FLOW] = unit
+
+
+def flow_name() -> str:
+    """What a flow is shown in, whatever the system: L/min, or the unit of the plant's rate."""
+    return PRACTICAL.get(_rates[FLOW], (_rates[FLOW], 1.0))[0]
+
+
+def lpm() -> float:
+    """Times its SI value, what is shown of a flow in `flow_name`."""
+    return PRACTICAL.get(_rates[FLOW], (_rates[FLOW], 1.0))[1]
+
+
 class System(StrEnum):
     """Units that a person reads: those of the workshop (MPa, L/min, mm, ms), or SI."""
 
@@ -214,6 +233,8 @@ class Scale:
 
 def scale_of(unit: str) -> Scale:
     """The scale on which quantities of an SI unit are shown; that of "m3/s/Pa/V" is L/min/MPa/V."""
+    if unit == FLOW or unit.startswith(f"{FLOW}/"):
+        unit = _rates[FLOW] + unit.removeprefix(FLOW)
     if _shown.get() == System.SI:
         return Scale(unit, 1.0)
     if unit in PRACTICAL:

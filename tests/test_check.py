@@ -62,7 +62,7 @@ def judged(folder: Path, edit: Edit) -> Report:
     trace = read_recording(project, folder / "trace.parquet")
     return judge(
         project.model, project.assembly, trace.samples, trace.series, trace.messages,
-        trace.refused, project.sections.geometry.stroke_m,
+        trace.refused, project.sections.stroke_m,
     )  # fmt: skip
 
 

@@ -77,7 +77,7 @@ def _judged(project: Project, path: Path, progress: Progress) -> Report:
     progress("reading", 0.0)
     read = read_recording(project, path)
     progress("judging signals and motion", 0.2)
-    stroke_m = project.sections.geometry.stroke_m
+    stroke_m = project.sections.stroke_m
     tables = project.table_assembly if read.is_table else None
     assembly = tables or project.assembly
     report = judge(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from rtid.cli.exits import Exit
+from rtid.cli.options import RoleOption, by_role
 from rtid.errors import RtidError
 
 if TYPE_CHECKING:
@@ -21,26 +23,32 @@ def init(
     output: Annotated[Path, typer.Option("-o", "--output", help="File to write.")] = Path(
         "project.toml"
     ),
+    role: RoleOption = None,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
 ) -> None:
     """Write a commented project file and say what is still missing.
 
-    Roles are proposed by unit and name; what only you know is marked TODO.
+    Roles are proposed by unit and name; what only you know is marked TODO.  A table without
+    pressures gives the complete file of a plant whose rate follows a command.
     """
     if output.exists() and not force:
         raise RtidError(f"{output} exists", "give another -o, or --force", Exit.USAGE)
     from rtid.project import ProjectError, load
-    from rtid.project.guess import propose, unused
+    from rtid.project.guess import named, propose, unused, with_named
     from rtid.project.template import project_text
 
     keys, candidates = _read(source, output.parent)
-    roles = propose(candidates)
+    given = named(candidates, by_role(role or []))
+    roles = with_named(propose(candidates), given)
+    if "time_column" in keys and not {"p_a", "p_b"} & roles.keys():
+        _write_rate(Path(source), output, given)
+        return
     rest = unused(candidates, roles)
     output.write_text(project_text(output.stem, keys, roles, rest), "utf-8")
     print(f"wrote {output}")
-    for role, candidate in roles.items():
+    for played, candidate in roles.items():
         guessed = ", unit guessed" if candidate.guessed_unit else ""
-        print(f"  {role:9} {candidate.full_name} [{candidate.unit}{guessed}]")
+        print(f"  {played:9} {candidate.full_name} [{candidate.unit}{guessed}]")
     if rest:
         print(f"Not used: {', '.join(c.full_name for c in rest)}")
     try:
@@ -50,6 +58,34 @@ def init(
         print("Still missing:")
         for problem in error.problems:
             print(f"  {problem}")
+
+
+def write_new(output: Path | None, text: str) -> None:
+    """Write a project file where there is none yet; nothing without a name."""
+    if output is None:
+        return
+    if output.exists():
+        raise RtidError(f"{output} exists", "give another -o", Exit.USAGE)
+    output.write_text(text, "utf-8")
+    print(f"wrote {output}")
+
+
+def _write_rate(table: Path, output: Path, given: Mapping[str, RoleCandidate]) -> None:
+    """The file of a plant without pressures; RtidError, with what is missing, where it is none."""
+    from rtid.study.quick_rate import no_plant, pairs_of, rate_text
+    from rtid.trace.quick_source import open_source
+
+    opened = open_source(table, None)
+    pairs = pairs_of(table, opened, given)
+    if not pairs:
+        raise no_plant(table, opened.signals)
+    output.write_text(rate_text(output.stem, table, opened, pairs[0]), "utf-8")
+    print(f"wrote {output}: a plant without pressures, d x / dt = f(u)")
+    for name, signal in (("u", pairs[0].command), ("x", pairs[0].state)):
+        print(f"  {name:9} {signal.full_name} [{signal.unit}]")
+    for other in pairs[1:]:
+        print(f"There is another pair: {other.options}")
+    print(f"It is complete. Next: rtid diagnose {table} -p {output}")
 
 
 def _read(source: str, folder: Path) -> tuple[dict[str, str], list[RoleCandidate]]:

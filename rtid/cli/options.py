@@ -34,6 +34,29 @@ UnitsOption = Annotated[
         help="What is printed: display (MPa, L/min, mm, ms) or si.  Files and JSON keep theirs.",
     ),
 ]
+
+
+def _roles(texts: list[str] | None) -> list[str]:
+    """Each is ROLE=NAME."""
+    for text in texts or ():
+        if not all(text.partition("=")):
+            raise typer.BadParameter(f"{text!r} is not ROLE=COLUMN, u=valve_1")
+    return texts or []
+
+
+def by_role(texts: list[str]) -> dict[str, str]:
+    """What `RoleOption` was given, by role."""
+    return {role: name for role, _, name in (text.partition("=") for text in texts)}
+
+
+RoleOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--role",
+        callback=_roles,
+        help="ROLE=COLUMN where a guess fails: u, x, p_a, p_b, p_supply, p_tank, v.",
+    ),
+]
 ProjectOption = Annotated[Path, typer.Option("--project", "-p", help="Project file.")]
 PriorOption = Annotated[
     Path | None,

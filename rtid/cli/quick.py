@@ -9,7 +9,8 @@ from typing import Annotated
 import typer
 
 from rtid.cli.exits import Exit, refuse_truncated
-from rtid.cli.options import AsJson, UnitsOption
+from rtid.cli.init import write_new
+from rtid.cli.options import AsJson, RoleOption, UnitsOption, by_role
 from rtid.units import System
 
 
@@ -29,19 +30,26 @@ def quick(
         float | None,
         typer.Option("--dead-volume", min=1e-4, help="Volume left at either end, hoses too, L."),
     ] = None,
+    role: RoleOption = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", help="Write the project of a plant without pressures."),
+    ] = None,
     as_json: AsJson = False,
     units: UnitsOption = System.DISPLAY,
 ) -> None:
     """Say within a minute whether this data is good enough, and which effect is missing.
 
     Guesses the roles of the signals by name, unit and range, takes the grids from the data, and
-    states what it assumes of the machine.  Exit code 3: the file cannot be read, or has no signal
-    for a role that is needed; 4: it is read, and too little for a verdict.
+    states what it assumes of the machine.  A table without pressures is one of a plant whose rate
+    follows a command: its neutral, dead band, gains and delay are found.  Exit code 3: the file
+    cannot be read, or is of no kind of plant; 4: it is read, and too little for a verdict.
     """
     from rtid.errors import RtidError
     from rtid.study.quick import quick as look
     from rtid.study.quick_machine import Given
-    from rtid.tell.quick import lines
+    from rtid.study.quick_rate import QuickRate
+    from rtid.tell.quick import lines, rate_lines
     from rtid.tell.replay import progress_bar
 
     if bore_mm is not None and rod_mm is not None and rod_mm >= bore_mm:
@@ -52,11 +60,15 @@ def quick(
     )
     given = Given(bore_m, rod_m, stroke_m, dead_volume_m3)
     with progress_bar() as progress:
-        looked = look(file, dbc, given, progress)
+        looked = look(file, dbc, given, progress, by_role(role or []))
     if as_json:
         print(json.dumps(looked.as_json()))
     else:
-        print("\n".join(lines(looked)))
-    refuse_truncated(file, {"truncated": int(looked.truncated)})
+        of = rate_lines(looked) if isinstance(looked, QuickRate) else lines(looked)
+        print("\n".join(of))
+    if isinstance(looked, QuickRate):
+        write_new(output, looked.text)
+    else:
+        refuse_truncated(file, {"truncated": int(looked.truncated)})
     if not looked.is_enough:
         raise typer.Exit(Exit.NEGATIVE)

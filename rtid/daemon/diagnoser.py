@@ -66,7 +66,7 @@ def check(job: Check, project: Project) -> Checked:
         read.series,
         read.messages,
         read.refused,
-        project.sections.geometry.stroke_m,
+        project.sections.stroke_m,
     )
     errors = [finding for finding in report.findings if finding.level == "error"]
     return Checked(tuple(f"{finding.subject}: {finding.text}" for finding in errors))

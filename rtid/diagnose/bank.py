@@ -14,7 +14,7 @@ from rtid.effects.laws import cause_of, causes
 from rtid.effects.laws.common import supply_change
 from rtid.effects.laws.pump import demand
 from rtid.effects.laws.sensors import late
-from rtid.effects.laws.timing import COMMAND, SUPPLY, TIMINGS
+from rtid.effects.laws.timing import COMMAND, SUPPLY, timings_of
 from rtid.effects.laws.timing import lagged as lagged_command
 from rtid.effects.page import Effect
 from rtid.effects.record_view import RecordView
@@ -110,7 +110,7 @@ def offer(
 def _offer_timings(view: RecordView, columns: Columns, revision: Revision) -> None:
     """What each timing of the bank would change, first order in the opening; coefficient 1."""
     names = {e.command: e.direction for e in view.model.edges}
-    for timing in TIMINGS:
+    for timing in timings_of(view.model, view.t_s):
         if revision.has((timing.effect, COMMAND)) or timing.own_spools:
             continue
         for psi in timing.bank:

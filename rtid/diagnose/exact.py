@@ -15,7 +15,7 @@ from rtid.diagnose.trials import GAIN, Trial, TrialState, scored
 from rtid.effects.column import Candidate
 from rtid.effects.laws.pump import PUMP, demand
 from rtid.effects.laws.sensors import sensor_timings
-from rtid.effects.laws.timing import TIMINGS, Psi, TimingLaw
+from rtid.effects.laws.timing import Psi, TimingLaw, timings_of
 from rtid.plain import Key
 
 LARGE = 1.5  # rho above which timing effects are refitted whatever their score
@@ -72,7 +72,7 @@ def timing_trials(
     state: TrialState, present: Fit, scores: dict[Key, tuple[Candidate, Score]], other: float
 ) -> list[Trial]:
     """Exact refits with one timing more, of those that may matter; scores: of the first order."""
-    timings = (*TIMINGS, *sensor_timings(state.model))
+    timings = (*timings_of(state.model, state.chunk[:, 0]), *sensor_timings(state.model))
     open_ = [t for t in timings if not present.revision.has(key_of(t))]
     if present.rho < LARGE:
         open_ = [t for t in open_ if key_of(t) in scores and scores[key_of(t)][1].gain > GAIN]

@@ -32,7 +32,7 @@ from rtid.diagnose.trials import (
 from rtid.diagnose.verdict import MATERIAL
 from rtid.effects.laws.pump import PUMP
 from rtid.effects.laws.sensors import sensor_timings
-from rtid.effects.laws.timing import COMMAND, TIMINGS
+from rtid.effects.laws.timing import COMMAND, timings_of
 from rtid.errors import RtidError
 from rtid.plain import Key
 from rtid.units import nearest
@@ -84,7 +84,8 @@ def extend(present: Standing, effect: str, where: str = "") -> Extension:
 
 def _timings(present: Standing, effect: str, where: str) -> list[Trial]:
     """Refits with a timing of that name; none if there is no such timing."""
-    all_timings = (*TIMINGS, *sensor_timings(present.state.model))
+    model = present.state.model
+    all_timings = (*timings_of(model, present.state.chunk[:, 0]), *sensor_timings(model))
     timings = [t for t in all_timings if t.effect == effect]
     if not timings:
         return []

@@ -16,7 +16,7 @@ from rtid.effects.column import Candidate, Cause
 from rtid.effects.laws import causes
 from rtid.effects.laws.pump import PUMP
 from rtid.effects.laws.sensors import sensor_timings
-from rtid.effects.laws.timing import COMMAND, TIMINGS, Psi, TimingLaw
+from rtid.effects.laws.timing import COMMAND, Psi, TimingLaw, timings_of
 from rtid.effects.page import Effect
 from rtid.effects.record_view import RecordView
 from rtid.errors import RtidError
@@ -57,7 +57,8 @@ def recall(
 
     Raises PartError where a part fits no effect of this machine and record.
     """
-    told = [(part, _timing(model, part)) for part in parts]
+    known = (*timings_of(model, chunk[:, 0]), PUMP, *sensor_timings(model))
+    told = [(part, _timing(part, known)) for part in parts]
     timings = tuple(timing for _, timing in told if timing is not None)
     fixed = [part for part, timing in told if timing is None]
     if not fixed:
@@ -68,8 +69,8 @@ def recall(
     return Revision(tuple(_candidate(p, offered) for p in fixed), timings)
 
 
-def _timing(model: Machine, part: AddedEffect) -> tuple[TimingLaw, Psi] | None:
-    for timing in (*TIMINGS, PUMP, *sensor_timings(model)):
+def _timing(part: AddedEffect, known: tuple[TimingLaw, ...]) -> tuple[TimingLaw, Psi] | None:
+    for timing in known:
         if timing.is_at(*part.key) and timing.own_spools == part.own_spools:
             return timing, tuple(_value(part, name) for name in timing.parameters)
     if part.where == COMMAND:

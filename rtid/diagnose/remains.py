@@ -14,7 +14,7 @@ from rtid.compare.dependence import (
     over_time,
 )
 from rtid.diagnose.fit import Fit
-from rtid.diagnose.residual import WN_RAD_S, ZETA, Residual, residual
+from rtid.diagnose.residual import Residual, residual
 from rtid.model import Machine
 from rtid.plain import FloatArray
 
@@ -31,7 +31,8 @@ NEXT = (
 
 def filtered(model: Machine, part: Residual, chunk: FloatArray) -> Comparison:
     """A residual beside the signals of its record, chunk (n, 2 + signals), SI, for `Dependence`."""
-    at_s = part.t_s - 2 * ZETA / WN_RAD_S  # the filter's delay at low frequencies
+    by = model.filter
+    at_s = part.t_s - 2 * by.zeta / by.wn_rad_s  # the filter's delay at low frequencies
     values = [np.interp(at_s, chunk[:, 0], chunk[:, 2 + j]) for j in range(len(model.signals))]
     empty = np.empty((0, len(model.chambers)))
     return Comparison(

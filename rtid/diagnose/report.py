@@ -119,7 +119,10 @@ class Small:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Everything that `rtid diagnose` says; residuals are root mean squares behind H_f."""
+    """Everything that `rtid diagnose` says; residuals are root mean squares behind H_f.
+
+    disturbance: what the rows were weighed for beside the sensors' noise, rate per sqrt(Hz).
+    """
 
     verdict: str
     added: tuple[FittedEffect, ...]
@@ -139,6 +142,7 @@ class Diagnosis:
     advice: tuple[str, ...]
     doubts: tuple[Doubt, ...] = ()
     cut: tuple[Cut, ...] = ()
+    disturbance: float = 0.0
 
     @property
     def is_slight(self) -> bool:
@@ -177,6 +181,7 @@ def diagnosis(result: Result) -> Diagnosis:
         advice=advice(result, unseen),
         doubts=doubts_about(last),
         cut=cuts(last.declared, last.chunk),
+        disturbance=max(chamber.disturbance for chamber in last.declared.chambers),
     )
 
 

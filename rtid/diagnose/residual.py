@@ -1,7 +1,8 @@
 """The equation residual of a fitted revision on any record, beside what the sensors alone leave.
 
-Everything passes the standard filter H_f (10 Hz, damping 0.8, 50 rows per second).  Intervals whose
-blocks the fit does not know are left out, and the filter settles anew behind them.
+Everything passes the machine's filter H_f (10 Hz, damping 0.8, 50 rows per second unless another is
+declared).  Intervals whose blocks the fit does not know are left out, and the filter settles anew
+behind them.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from rtid.estimator.state import variance
 from rtid.kernels.explain import filter_rows
 from rtid.plain import FloatArray
 
-WN_RAD_S, ZETA, ROWS_PER_S = 2 * np.pi * 10, 0.8, 50.0
-KNOWN = 0.004  # of the rated flow: where the map is known worse, nothing is judged
+KNOWN = 4.0  # times what a valid block may be uncertain by: where the map is known worse, nothing
+# is judged
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,12 @@ class Residual:
     measured: FloatArray
     left: FloatArray
     noise: FloatArray
+    rows_per_s: float = 50.0
+
+    @property
+    def judged_s(self) -> float:
+        """Length of what is judged: the map is known well enough there."""
+        return len(self.t_s) / self.rows_per_s
 
     @property
     def rms_m3s(self) -> float:
@@ -85,8 +92,8 @@ def residual(fit: Fit, chunk: FloatArray, leave_out: Candidate | None = None) ->
     view = RecordView.of(fit.model, sent, fit.weights, fit.map)
     flows = measured(view)
     rates = [flows, flows - modelled(fit, view, leave_out), _noise(fit, view)]
-    t_s, parts = through_filter(view, rates)
-    return Residual(t_s, *parts)
+    t_s, (moved, left, noise) = through_filter(view, rates)
+    return Residual(t_s, moved, left, noise, fit.model.filter.rows_per_s)
 
 
 def measured(view: RecordView) -> FloatArray:
@@ -104,10 +111,11 @@ def through_filter(
     left out.
     """
     rates_of_all = np.concatenate(rates, axis=1)
-    rates_of_all[~view.inside | (view.flow_sd() > KNOWN)] = np.nan
-    period = 1.0 / ROWS_PER_S
+    worst, by = KNOWN * view.model.gates.max_sd_share, view.model.filter
+    rates_of_all[~view.inside | (view.flow_sd() > worst)] = np.nan
+    period = 1.0 / by.rows_per_s
     out = np.empty((int((view.t_s[-1] - view.t_s[0]) / period) + 2, 1 + rates_of_all.shape[1]))
-    n = filter_rows(view.t_s, rates_of_all, WN_RAD_S, ZETA, period, out)
+    n = filter_rows(view.t_s, rates_of_all, by.wn_rad_s, by.zeta, period, out)
     return out[:n, 0], np.split(out[:n, 1:], len(rates), axis=1)
 
 

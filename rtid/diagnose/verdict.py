@@ -64,6 +64,7 @@ def verdict(
         return MATCHES if last.rho < most_rho(last) and not doubts_about(last) else UNKNOWN
     rest = last.held.sse - last.regression.dof
     explained = 1.0 - rest / state.excess if state.excess > 0 else 1.0
-    if last.rho >= most_rho(last) and explained < NAMED:
+    # a rate without pressures is disturbed by whatever moves the machine: unseen data have judged
+    if last.declared.has_pressures and last.rho >= most_rho(last) and explained < NAMED:
         return UNKNOWN
     return AMBIGUOUS if any(f.alike for f in state.found[:1]) else MISSING

@@ -387,6 +387,14 @@ def _refuse_endless(
         raise EffectError(f"{reason}, {at}", "guard roots, logarithms and quotients")
 
 
+def needs_no_pressure(effect: Effect) -> bool:
+    """True where an effect can sit on a plant that has neither pressures nor volumes."""
+    if effect.law:
+        return False
+    names = {name for line in lines_of(effect) for name in line.names}
+    return bool(effect.into) or not any(n.startswith(("p_", "V_", "A_")) for n in names - {"A"})
+
+
 def fitted_names(effect: Effect) -> frozenset[str]:
     """Which of MODULUS and LENGTH multiply the coefficient: a fit knows them better than a column.
 

@@ -135,10 +135,10 @@ class RecordView:
         return float(np.median(self.dt_s))
 
     def signal(self, name: str) -> FloatArray:
-        """A signal by its name (n,), SI."""
+        """A signal by its name (n,), SI; zero for a quantity that is not there."""
         if name not in self._signals:
-            column = 2 + self.model.column(name)
-            self._signals[name] = np.ascontiguousarray(self.chunk[:, column])
+            values = self.chunk[:, 2 + self.model.column(name)] if name else np.zeros(self.n)
+            self._signals[name] = np.ascontiguousarray(values)
         return self._signals[name]
 
     @cached_property
@@ -233,6 +233,6 @@ class RecordView:
 
     @cached_property
     def has_pressures(self) -> bool:
-        """True where every chamber's pressure is measured."""
-        kinds = {s.name: s.kind for s in self.model.signals}
+        """True where the pressure of every chamber that has one is measured."""
+        kinds = {s.name: s.kind for s in self.model.signals} | {"": PRESSURE}
         return all(kinds.get(c.pressure) == PRESSURE for c in self.model.chambers)

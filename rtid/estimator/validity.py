@@ -57,6 +57,8 @@ def doubts(model: Machine, compliance: FloatArray, cov: FloatArray) -> tuple[Dou
     half = Z95 * np.sqrt(np.maximum(np.diag(cov), 0.0))
     result = []
     for chamber, c, h in zip(model.chambers, compliance, half, strict=True):
+        if not chamber.pressure:
+            continue
         if c + h < low or c - h > high:
             bounds = range_of(min(model.beta_bounds_pa), max(model.beta_bounds_pa), "Pa")
             result.append(

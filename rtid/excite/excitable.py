@@ -153,7 +153,7 @@ def machine_of(
     prior: Prior | None = None,
 ) -> DrivenMachine:
     """The nominal machine: maps as learned, else of the prior or data sheet, else by rated flow."""
-    model, stroke_m = project.model, project.sections.geometry.stroke_m
+    model, stroke_m = project.model, project.sections.stroke_m
     compliance = np.full(len(model.chambers), 1.0 / model.beta_nominal_pa)
     if solution is not None:
         theta, compliance = published(solution, prior).theta_cells(), solution.compliance

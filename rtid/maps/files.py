@@ -102,7 +102,10 @@ def provenance(
 
     effects: those beside which it was fitted, whose flow is not in the map; None: not known.
     """
-    known = {} if effects is None else {"effects": list(effects)}
+    known: dict[str, Any] = {} if effects is None else {"effects": list(effects)}
+    units = {chamber.unit for chamber in solution.model.chambers}
+    if units != {"m3/s"}:  # what stands in the columns of flows
+        known["flow_unit"] = "+".join(sorted(units))
     return known | {
         "program": f"rtid {rtid.__version__}",
         "project": project,

@@ -12,8 +12,10 @@ from firmware_bridge.catalog import Catalog
 from firmware_bridge.config import CYCLE, MULTIRATE, Assembly, MessageSource, SignalSource
 from rtid.model import (
     BOTH,
+    COMMAND_ONLY,
     MOST_MODE,
     NONE,
+    OTHER,
     TAYLOR,
     Chamber,
     Edge,
@@ -26,12 +28,15 @@ from rtid.model import (
     Upkeep,
 )
 from rtid.project.project import Sections
-from rtid.project.references import KINDS
-from rtid.project.schema import EdgeSection, SignalSection
+from rtid.project.references import KINDS, OTHERS
+from rtid.project.schema import EdgeSection, MapSection, SignalSection
 from rtid.units import Unit, find_unit
 
 MIN_GAP_S = 0.05
 _SI_UNIT = {"pressure": "Pa", "position": "m", "velocity": "m/s"}
+_SI_OTHER = {"force": "N", "acceleration": "m/s2", "temperature": "K", "rotation": "rad/s"}
+_SI_OTHER |= {"flow": "m3/s", "mass": "kg", "angle": "rad"}
+NO_BORDERS = (-1.0, 1.0)  # of a second argument that a map has not
 
 
 def build_model(sections: Sections, catalog: Catalog | None) -> Machine:
@@ -40,8 +45,8 @@ def build_model(sections: Sections, catalog: Catalog | None) -> Machine:
     gates, lag = sections.gates, sections.dynamics.spool_lag
     return Machine(
         signals=signals,
-        chambers=tuple(_chamber(name, sections) for name in sections.chambers),
-        edges=tuple(_edge(name, edge, sections, signals) for name, edge in sections.edges.items()),
+        chambers=_chambers(sections, signals),
+        edges=_edges(sections, signals),
         position=_position(sections, signals),
         beta_nominal_pa=sections.beta.nominal_pa,
         beta_bounds_pa=sections.beta.bounds_pa,
@@ -144,7 +149,7 @@ def _signal(name: str, signal: SignalSection, catalog: Catalog | None) -> Signal
     unit = unit_of(signal, catalog)
     scale = 1.0 if signal.scale is None else signal.scale
     step, limits = _dbc(signal, catalog)
-    ends = sorted(scale * limit + signal.offset for limit in limits)
+    ends = sorted(scale * limit + (signal.offset or 0.0) for limit in limits)
     kind = _kind(signal, unit)
     known = (0.0, float(MOST_MODE)) if kind == "mode" else (ends[0], ends[1])
     low, high = _to_si(signal.range or known, signal, unit)
@@ -153,7 +158,7 @@ def _signal(name: str, signal: SignalSection, catalog: Catalog | None) -> Signal
     return Signal(
         name=name,
         kind=kind,
-        unit=_SI_UNIT.get(kind, unit.name if unit.factor == 1.0 else unit.name[-1]),
+        unit=_SI_UNIT.get(kind) or _SI_OTHER.get(unit.dimension) or _command_unit(unit),
         noise=slope * (signal.noise or 0.0),
         resolution=slope * resolution,
         minimum=low,
@@ -161,8 +166,13 @@ def _signal(name: str, signal: SignalSection, catalog: Catalog | None) -> Signal
     )
 
 
+def _command_unit(unit: Unit) -> str:
+    return unit.name if unit.factor == 1.0 else unit.name[-1]
+
+
 def _kind(signal: SignalSection, unit: Unit) -> str:
-    return signal.kind or ("position" if signal.table else KINDS[unit.dimension])
+    other = OTHER if unit.dimension in OTHERS else ""
+    return signal.kind or ("position" if signal.table else other or KINDS[unit.dimension])
 
 
 def _slope(signal: SignalSection, unit: Unit) -> float:
@@ -188,7 +198,7 @@ def _source(
     scale = 1.0 if signal.scale is None else signal.scale
     table = None
     if signal.table is not None:  # the table takes the raw signal: undo scale and offset
-        raw = tuple((angle - signal.offset) / scale for angle in signal.table.angle)
+        raw = tuple((angle - (signal.offset or 0.0)) / scale for angle in signal.table.angle)
         table = (raw, signal.table.position_m)
         table = table if scale > 0 else (raw[::-1], signal.table.position_m[::-1])
     kind = _kind(signal, unit)
@@ -197,7 +207,7 @@ def _source(
         message="" if column else signal.message or "",
         signal=(signal.column if column else signal.signal) or "",
         factor=unit.factor * scale,
-        offset=unit.si(signal.offset),
+        offset=unit.si(signal.offset or 0.0),
         table=table,
         constant=None if signal.constant is None else unit.si(signal.constant),
         hold=signal.hold or ("zero" if kind in ("command", "mode") else "linear"),
@@ -279,15 +289,54 @@ def _open_in(edge: str, sections: Sections) -> tuple[int, ...]:
 
 
 def _position(sections: Sections, signals: tuple[Signal, ...]) -> str:
-    named = sections.geometry.position
+    if sections.rate:
+        return sections.rate.state
+    named = sections.geometry.position if sections.geometry else None
     return named or next(signal.name for signal in signals if signal.kind == "position")
+
+
+def _chambers(sections: Sections, signals: tuple[Signal, ...]) -> tuple[Chamber, ...]:
+    """The pressure equations, or the one of a rate, which is called like its state."""
+    if sections.rate is None:
+        return tuple(_chamber(name, sections) for name in sections.chambers)
+    state = next(s for s in signals if s.name == sections.rate.state)
+    known = sections.rate.disturbance or 0.0
+    size = known * unit_of(sections.signals[state.name], None).factor
+    return (Chamber(state.name, NONE, 1.0, 1, 0.0, size, per_second(state.unit)),)
+
+
+def per_second(unit: str) -> str:
+    """The SI unit of a rate: m/s of m, m/s2 of m/s."""
+    return f"{unit}2" if unit.endswith("/s") else f"{unit}/s"
+
+
+def _edges(sections: Sections, signals: tuple[Signal, ...]) -> tuple[Edge, ...]:
+    """The metering edges, or the maps of a rate."""
+    if sections.rate is None:
+        return tuple(_edge(name, edge, sections, signals) for name, edge in sections.edges.items())
+    return tuple(_map(name, part, sections) for name, part in sections.maps.items())
+
+
+def _map(name: str, part: MapSection, sections: Sections) -> Edge:
+    """f(command, over): an edge whose pressure drop is the other signal; all sizes become SI."""
+    assert sections.rate is not None
+    factor = unit_of(sections.signals[sections.rate.state], None).factor
+    over = unit_of(sections.signals[part.over], None) if part.over else None
+    borders = NO_BORDERS if over is None else [over.si(v) for v in part.over_grid or ()]
+    grid = Grid(np.array(part.u_grid_v), np.array(borders))
+    return Edge(
+        name=name, source=part.over or NONE, sink=NONE, command=part.command, direction=1,
+        grid=grid, safe_band_v=-math.inf, rated_q_m3s=factor * part.rated,
+        rated_dp_pa=float(np.abs(grid.dp_pa).max()), basis=part.basis,
+        terms=BOTH if part.over else COMMAND_ONLY, signs=((sections.rate.state, 1),),
+    )  # fmt: skip
 
 
 def _chamber(name: str, sections: Sections) -> Chamber:
     """V(x) = v0 + sign A x; the dead volume is what is left at the end where V is smallest."""
     chamber = sections.chambers[name]
     area_m2 = chamber.net_area_m2()
-    swept_m3 = area_m2 * sections.geometry.stroke_m if chamber.sign < 0 else 0.0
+    swept_m3 = area_m2 * sections.stroke_m if chamber.sign < 0 else 0.0
     return Chamber(name, chamber.pressure, area_m2, chamber.sign, chamber.dead_volume_m3 + swept_m3)
 
 

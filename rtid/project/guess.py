@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,8 +10,9 @@ import numpy as np
 
 from firmware_bridge.catalog import Catalog
 from firmware_bridge.sources.table import Table, is_time
+from rtid.errors import RtidError
 from rtid.project.references import KIND_DIMENSIONS
-from rtid.units import find_unit, said, split_name, units_of, words_of
+from rtid.units import find_unit, nearest, said, split_name, units_of, words_of
 
 _PRESSURE = {"p", "pressure", "press", "pres", "prs", "druck"}
 _WANTED_NOT_MEASURED = {"ref", "reference", "set", "setpoint", "target", "desired", "demand", "des"}
@@ -113,7 +115,7 @@ def propose(candidates: list[RoleCandidate]) -> dict[str, RoleCandidate]:
     roles = _chosen(candidates, None)
     anchor = next((roles[name] for name in ("p_a", "p_b", "x") if name in roles), None)
     kin = _chosen(candidates, anchor)
-    return {role.name: _with_unit(kin[role.name], role) for role in ROLES if role.name in kin}
+    return {role.name: with_unit(kin[role.name], role) for role in ROLES if role.name in kin}
 
 
 def _chosen(
@@ -146,6 +148,31 @@ def unused(candidates: list[RoleCandidate], roles: dict[str, RoleCandidate]) -> 
     return [c for c in candidates if (c.message, c.name) not in used]
 
 
+def with_named(
+    roles: dict[str, RoleCandidate], given: Mapping[str, RoleCandidate]
+) -> dict[str, RoleCandidate]:
+    """Guessed roles with those that the user has named; a named signal plays no other role."""
+    taken = {(c.message, c.name) for c in given.values()}
+    return {r: c for r, c in roles.items() if (c.message, c.name) not in taken} | dict(given)
+
+
+def named(candidates: list[RoleCandidate], given: Mapping[str, str]) -> dict[str, RoleCandidate]:
+    """The signals that the user has named for roles; RtidError for a name that is none."""
+    known = {c.full_name: c for c in candidates} | {c.name: c for c in candidates}
+    kinds = {role.name: role for role in ROLES}
+    for role, name in given.items():
+        if role not in kinds or name not in known:
+            near = nearest(role, list(kinds)) if role not in kinds else nearest(name, list(known))
+            what = "role" if role not in kinds else "signal"
+            raise RtidError(f"--role {role}={name}: no such {what}", near, 2)
+    return {role: with_unit(known[name], kinds[role]) for role, name in given.items()}
+
+
+def is_wanted(candidate: RoleCandidate) -> bool:
+    """Whether a name says that its signal is wanted, and not measured."""
+    return bool(words_of(candidate.stem) & _WANTED_NOT_MEASURED)
+
+
 def _score(role: Role, candidate: RoleCandidate) -> float:
     """Positive if the candidate may play the role."""
     words = words_of(candidate.stem)
@@ -167,7 +194,7 @@ def _score(role: Role, candidate: RoleCandidate) -> float:
     return max(2 * matched + 2 * fits - 0.5 * foreign, 0.1)
 
 
-def _with_unit(candidate: RoleCandidate, role: Role) -> RoleCandidate:
+def with_unit(candidate: RoleCandidate, role: Role) -> RoleCandidate:
     """The candidate with a unit guessed from its range, if the file gives none."""
     if candidate.unit:
         return candidate

@@ -16,13 +16,14 @@ from rtid.project import added, build, effects, references, schema, trust
 from rtid.project.errors import Problem, ProjectError
 from rtid.project.project import Project, Sections
 from rtid.project.sections import Raw, read_section
-from rtid.units import find_unit, nearest, units_of
+from rtid.units import find_unit, nearest, show_flow_as, units_of
 
 MAX_FILE_BYTES = 4 << 20
 SINGLE: dict[str, type[schema.Section]] = {
     "project": schema.ProjectSection,
     "source": schema.SourceSection,
     "geometry": schema.GeometrySection,
+    "rate": schema.RateSection,
     "edge_defaults": schema.EdgeDefaults,
     "prior": schema.PriorSection,
     "beta": schema.BetaSection,
@@ -41,9 +42,11 @@ NAMED: dict[str, type[schema.Section]] = {
     "signals": schema.SignalSection,
     "chambers": schema.ChamberSection,
     "edges": schema.EdgeSection,
+    "maps": schema.MapSection,
     "effects": schema.EffectSection,
 }
-REQUIRED = ("project", "source", "signals", "geometry", "chambers", "edges")
+REQUIRED = ("project", "source", "signals")
+OF_PRESSURES, OF_RATE = ("geometry", "chambers", "edges"), ("rate", "maps")  # one or the other
 
 
 @door
@@ -60,7 +63,9 @@ def load(path: str | Path) -> Project:
     if problems:
         first = {problem.path: problem for problem in reversed(problems)}  # one per place
         raise ProjectError(path, [p for p in problems if first[p.path] is p])
-    return _assemble(path, Sections(**parts), databases, catalog, user_effects)
+    project = _assemble(path, Sections(**parts), databases, catalog, user_effects)
+    show_flow_as(project.model.chambers[0].unit)
+    return project
 
 
 def _parse(path: Path) -> Raw:
@@ -88,8 +93,16 @@ def _read_sections(raw: Raw) -> tuple[dict[str, Any], list[Problem]]:
         Problem(name, "unknown section", nearest(name, known)) for name in raw if name not in known
     ]
     problems += [
-        Problem(name, "missing", f"add a section [{name}]") for name in REQUIRED if name not in raw
+        Problem(name, "missing", f"add a section [{name}]")
+        for name in (*REQUIRED, *(OF_RATE if "rate" in raw else OF_PRESSURES))
+        if name not in raw
     ]
+    if "rate" in raw:
+        problems += [
+            Problem(n, "has no place beside [rate]", "drop it: a plant has pressures, or a rate")
+            for n in (*OF_PRESSURES, "edge_defaults", "modes")
+            if n in raw
+        ]
     parts: dict[str, Any] = {"messages": {}}
     for name, kind in SINGLE.items():
         if name in raw:

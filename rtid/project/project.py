@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,10 +26,12 @@ from rtid.project.schema import (
     FilterSection,
     GatesSection,
     GeometrySection,
+    MapSection,
     MessageSection,
     PriorSection,
     ProjectSection,
     PublishSection,
+    RateSection,
     RecordSection,
     SignalSection,
     SourceSection,
@@ -46,11 +49,13 @@ class Sections:
 
     project: ProjectSection
     source: SourceSection
-    geometry: GeometrySection
     messages: dict[str, MessageSection]
     signals: dict[str, SignalSection]
-    chambers: dict[str, ChamberSection]
-    edges: dict[str, EdgeSection]
+    geometry: GeometrySection | None = None  # none of a plant without pressures
+    chambers: dict[str, ChamberSection] = field(default_factory=dict)
+    edges: dict[str, EdgeSection] = field(default_factory=dict)
+    rate: RateSection | None = None
+    maps: dict[str, MapSection] = field(default_factory=dict)
     edge_defaults: EdgeDefaults = field(default_factory=EdgeDefaults)
     modes: dict[str, tuple[str, ...]] = field(default_factory=dict)
     beta: BetaSection = field(default_factory=BetaSection)
@@ -66,6 +71,11 @@ class Sections:
     publish: PublishSection = field(default_factory=PublishSection)
     effects: dict[str, EffectSection] = field(default_factory=dict)
     added: tuple[AddedSection, ...] = ()
+
+    @property
+    def stroke_m(self) -> float:
+        """The stroke; inf for a plant that has none."""
+        return self.geometry.stroke_m if self.geometry else math.inf
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from firmware_bridge.catalog import Catalog
+from rtid.model import OTHER
 from rtid.project.errors import Problem
 from rtid.project.sections import Raw, key_of
 from rtid.units import COMMAND_DIMENSIONS, UNITS, find_unit, nearest, units_of
@@ -20,6 +21,7 @@ KINDS = {
     "velocity": "velocity",
     "mode": "mode",
 } | dict.fromkeys(COMMAND_DIMENSIONS, "command")
+OTHERS = ("force", "acceleration", "temperature", "rotation", "flow", "mass")
 KIND_DIMENSIONS = {
     "command": COMMAND_DIMENSIONS,
     "pressure": ("pressure",),
@@ -33,10 +35,11 @@ REFERENCES = {
     ("edges", "source"): "pressure",
     ("edges", "sink"): "pressure",
     ("edges", "command"): "command",
+    ("maps", "command"): "command",
 }
 TEXT_KEYS = {
     *("dbc", "message", "signal", "column", "unit", "kind", "counter", "crc", "of"),
-    *("pressure", "position", "source", "sink", "command", "reference_map"),
+    *("pressure", "position", "source", "sink", "command", "reference_map", "state", "over"),
 }
 EDGE_NEEDS = {
     "u_grid": "u_grid_v = [1.0, {start = 1.5, stop = 4.0, step = 0.25}, 7.0]",
@@ -67,6 +70,8 @@ def kind_of(signal: Raw, dbc_unit: str | None = None) -> str | None:
         return kind
     if signal.get("table"):
         return "position"
+    if unit and unit.dimension in OTHERS:
+        return OTHER
     return KINDS.get(unit.dimension) if unit else None
 
 
@@ -86,7 +91,7 @@ def check(raw: Raw, catalog: Catalog | None, folder: Path) -> Iterator[Problem]:
     for name, signal in tables(raw, "signals").items():
         yield from _signal(f"signals.{name}", signal, kinds[name], catalog, raw)
     yield from _named_signals(raw, kinds)
-    yield from _position(raw, kinds)
+    yield from _rate(raw, kinds) if "rate" in raw else _position(raw, kinds)
     for name, chamber in tables(raw, "chambers").items():
         yield from _chamber(f"chambers.{name}", chamber)
     for name, edge in tables(raw, "edges").items():
@@ -101,6 +106,9 @@ def _signal(
     path: str, signal: Raw, kind: str | None, catalog: Catalog | None, raw: Raw
 ) -> Iterator[Problem]:
     yield from _signal_source(path, signal, catalog, raw)
+    if signal.get("offset") == "estimate" and (kind != "command" or "rate" not in raw or catalog):
+        remedy = "give a number; the neutral of a command is found in tables, beside [rate]"
+        yield Problem(f"{path}.offset", "cannot be estimated here", remedy)
     dbc_unit = find_dbc_unit(signal, catalog)
     name = signal.get("unit", dbc_unit)
     unit = find_unit(str(name)) if name else None
@@ -114,7 +122,7 @@ def _signal(
     elif kind in KIND_DIMENSIONS and unit.dimension not in KIND_DIMENSIONS[kind]:
         fit = [u.name for d in KIND_DIMENSIONS[kind] for u in units_of(d)]
         yield Problem(f"{path}.unit", f"{name!r} is no unit of {kind}", f"use {' or '.join(fit)}")
-    elif unit.dimension == "angle" and "table" not in signal:
+    elif unit.dimension == "angle" and "table" not in signal and kind != OTHER:
         remedy = "add table = {angle = [...], position_mm = [...]}"
         yield Problem(f"{path}.table", "missing: an angle is not yet a position", remedy)
     declared = find_unit(dbc_unit or "")
@@ -174,6 +182,28 @@ def _position(raw: Raw, kinds: dict[str, str | None]) -> Iterator[Problem]:
     elif len(positions) > 1:
         remedy = f"add position = {positions[0]!r}"
         yield Problem("geometry.position", f"several positions: {', '.join(positions)}", remedy)
+
+
+def _rate(raw: Raw, kinds: dict[str, str | None]) -> Iterator[Problem]:
+    """The state of [rate], and what its maps are over."""
+    named: dict[str, str | None] = {"rate.state": table(raw, "rate").get("state")}
+    for name, part in tables(raw, "maps").items():
+        named[f"maps.{name}.over"] = part.get("over")
+        if ("over" in part) != ("over_grid" in part):
+            remedy = "give both, or neither for a map over its command alone"
+            yield Problem(f"maps.{name}.over", "over and over_grid belong together", remedy)
+        yield from _map_unit(f"maps.{name}", part, raw)
+    for path, wanted in named.items():
+        if wanted is not None and wanted not in kinds:
+            yield Problem(path, f"there is no signal {wanted!r}", nearest(wanted, list(kinds)))
+
+
+def _map_unit(path: str, part: Raw, raw: Raw) -> Iterator[Problem]:
+    command = part.get("command")
+    signal = tables(raw, "signals").get(str(command))
+    unit = find_unit(str(signal.get("unit"))) if signal else None
+    if isinstance(command, str) and unit is not None:
+        yield from _command_unit(path, part, command, unit.dimension)
 
 
 def _chamber(path: str, chamber: Raw) -> Iterator[Problem]:

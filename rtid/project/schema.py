@@ -169,10 +169,10 @@ class SignalSection(Section):
     signal: str | None = None
     column: str | None = None
     unit: str | None = None
-    kind: Literal["command", "pressure", "position", "velocity", "mode"] | None = None
+    kind: Literal["command", "pressure", "position", "velocity", "mode", "other"] | None = None
     hold: Literal["zero", "linear"] | None = None
     scale: float | None = None
-    offset: float = 0.0
+    offset: Estimable = 0.0
     noise: Estimable = Field(default=None, ge=0)
     resolution: float | None = Field(default=None, ge=0)
     range: Interval | None = None
@@ -204,6 +204,31 @@ class ChamberSection(Section):
             return self.area_m2
         piston_m = self.piston_diameter_m or 0.0
         return math.pi / 4 * (piston_m**2 - self.rod_diameter_m**2)
+
+
+class RateSection(Section):
+    """[rate]: a plant without pressures, d state / dt = sum of its [maps]: a signal of any kind.
+
+    disturbance: what moves it beside, white, in the state's unit per second and sqrt(Hz); it is
+    found in the record unless given.
+    """
+
+    state: str = Field(description='state = "x", the signal whose rate the maps give')
+    disturbance: Estimable = Field(default=None, ge=0)
+
+
+class MapSection(Section):
+    """[maps.NAME]: a part f(command) of the rate, or f(command, over) of a second signal.
+
+    over_grid is in the unit of that signal, rated, its usual size, in that of the state per second.
+    """
+
+    command: str = Field(description='command = "u", a command of [signals]')
+    u_grid_v: Annotated[Borders, COMMAND] = Field(description="u_grid_v = [-10.0, 0.0, 10.0]")
+    over: str | None = None
+    over_grid: Borders | None = None
+    rated: float = Field(gt=0, description="rated = 50, the usual size, state's unit per second")
+    basis: Literal["taylor", "lapped", "blended"] = "taylor"
 
 
 class EdgeDefaults(Section):

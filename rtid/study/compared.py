@@ -132,7 +132,9 @@ def study(
                 extra.get(title),
             )
         parts = {title: examination.equation for title, examination in examinations.items()}
-        return Held(candidate.name, 1.0 / candidate.compliance, parts, candidate, examinations)
+        with np.errstate(divide="ignore"):  # of a plant without pressures: none
+            beta_pa = 1.0 / candidate.compliance
+        return Held(candidate.name, beta_pa, parts, candidate, examinations)
 
     return _assembled(result, references, name, chunks[IDENTIFICATION], hold)
 

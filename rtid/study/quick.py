@@ -7,8 +7,10 @@ diagnosis then do with it what they do with any other.
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,7 @@ from rtid.effects import catalogue
 from rtid.errors import RtidError
 from rtid.plain import Progress, silent
 from rtid.project import Project, load
+from rtid.project import guess as proposal
 from rtid.project.guess import RoleCandidate, unused
 from rtid.study.kept_record import model_for
 from rtid.study.quick_machine import (
@@ -29,6 +32,7 @@ from rtid.study.quick_machine import (
     fitted_machine,
 )
 from rtid.study.quick_project import DEAD_VOLUME, of_channels, of_missing, project_text
+from rtid.study.quick_rate import QuickRate, quick_rate
 from rtid.study.study import diagnose_trace
 from rtid.trace import Report, judge
 from rtid.trace.quick_data import BAD, Point, level_of, points
@@ -39,6 +43,8 @@ from rtid.trace.signals import Recording, read_recording
 SCHEMA = 1
 TURNS = 2  # signs that may have to be turned round
 SWAPPED = "chambers"
+CHAMBERS = {"p_a", "p_b"}
+NOBODY: Mapping[str, str] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -92,13 +98,34 @@ class Quick:
 
 
 def quick(
-    path: Path, dbc: Path | None = None, given: Given | None = None, progress: Progress = silent
-) -> Quick:
-    """Judge a table or a CAN log.  Raises RtidError where it cannot be read or lacks a role."""
+    path: Path,
+    dbc: Path | None = None,
+    given: Given | None = None,
+    progress: Progress = silent,
+    roles: Mapping[str, str] = NOBODY,
+) -> Quick | QuickRate:
+    """Judge a table or a CAN log; roles: names of signals by role, where guesses would fail.
+
+    A table without pressures is one of a plant that is a rate.  Raises RtidError where the file
+    cannot be read, or is of no kind of plant.
+    """
     given = given or Given()
     progress("reading", 0.0)
     source = open_source(path, dbc)
-    roles = roles_of(path, source)
+    named = proposal.named(source.signals, roles)
+    guessed = proposal.with_named(proposal.propose(source.signals), named)
+    if "time_column" in source.keys and not CHAMBERS & guessed.keys():
+        return quick_rate(path, source, named, progress)
+    return _of_cylinder(path, source, roles_of(path, source, named), given, progress)
+
+
+def _of_cylinder(
+    path: Path,
+    source: Source,
+    roles: dict[str, RoleCandidate],
+    given: Given,
+    progress: Progress,
+) -> Quick:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "machine.toml"
         arranged = _arranged(file, path, source, roles, given)
@@ -200,7 +227,7 @@ def _project(
 def _judged(project: Project, trace: Recording) -> Report:
     table = project.table_assembly
     assembly = table if trace.is_table and table else project.assembly
-    stroke_m = project.sections.geometry.stroke_m
+    stroke_m = project.sections.stroke_m
     return judge(
         project.model,
         assembly,

@@ -10,7 +10,7 @@ import numpy as np
 
 from rtid.diagnose.extend import Extension
 from rtid.diagnose.report import Value, parameters
-from rtid.diagnose.residual import ROWS_PER_S, Residual
+from rtid.diagnose.residual import Residual
 from rtid.diagnose.standing import Standing
 from rtid.project.added import AddedSection, ChangeSection, ErrorsSection, ParameterSection
 
@@ -69,7 +69,7 @@ def errors_between(before: Standing, after: Standing) -> ErrorsSection:
         heldout_pct=_percents(before.held_out, after.held_out, held_out),
         noise_floor_m3s=_finite(after.held_out.floor_m3s),
         noise_floor_pct=_finite(100 * after.held_out.floor_m3s / held_out),
-        judged_s=len(after.held_out.t_s) / ROWS_PER_S,
+        judged_s=after.held_out.judged_s,
     )
 
 

@@ -21,7 +21,7 @@ from rtid.diagnose.revision import Revision
 from rtid.effects.column import Candidate
 from rtid.effects.laws.pump import PUMP
 from rtid.effects.laws.sensors import sensor_timings
-from rtid.effects.laws.timing import TIMINGS, Psi
+from rtid.effects.laws.timing import Psi, timings_of
 from rtid.effects.page import Effect as Page
 from rtid.effects.record_view import MapTerms
 from rtid.estimator.blocks import Block
@@ -72,7 +72,7 @@ class Seed:
         def with_page(effect: Candidate) -> Candidate:
             return replace(effect, page=pages.get(effect.effect))
 
-        laws = (*TIMINGS, PUMP, *sensor_timings(model))
+        laws = (*timings_of(model, chunk[:, 0]), PUMP, *sensor_timings(model))
         kinds = {(t.effect, t.where, t.own_spools): t for t in laws}
         timings = tuple((kinds[effect, at, apart], psi) for effect, at, apart, psi in self.timings)
         effects = tuple(map(with_page, self.effects))

@@ -17,6 +17,7 @@ import numpy as np
 from rtid.compare import Reference
 from rtid.diagnose.clean import as_measured, usable
 from rtid.diagnose.diagnosis import Result, search, searched
+from rtid.diagnose.disturbance import with_disturbance
 from rtid.diagnose.extend import Extension, extend
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.partial import Exhibit, exhibits
@@ -82,8 +83,13 @@ class Study:
 
     @cached_property
     def machine(self) -> Machine:
-        """The declared machine, with the sensors' noise."""
-        return model_for(self.project, self.read.samples)
+        """The declared machine, with the sensors' noise, and what disturbs its rate if unknown."""
+        model = model_for(self.project, self.read.samples)
+        if model.has_pressures:
+            return model
+        self.progress("what moves it beside the command", 0.1)
+        chunk = taught(self.project, model, self.read)
+        return with_disturbance(model, chunk, added_parts(self.project), self.project.effects)
 
     @property
     def trace(self) -> Trace:

@@ -21,7 +21,7 @@ from rtid.model import COMMAND, POSITION, PRESSURE, VELOCITY, Machine, Signal
 from rtid.plain import FloatArray, Progress, silent
 from rtid.project import Project, Sections, load
 from rtid.project.build import digest
-from rtid.project.schema import GeometrySection, ProjectSection, SourceSection
+from rtid.project.schema import ProjectSection, SourceSection
 from rtid.study.compared import compare_trace
 from rtid.study.study import Study
 from rtid.trace.reading import Trace
@@ -104,15 +104,7 @@ def _project(machine: Project | Machine | str | Path) -> Project:
         return machine
     if not isinstance(machine, Machine):
         return load(machine)
-    sections = Sections(
-        ProjectSection(name="machine"),
-        SourceSection(),
-        GeometrySection(stroke_m=1.0),
-        {},
-        {},
-        {},
-        {},
-    )
+    sections = Sections(ProjectSection(name="machine"), SourceSection(), {}, {})
     nothing = Assembly(CYCLE, (), (), machine.position)
     key = digest(machine)
     return Project(Path("machine"), sections, machine, nothing, None, (), {}, (), {}, key, key)

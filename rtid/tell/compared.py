@@ -65,7 +65,7 @@ def of_span(comparison: TraceComparison, t0_s: float, t1_s: float) -> Story:
     rows = {(r.edge, r.i, r.j): r for rows in comparison.blocks_of.values() for r in rows}
     for visit in blocks_in_span(comparison, t0_s, t1_s):
         row = rows.get((visit.edge, visit.i, visit.j))
-        ranges = tables.ranges(row) if row else ("", "")
+        ranges = tables.ranges(row, scale_of("Pa").factor) if row else ("", "")
         state = (row.reason or row.status) if row else ""
         place = f"{visit.i},{visit.j}"
         cells.append((visit.edge, place, *ranges, f"{visit.time_s:.3f}", state))

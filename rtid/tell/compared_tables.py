@@ -42,9 +42,11 @@ def equation(studies: Sequence[TraceComparison]) -> Table:
             whole, rest = part.flow_rms_m3s[c], part.residual_rms_m3s[c]
             share, rho = f"{100 * part.residual_share[c]:.2f}", f"{part.rho[c]:.3g}"
             figures = flow.number(whole, 2), flow.number(rest, 4), share, rho
-        rows.append(
-            (tested.name, title, name, pressure.number(tested.beta_pa[c], 1), *figures, own_share)
-        )
+        beta = pressure.number(tested.beta_pa[c], 1)
+        rows.append((tested.name, title, name, beta, *figures, own_share))
+    if not any(comparison.replay.model.has_pressures for comparison in studies):
+        cells = [(*row[:3], *row[4:]) for row in rows]
+        return Table("Equation residual, rms", (*heads[:3], *heads[4:]), cells, keys=3)
     return Table("Equation residual, rms", heads, rows, keys=3)
 
 
@@ -133,11 +135,14 @@ def blocks(comparison: TraceComparison, title: str) -> Table:
     name = f", {comparison.held[0].name}" if comparison.held[0].name != "learned" else ""
     text = f"The {WORST} blocks with the largest share of the residual ({title}{name})"
     known = [row for row in comparison.blocks_of[title] if row.residual_rms_m3s >= 0]
+    model = comparison.replay.model
+    if not model.has_pressures:  # the second argument is one of any unit, or none
+        heads = ("map", "block", "u|", "over|", *units[1:], *heads[-2:])
     rows = [
         (
             row.edge,
             f"{row.i},{row.j}",
-            *ranges(row),
+            *ranges(row, scale_of("Pa").factor if model.has_pressures else 1.0),
             str(row.rows),
             flow.known(row.flow_m3s, row.sd_m3s, 3) if np.isfinite(row.flow_m3s) else "-",
             flow.number(row.residual_rms_m3s, 3) if np.isfinite(row.residual_rms_m3s) else "-",
@@ -149,9 +154,9 @@ def blocks(comparison: TraceComparison, title: str) -> Table:
     return Table(text, heads, rows, keys=2)
 
 
-def ranges(row: BlockRow) -> tuple[str, str]:
-    """The block's borders in V, and as pressures are shown."""
-    u, dp, factor = row.u_v, row.dp_pa, scale_of("Pa").factor
+def ranges(row: BlockRow, factor: float) -> tuple[str, str]:
+    """The block's borders in V, and of the drop times a factor."""
+    u, dp = row.u_v, row.dp_pa
     return f"{u[0]:g}..{u[1]:g}", f"{dp[0] * factor:g}..{dp[1] * factor:g}"
 
 

@@ -74,6 +74,8 @@ def remains(diagnosis: Diagnosis) -> str:
     called the same before an effect is added and after it.
     """
     is_open = diagnosis.verdict in (UNKNOWN, INSUFFICIENT)
+    if diagnosis.disturbance > 0 and not (is_open or diagnosis.something_remains):
+        return "What remains is taken for what moves the plant beside its command."
     if not diagnosis.something_remains:
         return (
             "" if is_open else "What remains is the sensors' noise: no model could be much better."

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 
+from rtid.compare.dead_band import DeadBand
 from rtid.effects import correcting
 from rtid.study.quick import Quick
 from rtid.study.quick_project import DEAD_VOLUME
+from rtid.study.quick_rate import QuickRate
 from rtid.tell.diagnosed import sentences
 from rtid.trace.quick_data import BAD, FAIR, GOOD
+from rtid.units import scale_of
 
 MARKS = {GOOD: "+", FAIR: "~", BAD: "-"}
 ANSWERS = {
@@ -44,6 +48,45 @@ def lines(quick: Quick) -> Iterator[str]:
     yield f"Next: {quick.next_command}"
     yield f"  fill in {FILL_IN}; then"
     yield f"  rtid check machine.toml {quick.path}  and  rtid diagnose {quick.path} -p machine.toml"
+
+
+def rate_lines(quick: QuickRate) -> Iterator[str]:
+    """Of a table without pressures: the pair, its neutral, band and gains, the verdict."""
+    pair, u, x = quick.pair, quick.pair.command, quick.pair.state
+    yield f"{quick.path.name}, without a project file: a plant without pressures, d x / dt = f(u)."
+    for role, candidate in (("u", u), ("x", x)):
+        guessed = ", unit guessed from its range" if candidate.guessed_unit else ""
+        yield f"  {role:9} {candidate.full_name} [{candidate.unit}{guessed}]"
+    for other in quick.others:
+        yield f"There is another pair: {other.options}"
+    if quick.unused:
+        yield f"Not used: {', '.join(quick.unused)}"
+    yield ""
+    yield f"The neutral of the command is {pair.neutral:.6g} {u.unit}: there x stands most."
+    for name, band in quick.bands.items():
+        yield from band_lines(name, band, quick.unit, quick.command_unit)
+    yield ""
+    yield f"Verdict: {quick.diagnosis.verdict}."
+    for sentence in sentences(quick.diagnosis):
+        yield f"  {sentence}"
+    yield ""
+    yield f"Next: {quick.next_command}"
+    then = f"rtid replay {quick.path} -p machine.toml"
+    yield f"  writes the project with what was found; then  {then}"
+
+
+def band_lines(name: str, band: DeadBand, unit: str, command_unit: str) -> Iterator[str]:
+    """Dead band and gains of one map in words; unit: SI, of its flow."""
+    if not math.isfinite(band.low):
+        yield f"Map {name} is not known on both sides of the neutral: command both ways."
+        return
+    scale = scale_of(unit)
+    gains = [scale.factor * gain for gain in (band.gain_below, band.gain_above)]
+    yield (
+        f"Map {name} passes next to nothing from {band.low:.3g} to {band.high:+.3g} {command_unit} "
+        f"about it; beyond, it gives {gains[0]:.3g} and {gains[1]:.3g} {scale.name} per "
+        f"{command_unit}, below and above."
+    )
 
 
 def _verdict(quick: Quick) -> Iterator[str]:

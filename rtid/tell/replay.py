@@ -146,6 +146,8 @@ class LearnedStory:
         for chamber, beta, sd in zip(
             model.chambers, solution.beta_pa, solution.beta_sd_pa, strict=True
         ):
+            if not chamber.pressure:
+                continue
             known = pressure.known(beta, sd, 1)
             yield f"bulk modulus, chamber {chamber.name}: {known} {pressure.name}"
         if fit.lag_sd_s > 0:
@@ -187,7 +189,13 @@ class LearnedStory:
         scale, drop = scale_of("m3/s"), scale_of("Pa")
         beside = "" if self.compared.reference is None else " | reference"
         title = f"{edge.name}: flow ±{beside} in {scale.name}   (~ not known well enough yet)"
+        declared = next(e for e in self.result.model.edges if e.name == edge.name)
+        unit = self.result.model.signals[self.result.model.column(declared.command)].unit
         heads = ("u \\ dp|", *(f"{drop.number(p, 2)} {drop.name}|" for p in dp))
+        if not (declared.source or declared.sink):
+            heads = ("u|", f"{scale.name}|")
+        elif not self.result.model.has_pressures:
+            heads = (f"u \\ {declared.source}|", *(f"{p:.4g}|" for p in dp))
         flows = None
         if self.compared.reference is not None:
             points = np.meshgrid(u, dp, indexing="ij")
@@ -196,7 +204,7 @@ class LearnedStory:
         for a, w in enumerate(u):
             row = None if flows is None else flows[a]
             cells = _map_cells(scale, edge, np.full(len(dp), w), dp, row)
-            rows.append((f"{w:.2f} V", *cells))
+            rows.append((f"{w:.2f} {unit}", *cells))
         return Table(title, heads, rows)
 
 

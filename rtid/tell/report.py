@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 import rtid
 from rtid.diagnose.regression import LIMIT_SD
 from rtid.diagnose.report import Unseen, Value
-from rtid.diagnose.residual import ROWS_PER_S, Residual
 from rtid.diagnose.trials import GAIN
 from rtid.diagnose.verdict import MATERIAL
 from rtid.effects.page import title
@@ -26,7 +25,7 @@ from rtid.tell.report_page import embedded, key_figures, page_of
 from rtid.tell.report_story import Ranked, ReportStory
 from rtid.tell.story import Bar, Bars, Chart, Planes, Story, StoryPart, Table
 from rtid.tell.words import named, quantity
-from rtid.units import CONVENTION, LPM, MPA, limit
+from rtid.units import CONVENTION, MPA, flow_name, limit, lpm
 
 NOTHING = "No flow of this record could be judged."
 PARTS = "identification part", "held-out part"
@@ -126,8 +125,8 @@ def _errors(story: ReportStory) -> Story:
         return Story("Error", (NOTHING,))
     caption = (
         f"Root mean square of measured less modelled chamber flow on the {part} of the record, "
-        f"in per cent of the rms flow of {LPM * diagnosis.rms_flow_m3s:.3g} "
-        f"L/min: {steps[0][1]:.2f} % for the model as it is"
+        f"in per cent of the rms flow of {lpm() * diagnosis.rms_flow_m3s:.3g} "
+        f"{flow_name()}: {steps[0][1]:.2f} % for the model as it is"
     )
     caption += f", {steps[-1][1]:.2f} % with everything that was found." if diagnosis.found else "."
     caption += f" Dashed: what the sensors' noise alone leaves, {floor:.2f} %."
@@ -153,18 +152,14 @@ def _flows(story: ReportStory) -> Story:
         "Flow into each chamber as the piston's motion measures it (dark) and as the model gives "
         "it (orange); below, the difference. The blue part taught the model, the yellow part was "
         "held out. Everything passes the same 10 Hz filter. "
-        f"The map is known well enough to judge {_judged_s(story.before[0]):.1f} s of the first "
+        f"The map is known well enough to judge {story.before[0].judged_s:.1f} s of the first "
         f"and "
-        f"{_judged_s(story.before[1]):.1f} s of the second; the rest is left out."
+        f"{story.before[1].judged_s:.1f} s of the second; the rest is left out."
     )
     if story.after:
         caption += " Left before, right with what was found, on the same scales."
     caption += " Drag to zoom in, double click for the whole record."
     return Story(heading_, (flows(story.chambers, models, caption),))
-
-
-def _judged_s(part: Residual) -> float:
-    return len(part.t_s) / ROWS_PER_S
 
 
 def _dependences(story: ReportStory) -> Story:
@@ -179,7 +174,7 @@ def _dependences(story: ReportStory) -> Story:
         "time, over the whole record, with its 95 % interval, and the share of the "
         "residual's variance that the bins explain. "
         "A trend says what the model misses; a right model lies on the zero line. The sensors' "
-        f"noise is {LPM * floor_m3s:.2g} L/min rms."
+        f"noise is {lpm() * floor_m3s:.2g} {flow_name()} rms."
     )
     return Story(heading_, (before_and_after(story.chambers, models, floor_m3s, caption),))
 

@@ -53,9 +53,10 @@ def _edge(
     model: Machine, edge: Edge, samples: Samples, is_row: BoolArray, period_s: float
 ) -> Coverage:
     w = edge.direction * samples.column(edge.command)
-    dp = samples.column(edge.source) - samples.column(edge.sink)
+    ends = [samples.column(n) if n else np.zeros(len(w)) for n in (edge.source, edge.sink)]
+    dp, shut = ends[0] - ends[1], max(edge.safe_band_v, 0.0) if model.has_pressures else -np.inf
     below = is_row & (w < edge.grid.u_v[0]) & (w > edge.safe_band_v)
-    opened = is_row & (w > max(edge.safe_band_v, 0.0))
+    opened = is_row & (w > shut)
     w, dp = w[opened], dp[opened]
     rows, _, _ = np.histogram2d(w, dp, [edge.grid.u_v, edge.grid.dp_pa])
     share = min(1.0, model.filter.rows_per_s * period_s) if model.form == "carry" else 1.0

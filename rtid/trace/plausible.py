@@ -62,7 +62,7 @@ def motion(model: Machine, samples: Samples) -> Motion:
     if len(windows.mean) < MIN_WINDOWS:
         nothing = Spring(float("nan"), float("nan"))
         return Motion(float("nan"), {c.name: nothing for c in model.chambers}, float("nan"))
-    springs = {c.name: _spring(model, c, windows) for c in model.chambers}
+    springs = {c.name: _spring(model, c, windows) for c in model.chambers if c.pressure}
     return Motion(_u_to_v(model, windows), springs, _v_slope(model, samples))
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -25,6 +27,7 @@ NEEDED = {
     "p_a": "the pressure of the chamber that grows with x",
     "p_b": "the pressure of the other chamber",
 }
+NOBODY: Mapping[str, RoleCandidate] = MappingProxyType({})
 LEAST_STEP = 1e-6  # of a signal's range: computed values have no noise of their own
 
 
@@ -107,12 +110,14 @@ def _signals(frames: Frames, name: str, catalog: Catalog) -> list[RoleCandidate]
     return candidates
 
 
-def roles_of(path: Path, source: Source) -> dict[str, RoleCandidate]:
-    """Who plays which role, all pressures of unknown unit in the same one.
+def roles_of(
+    path: Path, source: Source, given: Mapping[str, RoleCandidate] = NOBODY
+) -> dict[str, RoleCandidate]:
+    """Who plays which role, all pressures of unknown unit in the same one; given: as named.
 
     Raises RtidError naming what is missing and what there is.
     """
-    roles = proposal.propose(source.signals)
+    roles = proposal.with_named(proposal.propose(source.signals), given)
     missing = [f"{what} ({role})" for role, what in NEEDED.items() if role not in roles]
     if missing:
         there = ", ".join(f"{c.name} [{c.unit or '?'}]" for c in source.signals[:20]) or "nothing"

@@ -20,6 +20,7 @@ from rtid.plain import FloatArray
 from rtid.project import Project
 from rtid.trace.arrivals import Timing, timing
 from rtid.trace.learner import catalog_of
+from rtid.trace.neutral import about_neutral
 from rtid.trace.reading import assemble
 from rtid.trace.series import Series
 from rtid.trace.table import declared
@@ -61,6 +62,7 @@ def series_of(by_name: dict[str, Frames], catalog: Catalog) -> Iterator[tuple[st
 def _from_table(project: Project, content: Table) -> Recording:
     table, assembly = declared(project, content)
     samples, refused = to_samples(table, assembly)
+    samples = about_neutral(project, samples)
     t_us = table.t_us()
     series = tuple(
         Series(source.name, t_us, _si(table.column(source.signal), source))

@@ -25,6 +25,7 @@ from rtid.tell.words import quantity
 from rtid.ui.desk_views import Bench
 from rtid.ui.shared import Session, ShownRevision
 from rtid.ui.views import PageView
+from rtid.units import flow_name
 
 
 class AddView(PageView):
@@ -46,7 +47,7 @@ class AddView(PageView):
                 self._after.pressures.add(made, f"model {c}", BLUE, 1.0)
                 rows.append(row(made, sizing_mode="stretch_both"))
             title = f"chamber {chamber.name}: residual of the flow"
-            axis = plots.plot("add", "L/min", title, c == last)
+            axis = plots.plot("add", flow_name(), title, c == last)
             self._before.flows.add(axis, f"left {c}", ORANGE, 0.8)
             self._after.flows.add(axis, f"left {c}", BLUE, 0.8)
             rows.append(row(axis, sizing_mode="stretch_both"))

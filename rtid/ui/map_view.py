@@ -26,7 +26,7 @@ from rtid.tell.live import PanelPlot, PlanePlot
 from rtid.tell.story import Panel
 from rtid.ui.desk_views import Bench
 from rtid.ui.views import PageView
-from rtid.units import LPM, MPA, Z95
+from rtid.units import MPA, Z95, flow_name, lpm
 
 NOTHING = "nothing"
 ALONG = {"over the pressure drop": "dp", "over the command": "u"}
@@ -144,14 +144,16 @@ class MapView(PageView):
         points = deviations(single, reference, us, ps)[0]
         cells = []
         for k in range(len(points.w_v)):
-            words = f"{points.flow_m3s[k] * LPM:.2f} ± {Z95 * points.sd_m3s[k] * LPM:.2f}"
+            words = f"{points.flow_m3s[k] * lpm():.2f} ± {Z95 * points.sd_m3s[k] * lpm():.2f}"
             if other is not None and np.isfinite(points.reference_m3s[k]):
-                words += f" | {points.reference_m3s[k] * LPM:.2f} ({100 * points.share[k]:+.1f} %)"
+                words += (
+                    f" | {points.reference_m3s[k] * lpm():.2f} ({100 * points.share[k]:+.1f} %)"
+                )
             cells.append(text(words if points.status[k] == VALID else f"({words})"))
         rows = [
             (f"{d * MPA:g} MPa", *(cells[i * len(ps) + j] for i in range(len(us))))
             for j, d in enumerate(ps)
         ]
-        head = ("flow in L/min ± 95 %" + (f" | {self.beside}" if other else ""),
+        head = (f"flow in {flow_name()} ± 95 %" + (f" | {self.beside}" if other else ""),
                 *(f"{w:g} V" for w in us))  # fmt: skip
         return table(head, rows, "figures")

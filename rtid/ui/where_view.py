@@ -32,7 +32,7 @@ from rtid.tell.story import Panel
 from rtid.ui.add_view import name_of
 from rtid.ui.desk_views import Bench
 from rtid.ui.views import PageView
-from rtid.units import MPA
+from rtid.units import MPA, flow_name
 
 CHOICES = ("quantity", "part", "signal", "revision")
 
@@ -89,7 +89,7 @@ class WhereView(PageView):
         strips: list[figure] = []
         for c, chamber in enumerate(chambers):
             title, is_last = f"residual of chamber {chamber.name} over time", c == len(chambers) - 1
-            strip = self._time.plot("where", "L/min", title, is_last)
+            strip = self._time.plot("where", flow_name(), title, is_last)
             self._lines.add(strip, f"left {c}", CHAMBERS[c], 0.8)
             strips.append(strip)
         parts = [row(s, sizing_mode="stretch_both") for s in (*strips, self._over.root)]

@@ -11,7 +11,7 @@ from functools import partial
 from importlib import import_module
 
 from rtid.effects.column import Candidate, Cause, by_equation
-from rtid.effects.law import places_of
+from rtid.effects.law import needs_no_pressure, places_of
 from rtid.effects.laws.lines import lines
 from rtid.effects.laws.openings import opening
 from rtid.effects.laws.sensors import late_position, late_pressure
@@ -50,6 +50,8 @@ def cause_of(view: RecordView, candidate: Candidate) -> Cause:
 
 def _of(view: RecordView, effect: Effect) -> Iterator[Cause]:
     if not view.has_pressures or effect.law in COMMAND_LAWS or effect.no_law:
+        return
+    if not (view.model.has_pressures or needs_no_pressure(effect)):
         return
     if effect.law:
         yield from law_of(effect)(view, effect)

@@ -73,8 +73,11 @@ LATE_PRESSURE = of_law("late_pressure", quickened, where="")
 
 
 def sensor_timings(model: Machine) -> tuple[TimingLaw, ...]:
-    """The timings of a machine's sensors, each at its place."""
-    if not model.position:
+    """The timings of a machine's sensors, each at its place.
+
+    A plant without pressures has none: its position that is late is a command that is.
+    """
+    if not (model.position and model.has_pressures):
         return ()
     slow = (replace(LATE_PRESSURE, where=chamber.name) for chamber in model.chambers)
     return replace(LATE_POSITION, where=model.position), *slow

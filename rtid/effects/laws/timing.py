@@ -9,7 +9,7 @@ part of the command and rests at zero meanwhile: so there is one command for eit
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
@@ -17,11 +17,13 @@ import numpy as np
 
 from rtid.effects.page import catalogue
 from rtid.kernels.jit import kernel
+from rtid.model import Machine
 from rtid.plain import FloatArray
 
 Psi = tuple[float, ...]
 COMMAND, SUPPLY = "command", "supply"  # what a timing transforms; else a sensor at its place
 RATE = "rad/s"  # unit of a parameter that does the more the smaller it is
+USUAL_STEP_S = 0.01  # up to which the banks are those of the pages
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,23 @@ class TimingLaw:
     def of_sensor(self) -> bool:
         """True where it puts a measurement right."""
         return self.where not in (COMMAND, SUPPLY)
+
+    def at_step(self, step_s: float) -> TimingLaw:
+        """The same for a record of longer steps than a controller's: its times are so much longer.
+
+        step_s: usual step of the record.  A time below a fraction of it shows nothing.
+        """
+        times = step_s / USUAL_STEP_S
+        if times <= 1.0 or self.units[0] not in ("s", RATE):
+            return self
+        by = 1.0 / times if self.is_rate else times
+
+        def longer(psi: Psi) -> Psi:
+            return (by * psi[0], *psi[1:])
+
+        bank = tuple(longer(psi) for psi in self.bank)
+        low, high = longer(self.low), longer(self.high)
+        return replace(self, bank=bank, low=min(self.low, low), high=max(self.high, high))
 
     def strength(self, psi: Psi) -> float:
         """How much a command is changed, 0 for not at all."""
@@ -167,3 +186,12 @@ COMMAND_LAWS: dict[str, tuple[TimingLaw, ...]] = {
     "play": (of_law("play", played, is_linear=False),),
 }
 TIMINGS = tuple(timing for timings in COMMAND_LAWS.values() for timing in timings)
+
+
+def timings_of(model: Machine, t_s: FloatArray) -> tuple[TimingLaw, ...]:
+    """The timings that a command of this machine can have in a record with these instants (n,), s.
+
+    A plant without pressures has no spools of their own: its maps are over the signed command.
+    """
+    step_s = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
+    return tuple(t.at_step(step_s) for t in TIMINGS if model.has_pressures or not t.own_spools)

@@ -29,7 +29,7 @@ from rtid.model import Edge, Machine
 from rtid.tell.charts.theme import FIGURES_TAG, LIT, NARROWEST_PX, beside, plot
 from rtid.tell.colours import GREY
 from rtid.tell.live import YELLOWS
-from rtid.units import LPM, MPA, Z95
+from rtid.units import LPM, MPA, Z95, lpm
 
 Key = tuple[str, int, int]
 HATCHES = dict(zip(CAUSES, (" ", ".", "/", "\\", "x", "+"), strict=True))
@@ -209,12 +209,12 @@ def _columns(blocks: Sequence[BlockRow], quantity: Quantity) -> dict[str, list[A
         "ink": ["#ffffff" if d else "#22272b" for d in dark],
         "u": [f"{b.u_v[0]:g} to {b.u_v[1]:g}" for b in blocks],
         "dp": [f"{b.dp_pa[0] * MPA:.3g} to {b.dp_pa[1] * MPA:.3g}" for b in blocks],
-        "residual": [_told(b.residual_rms_m3s * LPM, ".3g") for b in blocks],
+        "residual": [_told(b.residual_rms_m3s * lpm(), ".3g") for b in blocks],
         "share": [_told(100 * b.residual_share, ".2g") for b in blocks],
         "rows": [f"{b.rows}" for b in blocks],
         "dwell": [f"{b.dwell_s:.2f}" for b in blocks],
-        "flow": [_told(b.flow_m3s * LPM, ".3g") for b in blocks],
-        "sd": [_told(Z95 * b.sd_m3s * LPM, ".2g") for b in blocks],
+        "flow": [_told(b.flow_m3s * lpm(), ".3g") for b in blocks],
+        "sd": [_told(Z95 * b.sd_m3s * lpm(), ".2g") for b in blocks],
         "condition": [_told(b.condition, ".1e") for b in blocks],
         "status": [b.status for b in blocks],
         "reason": [f"- {b.reason}" if b.reason else "" for b in blocks],

@@ -12,7 +12,7 @@ from rtid.model import Machine
 from rtid.plain import FloatArray
 from rtid.tell.colours import BLUE, CHAMBERS, MARKERS, ORANGE, UNITS
 from rtid.tell.story import Chart, Dots, Panel
-from rtid.units import LPM, Z95
+from rtid.units import Z95, flow_name, lpm
 
 COLUMNS = 2
 APART = 0.006, 0.1  # of the span, and of a step: between the points of two chambers
@@ -39,7 +39,7 @@ def over_signal(chambers: Sequence[str], dependence: Dependence) -> Panel:
     label = "" if by_name else f"{dependence.signal} in {unit}" if unit else dependence.signal
     title = f"residual over {dependence.signal}: explains {shares}"
     ticks = _directions(dependence) if by_name else ()
-    return Panel(title, label, "residual in L/min", points=points, ticks=ticks)
+    return Panel(title, label, f"residual in {flow_name()}", points=points, ticks=ticks)
 
 
 def dependences(
@@ -88,7 +88,7 @@ def _compared(
     )  # fmt: skip
     label = f"{first.signal} in {unit}" if unit else first.signal
     title = f"chamber {chamber} over {first.signal}"
-    return Panel(title, label, "residual in L/min", points=points, band=floor_m3s * LPM,
+    return Panel(title, label, f"residual in {flow_name()}", points=points, band=floor_m3s * lpm(),
                  limit=limit)  # fmt: skip
 
 
@@ -96,7 +96,7 @@ def _points(
     name: str, x: FloatArray, dependence: Dependence, c: int, look: tuple[str, str],
     is_joined: bool, note: str = "",
 ) -> Dots:  # fmt: skip
-    mean, error = dependence.mean_m3s[:, c] * LPM, Z95 * dependence.error_m3s[:, c] * LPM
+    mean, error = dependence.mean_m3s[:, c] * lpm(), Z95 * dependence.error_m3s[:, c] * lpm()
     return Dots(name, x, mean, error, *look, is_joined=is_joined, note=note)
 
 
@@ -112,4 +112,4 @@ def _scale(result: Sequence[Dependence]) -> float:
     means = np.concatenate([np.abs(d.mean_m3s).ravel() for d in result])
     ends = np.concatenate([(np.abs(d.mean_m3s) + Z95 * d.error_m3s).ravel() for d in result])
     most = max(1.1 * means.max(), 1.4 * np.quantile(ends, SHOWN)) if len(means) else 1.0
-    return float(LPM * most)
+    return float(lpm() * most)

@@ -11,7 +11,7 @@ from rtid.estimator.flowmap import VALID, EdgeMap, FlowMap
 from rtid.plain import BoolArray, FloatArray
 from rtid.tell.colours import BLUE, INK
 from rtid.tell.story import Chart, Dots, Line, Palette, Panel, Plane, Planes, Remark, Strip
-from rtid.units import LPM, MPA, Z95
+from rtid.units import MPA, Z95, flow_name, lpm
 
 FIELDS = 96, 120  # of a plane: over the pressure drop, over the command
 SLICES = 5
@@ -19,12 +19,16 @@ POINTS, DOTS = 200, 25  # of a slice, and of a reference beside it
 LEAST_FLOW = 0.02  # of the largest: what a row of blocks passes that is worth a slice
 SURE = 0.98  # quantile of what two maps differ by at which its scale ends
 DOUBT = 0.05  # of the largest flow: end of the scale of its interval
-COMMAND, DROP, FLOW = "opening command in V", "pressure drop in MPa", "flow in L/min"
+COMMAND, DROP = "opening command in V", "pressure drop in MPa"
+
+
+def _flow() -> str:
+    return f"flow in {flow_name()}"
 
 
 def maps(flowmap: FlowMap) -> Planes:
     """Q in L/min, one scale for all valves; veiled where a block is not valid."""
-    largest = max((np.nan_to_num(edge.q_max_m3s) for edge in flowmap.edges), default=0.0) * LPM
+    largest = max((np.nan_to_num(edge.q_max_m3s) for edge in flowmap.edges), default=0.0) * lpm()
     top = 1.25 * max(largest, 1e-3)
     planes = tuple(
         _plane(edge, edge.name, _flow_on(edge), (0.0, top), "flow") for edge in flowmap.edges
@@ -34,34 +38,34 @@ def maps(flowmap: FlowMap) -> Planes:
         "data, the others follow the valve's law from these."
     )
     words = "valid", "not valid: from the orifice law"
-    return Planes("maps", "Flow maps", planes, COMMAND, DROP, FLOW, caption, *words)
+    return Planes("maps", "Flow maps", planes, COMMAND, DROP, _flow(), caption, *words)
 
 
 def flow_plane(edge: EdgeMap) -> Plane:
     """The flow of a valve on its own scale."""
-    return _plane(edge, f"{edge.name}: {FLOW}", _flow_on(edge), (0.0, _top(edge)), "flow")
+    return _plane(edge, f"{edge.name}: {_flow()}", _flow_on(edge), (0.0, _top(edge)), "flow")
 
 
 def interval_plane(edge: EdgeMap) -> Plane:
     """Half the 95 % interval of a valve's flow."""
-    sd = Z95 * edge.sd(*_lattice(edge)) * LPM
-    title = f"{edge.name}: ± 95 % interval in L/min"
+    sd = Z95 * edge.sd(*_lattice(edge)) * lpm()
+    title = f"{edge.name}: ± 95 % interval in {flow_name()}"
     return _plane(edge, title, sd, (0.0, DOUBT * _top(edge)), "doubt")
 
 
 def change_plane(edge: EdgeMap, other: AnyMap, name: str) -> Plane:
     """The flow of a valve less that of another map, `name`."""
     w, dp = np.broadcast_arrays(*_lattice(edge))
-    change = _flow_on(edge) - other.flow(edge.name, w, dp) * LPM
+    change = _flow_on(edge) - other.flow(edge.name, w, dp) * lpm()
     known = np.abs(change[np.isfinite(change)])
     most = float(np.quantile(known, SURE)) if len(known) else 1.0
-    title = f"{edge.name}: flow less {name}, L/min"
+    title = f"{edge.name}: flow less {name}, {flow_name()}"
     return _plane(edge, title, change, (-most, most), "change")
 
 
 def _flow_on(edge: EdgeMap) -> FloatArray:
     """Flow in the middle of every field of a plane (rows, columns), L/min."""
-    return np.asarray(edge.flow(*_lattice(edge)) * LPM)
+    return np.asarray(edge.flow(*_lattice(edge)) * lpm())
 
 
 def _top(edge: EdgeMap) -> float:
@@ -154,7 +158,7 @@ def slice_panel(
     strip = Strip("95 % band", _joined(x), _joined(np.maximum(q - sd, 0.0)), _joined(q + sd), BLUE)
     dots = cut.dots(reference, reference_name)
     x_label = DROP if over_drop else COMMAND
-    return Panel(title, x_label, FLOW, lines, (dots,), (), tuple(ends), (strip,), has_zero=False)
+    return Panel(title, x_label, _flow(), lines, (dots,), (), tuple(ends), (strip,), has_zero=False)
 
 
 class _Cut:
@@ -177,14 +181,14 @@ class _Cut:
         """x, flow and half its 95 % interval, L/min, and where it is valid, each (cuts, n)."""
         x, w, dp = self._points(POINTS)
         valid = np.asarray(self._edge.status_at(w, dp) == VALID)
-        return x, self._edge.flow(w, dp) * LPM, Z95 * self._edge.sd(w, dp) * LPM, valid
+        return x, self._edge.flow(w, dp) * lpm(), Z95 * self._edge.sd(w, dp) * lpm(), valid
 
     def dots(self, reference: AnyMap | None, name: str) -> Dots:
         """Another map on the same cuts; no points without one."""
         if reference is None:
             return Dots("", np.empty(0), np.empty(0), None, INK, "c", is_joined=False)
         x, w, dp = self._points(DOTS)
-        q = reference.flow(self._edge.name, w.ravel(), dp.ravel()) * LPM
+        q = reference.flow(self._edge.name, w.ravel(), dp.ravel()) * lpm()
         return Dots(name, x.ravel(), np.asarray(q), None, INK, "c", is_joined=False)
 
 

@@ -13,7 +13,7 @@ from rtid.model import Machine
 from rtid.plain import FloatArray
 from rtid.tell.colours import BLUE, HELD_OUT, INK, ORANGE, SEEN
 from rtid.tell.story import Chart, Line, Panel, Remark, Shade
-from rtid.units import KPA, LPM, MPA
+from rtid.units import KPA, MPA, flow_name, lpm
 
 LIMIT = 0.998  # quantile of the errors that a common scale shows
 FLOWS = "Measured and modelled flow"
@@ -41,13 +41,14 @@ def residual(model: Machine, parts: Mapping[str, Comparison], name: str = "resid
     """Flows of every chamber and what is left of them; parts: by title, the first one taught."""
     pieces = {
         title: _Piece(
-            part.t_s, part.measured_m3s * LPM, part.modelled_m3s * LPM, part.residual_m3s * LPM,
-            [f"{LPM * rms:.3g} L/min rms, {100 * share:.2g} % of the flow" for rms, share
+            part.t_s,
+            part.measured_m3s * lpm(), part.modelled_m3s * lpm(), part.residual_m3s * lpm(),
+            [f"{lpm() * rms:.3g} {flow_name()} rms, {100 * share:.2g} % of the flow" for rms, share
              in zip(part.residual_rms_m3s, part.residual_share, strict=True)],
         )
         for title, part in parts.items() if len(part.t_s)
     }  # fmt: skip
-    return _chart(name, FLOWS, _names(model), {"": pieces}, "flow in L/min", "residual")
+    return _chart(name, FLOWS, _names(model), {"": pieces}, f"flow in {flow_name()}", "residual")
 
 
 def flows(chambers: Sequence[str], models: Mapping[str, Sequence[Residual]], caption: str) -> Chart:
@@ -55,14 +56,18 @@ def flows(chambers: Sequence[str], models: Mapping[str, Sequence[Residual]], cap
     columns = {
         title: {
             name: _Piece(
-                part.t_s, part.measured * LPM, (part.measured - part.left) * LPM, part.left * LPM,
-                [f"rms {LPM * rms:.3g} L/min" for rms in np.sqrt(np.mean(part.left**2, axis=0))],
+                part.t_s, part.measured * lpm(),
+                (part.measured - part.left) * lpm(), part.left * lpm(),
+                [f"rms {rms:.3g} {flow_name()}"
+                 for rms in lpm() * np.sqrt(np.mean(part.left**2, axis=0))],
             )
             for name, part in zip(PARTS, parts, strict=True) if len(part.t_s)
         }
         for title, parts in models.items()
     }  # fmt: skip
-    made = _chart("flows", FLOWS, chambers, columns, "flow in L/min", "residual in L/min")
+    made = _chart(
+        "flows", FLOWS, chambers, columns, f"flow in {flow_name()}", f"residual in {flow_name()}"
+    )
     return replace(made, caption=caption)
 
 
@@ -94,7 +99,7 @@ def beside(model: Machine, studies: Mapping[str, Mapping[str, Examination]]) -> 
     for c, chamber in enumerate(_names(model)):
         of_flow = {title: _flow_left(parts, c) for title, parts in studies.items()}
         of_pressure = {title: _pressure_left(parts, c) for title, parts in studies.items()}
-        rows.append(_row(of_flow, f"chamber {chamber}\nflow in L/min", is_titled=c == 0))
+        rows.append(_row(of_flow, f"chamber {chamber}\nflow in {flow_name()}", is_titled=c == 0))
         rows.append(_row(of_pressure, f"chamber {chamber}\npressure in kPa", is_titled=False))
     caption = "What each model leaves of the measured flow and of the pressures that it runs."
     size = 5.2, 1.75
@@ -107,7 +112,7 @@ Left = list[tuple[FloatArray, FloatArray, str]]  # times, values as shown and a 
 def _flow_left(parts: Mapping[str, Examination], c: int) -> Left:
     equations = [result.equation for result in parts.values()]
     return [
-        (e.t_s, e.residual_m3s[:, c] * LPM, f"{100 * e.residual_share[c]:.2g} % of the flow")
+        (e.t_s, e.residual_m3s[:, c] * lpm(), f"{100 * e.residual_share[c]:.2g} % of the flow")
         for e in equations
         if len(e.t_s)
     ]

@@ -17,7 +17,7 @@ from rtid.compare.tables import CAUSES, cause_of
 from rtid.model import Edge, Machine
 from rtid.tell.colours import GREY, INK, LINE
 from rtid.tell.stills import STYLE, label_outer, panels
-from rtid.units import LPM, MPA
+from rtid.units import MPA, flow_name, lpm
 
 HATCHES = dict(zip(CAUSES, ("", "....", "////", "\\\\\\\\", "xxxx", "++++"), strict=True))
 EMPTY = "#f4f4f2"
@@ -31,7 +31,7 @@ def residual_map(model: Machine, rows: Sequence[BlockRow]) -> Figure:
     """
     with mpl.rc_context(STYLE):
         figure, axes = panels(len(model.edges), width=10.0, height=3.4)
-        values = np.array([row.residual_rms_m3s * LPM for row in rows])
+        values = np.array([row.residual_rms_m3s * lpm() for row in rows])
         top = float(np.nanquantile(values, 0.98)) if np.isfinite(values).any() else 1.0
         norm, colours = mpl.colors.Normalize(0.0, max(top, 1e-9)), mpl.colormaps["YlOrBr"]
         for axis, edge in zip(axes, model.edges, strict=True):
@@ -41,7 +41,12 @@ def residual_map(model: Machine, rows: Sequence[BlockRow]) -> Figure:
         label_outer(axes, "opening command w in V", "pressure drop in MPa")
         scale = mpl.cm.ScalarMappable(norm, colours)
         bar = figure.colorbar(
-            scale, ax=axes, label="residual in L/min, rms", pad=0.015, aspect=40, extend="max"
+            scale,
+            ax=axes,
+            label=f"residual, {flow_name()} rms",
+            pad=0.015,
+            aspect=40,
+            extend="max",
         )
         bar.outline.set_visible(False)
         _legend(figure, rows)
@@ -61,7 +66,7 @@ def _blocks(
     axis.set_facecolor("white")
     for row in rows:
         known = np.isfinite(row.residual_rms_m3s)
-        face = colours(norm(row.residual_rms_m3s * LPM)) if known else EMPTY
+        face = colours(norm(row.residual_rms_m3s * lpm())) if known else EMPTY
         axis.add_patch(Rectangle(*_box(row), facecolor=face, edgecolor=LINE, linewidth=0.4))
     for cause, hatch in HATCHES.items():
         boxes = [Rectangle(*_box(row)) for row in rows if cause_of(row) == cause]

@@ -1,0 +1,297 @@
+"""A table without pressures: which command moves which signal, and the project of its rate.
+
+    d state / dt = f(command)
+
+The pair is told by units, by the words that both names share and by how much of the rate the
+command explains; the neutral, the grid and the part that is held out come from the record.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomlkit
+
+from firmware_bridge.sources import read_table
+from rtid.compare.dead_band import DeadBand, dead_band
+from rtid.diagnose.report import Diagnosis
+from rtid.diagnose.verdict import INSUFFICIENT
+from rtid.errors import RtidError
+from rtid.estimator.published import publish
+from rtid.plain import FloatArray, Progress, plain, silent
+from rtid.project.guess import ROLES, RoleCandidate, is_wanted, with_unit
+from rtid.study.study import Study
+from rtid.trace.neutral import neutral_of, slope_of
+from rtid.trace.quick_source import Source
+from rtid.units import COMMAND_DIMENSIONS, find_unit, words_of
+
+SCHEMA = 1
+STATES = ("length", "velocity", "angle", "rotation", "temperature")
+DRIVES = {"u", "cmd", "command", "valve", "spool", "pwm", "duty", "motor", "throttle", "lever"}
+MOVES = {"x", "pos", "position", "v", "speed", "velocity", "angle", "omega", "temp", "temperature"}
+BINS = 24  # of the command, to see how much of the rate it explains
+LEAST_SHARE = 0.1  # of the rate's variance that a command must explain
+BLOCKS = 13  # of the map
+LEAST_ROWS, LEAST_VALUES = 15, 5  # samples that a block needs, and different commands
+HELD_OUT = 0.25  # of the motion
+GAP_STEPS = 5.0  # usual steps: a longer one is a gap
+MAX_SD_SHARE = 0.05  # of the largest rate: known worse than this is not valid
+
+
+@dataclass(frozen=True)
+class RatePair:
+    """A command and the state that it moves, with units; neutral in the unit of the command.
+
+    share: of the rate's variance that the command explains; delay is not looked for.
+    """
+
+    command: RoleCandidate
+    state: RoleCandidate
+    share: float
+    neutral: float
+
+    @property
+    def options(self) -> str:
+        """What names this pair on the command line."""
+        return f"--role u={self.command.name} --role x={self.state.name}"
+
+
+def pairs_of(path: Path, source: Source, given: Mapping[str, RoleCandidate]) -> list[RatePair]:
+    """A pair for each command, the surest first; given: what the user has named."""
+    table = read_table(path)
+    t_s = table.seconds(source.keys["time_column"], source.keys["time_unit"])
+    made = []
+    for command in _candidates(source.signals, given.get("u"), COMMAND_DIMENSIONS, DRIVES, "u"):
+        for state in _candidates(source.signals, given.get("x"), STATES, MOVES, "x"):
+            if command.name == state.name:
+                continue
+            pair = _pair(t_s, table.columns, command, state)
+            if pair.share > LEAST_SHARE or {"u", "x"} <= given.keys():
+                alike = len(words_of(command.stem) & words_of(state.stem) - {"u", "x"})
+                made.append((alike, pair.share, pair))
+    best: dict[str, RatePair] = {}
+    for _, _, pair in sorted(made, key=lambda m: m[:2], reverse=True):
+        best.setdefault(pair.command.name, pair)
+    return list(best.values())
+
+
+def _candidates(
+    signals: list[RoleCandidate],
+    given: RoleCandidate | None,
+    dimensions: tuple[str, ...],
+    words: set[str],
+    role: str,
+) -> Iterator[RoleCandidate]:
+    if given is not None:
+        yield given
+        return
+    kind = next(known for known in ROLES if known.name == role)
+    for signal in signals:
+        unit = find_unit(signal.unit)
+        fits = unit.dimension in dimensions if unit else bool(words_of(signal.stem) & words)
+        if fits and signal.high > signal.low and not (role == "x" and is_wanted(signal)):
+            yield signal if signal.unit else with_unit(signal, kind)
+
+
+def _pair(
+    t_s: FloatArray, columns: Mapping[str, FloatArray], command: RoleCandidate, state: RoleCandidate
+) -> RatePair:
+    u, x = columns[command.name], columns[state.name]
+    whole = np.isfinite(t_s) & np.isfinite(u) & np.isfinite(x)
+    t_s, u, x = t_s[whole], u[whole], x[whole]
+    rate = slope_of(t_s, x)
+    edges = np.linspace(u.min(), u.max(), BINS + 1)[1:-1] if len(u) else np.zeros(0)
+    at = np.digitize(u, edges)
+    mean = np.bincount(at, rate, BINS) / np.maximum(np.bincount(at, minlength=BINS), 1)
+    total = float(np.var(rate)) if len(rate) else 0.0
+    share = 1.0 - float(np.var(rate - mean[at])) / total if total > 0 else 0.0
+    return RatePair(command, state, share, neutral_of(t_s, u, x))
+
+
+def rate_text(name: str, path: Path, source: Source, pair: RatePair) -> str:
+    """TOML of the project of a pair, complete."""
+    table = read_table(path)
+    t_s = table.seconds(source.keys["time_column"], source.keys["time_unit"])
+    u, x = table.columns[pair.command.name], table.columns[pair.state.name]
+    whole = np.isfinite(t_s) & np.isfinite(u) & np.isfinite(x)
+    t_s, u, x = t_s[whole] - t_s[whole][0], u[whole] - _neutral(pair), x[whole]
+    step_s = float(np.median(np.diff(t_s)))
+    unit = find_unit(pair.command.unit)
+    key = unit.key if unit else "v"
+    rows_hz = min(50.0, 1.0 / step_s)
+    state: dict[str, Any] = {"column": pair.state.name, "unit": pair.state.unit}
+    if _is_angle(pair.state):
+        state["kind"] = "other"
+    state |= {"noise": "estimate", "resolution": source.steps[pair.state.name]}
+    split = _split_s(t_s, x)
+    raw: dict[str, dict[str, Any]] = {
+        "project": {"name": name},
+        "source": dict(source.keys),
+        "signals": {
+            "u": {"column": pair.command.name, "unit": pair.command.unit, "offset": "estimate"},
+            "x": state,
+        },
+        "rate": {"state": "x"},
+        "maps": {
+            "f": {
+                "command": "u",
+                f"u_grid_{key}": _grid(u),
+                "rated": _three(max(float(np.quantile(np.abs(slope_of(t_s, x)), 0.99)), 1e-9)),
+                "basis": "blended",
+            }
+        },
+        "filter": {"natural_frequency_hz": _three(0.1 * rows_hz), "rows_per_s": _three(rows_hz)},
+        "gates": {"max_gap_ms": _three(1e3 * GAP_STEPS * step_s), "max_sd_share": MAX_SD_SHARE},
+        "record": {
+            "identification_s": [0.0, split],
+            "validation_s": [split, float(t_s[-1]) + step_s],
+        },
+    }
+    head = [
+        "# A plant without pressures, d x / dt = f(u), written by rtid: u counts from its neutral",
+        f"# ({pair.neutral:.6g} {pair.command.unit} here), which is found anew in every table.",
+    ]
+    return "\n".join([*head, "", tomlkit.dumps(raw)])
+
+
+def _neutral(pair: RatePair) -> float:
+    return pair.neutral if np.isfinite(pair.neutral) else 0.0
+
+
+def _is_angle(signal: RoleCandidate) -> bool:
+    unit = find_unit(signal.unit)
+    return unit is not None and unit.dimension == "angle"
+
+
+def _grid(u: FloatArray) -> list[float]:
+    """Borders of the map: even, the neutral in the middle of a block, room for it to move.
+
+    A block that knows one command alone, an end stop, would bend freely beside it: it joins the
+    next one towards the neutral.
+    """
+    step = max(float(np.ptp(u)), 1e-9) / BLOCKS
+    low, high = np.ceil(-u.min() / step), np.ceil(u.max() / step)
+    below = _joined(-u, [step * (k + 0.5) for k in range(int(max(low, 0.0)) + 1)])
+    above = _joined(u, [step * (k + 0.5) for k in range(int(max(high, 0.0)) + 1)])
+    return [*(-border for border in reversed(below)), *above]
+
+
+def _joined(u: FloatArray, borders: list[float]) -> list[float]:
+    """Those borders (m,) from the neutral outwards between which enough commands were sent."""
+    kept = borders[:1]
+    for border in borders[1:]:
+        inside = u[(u > kept[-1]) & (u <= border)]
+        if len(inside) >= LEAST_ROWS and len(np.unique(inside)) >= LEAST_VALUES:
+            kept.append(border)
+    if len(kept) > 1:
+        kept[-1] = borders[-1]
+    elif len(borders) > 1:
+        kept.append(borders[-1])
+    return [round(border, 9) for border in kept]
+
+
+def _split_s(t_s: FloatArray, x: FloatArray) -> float:
+    """When all but the last HELD_OUT of the motion is over: a clock would hold out a standstill."""
+    moved = np.concatenate([[0.0], np.cumsum(np.abs(slope_of(t_s, x))[:-1] * np.diff(t_s))])
+    at = int(np.searchsorted(moved, (1.0 - HELD_OUT) * moved[-1]))
+    return round(float(t_s[min(max(at, 1), len(t_s) - 2)]), 6)
+
+
+def _three(value: float) -> float:
+    return float(f"{value:.3g}")
+
+
+def no_plant(path: Path, signals: list[RoleCandidate]) -> RtidError:
+    """What a table has, what each kind of plant would need, and the command that goes on."""
+    there = ", ".join(f"{c.name} [{c.unit or '?'}]" for c in signals[:20]) or "nothing"
+    lines = (
+        f"{path}: no plant is told by the names and units of its columns. It has: {there}.",
+        "A cylinder with valves needs the command of the valves (u), the position of the piston (x)"
+        " and the pressures of both chambers (p_a, p_b).",
+        "A plant without pressures needs a command (u, in V, A, % or PWM) and what it moves (x: a "
+        "position, speed, angle or temperature), which must follow the command in this record.",
+        "A plant whose equations you know needs these in a file: `rtid refit PLANT.toml TABLE`.",
+    )
+    return RtidError("\n".join(lines), "name the columns: rtid quick FILE --role u=COLUMN "
+                     "--role x=COLUMN (and p_a, p_b where there are pressures)")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class QuickRate:
+    """What a table without pressures tells: the pair that was looked at, others, the diagnosis.
+
+    text: the project file; maps: dead band (low, high) about the neutral and gains (below, above)
+    by map, in SI, NaN where the map does not tell.
+    """
+
+    path: Path
+    pair: RatePair
+    others: tuple[RatePair, ...]
+    text: str
+    diagnosis: Diagnosis
+    bands: dict[str, DeadBand]
+    unused: tuple[str, ...]
+    unit: str
+    command_unit: str
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether there is a verdict that the data can bear."""
+        return self.diagnosis.verdict != INSUFFICIENT
+
+    @property
+    def next_command(self) -> str:
+        """What to do now."""
+        return f"rtid quick {self.path} {self.pair.options} -o machine.toml"
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain JSON types."""
+        pairs = [{"u": p.command.name, "x": p.state.name, "share": p.share} for p in self.others]
+        words: dict[str, Any] = plain(
+            {
+                "schema": SCHEMA,
+                "file": str(self.path),
+                "plant": "rate",
+                "roles": {"u": asdict(self.pair.command), "x": asdict(self.pair.state)},
+                "neutral": self.pair.neutral,
+                "others": pairs,
+                "unused": list(self.unused),
+                "maps": {name: asdict(band) for name, band in self.bands.items()},
+                "diagnosis": self.diagnosis.as_json(),
+                "next": self.next_command,
+            }
+        )
+        return words
+
+
+def quick_rate(
+    path: Path, source: Source, given: Mapping[str, RoleCandidate], progress: Progress = silent
+) -> QuickRate:
+    """Judge a table without pressures.  RtidError, with a page of help, where no command moves."""
+    if source.periods_ms or "time_column" not in source.keys:
+        raise no_plant(path, source.signals)
+    pairs = pairs_of(path, source, given)
+    if not pairs:
+        raise no_plant(path, source.signals)
+    pair, *others = pairs
+    text = rate_text(path.stem or "machine", path, source, pair)
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "machine.toml"
+        file.write_text(text, "utf-8")
+        study = Study(file, path, progress)
+        diagnosed = study.diagnosed
+        for effect in diagnosed.diagnosis.found[:1]:  # the maps are those beside it
+            with suppress(RtidError):
+                study.add(f"{effect.effect}:{effect.where}", force=True)
+        model, flowmap, text = study.machine, publish(study.fit.solution), file.read_text("utf-8")
+    used = {pair.command.name, pair.state.name}
+    unused = tuple(s.name for s in source.signals if s.name not in used)
+    bands = {edge.name: dead_band(edge) for edge in flowmap.edges}
+    units = model.chambers[0].unit, model.signals[model.column("u")].unit
+    return QuickRate(path, pair, tuple(others), text, diagnosed.diagnosis, bands, unused, *units)
