@@ -40,8 +40,8 @@ def init(
     keys, candidates = _read(source, output.parent)
     given = named(candidates, by_role(role or []))
     roles = with_named(propose(candidates), given)
-    if "time_column" in keys and not {"p_a", "p_b"} & roles.keys():
-        _write_rate(Path(source), output, given)
+    is_rate = "time_column" in keys and not {"p_a", "p_b"} & roles.keys()
+    if is_rate and _write_rate(Path(source), output, given):
         return
     rest = unused(candidates, roles)
     output.write_text(project_text(output.stem, keys, roles, rest), "utf-8")
@@ -70,22 +70,26 @@ def write_new(output: Path | None, text: str) -> None:
     print(f"wrote {output}")
 
 
-def _write_rate(table: Path, output: Path, given: Mapping[str, RoleCandidate]) -> None:
-    """The file of a plant without pressures; RtidError, with what is missing, where it is none."""
-    from rtid.study.quick_rate import no_plant, pairs_of, rate_text
+def _write_rate(table: Path, output: Path, given: Mapping[str, RoleCandidate]) -> bool:
+    """The file of a plant without pressures; False where the table is of none."""
+    from rtid.study.quick_rate import pairs_of, rate_text
     from rtid.trace.quick_source import open_source
 
     opened = open_source(table, None)
     pairs = pairs_of(table, opened, given)
     if not pairs:
-        raise no_plant(table, opened.signals)
+        return False
     output.write_text(rate_text(output.stem, table, opened, pairs[0]), "utf-8")
     print(f"wrote {output}: a plant without pressures, d x / dt = f(u)")
     for name, signal in (("u", pairs[0].command), ("x", pairs[0].state)):
         print(f"  {name:9} {signal.full_name} [{signal.unit}]")
+    used = {pairs[0].command.name, pairs[0].state.name}
+    if rest := [s.full_name for s in opened.signals if s.name not in used]:
+        print(f"Not used: {', '.join(rest)}")
     for other in pairs[1:]:
         print(f"There is another pair: {other.options}")
     print(f"It is complete. Next: rtid diagnose {table} -p {output}")
+    return True
 
 
 def _read(source: str, folder: Path) -> tuple[dict[str, str], list[RoleCandidate]]:

@@ -25,7 +25,7 @@ from rtid.diagnose.verdict import INSUFFICIENT
 from rtid.errors import RtidError
 from rtid.estimator.published import publish
 from rtid.plain import FloatArray, Progress, plain, silent
-from rtid.project.guess import ROLES, RoleCandidate, is_wanted, with_unit
+from rtid.project.guess import ROLES, RoleCandidate, is_wanted, propose, with_unit
 from rtid.study.study import Study
 from rtid.trace.neutral import neutral_of, slope_of
 from rtid.trace.quick_source import Source
@@ -66,6 +66,7 @@ def pairs_of(path: Path, source: Source, given: Mapping[str, RoleCandidate]) -> 
     """A pair for each command, the surest first; given: what the user has named."""
     table = read_table(path)
     t_s = table.seconds(source.keys["time_column"], source.keys["time_unit"])
+    first = propose(source.signals)
     made = []
     for command in _candidates(source.signals, given.get("u"), COMMAND_DIMENSIONS, DRIVES, "u"):
         for state in _candidates(source.signals, given.get("x"), STATES, MOVES, "x"):
@@ -74,9 +75,10 @@ def pairs_of(path: Path, source: Source, given: Mapping[str, RoleCandidate]) -> 
             pair = _pair(t_s, table.columns, command, state)
             if pair.share > LEAST_SHARE or {"u", "x"} <= given.keys():
                 alike = len(words_of(command.stem) & words_of(state.stem) - {"u", "x"})
-                made.append((alike, pair.share, pair))
+                is_first = {first.get("u"), first.get("x")} == {command, state}
+                made.append((alike, is_first, pair.share, pair))
     best: dict[str, RatePair] = {}
-    for _, _, pair in sorted(made, key=lambda m: m[:2], reverse=True):
+    for *_, pair in sorted(made, key=lambda m: m[:3], reverse=True):
         best.setdefault(pair.command.name, pair)
     return list(best.values())
 
