@@ -55,7 +55,8 @@ def test_it_opens_with_the_network_off(browser: Browser, written: Reported, sche
 @pytest.mark.slow
 def test_its_pictures_are_files_too(written: Reported) -> None:
     names = [path.name for path in written.pictures]
-    assert names == ["errors.png", "evidence.png", "flows.png", "dependences.png", "ranking.png"]
+    drawn = ("errors", "evidence", "flows", "dependences", "maps", "slices", "ranking")
+    assert names == [f"{name}.png" for name in drawn]
     for path in written.pictures:
         image = Image.open(path)
         assert image.width >= 1200
