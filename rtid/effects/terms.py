@@ -24,6 +24,7 @@ from rtid.plain import FloatArray
 
 LEAST_PA, MOST_PA = 5e4, 60e6  # between which a stored gas is described
 SHIFTS_PA = (0.0, 5e4, 2.5e5, 1.2e6, 6e6, 3e7, 3e8)  # c_k: the slope within 0.6 % from 0.5 bar on
+STRAIGHT = 0.01  # of the slope of what is stored, that may change where it counts as none
 DESCRIBED = 0.02  # of the slope of what is stored, that a sum of inverses may be off by
 LAWS = {"ssqrt": "root", "pos": "hinge"}
 
@@ -93,7 +94,7 @@ def _forms(model: Machine, chamber: str, line: LawLine) -> list[tuple[_Form, str
     if names_of(room) and not volume:
         return []
     form = _form(model, line.inner)
-    forms = [form] if form and form.shape != "root" else _inverses(model, line.inner)
+    forms = [form] if form and form.shape != "root" else _of_one_pressure(model, line.inner)
     # a term's rate has a minus of its own: - theta * scale * V df/dt
     return [(replace(f, size=-size * f.size), volume) for f in forms]
 
@@ -139,19 +140,24 @@ def _weights(model: Machine, node: Node) -> tuple[tuple[tuple[str, float], ...],
     return tuple(weights), float(linear(**dict.fromkeys(linear.names, 0.0)))
 
 
-def _inverses(model: Machine, node: Node) -> list[_Form]:
-    """A function of one pressure as a sum of -1 / (P + c); none where it is nothing like that.
+def _of_one_pressure(model: Machine, node: Node) -> list[_Form]:
+    """A function of one pressure as that pressure, or as a sum of -1 / (P + c); else none.
 
-    Nothing either where a declared range lets the pressure reach zero.
+    No sum either where a declared range lets the pressure reach zero.
     """
     names, kinds = names_of(node), {s.name: s for s in model.signals}
-    if len(names) != 1 or kinds[names[0]].kind != PRESSURE or kinds[names[0]].minimum <= 0.0:
+    if len(names) != 1 or kinds[names[0]].kind != PRESSURE:
         return []
-    slope = Expression("", derivative(node, names[0]))
+    weights = ((names[0], 1.0),)
     p = np.geomspace(LEAST_PA * (1 + 1e-9), MOST_PA, 200)
-    gains = shares(p, slope(**{names[0]: p}))
-    pairs = zip(SHIFTS_PA, gains, strict=True)
-    return [_Form(gain, ((names[0], 1.0),), shift, "inverse") for shift, gain in pairs if gain > 0]
+    slope = np.asarray(Expression("", derivative(node, names[0]))(**{names[0]: p}))
+    mean = float(slope.mean())
+    if np.abs(slope - mean).max() < STRAIGHT * abs(mean):
+        return [_Form(mean, weights, 0.0, "linear")]
+    if kinds[names[0]].minimum <= 0.0:
+        return []
+    pairs = zip(SHIFTS_PA, shares(p, slope), strict=True)
+    return [_Form(gain, weights, shift, "inverse") for shift, gain in pairs if gain > 0]
 
 
 def shares(p: FloatArray, slope: FloatArray) -> FloatArray:
