@@ -14,7 +14,7 @@ from benchmarks.interleave import Job, ratio, side_by_side
 from firmware_bridge.frames import empty, to_messages
 from firmware_bridge.sources import open_log
 
-N, MANY = 20_000, 150_000  # MF4 is read in a process of its own, which takes a second to start
+N = 20_000
 LEAST = 1.5  # times python-can's speed
 WRITERS: dict[str, Callable[[Path], Any]] = {
     ".blf": can.BLFWriter, ".log": can.CanutilsLogWriter, ".asc": can.ASCWriter,
@@ -44,12 +44,11 @@ def by_python_can(path: Path) -> int:
 def test_reading(benchmark: Any, tmp_path: Path, suffix: str, length: int) -> None:
     if length > 8 and suffix in (".csv", ".trc"):
         pytest.skip("CAN FD is not among what this format holds")
-    n = MANY if suffix == ".mf4" else N
-    path = write(tmp_path / f"log{suffix}", n, length)
-    assert len(open_log(path)) == by_python_can(path) == n
+    path = write(tmp_path / f"log{suffix}", N, length)
+    assert len(open_log(path)) == by_python_can(path) == N
     jobs = [
-        Job("rtid", lambda: open_log(path), n),
-        Job("python-can", lambda: by_python_can(path), n),
+        Job("rtid", lambda: open_log(path), N),
+        Job("python-can", lambda: by_python_can(path), N),
     ]
     title = f"Reading {suffix} of frames of {length} bytes"
     times = side_by_side(benchmark, title, "frame", jobs, "rtid", rounds=3)

@@ -1,13 +1,13 @@
-"""MF4 (ASAM MDF 4), through asammdf, which is an extra: pip install rtid[mf4].
+"""MF4 (ASAM MDF 4): logs of a bus by `mf4_bus`, plain measurements through asammdf.
 
-A log of a bus is read as frames.  Of a plain measurement every channel of numbers is read as a
-column, at the stamps of the group that has most of them; the others are interpolated to them.
+Of a plain measurement every channel of numbers is read as a column, at the stamps of the group that
+has most of them; the others are interpolated to them.  asammdf is an extra: pip install rtid[mf4].
 
 The index of a file may stand before its data (loggers) or behind (converters, asammdf, python-can).
 Of a log that is cut, all is read in the first case ("not_finalised": nothing says where such a log
 should end), nothing can be in the second: that is an error which says "truncated".  Compressed
 blocks carry a checksum: a damaged one is skipped and counted.  Uncompressed data, the heads of
-blocks and the index carry none: damage there may yield wrong frames.  Stamps are rounded to 1 us.
+blocks and the index carry none: damage there may yield wrong frames.
 """
 
 from __future__ import annotations
@@ -23,60 +23,51 @@ import numpy as np
 
 from firmware_bridge import frames as fr
 from firmware_bridge.frames import Frames
-from firmware_bridge.sources import mf4_child
+from firmware_bridge.sources import mf4_bus, mf4_child
 from firmware_bridge.sources.errors import LogError
 from firmware_bridge.sources.merged import Channel, merged
+from firmware_bridge.sources.mf4_blocks import UNFINISHED, Blocks, DamagedError
 from firmware_bridge.sources.table import Table
 from firmware_bridge.sources.unpacked import Budget
 
-FIRST_GROUP, GROUP_DATA = 88, 40  # where the links to the first data group and to its data stand
 CPU_S, BYTES_PER_CPU_S = 10.0, 2e6  # of processor time: a load of the machine costs none
+DAMAGE = (DamagedError, KeyError, IndexError, ValueError, OverflowError, struct.error)
 
 
 def read(path: Path) -> Frames | Table:
-    """All data frames of a bus-logging MF4, sorted by time, else its channels as a table."""
+    """All data frames of an MF4 log, sorted by time; of any other MF4 its channels as a table."""
+    raw = path.read_bytes()
+    if not raw.startswith((b"MDF ", UNFINISHED)):
+        raise LogError(f"{path}: not an MF4 file; check the file or its suffix")
+    blocks = Blocks(raw, Budget(path))
+    try:
+        frames = mf4_bus.read(blocks)
+    except DAMAGE as error:
+        why = error if isinstance(error, DamagedError) else "its index is damaged"
+        raise LogError(f"{path}: {why}; copy the log again") from error
+    if frames is None:
+        return _measurement(path)
+    if not len(frames) and not frames.refused:
+        raise LogError(f"{path}: holds no CAN frames; is it empty?")
+    fr.add_counts(frames.refused, {"not_finalised": int(not blocks.is_finished)})
+    return fr.by_time(frames)
+
+
+def _measurement(path: Path) -> Table:
+    """The channels of a plain measurement."""
     if PathFinder.find_spec("asammdf") is None:
-        raise LogError(f"{path}: reading MF4 needs asammdf; pip install 'rtid[mf4]'")
-    finalised = _check_index(path)
-    columns, refused = _extract(path)
-    if "titles" in columns:
-        named = zip(columns["titles"].tolist(), columns["units"].tolist(), strict=True)
-        return merged(path, [
-            Channel(title, unit, columns[f"t{k}"], columns[f"values{k}"])
-            for k, (title, unit) in enumerate(named)
-        ])  # fmt: skip
-    known = ("fd_frame", *mf4_child.COUNTED.values())
-    if not columns and not any(refused.get(kind) for kind in known):
-        lost = "all its blocks are damaged" if refused.get("bad_container") else "is it empty?"
-        raise LogError(f"{path}: holds neither CAN frames nor channels of numbers; {lost}")
-    frames = fr.by_time(Frames(**columns)) if columns else fr.empty(0)
-    fr.add_counts(frames.refused, refused | {"not_finalised": int(not finalised)})
-    return frames
+        raise LogError(f"{path}: reading a measurement needs asammdf; pip install 'rtid[mf4]'")
+    columns = _extract(path)
+    if not columns:
+        raise LogError(f"{path}: holds neither CAN frames nor channels of numbers; is it empty?")
+    named = zip(columns["titles"].tolist(), columns["units"].tolist(), strict=True)
+    return merged(path, [
+        Channel(title, unit, columns[f"t{k}"], columns[f"values{k}"])
+        for k, (title, unit) in enumerate(named)
+    ])  # fmt: skip
 
 
-def _check_index(path: Path) -> bool:
-    """Whether the log was closed by its writer; LogError if its index or data lie behind its end.
-
-    asammdf would say so less plainly.
-    """
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        place, head = 0, file.read(FIRST_GROUP + 8)
-        if not head.startswith((b"MDF ", b"UnFinMF ")):
-            raise LogError(f"{path}: not an MF4 file; check the file or its suffix")
-        for offset in (FIRST_GROUP, GROUP_DATA):
-            file.seek(place + offset)
-            link = file.read(8)
-            place = struct.unpack("<Q", link)[0] if len(link) == 8 else size
-            if place >= size:
-                raise LogError(
-                    f"{path}: truncated: it ends at byte {size}, before its index or first frame; "
-                    "copy the log again"
-                )
-    return head.startswith(b"MDF ")
-
-
-def _extract(path: Path) -> tuple[mf4_child.Columns, dict[str, int]]:
+def _extract(path: Path) -> mf4_child.Columns:
     """`mf4_child.extract` in a process of its own; LogError if it fails, crashes or hangs."""
     budget = Budget(path)
     cpu_s = CPU_S + path.stat().st_size / BYTES_PER_CPU_S
@@ -89,9 +80,7 @@ def _extract(path: Path) -> tuple[mf4_child.Columns, dict[str, int]]:
         _check_end(done, path, cpu_s, budget)
         answer.seek(0)
         with np.load(answer) as arrays:
-            columns = dict(arrays)
-    reasons, counts = columns.pop("reasons").tolist(), columns.pop("counts").tolist()
-    return columns, dict(zip(reasons, map(int, counts), strict=True))
+            return dict(arrays)
 
 
 def _check_end(
@@ -100,7 +89,7 @@ def _check_end(
     """LogError unless the child ended well."""
     if done.returncode == mf4_child.FAILED:
         why = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
-        raise LogError(f"{path}: not a readable MF4 bus log: {why}")
+        raise LogError(f"{path}: not a readable MF4: {why}")
     if done.returncode == mf4_child.TOO_MUCH:
         raise budget.exceeded()
     if done.returncode == -mf4_child.OUT_OF_TIME:

@@ -148,8 +148,8 @@ def main() -> NoReturn:
     Linear algebra stays on one thread, unless the environment says otherwise: matrices are small,
     and OpenBLAS' threads spin while they wait (`refit --diagnose` of the tanks beside another
     program: 142 s instead of 39, with the same result).  python-can's own MF4 support is left out:
-    where asammdf is installed it loads that and pandas, 0.4 s and 100 MB at each start, and we read
-    MF4 in a process of its own (`firmware_bridge.sources.mf4`): None is what is not to be found.
+    where asammdf is installed it loads that and pandas, 0.4 s and 100 MB at each start, and we use
+    it in a process of its own (`firmware_bridge.sources.mf4`): None is what is not to be found.
     """
     sys.modules.setdefault("asammdf", None)  # type: ignore[arg-type]
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read at the first import of numpy

@@ -5,8 +5,7 @@ import subprocess
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
-from itertools import islice, pairwise
-from multiprocessing import get_context
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -16,24 +15,36 @@ import pytest
 
 from firmware_bridge import frames as fr
 from firmware_bridge.frames import Frames
-from firmware_bridge.sources import LogError, mf4, mf4_child, open_log
+from firmware_bridge.sources import LogError, mf4, mf4_child, open_log, read_table
 from tests.bridge.machine import cycles, equal
 
 N = 50
-HANG_S = 10.0
 HELD_UP_S = 3.0
 LOOP = "    try:\n        while True:\n            pass\n        columns"
 HEAD = 48  # bytes of the head of a compressed block
 
 
+def measurement(path: Path) -> Path:
+    """A plain measurement: two channels of numbers."""
+    from asammdf import MDF, Signal
+
+    stamps = 0.01 * np.arange(100)
+    with MDF(version="4.10") as log:
+        log.append([Signal(np.sin(stamps + k), stamps, "bar", f"p{k}") for k in range(2)])
+        log.save(path)
+    return path
+
+
 def test_missing_asammdf_is_a_plain_message(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    path = measurement(tmp_path / "t.mf4")
+    assert set(read_table(path).columns) >= {"p0", "p1"}
+    bus = write(tmp_path / "bus.mf4", cycles(10))
     monkeypatch.setattr(sys, "path", [])
-    path = tmp_path / "t.mf4"
-    path.write_bytes(b"MDF     4.10    ")
     with pytest.raises(LogError, match=r"rtid\[mf4\]"):
-        open_log(path)
+        read_table(path)
+    assert len(open_log(bus)) == 30
 
 
 def write(path: Path, frames: Frames) -> Path:
@@ -59,28 +70,14 @@ def rows(frames: Frames) -> Counter[tuple[int, int, int, bytes]]:
     return Counter(zip(*columns, data, strict=True))
 
 
-def open_here(path: Path) -> Frames | str:
-    """`open_log` without a process for each file: for a worker, which may crash itself."""
-    mf4._extract = extract_here
-    try:
-        return open_log(path)
-    except LogError as error:
-        return str(error)
-
-
-def extract_here(path: Path) -> tuple[mf4_child.Columns, dict[str, int]]:
-    try:
-        return mf4_child.extract(str(path), 64 << 20)
-    except Exception as error:
-        raise LogError(f"{path}: {error}") from error
-
-
 def each(path: Path, contents: Iterator[bytes]) -> Iterator[Frames | str]:
-    """Read files one after the other in one worker; an error if it crashes or hangs."""
-    with get_context("spawn").Pool(1) as pool:  # its end kills a worker that hangs
-        for content in contents:
-            path.write_bytes(content)
-            yield pool.apply_async(open_here, (path,)).get(HANG_S)
+    """What is read of each content, or the error."""
+    for content in contents:
+        path.write_bytes(content)
+        try:
+            yield open_log(path)
+        except LogError as error:
+            yield str(error)
 
 
 def flips(raw: bytes, inside: Callable[[int], bool], seed: int) -> Iterator[bytes]:
@@ -154,44 +151,41 @@ def test_a_flipped_bit_costs_one_block(tmp_path: Path) -> None:
         lost.append(len(whole) - len(found))
         assert lost[-1] == 0 or found.refused["bad_container"] == 1
     print(f".mf4: {N} flips in blocks, worst loss {max(lost)} frames of one block, 0 wrong")
-    assert max(lost) <= (16 << 10) // 70 + 2 * mf4_child.SMALLEST_RUN
+    assert 0 < max(lost) <= (16 << 10) // 84 + 2
 
 
-def test_a_flipped_bit_in_the_index_does_no_harm_to_the_program(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """asammdf was seen to hang and to abort the process on such files; the log is refused then."""
-    monkeypatch.setattr(mf4, "CPU_S", 3.0)
+def test_a_flipped_bit_in_the_index_is_an_error_or_a_count(tmp_path: Path) -> None:
+    """No such file hangs or ends in anything else; frames are missing only with a word."""
     raw = write(tmp_path / "t.mf4", cycles(300)).read_bytes()
     index, seen, path = raw.rfind(b"##DT"), Counter[str](), tmp_path / "flip.mf4"
     index = raw.find(b"##", index + 4)
-    for content in islice(flips(raw, lambda k: k >= index, 17), 8):
-        path.write_bytes(content)
-        try:
-            open_log(path)
-            seen["read"] += 1
-        except LogError as error:
+    for result in each(path, flips(raw, lambda k: k >= index, 17)):
+        if isinstance(result, str):
             seen["refused"] += 1
-            assert str(path) in str(error)
+            assert str(path) in result
+        else:
+            seen["read"] += 1
+            assert len(result) == 900 or result.refused
     print(f".mf4: {seen.total()} flips in the index: {dict(seen)}")
+    assert seen["read"] > 10 and seen["refused"] > 3
 
 
 def test_a_crash_of_asammdf_is_an_error_of_the_log(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = write(tmp_path / "t.mf4", cycles(10))
+    path = measurement(tmp_path / "t.mf4")
     child = tmp_path / "child.py"
     monkeypatch.setattr(mf4_child, "__file__", str(child))
     child.write_text("import os; os.abort()")
     with pytest.raises(LogError, match="crashed"):
-        open_log(path)
+        read_table(path)
 
 
 def test_processor_time_ends_a_read_and_waiting_does_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A child that gets no processor for longer than its limit reads its whole log all the same."""
-    path = write(tmp_path / "t.mf4", cycles(10))
+    path = measurement(tmp_path / "t.mf4")
     monkeypatch.setattr(mf4, "CPU_S", 2.0)
     started = subprocess.run
 
@@ -200,7 +194,7 @@ def test_processor_time_ends_a_read_and_waiting_does_not(
         return started([sys.executable, "-c", wait, *arguments], **options)
 
     monkeypatch.setattr(subprocess, "run", held_up)
-    assert len(open_log(path)) == 30
+    assert len(read_table(path).column("p0")) == 100
     monkeypatch.setattr(subprocess, "run", started)
     monkeypatch.setattr(mf4, "CPU_S", 1.0)
     endless = Path(mf4_child.__file__).read_text().replace("    try:\n        columns", LOOP)
@@ -208,4 +202,4 @@ def test_processor_time_ends_a_read_and_waiting_does_not(
     child.write_text(endless)
     monkeypatch.setattr(mf4_child, "__file__", str(child))
     with pytest.raises(LogError, match="not read in 1 s of processor time"):
-        open_log(path)
+        read_table(path)
