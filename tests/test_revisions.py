@@ -30,7 +30,7 @@ from rtid.study.spans import parts
 from rtid.study.study import diagnose_trace
 from rtid.trace.reading import Trace, read_trace
 
-LEAK, WRONG = "internal_leakage_laminar", "entrained_air:both"
+LEAK, WRONG = "internal_leakage_laminar", "position_sensor_delay"
 DRIFT = "valve_gain_drift"  # of either sign: what is next to nothing is never impossible
 TRUTH = 2e-12  # m3/s/Pa, of the middle strength
 

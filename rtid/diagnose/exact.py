@@ -98,13 +98,15 @@ def exact_trials(
     timings: list[TimingLaw],
     other: float = 0.0,
     hints: Mapping[Key, float] = NO_HINTS,
+    anywhere: bool = False,
 ) -> list[Trial]:
     """Refits with one of these timings more, the best of each name.
 
     other: the best gain of any other cause; what cannot come close to it is left out.  hints:
-    strengths by name to try as well, where they are below those of the bank.
+    strengths by name to try as well, where they are below those of the bank.  anywhere: those too
+    that end at nothing or at a bound, and so are no causes.
     """
-    gains = _from_afar(state.coarse.beside(present), timings, other, hints)
+    gains = _from_afar(state.coarse.beside(present), timings, other, hints, anywhere)
     most = max([other, *(gain for gain, _, _ in gains)])
     trials: dict[Key, Trial] = {}
     for gain, timing, psi in gains:
@@ -112,7 +114,7 @@ def exact_trials(
             continue
         revision = replace(present.revision, timings=(*present.revision.timings, (timing, psi)))
         now = tried(state.model, state.chunk, present.weights, revision)
-        if not _is_inside(now):
+        if not (anywhere or is_inside(now)):
             continue
         exact, key = present.held.sse - now.estimate.sse, key_of(timing)
         if key not in trials or exact > trials[key].gain:
@@ -129,14 +131,18 @@ def carried_on(state: TrialState, present: Fit, trial: Trial) -> Fit:
 
 
 def _from_afar(
-    coarse: Beside, timings: list[TimingLaw], other: float, hints: Mapping[Key, float]
+    coarse: Beside,
+    timings: list[TimingLaw],
+    other: float,
+    hints: Mapping[Key, float],
+    anywhere: bool,
 ) -> list[tuple[float, TimingLaw, Psi]]:
-    """Gain and parameters of every promising timing on the coarse map; one of each name."""
+    """Gain and parameters of every timing that is promising from afar, or of all; one a name."""
     banks = {timing: coarse.bank(timing, hints.get(key_of(timing), 0.0)) for timing in timings}
     bar = PROMISING * max([other, *(max(bank.values()) for bank in banks.values())])
     best: dict[Key, tuple[float, TimingLaw, Psi]] = {}
     for timing, bank in banks.items():
-        if max(bank.values()) < bar or max(bank.values()) <= 0.0:
+        if not anywhere and (max(bank.values()) < bar or max(bank.values()) <= 0.0):
             continue
         psi, gain = coarse.closed_in(timing, bank)
         if key_of(timing) not in best or gain > best[key_of(timing)][0]:
@@ -144,7 +150,7 @@ def _from_afar(
     return list(best.values())
 
 
-def _is_inside(now: Fit) -> bool:
+def is_inside(now: Fit) -> bool:
     """True where the timing that was added last did not end at a bound, nor at nothing."""
     timing, psi = now.revision.timings[-1]
     sd = now.estimate.sd(now.timing_columns(len(now.revision.timings) - 1)[0])

@@ -13,7 +13,7 @@ import numpy as np
 
 from rtid.diagnose.contest import alike_ones
 from rtid.diagnose.diagnosis import LEAST_SHARE, taken_in
-from rtid.diagnose.exact import carried_on, exact_trials, key_of, with_pump
+from rtid.diagnose.exact import carried_on, exact_trials, is_inside, key_of, with_pump
 from rtid.diagnose.excuse import few_excused
 from rtid.diagnose.standing import Standing, with_bank
 from rtid.diagnose.trials import (
@@ -79,7 +79,19 @@ def extend(present: Standing, effect: str, where: str = "") -> Extension:
     now = carried_on(state, present.fit, best)
     after = Standing(state, with_bank(few_excused(now), state.suspects))
     against = tuple(_against(present, after, best))
-    return Extension(best.key, best.gain, present, after, against, _better(present, best))
+    tried = Extension(best.key, best.gain, present, after, against, _better(present, best))
+    if best.is_timing and effect != PUMP.effect and best.fit and not is_inside(best.fit):
+        raise _nothing(tried)
+    return tried
+
+
+def _nothing(tried: Extension) -> RefusedError:
+    """A timing whose fit ends at nothing or at a bound is no cause, by force neither."""
+    effect, where = tried.key
+    return RefusedError(
+        f"{effect} at {where}: the fit ends at nothing, or at a bound; {'; '.join(tried.against)}",
+        f"{tried.better}; ".lstrip("; ") + "`rtid diagnose` says what this record would have shown",
+    )
 
 
 def _timings(present: Standing, effect: str, where: str) -> list[Trial]:
@@ -94,13 +106,8 @@ def _timings(present: Standing, effect: str, where: str) -> list[Trial]:
     timings = [t for t in timings if t.where not in taken and where in ("", t.where)]
     if not timings:
         raise _already(effect, taken[0])
-    trials = exact_trials(present.state, present.fit, timings)
-    if not trials:
-        raise RefusedError(
-            f"{effect} at {timings[0].where}: the fit ends at nothing, or at a bound",
-            "`rtid diagnose` says what this record would have shown",
-        )
-    return trials
+    state, fit = present.state, present.fit
+    return exact_trials(state, fit, timings) or exact_trials(state, fit, timings, anywhere=True)
 
 
 def _flows(present: Standing, effect: str, where: str) -> list[Trial]:

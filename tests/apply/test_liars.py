@@ -186,6 +186,15 @@ def before(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[int, di
     return folder, {version: applied.images(version) for version in (1, 2)}
 
 
+@pytest.fixture
+def copied(
+    before: tuple[Path, dict[int, dict[int, bytes]]], tmp_path: Path
+) -> tuple[Path, dict[int, dict[int, bytes]]]:
+    """The project file in a copy of that folder, and the images of both maps."""
+    sent, images = before
+    return copytree(sent, tmp_path / "project") / "cylinder.toml", images
+
+
 def command(patch: pytest.MonkeyPatch, path: Path, liar: Liar, *words: str) -> tuple[int, Line]:
     """`rtid apply` over a line to the liar, in made-up time; its exit code."""
     line = Line(liar.controller, liar.spoil)
@@ -239,19 +248,17 @@ def test_there_are_fifty_lies() -> None:
 @pytest.mark.parametrize("name", LIES)
 def test_no_done_that_is_not_true(
     name: str,
-    before: tuple[Path, dict[int, dict[int, bytes]]],
-    tmp_path: Path,
+    copied: tuple[Path, dict[int, dict[int, bytes]]],
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    sent, images = before
-    folder = copytree(sent, tmp_path / "project")
+    path, images = copied
     lie, deaf = LIES[name]
     liar = Liar(holding(images[1], 1), lie, deaf)
     capsys.readouterr()
-    code, _ = command(monkeypatch, folder / "cylinder.toml", liar, "--again", "--replace-unknown")
+    code, _ = command(monkeypatch, path, liar, "--again", "--replace-unknown")
     told = capsys.readouterr()
-    rows = Applied(folder / "cylinder.state").rows()[2:]
+    rows = Applied(path.with_suffix(".state")).rows()[2:]
     done = [row for row in rows if row.outcome == DONE]
     assert all(is_true(liar.controller, row, images[2]) for row in done), rows
     if code == Exit.OK:
@@ -262,16 +269,13 @@ def test_no_done_that_is_not_true(
 
 
 def test_an_old_receiver_is_not_verified(
-    before: tuple[Path, dict[int, dict[int, bytes]]],
-    tmp_path: Path,
+    copied: tuple[Path, dict[int, dict[int, bytes]]],
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """It does not know the question for a flow, and is silent: what it says is all there is."""
-    sent, images = before
-    folder = copytree(sent, tmp_path / "project")
+    path, images = copied
     liar = Liar(holding(images[1], 1), silent(Op.FLOW))
-    path, state = folder / "cylinder.toml", folder / "cylinder.state"
     capsys.readouterr()
     assert command(monkeypatch, path, liar, "--again")[0] == Exit.NEGATIVE
     told = json.loads(capsys.readouterr().out)["applied"]
@@ -281,18 +285,15 @@ def test_an_old_receiver_is_not_verified(
     assert json.loads(capsys.readouterr().out)["verified"]["points"] == 0
     assert command(monkeypatch, path, liar, "--undo")[0] == Exit.NEGATIVE
     assert gives(liar.controller, images[1]), "undo knows what was sent, verified or not"
-    outcomes = [row.outcome for row in Applied(state).rows()]
+    outcomes = [row.outcome for row in Applied(path.with_suffix(".state")).rows()]
     assert outcomes == [DONE, DONE, UNVERIFIED, UNVERIFIED]
 
 
 def test_an_order_that_was_not_confirmed_is_verified_before_it_is_settled(
-    before: tuple[Path, dict[int, dict[int, bytes]]],
-    tmp_path: Path,
+    copied: tuple[Path, dict[int, dict[int, bytes]]],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    sent, images = before
-    folder = copytree(sent, tmp_path / "project")
-    path, state = folder / "cylinder.toml", folder / "cylinder.state"
+    path, images = copied
 
     def lost(liar: Liar, answer: bytes) -> bytes | None:
         if answer[:2] == bytes([Op.REPLY, Op.POLL]) and liar.committed:
@@ -304,21 +305,19 @@ def test_an_order_that_was_not_confirmed_is_verified_before_it_is_settled(
     liar.lie = pretends  # it says now that it has the maps, and it has not
     assert command(monkeypatch, path, liar, "--again")[0] == Exit.INPUT
     assert not gives(liar.controller, images[2])
-    outcomes = [row.outcome for row in Applied(state).rows()]
+    outcomes = [row.outcome for row in Applied(path.with_suffix(".state")).rows()]
     assert DONE not in outcomes[2:] and outcomes[2] == UNCONFIRMED
 
 
 def test_the_reason_stands_in_the_records(
-    before: tuple[Path, dict[int, dict[int, bytes]]],
-    tmp_path: Path,
+    copied: tuple[Path, dict[int, dict[int, bytes]]],
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    sent, images = before
-    folder = copytree(sent, tmp_path / "project")
+    path, images = copied
     liar = Liar(holding(images[1], 1), pretends, (Op.COMMIT,))
-    code, _ = command(monkeypatch, folder / "cylinder.toml", liar, "--again")
+    code, _ = command(monkeypatch, path, liar, "--again")
     told = capsys.readouterr().err
     assert code == Exit.INPUT
     assert "said done, but slot 0 gives" in told and "what was sent gives" in told
-    assert Applied(folder / "cylinder.state").rows()[-1].outcome == CONTRADICTED
+    assert Applied(path.with_suffix(".state")).rows()[-1].outcome == CONTRADICTED

@@ -118,6 +118,10 @@ def test_a_design_from_the_file_to_the_true_machine(
     assert done.value.code == 0, "segments are left that are worth running"
     again = " ".join(capsys.readouterr().out.split())
     assert all(word in again for word in ("median", "±", "largest", "L/min/MPa"))
+    with pytest.raises(SystemExit):
+        run([*asked, "--after", str(snapshot), "--json"])
+    again = json.loads(capsys.readouterr().out)
+    assert 0 < again["segments_worth_running"] <= again["segments_tried"]
 
 
 def test_what_goes_too_far_is_run_smaller(tmp_path: Path) -> None:
