@@ -62,6 +62,21 @@ def mean_flows(model: Machine, sums: Sums, theta: FloatArray) -> FloatArray:
     return np.asarray(rated[sums.blocks["edge"]] * (mean_phi(sums.blocks) * terms).sum(axis=1))
 
 
+def rms_slopes(model: Machine, sums: Sums, theta: FloatArray) -> FloatArray:
+    """Root mean square of dQ/ddp over the data of each block (m,), m3/s/Pa; theta (n,) as above."""
+    one, xi, eta, xi2, eta2, both = mean_phi(sums.blocks).T
+    _, _, a, _, b, c = theta[sums.n_shared :].reshape(-1, TERMS).T
+    square = a**2 * one + 4 * b**2 * eta2 + c**2 * xi2
+    square += 4 * a * b * eta + 2 * a * c * xi + 4 * b * c * both
+    edge, place = sums.blocks["edge"], sums.blocks["cell"]
+    scale = [
+        2 * e.rated_q_m3s / np.tile(np.diff(e.grid.dp_pa), e.grid.shape[0]) for e in model.edges
+    ]
+    first = np.array(model.first_cells)[edge]
+    per_height = np.array([scale[e][p] for e, p in zip(edge, place - first, strict=True)])
+    return np.asarray(per_height * np.sqrt(np.maximum(square, 0.0)))
+
+
 def largest_flows(model: Machine, sums: Sums, theta: FloatArray) -> FloatArray:
     """Largest block-mean flow of each edge (edges,), m3/s; the rated flow where none is known."""
     flows = np.abs(mean_flows(model, sums, theta))

@@ -128,7 +128,11 @@ def run(model: Machine, chunk: FloatArray, weights: Weights | None = None) -> St
 
 
 def refined(model: Machine, sketched: Sketch, lag_s: float) -> Weights:
-    """Weights from a first estimate: the orifice slope Q / (2 dp) at each block's mean flow.
+    """Weights from a first estimate: the slopes dQ/ddp of its own map, whatever the valves' law.
+
+    The noise of a pressure enters by the slope that is fitted, not by the true one: where dp hardly
+    moves in a block that slope is next to nothing, and the orifice's would count noise that is not
+    there.  No valve's flow rises faster than in proportion to dp.
 
     A compliance outside its declared bounds tells that the motion did not show it.
     """
@@ -136,7 +140,8 @@ def refined(model: Machine, sketched: Sketch, lag_s: float) -> Weights:
     span = np.concatenate([_span(edge) for edge in model.edges])
     known = np.isfinite(sketched.flow_m3s)
     cells = sketched.cells[known]
-    slopes[cells] = np.maximum(sketched.flow_m3s[known], 0.0) / span[cells]
+    proportional = 2.0 * np.maximum(sketched.flow_m3s[known], 0.0) / span[cells]
+    slopes[cells] = np.minimum(sketched.slope[known], proportional)
     low, high = 1 / model.beta_bounds_pa[1], 1 / model.beta_bounds_pa[0]
     possible = (sketched.compliance >= low) & (sketched.compliance <= high)
     compliance = np.where(possible, sketched.compliance, 1 / model.beta_nominal_pa)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from rtid.estimator.blocks import Block, mean_flows, read_blocks
+from rtid.estimator.blocks import Block, mean_flows, read_blocks, rms_slopes
 from rtid.estimator.correction import correct, leverage_of
 from rtid.estimator.factor import PRIOR_SD, factorize, misfit, one_thread
 from rtid.estimator.state import State
@@ -81,11 +81,13 @@ class Solution:
 class Sketch:
     """First estimate, no variances: compliance (chambers,), flow_m3s (blocks,), NaN: few rows.
 
-    cells (blocks,): the grid cells of the blocks; unknowns (n,): as of `Solution`.
+    slope (blocks,): root mean square of dQ/ddp over the data, m3/s/Pa; cells (blocks,): the grid
+    cells of the blocks; unknowns (n,): as of `Solution`.
     """
 
     compliance: FloatArray
     flow_m3s: FloatArray
+    slope: FloatArray
     cells: IntArray
     leverage: FloatArray
     unknowns: FloatArray
@@ -103,7 +105,8 @@ def sketch(model: Machine, learned: State | Sums) -> Sketch:
             theta = to_taylor(model, sums, factor.cov(), PRIOR_SD)[0] @ theta
     flow = mean_flows(model, sums, theta)
     flow[sums.blocks["rows"] < model.gates.min_rows] = np.nan
-    return Sketch(theta[:n_c] * sums.compliance, flow, sums.cells, leverage, unknowns)
+    slope = rms_slopes(model, sums, theta)
+    return Sketch(theta[:n_c] * sums.compliance, flow, slope, sums.cells, leverage, unknowns)
 
 
 def solve(
