@@ -1,13 +1,16 @@
 """What the visited blocks say about the rest of the map: the orifice law as a Gaussian process.
 
-    Q(w, dp) = s(dp) |dp|^delta [K(w) + K(w) h(log |dp|) + a K(w) l(dp) + e(w, dp)],
+    Q(w, dp) = s(dp) |dp|^delta [K(w) + K(w) h(w, log |dp|) + a K(w) l(dp) + e(w, dp)],
 
     s(dp) = sign(dp) sqrt |dp|,     l(dp) = 1 - (1 + (dp_laminar / dp)^2)^(-1/4)
 
 K(w), the flow gain, is an integrated Wiener process that starts at zero at the edge of the safe
 band: smooth where there are data, and less and less certain away from them.  delta is 0 unless the
-data clearly want another exponent than 1/2 (a load-compensated valve, a laminar gap).  h, another
-integrated Wiener process, is how the whole valve deviates from the law.  Towards dp = 0 every edge
+data clearly want another exponent than 1/2 (a load-compensated valve, a laminar gap); what has
+another one where it was seen need not have it elsewhere, so that h is as large at the least.  h,
+another integrated Wiener process of log |dp|, is how the valve deviates from the law; half of its
+variance is the whole valve's, the other half changes over the command (a notch that becomes an
+edge, a gap that opens, a spool that the jet closes).  Towards dp = 0 every edge
 turns laminar, at dp_laminar or elsewhere: a has the standard deviation 1.  e is what is left, in
 proportion to K, with a correlation that fades over the command and over log |dp|.  How rough K is
 and how large h and e are follow from the scatter of Q / s(dp) among the blocks themselves (largest
@@ -29,12 +32,14 @@ from rtid.plain import FloatArray
 REACH_LOG_DP = 1.0  # e fades by 1/e over this change of log |dp| ...
 REACH_W = 0.2  # ... and over this share of the command's range
 SLOPE_SD = 2.0  # of K' before any data, in units of the rated gain per range
-LAMINAR_DP_PA = 5e4  # about where metering edges turn laminar
+LAMINAR_DP_PA = 1.5e5  # about where metering edges turn laminar
 LEAST_SIZE = 0.02  # of the rated gain: e does not vanish in the dead band
 BLOCK_ERROR = 3e-4  # share of K by which a block's polynomial misses its data at the least
 # Log rough, log exponent, log deviation, delta: starts (law obeyed, or not) and bounds.
 ORIFICE, OTHER_LAW = (1.0, -5.0, -5.0, 0.0), (1.0, -3.0, -4.0, 0.0)
 SEARCH = ((-8.0, 8.0), (-8.0, 1.0), (-7.0, 1.0), (-0.5, 0.5))
+OWN = 0.5  # of h: its part that changes over the command, as where a notch becomes an edge
+UNSURE = 0.75  # of another exponent than 1/2: by so much it may change per unit of log |dp|
 CLEARLY = 10.0  # gain in log likelihood that another exponent must bring
 
 
@@ -142,7 +147,9 @@ class KernelShapes:
         shared = a.log_dp * b.log_dp + np.where(
             a.log_dp * b.log_dp > 0.0, wiener(np.minimum(*both), np.maximum(*both)), 0.0
         )
-        far = (high - low) / REACH_W + np.abs(a.log_dp - b.log_dp) / REACH_LOG_DP
+        apart = (high - low) / REACH_W
+        far = apart + np.abs(a.log_dp - b.log_dp) / REACH_LOG_DP
+        shared *= 1.0 - OWN + OWN * np.exp(-apart)
         known, rough = SLOPE_SD**2 * low * high, wiener(low, high)
         laminar, sizes = a.laminar * b.laminar, a.size * b.size
         return cls(known, rough, shared, np.exp(-far), laminar, sizes)
@@ -209,7 +216,8 @@ def root(dp_pa: FloatArray) -> FloatArray:
 
 def _strength(x: FloatArray) -> Strength:
     rough, exponent, deviation = np.exp(x[:3])
-    return float(rough), float(exponent), float(deviation), float(x[3])
+    exponent = max(float(exponent), UNSURE * abs(float(x[3])))
+    return float(rough), exponent, float(deviation), float(x[3])
 
 
 class _Conditioned:
