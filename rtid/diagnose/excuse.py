@@ -16,7 +16,7 @@ import numpy as np
 from rtid.diagnose.fit import Fit, columns_of_effects, fit, one_pass
 from rtid.diagnose.residual import effect_values
 from rtid.effects.extra import with_extra_flow
-from rtid.estimator.misfit import can_be_explained, residual_of
+from rtid.estimator.misfit import Misfit, can_be_explained, residual_of
 from rtid.estimator.missed import excusing, misses
 from rtid.estimator.record import run
 from rtid.estimator.solution import sketch
@@ -28,9 +28,12 @@ FEW = 0.1
 KNOWN = 1e-4  # share by which the flow of an effect may differ from what is fitted
 
 
-def few_excused(present: Fit) -> Fit:
-    """The fit with the blocks excused that miss the flow, as it is where they are many."""
-    return _excused(present, FEW)
+def few_excused(present: Fit, rest: Misfit | None = None) -> Fit:
+    """The fit with the blocks excused that miss the flow, as it is where they are many.
+
+    rest: what it leaves, where that is known.
+    """
+    return _excused(present, FEW, rest)
 
 
 def steady(present: Fit) -> Fit:
@@ -47,19 +50,23 @@ def rho_of_all(present: Fit) -> float:
     return one_pass(*record, present, bank=False).rho
 
 
-def _excused(present: Fit, most: float) -> Fit:
+def _excused(present: Fit, most: float, rest: Misfit | None = None) -> Fit:
     """A fit without the say of blocks that miss the flow, where they are at most such a share."""
     if present.weights.missed.any() or not can_be_explained(present.sent):
         return present
-    model, chunk = _machine(present)
-    rest = residual_of(
-        model, chunk, present.weights, sketch(model, run(model, chunk, present.weights))
-    )
-    missing = misses(model, rest)
+    rest = rest or left_over(present)
+    missing = misses(present.model, rest)
     if not 0.0 < missing.share <= most:
         return present
-    weights = excusing(model, chunk, present.weights, rest, missing.hot)
+    weights = excusing(present.model, present.sent, present.weights, rest, missing.hot)
     return fit(present.declared, present.chunk, weights, present.revision, present, bank=False)
+
+
+def left_over(present: Fit) -> Misfit:
+    """What the maps of a fit leave of its record beside its effects."""
+    model, chunk = _machine(present)
+    weights = present.weights
+    return residual_of(model, chunk, weights, sketch(model, run(model, chunk, weights)))
 
 
 def _machine(present: Fit) -> tuple[Machine, FloatArray]:

@@ -7,6 +7,7 @@ from functools import cached_property
 
 from rtid.diagnose.clean import as_measured, usable
 from rtid.diagnose.excuse import few_excused
+from rtid.diagnose.finer import fine_enough
 from rtid.diagnose.fit import Fit, fit, one_pass, prepare
 from rtid.diagnose.parts import AddedEffect, recall
 from rtid.diagnose.residual import Residual, residual
@@ -42,14 +43,16 @@ def fitted(
 ) -> Fit:
     """The one fit of a model with its parts to a record, chunk (n, 2 + signals), SI, light.
 
-    Replay, compare, export, diagnosis and page read this one.  suspects: effects of the user's, of
-    which parts may be.  Raises PartError where the record has no column for a part.
+    Replay, compare, export, diagnosis and page read this one; its `declared` has the grid that the
+    record needs.  suspects: effects of the user's, of which parts may be.  Raises PartError where
+    the record has no column for a part.
     """
     model, chunk = as_measured(model, chunk), usable(model, chunk)
     weights = prepare(model, chunk)
     revision = recall(model, chunk, weights, parts, suspects)
-    first = few_excused(fit(model, chunk, weights, revision, bank=False))
-    return one_pass(model, chunk, first.weights, first.revision, first, bank=False).light()
+    first = few_excused(*fine_enough(fit(model, chunk, weights, revision, bank=False)))
+    record = first.declared, chunk, first.weights, first.revision
+    return one_pass(*record, first, bank=False).light()
 
 
 def stand(

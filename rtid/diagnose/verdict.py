@@ -6,6 +6,7 @@ import numpy as np
 
 from rtid.diagnose.clean import saturated
 from rtid.diagnose.excuse import rho_of_all
+from rtid.diagnose.finer import BAND_SD
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.residual import Residual
 from rtid.diagnose.trials import MATCH_RHO, TrialState
@@ -17,7 +18,6 @@ MOST_CUT = 0.5  # of the record, that may be lost to pressures at an end of thei
 LEAST_ROWS = 50  # filtered rows that a part must have to be judged by
 LEAST_EVIDENCE = 1000  # scalar rows of the record
 MOVES = 5.0  # times the sensors' floor that the measured flow of a part must reach to judge by it
-BAND_SD = 3.0  # standard deviations of rho that a record's own length gives it
 
 MATCHES, MISSING, AMBIGUOUS = "matches", "missing", "ambiguous"
 UNKNOWN, INSUFFICIENT = "unknown", "insufficient_data"

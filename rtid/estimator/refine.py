@@ -1,8 +1,8 @@
 """Grid refinement: narrower intervals where a block's terms miss the flow by more than the noise.
 
 A block whose innovations exceed unit variance holds what its six terms cannot follow, as a rule the
-corner of the dead band.  The intervals with the largest excess are halved, and the finer grid is
-kept when it explains more than its new unknowns would by chance (Schwarz's criterion).
+corner of the dead band, or where a valve's law bends.  The intervals with the largest excess are
+halved; whether that is worth its new unknowns is for the fit to say (`rtid.diagnose.finer`).
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rtid.estimator.misfit import Misfit, residual_of
-from rtid.estimator.record import RecordFit, fit_record
-from rtid.estimator.solution import Solution
-from rtid.model import Edge, Grid, Machine
-from rtid.plain import FloatArray
+from rtid.estimator.misfit import Misfit
+from rtid.kernels.layout import MAX_BORDERS
+from rtid.model import COMMAND_ONLY, DROP_ONLY, Edge, Grid, Machine
+from rtid.plain import BoolArray, FloatArray
 
-ROUNDS = 4
 AT_ONCE = 2  # intervals halved per axis and edge in one round
 CLEARLY = 4.0  # standard deviations above unit variance
 LEAST_ROWS = 200  # in an interval: fewer cannot tell a misfit from a few odd rows
+WHOLE = (0, DROP_ONLY), (1, COMMAND_ONLY)  # axes along which such maps do not change: never halved
+LEAST_SHARE = 0.2  # of an edge's excess that an interval must hold
 
 
 @dataclass(frozen=True)
@@ -31,34 +31,25 @@ class Excess:
     beyond: FloatArray
 
 
-def refine(model: Machine, chunk: FloatArray, rounds: int = ROUNDS) -> tuple[Machine, RecordFit]:
-    """Fit a record, chunk (n, 2 + signals), SI, its grid as fine as it needs; model and fit."""
-    fit = fit_record(model, chunk)
-    misfit = _left(model, chunk, fit)
-    for _ in range(rounds):
-        result = excesses(model, misfit)
-        edges = tuple(_halved(e, x) for e, x in zip(model.edges, result, strict=True))
-        finer = replace(model, edges=edges)
-        if finer.n_cells == model.n_cells:
-            break
-        trial = fit_record(finer, chunk)
-        left_then = _left(finer, chunk, trial)
-        if criterion(left_then, trial.solution) >= criterion(misfit, fit.solution):
-            break
-        model, fit, misfit = finer, trial, left_then
-    return model, fit
+def halved(model: Machine, misfit: Misfit, clearly: float = CLEARLY) -> Machine:
+    """The machine with its worst intervals halved; as it is where none clearly misses the flow.
+
+    misfit: in units of the noise alone, nothing excused; clearly: standard deviations of excess.
+    """
+    result = excesses(model, misfit)
+    edges = tuple(_halved(e, x, clearly) for e, x in zip(model.edges, result, strict=True))
+    return replace(model, edges=edges)
 
 
-def _left(model: Machine, chunk: FloatArray, fit: RecordFit) -> Misfit:
-    """What a fit leaves, in units of the noise alone: excuses would hide a misfit."""
-    plain = replace(fit.weights, missed=np.zeros(len(fit.weights.missed)))
-    return residual_of(model, chunk, plain, fit.solution)
-
-
-def criterion(misfit: Misfit, solution: Solution) -> float:
-    """Schwarz's criterion: squared innovations and what the unknowns cost."""
-    known, rows = len(solution.unknowns), int(np.isfinite(misfit.innovation).sum())
-    return float(np.nansum(misfit.innovation**2) + known * np.log(max(rows, 1)))
+def in_halved(model: Machine, finer: Machine, misfit: Misfit) -> BoolArray:
+    """Rows (n - 1,) with a working point in an interval that the finer machine has halved."""
+    here = np.zeros(len(misfit.cells), bool)
+    for i, (edge, new) in enumerate(zip(model.edges, finer.edges, strict=True)):
+        pairs = (new.grid.u_v, edge.grid.u_v), (new.grid.dp_pa, edge.grid.dp_pa)
+        u, dp = (np.diff(np.searchsorted(fine, coarse)) > 1 for fine, coarse in pairs)
+        place = misfit.cells[:, i] - model.first_cells[i]
+        here |= (place >= 0) & (u[:, None] | dp).ravel()[np.maximum(place, 0)]
+    return here
 
 
 def excesses(model: Machine, misfit: Misfit) -> list[Excess]:
@@ -76,19 +67,19 @@ def excesses(model: Machine, misfit: Misfit) -> list[Excess]:
     return result
 
 
-def _halved(edge: Edge, excess: Excess) -> Edge:
+def _halved(edge: Edge, excess: Excess, clearly: float) -> Edge:
     """The edge with its worst intervals halved; as it is where none is clearly above the noise."""
-    axes = [_worst(excess, axis) for axis in (0, 1)]
+    axes = [_worst(excess, axis, clearly) if edge.terms != whole else [] for axis, whole in WHOLE]
     u, dp = (_split(b, k) for b, k in zip((edge.grid.u_v, edge.grid.dp_pa), axes, strict=True))
     return replace(edge, grid=Grid(u, dp))
 
 
-def _worst(excess: Excess, axis: int) -> list[int]:
+def _worst(excess: Excess, axis: int, clearly: float) -> list[int]:
     """Intervals along an axis whose excess is clear and holds a fair share of all of it."""
     rows, beyond = excess.rows.sum(axis=1 - axis), excess.beyond.sum(axis=1 - axis)
-    clear = (rows >= LEAST_ROWS) & (beyond > CLEARLY * np.sqrt(2.0 * rows))
-    share = beyond > 0.2 * max(float(beyond[beyond > 0].sum()), 1e-12)
-    worst = np.argsort(-beyond)[:AT_ONCE]
+    clear = (rows >= LEAST_ROWS) & (beyond > clearly * np.sqrt(2.0 * rows))
+    share = beyond > LEAST_SHARE * max(float(beyond[beyond > 0].sum()), 1e-12)
+    worst = np.argsort(-beyond)[: min(AT_ONCE, MAX_BORDERS - 2 - len(rows))]
     return [int(k) for k in worst if clear[k] and share[k]]
 
 

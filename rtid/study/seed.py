@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 from rtid.compare.dependence import Dependence
 from rtid.diagnose.clean import Cut
+from rtid.diagnose.finer import on_grids
 from rtid.diagnose.fit import NO_COV, Fit, one_pass
 from rtid.diagnose.partial import AddedVariable, Exhibit, Rise
 from rtid.diagnose.report import (
@@ -38,12 +39,13 @@ from rtid.study.known_effects import KnownEffect
 
 @dataclass(frozen=True)
 class Seed:
-    """Weights and revision of a fit, and the map (cells, terms) that gave its columns.
+    """Grids, weights and revision of a fit, and the map (cells, terms) that gave its columns.
 
     timings: (effect, place, whether the spools are apart, parameters).  Pages of effects are not
     kept.
     """
 
+    grids: tuple[Grid, ...]
     weights: Weights
     effects: tuple[Candidate, ...]
     timings: tuple[tuple[str, str, bool, Psi], ...]
@@ -59,7 +61,8 @@ class Seed:
         map_ = fit.before
         effects = tuple(replace(effect, page=None) for effect in revision.effects)
         sizes = tuple((replace(effect, page=None), size) for effect, size in revision.sizes)
-        return cls(fit.weights, effects, timings, sizes, map_.cells, map_.terms)
+        grids = tuple(edge.grid for edge in fit.declared.edges)
+        return cls(grids, fit.weights, effects, timings, sizes, map_.cells, map_.terms)
 
     def fit(self, model: Machine, chunk: FloatArray, own_effects: tuple[Page, ...] = ()) -> Fit:
         """The fit of the usable record that it was taken from, light.
@@ -80,7 +83,13 @@ class Seed:
         revision = Revision(effects, timings, sizes)
         before = MapTerms(self.cells, self.terms, NO_COV)
         return one_pass(
-            model, chunk, self.weights, revision, None, bank=False, before=before
+            on_grids(model, self.grids),
+            chunk,
+            self.weights,
+            revision,
+            None,
+            bank=False,
+            before=before,
         ).light()
 
 
@@ -117,7 +126,7 @@ class Said:
 
 
 FIT, LEARNED, FLOWS, SAID, EVIDENCE = "fit", "record", "map", "diagnosis", "evidence"
-_SEED = (Seed, Weights, Candidate)
+_SEED = (Seed, Grid, Weights, Candidate)
 _MODEL = (Machine, Signal, Chamber, Edge, Grid, Term, Lag, Filter, Gates, Upkeep)
 CLASSES: dict[str, tuple[type, ...]] = {
     FIT: _SEED,

@@ -123,7 +123,15 @@ class LearnedStory:
         maps = [self._map_table(edge) for edge in self.compared.flowmap.edges]
         return Story(
             "",
-            (*self._trace(), *self._parameters(), *doubts, self._residual(), self._blocks(), *maps),
+            (
+                *self._trace(),
+                *self._parameters(),
+                *self._grids(),
+                *doubts,
+                self._residual(),
+                self._blocks(),
+                *maps,
+            ),
         )
 
     def _trace(self) -> Iterator[str]:
@@ -158,6 +166,16 @@ class LearnedStory:
         for name, shift, sd in zip(self._offsets(), fit.offsets_s, fit.offsets_sd_s, strict=True):
             yield f"message {name}: {time.known(shift, sd, 2)} {time.name} beyond its age"
         yield CONVENTION
+
+    def _grids(self) -> Iterator[str]:
+        """Grids that the record needed finer than declared."""
+        for edge, used in zip(self.result.declared.edges, self.result.model.edges, strict=True):
+            (nu, nd), (mu, md) = edge.grid.shape, used.grid.shape
+            if (nu, nd) != (mu, md):
+                yield (
+                    f"grid of {edge.name}: {mu} x {md} blocks instead of {nu} x {nd}, halved where "
+                    "a block's terms missed the flow"
+                )
 
     def _residual(self) -> Table:
         chambers = [f"chamber {c.name}|" for c in self.result.model.chambers]

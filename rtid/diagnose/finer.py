@@ -1,0 +1,101 @@
+"""A grid as fine as its record needs it, in the one fit that everything reads.
+
+Before a record is said to be unexplained, the intervals whose terms miss the flow are halved.  A
+finer grid is kept where chi2 falls by more than k unknowns more would make it fall by chance, and
+by so much again that it predicts better; and where most of what was missed in the halved intervals
+is gone.  Half the width leaves 1/64 of what six terms miss of a cubic, and 1/8 at a corner; a
+missing effect hardly heeds the grid, and stays for the search: a leak that left rho 25 was
+swallowed down to 7 by grids that only had to explain a part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from rtid.diagnose.excuse import left_over
+from rtid.diagnose.fit import Fit, fit, one_pass, prepare, with_covariances
+from rtid.estimator.misfit import Misfit, can_be_explained
+from rtid.estimator.refine import CLEARLY, halved, in_halved
+from rtid.model import Grid, Machine
+from rtid.plain import BoolArray
+
+ROUNDS = 6
+HARDLY = 1.5  # standard deviations: tried where no interval is clear and rho is off its band
+WORTH = 2.0  # chi2 per unknown more, by which a finer grid predicts better
+BY_CHANCE = 4.0  # standard deviations of what unknowns more explain by chance
+BAND_SD = 3.0  # standard deviations of rho that a record's own length gives it
+LEFT = 0.35  # of the misfit in the halved intervals, at most: 1/8 at a corner, 1/64 of a cubic
+
+
+def fine_enough(present: Fit) -> tuple[Fit, Misfit | None]:
+    """The fit on a grid with the intervals halved that miss the flow, as it is where none does.
+
+    With it what it leaves, where that is known: the next who asks need not find it again.
+    """
+    if not can_be_explained(present.sent):
+        return present, None
+    rest = left_over(present)
+    finest = _finest(present, rest)
+    if finest is present:
+        return present, rest
+    record = finest.declared, finest.chunk, finest.weights, finest.revision
+    return fit(*record, finest, bank=False), None
+
+
+def _finest(present: Fit, rest: Misfit) -> Fit:
+    """A pass on the finest grid that is worth it; rest: what the present one leaves."""
+    clearly = CLEARLY
+    for _ in range(ROUNDS):
+        machine = halved(present.declared, rest, clearly)
+        if machine.n_cells > present.declared.n_cells:
+            better = _better(present, rest, machine)
+            if better is None:
+                break
+            present, rest = better
+        elif clearly == HARDLY or _is_in_band(present):
+            break
+        else:
+            clearly = HARDLY
+    return present
+
+
+def on_grids(model: Machine, grids: Iterable[Grid]) -> Machine:
+    """The machine with these grids of its edges."""
+    pairs = zip(model.edges, grids, strict=True)
+    return replace(model, edges=tuple(replace(e, grid=g) for e, g in pairs))
+
+
+def _better(present: Fit, rest: Misfit, machine: Machine) -> tuple[Fit, Misfit] | None:
+    """A pass on the finer grid of a machine, and what it leaves; None where it is not worth it.
+
+    rest: what the present one leaves.
+    """
+    known, weights = present.weights, prepare(machine, present.chunk)
+    weights = replace(weights, lag_s=known.lag_s, compliance=known.compliance)
+    record = machine, present.chunk, weights, present.revision
+    trial = one_pass(*record, None, bank=False, thorough=False)
+    if not _is_worth(present, trial):
+        return None
+    after, here = left_over(trial), in_halved(present.declared, machine, rest)
+    gone = _beyond(after, here) < LEFT * _beyond(rest, here)
+    return (trial, after) if gone else None
+
+
+def _beyond(rest: Misfit, here: BoolArray) -> float:
+    """Squared innovations of the rows `here` (n - 1,) beyond one each."""
+    return float(np.nansum(rest.innovation[here] ** 2 - 1.0))
+
+
+def _is_worth(present: Fit, trial: Fit) -> bool:
+    more = max(1.0, present.regression.dof - trial.regression.dof)
+    gain = present.held.sse - trial.held.sse
+    return gain > max(WORTH * more, more + BY_CHANCE * float(np.sqrt(2.0 * more)))
+
+
+def _is_in_band(fitted: Fit) -> bool:
+    """True where rho is off 1 by no more than so long a record gives; rare blocks are not free."""
+    known = with_covariances(fitted)
+    return known.rho < 1.0 + BAND_SD * float(np.sqrt(2.0 / max(1.0, known.regression.dof)))
