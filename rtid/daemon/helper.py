@@ -15,12 +15,15 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from pathlib import Path
 
 from rtid.daemon.jobs import Answer, Batch, Job
 from rtid.daemon.pipe import Pipe, pair
 
 QUEUED = 500  # jobs that may wait: a slow disk or a long solve
 QUEUED_BYTES = 16 << 20  # ... and what their batches may hold
+PATIENCE_S, LOOK_S = 20.0, 0.2  # for its end
+TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 RESTART_S = (1.0, 60.0)  # first and longest pause before a helper is started again
 
 
@@ -69,18 +72,37 @@ class Helper:
         """Jobs that wait."""
         return len(self._jobs)
 
-    def stop(self, timeout_s: float = 20.0) -> bool:
-        """Let it finish all jobs, then end it; False if it had to be killed."""
+    def stop(self, patience_s: float = PATIENCE_S) -> bool:
+        """Let it finish all jobs, then end it; False if it had to be killed.
+
+        On a busy computer its start alone may take a minute: patience ends with so many seconds of
+        processor time, or as many of the clock in which it gets none (a disk that hangs).
+        """
         with self._wake:
             self._stopping = True
             self._wake.notify()
-        self._feeder.join(timeout_s)
+        begin_s = newest_s = self._cpu_s()
+        moved_s = time.monotonic()
+        while time.monotonic() - moved_s < patience_s and newest_s - begin_s < patience_s:
+            self._feeder.join(min(LOOK_S, patience_s))
+            if not self._feeder.is_alive():
+                break
+            if (now_s := self._cpu_s()) != newest_s:
+                newest_s, moved_s = now_s, time.monotonic()
         process = self.process
         if process is not None and process.poll() is None:
             process.kill()
             process.wait()
             return False
         return not self._feeder.is_alive()
+
+    def _cpu_s(self) -> float:
+        """Processor time of the process so far; 0 where there is none."""
+        try:
+            fields = Path(f"/proc/{self.process.pid}/stat").read_text() if self.process else ""
+        except OSError:
+            return 0.0
+        return sum(map(int, fields.rpartition(")")[2].split()[11:13])) / TICKS_PER_S
 
     def _drop_one(self) -> bool:
         for k, job in enumerate(self._jobs):
@@ -128,7 +150,7 @@ class Helper:
             pipe.send(None)
             self.process.wait()
         finally:
-            listener.join(1.0)
+            listener.join(PATIENCE_S)  # what it has said last
             pipe.close()
 
     def _next(self) -> Job | None:

@@ -176,6 +176,9 @@ class Keeper:
         names = [message.name for message in project.assembly.messages]
         doubted = [n for n, bad in zip(names, learner.senders.doubted, strict=True) if bad]
         self.alarms.put("second_sender", "bus", wording.second_sender(doubted))
+        taken = zip(names, learner.senders.channels.tolist(), strict=True)
+        doubled = {name: channel for name, channel in taken if channel >= 0}
+        self.alarms.put("several_channels", "bus", wording.several_channels(doubled))
         signals = [source.name for source in project.assembly.signals]
         frozen = [n for n, bad in zip(signals, learner.frozen.doubted, strict=True) if bad]
         self.alarms.put("sensor_frozen", "sensor", wording.frozen(frozen))

@@ -36,6 +36,14 @@ def second_sender(names: list[str]) -> str:
     )
 
 
+def several_channels(taken: Mapping[str, int]) -> str:
+    """Messages that come on several channels, and which one is taken."""
+    if not taken:
+        return ""
+    named = ", ".join(f"{name} (taken from {channel})" for name, channel in taken.items())
+    return f"comes on several channels: {named}; declare `channel` for the right one"
+
+
 def frozen(names: list[str]) -> str:
     """Signals that repeat as noise never would."""
     if not names:

@@ -346,7 +346,7 @@ def test_the_daemon_learns_from_j1939_as_it_comes(
     finally:
         is_over.set()
         sender.join()
-    assert code in (0, 4), err  # 4: the last state was not saved in time, on a busy computer
+    assert code == 0, err
     status = json.loads(out.splitlines()[-1])
     assert status["estimate"]["samples"] > 100, status["estimate"]
     counts = status["estimate"]["refused"]

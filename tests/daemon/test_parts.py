@@ -274,6 +274,28 @@ def test_a_helper_that_dies_is_started_again(echo: str) -> None:
     assert isinstance(answers[-1], Ready)
 
 
+def test_a_helper_that_gets_little_of_a_busy_computer_ends_its_work(
+    tmp_path: Path, echo: str
+) -> None:
+    """It has a tenth of a processor: its clock runs out long before its processor time."""
+    module = tmp_path / "echo_helper.py"
+    slow = "import time\nend = time.time() + 2.0\nwhile time.time() < end:\n    time.sleep(0.02)\n"
+    module.write_text(module.read_text() + slow + "    for _ in range(50_000): pass\n")
+    answers: deque[Answer] = deque()
+    helper = Helper(echo, [], answers.append)
+    helper.put(Batch(np.zeros((5, 2)), None))
+    until(lambda: len(answers) == 1)
+    assert helper.stop(patience_s=1.0)
+
+
+def test_a_helper_that_hangs_at_the_end_is_ended(echo: str) -> None:
+    helper = Helper(echo, [], lambda _: None)
+    until(lambda: helper.process is not None)
+    assert helper.process is not None
+    os.kill(helper.process.pid, 19)
+    assert not helper.stop(patience_s=0.3)
+
+
 def test_a_helper_that_is_slow_loses_the_oldest_batches_and_says_how_much(echo: str) -> None:
     helper = Helper(echo, [], lambda _: None)
     until(lambda: helper.process is not None)

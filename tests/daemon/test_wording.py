@@ -17,6 +17,7 @@ LEAK = Verdict(0.0, "missing", "An internal leakage of 0.5 L/min at 10 MPa is mi
 
 SAID = {
     "second_sender": (wording.second_sender(["Pressures"]), "Pressures comes faster"),
+    "channels": (wording.several_channels({"A": 1}), "A (taken from 1)"),
     "two second senders": (wording.second_sender(["A", "B"]), "A, B come faster"),
     "frozen": (wording.frozen(["p_a"]), "p_a does not move"),
     "bus_down": (wording.bus_down("socketcan can0"), "socketcan can0 has failed"),

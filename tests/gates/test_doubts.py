@@ -40,6 +40,24 @@ def test_two_senders_fill_the_bucket_by_three_eighths_per_frame() -> None:
     assert not len(found) and found.refused == {"too_fast": 1} and gate.doubted.all()
 
 
+def test_of_two_channels_the_first_is_taken_until_one_is_declared() -> None:
+    """A gateway repeats every fifth frame on another channel: too seldom to be too fast."""
+    both = at(T * np.repeat(np.arange(20.0), 2))
+    both.channel[1::2] = 1
+    rare = both[(both.channel == 0) | (np.arange(40) % 10 == 1)]
+    for channel, kept_channel, others in ((-1, 0, 4), (0, 0, 0), (1, 1, 0)):
+        gate = senders(channel=channel)
+        believed = gate.push(rare)
+        assert believed.refused == ({"other_channel": others} if others else {})
+        taken = believed.channel == kept_channel
+        assert taken.sum() == (20 if kept_channel == 0 else 4)
+        assert gate.channels.tolist() == [0 if others else -1]
+    gate = senders()
+    gate.push(rare)
+    gate.push(at(T * np.arange(20.0, 90.0)))  # the other one has ended
+    assert gate.channels.tolist() == [-1]
+
+
 def test_refused_until_half_a_second_after_the_last_overflow() -> None:
     """A flood fills it to 8.5 and no further; at the usual pace that is 7.5 after 4 frames."""
     gate, end = senders(), 100.0
