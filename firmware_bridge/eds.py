@@ -7,7 +7,8 @@ Object 0x1800 + n says under which identifier TPDO n + 1 is sent and how often (
 
 An EDS is of a type of device: identifiers hold $NODEID.  A DCF is of one and names its node.  Units
 are those of the profiles CiA 404 (measuring devices: value / 10^digits of a unit by CiA 303-2) and
-CiA 406 (linear encoders: steps of nm, and of 0.01 mm/s); else a number is as it is sent.
+CiA 406 (linear encoders: steps of nm, and of 0.01 mm/s); else a number is as it is sent.  An
+object's LowLimit and HighLimit are the range of its signal: what lies outside is not available.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ COB_ID, EVENT_TIMER_MS = 1, 5  # subindices of the first
 SWITCHED_OFF, IS_EXTENDED = 1 << 31, 1 << 29
 DUMMIES = 0x1F  # objects up to here only take room
 BOOLEAN, REALS = 0x1, (0x8, 0x11)
-INTEGERS = (0x2, 0x3, 0x4, 0x10, 0x12, 0x13, 0x14, 0x15)
+INTEGERS = {0x2: 8, 0x3: 16, 0x4: 32, 0x10: 24, 0x12: 40, 0x13: 48, 0x14: 56, 0x15: 64}  # bits
+WHOLE = re.compile(r"[-+]?(0[xX][0-9a-fA-F]{1,16}|[1-9][0-9]{0,18}|0)")
 NUMBERS = {BOOLEAN, *REALS, *INTEGERS, 0x5, 0x6, 0x7, 0x16, 0x18, 0x19, 0x1A, 0x1B}
 MEASURED, FLOAT_MEASURED = (0x7130, 0x9130), 0x6130  # CiA 404: process values
 UNIT, DIGITS = 0x6131, 0x6132
@@ -107,6 +109,17 @@ class _Objects:
         text = next((part["datatype"] for part in parts if "datatype" in part), None)
         return self._number(text, f"{index:04X}sub{sub:X}") if text else None
 
+    def limits(self, index: int, sub: int) -> tuple[int, int] | None:
+        """Lowest and highest number of an object; None unless both are said.
+
+        Negative ones may be written as the bits that are sent, 0xFF00 for -256.
+        """
+        entry, kind = self._entry(index, sub), self.type_of(index, sub)
+        low, high = (entry.get(key, "").strip() for key in ("lowlimit", "highlimit"))
+        if kind in REALS or not (WHOLE.fullmatch(low) and WHOLE.fullmatch(high)):
+            return None
+        return _signed(int(low, 0), kind), _signed(int(high, 0), kind)
+
     def is_record(self, index: int) -> bool:
         """Whether an object has parts."""
         return f"{index:04X}SUB0" in self._sections or "compactsubobj" in self._whole(index)
@@ -130,6 +143,12 @@ class _Objects:
             except ValueError:
                 raise EdsError(f"[{place}]: {text!r} is no whole number") from None
         return total
+
+
+def _signed(number: int, kind: int | None) -> int:
+    """A number of a signed type whose bits were written as those of an unsigned one."""
+    bits = INTEGERS.get(kind or 0, 0)
+    return number - (1 << bits) if bits and number >> (bits - 1) == 1 else number
 
 
 def _messages(objects: _Objects, kind: str) -> Iterator[Message]:
@@ -177,9 +196,11 @@ def _signal(
 ) -> Signal:
     name, kind = objects.name(index, sub), objects.type_of(index, sub)
     unit, scale = _physical(objects, index, sub)
+    low, high = objects.limits(index, sub) or (0, 0)  # which is none
     return Signal(
         f"{name}_{index:04X}" if name in taken else name, begin, length,
         is_signed=kind in INTEGERS, unit=unit or None,
+        minimum=scale * low, maximum=scale * high,
         conversion=BaseConversion.factory(scale=scale, is_float=kind in REALS),
     )  # fmt: skip
 
