@@ -44,10 +44,10 @@ faults: $(READY)
 	  status=$$?; .venv/bin/python -m tests.faults.table out/faults.jsonl | tee out/faults.md; \
 	  exit $$status
 
-# Mutated projects, DBCs, logs, tables and plant files, each through its command (ten minutes):
-# make fuzz SEED=2 FUZZ="--logs 5000 --dbcs 0"; one case again: make fuzz FUZZ="--case logs-17"
+# Mutated projects, DBCs, EDS, logs, tables and plant files, 500 of each format, each through its
+# command (an hour): make fuzz SEED=2 FUZZ="--logs 500 --dbcs 0"; one case again: --case logs-17
 SEED ?= 1
-FUZZ ?= --projects 500 --dbcs 500 --logs 1000 --tables 1000 --plants 200 --bombs 8
+FUZZ ?= --projects 500 --dbcs 500 --nodes 500 --logs 5000 --tables 3000 --plants 200 --bombs 8
 fuzz: $(READY)
 	@rm -rf out/fuzz && mkdir -p out
 	.venv/bin/python -m tests.fuzz --seed $(SEED) --out out/fuzz $(FUZZ)

@@ -29,7 +29,10 @@ from tests.fuzz.judge import judge
 from tests.fuzz.seeds import Seeds
 from tests.fuzz.seeds import make as make_seeds
 
-SIZES = {"projects": 500, "dbcs": 500, "logs": 1000, "tables": 1000, "plants": 200, "bombs": 8}
+SIZES = {
+    "projects": 500, "dbcs": 500, "nodes": 500, "logs": 5000, "tables": 3000, "plants": 200,
+    "bombs": 8,
+}  # fmt: skip
 DEFECTS = ("traceback", "hang", "memory", "crash", "loss", "output")
 
 
@@ -87,7 +90,7 @@ def _warm(seeds: Seeds, scratch: Path, kinds: set[str]) -> None:
         call(["excite", "-p", str(at / "cylinder.toml"), str(scratch / "motion.csv"), "--json"])
     if kinds & {"projects", "tables"}:
         call(["diagnose", table_, "-p", str(at / "table.toml"), "--json"])
-    if kinds & {"dbcs", "logs", "tables", "bombs"}:
+    if kinds & {"dbcs", "nodes", "logs", "tables", "bombs"}:
         call(["quick", table_, "--json"])
         call(["init", str(at / "machine.dbc"), "-o", str(scratch / "new.toml")])
     if kinds & {"plants", "tables"}:

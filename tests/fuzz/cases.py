@@ -23,7 +23,7 @@ from tests.fuzz import mutate
 from tests.fuzz.bombs import BOMBS
 from tests.fuzz.seeds import LOGS, TABLES, Seeds, write_mcap
 
-KINDS = ("projects", "dbcs", "logs", "tables", "plants", "bombs")
+KINDS = ("projects", "dbcs", "nodes", "logs", "tables", "plants", "bombs")
 HARMLESS_SHARE = 0.02  # of the cases that stay as they are: what is sound must pass
 
 
@@ -109,6 +109,23 @@ def _dbc(_seeds: Seeds, rng: random.Random, folder: Path) -> Made:
     return path, None, rng.choice(commands)
 
 
+def _nodes(_seeds: Seeds, rng: random.Random, folder: Path) -> Made:
+    """An EDS or DCF of one of three nodes."""
+    path = folder / rng.choice(("valve.eds", "sensor.eds", "encoder.dcf"))
+    if rng.random() > HARMLESS_SHARE:
+        _replace(path, mutate.of_text(path.read_bytes(), rng))
+    names = ",".join(
+        map(str, (folder / "valve.eds:5", folder / "sensor.eds:9", folder / "encoder.dcf"))
+    )
+    log = str(folder / "nodes.blf")
+    commands = (
+        ["init", names, "-o", str(folder / "new.toml")],
+        ["check", "--bus-only", log, "--dbc", names, "--json"],
+        ["quick", log, "--dbc", names, "--json"],
+    )
+    return path, None, rng.choice(commands)
+
+
 def _doubled_message(content: bytes, rng: random.Random) -> bytes:
     """One message once more: with the same name, the same identifier, or both."""
     blocks = re.findall(rb"(?ms)^BO_ .*?\n(?=\n)", content)
@@ -124,7 +141,7 @@ def _log(seeds: Seeds, rng: random.Random, folder: Path) -> Made:
     path = folder / f"log{suffix}"
     content, expected = path.read_bytes(), None
     if rng.random() > HARMLESS_SHARE:
-        of = mutate.of_bytes if suffix in (".blf", ".asc.gz") else mutate.of_text
+        of = mutate.of_bytes if suffix in (".blf", ".asc.gz", ".mf4") else mutate.of_text
         _replace(path, of(content, rng))
     else:
         expected = seeds.frames
@@ -169,8 +186,8 @@ def _record(seeds: Seeds, rng: random.Random, folder: Path) -> Made:
 
 def _mutate_table(path: Path, rng: random.Random) -> int | None:
     """Change bytes, or columns; then the number of rows is known."""
-    if rng.random() < 0.4:
-        binary = path.suffix in (".parquet", ".mat", ".mcap")
+    if rng.random() < 0.4 or path.suffix == ".mf4":
+        binary = path.suffix in (".parquet", ".mat", ".mcap", ".mf4")
         of = mutate.of_bytes if binary else mutate.of_text
         _replace(path, of(path.read_bytes(), rng))
         return None
@@ -234,6 +251,7 @@ def _bomb(_seeds: Seeds, rng: random.Random, folder: Path) -> Made:
 _MAKERS: dict[str, Callable[[Seeds, random.Random, Path], Made]] = {
     "projects": _project,
     "dbcs": _dbc,
+    "nodes": _nodes,
     "logs": _log,
     "tables": _table,
     "plants": _plant,

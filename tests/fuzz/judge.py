@@ -61,7 +61,7 @@ def _lost_frames(case: Case, words: dict[str, Any], outcome: Outcome, seeds: See
     if words["refused"] or outcome.err:
         return None
     shown = seeds.frames
-    if case.mutated.suffix not in (".blf", ".gz"):
+    if case.mutated.suffix not in (".blf", ".gz", ".mf4"):
         sound = (seeds.folder / case.mutated.name).read_bytes()
         shown = min(shown, frames_shown(case.mutated.read_bytes(), sound))
     return f"{frames} frames of {shown}, and nothing was refused" if frames < shown else None

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import random
 import re
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
@@ -141,10 +142,10 @@ def _change(raw: dict[str, Any], rng: random.Random) -> None:
     if kind == 0:
         del holder[key]
     elif kind == 1 and isinstance(holder, dict):
-        holder[rng.choice(ODD_TEXTS) or "extra"] = holder[key]
+        holder[rng.choice(ODD_TEXTS) or "extra"] = deepcopy(holder[key])
     elif kind == 2 and isinstance(holder, dict):
         other = rng.choice(places)
-        holder[key] = other[0][other[1]]
+        holder[key] = deepcopy(other[0][other[1]])  # it may be what this one stands in
     else:
         holder[key] = odd_value(holder[key], rng)
 

@@ -10,6 +10,7 @@ import json
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
 import can
@@ -22,12 +23,18 @@ from scipy.io import savemat
 import rtid.project
 from firmware_bridge.catalog import CONTROLLER_DBC
 from firmware_bridge.frames import Frames, to_messages
-from firmware_bridge.sources import open_log
+from firmware_bridge.sources import blf, open_log
+from rtid.sim.run import simulate
+from rtid.sim.simulated_plant import SimulatedPlant
+from tests.bridge import canopen
 from tests.fuzz.command import call
 
 EXAMPLES = Path(rtid.project.__file__).parent / "examples"
-LOGS = (".blf", ".log", ".asc", ".trc", ".csv", ".asc.gz", ".savvy.csv", ".shown.log", ".fd.log")
-TABLES = (".parquet", ".csv", ".mat", ".tsv", ".mcap")
+LOGS = (
+    *(".blf", ".log", ".asc", ".trc", ".csv", ".mf4"),
+    *(".asc.gz", ".savvy.csv", ".shown.log", ".fd.log"),
+)
+TABLES = (".parquet", ".csv", ".mat", ".tsv", ".mcap", ".mf4")
 LOG_S, TABLE_S = "0.5", "24"  # a log that is read in no time; a table in which quick finds enough
 EVERY = 20  # rows of the table at 1 kHz of which one is kept
 
@@ -53,13 +60,17 @@ def make(folder: Path) -> Seeds:
     rows = _tables(folder)
     _projects(folder)
     _plants(folder)
+    run = simulate(SimulatedPlant(), "rich", 0, 2.0)
+    names = ("u", "x", "v", "p_a", "p_b", "p_supply")
+    canopen.machine(folder)
+    blf.write(folder / "nodes.blf", canopen.bus({n: run.samples.column(n)[::10] for n in names}))
     return Seeds(folder, frames, rows)
 
 
 def _logs(folder: Path) -> int:
     _done("simulate", str(folder / "log.blf"), "--duration", LOG_S, "--motion", "rich")
     frames = open_log(folder / "log.blf")
-    for suffix in (".log", ".asc", ".trc", ".csv"):
+    for suffix in (".log", ".asc", ".trc", ".csv", ".mf4"):
         with can.Logger(folder / f"log{suffix}") as log:
             for message in to_messages(frames):
                 log.on_message_received(message)
@@ -107,6 +118,17 @@ def write_mcap(path: Path, columns: dict[str, np.ndarray]) -> None:
         log.finish()
 
 
+def write_mf4(path: Path, columns: dict[str, np.ndarray]) -> None:
+    """Columns with their time as a measurement, as an MF4 file."""
+    from asammdf import MDF, Signal
+
+    time = next(iter(columns.values()))
+    with MDF(version="4.10") as log:
+        log.start_time = datetime(2020, 9, 13, tzinfo=UTC)
+        log.append([Signal(c, time, name=name) for name, c in list(columns.items())[1:]])
+        log.save(path)
+
+
 def _without_today(path: Path, pattern: bytes, line: bytes) -> None:
     """One seed gives the same bytes on each day and in each folder."""
     path.write_bytes(re.sub(pattern, line, path.read_bytes(), count=1))
@@ -123,6 +145,7 @@ def _tables(folder: Path) -> int:
     columns = {name: kept[name].to_numpy() for name in kept.column_names}
     savemat(folder / "table.mat", columns, do_compression=True)
     write_mcap(folder / "table.mcap", columns)
+    write_mf4(folder / "table.mf4", columns)
     return kept.num_rows
 
 
