@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -22,12 +23,16 @@ SNAPSHOT = ".npz"
 def export(
     source: Annotated[Path, typer.Argument(help="Snapshot (.npz) of `rtid replay`, or a trace.")],
     output: Annotated[
-        Path, typer.Argument(help="File to write: .csv .json .npz .mat .m .dcm .cdfx .h.")
+        Path, typer.Argument(help="File to write: .csv .json .npz .mat .m .dcm .cdfx .h .fmu.")
     ],
     project: ProjectOption,
     prior_map: PriorOption = None,
     force: Annotated[
         bool, typer.Option("--force", help="Write it even if what was learned is impossible.")
+    ] = False,
+    fmi: Annotated[int, typer.Option("--fmi", help="Version of FMI of an FMU: 2 or 3.")] = 2,
+    map_alone: Annotated[
+        bool, typer.Option("--map", help="An FMU of the maps alone: pressures are its inputs.")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print a summary as JSON.")] = False,
     no_cache: NoCache = False,
@@ -37,7 +42,8 @@ def export(
     CSV is a long table at the nodes and centres of the grid; JSON and npz hold everything; .mat, .m
     (Simulink.LookupTable), .dcm and .cdfx (calibration tools) hold grids on which straight lines
     miss no more than 0.1 % of the largest flow, with deviation and status; a C99 header holds
-    look-up tables, float and fixed point, with their functions beside it; packages may bring more.
+    look-up tables, float and fixed point, with their functions beside it; an FMU (co-simulation by
+    FMI 2.0 or 3.0) holds the machine with its effects, bulk moduli and lag; packages bring more.
     From a trace the maps are learned beside the effects that `rtid add` has added, whose flow is
     not in them; a snapshot holds the maps as they were learned, on board beside those that can run
     live.  Exit code 4: what was learned is impossible, and nothing is written without --force.
@@ -45,15 +51,18 @@ def export(
     from rtid.errors import RtidError
     from rtid.maps.c_header import SUFFIX, write_header
     from rtid.maps.files import formats, provenance, write_map
+    from rtid.maps.fmu import SUFFIX as FMU
     from rtid.maps.prior_map import find_prior, said_of, with_prior
     from rtid.project import load
 
-    if output.suffix.lower() not in (*formats(), SUFFIX):
-        remedy = f"end its name in {', '.join((*formats(), SUFFIX))}"
+    known = (*formats(), SUFFIX, FMU)
+    if output.suffix.lower() not in known:
+        remedy = f"end its name in {', '.join(known)}"
         raise RtidError(f"{output}: unknown format", remedy, exit_code=2)
     loaded = with_prior(load(project), prior_map)
     prior = find_prior(loaded)
-    solution, flowmap, effects, invalid = _learned(loaded, source)
+    learned = _learned(loaded, source)
+    solution, flowmap, effects, invalid = learned[:4]
     if invalid and not force:
         raise RtidError(
             f"{source}: not exported, {'; '.join(doubt.text for doubt in invalid)}",
@@ -64,6 +73,8 @@ def export(
     if output.suffix.lower() == SUFFIX:
         percent = loaded.sections.publish.error_percent
         write_header(output, loaded.model, flowmap, origin, percent)
+    elif output.suffix.lower() == FMU:
+        _write_fmu(output, learned, origin, fmi, map_alone)
     else:
         write_map(output, flowmap, origin)
     cells = {e.name: int((e.status == "valid").sum()) for e in flowmap.edges}
@@ -92,12 +103,37 @@ def _beside(effects: list[dict[str, Any]], project: Project) -> str:
     return "The project has added no effects."
 
 
-def _learned(
-    project: Project, source: Path
-) -> tuple[Solution, FlowMap, list[dict[str, Any]], list[Doubt]]:
+class Learned(NamedTuple):
+    """What is exported; lag_s: of the spools; timings: effects that act on times of signals."""
+
+    solution: Solution
+    flowmap: FlowMap
+    effects: list[dict[str, Any]]
+    invalid: list[Doubt]
+    lag_s: float
+    timings: list[str]
+
+
+def _write_fmu(
+    output: Path, learned: Learned, origin: dict[str, Any], version: int, map_alone: bool
+) -> None:
+    from rtid.maps.fmu import Dynamics, NoFmuError, write_fmu
+
+    solution = learned.solution
+    if learned.timings and not map_alone:
+        names = ", ".join(learned.timings)
+        raise NoFmuError(f"{names}: an effect on times of signals", "--map exports the map alone")
+    dynamics = Dynamics(solution.compliance, solution.terms_theta, learned.lag_s)
+    given = None if map_alone else dynamics
+    if not write_fmu(output, solution.model, learned.flowmap, given, origin, version):
+        print("There is no C compiler here: it has sources alone, and no binary.", file=sys.stderr)
+
+
+def _learned(project: Project, source: Path) -> Learned:
     """From a snapshot as it is, from a trace by the record path; effects beside, what is wrong."""
     from rtid.estimator.validity import doubts_of
 
+    timings: list[str] = []
     if source.suffix.lower() == SNAPSHOT:
         from rtid.maps.prior_map import find_prior, published
         from rtid.study.on_board import load_for
@@ -106,6 +142,7 @@ def _learned(
         solution, lag = estimator.solution(), (0.0, 0.0)
         flowmap = published(solution, find_prior(project))
         effects = [{"effect": a.effect, "where": a.where} for a in live]
+        lag_s = solution.model.lag.nominal_s
     else:
         from rtid.study.known_effects import as_json
         from rtid.study.study import Study
@@ -114,7 +151,8 @@ def _learned(
         with progress_bar() as progress:
             study = Study(project, source, progress)
             fit, flowmap = study.fit, study.map
+            timings = [timing.effect for timing, _ in study.fitted.revision.timings]
         solution, lag = fit.solution, (fit.lag_s, fit.lag_sd_s)
-        effects = as_json(study.effects)
+        effects, lag_s = as_json(study.effects), fit.lag_s
     invalid = [doubt for doubt in doubts_of(solution, *lag) if doubt.is_invalid]
-    return solution, flowmap, effects, invalid
+    return Learned(solution, flowmap, effects, invalid, lag_s, timings)

@@ -96,13 +96,19 @@ def _lines(path: Path, sampled: Iterable[Sampled], provenance: Mapping[str, Any]
 
 
 def _edge(name: str, sampled: Sampled) -> Iterator[str]:
-    t = sampled.table
-    status = t.status.copy()
-    status[0] |= np.where(t.rising, RISING, 0).astype(np.uint8)
-    yield ""
     largest, rms = 6e4 * sampled.error_max_m3s, 6e4 * sampled.error_rms_m3s
+    yield ""
+    t = sampled.table
     yield f"/* Edge {sampled.edge}: {len(t.w_v)} commands, {len(t.s)} roots of the pressure drop."
     yield f" * Off by {largest:.2g} L/min from the map at most, rms {rms:.2g}. */"
+    yield from float_map(name, t)
+    yield from _fixed(name, t)
+
+
+def float_map(name: str, t: Table) -> Iterator[str]:
+    """A table as the constant `name` of type rtid_map (c/rtid_map.h), line by line."""
+    status = t.status.copy()
+    status[0] |= np.where(t.rising, RISING, 0).astype(np.uint8)
     yield from _array("float", f"{name}_u", (_float(x) for x in t.w_v))
     yield from _array("float", f"{name}_s", (_float(x) for x in t.s))
     yield from _array("int16_t", f"{name}_q", map(str, t.counts.ravel().tolist()))
@@ -111,7 +117,6 @@ def _edge(name: str, sampled: Sampled) -> Iterator[str]:
     yield f"static const rtid_map {name} = {{"
     yield f"    {name}_u, {name}_s, {name}_q, {name}_status, {_float(t.scale)}, {safe},"
     yield f"    {len(t.w_v)}, {len(t.s)}, {t.direction}}};"
-    yield from _fixed(name, t)
 
 
 def _fixed(name: str, t: Table) -> Iterator[str]:
