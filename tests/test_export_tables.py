@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -14,6 +15,7 @@ from scipy.io import loadmat
 from firmware_bridge.lookup import STATUS
 from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.published import publish
+from rtid.maps.a2l import NoA2lError
 from rtid.maps.files import write_map
 from rtid.maps.gridded import ERROR_SHARE, Gridded, gridded
 from tests.flow_maps import machine, orifice, solved
@@ -75,6 +77,45 @@ def test_an_independent_reader_takes_the_dcm_file(
 def numbers(parent: ET.Element | None) -> list[float]:
     assert parent is not None
     return [float(v.text or "nan") for v in parent.iter("V")]
+
+
+def test_an_independent_parser_takes_the_a2l_file(
+    flowmap: FlowMap, grids: tuple[Gridded, ...], tmp_path: Path
+) -> None:
+    """The same names, units and axes as the DCM that is loaded into it."""
+    parser = pytest.importorskip("pya2l.parser", reason="pip install 'rtid[dev]'")
+    path = tmp_path / "maps.a2l"
+    write_map(path, flowmap, PROVENANCE)
+    with parser.A2lParser() as reader:
+        tree = reader.tree_from_a2l(path.read_bytes())
+        assert not reader.warnings
+    (module,) = tree.PROJECT.MODULE
+    units = {m.Name.Value: m.Unit.Value for m in module.COMPU_METHOD}
+    known = {c.Name.Value: c for c in module.CHARACTERISTIC}
+    assert set(known) == {
+        "beta_0", "beta_1", *(f"{g.name}_flow{s}" for g in grids for s in ("", "_sd", "_status"))
+    }  # fmt: skip
+    for g in grids:
+        flow = known[f"{g.name}_flow"]
+        assert flow.Type == "MAP" and units[flow.Conversion.Value] == "L/min"
+        x, y = flow.AXIS_DESCR
+        assert (x.MaxAxisPoints.Value, y.MaxAxisPoints.Value) == (len(g.dp_pa), len(g.u_v))
+        assert [units[a.Conversion.Value] for a in (x, y)] == ["MPa", "V"]
+        assert flow.UpperLimit.Value == pytest.approx(LPM * g.flow_m3s.max(), rel=1e-6)
+        assert flow.SYMBOL_LINK.SymbolName.Value == f"{g.name}_flow"
+    (words,) = module.COMPU_VTAB
+    assert words.NumberValuePairs.Value == len(STATUS)
+
+
+def test_maps_whose_names_an_a2l_cannot_tell_apart_are_refused(
+    flowmap: FlowMap, tmp_path: Path
+) -> None:
+    twins = FlowMap(
+        tuple(replace(e, name=n) for e, n in zip(flowmap.edges, ("p-a", "p a"), strict=True))
+    )
+    with pytest.raises(NoA2lError, match="p_a_flow"):
+        write_map(tmp_path / "maps.a2l", twins, PROVENANCE)
+    assert not list(tmp_path.iterdir())
 
 
 def test_cdfx_holds_the_same_and_its_elements_are_in_order(

@@ -29,6 +29,7 @@ fmpy = pytest.importorskip("fmpy", reason="pip install 'rtid[dev]'")
 read_model_description, simulate_fmu, extract = (
     fmpy.read_model_description, fmpy.simulate_fmu, fmpy.extract
 )  # fmt: skip
+validate_fmu = pytest.importorskip("fmpy.validation").validate_fmu
 COMPLIANCE = np.array([1 / 800e6, 1 / 900e6])
 ORIGIN = {"project": "here", "rows": 7}
 
@@ -66,7 +67,7 @@ def test_the_fmu_is_the_free_run(
     chunk, path = signals(200), tmp_path / "machine.fmu"
     dynamics = Dynamics(COMPLIANCE, THETA_TERMS[: len(terms)], lag_s)
     assert write_fmu(path, model, flowmap, dynamics, ORIGIN, version)
-    assert fmpy.validation.validate_fmu(str(path)) == []
+    assert validate_fmu(str(path)) == []
     described = read_model_description(str(path))
     units = {v.name: v.unit for v in described.modelVariables}
     assert units["p_a"] == units["beta_a"] == "Pa" and units["Q_pa_low"] == "m3/s"
@@ -95,7 +96,7 @@ def test_the_map_alone_tells_flow_interval_and_what_it_stands_on(
     path, chunk = tmp_path / "map.fmu", signals(100)
     chunk[:, 3] = np.linspace(1e6, 7e6, len(chunk))
     assert write_fmu(path, model, flowmap, None, ORIGIN, version)
-    assert fmpy.validation.validate_fmu(str(path)) == []
+    assert validate_fmu(str(path)) == []
     got = simulate_fmu(
         str(path), stop_time=chunk[-1, 0], step_size=1e-3, output_interval=1e-3,
         input=inputs(model, chunk, pressures=True),
@@ -144,7 +145,7 @@ def driven(path: Path, names: list[str], rows: FloatArray, start: list[float]) -
     described = read_model_description(str(path))
     at = {v.name: v.valueReference for v in described.modelVariables}
     unit = FMU2Slave(
-        guid=described.guid, unzipDirectory=extract(str(path)),
+        guid=described.guid, unzipDirectory=extract(str(path), str(path.with_suffix(""))),
         modelIdentifier=described.coSimulation.modelIdentifier,
     )  # fmt: skip
     unit.instantiate()

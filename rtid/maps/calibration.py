@@ -29,7 +29,9 @@ DOCTYPE = (
 
 
 @dataclass(frozen=True, eq=False)
-class _Map:
+class CalibrationMap:
+    """One map of a calibration tool: values (y, x) over x_mpa (x,) and y_v (y,), in `unit`."""
+
     name: str
     about: str
     unit: str
@@ -56,26 +58,29 @@ def write_cdfx(path: Path, flowmap: FlowMap, provenance: Mapping[str, Any]) -> N
     tree = ET.SubElement(spec, "SW-INSTANCE-TREE")
     _text(tree, "SHORT-NAME", "learned")
     _text(tree, "CATEGORY", "NO_VCD")
-    for name, unit, value in _values(provenance):
+    for name, unit, value in calibration_values(provenance):
         _instance(tree, name, "effective bulk modulus", "VALUE", unit, [value])
-    for table in _maps(flowmap):
+    for table in calibration_maps(flowmap):
         _map_instance(tree, table)
     ET.indent(root)
     body = ET.tostring(root, encoding="unicode")
     path.write_text(f'<?xml version="1.0" encoding="utf-8"?>\n{DOCTYPE}\n{body}\n', "utf-8")
 
 
-def _maps(flowmap: FlowMap) -> Iterator[_Map]:
+def calibration_maps(flowmap: FlowMap) -> Iterator[CalibrationMap]:
+    """Flow, deviation and status of every edge."""
     codes = ", ".join(f"{k} {word}" for k, word in enumerate(STATUS))
     for g in gridded(flowmap):
-        axes = MPA * g.dp_pa, g.u_v
-        yield _Map(f"{g.name}_flow", f"flow of {g.name}", "L/min", LPM * g.flow_m3s, *axes)
-        about = f"standard deviation of {g.name}_flow"
-        yield _Map(f"{g.name}_flow_sd", about, "L/min", LPM * g.sd_m3s, *axes)
-        yield _Map(f"{g.name}_flow_status", f"{g.name}_flow stands on: {codes}", "-", g.code, *axes)
+        name, axes = f"{g.name}_flow", (MPA * g.dp_pa, g.u_v)
+        yield CalibrationMap(name, f"flow of {g.name}", "L/min", LPM * g.flow_m3s, *axes)
+        about = f"standard deviation of {name}"
+        yield CalibrationMap(f"{name}_sd", about, "L/min", LPM * g.sd_m3s, *axes)
+        about = f"{name} stands on: {codes}"
+        yield CalibrationMap(f"{name}_status", about, "-", g.code, *axes)
 
 
-def _values(provenance: Mapping[str, Any]) -> Iterator[tuple[str, str, float]]:
+def calibration_values(provenance: Mapping[str, Any]) -> Iterator[tuple[str, str, float]]:
+    """Name, unit and value of each bulk modulus."""
     for k, beta_pa in enumerate(provenance.get("beta_pa", ())):
         yield f"beta_{k}", "MPa", MPA * float(beta_pa)
 
@@ -89,14 +94,14 @@ def _dcm(flowmap: FlowMap, provenance: Mapping[str, Any]) -> Iterator[str]:
     for key, value in sorted(provenance.items()):
         yield f"* {key}: {json.dumps(value)}"
     yield "KONSERVIERUNG_FORMAT 2.0"
-    for name, unit, value in _values(provenance):
+    for name, unit, value in calibration_values(provenance):
         yield ""
         yield f"FESTWERT {name}"
         yield '   LANGNAME "effective bulk modulus"'
         yield f'   EINHEIT_W "{unit}"'
         yield f"   WERT {_number(value)}"
         yield "END"
-    for table in _maps(flowmap):
+    for table in calibration_maps(flowmap):
         yield ""
         yield f"KENNFELD {table.name} {len(table.x_mpa)} {len(table.y_v)}"
         yield f'   LANGNAME "{table.about}"'
@@ -116,7 +121,7 @@ def _rows(key: str, values: Iterable[float]) -> Iterator[str]:
         yield f"   {key} {' '.join(words[start : start + PER_LINE])}"
 
 
-def _map_instance(tree: ET.Element, table: _Map) -> None:
+def _map_instance(tree: ET.Element, table: CalibrationMap) -> None:
     instance = _instance(tree, table.name, table.about, "MAP", table.unit, table.values)
     axes = ET.SubElement(instance, "SW-AXIS-CONTS")
     for unit, values in (("MPa", table.x_mpa), ("V", table.y_v)):

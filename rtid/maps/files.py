@@ -23,6 +23,7 @@ from firmware_bridge.sources.unpacked import Budget
 from rtid.errors import RtidError, door
 from rtid.estimator.flowmap import VALID, EdgeMap, FlowMap
 from rtid.estimator.solution import Solution
+from rtid.maps.a2l import write_a2l
 from rtid.maps.calibration import write_cdfx, write_dcm
 from rtid.maps.matlab import write_m, write_mat
 from rtid.model import Grid
@@ -231,4 +232,5 @@ WRITERS: dict[str, Writer] = {
     ".m": write_m,
     ".dcm": write_dcm,
     ".cdfx": write_cdfx,
+    ".a2l": write_a2l,
 }
