@@ -16,14 +16,19 @@ if TYPE_CHECKING:
     from rtid.estimator.solution import Solution
     from rtid.estimator.validity import Doubt
     from rtid.project import Project
+    from rtid.study.study import Study
 
 SNAPSHOT = ".npz"
+RECORDED = (".mf4", ".mcap")
 
 
 def export(
     source: Annotated[Path, typer.Argument(help="Snapshot (.npz) of `rtid replay`, or a trace.")],
     output: Annotated[
-        Path, typer.Argument(help="File to write: .csv .json .npz .mat .m .dcm .cdfx .h .fmu.")
+        Path,
+        typer.Argument(
+            help="File to write: .csv .json .npz .mat .m .dcm .cdfx .a2l .h .fmu .mf4 .mcap."
+        ),
     ],
     project: ProjectOption,
     prior_map: PriorOption = None,
@@ -44,6 +49,7 @@ def export(
     miss no more than 0.1 % of the largest flow, with deviation and status; a C99 header holds
     look-up tables, float and fixed point, with their functions beside it; an FMU (co-simulation by
     FMI 2.0 or 3.0) holds the machine with its effects, bulk moduli and lag; packages bring more.
+    .mf4 and .mcap hold the record: signals, residual, block and status over time, estimates.
     From a trace the maps are learned beside the effects that `rtid add` has added, whose flow is
     not in them; a snapshot holds the maps as they were learned, on board beside those that can run
     live.  Exit code 4: what was learned is impossible, and nothing is written without --force.
@@ -55,7 +61,7 @@ def export(
     from rtid.maps.prior_map import find_prior, said_of, with_prior
     from rtid.project import load
 
-    known = (*formats(), SUFFIX, FMU)
+    known = (*formats(), SUFFIX, FMU, *RECORDED)
     if output.suffix.lower() not in known:
         remedy = f"end its name in {', '.join(known)}"
         raise RtidError(f"{output}: unknown format", remedy, exit_code=2)
@@ -75,6 +81,12 @@ def export(
         write_header(output, loaded.model, flowmap, origin, percent)
     elif output.suffix.lower() == FMU:
         _write_fmu(output, learned, origin, fmi, map_alone)
+    elif output.suffix.lower() in RECORDED:
+        from rtid.tell.recorded import write_recorded
+
+        if learned.study is None:
+            raise RtidError(f"{source}: holds no record over time", "export from a trace")
+        write_recorded(output, learned.study, origin)
     else:
         write_map(output, flowmap, origin)
     cells = {e.name: int((e.status == "valid").sum()) for e in flowmap.edges}
@@ -104,7 +116,10 @@ def _beside(effects: list[dict[str, Any]], project: Project) -> str:
 
 
 class Learned(NamedTuple):
-    """What is exported; lag_s: of the spools; timings: effects that act on times of signals."""
+    """What is exported; lag_s: of the spools; timings: effects that act on times of signals.
+
+    study: of the trace; None of a snapshot.
+    """
 
     solution: Solution
     flowmap: FlowMap
@@ -112,6 +127,7 @@ class Learned(NamedTuple):
     invalid: list[Doubt]
     lag_s: float
     timings: list[str]
+    study: Study | None = None
 
 
 def _write_fmu(
@@ -133,7 +149,7 @@ def _learned(project: Project, source: Path) -> Learned:
     """From a snapshot as it is, from a trace by the record path; effects beside, what is wrong."""
     from rtid.estimator.validity import doubts_of
 
-    timings: list[str] = []
+    timings, study = list[str](), None
     if source.suffix.lower() == SNAPSHOT:
         from rtid.maps.prior_map import find_prior, published
         from rtid.study.on_board import load_for
@@ -155,4 +171,4 @@ def _learned(project: Project, source: Path) -> Learned:
         solution, lag = fit.solution, (fit.lag_s, fit.lag_sd_s)
         effects, lag_s = as_json(study.effects), fit.lag_s
     invalid = [doubt for doubt in doubts_of(solution, *lag) if doubt.is_invalid]
-    return Learned(solution, flowmap, effects, invalid, lag_s, timings)
+    return Learned(solution, flowmap, effects, invalid, lag_s, timings, study)
