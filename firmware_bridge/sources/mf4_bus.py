@@ -46,7 +46,7 @@ class Field(NamedTuple):
     conversion: Block | None
 
 
-class Group(NamedTuple):
+class BusGroup(NamedTuple):
     """A channel group: where it stands, its number, size of a record, flags and fields by name."""
 
     place: int
@@ -95,14 +95,14 @@ def read(blocks: Blocks) -> Frames | None:
     return frames if is_bus else None
 
 
-def _event(group: Group) -> str:
+def _event(group: BusGroup) -> str:
     """Which event of a bus a group holds; "" if none."""
     return next((name for name in (DATA_FRAME, *COUNTED) if name in group.fields), "")
 
 
-def _group(blocks: Blocks, block: Block) -> Group:
+def _group(blocks: Blocks, block: Block) -> BusGroup:
     number, count, flags, size, invalid = struct.unpack_from("<QQH6xII", block.data)
-    return Group(
+    return BusGroup(
         block.place, number, count, size + invalid, flags, dict(_fields(blocks, block.links[1]))
     )
 
@@ -122,7 +122,9 @@ def _fields(blocks: Blocks, place: int, depth: int = 0) -> Iterator[tuple[str, F
             yield from _fields(blocks, block.links[1], 1)
 
 
-def _records(blocks: Blocks, block: Block, groups: list[Group], refused: dict[str, int]) -> Records:
+def _records(
+    blocks: Blocks, block: Block, groups: list[BusGroup], refused: dict[str, int]
+) -> Records:
     """Where the records of a data group begin, less those that a hole has hit; counts holes."""
     stream, id_bytes = blocks.stream(block.links[2]), block.data[0]
     size = len(stream.text)
@@ -146,9 +148,9 @@ def _records(blocks: Blocks, block: Block, groups: list[Group], refused: dict[st
 
 
 def _walked(
-    text: Bytes, id_bytes: int, groups: list[Group]
+    text: Bytes, id_bytes: int, groups: list[BusGroup]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], bool]:
-    """Group, begin (behind the number) and end of each record; whether the walk was stopped."""
+    """BusGroup, begin (behind the number) and end of each record; whether the walk was stopped."""
     order = np.argsort([group.number for group in groups])
     numbers = np.array([groups[k].number for k in order], np.int64)
     sizes = np.array([-1 if g.flags & VLSD_GROUP else g.size for g in groups], np.int64)[order]
@@ -195,7 +197,7 @@ def walk(
 
 
 def _payloads(
-    blocks: Blocks, groups: list[Group], records: Records, group: Group
+    blocks: Blocks, groups: list[BusGroup], records: Records, group: BusGroup
 ) -> tuple[Bytes, NDArray[np.int64]] | None:
     """Where payloads stand that are not in the records: text, and (m, 2): offset, first byte."""
     field = group.fields.get("DataBytes")
@@ -213,7 +215,7 @@ def _payloads(
 
 
 def _frames(
-    text: Bytes, begins: NDArray[np.int64], group: Group,
+    text: Bytes, begins: NDArray[np.int64], group: BusGroup,
     payloads: tuple[Bytes, NDArray[np.int64]] | None, start_us: int,
 ) -> Frames:  # fmt: skip
     """Frames of some records; those longer than CAN FD's, or without a stamp, are counted."""

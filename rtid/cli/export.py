@@ -115,7 +115,7 @@ def _beside(effects: list[dict[str, Any]], project: Project) -> str:
     return "The project has added no effects."
 
 
-class Learned(NamedTuple):
+class Exported(NamedTuple):
     """What is exported; lag_s: of the spools; timings: effects that act on times of signals.
 
     study: of the trace; None of a snapshot.
@@ -131,7 +131,7 @@ class Learned(NamedTuple):
 
 
 def _write_fmu(
-    output: Path, learned: Learned, origin: dict[str, Any], version: int, map_alone: bool
+    output: Path, learned: Exported, origin: dict[str, Any], version: int, map_alone: bool
 ) -> None:
     from rtid.maps.fmu import Dynamics, NoFmuError, write_fmu
 
@@ -145,7 +145,7 @@ def _write_fmu(
         print("There is no C compiler here: it has sources alone, and no binary.", file=sys.stderr)
 
 
-def _learned(project: Project, source: Path) -> Learned:
+def _learned(project: Project, source: Path) -> Exported:
     """From a snapshot as it is, from a trace by the record path; effects beside, what is wrong."""
     from rtid.estimator.validity import doubts_of
 
@@ -171,4 +171,4 @@ def _learned(project: Project, source: Path) -> Learned:
         solution, lag = fit.solution, (fit.lag_s, fit.lag_sd_s)
         effects, lag_s = as_json(study.effects), fit.lag_s
     invalid = [doubt for doubt in doubts_of(solution, *lag) if doubt.is_invalid]
-    return Learned(solution, flowmap, effects, invalid, lag_s, timings, study)
+    return Exported(solution, flowmap, effects, invalid, lag_s, timings, study)

@@ -32,7 +32,7 @@ from rtid.estimator.windows import OVERLAP
 from rtid.kernels.layout import FLOW, HINGE, INVERSE, ROOT
 from rtid.kernels.map_point import foot_width
 from rtid.maps.c_header import float_map
-from rtid.maps.fmu_description import Variable, described
+from rtid.maps.fmu_description import FmuVariable, described
 from rtid.maps.lookup import ERROR_PERCENT, drops, sample
 from rtid.model import COMMAND, MODE, Edge, Machine
 from rtid.plain import FloatArray
@@ -120,7 +120,7 @@ def _check(model: Machine, dynamics: Dynamics | None) -> None:
 
 def _model(
     model: Machine, flowmap: FlowMap, dynamics: Dynamics | None, error_percent: float
-) -> tuple[str, list[Variable]]:
+) -> tuple[str, list[FmuVariable]]:
     """rtid_model.h, and the variables as a model description lists them."""
     engine = build(model.with_taylor_maps, nominal_weights(model)).engine
     e = engine.view(np.recarray)[0]
@@ -207,7 +207,7 @@ def _used(model: Machine, dynamics: Dynamics | None) -> set[str]:
     return used - {""}
 
 
-def _variables(model: Machine, dynamics: Dynamics | None, used: set[str]) -> Iterator[Variable]:
+def _variables(model: Machine, dynamics: Dynamics | None, used: set[str]) -> Iterator[FmuVariable]:
     """All variables, with their places in `Machine.real` of fmu_c/rtid_machine.h."""
     n = len(model.signals)
     states = {c.pressure: c for c in model.chambers} if dynamics else {}
@@ -217,33 +217,37 @@ def _variables(model: Machine, dynamics: Dynamics | None, used: set[str]) -> Ite
         unit, at = signal.unit, 1 + k
         if signal.name in states:
             about = f"pressure of chamber {states[signal.name].name}; its start is the run's"
-            yield Variable(signal.name, at, "state", unit, about, 1e5)
+            yield FmuVariable(signal.name, at, "state", unit, about, 1e5)
             continue
         is_held = signal.kind in (COMMAND, MODE)
         kind = "command" if is_held else "input"
-        yield Variable(signal.name, at, kind, unit, f"{signal.kind}", _start(signal.minimum))
+        yield FmuVariable(signal.name, at, kind, unit, f"{signal.kind}", _start(signal.minimum))
         if dynamics and not is_held:
             about = f"rate of {signal.name} over the step"
-            yield Variable(f"{signal.name}_rate", at + n, "command", f"{unit}/s", about, 0.0)
+            yield FmuVariable(f"{signal.name}_rate", at + n, "command", f"{unit}/s", about, 0.0)
     at = 1 + 2 * n
     if dynamics:
         for chamber, compliance in zip(model.chambers, dynamics.compliance, strict=True):
             about = f"effective bulk modulus of chamber {chamber.name}"
-            yield Variable(f"beta_{chamber.name}", at, "parameter", "Pa", about, 1 / compliance)
+            yield FmuVariable(f"beta_{chamber.name}", at, "parameter", "Pa", about, 1 / compliance)
             at += 1
-        yield Variable("lag", at, "parameter", "s", "first-order lag of the spools", dynamics.lag_s)
+        yield FmuVariable(
+            "lag", at, "parameter", "s", "first-order lag of the spools", dynamics.lag_s
+        )
     at += 1
     for word, about in (("", "flow"), ("_low", "95 % interval"), ("_high", "95 % interval")):
         for edge in model.edges:
             text = f"{about} of edge {edge.name}"
-            yield Variable(f"Q_{edge.name}{word}", at, "output", "m3/s", text)
+            yield FmuVariable(f"Q_{edge.name}{word}", at, "output", "m3/s", text)
             at += 1
     for edge in model.edges:
         text = f"what Q_{edge.name} stands on: 0 data, 1 shut, 2 few data, 3 the orifice law, "
-        yield Variable(f"status_{edge.name}", at, "status", "", text + "4 declared, 5 off its grid")
+        yield FmuVariable(
+            f"status_{edge.name}", at, "status", "", text + "4 declared, 5 off its grid"
+        )
         at += 1
     text = "the last step: 1 inside all grids, 2 a pressure drop beyond its grid, 4 a command"
-    yield Variable("status", at, "status", "", text)
+    yield FmuVariable("status", at, "status", "", text)
 
 
 def _start(minimum: float) -> float:

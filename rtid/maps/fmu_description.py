@@ -28,7 +28,7 @@ TOKEN = {2: "guid", 3: "instantiationToken"}
 
 
 @dataclass(frozen=True)
-class Variable:
+class FmuVariable:
     """One variable: reference is its place in the C model; kind: one of KINDS; SI unit."""
 
     name: str
@@ -43,7 +43,7 @@ def described(
     version: int,
     identifier: str,
     token: str,
-    variables: Sequence[Variable],
+    variables: Sequence[FmuVariable],
     sources: Iterable[str],
     about: str,
 ) -> dict[str, str]:
@@ -87,7 +87,7 @@ def _build_description(identifier: str, sources: Iterable[str]) -> str:
     return _text(root)
 
 
-def _units(root: ET.Element, variables: Sequence[Variable]) -> None:
+def _units(root: ET.Element, variables: Sequence[FmuVariable]) -> None:
     units = ET.SubElement(root, "UnitDefinitions")
     for name in dict.fromkeys(v.unit for v in variables if v.unit):
         unit = ET.SubElement(units, "Unit", {"name": name})
@@ -95,7 +95,7 @@ def _units(root: ET.Element, variables: Sequence[Variable]) -> None:
             ET.SubElement(unit, "BaseUnit", {k: str(n) for k, n in BASE[name].items()})
 
 
-def _common(variable: Variable) -> dict[str, str]:
+def _common(variable: FmuVariable) -> dict[str, str]:
     causality, variability, initial = KINDS[variable.kind]
     return {
         "name": variable.name, "valueReference": str(variable.reference),
@@ -103,16 +103,16 @@ def _common(variable: Variable) -> dict[str, str]:
     } | ({"initial": initial} if initial else {})  # fmt: skip
 
 
-def _value(variable: Variable) -> dict[str, str]:
+def _value(variable: FmuVariable) -> dict[str, str]:
     unit = {"unit": variable.unit} if variable.unit else {}
     return unit | ({} if variable.start is None else {"start": repr(float(variable.start))})
 
 
-def _is_output(variable: Variable) -> bool:
+def _is_output(variable: FmuVariable) -> bool:
     return KINDS[variable.kind][0] == "output"
 
 
-def _by_two(body: ET.Element, structure: ET.Element, variables: Sequence[Variable]) -> None:
+def _by_two(body: ET.Element, structure: ET.Element, variables: Sequence[FmuVariable]) -> None:
     outputs = ET.SubElement(structure, "Outputs")
     unknown = ET.SubElement(structure, "InitialUnknowns")
     for index, variable in enumerate(variables, 1):
@@ -124,7 +124,7 @@ def _by_two(body: ET.Element, structure: ET.Element, variables: Sequence[Variabl
                 ET.SubElement(unknown, "Unknown", {"index": str(index)})
 
 
-def _by_three(body: ET.Element, structure: ET.Element, variables: Sequence[Variable]) -> None:
+def _by_three(body: ET.Element, structure: ET.Element, variables: Sequence[FmuVariable]) -> None:
     time = {"name": "time", "valueReference": "0", "causality": "independent"}
     ET.SubElement(body, "Float64", time | {"variability": "continuous"})
     calculated = []

@@ -30,7 +30,7 @@ TOPIC, SOURCE = "/rtid/", "rtid"
 
 
 @dataclass(frozen=True)
-class Channel:
+class RecordedChannel:
     """One channel: unit ("" for a number without one), what it is, and its values (n,)."""
 
     unit: str
@@ -39,15 +39,15 @@ class Channel:
 
 
 @dataclass(frozen=True)
-class Group:
+class RecordedGroup:
     """Channels of one time base t_s (n,), seconds from the record's beginning."""
 
     name: str
     t_s: FloatArray
-    channels: dict[str, Channel]
+    channels: dict[str, RecordedChannel]
 
 
-def groups_of(study: Study) -> tuple[Group, ...]:
+def groups_of(study: Study) -> tuple[RecordedGroup, ...]:
     """All that is recorded of a study.  Raises the errors of `Study`."""
     replay = study.replay
     held = compare_trace(replay).held[0]
@@ -59,38 +59,39 @@ def groups_of(study: Study) -> tuple[Group, ...]:
         for word in ("measured", "modelled", "residual")
     }
     residual = {
-        f"{word}_{chamber.name}": Channel(chamber.unit, f"{word} flow", columns[:, c])
+        f"{word}_{chamber.name}": RecordedChannel(chamber.unit, f"{word} flow", columns[:, c])
         for word, columns in flows.items()
         for c, chamber in enumerate(model.chambers)
     }
     codes = np.append([STATUS.index(word) for word in held.candidate.status], STATUS.index("shut"))
-    blocks = dict[str, Channel]()
+    blocks = dict[str, RecordedChannel]()
     for i, edge in enumerate(model.edges):
         at, first = cells[:, i], model.first_cells[i]
-        blocks[f"block_{edge.name}"] = Channel(
+        blocks[f"block_{edge.name}"] = RecordedChannel(
             "",
             f"block, {edge.grid.shape[1]} per command; -1: shut",
             np.where(at < 0, -1, at - first),
         )
         words = ", ".join(f"{k} {word}" for k, word in enumerate(STATUS))
-        blocks[f"status_{edge.name}"] = Channel("", words, codes[at])
+        blocks[f"status_{edge.name}"] = RecordedChannel("", words, codes[at])
     return (
-        _signals(study), Group("residual", rows_s, residual), Group("blocks", rows_s, blocks),
+        _signals(study),
+        RecordedGroup("residual", rows_s, residual), RecordedGroup("blocks", rows_s, blocks),
         _estimates(study, rows_s[[0, -1]]),
     )  # fmt: skip
 
 
-def _signals(study: Study) -> Group:
+def _signals(study: Study) -> RecordedGroup:
     samples, known = study.trace.samples, study.machine.signals
     channels = {
-        signal.name: Channel(signal.unit, signal.kind, samples.column(signal.name))
+        signal.name: RecordedChannel(signal.unit, signal.kind, samples.column(signal.name))
         for signal in known
         if signal.name in samples.names
     }
-    return Group("signals", 1e-6 * (samples.t_us - samples.t_us[0]), channels)
+    return RecordedGroup("signals", 1e-6 * (samples.t_us - samples.t_us[0]), channels)
 
 
-def _estimates(study: Study, span_s: FloatArray) -> Group:
+def _estimates(study: Study, span_s: FloatArray) -> RecordedGroup:
     """Constants of the record, at its beginning and end."""
     solution, fit = study.fit.solution, study.fit
     values = {"lag": (fit.lag_s, "s"), "lag_sd": (fit.lag_sd_s, "s")}
@@ -99,10 +100,11 @@ def _estimates(study: Study, span_s: FloatArray) -> Group:
     ):
         if np.isfinite(beta):
             values |= {f"beta_{chamber.name}": (beta, "Pa"), f"beta_{chamber.name}_sd": (sd, "Pa")}
-    return Group(
-        "estimates", span_s,
-        {name: Channel(unit, name, np.full(2, value)) for name, (value, unit) in values.items()},
-    )  # fmt: skip
+    constant = {
+        name: RecordedChannel(unit, name, np.full(2, value))
+        for name, (value, unit) in values.items()
+    }
+    return RecordedGroup("estimates", span_s, constant)
 
 
 def write_recorded(path: Path, study: Study, provenance: Mapping[str, Any]) -> None:
@@ -123,7 +125,7 @@ def write_recorded(path: Path, study: Study, provenance: Mapping[str, Any]) -> N
     os.replace(part, path)
 
 
-def _write_mf4(path: Path, groups: tuple[Group, ...], start_us: int, about: str) -> None:
+def _write_mf4(path: Path, groups: tuple[RecordedGroup, ...], start_us: int, about: str) -> None:
     from asammdf import MDF, Signal  # noqa: PLC0415 - an extra
 
     with MDF(version="4.10") as log:
@@ -138,7 +140,7 @@ def _write_mf4(path: Path, groups: tuple[Group, ...], start_us: int, about: str)
         log.save(path, overwrite=True)
 
 
-def _write_mcap(path: Path, groups: tuple[Group, ...], start_us: int, about: str) -> None:
+def _write_mcap(path: Path, groups: tuple[RecordedGroup, ...], start_us: int, about: str) -> None:
     from mcap.writer import Writer  # noqa: PLC0415 - an extra
 
     with path.open("wb") as file:
@@ -153,7 +155,7 @@ def _write_mcap(path: Path, groups: tuple[Group, ...], start_us: int, about: str
         log.finish()
 
 
-def _topic(log: Any, group: Group) -> int:
+def _topic(log: Any, group: RecordedGroup) -> int:
     """The channel of a group, with a schema that names units."""
     fields = {
         name: {"type": "number", "description": f"{channel.about} [{channel.unit or '-'}]"}
@@ -164,7 +166,7 @@ def _topic(log: Any, group: Group) -> int:
     return int(log.register_channel(TOPIC + group.name, "json", number))
 
 
-def _rows(group: Group, k: int) -> Iterator[tuple[float, int, int, bytes]]:
+def _rows(group: RecordedGroup, k: int) -> Iterator[tuple[float, int, int, bytes]]:
     """Time, group, number and message of each row; what is no number is left out."""
     names = list(group.channels)
     table = np.column_stack([channel.values for channel in group.channels.values()])
@@ -173,5 +175,5 @@ def _rows(group: Group, k: int) -> Iterator[tuple[float, int, int, bytes]]:
         yield t_s, k, number, json.dumps(told).encode()
 
 
-Writer = Callable[[Path, tuple[Group, ...], int, str], None]
+Writer = Callable[[Path, tuple[RecordedGroup, ...], int, str], None]
 WRITERS: dict[str, Writer] = {".mf4": _write_mf4, ".mcap": _write_mcap}
