@@ -8,9 +8,9 @@ K(w), the flow gain, is an integrated Wiener process that starts at zero at the 
 band: smooth where there are data, and less and less certain away from them.  delta is 0 unless the
 data clearly want another exponent than 1/2 (a load-compensated valve, a laminar gap); what has
 another one where it was seen need not have it elsewhere, so that h is as large at the least.  h,
-another integrated Wiener process of log |dp|, is how the valve deviates from the law; half of its
-variance is the whole valve's, the other half changes over the command (a notch that becomes an
-edge, a gap that opens, a spool that the jet closes).  Towards dp = 0 every edge
+another integrated Wiener process of log |dp|, is how the valve deviates from the law; most of its
+variance is the whole valve's, a quarter changes over the command (a notch that becomes an edge, a
+gap that opens, a spool that the jet closes).  Towards dp = 0 every edge
 turns laminar, at dp_laminar or elsewhere: a has the standard deviation 1.  e is what is left, in
 proportion to K, with a correlation that fades over the command and over log |dp|.  How rough K is
 and how large h and e are follow from the scatter of Q / s(dp) among the blocks themselves (largest
@@ -38,7 +38,7 @@ BLOCK_ERROR = 3e-4  # share of K by which a block's polynomial misses its data a
 # Log rough, log exponent, log deviation, delta: starts (law obeyed, or not) and bounds.
 ORIFICE, OTHER_LAW = (1.0, -5.0, -5.0, 0.0), (1.0, -3.0, -4.0, 0.0)
 SEARCH = ((-8.0, 8.0), (-8.0, 1.0), (-7.0, 1.0), (-0.5, 0.5))
-OWN = 0.5  # of h: its part that changes over the command, as where a notch becomes an edge
+OWN = 0.25  # of h: its part that changes over the command, as where a notch becomes an edge
 UNSURE = 0.75  # of another exponent than 1/2: by so much it may change per unit of log |dp|
 CLEARLY = 10.0  # gain in log likelihood that another exponent must bring
 
