@@ -13,9 +13,9 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.io import loadmat
 
 from firmware_bridge.lookup import STATUS
+from rtid.errors import RtidError
 from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.published import publish
-from rtid.maps.a2l import NoA2lError
 from rtid.maps.files import write_map
 from rtid.maps.gridded import ERROR_SHARE, Gridded, gridded
 from tests.flow_maps import machine, orifice, solved
@@ -107,14 +107,48 @@ def test_an_independent_parser_takes_the_a2l_file(
     assert words.NumberValuePairs.Value == len(STATUS)
 
 
-def test_maps_whose_names_an_a2l_cannot_tell_apart_are_refused(
+PROBE = """
+model Probe
+  Real u = 0.5 + 8 * time;
+  Real dp = 3e6 * sin(9 * time) + 3e6;
+  Real q;
+  maps.Edge_{1} edge;
+  Real x(start = 0, fixed = true);
+equation
+  q = maps.flow_{0}(u, dp);
+  edge.u = u;
+  edge.dp = dp;
+  der(x) = 1;
+end Probe;
+"""
+
+
+def test_a_modelica_compiler_takes_the_package_and_its_flows_are_the_map(
+    flowmap: FlowMap, grids: tuple[Gridded, ...], tmp_path: Path
+) -> None:
+    rumoca = pytest.importorskip("rumoca", reason="pip install 'rtid[dev]'")
+    path = tmp_path / "maps.mo"
+    write_map(path, flowmap, PROVENANCE | {"said": 'a "b" \\'})
+    source = path.read_text() + PROBE.format(*(g.name for g in grids))
+    got = rumoca.Session().loads(source, model="Probe").simulate(t=1.0, dt=0.02)
+    u, dp = (np.asarray(got[name]) for name in ("u", "dp"))
+    for edge, name in zip(flowmap.edges, ("q", "edge.q"), strict=True):
+        top = edge.grid.u_v[-1], edge.grid.dp_pa[-1]
+        flow = edge.flow(np.clip(u, edge.grid.u_v[0], top[0]), np.clip(dp, None, top[1]))
+        largest = np.abs(flow).max()
+        assert (flow > 0.1 * largest).sum() > 20
+        assert np.abs(np.asarray(got[name]) - flow).max() < 1.1 * ERROR_SHARE * largest
+
+
+def test_maps_whose_names_a_format_cannot_tell_apart_are_refused(
     flowmap: FlowMap, tmp_path: Path
 ) -> None:
     twins = FlowMap(
         tuple(replace(e, name=n) for e, n in zip(flowmap.edges, ("p-a", "p a"), strict=True))
     )
-    with pytest.raises(NoA2lError, match="p_a_flow"):
-        write_map(tmp_path / "maps.a2l", twins, PROVENANCE)
+    for suffix in (".a2l", ".mo"):
+        with pytest.raises(RtidError, match="called p_a"):
+            write_map(tmp_path / f"maps{suffix}", twins, PROVENANCE)
     assert not list(tmp_path.iterdir())
 
 

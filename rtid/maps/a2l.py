@@ -69,7 +69,7 @@ def _symbol(name: str, taken: set[str]) -> str:
     symbol = re.sub(r"\W", "_", name, flags=re.ASCII)
     symbol = symbol if symbol[:1].isalpha() or symbol[:1] == "_" else f"_{symbol}"
     if symbol in taken:
-        raise NoA2lError(f"{name}: another map is called {symbol} in an A2L too", "rename its edge")
+        raise NoA2lError(f"{name}: another map is called {symbol} too", "rename its edge")
     taken.add(symbol)
     return symbol
 

@@ -26,6 +26,7 @@ from rtid.estimator.solution import Solution
 from rtid.maps.a2l import write_a2l
 from rtid.maps.calibration import write_cdfx, write_dcm
 from rtid.maps.matlab import write_m, write_mat
+from rtid.maps.modelica import write_mo
 from rtid.model import Grid
 from rtid.plain import FloatArray, plain
 from rtid.trace.state_files import read_bytes
@@ -233,4 +234,5 @@ WRITERS: dict[str, Writer] = {
     ".dcm": write_dcm,
     ".cdfx": write_cdfx,
     ".a2l": write_a2l,
+    ".mo": write_mo,
 }
