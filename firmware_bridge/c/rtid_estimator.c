@@ -29,7 +29,7 @@ void rtid_est_remember(rtid_estimator *e, const rtid_estimator_sample *sample)
 /* End all memory at a break of continuity; learned sums stay. */
 static void stop(rtid_estimator *e)
 {
-    rtid_est_end(e);
+    rtid_est_stop(e);
     for (int i = 0; i < RTID_EST_N_EDGES; i++)
         e->edge[i].u = SHUT;
     e->running = 0;
@@ -50,12 +50,12 @@ void rtid_estimator_start(rtid_estimator *e)
         e->slot[c] = -1;
 }
 
-int rtid_estimator_update(rtid_estimator *e, const rtid_estimator_sample *sample)
+static int take(rtid_estimator *e, const rtid_estimator_sample *sample)
 {
     int verdict = acceptable(sample);
     const int whole = verdict == RTID_EST_TAKEN, was_running = e->running;
     e->counts[RTID_EST_SAMPLES]++;
-    rtid_est_pay(e, TILES_PER_TICK);
+    e->tiles = RTID_EST_TILES_PER_TICK;
     if (whole && was_running) {
         const int64_t dt_us = sample->t_us - e->t_us;
         if (sample->gap || dt_us > RTID_EST_MAX_GAP_US || dt_us <= 0)
@@ -79,7 +79,18 @@ int rtid_estimator_update(rtid_estimator *e, const rtid_estimator_sample *sample
             e->counts[RTID_EST_RECOVERING]++;
             return RTID_EST_RECOVERING;
         }
+        if (rtid_est_is_full(e)) {
+            e->counts[RTID_EST_BUSY]++;
+            return RTID_EST_BUSY;
+        }
         rtid_est_begin(e);
     }
+    return verdict;
+}
+
+int rtid_estimator_update(rtid_estimator *e, const rtid_estimator_sample *sample)
+{
+    const int verdict = take(e, sample);
+    rtid_est_pay(e); /* with what the sample has left of the tick */
     return verdict;
 }

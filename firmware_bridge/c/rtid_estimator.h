@@ -14,7 +14,7 @@
  *     static rtid_estimator e;  static rtid_estimator_work w;  rtid_estimator_solution s;
  *     rtid_estimator_start(&e);
  *     every tick:      rtid_estimator_update(&e, &sample);
- *     on demand:       rtid_estimator_freeze(&e, &w);     while no update runs: settles, copies
+ *     on demand:       rtid_estimator_freeze(&e, &w);     while no update runs: copies
  *                      rtid_estimator_solve(&w, &s);      anywhere, while updates go on
  */
 #ifndef RTID_ESTIMATOR_H
@@ -44,6 +44,8 @@ typedef double rtid_sum;
 /* of a block with y, the shared columns and its own terms up to each */
 #define RTID_EST_KEPT \
     (RTID_EST_TERMS * RTID_EST_BLOCKS_AT + RTID_EST_TERMS * (RTID_EST_TERMS + 1) / 2)
+/* visits at once: blocks that ring, and as many that are settled or were visited again */
+#define RTID_EST_MAX_VISITS (2 * RTID_EST_MAX_RECENT + RTID_EST_MAX_OPEN * (RTID_EST_MAX_OPEN + 4))
 #define RTID_EST_SUMS ((1 + RTID_EST_UNKNOWNS) * (2 + RTID_EST_UNKNOWNS) / 2)
 
 /* What became of samples; counts by these numbers. */
@@ -58,6 +60,7 @@ enum {
     RTID_EST_RESTART_MEMORY, /* too many blocks rang at once: all began anew */
     RTID_EST_RECOVERING,
     RTID_EST_NO_ROOM, /* a new block, and RTID_EST_MAX_BLOCKS are in use */
+    RTID_EST_BUSY,    /* more changes of block than can be worked off: not learned from */
     RTID_EST_N_COUNTS,
     RTID_EST_TAKEN = -1
 };
@@ -77,37 +80,45 @@ typedef struct {
     rtid_sum phi[RTID_EST_TERMS]; /* integral of its terms over the time spent in it, s */
 } rtid_estimator_block;
 
-/* A block that is open, or left and still rings in the whitener. */
+/* A visit to a block.  While it is open its column moves with every sample; behind that it rings in
+ * the whitener as d x ring, whose ring all visits share; in the end it is silent, or is opened again
+ * and goes on as another visit.  What it shares with a visit before it that rings is left' d of that
+ * one; that is added to the sums when either changes, a few such tiles per tick. */
 typedef struct {
     int16_t slot;
     uint8_t status;
-    rtid_real size;                   /* of its state when it closed */
-    rtid_real d[RTID_EST_TERMS];      /* its state, referred to the ring's origin */
-    rtid_sum through[RTID_EST_TERMS]; /* ring x block while it was open */
-    rtid_sum w_start;                 /* ring x ring when it closed */
-    rtid_sum shared_start[RTID_EST_RING];
-} rtid_estimator_recent;
-
-/* Products of blocks not yet added to the sums, left_p' d_q: of p with the first of those noted. */
-typedef struct {
-    uint16_t n, p, q;
-    int16_t slot[RTID_EST_MAX_RECENT];
-    uint16_t partners[RTID_EST_MAX_RECENT];
-    rtid_sum left[RTID_EST_MAX_RECENT][RTID_EST_TERMS];
-    rtid_real d[RTID_EST_MAX_RECENT][RTID_EST_TERMS];
-} rtid_estimator_debt;
+    uint16_t memory;              /* visits of another memory share nothing with it */
+    uint32_t epoch;               /* units of its numbers: 2^-epoch of the ring */
+    rtid_real fade;               /* 2^(epoch - epoch of the ring) */
+    rtid_real start;              /* ring when it closed, in units of its epoch */
+    rtid_real d[RTID_EST_TERMS];  /* its state when the ring was 1 */
+    rtid_sum left[RTID_EST_TERMS]; /* its column x ring while it was open */
+    rtid_sum ring;                /* ring x ring since it closed */
+    rtid_sum shared[RTID_EST_BLOCKS_AT]; /* ring x y and shared columns since it closed */
+} rtid_estimator_visit;
 
 typedef struct {
-    int16_t edge, slot, recent, u, dp;
+    int16_t edge, slot, visit, u, dp;
 } rtid_estimator_open;
+
+/* Products not yet added to the sums. */
+typedef struct {
+    rtid_sum local[RTID_EST_WIDTH][RTID_EST_WIDTH]; /* of the rows since the epoch began */
+    uint16_t memory, n_open, n_line, n_paid;
+    uint32_t epoch;
+    rtid_estimator_open open[RTID_EST_MAX_OPEN];
+    rtid_estimator_visit visit[RTID_EST_MAX_VISITS];
+    uint16_t line[RTID_EST_MAX_VISITS]; /* closed visits, oldest first; the first one is settled
+                                         * with the n_paid ones behind it */
+} rtid_estimator_owed;
 
 /* All that the estimator knows; begin with rtid_estimator_start.  A plain copy saves it. */
 typedef struct {
     /* local columns, those that move at every sample */
     rtid_real d[RTID_EST_WIDTH];                    /* whitener's state of each column */
-    rtid_sum local[RTID_EST_WIDTH][RTID_EST_WIDTH]; /* products of the rows since the ring began */
     uint16_t width;
-    rtid_real faded; /* what is left of the state of a block that closed at the last forgetting */
+    rtid_real faded; /* of the ring's unit since the last look for silent blocks */
+    rtid_estimator_owed owed;
     /* whitener */
     rtid_real cov, echo;
     rtid_sum noise;
@@ -122,11 +133,7 @@ typedef struct {
         rtid_real w, m1, var, mt, dp0, dp1;
         int16_t u, dp, to_u, to_dp, place;
     } edge[RTID_EST_N_EDGES];
-    uint16_t n_open, n_recent, n_closed, n_young, n_slots;
-    rtid_estimator_open open[RTID_EST_MAX_OPEN];
-    rtid_estimator_recent recent[RTID_EST_MAX_RECENT];
-    uint16_t young[RTID_EST_MAX_RECENT]; /* closed since the ring began, in their order */
-    rtid_estimator_debt debt;
+    uint16_t n_closed, n_slots, tiles; /* blocks that ring; tiles left in this tick */
     int16_t slot[RTID_EST_N_CELLS];      /* of each cell of the grids, -1 before the first visit */
     rtid_estimator_block block[RTID_EST_MAX_BLOCKS];
     rtid_sum sums[RTID_EST_SUMS]; /* lower triangle, row by row, of [y | shared | blocks] */
@@ -152,6 +159,7 @@ typedef struct {
     double noise, rows, cov_change;
     int64_t now_us;
     uint16_t n_slots;
+    rtid_estimator_owed owed;
     rtid_estimator_block block[RTID_EST_MAX_BLOCKS];
     rtid_estimator_map map[RTID_EST_MAX_BLOCKS];
 } rtid_estimator_work;
@@ -171,8 +179,8 @@ void rtid_estimator_start(rtid_estimator *e);
 /* Take one sample: RTID_EST_TAKEN, or the reason against it, which is counted. */
 int rtid_estimator_update(rtid_estimator *e, const rtid_estimator_sample *sample);
 
-/* Bring the sums up to date and copy them; not while an update runs. */
-void rtid_estimator_freeze(rtid_estimator *e, rtid_estimator_work *w);
+/* Copy the sums and what is owed to them: a plain copy; not while an update runs. */
+void rtid_estimator_freeze(const rtid_estimator *e, rtid_estimator_work *w);
 
 /* Solve what was frozen: w->map[0 .. w->n_slots - 1], whose place in the grid is in w->block, and
  * *s.  Takes nothing but w. */

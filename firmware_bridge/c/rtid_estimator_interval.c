@@ -174,7 +174,7 @@ static void change_block(rtid_estimator *e, int i)
     if (was_open)
         rtid_est_close(e, place);
     if (e->edge[i].u != SHUT)
-        rtid_est_open(e, was_open ? place : e->n_open, i, slot_of(e, i));
+        rtid_est_open(e, was_open ? place : e->owed.n_open, i, slot_of(e, i));
     else if (was_open)
         rtid_est_remove_open(e, place);
 }
@@ -199,9 +199,9 @@ static void start_whitener(rtid_estimator *e)
 /* Edges that shut come first, or a reversal could exceed the places for open blocks. */
 static void change_blocks(rtid_estimator *e)
 {
-    if (e->n_open + e->n_closed + RTID_EST_MAX_OPEN > RTID_EST_MAX_RECENT) {
+    if (e->owed.n_open + e->n_closed + RTID_EST_MAX_OPEN > RTID_EST_MAX_RECENT) {
         e->counts[RTID_EST_RESTART_MEMORY]++;
-        rtid_est_rebase(e, END_ALL);
+        rtid_est_end(e);
         start_whitener(e);
     }
     for (int opening = 0; opening < 2; opening++)
@@ -221,6 +221,8 @@ int rtid_est_place(rtid_estimator *e, const rtid_real *now, int64_t dt_us)
         return RTID_EST_NO_ROOM;
     for (int i = 0; i < RTID_EST_N_EDGES; i++)
         any = any || moved(e, i);
+    if (any && rtid_est_is_full(e))
+        return RTID_EST_BUSY;
     if (any)
         change_blocks(e);
     return RTID_EST_TAKEN;
@@ -288,7 +290,7 @@ static void mean_terms(const rtid_estimator *e, const rtid_estimator_open *open,
 
 static void block_increments(rtid_estimator *e, int k, int64_t t_us, int row)
 {
-    const rtid_estimator_open *open = &e->open[k];
+    const rtid_estimator_open *open = &e->owed.open[k];
     rtid_estimator_block *block = &e->block[open->slot];
     const edge_row *edge = &EDGES[open->edge];
     const cell_row *cell = &CELLS[cell_of(open->edge, open->u, open->dp)];
@@ -320,7 +322,7 @@ static void make_row(rtid_estimator *e)
     }
     for (int i = 0; i < n; i++)
         for (int j = 0; j <= i; j++)
-            merge(&e->local[i][j], product(row[i], row[j]));
+            merge(&e->owed.local[i][j], product(row[i], row[j]));
     merge(&e->noise, as_sum((v + e->echo) / s));
     e->echo = keep * keep * e->echo + lost * lost * v;
     e->cov *= keep;
@@ -333,16 +335,16 @@ void rtid_est_integrate(rtid_estimator *e, const rtid_estimator_sample *sample)
 #if RTID_EST_N_TERMS > 0
     term_increments(e, sample->values);
 #endif
-    for (int k = 0; k < e->n_open; k++)
+    for (int k = 0; k < e->owed.n_open; k++)
         block_increments(e, k, sample->t_us, sample->row);
     rtid_est_remember(e, sample);
     e->cov += Q_FLOOR * e->dt_s;
     if (sample->row)
         make_row(e);
     if (e->faded * e->d[RTID_EST_RING] < FORGET_AT)
-        rtid_est_rebase(e, FORGET_SILENT);
-    else if (e->d[RTID_EST_RING] < RING_LIMIT)
-        rtid_est_rebase(e, SETTLE);
+        rtid_est_forget(e);
+    if (e->d[RTID_EST_RING] < RING_LIMIT)
+        rtid_est_renew(e);
 }
 
 void rtid_est_begin(rtid_estimator *e)

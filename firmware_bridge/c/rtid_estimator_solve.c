@@ -25,15 +25,13 @@ static int unknowns(const rtid_estimator_work *w)
 
 static double prior(int i) { return i < RTID_EST_SHARED ? SHARED_PRIOR : FLOW_PRIOR; }
 
-void rtid_estimator_freeze(rtid_estimator *e, rtid_estimator_work *w)
+void rtid_estimator_freeze(const rtid_estimator *e, rtid_estimator_work *w)
 {
-    if (e->running)
-        rtid_est_rebase(e, SETTLE);
-    rtid_est_pay(e, ALL_TILES);
     w->n_slots = e->n_slots;
     w->now_us = e->t_us;
     w->rows = (double)e->counts[RTID_EST_ROWS];
     w->noise = exact(e->noise);
+    w->owed = e->owed;
     memcpy(w->block, e->block, sizeof *w->block * e->n_slots);
     /* as they are: the numbers are made of them by rtid_estimator_solve */
     memcpy(w->matrix, e->sums, (size_t)(row_of(w, unknowns(w) + 1) - w->matrix) * sizeof(rtid_sum));
@@ -49,6 +47,88 @@ static void read_sums(rtid_estimator_work *w)
         *p = exact(sum);
     }
 }
+
+/* ---- what is owed to the sums ---- */
+
+static void add_between(rtid_estimator_work *w, int slot, int other, const double *left,
+                        const double *d)
+{
+    const int mine = RTID_EST_BLOCKS_AT + T * slot, its = RTID_EST_BLOCKS_AT + T * other;
+    for (int i = 0; i < T; i++)
+        for (int j = 0; j < T; j++) {
+            if (mine > its)
+                row_of(w, mine + i)[its + j] += left[i] * d[j];
+            else if (mine < its)
+                row_of(w, its + j)[mine + i] += left[i] * d[j];
+            else if (j <= i)
+                row_of(w, mine + i)[mine + j] += left[i] * d[j] + left[j] * d[i];
+        }
+}
+
+/* Of a visit with those before the n-th of the line. */
+static void settle_before(rtid_estimator_work *w, const rtid_estimator_visit *v, int n)
+{
+    rtid_sum sum[T];
+    double left[T], d[T];
+    rtid_est_left(&w->owed, v, sum);
+    for (int i = 0; i < T; i++)
+        left[i] = exact(sum[i]);
+    for (int b = n <= w->owed.n_paid; b < n; b++) {
+        const rtid_estimator_visit *before = &w->owed.visit[w->owed.line[b]];
+        if (before->memory != v->memory || !rtid_est_rings(before))
+            continue;
+        for (int i = 0; i < T; i++)
+            d[i] = (double)(rtid_est_units(v, before) * before->d[i]);
+        add_between(w, v->slot, before->slot, left, d);
+    }
+}
+
+/* Of a visit with itself, y and the shared columns since it closed. */
+static void settle_alone(rtid_estimator_work *w, const rtid_estimator_visit *v)
+{
+    const int at = RTID_EST_BLOCKS_AT + T * v->slot;
+    const double ring = exact(rtid_est_ring(&w->owed, v));
+    for (int i = 0; i < T; i++) {
+        double *row = row_of(w, at + i);
+        for (int j = 0; j < RTID_EST_BLOCKS_AT; j++)
+            row[j] += exact(rtid_est_shared(&w->owed, v, j)) * v->d[i];
+        for (int j = 0; j <= i; j++)
+            row[at + j] += ring * v->d[i] * v->d[j];
+    }
+}
+
+/* Row or column of the sums of a local column. */
+static int place_of(const rtid_estimator_owed *o, int column)
+{
+    const int k = (column - RTID_EST_OPEN_AT) / T;
+    if (column < RTID_EST_RING)
+        return column;
+    return RTID_EST_BLOCKS_AT + T * o->open[k].slot + (column - first_of(k));
+}
+
+void rtid_est_settle(rtid_estimator_work *w)
+{
+    rtid_estimator_owed *o = &w->owed;
+    read_sums(w);
+    for (int k = 0; k < o->n_open; k++)
+        rtid_est_take_left(o, k);
+    for (int a = 0; a < o->n_line; a++) {
+        const rtid_estimator_visit *v = &o->visit[o->line[a]];
+        settle_before(w, v, a);
+        if (rtid_est_rings(v))
+            settle_alone(w, v);
+    }
+    for (int k = 0; k < o->n_open; k++)
+        settle_before(w, &o->visit[o->open[k].visit], o->n_line);
+    for (int i = 0; i < first_of(o->n_open); i++)
+        for (int j = 0; j <= i; j++) {
+            const int a = place_of(o, i), b = place_of(o, j);
+            if (i != RTID_EST_RING && j != RTID_EST_RING)
+                row_of(w, a > b ? a : b)[a > b ? b : a] += exact(o->local[i][j]);
+        }
+}
+
+/* ---- the estimate ---- */
 
 /* Add the prior, scale to a diagonal of 1/4 to 2: powers of two leave the sums as they are. */
 static void scale_sums(rtid_estimator_work *w)
@@ -283,7 +363,7 @@ static uint8_t status_of(const rtid_estimator_work *w, int slot)
 void rtid_estimator_solve(rtid_estimator_work *w, rtid_estimator_solution *s)
 {
     memset(s, 0, sizeof *s);
-    read_sums(w);
+    rtid_est_settle(w);
     for (int slot = 0; slot < w->n_slots; slot++)
         w->map[slot].condition = condition(w, slot);
     scale_sums(w);

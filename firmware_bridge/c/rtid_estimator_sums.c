@@ -1,6 +1,12 @@
 /* Sparse information sums of rows that touch many blocks, each with a fading memory: see
  * rtid/kernels/sparse_sums.py for the algebra.  Here the state of a column is one number, and what
- * two blocks share goes straight to the dense triangle of sums. */
+ * two blocks share goes straight to the dense triangle of sums.
+ *
+ * A block that was left rings as d x ring, with one ring for all.  So with a later visit v, whose
+ * column is c_v, it shares d' sum(ring c_v), and both factors can wait: the product is made when one
+ * of the two changes, or when the earlier one is silent.  Closed visits stand in a line, in the order
+ * in which they closed; each owes a tile to all before it that ring, and to none behind it.  The
+ * oldest is settled with those behind it, a few tiles per tick, then leaves the line. */
 #include "rtid_estimator_sums.h"
 
 #include <string.h>
@@ -30,12 +36,17 @@ static void add_kept(rtid_estimator *e, int slot, int i, int j, rtid_sum x)
 #endif
 }
 
-/* What a block shares with itself += left' right, which is symmetric: its lower triangle. */
-static void add_own_tile(rtid_estimator *e, int slot, const rtid_sum *left, const rtid_real *right)
+/* Lower triangle of what a block shares with itself += left' right + right' left, or half of that. */
+static void add_own_tile(rtid_estimator *e, int slot, const rtid_sum *left, const rtid_real *right,
+                         int both)
 {
     for (int i = 0; i < T; i++)
-        for (int j = 0; j <= i; j++)
-            add_kept(e, slot, i, at_slot(slot) + j, times(left[i], right[j]));
+        for (int j = 0; j <= i; j++) {
+            rtid_sum x = times(left[i], right[j]);
+            if (both)
+                merge(&x, times(left[j], right[i]));
+            add_kept(e, slot, i, at_slot(slot) + j, x);
+        }
 }
 
 /* What two blocks share += left' right. */
@@ -44,7 +55,7 @@ static void add_tile(rtid_estimator *e, int slot, int other, const rtid_sum *res
 {
     const int mine = at_slot(slot), its = at_slot(other);
     if (slot == other)
-        add_own_tile(e, slot, left, right);
+        add_own_tile(e, slot, left, right, 1);
     for (int i = 0; i < T && mine > its; i++) {
         rtid_sum *restrict target = sum_at(e, mine + i, its);
         for (int j = 0; j < T; j++)
@@ -61,41 +72,26 @@ static void add_tile(rtid_estimator *e, int slot, int other, const rtid_sum *res
 
 void rtid_est_set_open(rtid_estimator *e, int n)
 {
-    e->n_open = (uint16_t)n;
+    e->owed.n_open = (uint16_t)n;
     e->width = (uint16_t)first_of(n);
 }
 
 static void clear_columns(rtid_estimator *e, int first, int last)
 {
-    for (int i = 0; i < RTID_EST_WIDTH; i++)
-        for (int j = 0; j <= i; j++)
-            if ((i >= first && i < last) || (j >= first && j < last))
-                e->local[i][j] = as_sum(0);
+    for (int i = first; i < e->width; i++)
+        for (int j = i < last ? 0 : first; j <= i && (i < last || j < last); j++)
+            e->owed.local[i][j] = as_sum(0);
 }
-
-static rtid_sum ring_ring(const rtid_estimator *e)
-{
-    return e->local[RTID_EST_RING][RTID_EST_RING];
-}
-
-/* Ring x open block k. */
-static void read_through(const rtid_estimator *e, int k, rtid_sum *out)
-{
-    for (int i = 0; i < T; i++)
-        out[i] = e->local[first_of(k) + i][RTID_EST_RING];
-}
-
-/* ---- products of one block, see rtid/kernels/sparse_sums.py ---- */
 
 /* Of open block k with itself, y and the shared columns. */
 static void add_own(rtid_estimator *e, int k)
 {
-    const int first = first_of(k), slot = e->open[k].slot;
+    const int first = first_of(k), slot = e->owed.open[k].slot;
     for (int i = 0; i < T; i++) {
-        for (int j = 0; j < 1 + RTID_EST_SHARED; j++)
-            add_kept(e, slot, i, j, e->local[first + i][j]);
+        for (int j = 0; j < RTID_EST_BLOCKS_AT; j++)
+            add_kept(e, slot, i, j, e->owed.local[first + i][j]);
         for (int j = 0; j <= i; j++)
-            add_kept(e, slot, i, at_slot(slot) + j, e->local[first + i][first + j]);
+            add_kept(e, slot, i, at_slot(slot) + j, e->owed.local[first + i][first + j]);
     }
 }
 
@@ -104,10 +100,10 @@ static void add_open_pair(rtid_estimator *e, int k, int other)
 {
 #if RTID_EST_MAX_OPEN > 1
     const int a = k > other ? k : other, b = k + other - a;
-    const int slot_a = at_slot(e->open[a].slot), slot_b = at_slot(e->open[b].slot);
+    const int slot_a = at_slot(e->owed.open[a].slot), slot_b = at_slot(e->owed.open[b].slot);
     for (int i = 0; i < T; i++)
         for (int j = 0; j < T; j++) {
-            const rtid_sum product = e->local[first_of(a) + i][first_of(b) + j];
+            const rtid_sum product = e->owed.local[first_of(a) + i][first_of(b) + j];
             if (slot_a > slot_b)
                 merge(sum_at(e, slot_a + i, slot_b + j), product);
             else
@@ -118,280 +114,414 @@ static void add_open_pair(rtid_estimator *e, int k, int other)
 #endif
 }
 
-/* left = what the closed block shares with the ring's origin, own = the part since it closed. */
-static void weigh(const rtid_estimator *e, const rtid_estimator_recent *item, rtid_sum *own,
-                  rtid_sum *left)
+/* ---- visits ---- */
+
+static rtid_real power(int n) { return R(ldexp(1.0, n)); } /* 0 where that is too small */
+
+int rtid_est_rings(const rtid_estimator_visit *v)
 {
-    const rtid_sum w = sum_of(ring_ring(e), minus(item->w_start));
+    return v->status >= RINGING && v->status <= SILENT_NOW;
+}
+
+rtid_real rtid_est_units(const rtid_estimator_visit *later, const rtid_estimator_visit *earlier)
+{
+    return power(-(int)(later->epoch - earlier->epoch));
+}
+
+rtid_sum rtid_est_ring(const rtid_estimator_owed *o, const rtid_estimator_visit *v)
+{
+    if (v->memory != o->memory)
+        return v->ring;
+    return sum_of(v->ring, times(o->local[RTID_EST_RING][RTID_EST_RING], v->fade * v->fade));
+}
+
+rtid_sum rtid_est_shared(const rtid_estimator_owed *o, const rtid_estimator_visit *v, int j)
+{
+    if (v->memory != o->memory)
+        return v->shared[j];
+    return sum_of(v->shared[j], times(o->local[RTID_EST_RING][j], v->fade));
+}
+
+void rtid_est_left(const rtid_estimator_owed *o, const rtid_estimator_visit *v, rtid_sum *left)
+{
+    const rtid_sum ring = rtid_est_rings(v) ? rtid_est_ring(o, v) : as_sum(0);
+    for (int i = 0; i < T; i++)
+        left[i] = rtid_est_rings(v) ? sum_of(v->left[i], times(ring, v->d[i])) : v->left[i];
+}
+
+void rtid_est_take_left(rtid_estimator_owed *o, int k)
+{
+    rtid_estimator_visit *v = &o->visit[o->open[k].visit];
     for (int i = 0; i < T; i++) {
-        own[i] = times(w, item->d[i]);
-        left[i] = sum_of(item->through[i], own[i]);
+        rtid_sum *through = &o->local[first_of(k) + i][RTID_EST_RING];
+        merge(&v->left[i], times(*through, v->fade));
+        *through = as_sum(0);
     }
 }
 
-/* Of a closed block with y and the shared columns since it closed. */
-static void add_shared(rtid_estimator *e, const rtid_estimator_recent *item)
+static rtid_estimator_visit *open_visit(rtid_estimator *e, int k)
 {
-    for (int j = 0; j < 1 + RTID_EST_SHARED; j++) {
-        const rtid_sum since = sum_of(e->local[RTID_EST_RING][j], minus(item->shared_start[j]));
-        for (int i = 0; i < T; i++)
-            add_kept(e, item->slot, i, j, times(since, item->d[i]));
-    }
+    return &e->owed.visit[e->owed.open[k].visit];
 }
 
-/* left x all blocks that rang all the time */
-static void spread(rtid_estimator *e, int slot, const rtid_sum *left)
+static rtid_estimator_visit *at_line(rtid_estimator *e, int n)
 {
-    for (int q = 0; q < e->n_recent; q++)
-        if (e->recent[q].status == RINGING)
-            add_tile(e, slot, e->recent[q].slot, left, e->recent[q].d);
+    return &e->owed.visit[e->owed.line[n]];
 }
 
-/* ---- recent blocks ---- */
+/* From now on nothing is known of what a visit shares with the ring. */
+static void begin_visit(const rtid_estimator *e, rtid_estimator_visit *v)
+{
+    v->memory = e->owed.memory;
+    v->epoch = e->owed.epoch;
+    v->fade = R(1);
+    for (int i = 0; i < T; i++)
+        v->left[i] = as_sum(0);
+}
 
+/* A visit that begins now; rtid_est_is_full has said that there is room. */
 static int admit(rtid_estimator *e, int slot)
 {
     int p = 0;
-    while (p < e->n_recent && e->recent[p].status != FREE)
+    while (e->owed.visit[p].status != FREE)
         p++;
-    if (p == e->n_recent)
-        e->n_recent++;
-    e->recent[p].status = OPEN;
-    e->recent[p].slot = (int16_t)slot;
+    e->owed.visit[p].slot = (int16_t)slot;
+    e->owed.visit[p].status = OPEN;
+    begin_visit(e, &e->owed.visit[p]);
     return p;
 }
 
-static void release(rtid_estimator *e, int p)
+int rtid_est_is_full(const rtid_estimator *e)
 {
-    e->recent[p].status = FREE;
-    while (e->n_recent > 0 && e->recent[e->n_recent - 1].status == FREE)
-        e->n_recent--;
+    /* each edge that changes its block closes one visit, splits those of the others, opens one */
+    const int least = RTID_EST_MAX_OPEN * (RTID_EST_MAX_OPEN + 3);
+    return e->owed.n_line + e->owed.n_open + least > RTID_EST_MAX_VISITS;
 }
 
-/* Products of the a-th young block with itself and all that closed before it. */
-static void settle_young(rtid_estimator *e, int a)
+/* Take the n-th visit out of the line. */
+static void leave_line(rtid_estimator *e, int n)
 {
-    const rtid_estimator_recent *item = &e->recent[e->young[a]];
-    rtid_sum own[T], left[T];
-    weigh(e, item, own, left);
-    add_tile(e, item->slot, item->slot, own, item->d);
-    spread(e, item->slot, left);
-    for (int b = 0; b < a; b++)
-        add_tile(e, item->slot, e->recent[e->young[b]].slot, left, e->recent[e->young[b]].d);
+    rtid_estimator_owed *o = &e->owed;
+    at_line(e, n)->status = FREE;
+    o->n_line--;
+    for (int a = n; a < o->n_line; a++)
+        o->line[a] = o->line[a + 1];
+    if (n == 0)
+        o->n_paid = 0;
+    else if (n <= o->n_paid)
+        o->n_paid--;
 }
+
+/* What ended owes to the same visits as the next one of its block, if none that rings stands
+ * between: the n-th takes over from such a one. */
+static void take_over(rtid_estimator *e, int n)
+{
+    rtid_estimator_visit *v = at_line(e, n);
+    for (int a = n - 1; a > 0 && a >= n - MOST_SCANNED; a--) {
+        const rtid_estimator_visit *before = at_line(e, a);
+        const int32_t apart = (int32_t)(v->epoch - before->epoch);
+        if (before->memory != v->memory || rtid_est_rings(before))
+            return;
+        if (before->slot != v->slot || (a <= e->owed.n_paid) != (n <= e->owed.n_paid)
+            || apart > MOST_APART)
+            continue;
+        for (int i = 0; i < T; i++)
+            merge(&v->left[i], times(before->left[i], power(apart)));
+        leave_line(e, a);
+        return;
+    }
+}
+
+/* The same for the n-th visit, which has just ended, and those behind it up to one that rings. */
+static void take_over_from(rtid_estimator *e, int n)
+{
+    for (int k = 0; k < MOST_SCANNED && n < e->owed.n_line; k++) {
+        const int before = e->owed.n_line, last = k > 0 && rtid_est_rings(at_line(e, n));
+        take_over(e, n);
+        n += e->owed.n_line == before;
+        if (last)
+            return;
+    }
+}
+
+static void join_line(rtid_estimator *e, int p)
+{
+    e->owed.line[e->owed.n_line++] = (uint16_t)p;
+    take_over(e, e->owed.n_line - 1);
+}
+
+/* 1 where the last visit in the line that rings is of this memory. */
+static int any_rings(rtid_estimator *e)
+{
+    for (int a = e->owed.n_line - 1; a >= 0 && at_line(e, a)->memory == e->owed.memory; a--)
+        if (rtid_est_rings(at_line(e, a)))
+            return 1;
+    return 0;
+}
+
+/* What open block k shares with the ring up to now goes into the line as a visit that ended. */
+static void split(rtid_estimator *e, int k)
+{
+    rtid_estimator_visit *v = open_visit(e, k);
+    rtid_est_take_left(&e->owed, k);
+    if (any_rings(e)) {
+        const int p = admit(e, v->slot);
+        e->owed.visit[p] = *v;
+        e->owed.visit[p].status = ENDED;
+        join_line(e, p);
+    }
+    begin_visit(e, v);
+}
+
+/* ---- what two visits share ---- */
+
+/* Of a later visit with an earlier one that rings, up to now. */
+static void share(rtid_estimator *e, const rtid_estimator_visit *later,
+                  const rtid_estimator_visit *earlier)
+{
+    const rtid_real units = rtid_est_units(later, earlier);
+    rtid_sum left[T];
+    rtid_real d[T];
+    rtid_est_left(&e->owed, later, left);
+    for (int i = 0; i < T; i++)
+        d[i] = units * earlier->d[i];
+    add_tile(e, later->slot, earlier->slot, left, d);
+    e->tiles = (uint16_t)(e->tiles > 0 ? e->tiles - 1 : 0);
+}
+
+static void share_open(rtid_estimator *e, int k, const rtid_estimator_visit *earlier)
+{
+    rtid_est_take_left(&e->owed, k);
+    share(e, open_visit(e, k), earlier);
+}
+
+/* Of a visit with itself, y and the shared columns since it closed. */
+static void settle_own(rtid_estimator *e, const rtid_estimator_visit *v)
+{
+    const rtid_sum ring = rtid_est_ring(&e->owed, v);
+    rtid_sum own[T];
+    for (int i = 0; i < T; i++)
+        own[i] = times(ring, v->d[i]);
+    add_own_tile(e, v->slot, own, v->d, 0);
+    for (int j = 0; j < RTID_EST_BLOCKS_AT; j++) {
+        const rtid_sum since = rtid_est_shared(&e->owed, v, j);
+        for (int i = 0; i < T; i++)
+            add_kept(e, v->slot, i, j, times(since, v->d[i]));
+    }
+    e->tiles = (uint16_t)(e->tiles > 0 ? e->tiles - 1 : 0);
+}
+
+/* ---- open and closed ---- */
 
 void rtid_est_close(rtid_estimator *e, int k)
 {
-    rtid_estimator_recent *item = &e->recent[e->open[k].recent];
-    rtid_sum left[T];
-    item->status = YOUNG;
-    item->size = 0;
+    rtid_estimator_owed *o = &e->owed;
+    rtid_estimator_visit *v = open_visit(e, k);
+    for (int other = 0; other < o->n_open; other++)
+        if (other != k) {
+            split(e, other);
+            add_open_pair(e, k, other);
+        }
+    add_own(e, k);
+    if (!any_rings(e) || (int32_t)(o->epoch - v->epoch) > MOST_APART)
+        split(e, k);
+    rtid_est_take_left(o, k);
     for (int i = 0; i < T; i++) {
-        const rtid_real d = e->d[first_of(k) + i];
-        item->size = ABS(d) > item->size ? ABS(d) : item->size;
-        item->d[i] = d / e->d[RTID_EST_RING];
+        v->left[i] = times(v->left[i], R(1) / v->fade);
+        v->d[i] = e->d[first_of(k) + i] / e->d[RTID_EST_RING];
         e->d[first_of(k) + i] = 0;
     }
-    item->w_start = ring_ring(e);
-    memcpy(item->shared_start, e->local[RTID_EST_RING], sizeof item->shared_start);
-    read_through(e, k, item->through);
-    add_own(e, k);
-    for (int other = 0; other < e->n_open; other++)
-        if (other != k) {
-            add_open_pair(e, k, other);
-            read_through(e, other, left);
-            for (int i = 0; i < T; i++)
-                left[i] = minus(left[i]); /* `other` will charge it from the beginning */
-            add_tile(e, e->open[other].slot, item->slot, left, item->d);
-        }
+    v->epoch = o->epoch;
+    v->fade = R(1);
+    v->start = e->d[RTID_EST_RING];
+    v->ring = minus(o->local[RTID_EST_RING][RTID_EST_RING]);
+    for (int j = 0; j < RTID_EST_BLOCKS_AT; j++)
+        v->shared[j] = minus(o->local[RTID_EST_RING][j]);
+    v->status = RINGING;
     clear_columns(e, first_of(k), first_of(k + 1));
-    e->young[e->n_young++] = (uint16_t)e->open[k].recent;
     e->n_closed++;
+    join_line(e, o->open[k].visit);
 }
 
-/* Settle what closed block p shares with all but open block k; a young one is so no more. */
-static void settle_one(rtid_estimator *e, int k, int p)
+/* Let the n-th visit of the line go on as open block k: all behind it is settled with it. */
+static void go_on(rtid_estimator *e, int k, int n)
 {
-    const rtid_estimator_recent *item = &e->recent[p];
-    rtid_sum own[T], left[T];
-    int later = 0;
-    if (item->status == YOUNG) {
-        while (e->young[later] != p)
-            later++;
-        settle_young(e, later);
-        e->n_young--;
-        for (int a = later; a < e->n_young; a++)
-            e->young[a] = e->young[a + 1];
-    } else {
-        weigh(e, item, own, left);
-        spread(e, item->slot, left);
-    }
-    for (int a = later; a < e->n_young; a++) {
-        const rtid_estimator_recent *young = &e->recent[e->young[a]];
-        weigh(e, young, own, left);
-        add_tile(e, young->slot, item->slot, left, item->d);
-    }
-    for (int other = 0; other < e->n_open; other++)
-        if (other != k) {
-            read_through(e, other, left);
-            add_tile(e, e->open[other].slot, item->slot, left, item->d);
-        }
-    add_shared(e, item);
+    rtid_estimator_owed *o = &e->owed;
+    rtid_estimator_visit *v = at_line(e, n);
+    rtid_sum left[T];
+    for (int a = n + 1; a < o->n_line; a++)
+        share(e, at_line(e, a), v);
+    for (int other = 0; other < o->n_open; other++)
+        if (other != k)
+            share_open(e, other, v);
+    settle_own(e, v);
+    rtid_est_left(o, v, left);
+    memcpy(v->left, left, sizeof left);
+    for (int i = 0; i < T; i++)
+        e->d[first_of(k) + i] = e->d[RTID_EST_RING] * v->fade * v->d[i];
+    v->status = ENDED;
+    take_over_from(e, n);
 }
 
 void rtid_est_open(rtid_estimator *e, int k, int edge, int slot)
 {
-    if (k == e->n_open)
+    rtid_estimator_owed *o = &e->owed;
+    int n = o->n_line - 1;
+    if (k == o->n_open)
         rtid_est_set_open(e, k + 1);
-    e->open[k].edge = (int16_t)edge;
-    e->open[k].slot = (int16_t)slot;
-    e->open[k].u = e->edge[edge].u;
-    e->open[k].dp = e->edge[edge].dp;
+    o->open[k].edge = (int16_t)edge;
+    o->open[k].slot = (int16_t)slot;
+    o->open[k].u = e->edge[edge].u;
+    o->open[k].dp = e->edge[edge].dp;
     e->edge[edge].place = (int16_t)k;
-    for (int p = 0; p < e->n_recent; p++) {
-        rtid_estimator_recent *item = &e->recent[p];
-        if (item->slot != slot || item->status < YOUNG)
-            continue;
-        settle_one(e, k, p);
-        for (int i = 0; i < T; i++)
-            e->d[first_of(k) + i] = e->d[RTID_EST_RING] * item->d[i];
-        item->status = OPEN;
-        e->open[k].recent = (int16_t)p;
+    while (n >= 0 && !(at_line(e, n)->slot == slot && at_line(e, n)->status == RINGING
+                       && at_line(e, n)->memory == o->memory))
+        n--;
+    if (n >= 0) {
         e->n_closed--;
-        return;
+        if (o->n_line - n + o->n_open <= e->tiles)
+            go_on(e, k, n);
+        else
+            at_line(e, n)->status = ECHO; /* too much for one tick: it rings on by itself */
     }
-    e->open[k].recent = (int16_t)admit(e, slot);
+    o->open[k].visit = (int16_t)admit(e, slot);
 }
 
 void rtid_est_remove_open(rtid_estimator *e, int k)
 {
-    const int last = e->n_open - 1, to = first_of(k), source = first_of(last);
-    e->edge[e->open[k].edge].place = -1;
+    rtid_estimator_owed *o = &e->owed;
+    const int last = o->n_open - 1, to = first_of(k), source = first_of(last);
+    e->edge[o->open[k].edge].place = -1;
     if (k < last) {
         for (int i = 0; i < T; i++) {
             e->d[to + i] = e->d[source + i];
             e->d[source + i] = 0;
             for (int j = 0; j < to; j++)
-                e->local[to + i][j] = e->local[source + i][j];
+                o->local[to + i][j] = o->local[source + i][j];
             for (int j = to + T; j < source; j++)
-                e->local[j][to + i] = e->local[source + i][j];
+                o->local[j][to + i] = o->local[source + i][j];
             for (int j = 0; j <= i; j++)
-                e->local[to + i][to + j] = e->local[source + i][source + j];
+                o->local[to + i][to + j] = o->local[source + i][source + j];
         }
-        e->open[k] = e->open[last];
-        e->edge[e->open[k].edge].place = (int16_t)k;
+        o->open[k] = o->open[last];
+        e->edge[o->open[k].edge].place = (int16_t)k;
     }
     clear_columns(e, source, source + T);
     rtid_est_set_open(e, last);
 }
 
-/* ---- the ring begins anew ---- */
+/* ---- epochs and memories ---- */
 
-/* Note what a block shares with the first `partners` of those noted: too much work for one tick. */
-static void owe(rtid_estimator *e, int slot, const rtid_sum *left, const rtid_real *d, int partners)
+/* The oldest visit is settled with all behind it; it leaves the line. */
+static void leave_first(rtid_estimator *e)
 {
-    rtid_estimator_debt *debt = &e->debt;
-    debt->slot[debt->n] = (int16_t)slot;
-    debt->partners[debt->n] = (uint16_t)partners;
-    for (int i = 0; i < T; i++) {
-        debt->left[debt->n][i] = left[i];
-        debt->d[debt->n][i] = d[i];
-    }
-    debt->n++;
+    settle_own(e, at_line(e, 0));
+    leave_line(e, 0);
+    if (!any_rings(e))
+        for (int k = 0; k < e->owed.n_open; k++) {
+            rtid_est_take_left(&e->owed, k);
+            begin_visit(e, open_visit(e, k)); /* it owes nothing to anybody */
+        }
 }
 
-void rtid_est_pay(rtid_estimator *e, int tiles)
+void rtid_est_pay(rtid_estimator *e)
 {
-    rtid_estimator_debt *debt = &e->debt;
-    while (debt->p < debt->n && tiles > 0) {
-        if (debt->q >= debt->partners[debt->p]) {
-            debt->p++;
-            debt->q = 0;
+    rtid_estimator_owed *o = &e->owed;
+    while (o->n_line > 0 && e->tiles > 0) {
+        const rtid_estimator_visit *first = at_line(e, 0);
+        const int next = o->n_paid + 1, now = first->memory == o->memory;
+        if (first->status == ENDED) {
+            leave_line(e, 0);
             continue;
         }
-        add_tile(e, debt->slot[debt->p], debt->slot[debt->q], debt->left[debt->p],
-                 debt->d[debt->q]);
-        debt->q++;
-        tiles--;
-    }
-}
-
-/* Owe what closed blocks share: those that rang all the time, then the young in their order. */
-static void settle_closed(rtid_estimator *e)
-{
-    rtid_sum own[T], left[T];
-    for (int p = 0; p < e->n_recent; p++) {
-        const rtid_estimator_recent *item = &e->recent[p];
-        if (item->status != RINGING)
+        if (now && first->status != SILENT_NOW)
+            return;
+        if (next < o->n_line && at_line(e, next)->memory == first->memory) {
+            share(e, at_line(e, next), first);
+            o->n_paid++;
             continue;
-        weigh(e, item, own, left);
-        owe(e, item->slot, left, item->d, e->debt.n + 1);
-        add_shared(e, item);
-    }
-    for (int a = 0; a < e->n_young; a++) {
-        const rtid_estimator_recent *item = &e->recent[e->young[a]];
-        weigh(e, item, own, left);
-        add_tile(e, item->slot, item->slot, own, item->d);
-        owe(e, item->slot, left, item->d, e->debt.n);
-        add_shared(e, item);
+        }
+        for (int k = 0; now && k < o->n_open; k++)
+            share_open(e, k, first);
+        leave_first(e);
     }
 }
 
-/* Add what open blocks share among themselves, owe what they share with the closed ones. */
-static void settle_open(rtid_estimator *e)
+/* Products of the rows of this epoch go to the sums and to the visits that ring. */
+static void close_epoch(rtid_estimator *e)
 {
-    const int closed = e->debt.n;
-    rtid_sum left[T];
-    for (int k = 0; k < e->n_open; k++) {
+    rtid_estimator_owed *o = &e->owed;
+    for (int a = 0; a < o->n_line; a++) {
+        rtid_estimator_visit *v = at_line(e, a);
+        if (v->memory != o->memory || !rtid_est_rings(v))
+            continue;
+        v->ring = rtid_est_ring(o, v);
+        for (int j = 0; j < RTID_EST_BLOCKS_AT; j++)
+            v->shared[j] = rtid_est_shared(o, v, j);
+    }
+    for (int k = 0; k < o->n_open; k++) {
+        rtid_est_take_left(o, k);
         add_own(e, k);
         for (int other = 0; other < k; other++)
             add_open_pair(e, k, other);
-        read_through(e, k, left);
-        owe(e, e->open[k].slot, left, e->recent[e->open[k].recent].d, closed);
     }
+    for (int i = 0; i < RTID_EST_BLOCKS_AT; i++)
+        for (int j = 0; j <= i; j++)
+            merge(sum_at(e, i, j), o->local[i][j]);
+    clear_columns(e, 0, e->width);
 }
 
-void rtid_est_rebase(rtid_estimator *e, int how)
+void rtid_est_renew(rtid_estimator *e)
 {
-    rtid_est_pay(e, ALL_TILES);
-    e->debt.n = e->debt.p = e->debt.q = 0;
-    settle_closed(e);
-    settle_open(e);
-    for (int i = 0; i < 1 + RTID_EST_SHARED; i++)
-        for (int j = 0; j <= i; j++)
-            merge(sum_at(e, i, j), e->local[i][j]);
-    e->n_young = 0;
-    for (int p = e->n_recent - 1; p >= 0; p--) {
-        rtid_estimator_recent *item = &e->recent[p];
-        rtid_real largest = 0;
-        if (item->status < YOUNG)
+    rtid_estimator_owed *o = &e->owed;
+    rtid_real shrink;
+    int exponent;
+    (void)frexp((double)e->d[RTID_EST_RING], &exponent);
+    shrink = power(exponent);
+    close_epoch(e);
+    o->epoch += (uint32_t)-exponent;
+    for (int a = 0; a < o->n_line; a++)
+        at_line(e, a)->fade *= shrink;
+    for (int k = 0; k < o->n_open; k++)
+        open_visit(e, k)->fade *= shrink;
+    e->d[RTID_EST_RING] /= shrink;
+    e->faded *= shrink;
+}
+
+void rtid_est_forget(rtid_estimator *e)
+{
+    const rtid_real ring = e->d[RTID_EST_RING];
+    for (int a = 0; a < e->owed.n_line; a++) {
+        rtid_estimator_visit *v = at_line(e, a);
+        if (v->memory != e->owed.memory || (v->status != RINGING && v->status != ECHO)
+            || ring * v->fade > SILENT * v->start)
             continue;
-        item->status = RINGING;
-        item->w_start = as_sum(0);
-        for (int i = 0; i < T; i++) {
-            item->d[i] *= e->d[RTID_EST_RING];
-            item->through[i] = as_sum(0);
-            largest = ABS(item->d[i]) > largest ? ABS(item->d[i]) : largest;
-        }
-        for (int j = 0; j < 1 + RTID_EST_SHARED; j++)
-            item->shared_start[j] = as_sum(0);
-        if (how == END_ALL || (how == FORGET_SILENT && !(largest > SILENT * item->size))) {
-            e->n_closed--;
-            release(e, p);
-        }
+        e->n_closed = (uint16_t)(e->n_closed - (v->status == RINGING));
+        v->status = SILENT_NOW;
     }
-    clear_columns(e, 0, e->width);
-    for (int j = 0; how == END_ALL && j < RTID_EST_WIDTH; j++)
-        e->d[j] = 0;
-    e->faded = how == SETTLE ? e->faded * e->d[RTID_EST_RING] : R(1);
-    e->d[RTID_EST_RING] = R(1);
+    e->faded = R(1) / ring;
 }
 
 void rtid_est_end(rtid_estimator *e)
 {
-    rtid_est_rebase(e, END_ALL);
-    while (e->n_open > 0) {
-        release(e, e->open[e->n_open - 1].recent);
-        rtid_est_remove_open(e, e->n_open - 1);
+    rtid_estimator_owed *o = &e->owed;
+    close_epoch(e);
+    for (int k = 0; k < o->n_open; k++)
+        split(e, k);
+    o->memory++;
+    for (int k = 0; k < o->n_open; k++)
+        begin_visit(e, open_visit(e, k));
+    e->n_closed = 0;
+    for (int j = 0; j < RTID_EST_WIDTH; j++)
+        e->d[j] = 0;
+    e->faded = e->d[RTID_EST_RING] = R(1);
+}
+
+void rtid_est_stop(rtid_estimator *e)
+{
+    rtid_est_end(e);
+    while (e->owed.n_open > 0) {
+        open_visit(e, e->owed.n_open - 1)->status = FREE;
+        rtid_est_remove_open(e, e->owed.n_open - 1);
     }
 }

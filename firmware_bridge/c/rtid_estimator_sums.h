@@ -12,10 +12,15 @@
 
 #define R(x) ((rtid_real)(x))
 enum { T = RTID_EST_TERMS, SHUT = -1 };
-enum { FREE, OPEN, YOUNG, RINGING }; /* a recent block; young: closed since the ring began */
-enum { TILES_PER_TICK = 4, ALL_TILES = RTID_EST_MAX_RECENT * RTID_EST_MAX_RECENT };
-enum { SETTLE, FORGET_SILENT, END_ALL }; /* what a rebase does to the memory of closed blocks */
-#define RING_LIMIT R(0.1) /* rebase before the ring's column loses digits */
+/* A visit is open, rings, rings beside a later visit of the same block, is silent but owes still, or
+ * has gone on as another visit. */
+enum { FREE, OPEN, RINGING, ECHO, SILENT_NOW, ENDED };
+enum { MOST_SCANNED = 16 }; /* visits that are looked at for one that can be merged */
+enum { MOST_APART = 40 };   /* epochs, in bits, between two that are merged */
+#ifndef RTID_EST_TILES_PER_TICK
+#define RTID_EST_TILES_PER_TICK 12 /* products of two blocks, 36 each */
+#endif
+#define RING_LIMIT R(0.1) /* its unit is made smaller before its sums lose digits */
 #define FORGET_AT R(1e-3) /* look for silent blocks each time that all memory has faded so far */
 
 #ifdef RTID_ESTIMATOR_FLOAT32
@@ -104,7 +109,7 @@ void rtid_est_integrate(rtid_estimator *e, const rtid_estimator_sample *sample);
 /* Let n blocks be open; the width of the rows follows. */
 void rtid_est_set_open(rtid_estimator *e, int n);
 
-/* Let open block k ring on, its state referred to the ring's origin; clear its columns. */
+/* Let open block k ring on; clear its columns. */
 void rtid_est_close(rtid_estimator *e, int k);
 
 /* Make `slot` open block k, a place just closed or n_open; if it still rings, it goes on. */
@@ -113,13 +118,41 @@ void rtid_est_open(rtid_estimator *e, int k, int edge, int slot);
 /* Take the closed and cleared block k out of the open ones; the last one takes its place. */
 void rtid_est_remove_open(rtid_estimator *e, int k);
 
-/* Work off so many tiles of what the last rebase left. */
-void rtid_est_pay(rtid_estimator *e, int tiles);
+/* 1 where the line is too long to go on. */
+int rtid_est_is_full(const rtid_estimator *e);
 
-/* Settle all products, start the ring anew; with END_ALL all states are zero. */
-void rtid_est_rebase(rtid_estimator *e, int how);
+/* Work off tiles that are owed, as far as this tick's go. */
+void rtid_est_pay(rtid_estimator *e);
 
-/* END_ALL, and no block stays open. */
+/* Add what open blocks and shared columns have, begin a new epoch in which the ring is 0.5 to 1. */
+void rtid_est_renew(rtid_estimator *e);
+
+/* Look for blocks that are silent. */
+void rtid_est_forget(rtid_estimator *e);
+
+/* End all memory; open blocks stay open, from nothing. */
 void rtid_est_end(rtid_estimator *e);
+
+/* The same, and no block stays open. */
+void rtid_est_stop(rtid_estimator *e);
+
+/* Ring x column of a visit up to now, in units of its epoch. */
+void rtid_est_left(const rtid_estimator_owed *o, const rtid_estimator_visit *v, rtid_sum *left);
+
+/* Ring x ring, and ring x column j of y and the shared ones, of a visit since it closed. */
+rtid_sum rtid_est_ring(const rtid_estimator_owed *o, const rtid_estimator_visit *v);
+rtid_sum rtid_est_shared(const rtid_estimator_owed *o, const rtid_estimator_visit *v, int j);
+
+/* What open block k shares with the ring goes from its columns to its visit. */
+void rtid_est_take_left(rtid_estimator_owed *o, int k);
+
+/* Frozen sums become numbers, with what is owed to them. */
+void rtid_est_settle(rtid_estimator_work *w);
+
+/* 1 where the state of a closed visit counts still. */
+int rtid_est_rings(const rtid_estimator_visit *v);
+
+/* What turns left x d, each in units of its visit, into a product. */
+rtid_real rtid_est_units(const rtid_estimator_visit *later, const rtid_estimator_visit *earlier);
 
 #endif

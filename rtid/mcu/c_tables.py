@@ -40,6 +40,11 @@ class Sizes:
         return 1 + self.terms + layout.TERMS * self.blocks
 
     @property
+    def visits(self) -> int:
+        """Visits to blocks at once: those that ring, and those that were settled or continued."""
+        return 2 * self.recent + self.open * (self.open + 4)
+
+    @property
     def sums(self) -> int:
         """Products of y and all unknowns: a triangle."""
         return (1 + self.unknowns) * (2 + self.unknowns) // 2

@@ -17,8 +17,8 @@ from rtid.kernels.layout import COUNTERS, OUTLIER, TERMS
 from rtid.mcu.c_tables import Sizes
 from rtid.plain import FloatArray
 
-COUNTS = (*COUNTERS[:OUTLIER], "no_room")  # as far as no row is judged by a map held
-_I2, _U1, _U2, _U8, _I8 = np.int16, np.uint8, np.uint16, np.uint64, np.int64
+COUNTS = (*COUNTERS[:OUTLIER], "no_room", "busy")  # as far as no row is judged by a map held
+_I2, _U1, _U2, _U4, _U8, _I8 = np.int16, np.uint8, np.uint16, np.uint32, np.uint64, np.int64
 
 
 Field = tuple[Any, ...]
@@ -69,34 +69,37 @@ class Layout:
         return _record([*place, *times, ("phi", self._sum, (TERMS,))])
 
     @property
+    def owed(self) -> np.dtype[np.void]:
+        """rtid_estimator_owed."""
+        real, total, n = self._real, self._sum, self.sizes
+        visit: list[Field] = [("slot", _I2), ("status", _U1), ("memory", _U2), ("epoch", _U4)]
+        visit += [("fade", real), ("start", real), ("d", real, (TERMS,))]
+        visit += [("left", total, (TERMS,)), ("ring", total), ("shared", total, (2 + n.terms,))]
+        opened = [(name, _I2) for name in ("edge", "slot", "visit", "u", "dp")]
+        fields: list[Field] = [("local", total, (self._width, self._width))]
+        fields += [(name, _U2) for name in ("memory", "n_open", "n_line", "n_paid")]
+        fields += [("epoch", _U4), ("open", _record(opened), (n.open,))]
+        return _record(
+            [*fields, ("visit", _record(visit), (n.visits,)), ("line", _U2, (n.visits,))]
+        )
+
+    @property
+    def _width(self) -> int:
+        return 3 + self.sizes.terms + TERMS * self.sizes.open
+
+    @property
     def estimator(self) -> np.dtype[np.void]:
         """rtid_estimator."""
         real, total, n = self._real, self._sum, self.sizes
-        shared = 1 + n.terms
-        width = 2 + shared + TERMS * n.open
-        kept = [("slot", _I2), ("status", _U1), ("size", real), ("d", real, (TERMS,))]
-        kept += [
-            ("through", total, (TERMS,)),
-            ("w_start", total),
-            ("shared_start", total, (1 + shared,)),
-        ]
-        opened = [(name, _I2) for name in ("edge", "slot", "recent", "u", "dp")]
         edge = [(name, real) for name in ("w", "m1", "var", "mt", "dp0", "dp1")]
         edge += [(name, _I2) for name in ("u", "dp", "to_u", "to_dp", "place")]
-        fields: list[Field] = [("d", real, (width,))]
-        fields += [("local", total, (width, width))]
-        fields += [("width", _U2), ("faded", real)]
+        fields: list[Field] = [("d", real, (self._width,)), ("width", _U2), ("faded", real)]
+        fields += [("owed", self.owed)]
         fields += [(name, real) for name in ("cov", "echo")] + [("noise", total)]
         fields += [(name, _I8) for name in ("t_us", "ready_us", "dt_us")]
         fields += [("values", real, (n.signals + 1,)), ("dt_s", real), ("lag_decay", real)]
         fields += [("running", _U1), ("edge", _record(edge), (n.edges,))]
-        fields += [(f"n_{name}", _U2) for name in ("open", "recent", "closed", "young", "slots")]
-        fields += [("open", _record(opened), (n.open,))]
-        owed: list[Field] = [(name, _U2) for name in ("n", "p", "q")]
-        owed += [("slot", _I2, (n.recent,)), ("partners", _U2, (n.recent,))]
-        owed += [("left", total, (n.recent, TERMS)), ("d", real, (n.recent, TERMS))]
-        fields += [("recent", _record(kept), (n.recent,)), ("young", _U2, (n.recent,))]
-        fields += [("debt", _record(owed))]
+        fields += [(name, _U2) for name in ("n_closed", "n_slots", "tiles")]
         fields += [("slot", _I2, (n.cells,)), ("block", self.block, (n.blocks,))]
         fields += [("sums", total, (n.sums,))]
         if not self.single:
@@ -111,7 +114,8 @@ class Layout:
         fields: list[Field] = [("matrix", np.float64, (n.sums,))]
         fields += [(name, np.float64, (n.unknowns,)) for name in ("scale", "theta", "basis")]
         fields += [(name, np.float64) for name in ("noise", "rows", "cov_change")]
-        fields += [("now_us", _I8), ("n_slots", _U2), ("block", self.block, (n.blocks,))]
+        fields += [("now_us", _I8), ("n_slots", _U2), ("owed", self.owed)]
+        fields += [("block", self.block, (n.blocks,))]
         return _record([*fields, ("map", MAP, (n.blocks,))])
 
     @property
@@ -122,11 +126,11 @@ class Layout:
         numbers = [(name, np.float64) for name in ("rho", "leverage")]
         return _record([*fields, *numbers, ("raised", _U2), ("finite", _U1)])
 
-    def normal(self, memory: np.void) -> Normal:
-        """The normal equations in a record of `estimator` that was frozen: settled sums."""
+    def normal(self, memory: np.void, matrix: FloatArray) -> Normal:
+        """The normal equations, from `estimator` and its settled sums, a triangle."""
         n = 1 + 1 + self.sizes.terms + TERMS * int(memory["n_slots"])
         whole = np.zeros((n, n))
-        whole[np.tril_indices(n)] = self._number(memory["sums"][: n * (n + 1) // 2])
+        whole[np.tril_indices(n)] = matrix[: n * (n + 1) // 2]
         whole += np.tril(whole, -1).T
         noise = np.array([float(self._number(memory["noise"]))])
         rows = float(memory["counts"][COUNTS.index("rows")])

@@ -34,11 +34,12 @@ def files() -> list[Path]:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the C made of samples: verdict of each, memory after the last, its solution and maps."""
+    """What the C made of samples: verdict of each, memory after the last, settled sums, solution and maps."""
 
     layout: Layout
     verdicts: NDArray[np.int8]
     memory: np.void
+    matrix: FloatArray
     work: np.void
     solution: np.void
 
@@ -92,10 +93,11 @@ class Program:
         rest = memoryview(done.stdout)
         records = [layout.estimator, layout.work, layout.sample, layout.solution]
         sizes, rest = np.frombuffer(rest[:32], np.uint64), rest[32:]
-        assert sizes.tolist() == [record.itemsize for record in records]
+        assert sizes.tolist() == [record.itemsize for record in records], sizes
         verdicts, rest = np.frombuffer(rest[:n], np.int8), rest[n:]
         found = []
-        for dtype in (layout.estimator, layout.work, layout.solution):
+        matrix = np.dtype((np.float64, (layout.sizes.sums,)))
+        for dtype in (layout.estimator, matrix, layout.work, layout.solution):
             found.append(np.frombuffer(rest[: dtype.itemsize], dtype)[0])
             rest = rest[dtype.itemsize :]
         assert not rest

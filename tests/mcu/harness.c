@@ -3,7 +3,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 
-#include "rtid_estimator.h"
+#include "rtid_estimator_sums.h"
 
 static rtid_estimator e;
 static rtid_estimator_work work;
@@ -29,6 +29,9 @@ int main(int argc, char **argv)
     }
     rtid_estimator_freeze(&e, &work);
     put(&e, sizeof e);
+    rtid_est_settle(&work);
+    put(work.matrix, sizeof work.matrix);
+    rtid_estimator_freeze(&e, &work);
     rtid_estimator_solve(&work, &solution);
     put(&work, sizeof work);
     put(&solution, sizeof solution);

@@ -105,7 +105,7 @@ def rig_reference(shared: Path, run: int) -> tuple[Record, Reference]:
 
 def sums_apart(outcome: Outcome, reference: Reference) -> float:
     """Largest difference of the sums, each in units of its two columns' sizes."""
-    ours, theirs = outcome.layout.normal(outcome.memory), reference.normal
+    ours, theirs = outcome.layout.normal(outcome.memory, outcome.matrix), reference.normal
     size = np.sqrt(np.where(np.diag(theirs.gram) > 0, np.diag(theirs.gram), 1.0))
     gram = np.abs(ours.gram - theirs.gram) / np.outer(size, size)
     right = np.abs(ours.right - theirs.right) / size / np.sqrt(theirs.square)
