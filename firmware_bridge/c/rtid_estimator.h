@@ -44,6 +44,14 @@ typedef double rtid_sum;
 /* of a block with y, the shared columns and its own terms up to each */
 #define RTID_EST_KEPT \
     (RTID_EST_TERMS * RTID_EST_BLOCKS_AT + RTID_EST_TERMS * (RTID_EST_TERMS + 1) / 2)
+/* Work of one tick beside its row, in products of two blocks' terms, 36 each. */
+#ifndef RTID_EST_TILES_PER_TICK
+#ifdef RTID_ESTIMATOR_FLOAT32
+#define RTID_EST_TILES_PER_TICK 11
+#else
+#define RTID_EST_TILES_PER_TICK 28
+#endif
+#endif
 /* visits at once: blocks that ring, and as many that are settled or were visited again */
 #define RTID_EST_MAX_VISITS (2 * RTID_EST_MAX_RECENT + RTID_EST_MAX_OPEN * (RTID_EST_MAX_OPEN + 4))
 #define RTID_EST_SUMS ((1 + RTID_EST_UNKNOWNS) * (2 + RTID_EST_UNKNOWNS) / 2)
@@ -104,7 +112,7 @@ typedef struct {
 /* Products not yet added to the sums. */
 typedef struct {
     rtid_sum local[RTID_EST_WIDTH][RTID_EST_WIDTH]; /* of the rows since the epoch began */
-    uint16_t memory, n_open, n_line, n_paid;
+    uint16_t memory, n_open, n_line, n_paid, last_begun;
     uint32_t epoch;
     rtid_estimator_open open[RTID_EST_MAX_OPEN];
     rtid_estimator_visit visit[RTID_EST_MAX_VISITS];

@@ -167,7 +167,7 @@ static void rotate(double a[T][T], int n, int p, int q)
 /* Condition number of the information on the terms that a block's map has; HUGE_VAL: singular. */
 static double condition(rtid_estimator_work *w, int slot)
 {
-    double a[T][T], low, high;
+    double a[T][T] = {{0.0}}, low, high;
     int used[T], n = 0;
     for (int i = 0; i < T; i++)
         if (rtid_est_has_term(w->block[slot].edge, i))

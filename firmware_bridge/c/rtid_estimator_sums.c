@@ -116,7 +116,13 @@ static void add_open_pair(rtid_estimator *e, int k, int other)
 
 /* ---- visits ---- */
 
-static rtid_real power(int n) { return R(ldexp(1.0, n)); } /* 0 where that is too small */
+/* So many tiles' work is done in this tick. */
+static void spend(rtid_estimator *e, int tiles)
+{
+    e->tiles = (uint16_t)(e->tiles > tiles ? e->tiles - tiles : 0);
+}
+
+static rtid_real power(int n) { return LDEXP(R(1), n); } /* 0 where that is too small */
 
 int rtid_est_rings(const rtid_estimator_visit *v)
 {
@@ -132,14 +138,14 @@ rtid_sum rtid_est_ring(const rtid_estimator_owed *o, const rtid_estimator_visit 
 {
     if (v->memory != o->memory)
         return v->ring;
-    return sum_of(v->ring, times(o->local[RTID_EST_RING][RTID_EST_RING], v->fade * v->fade));
+    return sum_of(v->ring, scaled(o->local[RTID_EST_RING][RTID_EST_RING], v->fade * v->fade));
 }
 
 rtid_sum rtid_est_shared(const rtid_estimator_owed *o, const rtid_estimator_visit *v, int j)
 {
     if (v->memory != o->memory)
         return v->shared[j];
-    return sum_of(v->shared[j], times(o->local[RTID_EST_RING][j], v->fade));
+    return sum_of(v->shared[j], scaled(o->local[RTID_EST_RING][j], v->fade));
 }
 
 void rtid_est_left(const rtid_estimator_owed *o, const rtid_estimator_visit *v, rtid_sum *left)
@@ -154,7 +160,7 @@ void rtid_est_take_left(rtid_estimator_owed *o, int k)
     rtid_estimator_visit *v = &o->visit[o->open[k].visit];
     for (int i = 0; i < T; i++) {
         rtid_sum *through = &o->local[first_of(k) + i][RTID_EST_RING];
-        merge(&v->left[i], times(*through, v->fade));
+        merge(&v->left[i], scaled(*through, v->fade));
         *through = as_sum(0);
     }
 }
@@ -182,9 +188,11 @@ static void begin_visit(const rtid_estimator *e, rtid_estimator_visit *v)
 /* A visit that begins now; rtid_est_is_full has said that there is room. */
 static int admit(rtid_estimator *e, int slot)
 {
-    int p = 0;
-    while (e->owed.visit[p].status != FREE)
-        p++;
+    int p = e->owed.last_begun;
+    do
+        p = p + 1 < RTID_EST_MAX_VISITS ? p + 1 : 0;
+    while (e->owed.visit[p].status != FREE);
+    e->owed.last_begun = (uint16_t)p;
     e->owed.visit[p].slot = (int16_t)slot;
     e->owed.visit[p].status = OPEN;
     begin_visit(e, &e->owed.visit[p]);
@@ -226,7 +234,7 @@ static void take_over(rtid_estimator *e, int n)
             || apart > MOST_APART)
             continue;
         for (int i = 0; i < T; i++)
-            merge(&v->left[i], times(before->left[i], power(apart)));
+            merge(&v->left[i], scaled(before->left[i], power(apart)));
         leave_line(e, a);
         return;
     }
@@ -286,7 +294,7 @@ static void share(rtid_estimator *e, const rtid_estimator_visit *later,
     for (int i = 0; i < T; i++)
         d[i] = units * earlier->d[i];
     add_tile(e, later->slot, earlier->slot, left, d);
-    e->tiles = (uint16_t)(e->tiles > 0 ? e->tiles - 1 : 0);
+    spend(e, 1);
 }
 
 static void share_open(rtid_estimator *e, int k, const rtid_estimator_visit *earlier)
@@ -308,7 +316,7 @@ static void settle_own(rtid_estimator *e, const rtid_estimator_visit *v)
         for (int i = 0; i < T; i++)
             add_kept(e, v->slot, i, j, times(since, v->d[i]));
     }
-    e->tiles = (uint16_t)(e->tiles > 0 ? e->tiles - 1 : 0);
+    spend(e, 1);
 }
 
 /* ---- open and closed ---- */
@@ -327,7 +335,7 @@ void rtid_est_close(rtid_estimator *e, int k)
         split(e, k);
     rtid_est_take_left(o, k);
     for (int i = 0; i < T; i++) {
-        v->left[i] = times(v->left[i], R(1) / v->fade);
+        v->left[i] = scaled(v->left[i], R(1) / v->fade);
         v->d[i] = e->d[first_of(k) + i] / e->d[RTID_EST_RING];
         e->d[first_of(k) + i] = 0;
     }
@@ -341,6 +349,7 @@ void rtid_est_close(rtid_estimator *e, int k)
     clear_columns(e, first_of(k), first_of(k + 1));
     e->n_closed++;
     join_line(e, o->open[k].visit);
+    spend(e, 2);
 }
 
 /* Let the n-th visit of the line go on as open block k: all behind it is settled with it. */
@@ -427,6 +436,7 @@ static void leave_first(rtid_estimator *e)
 void rtid_est_pay(rtid_estimator *e)
 {
     rtid_estimator_owed *o = &e->owed;
+    e->tiles = e->tiles > MOST_PAID ? MOST_PAID : e->tiles > LEAST_PAID ? e->tiles : LEAST_PAID;
     while (o->n_line > 0 && e->tiles > 0) {
         const rtid_estimator_visit *first = at_line(e, 0);
         const int next = o->n_paid + 1, now = first->memory == o->memory;
@@ -455,9 +465,9 @@ static void close_epoch(rtid_estimator *e)
         rtid_estimator_visit *v = at_line(e, a);
         if (v->memory != o->memory || !rtid_est_rings(v))
             continue;
-        v->ring = rtid_est_ring(o, v);
+        merge(&v->ring, scaled(o->local[RTID_EST_RING][RTID_EST_RING], v->fade * v->fade));
         for (int j = 0; j < RTID_EST_BLOCKS_AT; j++)
-            v->shared[j] = rtid_est_shared(o, v, j);
+            merge(&v->shared[j], scaled(o->local[RTID_EST_RING][j], v->fade));
     }
     for (int k = 0; k < o->n_open; k++) {
         rtid_est_take_left(o, k);
@@ -469,6 +479,7 @@ static void close_epoch(rtid_estimator *e)
         for (int j = 0; j <= i; j++)
             merge(sum_at(e, i, j), o->local[i][j]);
     clear_columns(e, 0, e->width);
+    spend(e, 1 + o->n_line / 8);
 }
 
 void rtid_est_renew(rtid_estimator *e)
@@ -476,7 +487,7 @@ void rtid_est_renew(rtid_estimator *e)
     rtid_estimator_owed *o = &e->owed;
     rtid_real shrink;
     int exponent;
-    (void)frexp((double)e->d[RTID_EST_RING], &exponent);
+    (void)FREXP(e->d[RTID_EST_RING], &exponent);
     shrink = power(exponent);
     close_epoch(e);
     o->epoch += (uint32_t)-exponent;

@@ -15,11 +15,9 @@ enum { T = RTID_EST_TERMS, SHUT = -1 };
 /* A visit is open, rings, rings beside a later visit of the same block, is silent but owes still, or
  * has gone on as another visit. */
 enum { FREE, OPEN, RINGING, ECHO, SILENT_NOW, ENDED };
+enum { LEAST_PAID = 2, MOST_PAID = RTID_EST_TILES_PER_TICK * 2 / 3 }; /* of what is owed, per tick */
 enum { MOST_SCANNED = 16 }; /* visits that are looked at for one that can be merged */
 enum { MOST_APART = 40 };   /* epochs, in bits, between two that are merged */
-#ifndef RTID_EST_TILES_PER_TICK
-#define RTID_EST_TILES_PER_TICK 12 /* products of two blocks, 36 each */
-#endif
 #define RING_LIMIT R(0.1) /* its unit is made smaller before its sums lose digits */
 #define FORGET_AT R(1e-3) /* look for silent blocks each time that all memory has faded so far */
 
@@ -30,6 +28,8 @@ enum { MOST_APART = 40 };   /* epochs, in bits, between two that are merged */
 #define ABS fabsf
 /* No quantity in SI units is that large, and its square is still a number. */
 #define INSANE 1e9f
+#define FREXP frexpf
+#define LDEXP ldexpf
 #define SILENT 1e-7f /* a closed block whose state decayed to this share is forgotten */
 
 /* s += x to 48 bits: Knuth's sum of two numbers with what it rounded off, then brought in order */
@@ -60,6 +60,9 @@ static inline rtid_sum times(rtid_sum a, rtid_real b)
     return p;
 }
 
+/* a b, b a power of two */
+static inline rtid_sum scaled(rtid_sum a, rtid_real b) { return (rtid_sum){a.high * b, a.low * b}; }
+
 static inline rtid_sum as_sum(rtid_real x) { return (rtid_sum){x, 0.0f}; }
 static inline rtid_sum minus(rtid_sum a) { return (rtid_sum){-a.high, -a.low}; }
 static inline double exact(rtid_sum s) { return (double)s.high + (double)s.low; }
@@ -70,11 +73,14 @@ static inline double exact(rtid_sum s) { return (double)s.high + (double)s.low; 
 #define EXP exp
 #define ABS fabs
 #define INSANE 1e30
+#define FREXP frexp
+#define LDEXP ldexp
 #define SILENT 1e-11
 
 static inline void merge(rtid_sum *s, rtid_sum x) { *s += x; }
 static inline rtid_sum product(rtid_real a, rtid_real b) { return a * b; }
 static inline rtid_sum times(rtid_sum a, rtid_real b) { return a * b; }
+static inline rtid_sum scaled(rtid_sum a, rtid_real b) { return a * b; }
 static inline rtid_sum as_sum(rtid_real x) { return x; }
 static inline rtid_sum minus(rtid_sum a) { return -a; }
 static inline double exact(rtid_sum s) { return s; }

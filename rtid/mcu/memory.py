@@ -77,7 +77,7 @@ class Layout:
         visit += [("left", total, (TERMS,)), ("ring", total), ("shared", total, (2 + n.terms,))]
         opened = [(name, _I2) for name in ("edge", "slot", "visit", "u", "dp")]
         fields: list[Field] = [("local", total, (self._width, self._width))]
-        fields += [(name, _U2) for name in ("memory", "n_open", "n_line", "n_paid")]
+        fields += [(name, _U2) for name in ("memory", "n_open", "n_line", "n_paid", "last_begun")]
         fields += [("epoch", _U4), ("open", _record(opened), (n.open,))]
         return _record(
             [*fields, ("visit", _record(visit), (n.visits,)), ("line", _U2, (n.visits,))]

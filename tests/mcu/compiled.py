@@ -34,7 +34,7 @@ def files() -> list[Path]:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the C made of samples: verdict of each, memory after the last, settled sums, solution and maps."""
+    """What the C made of samples: verdicts, memory after the last, settled sums, solution, maps."""
 
     layout: Layout
     verdicts: NDArray[np.int8]

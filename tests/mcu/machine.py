@@ -105,12 +105,23 @@ def rig_reference(shared: Path, run: int) -> tuple[Record, Reference]:
 
 def sums_apart(outcome: Outcome, reference: Reference) -> float:
     """Largest difference of the sums, each in units of its two columns' sizes."""
-    ours, theirs = outcome.layout.normal(outcome.memory, outcome.matrix), reference.normal
+    ours = outcome.layout.normal(outcome.memory, outcome.matrix)
+    return matrix_apart(ours, reference.normal)
+
+
+def matrix_apart(ours: Normal, theirs: Normal) -> float:
+    """The same of two normal equations."""
     size = np.sqrt(np.where(np.diag(theirs.gram) > 0, np.diag(theirs.gram), 1.0))
     gram = np.abs(ours.gram - theirs.gram) / np.outer(size, size)
     right = np.abs(ours.right - theirs.right) / size / np.sqrt(theirs.square)
     square, noise = abs(ours.square / theirs.square - 1), np.abs(ours.noise / theirs.noise - 1)
     return float(max(gram.max(), right.max(), square, noise.max()))
+
+
+def beta_in_sd(ours: np.void, theirs: Solution) -> float:
+    """Difference of two bulk moduli, in standard deviations as large as the residual is."""
+    sd = float(np.sqrt(max(1.0, theirs.rho) * theirs.compliance_cov[0, 0]))
+    return abs(float(ours["shared"][0] - theirs.compliance[0])) / sd
 
 
 @dataclass(frozen=True)

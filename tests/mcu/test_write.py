@@ -43,11 +43,11 @@ ARM = arm_compiler()
 TARGETS = {
     "Cortex-M4, float32": (
         ("-mcpu=cortex-m4", "-mfpu=fpv4-sp-d16", "-DRTID_ESTIMATOR_FLOAT32"),
-        (8_000, 12_500),
+        (8_000, 14_500),
     ),
-    "Cortex-M7, float64": (("-mcpu=cortex-m7", "-mfpu=fpv5-d16"), (7_000, 11_500)),
+    "Cortex-M7, float64": (("-mcpu=cortex-m7", "-mfpu=fpv5-d16"), (7_000, 13_000)),
 }
-UPDATE_STACK, SOLVE_STACK = 1_200, 1_800  # bytes
+UPDATE_STACK, SOLVE_STACK = 1_400, 2_400  # bytes
 
 
 def command(*arguments: str) -> int:
