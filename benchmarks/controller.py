@@ -1,4 +1,4 @@
-"""Instructions of each tick of the controller's estimator on emulated boards, into docs/controller.md.
+"""Instructions per tick of the controller's estimator on emulated boards, into docs/controller.md.
 
 python -m benchmarks.controller
 """

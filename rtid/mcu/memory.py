@@ -127,7 +127,7 @@ class Layout:
         return _record([*fields, *numbers, ("raised", _U2), ("finite", _U1)])
 
     def normal(self, memory: np.void, matrix: FloatArray) -> Normal:
-        """The normal equations, from `estimator` and its settled sums, a triangle."""
+        """The normal equations of `estimator` and its settled sums: a triangle (sums,), scaled."""
         n = 1 + 1 + self.sizes.terms + TERMS * int(memory["n_slots"])
         whole = np.zeros((n, n))
         whole[np.tril_indices(n)] = matrix[: n * (n + 1) // 2]
