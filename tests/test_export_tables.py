@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -14,10 +15,12 @@ from scipy.io import loadmat
 
 from firmware_bridge.lookup import STATUS
 from rtid.errors import RtidError
-from rtid.estimator.flowmap import FlowMap
+from rtid.estimator.flowmap import VALID, EdgeMap, FlowMap
 from rtid.estimator.published import publish
+from rtid.maps import plc
 from rtid.maps.files import write_map
 from rtid.maps.gridded import ERROR_SHARE, Gridded, gridded
+from rtid.model import Grid
 from tests.flow_maps import machine, orifice, solved
 
 PROVENANCE = {"trace": "run.blf", "digest": "abc", "beta_pa": [7.1e8, 6.9e8]}
@@ -107,6 +110,63 @@ def test_an_independent_parser_takes_the_a2l_file(
     assert words.NumberValuePairs.Value == len(STATUS)
 
 
+AS_PYTHON = (  # of the lines of a function block
+    (r"\(\*.*?\*\)", ""), (r":=", "="), (r"^(\s*)WHILE (.*) DO", r"\1while \2:"),
+    (r"^(\s*)IF (.*) THEN", r"\1if \2:"), (r"<>", "!="), (r"END_(WHILE|IF);", ""), (r";", ""),
+    (r"\bAND\b", "and"), (r"\bOR\b", "or"), (r"^    ", ""),
+)  # fmt: skip
+
+
+def as_python(block: str) -> tuple[dict[str, list[float]], str]:
+    """Constants and statements of a function block, the statements as Python."""
+    tables = {
+        name: [float(x) for x in values.split(",")]
+        for name, values in re.findall(r"(\w+) : ARRAY\S* OF \w+ := \[([^\]]*)\];", block)
+    }
+    body = block.rpartition("END_VAR")[2].partition("END_FUNCTION_BLOCK")[0]
+    body = body.replace("\n        +", " +")
+    for pattern, text in AS_PYTHON:
+        body = re.sub(pattern, text, body, flags=re.MULTILINE)
+    return tables, body
+
+
+def test_structured_text_and_its_tables_are_the_map(
+    flowmap: FlowMap, grids: tuple[Gridded, ...], tmp_path: Path
+) -> None:
+    write_map(tmp_path / "maps.st", flowmap, PROVENANCE)
+    blocks = (tmp_path / "maps.st").read_text().split("FUNCTION_BLOCK RTID_")[1:]
+    rng = np.random.default_rng(2)
+    for edge, g, block in zip(flowmap.edges, grids, blocks, strict=True):
+        table = np.loadtxt(tmp_path / f"maps_{g.name}.csv", delimiter=",", skiprows=1)
+        np.testing.assert_allclose(table[:, 1:], g.flow_m3s, rtol=1e-8)
+        np.testing.assert_allclose(table[:, 0], g.u_v)
+        tables, body = as_python(block)
+        largest = np.abs(g.flow_m3s).max()
+        for u, dp in zip(rng.uniform(1.5, 8, 100), rng.uniform(-0.4e6, 7e6, 100), strict=True):
+            space: dict[str, Any] = {**tables, "u": u, "dp": dp}
+            space["LIMIT"] = lambda *three: sorted(three)[1]
+            exec(body, {}, space)
+            assert abs(space["q"] - edge.flow(u, dp)) < 1.1 * ERROR_SHARE * largest
+            assert STATUS[int(space["stands_on"])] in set(edge.status.ravel()) | {"shut"}
+
+
+def test_an_independent_parser_takes_structured_text(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A small map: the parser takes a hundredth of a second per number."""
+    blark = pytest.importorskip("blark.parse", reason="pip install 'rtid[dev]'")
+    grid = Grid(np.array([1.0, 4.0]), np.array([0.0, 1e6]))
+    theta = np.array([[[2e-4, 1e-4, 1e-4, 0, 0, 5e-5]]])
+    edge = EdgeMap("p-a", grid, 1.0, theta, np.zeros((1, 1, 6, 6)), np.full((1, 1), VALID), {})
+    monkeypatch.setattr(plc, "gridded", lambda flowmap: gridded(flowmap, 0.9))
+    write_map(tmp_path / "small.st", FlowMap((edge,)), {"trace": "a *) b"})
+    (block,) = blark.parse_source_code((tmp_path / "small.st").read_text()).transform().items
+    assert block.name == "RTID_p_a"
+    assert [type(part).__name__ for part in block.declarations] == [
+        "InputDeclarations", "OutputDeclarations", "VariableDeclarations", "VariableDeclarations",
+    ]  # fmt: skip
+
+
 PROBE = """
 model Probe
   Real u = 0.5 + 8 * time;
@@ -146,7 +206,7 @@ def test_maps_whose_names_a_format_cannot_tell_apart_are_refused(
     twins = FlowMap(
         tuple(replace(e, name=n) for e, n in zip(flowmap.edges, ("p-a", "p a"), strict=True))
     )
-    for suffix in (".a2l", ".mo"):
+    for suffix in (".a2l", ".mo", ".st"):
         with pytest.raises(RtidError, match="called p_a"):
             write_map(tmp_path / f"maps{suffix}", twins, PROVENANCE)
     assert not list(tmp_path.iterdir())

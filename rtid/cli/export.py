@@ -27,7 +27,7 @@ def export(
     output: Annotated[
         Path,
         typer.Argument(
-            help="File to write: .csv .json .npz .mat .m .dcm .cdfx .a2l .mo .h .fmu .mf4 .mcap."
+            help="File: .csv .json .npz .mat .m .dcm .cdfx .a2l .mo .st .h .fmu .mf4 .mcap."
         ),
     ],
     project: ProjectOption,

@@ -27,6 +27,7 @@ from rtid.maps.a2l import write_a2l
 from rtid.maps.calibration import write_cdfx, write_dcm
 from rtid.maps.matlab import write_m, write_mat
 from rtid.maps.modelica import write_mo
+from rtid.maps.plc import write_st
 from rtid.model import Grid
 from rtid.plain import FloatArray, plain
 from rtid.trace.state_files import read_bytes
@@ -235,4 +236,5 @@ WRITERS: dict[str, Writer] = {
     ".cdfx": write_cdfx,
     ".a2l": write_a2l,
     ".mo": write_mo,
+    ".st": write_st,
 }
