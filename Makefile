@@ -69,9 +69,10 @@ paper: $(READY)
 	.venv/bin/python -m benchmarks.paper --out out/paper; status=$$?; \
 	  .venv/bin/python -m tools.paper_pictures out/paper tools/pictures && exit $$status
 
-# The pictures of README; the first one is the page's, as `make screenshots` takes it.
+# The pictures of README and docs/tools.md; the first one is the page's, as `make screenshots` takes it.
 pictures: $(READY)
 	.venv/bin/python -m tools.readme_pictures tools/pictures
+	.venv/bin/python -m tools.tool_pictures tools/pictures
 	.venv/bin/python -m tools.screenshots out/screenshots tools/pictures
 
 $(READY): requirements.lock pyproject.toml

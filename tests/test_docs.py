@@ -19,6 +19,7 @@ from firmware_bridge.sources import blf_objects, slcan_lines, text
 from firmware_bridge.sources.formats import suffixes
 from rtid.cli import main
 from rtid.cli.exits import Exit
+from rtid.cli.export import RECORDED
 from rtid.cli.teaching import EXAMPLES, PANELS
 from rtid.daemon import wording
 from rtid.diagnose import verdict
@@ -161,6 +162,11 @@ def test_the_help_of_excite_names_every_limit() -> None:
     told = command("rtid excite")[0].help
     for name in ExciteSection.model_fields:
         assert re.sub(r"_(m|s|mps|pa|kg|n|v)$", "", name) in told, name
+
+
+def test_every_format_of_export_has_its_place_in_the_pages() -> None:
+    known = {*WRITERS, *RECORDED, ".fmu", ".h"}
+    assert known <= set(re.findall(r"`[^`\s]*?(\.\w+)`", (DOCS / "tools.md").read_text()))
 
 
 @pytest.mark.parametrize("page", sorted(path.name for path in DOCS.glob("*.md")))
