@@ -42,6 +42,8 @@ def read(path: Path) -> Frames | Table:
     blocks = Blocks(raw, Budget(path))
     try:
         frames = mf4_bus.read(blocks)
+    except LogError:  # too large, which is a ValueError too
+        raise
     except DAMAGE as error:
         why = error if isinstance(error, DamagedError) else "its index is damaged"
         raise LogError(f"{path}: {why}; copy the log again") from error
