@@ -56,6 +56,27 @@ def test_the_other_libraries_find_the_same_parameters() -> None:
         np.testing.assert_allclose(values, expected, atol=1e-6)
 
 
+def standing() -> FloatArray:
+    """One sample of the record held for BLOCK samples: no change of block hides what a row costs.
+
+    The swept sine changes blocks 20 times in 1,000 samples.
+    """
+    data = chunk(record())
+    held = np.repeat(data[ALL // 3 : ALL // 3 + 1], BLOCK, axis=0)
+    held[:, 0] = data[-1, 0] + 1e-3 * np.arange(1, BLOCK + 1)
+    return held
+
+
+def standing_jobs(machine: Machine) -> list[Job]:
+    """The joint update by C and by rtid over arrays, without changes of block."""
+    data, held, reference = chunk(record()), standing(), Reference()
+    by_c, by_arrays = (warmed(machine, data) for _ in range(2))
+    return [
+        Job(C_BY_HAND, lambda: reference.advance(by_c, held), BLOCK),
+        Job(ARRAYS, lambda: by_arrays.advance(held), BLOCK),
+    ]
+
+
 def joint_jobs(machine: Machine) -> list[Job]:
     """The joint update by C, by rtid over arrays and by rtid one sample at a time.
 
@@ -103,6 +124,13 @@ def test_update_of_one_block(benchmark: Any) -> None:
 def test_update_of_two_chambers(benchmark: Any) -> None:
     title = "Update, two chambers whitened jointly, four edges, 30 x 20 blocks per edge"
     side_by_side(benchmark, title, "sample", joint_jobs(model()), C_BY_HAND)
+
+
+@pytest.mark.parametrize("chambers", [1, 2])
+def test_update_without_changes_of_block(benchmark: Any, chambers: int) -> None:
+    machine = model() if chambers == 2 else one_chamber(model())
+    title = f"Update without changes of block, chambers: {chambers}"
+    side_by_side(benchmark, title, "sample", standing_jobs(machine), C_BY_HAND, rounds=60)
 
 
 def test_update_cold_inside_a_1_khz_loop(benchmark: Any) -> None:

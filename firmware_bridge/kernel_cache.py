@@ -24,8 +24,11 @@ from pathlib import Path
 from typing import Any
 
 from numba import config, njit
+from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler_lock import global_compiler_lock
 from numba.extending import is_jitted
+
+from firmware_bridge.kernel_parts import compiled_as
 
 WAIT_S = 120.0  # for another process that compiles the same: it may have been stopped
 
@@ -76,7 +79,8 @@ def _compile_once(kernel: Any, lock: Path) -> None:
     def compile_alone(signature: Any) -> Any:
         if isinstance(signature, tuple) and signature in kernel.overloads:
             return compiled(signature)
-        with global_compiler_lock, alone(lock):  # numba's first, in every thread
+        # numba's lock first, in every thread; a kernel that a part calls is still one for Python
+        with global_compiler_lock, alone(lock), compiled_as(JITCodeLibrary):
             return compiled(signature)
 
     kernel.compile = compile_alone

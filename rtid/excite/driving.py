@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rtid.kernels.engine import remember, set_step
-from rtid.kernels.free_run import BEYOND, OFF_GRID, interval, spools
+from rtid.kernels.free_run import BEYOND, OFF_GRID, STAGES, interval, spools
 from rtid.kernels.jit import kernel
 from rtid.kernels.layout import MAX_EDGES, MAX_SIGNALS
 from rtid.kernels.map_point import foot_width
@@ -83,7 +83,7 @@ def drive(
     p, now, slopes, foot = (
         np.zeros(2),
         np.zeros(MAX_SIGNALS + 1),
-        np.zeros((7, 2)),
+        np.zeros((STAGES + 1, 2)),
         np.ones(MAX_EDGES),
     )
     for i in range(e.n_edges):

@@ -23,7 +23,7 @@ from rtid.kernels.increments import (
     term_increments,
     windowed_increments,
 )
-from rtid.kernels.jit import inlined, kernel, part
+from rtid.kernels.jit import inlined, lean, part
 from rtid.kernels.layout import (
     BLOCK,
     BLOCK_CHANGES,
@@ -66,7 +66,7 @@ INSANE = 1e30  # no quantity in SI units is that large, and its square is still 
 SHUT, OUTSIDE = -1, -2  # cell of an edge that passes nothing / whose working point is off the grid
 
 
-@kernel
+@lean
 def advance(memory: Any, chunk: FloatArray) -> int:
     """Take samples, rows of chunk (n, 2 + signals): [t_s, flags, values...], SI units.
 

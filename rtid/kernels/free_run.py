@@ -85,7 +85,7 @@ def free_run(
     """
     e = engine[0]
     p, now = np.zeros(2), np.zeros(MAX_SIGNALS + 1)
-    foot, slopes = np.ones(MAX_EDGES), np.zeros((STAGES, 2))
+    foot, slopes = np.ones(MAX_EDGES), np.zeros((STAGES + 1, 2))
     for i in range(e.n_edges):
         foot[i] = foot_width(e, i, overlap)
     due, h = 0.0, 1.0
@@ -156,9 +156,10 @@ def interval(
 ) -> tuple[int, float]:
     """Integrate p (chambers,), in place, over one interval; its status and the next first step.
 
-    Time runs from 0 to 1 in units of the interval; h: first step to try.
+    Time runs from 0 to 1 in units of the interval; h: first step to try.  slopes (STAGES + 1, 2)
+    and now (signals + 1,) are scratch.
     """
-    s, h, code, trial = 0.0, min(1.0, h), INSIDE, np.zeros(2)
+    s, h, code, trial = 0.0, min(1.0, h), INSIDE, slopes[STAGES]
     for _ in range(MOST_STEPS):
         h = min(h, 1.0 - s)
         error = 0.0

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from numba import njit
-
+from firmware_bridge import kernel_parts
 from firmware_bridge.kernel_cache import cache_folder, cached
+from firmware_bridge.kernel_parts import UNCOUNTED
 
 # x / 0 is inf, as in numpy: a check and a branch less per division
 _OPTIONS = {"error_model": "numpy"}
@@ -21,11 +21,16 @@ def kernel(function: Callable[..., Any]) -> Any:
     return cached(_FOLDER, function, **_OPTIONS)
 
 
+def lean(function: Callable[..., Any]) -> Any:
+    """Compile an entry point that allocates nothing: no references are counted."""
+    return cached(_FOLDER, function, **_OPTIONS, **UNCOUNTED)
+
+
 def part(function: Callable[..., Any]) -> Any:
-    """Compile a function that kernels call and Python does not."""
-    return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS)(function)
+    """Compile a function that kernels call and Python does not; it allocates nothing."""
+    return kernel_parts.part(function, **_OPTIONS)
 
 
 def inlined(function: Callable[..., Any]) -> Any:
-    """Insert a function into the kernels that call it: a call costs more than what it does."""
-    return cached(_FOLDER, function, inline="always", **_OPTIONS)
+    """Insert a part into the kernels that call it: a call costs more than what it does."""
+    return kernel_parts.part(function, forceinline=True, **_OPTIONS)

@@ -73,7 +73,8 @@ def _removed(used: Any, n: int, at: int, L: Any, c: Any) -> None:
 @part
 def _solved(n: int, L: Any, c: Any, s: Any) -> None:
     """Multipliers s (n,) of the rows in use: L' s = c."""
-    s[:n] = c[:n]
+    for i in range(n):
+        s[i] = c[i]
     for i in range(n - 1, -1, -1):
         s[i] /= L[i, i]
         for k in range(i):

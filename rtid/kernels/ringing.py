@@ -45,7 +45,7 @@ def map_products(
     live, moving = np.empty(n_v, np.int64), np.empty(n_v, np.int64)
     is_live, moves = np.zeros(n_v, np.bool_), np.zeros(n_v, np.bool_)
     n_live, r = 0, 0
-    way = np.empty((2, 2))
+    way, both = np.empty((2, 2)), np.empty(TERMS)
     while r < rows:
         if fresh[r]:
             for n in range(n_live):
@@ -65,7 +65,7 @@ def map_products(
                     moves[v] = True
                     moving[n_moving] = v
                     n_moving += 1
-                _meet(v, terms[n], sign[v], M[r], way, moving[:n_moving], new, felt, gram)
+                _meet(v, terms[n], sign[v], M[r], way, moving[:n_moving], new, felt, gram, both)
             r += 1
         for a in range(n_moving):
             _ring(moving[a], felt[moving[a]], live[:n_live], d, gram)
@@ -157,10 +157,13 @@ def _meet(
     new: FloatArray,
     felt: FloatArray,
     gram: FloatArray,
+    both: FloatArray,
 ) -> None:
-    """Products of one entry with what blocks have added since the span began, and with itself."""
+    """Products of one entry with what blocks have added since the span began, and with itself.
+
+    both (6,) is scratch.
+    """
     m0, m1 = M[0] * s[0] + M[1] * s[1], M[1] * s[0] + M[2] * s[1]
-    both = np.empty(TERMS)
     for n in range(len(moving)):
         w = moving[n]
         for p in range(TERMS):
