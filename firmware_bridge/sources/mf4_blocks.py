@@ -23,6 +23,7 @@ PACKED = struct.Struct("<2sBxIQQ")  # kind inside, method, columns, size inside,
 DEFLATED, TRANSPOSED = 0, 1
 FIRST = 64  # where the header block stands
 UNFINISHED = b"UnFinMF "
+UNFINISHED_FLAGS, LAST_SIZE = 60, 4  # place of what the writer left undone; the last DT's size
 PLAIN = (b"##DT", b"##DV", b"##SD", b"##RD")
 
 
@@ -120,8 +121,9 @@ class Blocks:
     def _content(self, block: Block) -> tuple[bytes, bool]:
         """What a block of data holds, and whether that is all right."""
         if block.kind in PLAIN:
-            is_open = not self.is_finished and not block.data
-            return (self._raw[block.place + HEAD.size :] if is_open else block.data), True
+            return (
+                self._raw[block.place + HEAD.size :] if self._is_open(block) else block.data
+            ), True
         _, method, columns, size, _ = PACKED.unpack_from(block.data)
         if method not in (DEFLATED, TRANSPOSED):
             raise DamagedError(f"compressed by method {method} of MDF 4.3, which is not read")
@@ -133,6 +135,13 @@ class Blocks:
         if method == TRANSPOSED and columns:
             content = _transposed(content, columns)
         return content, engine.eof and len(content) == size
+
+    def _is_open(self, block: Block) -> bool:
+        """Whether a block goes on to the end of the file: its writer has not said its size."""
+        if self.is_finished or not block.data:
+            return not self.is_finished
+        (flags,) = struct.unpack_from("<H", self._raw, UNFINISHED_FLAGS)
+        return bool(flags & LAST_SIZE) and self._raw.rfind(b"##DT") == block.place
 
     def _is_cut(self, block: Block) -> bool:
         return block.place + HEAD.unpack_from(self._raw, block.place)[1] > len(self._raw)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+import struct
 import subprocess
 import sys
 from collections import Counter
@@ -124,6 +125,9 @@ def test_cut_real_capture_keeps_what_stands_before(shared: Path, tmp_path: Path)
         shares.append(len(part) / ((cut - first) / size))
     print(f".mf4, index first: {N} cuts, kept >= {100 * min(shares):.1f} %, 0 wrong")
     assert min(shares) >= 0.995
+    place = raw.rfind(b"##DT")  # a size that the logger wrote some time before it was cut
+    path.write_bytes(raw[: place + 8] + struct.pack("<Q", 5000) + raw[place + 16 :])
+    assert rows(open_log(path)) == good
     path.write_bytes(raw[: first - 5000])
     with pytest.raises(LogError, match="truncated"):
         open_log(path)
