@@ -12,7 +12,7 @@ import pytest
 from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.published import publish
 from rtid.maps.datasheet import read_reference
-from rtid.maps.files import SCHEMA, MapFileError, read_map, write_map
+from rtid.maps.files import SAYS_FLOW, SCHEMA, MapFileError, read_map, write_map
 from tests.flow_maps import machine, orifice, solved
 
 PROVENANCE = {"trace": "run.blf", "digest": "abc"}
@@ -47,6 +47,15 @@ def test_a_map_without_safe_band_round_trips(tmp_path: Path, suffix: str) -> Non
     flowmap = publish(solved(model, orifice, np.random.default_rng(0)))
     write_map(tmp_path / f"map{suffix}", flowmap, {})
     assert read_map(tmp_path / f"map{suffix}")[0][0].safe_band_v == -np.inf
+
+
+@pytest.mark.parametrize("suffix", SAYS_FLOW)
+def test_a_format_that_cannot_say_the_unit_of_a_rate_is_refused(
+    flowmap: FlowMap, tmp_path: Path, suffix: str
+) -> None:
+    with pytest.raises(MapFileError, match="the map is in m/s"):
+        write_map(tmp_path / f"map{suffix}", flowmap, PROVENANCE | {"flow_unit": "m/s"})
+    assert not list(tmp_path.iterdir())
 
 
 def test_json_says_what_it_holds(flowmap: FlowMap, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
@@ -133,6 +134,9 @@ def test_every_command_takes_it(crane: tuple[Crane, Path, Path], folder: Path) -
     said("undo", "-p", project)
     said("export", table, folder / "jib_map.csv", "-p", project)
     assert '"flow_unit": "m/s"' in (folder / "jib_map.csv").read_text()
+    said("export", table, folder / "jib_map.fmu", "-p", project, "--map")
+    with ZipFile(folder / "jib_map.fmu") as archive:
+        assert 'unit="m/s"' in archive.read("modelDescription.xml").decode()
 
 
 def test_neutral_is_found_anew_in_each_record(

@@ -13,6 +13,7 @@ import pytest
 from firmware_bridge.sources import read_table
 from rtid.cli import main
 from rtid.errors import RtidError
+from rtid.estimator.estimator import Estimator
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import SimulatedPlant
@@ -89,10 +90,17 @@ def test_a_missing_library_and_a_snapshot_are_refused_in_words(
     monkeypatch.setitem(sys.modules, "mcap.writer", None)
     with pytest.raises(RtidError, match="needs mcap"):
         write_recorded(tmp_path / "out.mcap", study, ORIGIN)
-    snapshot, project = tmp_path / "run.npz", study.project
+    snapshot, empty, project = tmp_path / "run.npz", tmp_path / "empty.npz", study.project
     save_snapshot(snapshot, study.replay.live, project.digest)
-    words = ["export", str(snapshot), str(tmp_path / "out.mf4"), "-p", str(project.path)]
-    with pytest.raises(SystemExit) as ended:
-        main.run(words)
-    assert ended.value.code and "export from a trace" in capsys.readouterr().err
-    assert [p.name for p in tmp_path.iterdir()] == ["run.npz"]
+    save_snapshot(empty, Estimator(project.model), project.digest)
+    for source, output, words, reason in (
+        (snapshot, "out.mf4", [], "export from a trace"),
+        (snapshot, "out.fmu", ["--fmi", "1"], "no FMI 1"),
+        (empty, "out.fmu", [], "no block of its maps stands on data"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            main.run(
+                ["export", str(source), str(tmp_path / output), "-p", str(project.path), *words]
+            )
+        assert ended.value.code and reason in " ".join(capsys.readouterr().err.split())
+    assert {p.name for p in tmp_path.iterdir()} == {"run.npz", "empty.npz"}

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from rtid.study.study import Study
 
 SNAPSHOT = ".npz"
+COMPLETE = (".json", ".npz", ".csv")  # for programs that read what a map stands on
 RECORDED = (".mf4", ".mcap")
 
 
@@ -52,12 +53,14 @@ def export(
     .mf4 and .mcap hold the record: signals, residual, block and status over time, estimates.
     From a trace the maps are learned beside the effects that `rtid add` has added, whose flow is
     not in them; a snapshot holds the maps as they were learned, on board beside those that can run
-    live.  Exit code 4: what was learned is impossible, and nothing is written without --force.
+    live.  Exit code 4: what was learned is impossible, or no block stands on data (but in .json,
+    .npz and .csv), and nothing is written without --force.
     """
     from rtid.errors import RtidError
     from rtid.maps.c_header import SUFFIX, write_header
     from rtid.maps.files import formats, provenance, write_map
     from rtid.maps.fmu import SUFFIX as FMU
+    from rtid.maps.fmu import check_version
     from rtid.maps.prior_map import find_prior, said_of, with_prior
     from rtid.project import load
 
@@ -65,6 +68,7 @@ def export(
     if output.suffix.lower() not in known:
         remedy = f"end its name in {', '.join(known)}"
         raise RtidError(f"{output}: unknown format", remedy, exit_code=2)
+    check_version(fmi)
     loaded = with_prior(load(project), prior_map)
     prior = find_prior(loaded)
     learned = _learned(loaded, source)
@@ -73,6 +77,13 @@ def export(
         raise RtidError(
             f"{source}: not exported, {'; '.join(doubt.text for doubt in invalid)}",
             "--force writes it all the same",
+            exit_code=4,
+        )
+    cells = {e.name: int((e.status == "valid").sum()) for e in flowmap.edges}
+    if not (any(cells.values()) or prior or force or output.suffix.lower() in COMPLETE):
+        raise RtidError(
+            f"{source}: not exported, no block of its maps stands on data",
+            f"`rtid check` says what motion is missing; {', '.join(COMPLETE)} or --force write it",
             exit_code=4,
         )
     origin = provenance(solution, loaded.name, loaded.digest, source.name, effects)
@@ -89,7 +100,6 @@ def export(
         write_recorded(output, learned.study, origin)
     else:
         write_map(output, flowmap, origin)
-    cells = {e.name: int((e.status == "valid").sum()) for e in flowmap.edges}
     if as_json:
         document = {"schema": 1, "written": str(output), "valid_blocks": cells, "effects": effects}
         print(json.dumps(document))

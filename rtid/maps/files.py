@@ -34,6 +34,8 @@ from rtid.trace.state_files import read_bytes
 
 SCHEMA = "rtid-flowmap/1"
 PLUGINS = "rtid.export"  # entry points of other packages: suffix = function, as in WRITERS
+FLOW_UNIT = "m3/s"
+SAYS_FLOW = (".mat", ".m", ".dcm", ".cdfx", ".a2l", ".mo", ".st")  # these cannot say another unit
 MAP_FILES = (".json", ".npz")  # what comes back with `read_map`
 UNITS = {"u_v": "V", "dp_pa": "Pa", "theta_m3s": "m3/s", "cov_m6s2": "m6/s2"}
 BASIS = "Taylor: 1, xi, eta, xi^2, eta^2, xi eta; xi and eta run from -1 to 1 over each block"
@@ -52,9 +54,18 @@ def write_map(path: str | Path, flowmap: FlowMap, provenance: Mapping[str, Any])
     write = writer_of(path.suffix.lower())
     if write is None:
         raise MapFileError(f"{path}: unknown format", f"end the name in {', '.join(formats())}")
+    unit = provenance.get("flow_unit", FLOW_UNIT)
+    if unit != FLOW_UNIT and path.suffix.lower() in SAYS_FLOW:
+        raise MapFileError(
+            f"{path}: this format says L/min or m3/s, and the map is in {unit}",
+            "write .csv, .json, .npz or .fmu",
+        )
     temporary = path.with_name(path.name + ".part")
-    write(temporary, flowmap, provenance)
-    os.replace(temporary, path)
+    try:
+        write(temporary, flowmap, provenance)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def formats() -> tuple[str, ...]:
@@ -107,7 +118,7 @@ def provenance(
     """
     known: dict[str, Any] = {} if effects is None else {"effects": list(effects)}
     units = {chamber.unit for chamber in solution.model.chambers}
-    if units != {"m3/s"}:  # what stands in the columns of flows
+    if units != {FLOW_UNIT}:  # what stands in the columns of flows
         known["flow_unit"] = "+".join(sorted(units))
     return known | {
         "program": f"rtid {rtid.__version__}",

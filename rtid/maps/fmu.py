@@ -76,8 +76,7 @@ def write_fmu(
 
     dynamics: None for the map alone.  Raises NoFmuError, NoTableError, OSError.
     """
-    if version not in VERSIONS:
-        raise NoFmuError(f"there is no FMI {version} here", "--fmi 2 or --fmi 3")
+    check_version(version)
     _check(model, dynamics)
     header, variables = _model(model, flowmap, dynamics, error_percent)
     token = hashlib.sha256(header.encode()).hexdigest()
@@ -94,9 +93,18 @@ def write_fmu(
         )
         has_binary = _compiled(root, version)
         part = path.with_name(path.name + ".part")
-        _pack(root, part)
-        part.replace(path)
+        try:
+            _pack(root, part)
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
     return has_binary
+
+
+def check_version(version: int) -> None:
+    """NoFmuError for a version of FMI that is not written."""
+    if version not in VERSIONS:
+        raise NoFmuError(f"there is no FMI {version} here", "--fmi 2 or --fmi 3")
 
 
 def _check(model: Machine, dynamics: Dynamics | None) -> None:
@@ -238,7 +246,8 @@ def _variables(model: Machine, dynamics: Dynamics | None, used: set[str]) -> Ite
     for word, about in (("", "flow"), ("_low", "95 % interval"), ("_high", "95 % interval")):
         for edge in model.edges:
             text = f"{about} of edge {edge.name}"
-            yield FmuVariable(f"Q_{edge.name}{word}", at, "output", "m3/s", text)
+            unit = next((c.unit for c in model.chambers if edge.sign(c)), "m3/s")
+            yield FmuVariable(f"Q_{edge.name}{word}", at, "output", unit, text)
             at += 1
     for edge in model.edges:
         text = f"what Q_{edge.name} stands on: 0 data, 1 shut, 2 few data, 3 the orifice law, "

@@ -121,8 +121,11 @@ def write_recorded(path: Path, study: Study, provenance: Mapping[str, Any]) -> N
         raise RtidError(f"{path}: needs {module.split('.')[0]}", f"pip install '{extra}'") from None
     start_us = int(study.trace.samples.t_us[0])
     part = path.with_name(f".{path.stem}.part{path.suffix}")
-    WRITERS[path.suffix.lower()](part, groups_of(study), start_us, json.dumps(dict(provenance)))
-    os.replace(part, path)
+    try:
+        WRITERS[path.suffix.lower()](part, groups_of(study), start_us, json.dumps(dict(provenance)))
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def _write_mf4(path: Path, groups: tuple[RecordedGroup, ...], start_us: int, about: str) -> None:
