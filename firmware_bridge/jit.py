@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from firmware_bridge import kernel_parts
 from firmware_bridge.kernel_cache import cache_folder, cached
 
 Record = Any  # one row of a structured array
@@ -32,4 +32,4 @@ def kernel(function: Callable[..., Any]) -> Any:
 
 def inlined(function: Callable[..., Any]) -> Any:
     """Compile a part of a kernel; always inlined."""
-    return kernel_parts.part(function, forceinline=True)
+    return njit(forceinline=True, no_cfunc_wrapper=True)(function)
