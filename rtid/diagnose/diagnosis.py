@@ -24,6 +24,7 @@ from rtid.diagnose.trials import (
     AcceptedEffect,
     Trial,
     TrialState,
+    is_at_a_bound,
     material_share,
     own_share,
     physical,
@@ -128,6 +129,7 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
     """Add the best cause that is significant and material; None when there is none.
 
     Material is what the held-out residual shows, or what the maps have taken in (`consequence`).
+    One that ends at a bound of its page and leaves misfit is of another form: it is passed over.
     One that changes next to nothing is only listed, unless it explains a part of the misfit that
     would be found in another guise.
     """
@@ -140,11 +142,15 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
             return None
         trial, alike = contest(state, present, best, trials)
         now = with_covariances(carried_on(state, present, trial), like=present)
+        if now.rho >= most_rho(now) and not trial.is_timing and is_at_a_bound(now):
+            continue
         after = residual(now, state.held_out)
         own = own_share(now, trial, state.held_out)
         share = min(material_share(last, after), BENT * own)
         is_shown = share >= MATERIAL
-        does = None if is_shown else taken_in(present, now, trial, own, last, after)
+        does = None
+        if not (is_shown or is_form_of_another(state, trial.key)):
+            does = taken_in(present, now, trial, own, last, after)
         if is_shown or does is not None:
             kept, after = _with_bank(state, now)
             what = trial.key, alike, trial.gain, trial.n_parameters
@@ -172,6 +178,15 @@ def taken_in(
     misfit = present.held.sse - present.regression.dof
     is_needed = present.rho >= most_rho(present) and trial.gain > SHARE * misfit
     return does if (does.is_material or is_needed) and is_stable(now, trial) else None
+
+
+def is_form_of_another(state: TrialState, key: Key) -> bool:
+    """True for a cause that was not told from one that was found.
+
+    Beside it, what it takes is what the other's form misses: a gap that widens with pressure was
+    named a leak, and a relief valve too.
+    """
+    return any(key in f.alike for f in state.found)
 
 
 def _with_bank(state: TrialState, now: Fit) -> tuple[Fit, Residual]:

@@ -131,6 +131,14 @@ def best_by_key(
     return best
 
 
+def is_at_a_bound(now: Fit) -> bool:
+    """True where a form of the last effect has ended at an end of its page's range; 0 is none."""
+    effect = now.revision.effects[-1]
+    pages = {p.name: p for p in effect.law.parameters}
+    known = [(pages.get(name), v) for name, v in zip(effect.shape_names, effect.shape, strict=True)]
+    return any(p and (v > 0.99 * p.high or 0.0 < v < 1.01 * p.low) for p, v in known)
+
+
 def physical(fit_: Fit, candidate: Candidate, value: float) -> float:
     """A coefficient as the effect's parameter.
 

@@ -20,12 +20,15 @@ DURATION_S, HELD_OUT_S = 40.0, 30.0
 
 @cache
 def record(
-    effect: str = "", strength: float = 0.0, seed: int = 3, motion: str = "rich"
+    effect: str = "", strength: float = 0.0, seed: int = 3, motion: str = "rich", where: str = ""
 ) -> tuple[Machine, FloatArray, FloatArray]:
-    """Model, identification and held-out part of a random machine with a hidden effect."""
+    """Model, identification and held-out part of a random machine with a hidden effect.
+
+    where: "" for its first place.
+    """
     plant = draw(seed)
     if effect:
-        plant = hide(plant, effect, strength)
+        plant = hide(plant, effect, strength, where)
     run = simulate(plant, motion, seed, DURATION_S)
     model = declared_model(plant, seed=seed, grid=grid(plant.p_supply_pa))
     chunk = to_chunk(model, run.samples, 0)

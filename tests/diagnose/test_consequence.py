@@ -9,11 +9,12 @@ import pytest
 
 from rtid.diagnose import consequence as evidence
 from rtid.diagnose.consequence import Consequence, finer, is_stable
-from rtid.diagnose.diagnosis import Result, search
+from rtid.diagnose.diagnosis import Result, is_form_of_another, search
 from rtid.diagnose.experiment import FLOW, would_separate
 from rtid.diagnose.report import Diagnosis, diagnosis
-from rtid.diagnose.trials import Trial
+from rtid.diagnose.trials import Trial, TrialState
 from rtid.diagnose.verdict import MATERIAL
+from rtid.plain import silent
 from rtid.tell.diagnosed import sentences
 from tests.diagnose.records import record
 
@@ -86,6 +87,15 @@ def test_a_size_must_be_that_of_both_halves_and_of_a_finer_grid(
     monkeypatch.setattr(evidence, "_size", lambda *_: next(told))
     last, accepted = result.last, result.found[0]
     assert is_stable(last, Trial(accepted.key, accepted.gain, last.revision)) == is_believed
+
+
+def test_the_form_of_what_was_found_is_no_effect_of_its_own(result: Result) -> None:
+    """A cause that could not be told from another is not named beside it for what that leaves."""
+    relief, other = ("relief_valve", "b"), ("relief_valve", "a")
+    leak = replace(result.found[0], alike=(relief,))
+    state = TrialState(result.last.declared, result.last.chunk, result.last.chunk, silent, [leak])
+    assert is_form_of_another(state, relief)
+    assert not is_form_of_another(state, other)
 
 
 @pytest.mark.parametrize("seed", [3, 4, 5])

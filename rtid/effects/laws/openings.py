@@ -18,7 +18,7 @@ from rtid.effects.record_view import RecordView
 OPENINGS = 8  # opening pressures that are tried, over the range
 OWN_TIMES_S = (0.0, 0.02, 0.06)
 SHUT, RARE = 0.1, 0.998  # quantiles of the pressure: one that never shuts is a leak
-MAKEUP_PA = 1.5e6  # a make-up valve feeds from the tank line: it opens at low pressure
+MAKEUP_PA = 6e6  # a make-up valve feeds from the tank line, or from a charge line of some MPa
 HYSTERESIS = 0.04  # of the highest pressure: where the search begins
 
 
