@@ -3,7 +3,8 @@
 A free map swallows what is nearly a function of (u, dp): a leak of a tenth of the flow may leave a
 held-out residual at the sensors' floor, and a map that is as much wrong.  So an effect matters by
 its consequence.  It is believed where it is *stable*: the sizes from two halves of the record, and
-from a grid of half the spacing, agree with the size from all of it.
+from a grid of half the spacing, agree with the size from all of it within their joint 95 %, or a
+tenth.
 
     bend of a map = rms(Q_without - Q_with) / largest Q_with,  over the intervals of the record
 """
@@ -26,7 +27,10 @@ from rtid.units import Z95
 OWN = 0.01  # of the rms flow: an effect's own flow from which it matters
 BEND = 0.01  # of its largest flow: a map's move
 SOFTER = 0.01  # of the modulus: its move, if beyond its 95 % interval without the effect
-ALIKE = 0.1  # of the size: within so much, two sizes agree whatever their intervals say
+# of the size: within so much, two sizes agree whatever their intervals say, which do not know that
+# a law is not quite the catalogue's.  The halves of a leak whose gap widens with pressure were 3 %
+# apart, 3.8 of their joint standard deviations; without this it was not named at all
+ALIKE = 0.1
 PART = 0.5  # of the record, each of the two
 
 
