@@ -6,6 +6,7 @@ are written as they come, beside the job in work: a kill must not cost what a so
 
 from __future__ import annotations
 
+import math
 import os
 import sqlite3
 import sys
@@ -15,7 +16,7 @@ from collections import Counter, deque
 from collections.abc import Callable
 from pathlib import Path
 from queue import Queue
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from rtid.compare.suspects import LikelyCause
 from rtid.daemon import jobs
 from rtid.daemon.chronicle import Chronicle
 from rtid.daemon.first import against_first
-from rtid.daemon.guard import PROOF, Guard, candidate_of
+from rtid.daemon.guard import PROOF, TRUST, Guard, candidate_of
 from rtid.daemon.map_check import Judge
 from rtid.daemon.offering import Offering
 from rtid.daemon.pipe import Pipe
@@ -47,7 +48,6 @@ NICE = 5
 MAP_FILE = "map.npz"
 KEPT = 3  # handovers that can be recalled
 CLEAN_S = 2.0  # a handover must be older than a suspicion by the piece in which that began
-RESTORED_PAUSE, LONGEST_PAUSE = 60, 600  # seconds of motion between two writes of the baseline
 FIRST_S = 60.0  # of samples that a first map is checked by
 QUEUED_BYTES = 16 << 20  # of jobs taken from the pipe while one is in work
 FLOOD_S = 10.0  # the same refusal of the disk is told at most this often
@@ -104,11 +104,9 @@ class Analyst:
         self._guard: Guard | None = None
         self._baseline: Estimator | None = None
         self._is_named = True  # what contradicts the baseline, if something does
-        self._has_baseline = False  # that this process has written
-        self._stored, self._pause = 0, PROOF  # `Guard.judged` of the last time, and until the next
-        self._next: tuple[jobs.Handover, CandidateMap, int] | None = (
-            None  # with `Guard.judged` then
-        )
+        self._next: tuple[jobs.Handover, CandidateMap] | None = None  # to become the baseline
+        self._waiting_s: float | None = None  # newest sample of a snapshot not yet trusted
+        self._trusted_s = -math.inf  # ... of the one on the disk that is
         self._first: deque[FloatArray] = deque()  # samples of a first map
         self._shadow: Shadow | None = None  # of a baseline that is lost
 
@@ -124,7 +122,7 @@ class Analyst:
         job = jobs.Handover(0, result.estimator, publish=True, store=False)
         candidate = self._tell(job)
         assert candidate is not None, "only a first map can be refused"
-        self._baseline, self._pause = result.estimator, RESTORED_PAUSE
+        self._baseline, self._trusted_s = result.estimator, _newest_s(result.estimator)
         known = None if level is None else np.array(level)
         share = float(result.notes.get("known_share", 0.0))
         self._guard = Guard(self._project.model, candidate, known, "proving", share)
@@ -172,15 +170,26 @@ class Analyst:
         """As the state to go on with, or beside the baseline that has not proven itself yet."""
         guard = self._guard
         if guard is None or guard.state == "proven" or not job.is_proving:
-            return self._generations.save(job.estimator, not job.is_last)
+            path = self._generations.save(job.estimator, not job.is_last, _notes(guard))
+            if guard is not None and guard.state == "proven":
+                self._await_trust(path, _newest_s(job.estimator))
+            return path
         if guard.state == "contradicted":  # meanwhile: what it has learned is not to be kept
             return self._generations.baseline_path
         notes = {"proof": guard.progress}
         return self._generations.save_shadow(job.estimator, notes, not job.is_last)
 
+    def _await_trust(self, path: Path, newest_s: float) -> None:
+        """Keep a snapshot until the motion behind it shows that no fault was learned into it."""
+        if self._waiting_s is None or newest_s < self._waiting_s:  # the clock was set
+            self._generations.await_trust(path)
+            self._waiting_s = newest_s
+
     def close(self) -> None:
-        """Close the files; the newest baseline is on the disk."""
-        if self._has_baseline:
+        """Close the files; the newest estimate that can be trusted is the baseline on the disk."""
+        trusted = [job.estimator for job in self._handed if self._is_trusted(job.estimator)]
+        if trusted and _newest_s(trusted[-1]) > self._trusted_s:
+            self._baseline = trusted[-1]
             self._store_baseline()
         if self._recorder is not None:
             self._recorder.close()
@@ -228,13 +237,26 @@ class Analyst:
                 self._answer(words)
         if guard.level is not None and not had_level:
             self._store_baseline()
-        if self._next is not None and guard.is_calm and guard.judged - self._next[2] >= PROOF:
-            job, candidate, _ = self._next
-            self._next, self._baseline = None, job.estimator
-            guard.follow(candidate)
-            if guard.judged - self._stored >= self._pause:
-                self._pause = min(2 * self._pause, LONGEST_PAUSE)
-                self._store_baseline()
+        waiting_s = self._waiting_s
+        if waiting_s is not None and guard.is_calm_behind(waiting_s, TRUST):
+            self._trust(waiting_s)
+        if self._next is not None:
+            job, candidate = self._next
+            if guard.is_calm_behind(_newest_s(job.estimator), PROOF):
+                self._next, self._baseline = None, job.estimator
+                guard.follow(candidate)
+
+    def _is_trusted(self, estimator: Estimator) -> bool:
+        """Whether the motion behind what it has learned shows no fault."""
+        return self._guard is not None and self._guard.is_calm_behind(_newest_s(estimator), TRUST)
+
+    def _trust(self, newest_s: float) -> None:
+        """What was saved before this motion goes on being published after a kill."""
+        with self._disk:
+            if self._waiting_s == newest_s:  # no other one was saved meanwhile
+                self._guarded("baseline", self._generations.trust)
+                self._guarded("points", lambda: self._generations.keep("publish"))
+                self._trusted_s, self._waiting_s = newest_s, None
 
     def _lead(self, guard: Guard, shadow: Shadow, chunk: FloatArray) -> bool:
         """Whether what was learned in the shadow takes the place of a baseline that is lost."""
@@ -261,6 +283,8 @@ class Analyst:
         if guard.state == "contradicted":
             self._next = None
             with self._disk:
+                self._waiting_s = None
+                self._guarded("snapshot", self._generations.distrust)
                 self._guarded("snapshot", self._generations.drop_shadow)
             self._guarded("points", lambda: self._generations.keep("alarm"))
             words = _foretold("contradicted", guard, guard.causes())
@@ -271,13 +295,11 @@ class Analyst:
 
     def _store_baseline(self) -> None:
         """Write the baseline with its level, and now and then a point in time."""
-        guard, baseline = self._guard, self._baseline
-        if guard is None or baseline is None:
+        baseline, notes = self._baseline, _notes(self._guard)
+        if baseline is None:
             return
-        level = None if guard.level is None else guard.level.tolist()
-        notes = {"level_m3s": level, "known_share": guard.known_share, "unix_s": time.time()}
-        self._stored, self._has_baseline = guard.judged, True
         with self._disk:
+            self._trusted_s = _newest_s(baseline)
             self._guarded("baseline", lambda: self._generations.save_baseline(baseline, notes))
             self._guarded("points", lambda: self._generations.keep("publish"))
 
@@ -316,6 +338,7 @@ class Analyst:
         self._guard = self._baseline = self._next = self._shadow = None
         self._answer(jobs.Recalled(estimator, is_accepted=True))
         with self._disk:
+            self._waiting_s = None
             self._guarded("snapshot", lambda: self._generations.set_aside("accept"))
             self._guarded("snapshot", lambda: self._generations.save(estimator))
         self._guarded("history", lambda: self._history().note_acceptance(job.acceptance))
@@ -335,7 +358,7 @@ class Analyst:
             self._baseline = job.estimator  # the first maps: each is known for more places
             self._guard.follow(candidate)
         elif self._next is None:
-            self._next = job, candidate, self._guard.judged
+            self._next = job, candidate
 
     def _tell(self, job: jobs.Handover) -> CandidateMap | None:
         """Solve, judge from now on, and publish; None for a first map that cannot be."""
@@ -427,6 +450,14 @@ def _foretold(
 def _newest_s(estimator: Estimator) -> float:
     """Time of the newest sample that was learned."""
     return float(estimator.state.engine[0]["t_s"])
+
+
+def _notes(guard: Guard | None) -> dict[str, Any]:
+    """What a start has to know of a baseline, for JSON."""
+    if guard is None:
+        return {}
+    level = None if guard.level is None else guard.level.tolist()
+    return {"level_m3s": level, "known_share": guard.known_share, "unix_s": time.time()}
 
 
 def edges_of(estimator: Estimator, solution: Solution, flow_map: FlowMap) -> tuple[EdgeHealth, ...]:

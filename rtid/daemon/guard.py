@@ -9,6 +9,7 @@ not keep out of all that it knows.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping
 from itertools import pairwise
@@ -40,6 +41,7 @@ from rtid.plain import FloatArray
 PIECE_S = 2.0  # of samples that are judged at once
 KEPT = 60  # seconds of motion that are looked back on
 PROOF = 20  # ... that must have been foretold
+TRUST = 4  # ... behind a snapshot that goes on being published after a kill
 ENOUGH = 60  # ... after which a map that is not known there must not hold up the learning
 LEVEL = 30  # ... that make a level
 SURE = 10  # ... among the newest samples that must move as declared
@@ -82,10 +84,11 @@ class Guard:
         self._alarm_s, self._due = 0.0, 0  # of the contradiction; `_moved` to look for causes again
         self._is_sure = False  # there is motion enough for that
         self.has_foretold = False  # and was not merely known too little
-        self.judged = 0  # seconds of motion since the beginning that the map was known for
-        self._moved = 0  # ... all of them
+        self._moved = 0  # seconds of motion since the beginning
+        self._moved_s = -math.inf  # the newest of them: a piece may end within it
         self._counts: deque[tuple[int, int]] = deque(maxlen=COUNTED)  # rows in motion, known ones
         self._rows: Residuals | None = None
+        self._weighed: tuple[Residuals, FloatArray | None, Seconds] | None = None  # `_window`
         self._pieces: list[FloatArray] = []
         self._recent: list[FloatArray] = []  # samples for the causes
 
@@ -107,6 +110,7 @@ class Guard:
             return False
         if self._pieces and chunk[0, 0] < self._pieces[-1][-1, 0]:  # the clock was set
             self._pieces, self._recent, self._rows = [], [], None
+            self._moved_s = -math.inf
         self._pieces.append(chunk)
         first_s, last_s = self._pieces[0][0, 0], chunk[-1, 0]
         if last_s - first_s < PIECE_S + WARM_S:
@@ -124,11 +128,11 @@ class Guard:
         rows = self._rows
         parts = {} if rows is None else {name: part.tolist() for name, part in vars(rows).items()}
         counts = [list(count) for count in self._counts]
-        return {"judged": self.judged, "moved": self._moved, "counts": counts, "rows": parts}
+        return {"moved": self._moved, "counts": counts, "rows": parts}
 
     def resume(self, progress: Mapping[str, Any]) -> None:
         """Go on with the `progress` of a process that was ended; times are those of its samples."""
-        self.judged, self._moved = int(progress["judged"]), int(progress["moved"])
+        self._moved = int(progress["moved"])
         self._counts.extend((int(moved), int(known)) for moved, known in progress["counts"])
         if parts := progress["rows"]:
             self._rows = Residuals(**{name: np.array(part) for name, part in parts.items()})
@@ -162,10 +166,12 @@ class Guard:
         """Whether it can say nothing of all that motion, for it or against it."""
         return self.state == "proving" and self.has_seen_much and not self._window().cusum[0]
 
-    @property
-    def is_calm(self) -> bool:
-        """Whether nothing speaks against the baseline at the moment."""
-        return self.state == "proven" and self._window().cusum[0] == 0.0
+    def is_calm_behind(self, t_s: float, n: int) -> bool:
+        """Whether so many seconds of motion behind a time speak in no way against the baseline."""
+        if self.state != "proven":
+            return False
+        window = self._window()
+        return window.cusum[0] == 0.0 and int((window.t_s >= t_s).sum()) >= n
 
     @property
     def known_share(self) -> float:
@@ -180,7 +186,9 @@ class Guard:
 
     def _judge(self, piece: FloatArray) -> bool:
         every = moving(self._model, residuals(self._model, self._candidate, piece))
-        self._moved += len(np.unique(np.floor(every.t_s)))
+        second = np.unique(np.floor(every.t_s))
+        self._moved += int((second > self._moved_s).sum())
+        self._moved_s = max([self._moved_s, *second])
         self._counts.append((len(every.t_s), int(every.known.sum())))
         recent = self.newest
         moved = sum(count > 0 for count, _ in [*self._counts][-len(self._recent) :])
@@ -189,7 +197,6 @@ class Guard:
         rows = in_motion(self._model, every)
         self._rows = rows if self._rows is None else self._rows + rows
         window = self._window()
-        self.judged += len(np.unique(np.floor(rows.t_s)))
         if len(window.t_s) > KEPT:
             self._rows = self._rows.since(window.t_s[-KEPT])
         if self.level is None and self.state == "proven" and self._can_measure():
@@ -240,9 +247,12 @@ class Guard:
         return self._is_sure and self.has_seen_much and len(window.t_s) < PROOF and usual
 
     def _window(self) -> Seconds:
-        if self._rows is None:
+        rows, level = self._rows, self.level
+        if rows is None:
             return Seconds(np.empty(0), np.empty((0, len(self._model.chambers))))
-        return seconds(self._model, self._rows, self._level)
+        if self._weighed is None or self._weighed[0] is not rows or self._weighed[1] is not level:
+            self._weighed = rows, level, seconds(self._model, rows, self._level)
+        return self._weighed[2]
 
     def _can_measure(self) -> bool:
         return len(self._window().t_s) >= LEVEL

@@ -29,7 +29,7 @@ from rtid.estimator.state import State, Weights
 from rtid.estimator.sums import Sums
 from rtid.model import Machine
 from rtid.trace import points
-from rtid.trace.state_files import made_folder, read_bytes, write_whole
+from rtid.trace.state_files import made_folder, name_also, read_bytes, rename, write_whole
 
 SCHEMA = 4
 RELEARN = "learn again with `rtid replay` or `rtid run`"
@@ -194,7 +194,12 @@ class Generations:
         """Where the snapshot of this number goes."""
         return self.folder / f"state-{serial % 2}.npz"
 
-    def save(self, estimator: Estimator, if_changed: bool = False) -> Path:
+    def save(
+        self,
+        estimator: Estimator,
+        if_changed: bool = False,
+        notes: Mapping[str, Any] | None = None,
+    ) -> Path:
         """Replace the older one; OSError where the disk does not take it.
 
         if_changed: not where the maps' sums are those of the last one, as at standstill.
@@ -206,7 +211,7 @@ class Generations:
             self._serial = max((serial for serial, _ in self._whole()[0]), default=0)
         made_folder(self.folder)
         path = self.path(self._serial + 1)
-        save(path, estimator, self._digest, self._serial + 1)
+        save(path, estimator, self._digest, self._serial + 1, notes)
         self._serial, self._seal = self._serial + 1, seal
         self.drop_shadow()
         return path
@@ -249,6 +254,23 @@ class Generations:
         made_folder(self.folder)
         save(self.baseline_path, estimator, self._digest, notes=notes)
 
+    def await_trust(self, path: Path) -> None:
+        """Keep a snapshot, which is soon written over, until it is known whether to trust it."""
+        name_also(path, self._waiting_path)
+
+    def trust(self) -> None:
+        """Make the snapshot that is kept so the baseline: no byte is written again; OSError."""
+        rename(self._waiting_path, self.baseline_path)
+        self.distrust()  # two names of one file: neither was renamed
+
+    def distrust(self) -> None:
+        """Let the snapshot that is kept so go; OSError."""
+        self._waiting_path.unlink(missing_ok=True)
+
+    @property
+    def _waiting_path(self) -> Path:
+        return self.folder / "waiting.npz"
+
     def baseline(self, model: Machine) -> Restored:
         """The baseline with its notes; none where there is none, or where it is damaged."""
         return self._beside(self.baseline_path, model)
@@ -282,6 +304,7 @@ class Generations:
         self.keep(reason)
         for path in (self.path(0), self.path(1), self.baseline_path, self.folder / WATCH_FILE):
             path.unlink(missing_ok=True)
+        self.distrust()
         self.drop_shadow()
 
     def go_back(self, point: points.KeptPoint, model: Machine) -> None:

@@ -71,8 +71,27 @@ def write_whole(path: Path, content: bytes) -> None:
     """Replace a file by these bytes, so that after a power cut there is the old one or the new."""
     temporary = path.with_name(path.name + ".part")
     write_bytes(temporary, content, sync=True)
-    os.replace(temporary, path)
-    _sync(path.parent)
+    rename(temporary, path)
+
+
+def name_also(path: Path, name: Path) -> None:
+    """Give a file that is only ever replaced a second name; OSError.
+
+    A copy where the file system has no links.
+    """
+    temporary = name.with_name(name.name + ".part")
+    temporary.unlink(missing_ok=True)
+    try:
+        os.link(path, temporary)
+    except OSError:
+        write_bytes(temporary, read_bytes(path), sync=True)
+    rename(temporary, name)
+
+
+def rename(path: Path, name: Path) -> None:
+    """Give a file another name, which is on the disk on return; OSError."""
+    os.replace(path, name)
+    _sync(name.parent)
 
 
 def exchange(new: Path, old: Path) -> None:

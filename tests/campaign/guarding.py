@@ -60,7 +60,7 @@ class Fault:
     spoil: Spoil | None = None
 
 
-def _leak(share: float) -> Callable[[SimulatedPlant, float], SimulatedPlant]:
+def leak(share: float) -> Callable[[SimulatedPlant, float], SimulatedPlant]:
     """An internal leak whose flow is, root mean square on the healthy motion, a share of rated."""
     return lambda plant, rate: replace(
         plant, extra=plant.extra._replace(internal_laminar=share * rate)
@@ -94,8 +94,8 @@ def _air(plant: SimulatedPlant, _rate: float) -> SimulatedPlant:
 
 
 FAULTS = {
-    "leak of 2 %": Fault(("leak",), _leak(0.02)),
-    "leak of 10 %": Fault(("leak",), _leak(0.1)),
+    "leak of 2 %": Fault(("leak",), leak(0.02)),
+    "leak of 10 %": Fault(("leak",), leak(0.1)),
     "air, 2 %": Fault(("air",), _air),
     "pressures swapped": Fault(("p_a and p_b are swapped",), spoil=_swapped),
     "u reversed": Fault(

@@ -6,6 +6,7 @@ python -m tests.campaign.report [docs/figures.md]   (`make campaign` does)
 from __future__ import annotations
 
 import json
+import re
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
@@ -14,6 +15,7 @@ from benchmarks.table import replace_between
 
 FOLDER = Path(__file__).parents[2] / "out" / "campaign"
 MARKER = "campaign"
+HEAD = "| | measured | must | over |\n|---|---|---|---|\n"
 
 
 def leave(what: str, figure: str, limit: str, basis: str) -> None:
@@ -24,19 +26,24 @@ def leave(what: str, figure: str, limit: str, basis: str) -> None:
     (FOLDER / f"{name}.json").write_text(json.dumps(line))
 
 
-def table() -> str:
-    """Markdown of all lines that were left."""
-    lines = [json.loads(path.read_text()) for path in sorted(FOLDER.glob("*.json"))]
-    rows = [f"| {x['what']} | {x['figure']} | {x['limit']} | {x['basis']} |" for x in lines]
+def table(before: str) -> str:
+    """Markdown of all lines that were left; rows of before that were not run again stay."""
+    head, _, rows = before.partition(HEAD)
+    kept = {row.split("|")[1].strip(): row for row in rows.splitlines() if row.strip()}
+    for path in sorted(FOLDER.glob("*.json")):
+        x = json.loads(path.read_text())
+        kept[x["what"]] = f"| {x['what']} | {x['figure']} | {x['limit']} | {x['basis']} |"
     day = datetime.now(UTC).date().isoformat()
-    head = f"Written by `make campaign` on {day}.\n"
-    return "\n".join([head, "| | measured | must | over |", "|---|---|---|---|", *rows])
+    said = re.sub(r"Newest run on [0-9-]+", f"Newest run on {day}", head).strip("\n")
+    return "\n".join([said, "", HEAD.strip("\n"), *kept.values()])
 
 
 def main(arguments: list[str]) -> None:
     """Rewrite the page's table."""
-    readme = Path(arguments[0] if arguments else "docs/figures.md")
-    readme.write_text(replace_between(readme.read_text(), MARKER, table()))
+    page = Path(arguments[0] if arguments else "docs/figures.md")
+    text = page.read_text()
+    before = text.partition(f"<!-- {MARKER}:begin -->")[2].partition(f"<!-- {MARKER}:end -->")[0]
+    page.write_text(replace_between(text, MARKER, table(before)))
 
 
 if __name__ == "__main__":

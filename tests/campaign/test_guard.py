@@ -10,21 +10,27 @@ import itertools
 import multiprocessing
 import os
 import shutil
-from collections import Counter
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from rtid.estimator.flowmap import FlowMap
+from rtid.estimator.published import publish
+from rtid.sim.bus import run_frames
 from rtid.sim.run import Run, SimulationError
-from tests.campaign.guarding import FAULTS, Bench, Fault, Simulated, oil
+from rtid.sim.run_files import START_US
+from rtid.sim.simulated_plant import SimulatedPlant
+from rtid.trace.learner import Learner
+from tests.campaign.guarding import FAULTS, PIECE, Bench, Fault, Simulated, leak, oil
 from tests.campaign.report import leave
-from tests.faults.harness import drift, map_drift
+from tests.faults.harness import map_drift
 
 MACHINES = int(os.environ.get("RTID_GUARD_MACHINES", "3"))
 RESTARTS = int(os.environ.get("RTID_GUARD_RESTARTS", "60"))
-FIRST = 9000
+FIRST, AT_ONCE = 9000, 2
 HEALTHY_S, BEFORE_S, FAULT_S, BEFORE_KILL_S = 120.0, 40.0, 60.0, 2.0
 BEGUN = ("in a run", "while down", "before a kill")
 
@@ -40,7 +46,7 @@ class Taught:
         daemon = Simulated(self.bench, self.state, 0.0)
         daemon.hear(self.bench.run(HEALTHY_S, seed))
         daemon.stop()
-        self.solution = daemon.solution
+        self.solution, self.published = daemon.solution, daemon.published
 
     def again(self, name: str) -> Simulated:
         """Another start on a copy of the state."""
@@ -64,65 +70,114 @@ class Begun:
         seed = self._bench.seed + (500 if healthy_s else 501)
         return self._bench.faulty(fault, healthy_s, healthy_s + FAULT_S, seed)
 
-    def row(self, name: str, how: str) -> tuple[bool, str]:
-        """Whether a fault is as it must be, in words; only once in a process."""
+    def row(self, name: str, how: str) -> Row:
+        """What becomes of a fault; only once in a process.
+
+        The drift is against what was published when the fault began, and for a restart against
+        what was published when the run before ended.
+        """
         fault, daemon = FAULTS[name], self._daemon
-        begins_s, cost = BEFORE_S if how == "in a run" else 0.0, ""
+        begins_s, before = BEFORE_S if how == "in a run" else 0.0, daemon.published
         if how == "while down":
-            daemon = self._taught.again("down")
+            before, daemon = self._taught.published, self._taught.again(f"down-{os.getpid()}")
         else:
-            daemon.branched(self._folder / "case")
+            daemon.branched(self._folder / f"case-{os.getpid()}")
         if how == "before a kill":
             daemon.hear(self._run(fault, BEFORE_S), BEFORE_S, BEFORE_S + BEFORE_KILL_S)
-            at_kill, daemon = daemon.published, daemon.killed()
-            cost = f"the kill alone {100 * map_drift(at_kill, daemon.published):.2f} %, "
-        before = daemon.published
+            daemon = daemon.killed()
+        ending = map_drift(before, daemon.published)  # what the end of the run alone has cost
         daemon.hear(self._run(fault, begins_s), begins_s)
-        alarm_s, moved = daemon.alarm_s - begins_s, map_drift(before, daemon.published)
-        learns = daemon.core.learner.learns and not daemon.is_held
-        named = any(word in daemon.text for word in fault.names)
-        good = 0 <= alarm_s <= 60 and moved <= 0.01 and named and not learns
-        text = f"alarm after {alarm_s:.1f} s, drift {100 * moved:.2f} %, {cost}learns {learns}, "
-        return good, f"{text}named {named}: {daemon.text.partition('. ')[2][:200]}"
+        return Row(
+            name,
+            how,
+            self._bench.seed,
+            daemon.alarm_s - begins_s,
+            map_drift(before, daemon.published),
+            ending,
+            any(word in daemon.text for word in fault.names),
+            daemon.core.learner.learns and not daemon.is_held,
+            daemon.text.partition(". ")[2][:200],
+        )
 
 
-def _forked(begun: Begun, name: str, how: str) -> tuple[bool, str]:
-    """The row of a case, from a process that is forked for it."""
-    context = multiprocessing.get_context("fork")
-    theirs, ours = context.Pipe()
-    process = context.Process(target=lambda: theirs.send(begun.row(name, how)))
-    process.start()
-    theirs.close()
-    try:
-        answer: tuple[bool, str] = ours.recv()
-        return answer
-    finally:
-        process.join()
+@dataclass(frozen=True)
+class Row:
+    """moved, ending: relative drift of the published map, in all and at the end of the run."""
+
+    name: str
+    how: str
+    machine: int
+    alarm_s: float
+    moved: float
+    ending: float
+    is_named: bool
+    learns: bool
+    text: str
+
+    @property
+    def is_good(self) -> bool:
+        """Whether it is as it must be."""
+        held = self.moved <= 0.01 and not self.learns
+        return 0 <= self.alarm_s <= 60 and self.is_named and held
+
+    def __str__(self) -> str:
+        return (
+            f"{'ok ' if self.is_good else 'BAD'} machine {self.machine}, {self.name}, {self.how}: "
+            f"alarm after {self.alarm_s:.1f} s, drift {100 * self.moved:.2f} %, of the end alone "
+            f"{100 * self.ending:.2f} %, learns {self.learns}, named {self.is_named}: {self.text}"
+        )
+
+
+def figure(rows: Sequence[Row]) -> str:
+    """Alarms and drifts of one fault in a line."""
+    said = [f"{sum(row.is_good for row in rows)} of {len(rows)} as they must"]
+    for how in BEGUN:
+        mine = [row for row in rows if row.how == how]
+        alarms = ", ".join(f"{row.alarm_s:.1f}" for row in mine)
+        drifts = ", ".join(f"{100 * row.moved:.2f}" for row in mine)
+        ends = ", ".join(f"{100 * row.ending:.2f}" for row in mine)
+        of_end = "" if how == BEGUN[0] else f" ({ends} by the end of the run alone)"
+        said.append(f"{how}: alarm after {alarms} s, drift {drifts} %{of_end}")
+    return "; ".join(said)
+
+
+class Forked:
+    """A case in a process that is forked for it."""
+
+    def __init__(self, begun: Begun, name: str, how: str) -> None:
+        context = multiprocessing.get_context("fork")
+        theirs, self._ours = context.Pipe()
+        self._process = context.Process(target=lambda: theirs.send(begun.row(name, how)))
+        self._process.start()
+        theirs.close()
+
+    def row(self) -> Row:
+        """What it has found, when it is done."""
+        try:
+            answer: Row = self._ours.recv()
+            return answer
+        finally:
+            self._process.join()
 
 
 def test_a_fault_is_never_learned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    good, bad = Counter[str](), []
+    rows: list[Row] = []
     for k in range(MACHINES):
         monkeypatch.chdir(tmp_path)  # and back at the end
         taught = Taught(made(tmp_path / str(k)), FIRST + k)
         begun = Begun(taught, made(tmp_path / f"begun-{k}"))
-        for name, how in itertools.product(FAULTS, BEGUN):
-            is_good, text = _forked(begun, name, how)
-            shutil.rmtree(tmp_path / f"begun-{k}" / "case", ignore_errors=True)
-            row = f"machine {FIRST + k}, {name}, {how}: {text}"
-            good[name] += is_good
-            bad += [] if is_good else [row]
-            print("ok " if is_good else "BAD", row, flush=True)
-            print(
-                "ok " if is_good else "BAD",
-                row,
-                flush=True,
-            )
-    basis = f"{MACHINES} machines, rich motion; in a run, while down, 2 s before a kill"
+        cases = [*itertools.product(FAULTS, BEGUN)]
+        for n in range(0, len(cases), AT_ONCE):
+            for case in [Forked(begun, *names) for names in cases[n : n + AT_ONCE]]:
+                rows.append(case.row())
+                print(rows[-1], flush=True)
+        shutil.rmtree(tmp_path / f"begun-{k}")
+        shutil.rmtree(tmp_path / str(k))
+    basis = f"machines {FIRST} to {FIRST + MACHINES - 1}, rich motion, saved every 30 s"
     for name in FAULTS:
-        said = f"{good[name]} of {MACHINES * len(BEGUN)} named within 60 s, drift at most 1 %"
-        leave(f"guard: {name}", said, "all", basis)
-    assert not bad, "\n".join(bad)
+        said = figure([row for row in rows if row.name == name])
+        leave(f"guard: {name}", said, "named within 60 s, drift 1 %, none learned", basis)
+    assert all(row.is_good for row in rows), "\n".join(str(r) for r in rows if not r.is_good)
 
 
 def made(folder: Path) -> Path:
@@ -141,38 +196,85 @@ def healthy_day(taught: Taught, rng: np.random.Generator) -> Run:
     return taught.bench.run(60.0, seed, motion, plant=plant)
 
 
+def unguarded(taught: Taught, daemon: Simulated, run: Run) -> FlowMap:
+    """What is learned of a run from the same state where no guard stands between."""
+    project = taught.bench.project
+    learner = Learner(project.model, taught.bench.catalog, project.assembly)
+    learner.estimator = daemon.core.learner.estimator.copy(with_history=False)
+    for piece in run_frames(run, start_us=START_US + round(1e6 * daemon.begin_s)).chunks(PIECE):
+        learner.push(piece)
+    return publish(learner.estimator.solution())
+
+
 def test_a_healthy_day_is_not_refused(tmp_path: Path) -> None:
-    rng, alarms, late, restarts = np.random.default_rng(18), [], [], 0
+    """Nor does the guard cost any of what is learned meanwhile."""
+    rng, alarms, late, apart = np.random.default_rng(18), list[str](), list[float](), [0.0]
     benches = [Taught(made(tmp_path / str(k)), FIRST + 100 + k) for k in range(MACHINES)]
-    while restarts < RESTARTS:
-        taught = benches[restarts % len(benches)]
+    while len(late) < RESTARTS:
+        taught = benches[len(late) % len(benches)]
         try:
             run = healthy_day(taught, rng)
         except SimulationError:  # it cavitates: no healthy day of this machine
             continue
-        restarts += 1
         daemon = taught.again("day")
+        plain = unguarded(taught, daemon, run)
         daemon.hear(run)
-        if np.isfinite(daemon.alarm_s):
-            alarms.append(daemon.text)
+        alarms += [daemon.text] if np.isfinite(daemon.alarm_s) else []
         late.append(daemon.learning_s)
-        print(f"restart {restarts}: learns after {daemon.learning_s:.1f} s {daemon.text}",
-              flush=True)  # fmt: skip
-    said = f"{len(alarms)} alarms in {restarts} restarts, learning after {np.nanmax(late):.0f} s"
-    leave("guard: restarts of healthy machines", said, "0 alarms, 60 s", "oil, load, motion")
+        if np.isfinite(daemon.learning_s):
+            apart.append(map_drift(plain, publish(daemon.solution)))
+        print(f"restart {len(late)}: learns after {late[-1]:.1f} s, {100 * apart[-1]:.3f} % from "
+              f"the map without a guard {daemon.text}", flush=True)  # fmt: skip
+    waited = sum(not np.isfinite(late_s) for late_s in late)
+    said = f"{len(alarms)} alarms in {len(late)} restarts; learning after {np.nanmedian(late):.0f}"
+    said += f" s (median), {np.nanmax(late):.0f} s at most, {waited} not within 60 s; the map is "
+    said += f"{100 * max(apart):.3f} % at most from the one without a guard"
+    limit = "0 alarms, 60 s, 1.1 times the error without it"
+    basis = f"{len(benches)} machines; oil +-20 K, load and supply +-20 %, five motions of 60 s"
+    leave("guard: restarts of healthy machines", said, limit, basis)
     assert not alarms, alarms
-    assert np.isfinite(late).all() and max(late) <= 60.0
+    assert not waited and max(late) <= 60.0 and max(apart) < 0.01
 
 
-def test_what_the_guard_costs(tmp_path: Path) -> None:
-    """After a restart all that was learned counts: the map is that without the guard."""
-    taught = Taught(made(tmp_path / "machine"), FIRST + 200)
-    run = taught.bench.run(60.0, 77)
-    daemon = taught.again("guarded")
-    plain = daemon.core.learner.estimator.copy(with_history=False)
-    daemon.hear(run)
-    plain.origin_us = daemon.core.learner.estimator.origin_us
-    guarded = drift(taught.solution, daemon.solution)
-    print(f"the map moves by {100 * guarded:.2f} % in a minute with the guard")
-    samples = daemon.core.learner.estimator.counters["samples"]
-    assert samples - plain.counters["samples"] >= 59_000
+def _gains(plant: SimulatedPlant, worn: float, edges: Sequence[int]) -> SimulatedPlant:
+    valves = [
+        replace(valve, gain=valve.gain * (1 + 0.1 * worn * (k in edges)))
+        for k, valve in enumerate(plant.valves)
+    ]
+    return replace(plant, valves=tuple(valves))
+
+
+WEAR: dict[str, Callable[[Bench, float], SimulatedPlant]] = {
+    "all valves": lambda bench, worn: _gains(bench.plant, worn, range(5)),
+    "one valve": lambda bench, worn: _gains(bench.plant, worn, [0]),
+    "a leak": lambda bench, worn: leak(0.1 * worn)(bench.plant, bench.rate),
+}
+
+
+@pytest.mark.parametrize("name", WEAR)
+def test_slow_wear_is_followed(name: str, tmp_path: Path) -> None:
+    """10 % in 10 h, a minute of motion each ten minutes; a restart each 100 minutes."""
+    taught = Taught(made(tmp_path / "machine"), FIRST + 300 + [*WEAR].index(name))
+    bench, daemon, learns_s = taught.bench, taught.again("wears"), list[float]()
+    for k in range(60):
+        run = bench.run(60.0, 1000 + k, plant=WEAR[name](bench, (k + 1) / 60))
+        daemon.hear(run)
+        daemon.begin_s += 440.0  # behind the 100 s that `hear` leaves
+        assert not np.isfinite(daemon.alarm_s), f"after {k + 1} of 60: {daemon.text}"
+        if k % 10 == 9:
+            learns_s.append(daemon.learning_s)
+            begin_s, change = daemon.begin_s, map_drift(taught.published, daemon.published)
+            print(f"{name}, {k + 1} of 60: {100 * change:.1f} % from the new one", flush=True)
+            followed = daemon.published
+            daemon.stop()
+            daemon = daemon.killed()
+            daemon.begin_s = begin_s
+    worn = Simulated(bench, made(tmp_path / "worn"), 0.0)
+    worn.hear(bench.run(HEALTHY_S, 2000, plant=WEAR[name](bench, 1.0)))
+    behind, changed = (map_drift(worn.published, m) for m in (followed, taught.published))
+    said = f"0 alarms; the map has gone with it: {100 * behind:.1f} % from that of the worn "
+    said += f"machine, the one of the new machine {100 * changed:.1f} %"
+    said += f"; learning {max(learns_s):.0f} s at most after each of 6 restarts"
+    limit = "followed, no alarm"
+    leave(f"guard: wear of 10 % in 10 h, {name}", said, limit, f"machine {bench.seed}, 1 h motion")
+    assert behind < 0.5 * changed and max(learns_s) <= 60.0

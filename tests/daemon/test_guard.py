@@ -103,6 +103,59 @@ def pushed(guard: Guard, chunk: FloatArray) -> list[State]:
     return states
 
 
+def test_a_second_that_two_pieces_share_is_counted_once(bench: Bench) -> None:
+    """Pieces begin anywhere within a second."""
+    model, solution = machine().project.model, fault_free()
+    guard = Guard(model, candidate_of(solution, publish(solution)), None, "proven")
+    pushed(guard, chunk_of(bench.run(13.3, 3)))
+    assert 8 <= guard.progress["moved"] <= 13
+
+
+def test_what_is_saved_is_trusted_once_the_motion_behind_it_shows_no_fault(
+    bench: Bench, tmp_path: Path
+) -> None:
+    """After a kill it is what is published; what may hold a fault is not."""
+    project, answers = machine().project, list[jobs.Answer]()
+    learner, analyst = machine().learner(), Analyst(project, tmp_path, answers.append)
+    generations = Generations(tmp_path, project.digest)
+
+    def handed(number: int, publish: bool) -> jobs.Handover:
+        copy = learner.estimator.copy(with_history=False)
+        return jobs.Handover(number, copy, publish=publish, store=not publish)
+
+    def until(end: int, begin: int) -> None:
+        for frames in machine().frames[3000 * begin : 3000 * end].chunks(600):
+            analyst.take(jobs.Batch(learner.push(frames), None))
+
+    def baseline_s() -> float:
+        estimator = generations.baseline(project.model).estimator
+        assert estimator is not None
+        return float(estimator.state.engine[0]["t_s"])
+
+    until(20, 0)
+    analyst.take(handed(1, publish=True))
+    published_s = baseline_s()
+    until(25, 20)
+    saved = handed(2, publish=False)
+    analyst.save(saved)
+    until(27, 25)
+    assert baseline_s() == published_s, "nothing has judged it yet"
+    until(34, 27)
+    saved_s = float(saved.estimator.state.engine[0]["t_s"])
+    assert baseline_s() == saved_s > published_s
+    guard = analyst._guard
+    assert guard is not None
+    guard.level = np.full(2, 0.003 * rated_m3s(project.model))
+    sick = chunk_of(bench.faulty(FAULTS["leak of 10 %"], 0.0, 12.0, 3))
+    sick[:, 0] += learner.estimator.state.engine[0]["t_s"] + 0.001 - sick[0, 0]
+    analyst.save(handed(3, publish=False))
+    for piece in np.array_split(sick, 24):
+        analyst.take(jobs.Batch(piece, None))
+    assert guard.state == "contradicted" and baseline_s() == saved_s
+    analyst.close()
+    assert baseline_s() == saved_s
+
+
 @pytest.mark.parametrize(("name", "said"), [("u reversed", "u"), ("x reversed", "x")])
 def test_samples_with_a_wrong_sign_prove_no_map(bench: Bench, name: str, said: str) -> None:
     """Also where they fall on hardly any cell that the map knows."""
