@@ -21,6 +21,8 @@ from rtid.cli.main import run
 from rtid.estimator.noise import estimate_noise
 from rtid.project import load
 from rtid.trace import Finding, Report, bus, judge, timing
+from rtid.trace.check import against_signs
+from rtid.trace.plausible import Motion, Spring
 from rtid.trace.series import Series, describe, longest_frozen
 from rtid.trace.signals import read_recording
 
@@ -127,6 +129,18 @@ def test_wrong_unit_or_sign_is_named(folder: Path, edit: Edit, subject: str, wor
     assert not report.ok
     assert words in errors(report)[subject].text
     assert errors(report)[subject].remedy
+
+
+def test_a_spring_that_is_no_oil_speaks_against_no_sign(folder: Path) -> None:
+    """Slow motion bends the rough law: with warm oil a sweep gave t = -9 and 5.8 GPa."""
+    model = load(folder / "trace.toml").model
+    a, nothing = Spring(1.7e9, 11.0), float("nan")
+    slow, reverse = Spring(-5.8e9, -9.1), Spring(-1.5e9, -25.0)
+    assert not [*against_signs(model, Motion(0.96, {"a": a, "b": slow}, nothing))]
+    (finding,) = against_signs(model, Motion(0.96, {"a": a, "b": reverse}, nothing))
+    assert finding.subject == "chambers.b"
+    (finding,) = against_signs(model, Motion(0.96, {"a": slow, "b": reverse}, nothing))
+    assert "swapped" in finding.text
 
 
 def test_wrong_noise_is_a_warning_with_the_right_figure(folder: Path) -> None:

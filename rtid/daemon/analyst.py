@@ -103,7 +103,7 @@ class Analyst:
         self._offering = Offering(project, folder)
         self._guard: Guard | None = None
         self._baseline: Estimator | None = None
-        self._is_named = True  # what contradicts the baseline, if something does
+        self._is_named = True  # what contradicts the baseline, by what came behind the alarm
         self._next: tuple[jobs.Handover, CandidateMap] | None = None  # to become the baseline
         self._waiting_s: float | None = None  # newest sample of a snapshot not yet trusted
         self._trusted_s = -math.inf  # ... of the one on the disk that is
@@ -287,9 +287,8 @@ class Analyst:
                 self._guarded("snapshot", self._generations.distrust)
                 self._guarded("snapshot", self._generations.drop_shadow)
             self._guarded("points", lambda: self._generations.keep("alarm"))
-            words = _foretold("contradicted", guard, guard.causes())
-            self._is_named = bool(words.text)
-            self._answer(words)
+            self._answer(_foretold("contradicted", guard, guard.causes()))
+            self._is_named = False  # but by few seconds, of which some may be healthy
         else:
             self._answer(jobs.Foretold("proven"))
 

@@ -23,6 +23,7 @@ GAP_SHARE = 1e-3
 OUT_OF_RANGE_SHARE = 1e-3
 OUTSIDE_GRID_SHARE = 0.02
 MIN_T = 8.0  # of the rough bulk modulus, before its sign is believed
+STIFFEST = 2.0  # of the upper bound: what is stiffer the other way is no oil, but the slow motion
 MIN_CORRELATION = 0.2
 BETA_DECADE = 30.0  # a rough bulk modulus this far outside the bounds is a wrong unit
 FEWEST_BLOCKS = 4  # of a map that is worth its name
@@ -238,7 +239,8 @@ def against_motion(model: Machine, result: Motion) -> Iterator[Finding]:
 
 def against_signs(model: Machine, result: Motion) -> Iterator[Finding]:
     """Signs and swapped pressures that cannot be as declared."""
-    known = [s for s in result.springs.values() if abs(s.t) > MIN_T]
+    stiffest_pa = STIFFEST * model.beta_bounds_pa[1]
+    known = [s for s in result.springs.values() if abs(s.t) > MIN_T and -s.beta_pa < stiffest_pa]
     soft = [s for s in known if s.t < 0]
     against = result.u_to_v < -MIN_CORRELATION
     x = model.position
@@ -257,7 +259,7 @@ def against_signs(model: Machine, result: Motion) -> Iterator[Finding]:
             text = f"the machine moves against {command}: the sign of {command} or {x} is reversed"
         yield _error(command, text, f"set signals.{command}.scale = -1, or turn the directions")
     elif soft:
-        names = [name for name, s in result.springs.items() if s.t < -MIN_T]
+        names = [name for name, s in result.springs.items() if s in soft]
         text = "pressure falls where the oil is compressed"
         yield _error(f"chambers.{names[0]}", text, "check its sign and its pressure signal")
 

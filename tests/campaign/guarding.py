@@ -164,6 +164,13 @@ class Bench:
         rate = rated / float(np.sqrt(np.mean(drop**2)))
         return cls(plant, project, catalog_of(project), seed, rate)
 
+    def publishing(self, every_s: float) -> Bench:
+        """The same, whose daemon publishes that seldom: most of its time goes into it."""
+        sections = self.project.sections
+        daemon = sections.daemon.model_copy(update={"publish_s": every_s})
+        changed = replace(self.project, sections=replace(sections, daemon=daemon))
+        return replace(self, project=changed)
+
     def run(self, seconds: float, seed: int, motion: str = "rich", **plant: Any) -> Run:
         """A healthy run; plant: another one than its own, or a change while it runs."""
         made = plant.pop("plant", self.plant)
@@ -215,7 +222,7 @@ class Simulated:
 
     def __init__(self, bench: Bench, folder: Path, begin_s: float) -> None:
         project, answers = bench.project, deque[jobs.Answer]()
-        self._bench, self._folder = bench, folder
+        self._bench, self.folder = bench, folder
         learner = Learner(project.model, bench.catalog, project.assembly)
         generations = Generations(folder, project.digest)
         self.restored = generations.restore(learner.estimator.model)
@@ -244,7 +251,7 @@ class Simulated:
 
     def killed(self) -> Simulated:
         """The next start, after a kill."""
-        return Simulated(self._bench, self._folder, self.begin_s + 100.0)
+        return Simulated(self._bench, self.folder, self.begin_s + 100.0)
 
     @property
     def is_held(self) -> bool:

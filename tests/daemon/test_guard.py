@@ -146,12 +146,15 @@ def test_what_is_saved_is_trusted_once_the_motion_behind_it_shows_no_fault(
     guard = analyst._guard
     assert guard is not None
     guard.level = np.full(2, 0.003 * rated_m3s(project.model))
-    sick = chunk_of(bench.faulty(FAULTS["leak of 10 %"], 0.0, 12.0, 3))
+    sick = chunk_of(bench.faulty(FAULTS["leak of 10 %"], 0.0, 20.0, 3))
     sick[:, 0] += learner.estimator.state.engine[0]["t_s"] + 0.001 - sick[0, 0]
     analyst.save(handed(3, publish=False))
-    for piece in np.array_split(sick, 24):
+    for piece in np.array_split(sick, 40):
         analyst.take(jobs.Batch(piece, None))
     assert guard.state == "contradicted" and baseline_s() == saved_s
+    said = [answer for answer in answers if isinstance(answer, jobs.Foretold)]
+    assert [answer.state for answer in said] == ["contradicted", "named"], "looked at again"
+    assert all("a leak from a to b" in answer.text for answer in said)
     analyst.close()
     assert baseline_s() == saved_s
 
