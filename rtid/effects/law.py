@@ -20,6 +20,7 @@ from types import MappingProxyType
 import numpy as np
 
 from rtid.effects.expression import Expression
+from rtid.effects.filtering import filtered
 from rtid.effects.page import FUNCTION, Effect, EffectError
 from rtid.effects.record_view import RecordView, supply_of, tank_of
 from rtid.effects.tree import NAME, ZERO, Node, derivative, evaluate, names_of, number, substituted
@@ -340,9 +341,7 @@ def lagged(values: FloatArray, step_s: float, lag_s: float) -> FloatArray:
     if lag_s <= 0.0:
         return values
     fade = float(np.exp(-step_s / lag_s))
-    from scipy.signal import lfilter  # noqa: PLC0415 - takes long to import
-
-    return np.asarray(lfilter([1 - fade], [1, -fade], values - values[0]) + values[0])
+    return filtered((1 - fade, 0.0, 0.0), (1.0, -fade, 0.0), values - values[0]) + values[0]
 
 
 def flow_in_python(effect: Effect, seen: Seen, shape: Mapping[str, float]) -> FloatArray:

@@ -6,15 +6,15 @@ Values at samples have n entries, means and volumes over intervals n - 1.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 
 import numpy as np
 
+from rtid.effects.filtering import fitted
 from rtid.effects.view import View as Seen
 from rtid.estimator.state import Weights, build
 from rtid.kernels.following import follow_map
 from rtid.kernels.layout import TERMS
-from rtid.kernels.smoothing import correlate
 from rtid.model import COMMAND, MODE, PRESSURE, Edge, Machine
 from rtid.plain import BoolArray, FloatArray, IntArray
 
@@ -32,21 +32,6 @@ def has_noise(values: FloatArray) -> bool:
     change = np.diff(values)
     change = change[change != 0.0]
     return len(change) > 2 and bool(np.mean(change[1:] * change[:-1] < 0.0) > TURNS)
-
-
-@cache
-def _parabolas(
-    half: int, derivative: int, step_s: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Weights (2 half + 1) of a parabola's value: at the first points, the middle, the last."""
-    from scipy.signal import savgol_coeffs  # noqa: PLC0415 - takes long to import
-
-    m = 2 * half + 1
-    at = [
-        savgol_coeffs(m, 2, derivative, step_s, pos=k, use="dot").astype(np.float64)
-        for k in range(m)
-    ]
-    return np.array(at[:half]), at[half], np.array(at[half + 1 :])
 
 
 def tank_of(model: Machine) -> str:
@@ -212,11 +197,7 @@ class RecordView:
         half = max(2, round(SMOOTH_S / self.step_s))
         if len(values) <= 2 * half:
             return np.zeros(len(values))
-        means, m = np.empty(len(values)), 2 * half + 1
-        first, middle, last = _parabolas(half, derivative, self.step_s)
-        means[:half], means[-half:] = first @ values[:m], last @ values[-m:]
-        correlate(np.ascontiguousarray(values), middle, means[half : len(values) - half])
-        return means
+        return fitted(values, half, derivative, self.step_s)
 
     def into_chamber(self, c: int, per_edge: list[FloatArray]) -> FloatArray:
         """Sum of per_edge (n - 1,), m3/s, with the sign with which each feeds chamber c."""

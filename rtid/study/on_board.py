@@ -112,7 +112,7 @@ def _why_not(project: Project, added: AddedSection) -> str:
 
 def _terms(project: Project, added: AddedSection) -> tuple[Term, ...]:
     """The terms of an added effect; () where it is no function of signals that the kernels know."""
-    # scipy.signal: a second of the start of a daemon that has no effects
+    # a daemon that has no effects starts without all that refits them
     from rtid.effects.terms import terms_of  # noqa: PLC0415
 
     model, candidate = project.model, _column(project, added)

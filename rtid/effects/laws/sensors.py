@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from rtid.effects.column import Cause, fixed, of_page
+from rtid.effects.filtering import fitted
 from rtid.effects.law import Volumes
 from rtid.effects.laws.common import slope_to, stored
 from rtid.effects.laws.timing import Psi, TimingLaw, of_law
@@ -60,12 +61,10 @@ def ahead(values: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
 
 def quickened(values: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
     """What a sensor of time constant psi has seen (n,), by the rate of a parabola, any unit."""
-    from scipy.signal import savgol_filter  # noqa: PLC0415 - takes long to import
-
-    width = 2 * max(2, round(QUICK_S / dt_s)) + 1
-    if len(values) < width:
+    half = max(2, round(QUICK_S / dt_s))
+    if len(values) < 2 * half + 1:
         return values
-    return np.asarray(values + psi[0] * savgol_filter(values, width, 2, deriv=1, delta=dt_s))
+    return np.asarray(values + psi[0] * fitted(values, half, 1, dt_s))
 
 
 LATE_POSITION = of_law("late_position", ahead, where="")

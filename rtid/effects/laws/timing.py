@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from rtid.effects.filtering import filtered, held_second_order
 from rtid.effects.page import catalogue
 from rtid.kernels.jit import kernel
 from rtid.model import Machine
@@ -119,21 +120,14 @@ def lagged(u: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
     """First-order lag of time constant psi, mean over each interval (n,), exact where u is held."""
     tau = max(psi[0], 1e-9)
     fade = float(np.exp(-dt_s / tau))
-    from scipy.signal import lfilter  # noqa: PLC0415 - takes long to import
-
-    start = lfilter([0.0, 1.0 - fade], [1.0, -fade], u - u[0]) + u[0]
+    start = filtered((0.0, 1.0 - fade, 0.0), (1.0, -fade, 0.0), u - u[0]) + u[0]
     return np.asarray(u + (start - u) * tau / dt_s * (1.0 - fade))
 
 
 def second_order(u: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
     """Spool of natural frequency psi[0] rad/s and damping psi[1], mean over each interval (n,)."""
     wn, zeta = psi
-    from scipy.signal import cont2discrete, lfilter  # noqa: PLC0415 - takes long to import
-
-    b, a, _ = cont2discrete(
-        (np.array([wn * wn]), np.array([1.0, 2.0 * zeta * wn, wn * wn])), dt_s, method="zoh"
-    )
-    start = lfilter(np.ravel(b), a, u - u[0]) + u[0]
+    start = filtered(*held_second_order(wn, zeta, dt_s), u - u[0]) + u[0]
     return np.asarray(0.5 * (start + np.append(start[1:], start[-1])))
 
 
