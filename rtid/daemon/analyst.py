@@ -14,6 +14,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from queue import Queue
 from typing import Any, Literal, TypeVar
@@ -48,6 +49,7 @@ NICE = 5
 MAP_FILE = "map.npz"
 KEPT = 3  # handovers that can be recalled
 CLEAN_S = 2.0  # a handover must be older than a suspicion by the piece in which that began
+CALM_S, CALM = 6.0, 2  # before a judgement; seconds of them that the guard has judged, a piece late
 FIRST_S = 60.0  # of samples that a first map is checked by
 QUEUED_BYTES = 16 << 20  # of jobs taken from the pipe while one is in work
 FLOOD_S = 10.0  # the same refusal of the disk is told at most this often
@@ -246,6 +248,10 @@ class Analyst:
                 self._next, self._baseline = None, job.estimator
                 guard.follow(candidate)
 
+    def _is_calm(self, t_s: float) -> bool:
+        """Whether the guard has judged some of the seconds before a time and objects to none."""
+        return self._guard is not None and self._guard.is_calm_behind(t_s - CALM_S, CALM)
+
     def _is_trusted(self, estimator: Estimator) -> bool:
         """Whether the motion behind what it has learned shows no fault."""
         return self._guard is not None and self._guard.is_calm_behind(_newest_s(estimator), TRUST)
@@ -317,7 +323,7 @@ class Analyst:
         if self._judge is not None:
             judgement = self._judge.push(batch.chunk)
             if judgement is not None:
-                self._answer(judgement)
+                self._answer(replace(judgement, is_calm=self._is_calm(judgement.t_s)))
         if len(batch.chunk):
             self._watch(batch.chunk)
         self._guarded("offer", lambda: self._offering.push(batch.chunk))

@@ -127,13 +127,15 @@ class Publication:
 class HandoverJudgement:
     """How well the map of handover `number` foretells the samples that came behind it.
 
-    surprise: mean square of whitened innovations over `rows` of them; 1 is noise.
+    surprise: mean square of whitened innovations over `rows` of them; 1 is noise.  is_calm: the
+    baseline, held against the same motion by what would matter, has nothing against it.
     """
 
     number: int
     surprise: float
     rows: int
     t_s: float
+    is_calm: bool = False
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,9 @@
 
 The level of a healthy plant is learned: its median surprise, at least 1.  Five of eight judgements
 beyond FACTOR times that level are a change; ten in a row that are not, and it is over.  A slow
-drift moves the level and the map with it.
+drift moves the level and the map with it.  Innovations show what is far too small to matter: warm
+oil, another motion.  So none is held against the plant while the baseline's guard, which weighs
+what matters, has judged the same motion and is calm.
 """
 
 from __future__ import annotations
@@ -50,7 +52,8 @@ class PlantWatch:
         self.surprise = judgement.surprise
         if self.contradicted:
             return False
-        bad = self.is_ready and judgement.surprise > FACTOR * self.level
+        is_large = judgement.surprise > FACTOR * self.level
+        bad = self.is_ready and is_large and not judgement.is_calm
         if self.changed:
             return self._await_health(bad)
         self._follow(judgement)

@@ -124,6 +124,17 @@ def test_single_surprises_and_a_slow_drift_are_no_change() -> None:
     assert watch([float(x) for x in np.linspace(1.2, 6.0, 600)]) == []
 
 
+def test_what_the_guard_of_the_good_map_does_not_mind_is_no_change() -> None:
+    """Another oil moves the innovations far more than it moves the map."""
+    plant = PlantWatch()
+    for k in range(60):
+        plant.push(HandoverJudgement(1, 1.5 if k < 40 else 9.0, 1000, float(k), is_calm=True))
+    assert not plant.changed
+    for k in range(60, 65):
+        plant.push(HandoverJudgement(1, 40.0, 1000, float(k)))
+    assert plant.changed
+
+
 def test_the_last_map_that_foretold_well_is_trusted() -> None:
     """A change 1 s after a handover: the map of the handover before is the safe one."""
     plant = PlantWatch()
