@@ -89,7 +89,10 @@ def _judged(project: Project, path: Path, progress: Progress) -> Report:
         edges = Study(project, path, lambda t, share: progress(t, 0.4 + 0.6 * share)).map.edges
     except NoSamplesError:
         return with_learned(report, {edge.name: 0 for edge in project.model.edges})
-    return with_learned(report, {e.name: int((e.status == VALID).sum()) for e in edges})
+    learned = {edge.name: int((edge.status == VALID).sum()) for edge in edges}
+    pairs = zip(edges, project.model.edges, strict=True)
+    finer = [edge.name for edge, given in pairs if edge.status.shape != given.grid.shape]
+    return with_learned(report, learned, frozenset(finer))
 
 
 def _check_bus(log: Path, dbc: Path | None, as_json: bool) -> None:

@@ -26,6 +26,7 @@ MIN_T = 8.0  # of the rough bulk modulus, before its sign is believed
 STIFFEST = 2.0  # of the upper bound: what is stiffer the other way is no oil, but the slow motion
 MIN_CORRELATION = 0.2
 BETA_DECADE = 30.0  # a rough bulk modulus this far outside the bounds is a wrong unit
+TOO_COARSE = "the grid is too coarse for the valve"
 FEWEST_BLOCKS = 4  # of a map that is worth its name
 
 
@@ -90,12 +91,15 @@ def judge(
     )
 
 
-def with_learned(report: Report, learned: dict[str, int]) -> Report:
+def with_learned(
+    report: Report, learned: dict[str, int], finer: frozenset[str] = frozenset()
+) -> Report:
     """The report with the valid blocks of each edge that a replay learned, and what they mean.
 
     A count of rows does not tell them: rows may stand at one place of a block, or along one line.
+    finer: edges whose grid the replay had to make finer.
     """
-    findings = list(report.findings)
+    findings = [*report.findings, *map(_too_coarse, sorted(finer))]
     for covered in report.coverage:
         if covered.enough > 0 and learned.get(covered.edge, 0) < min(FEWEST_BLOCKS, covered.enough):
             findings.append(_few_learned(covered, learned.get(covered.edge, 0)))
@@ -105,6 +109,12 @@ def with_learned(report: Report, learned: dict[str, int]) -> Report:
     return replace(report, learned=learned, findings=tuple(findings))
 
 
+def _too_coarse(edge: str) -> Finding:
+    text = f"replay has halved intervals of its grid: {TOO_COARSE}"
+    remedy = f"give u_grid and dp_grid of edges.{edge} narrower steps: on board they stay as given"
+    return _warning(f"edges.{edge}", text, remedy)
+
+
 def _few_learned(covered: Coverage, learned: int) -> Finding:
     """Few blocks in spite of many rows: a grid as wide as the motion, or a record too short."""
     subject = f"edges.{covered.edge}"
@@ -112,8 +122,7 @@ def _few_learned(covered: Coverage, learned: int) -> Finding:
         f"{covered.enough} blocks get {covered.min_rows} rows, but replay learns {learned} of them"
     )
     if covered.enough < FEWEST_BLOCKS:
-        text += ": the grid is too coarse for the valve"
-        return _warning(subject, text, f"give u_grid and dp_grid of {subject} narrower steps")
+        return replace(_too_coarse(covered.edge), text=f"{text}: {TOO_COARSE}")
     remedy = "record longer, and at more commands and loads; see the blocks with rtid replay"
     return _warning(subject, text, remedy)
 
