@@ -94,10 +94,13 @@ def added(
 
 
 def with_effect(study: Study, effect: str, where: str, reason: str) -> Study:
-    """The study with one effect more in its model, in memory: what the page and `add` show."""
+    """The study with one effect more in its model, in memory: what the page and `add` show.
+
+    What is told of it is fitted anew: with the effect the grid may have to be finer.
+    """
     extension = study.tried(effect, where)
     sections = extended(study.project.sections.added, extension, study.path.name, reason)
-    return study.having(extension.after, sections)
+    return study.having(extension.after, sections, is_final=False)
 
 
 def without(study: Study, gone: AddedSection) -> tuple[Study, ErrorsSection]:

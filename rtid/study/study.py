@@ -227,18 +227,25 @@ class Study:
         """The model with one effect more, fitted once.  Raises RefusedError."""
         made: dict[tuple[str, str], Extension] = vars(self).setdefault("_tried", {})
         if (effect, where) not in made:
-            present = self.standing
+            present: Standing = vars(self).get("_onward") or self.standing
             self.progress("fitting with the effect", 0.5)
             made[effect, where] = extend(present, effect, where)
         return made[effect, where]
 
-    def having(self, standing: Standing, sections: tuple[AddedSection, ...]) -> Study:
-        """The same record with another model that was fitted to it; the project file stays."""
+    def having(
+        self, standing: Standing, sections: tuple[AddedSection, ...], is_final: bool = True
+    ) -> Study:
+        """The same record with another model in memory; the project file stays.
+
+        standing: it fitted to the record; where that is not final, the next change begins there,
+        and all else is made anew, as by whoever opens the project next.
+        """
         project = replace(self.project, sections=replace(self.project.sections, added=sections))
         other = Study(project, self.path, self.progress, self.bus_speed)
         shared = {"read", "_aged", "machine", "taught", "spans"} & vars(self).keys()
-        vars(other).update({name: vars(self)[name] for name in shared})
-        vars(other).update(standing=standing, fitted=standing.fit.light(), _place=None)
+        vars(other).update({name: vars(self)[name] for name in shared}, _place=None)
+        final = {"standing": standing, "fitted": standing.fit.light()}
+        vars(other).update(final if is_final else {"_onward": standing})
         return other
 
     @property
