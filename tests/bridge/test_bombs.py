@@ -27,12 +27,15 @@ from rtid.maps.files import MapFileError, read_map
 MAX_RSS_BYTES, MAX_CPU_S = 1e9, 20.0
 HALF = FREE_BYTES // 16  # numbers of which two columns pass what a small file may unpack to
 MEASURE = """
-import json, resource, sys
+import json, re, resource, sys
+from pathlib import Path
 from rtid.cli.main import main
 try: main()
 finally:
     used = resource.getrusage(resource.RUSAGE_SELF)
-    print(json.dumps([1024 * used.ru_maxrss, used.ru_utime + used.ru_stime]), file=sys.stderr)
+    status = Path("/proc/self/status").read_text()  # ru_maxrss would be that of the parent
+    peak_kib = int(re.search(r"VmHWM:\\s*(\\d+)", status)[1])
+    print(json.dumps([1024 * peak_kib, used.ru_utime + used.ru_stime]), file=sys.stderr)
 """
 
 

@@ -55,17 +55,16 @@ def test_windows_leave_a_tenth_of_the_jump(estimates: dict[str, Estimate]) -> No
     assert rms(jumps(lapped.grid, lapped.windowed)) < 0.1 * without
 
 
-@pytest.mark.parametrize(
-    "basis",
-    [TAYLOR, pytest.param(LAPPED, marks=pytest.mark.xfail(strict=True, reason="10.3 % here"))],
-)
+@pytest.mark.parametrize("basis", [TAYLOR, LAPPED])
 def test_windows_leave_a_tenth_of_the_change_over_a_border(
     estimates: dict[str, Estimate], basis: str
 ) -> None:
     """The plain count: all change beyond the truth's, that of a steep estimate too."""
     own, taylor = estimates[basis], estimates[TAYLOR]
     surface = own.published.flow if basis == TAYLOR else own.windowed
-    assert rms(excess(own.grid, surface)) < 0.1 * rms(excess(taylor.grid, taylor.unwindowed))
+    share = rms(excess(own.grid, surface)) / rms(excess(taylor.grid, taylor.unwindowed))
+    print(f"{basis}: {100 * share:.2f} %")
+    assert share < 0.1
 
 
 def test_a_corner_is_no_jump_and_a_step_is_one() -> None:
