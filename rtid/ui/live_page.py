@@ -174,7 +174,7 @@ def _histogram(distribution: Distribution, deadline_us: float) -> str:
         if 10.0**k >= 10**low
     )
     return (
-        '<svg viewBox="0 0 470 70" width="470" role="img" '
+        '<svg viewBox="0 0 490 70" width="490" role="img" '
         'aria-label="histogram of the work per tick" '
         f'style="max-width:100%"><g fill="var(--bar)">{bars}</g><line x1="{x(deadline_us):.1f}" '
         f'x2="{x(deadline_us):.1f}" y1="0" y2="54" stroke="var(--found)" stroke-dasharray="4 3"/>'

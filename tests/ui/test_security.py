@@ -41,8 +41,8 @@ def port_of(bench: Workbench) -> int:
 
 def come_in(bench: Workbench) -> str:
     """What a browser that opens the printed address gets to keep, as a Cookie header."""
-    status, page, headers = ask(bench, path="/?" + urlsplit(bench.url).query, Cookie="")
-    assert status == 200 and 'content="0;url=/"' in page
+    page, headers = wait_for_room(bench, path="/?" + urlsplit(bench.url).query, Cookie="")
+    assert 'content="0;url=/"' in page
     return headers["Set-Cookie"].split(";")[0]
 
 
@@ -198,10 +198,10 @@ def done(answer: Coroutine[Any, Any, T]) -> T:
         return pool.submit(asyncio.run, answer).result()
 
 
-def wait_for_room(bench: Workbench) -> tuple[str, dict[str, str]]:
+def wait_for_room(bench: Workbench, **asked: str) -> tuple[str, dict[str, str]]:
     """The page and its headers, as soon as pages that nobody looked at have been forgotten."""
     for _ in range(60):
-        status, page, headers = ask(bench)
+        status, page, headers = ask(bench, **asked)
         if status == 200:
             return page, headers
         assert status == 503
