@@ -7,9 +7,10 @@ One table defines the wire: the C cannot drift from the DBC while this file is g
 
 from __future__ import annotations
 
+import hashlib
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from firmware_bridge.jit import Record
 
 MESSAGES = ("ValveCommand", "Pressures", "Motion")
 HEADER = Path(__file__).with_name("c") / "rtid_tables.h"
+VERSION = HEADER.with_name("rtid_version.h")
 MAX_BITS = 52  # a double holds every count
 
 
@@ -31,6 +33,13 @@ def tables(catalog: Catalog, messages: Sequence[str] = MESSAGES) -> str:
     period, a CRC-8 and an alive counter.
     """
     return "\n".join(_lines(catalog, messages)) + "\n"
+
+
+def bill(sources: Iterable[Path]) -> str:
+    """A line for a software bill of materials: package, release, SHA-256 over the sources."""
+    release = VERSION.read_text("utf-8").split('"')[1]
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
+    return f"pkg:generic/rtid-c@{release}?checksum=sha256:{digest} (MIT)"
 
 
 def _lines(catalog: Catalog, messages: Sequence[str]) -> Iterator[str]:

@@ -6,10 +6,11 @@
 
 static uint8_t crc8_step(uint8_t crc, uint8_t byte)
 {
-    crc ^= byte;
-    for (int bit = 0; bit < 8; bit++)
-        crc = (uint8_t)(crc & 0x80 ? crc << 1 ^ 0x1D : crc << 1);
-    return crc;
+    uint32_t now = (uint32_t)crc ^ byte;
+    for (int bit = 0; bit < 8; bit++) {
+        now = ((now & 0x80u) != 0u) ? (((now << 1) ^ 0x1Du) & 0xFFu) : (now << 1);
+    }
+    return (uint8_t)now;
 }
 
 #endif

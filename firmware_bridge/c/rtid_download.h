@@ -19,11 +19,11 @@
 
 #include "rtid_map.h"
 
-#define RTID_DOWNLOAD_FORMAT 1
-#define RTID_DOWNLOAD_SLOTS 16 /* at most */
+#define RTID_DOWNLOAD_FORMAT 1u
+#define RTID_DOWNLOAD_SLOTS 16u /* at most */
 #define RTID_DOWNLOAD_ANSWERS 2
 #define RTID_DOWNLOAD_IDLE_MS 2000u /* a sender that is silent for longer has lost its session */
-#define RTID_DOWNLOAD_HEAD 16
+#define RTID_DOWNLOAD_HEAD 16u
 
 /* Kinds of images. */
 enum { RTID_KIND_MAP = 1, RTID_KIND_NUMBERS = 2 };
@@ -137,5 +137,7 @@ typedef struct {
 
 /* Read a notice; its first byte, or 0 if it is none. */
 int rtid_notice_read(const uint8_t *data, uint8_t length, rtid_notice *notice);
+
+extern const char rtid_download_version[];
 
 #endif

@@ -112,11 +112,12 @@ typedef struct {
 /* Products not yet added to the sums. */
 typedef struct {
     rtid_sum local[RTID_EST_WIDTH][RTID_EST_WIDTH]; /* of the rows since the epoch began */
-    uint16_t memory, n_open, n_line, n_paid, last_begun;
+    uint16_t memory;
+    int16_t n_open, n_line, n_paid, last_begun;
     uint32_t epoch;
     rtid_estimator_open open[RTID_EST_MAX_OPEN];
     rtid_estimator_visit visit[RTID_EST_MAX_VISITS];
-    uint16_t line[RTID_EST_MAX_VISITS]; /* closed visits, oldest first; the first one is settled
+    int16_t line[RTID_EST_MAX_VISITS]; /* closed visits, oldest first; the first one is settled
                                          * with the n_paid ones behind it */
 } rtid_estimator_owed;
 
@@ -124,7 +125,7 @@ typedef struct {
 typedef struct {
     /* local columns, those that move at every sample */
     rtid_real d[RTID_EST_WIDTH];                    /* whitener's state of each column */
-    uint16_t width;
+    int16_t width;
     rtid_real faded; /* of the ring's unit since the last look for silent blocks */
     rtid_estimator_owed owed;
     /* whitener */
@@ -141,7 +142,7 @@ typedef struct {
         rtid_real w, m1, var, mt, dp0, dp1;
         int16_t u, dp, to_u, to_dp, place;
     } edge[RTID_EST_N_EDGES];
-    uint16_t n_closed, n_slots, tiles; /* blocks that ring; tiles left in this tick */
+    int16_t n_closed, n_slots, tiles; /* blocks that ring; tiles left in this tick */
     int16_t slot[RTID_EST_N_CELLS];      /* of each cell of the grids, -1 before the first visit */
     rtid_estimator_block block[RTID_EST_MAX_BLOCKS];
     rtid_sum sums[RTID_EST_SUMS]; /* lower triangle, row by row, of [y | shared | blocks] */
@@ -166,7 +167,7 @@ typedef struct {
     double scale[RTID_EST_UNKNOWNS], theta[RTID_EST_UNKNOWNS], basis[RTID_EST_UNKNOWNS];
     double noise, rows, cov_change;
     int64_t now_us;
-    uint16_t n_slots;
+    int16_t n_slots;
     rtid_estimator_owed owed;
     rtid_estimator_block block[RTID_EST_MAX_BLOCKS];
     rtid_estimator_map map[RTID_EST_MAX_BLOCKS];
@@ -180,6 +181,9 @@ typedef struct {
     uint16_t raised; /* 0, or directions in which the sums were not definite */
     uint8_t finite;  /* 0: an absurd sample was let in, and nothing here holds */
 } rtid_estimator_solution;
+
+/* Release, chamber and project. */
+extern const char rtid_estimator_version[];
 
 /* Begin without knowledge. */
 void rtid_estimator_start(rtid_estimator *e);

@@ -36,33 +36,36 @@ static const rtid_real AREA = R(RTID_EST_AREA), V0 = R(RTID_EST_V0), X_VAR = R(R
 
 double rtid_est_rated(int edge) { return EDGES[edge].scale; }
 
-int rtid_est_has_term(int edge, int term) { return EDGES[edge].mask[term] != 0; }
+bool rtid_est_has_term(int edge, int term) { return EDGES[edge].mask[term] > 0; }
 
 double rtid_est_shared_scale(int shared)
 {
 #if RTID_EST_N_TERMS > 0
-    if (shared > 0)
+    if (shared > 0) {
         return TERMS[shared - 1].scale;
+    }
 #endif
     (void)shared;
     return RTID_EST_COMPLIANCE;
 }
 
-static rtid_real volume(rtid_real x) { return V0 + AREA * x; }
+static rtid_real volume(rtid_real x) { return V0 + (AREA * x); }
 
 /* ---- one interval ---- */
 
 static int locate(const rtid_real *border, int n, rtid_real value)
 {
     int low = 0, high = n;
-    if (!(value >= border[0] && value <= border[n]))
+    if (!((value >= border[0]) && (value <= border[n]))) {
         return -1;
-    while (high - low > 1) {
+    }
+    while ((high - low) > 1) {
         const int mid = (low + high) / 2;
-        if (value >= border[mid])
+        if (value >= border[mid]) {
             low = mid;
-        else
+        } else {
             high = mid;
+        }
     }
     return low;
 }
@@ -72,8 +75,9 @@ static int relocate(const rtid_real *border, int n, rtid_real value, int current
 {
     if (current >= 0) {
         const rtid_real margin = HYSTERESIS * (border[current + 1] - border[current]);
-        if (value >= border[current] - margin && value <= border[current + 1] + margin)
+        if ((value >= (border[current] - margin)) && (value <= (border[current + 1] + margin))) {
             return current;
+        }
     }
     return locate(border, n, value);
 }
@@ -87,7 +91,7 @@ static void set_step(rtid_estimator *e, int64_t dt_us)
 {
     e->dt_us = dt_us;
     e->dt_s = R((double)dt_us * 1e-6);
-    e->lag_decay = LAG > 0 ? EXP(-e->dt_s / LAG) : 0;
+    e->lag_decay = (LAG > R(0)) ? EXP(-e->dt_s / LAG) : R(0);
 }
 
 /* Lagged command of edge i over the interval: its end value and moments. */
@@ -99,56 +103,64 @@ static void follow_command(rtid_estimator *e, int i)
     e->edge[i].m1 = held;
     e->edge[i].var = 0;
     e->edge[i].mt = 0;
-    if (!(LAG > 0))
+    if (!(LAG > R(0))) {
         return;
-    e->edge[i].w = held + g * decay;
-    e->edge[i].m1 = held + g * mean;
-    e->edge[i].var = g * g * (R(0.5) * k * (R(1) - decay * decay) - mean * mean);
-    e->edge[i].mt = g * (k * (mean - decay) - R(0.5) * mean);
+    }
+    e->edge[i].w = held + (g * decay);
+    e->edge[i].m1 = held + (g * mean);
+    e->edge[i].var = g * g * ((R(0.5) * k * (R(1) - (decay * decay))) - (mean * mean));
+    e->edge[i].mt = g * ((k * (mean - decay)) - (R(0.5) * mean));
 }
 
-static int moved(const rtid_estimator *e, int i)
+static bool moved(const rtid_estimator *e, int i)
 {
-    return e->edge[i].to_u != e->edge[i].u
-           || (e->edge[i].to_u != SHUT && e->edge[i].to_dp != e->edge[i].dp);
+    return (e->edge[i].to_u != e->edge[i].u)
+           || ((e->edge[i].to_u != SHUT) && (e->edge[i].to_dp != e->edge[i].dp));
 }
 
-/* Find the block that each edge asks for; 0 where one is off its grid. */
-static int working_points(rtid_estimator *e, const rtid_real *now)
+static rtid_real read(const rtid_real *values, int column)
 {
-    int inside = 1;
+    return (column < RTID_EST_N_SIGNALS) ? values[column] : R(0);
+}
+
+/* Find the block that each edge asks for; false where one is off its grid. */
+static bool working_points(rtid_estimator *e, const rtid_real *now)
+{
+    bool inside = true;
     for (int i = 0; i < RTID_EST_N_EDGES; i++) {
         const edge_row *row = &EDGES[i];
-        const int before = e->edge[i].u != SHUT ? e->edge[i].dp : SHUT;
+        const int before = (e->edge[i].u != SHUT) ? e->edge[i].dp : SHUT;
         rtid_real mid;
         int u, dp;
         follow_command(e, i);
         e->edge[i].to_u = SHUT;
         e->edge[i].to_dp = e->edge[i].dp;
-        if (!(e->edge[i].m1 > row->safe))
+        if (!(e->edge[i].m1 > row->safe)) {
             continue;
+        }
         e->edge[i].dp0 = e->values[row->source] - e->values[row->sink];
-        e->edge[i].dp1 = (row->source < RTID_EST_N_SIGNALS ? now[row->source] : 0)
-                         - (row->sink < RTID_EST_N_SIGNALS ? now[row->sink] : 0);
+        e->edge[i].dp1 = read(now, row->source) - read(now, row->sink);
         u = relocate(&BORDERS[row->first_u], row->n_u, e->edge[i].m1, e->edge[i].u);
         mid = R(0.5) * (e->edge[i].dp0 + e->edge[i].dp1);
         dp = relocate(&BORDERS[row->first_dp], row->n_dp, mid, before);
         e->edge[i].to_u = (int16_t)u;
         e->edge[i].to_dp = (int16_t)dp;
-        inside = inside && u >= 0 && dp >= 0;
+        inside = inside && (u >= 0) && (dp >= 0);
     }
     return inside;
 }
 
-static int cell_of(int i, int u, int dp) { return EDGES[i].first_cell + u * EDGES[i].n_dp + dp; }
+static int cell_of(int i, int u, int dp) { return (int)EDGES[i].first_cell + (u * (int)EDGES[i].n_dp) + dp; }
 
-/* 1 if every block that is asked for has a slot or finds one. */
-static int has_room(const rtid_estimator *e)
+/* Every block that is asked for has a slot or finds one. */
+static bool has_room(const rtid_estimator *e)
 {
     int wanted = e->n_slots;
-    for (int i = 0; i < RTID_EST_N_EDGES; i++)
-        if (e->edge[i].to_u != SHUT)
-            wanted += e->slot[cell_of(i, e->edge[i].to_u, e->edge[i].to_dp)] < 0;
+    for (int i = 0; i < RTID_EST_N_EDGES; i++) {
+        if (e->edge[i].to_u != SHUT) {
+            wanted += (e->slot[cell_of(i, e->edge[i].to_u, e->edge[i].to_dp)] < 0) ? 1 : 0;
+        }
+    }
     return wanted <= RTID_EST_MAX_BLOCKS;
 }
 
@@ -160,23 +172,29 @@ static int slot_of(rtid_estimator *e, int i)
         block->edge = (int16_t)i;
         block->u = e->edge[i].u;
         block->dp = e->edge[i].dp;
-        *slot = (int16_t)e->n_slots++;
+        *slot = e->n_slots;
+        e->n_slots++;
     }
     return *slot;
 }
 
 static void change_block(rtid_estimator *e, int i)
 {
-    const int place = e->edge[i].place, was_open = place >= 0;
+    const int place = e->edge[i].place;
+    const bool was_open = place >= 0;
     e->counts[RTID_EST_BLOCK_CHANGES]++;
     e->edge[i].u = e->edge[i].to_u;
     e->edge[i].dp = e->edge[i].to_dp;
-    if (was_open)
+    if (was_open) {
         rtid_est_close(e, place);
-    if (e->edge[i].u != SHUT)
-        rtid_est_open(e, was_open ? place : e->owed.n_open, i, slot_of(e, i));
-    else if (was_open)
+    }
+    if (e->edge[i].u != SHUT) {
+        rtid_est_open(e, was_open ? place : (int)e->owed.n_open, i, slot_of(e, i));
+    } else if (was_open) {
         rtid_est_remove_open(e, place);
+    } else {
+        /* it was shut before */
+    }
 }
 
 static rtid_real column_variance(const rtid_estimator *e)
@@ -187,7 +205,7 @@ static rtid_real column_variance(const rtid_estimator *e)
 
 static rtid_real position_noise(const rtid_estimator *e)
 {
-    return AREA * AREA * X_VAR + column_variance(e);
+    return (AREA * AREA * X_VAR) + column_variance(e);
 }
 
 static void start_whitener(rtid_estimator *e)
@@ -199,32 +217,41 @@ static void start_whitener(rtid_estimator *e)
 /* Edges that shut come first, or a reversal could exceed the places for open blocks. */
 static void change_blocks(rtid_estimator *e)
 {
-    if (e->owed.n_open + e->n_closed + RTID_EST_MAX_OPEN > RTID_EST_MAX_RECENT) {
+    if ((e->owed.n_open + e->n_closed + RTID_EST_MAX_OPEN) > RTID_EST_MAX_RECENT) {
         e->counts[RTID_EST_RESTART_MEMORY]++;
         rtid_est_end(e);
         start_whitener(e);
     }
-    for (int opening = 0; opening < 2; opening++)
-        for (int i = 0; i < RTID_EST_N_EDGES; i++)
-            if ((e->edge[i].to_u != SHUT) == opening && moved(e, i))
+    for (int opening = 0; opening < 2; opening++) {
+        for (int i = 0; i < RTID_EST_N_EDGES; i++) {
+            if (((e->edge[i].to_u != SHUT) == (opening > 0)) && moved(e, i)) {
                 change_block(e, i);
+            }
+        }
+    }
 }
 
 int rtid_est_place(rtid_estimator *e, const rtid_real *now, int64_t dt_us)
 {
-    int any = 0;
-    if (dt_us != e->dt_us)
+    bool any = false;
+    if (dt_us != e->dt_us) {
         set_step(e, dt_us);
-    if (!working_points(e, now))
+    }
+    if (!working_points(e, now)) {
         return RTID_EST_OUTSIDE_GRID;
-    if (!has_room(e))
+    }
+    if (!has_room(e)) {
         return RTID_EST_NO_ROOM;
-    for (int i = 0; i < RTID_EST_N_EDGES; i++)
+    }
+    for (int i = 0; i < RTID_EST_N_EDGES; i++) {
         any = any || moved(e, i);
-    if (any && rtid_est_is_full(e))
+    }
+    if (any && rtid_est_is_full(e)) {
         return RTID_EST_BUSY;
-    if (any)
+    }
+    if (any) {
         change_blocks(e);
+    }
     return RTID_EST_TAKEN;
 }
 
@@ -242,14 +269,16 @@ static void shared_increments(rtid_estimator *e, const rtid_real *now)
 static rtid_real shaped(const term_row *row, const rtid_real *values)
 {
     rtid_real z = row->constant;
-    for (int j = 0; j < RTID_EST_N_SIGNALS; j++)
+    for (int j = 0; j < RTID_EST_N_SIGNALS; j++) {
         z += row->weight[j] * values[j];
-    switch (row->shape) {
-    case SIGNED_ROOT: return z < 0 ? -ROOT(-z) : ROOT(z);
-    case HINGE: return z > 0 ? z : 0;
-    case INVERSE: return R(-1) / z;
-    default: return z;
     }
+    switch (row->shape) {
+    case SIGNED_ROOT: z = (z < R(0)) ? -ROOT(-z) : ROOT(z); break;
+    case HINGE: z = (z > R(0)) ? z : R(0); break;
+    case INVERSE: z = R(-1) / z; break;
+    default: break; /* LINEAR */
+    }
+    return z;
 }
 
 static void term_increments(rtid_estimator *e, const rtid_real *now)
@@ -258,10 +287,11 @@ static void term_increments(rtid_estimator *e, const rtid_real *now)
         const term_row *row = &TERMS[k];
         const rtid_real start = shaped(row, e->values), end = shaped(row, now);
         rtid_real sum = e->dt_s * (start + end);
-        if (row->rate) {
+        if (row->rate != 0u) {
             sum = R(-2) * (end - start);
-            if (row->volume)
+            if (row->volume != 0u) {
                 sum *= R(0.5) * (volume(e->values[RTID_EST_X]) + volume(now[RTID_EST_X]));
+            }
         }
         e->d[2 + k] += R(0.5) * row->sign * row->scale * sum;
     }
@@ -272,41 +302,43 @@ static void term_increments(rtid_estimator *e, const rtid_real *now)
 static void mean_terms(const rtid_estimator *e, const rtid_estimator_open *open, rtid_real *phi)
 {
     const int i = open->edge;
-    const rtid_real *u = &BORDERS[EDGES[i].first_u + open->u];
-    const rtid_real *p = &BORDERS[EDGES[i].first_dp + open->dp];
+    const rtid_real *u = &BORDERS[(int)EDGES[i].first_u + open->u];
+    const rtid_real *p = &BORDERS[(int)EDGES[i].first_dp + open->dp];
     const rtid_real hu = R(2) / (u[1] - u[0]), hp = R(2) / (p[1] - p[0]);
     const rtid_real uc = R(0.5) * (u[1] + u[0]), pc = R(0.5) * (p[1] + p[0]);
     const rtid_real eta0 = (e->edge[i].dp0 - pc) * hp, eta1 = (e->edge[i].dp1 - pc) * hp;
     phi[0] = R(1);
     phi[1] = (e->edge[i].m1 - uc) * hu;
     phi[2] = R(0.5) * (eta0 + eta1);
-    phi[3] = phi[1] * phi[1] + e->edge[i].var * hu * hu; /* local: no digits are lost in float */
-    phi[4] = (eta0 * eta0 + eta0 * eta1 + eta1 * eta1) * R(1.0 / 3.0);
-    phi[5] = phi[1] * phi[2] + e->edge[i].mt * hu * (eta1 - eta0);
-    if (EDGES[i].masked)
-        for (int j = 0; j < T; j++)
+    phi[3] = (phi[1] * phi[1]) + (e->edge[i].var * hu * hu); /* local: no digits are lost in float */
+    phi[4] = ((eta0 * eta0) + (eta0 * eta1) + (eta1 * eta1)) * R(1.0 / 3.0);
+    phi[5] = (phi[1] * phi[2]) + (e->edge[i].mt * hu * (eta1 - eta0));
+    if (EDGES[i].masked != 0u) {
+        for (int j = 0; j < T; j++) {
             phi[j] *= EDGES[i].mask[j];
+        }
+    }
 }
 
-static void block_increments(rtid_estimator *e, int k, int64_t t_us, int row)
+static void block_increments(rtid_estimator *e, int k, const rtid_estimator_sample *sample)
 {
     const rtid_estimator_open *open = &e->owed.open[k];
     rtid_estimator_block *block = &e->block[open->slot];
     const edge_row *edge = &EDGES[open->edge];
     const cell_row *cell = &CELLS[cell_of(open->edge, open->u, open->dp)];
     const rtid_real scale = edge->sign * edge->scale * e->dt_s;
-    const rtid_real period = P_PERIOD > 0 ? P_PERIOD : e->dt_s;
+    const rtid_real period = (P_PERIOD > R(0)) ? P_PERIOD : e->dt_s;
     rtid_real phi[T];
     mean_terms(e, open, phi);
     block->dwell_us += e->dt_us;
-    block->last_us = t_us;
-    block->rows += row != 0;
+    block->last_us = sample->t_us;
+    block->rows += (sample->row != 0u) ? 1u : 0u;
     for (int j = 0; j < T; j++) {
         merge(&block->phi[j], as_sum(phi[j] * e->dt_s));
         e->d[first_of(k) + j] += scale * phi[j];
     }
     /* random walk of the integral: pressure noise through dQ/ddp and missed flow */
-    e->cov += (cell->slope * cell->slope * edge->dp_var * period + cell->missed) * e->dt_s;
+    e->cov += ((cell->slope * cell->slope * edge->dp_var * period) + cell->missed) * e->dt_s;
 }
 
 /* A row of all columns and their decay, by the Kalman whitener; see rtid/kernels/rows.py. */
@@ -320,11 +352,13 @@ static void make_row(rtid_estimator *e)
         row[j] = scale * e->d[j];
         e->d[j] *= keep;
     }
-    for (int i = 0; i < n; i++)
-        for (int j = 0; j <= i; j++)
+    for (int i = 0; i < n; i++) {
+        for (int j = 0; j <= i; j++) {
             merge(&e->owed.local[i][j], product(row[i], row[j]));
+        }
+    }
     merge(&e->noise, as_sum((v + e->echo) / s));
-    e->echo = keep * keep * e->echo + lost * lost * v;
+    e->echo = (keep * keep * e->echo) + (lost * lost * v);
     e->cov *= keep;
     e->counts[RTID_EST_ROWS]++;
 }
@@ -335,22 +369,27 @@ void rtid_est_integrate(rtid_estimator *e, const rtid_estimator_sample *sample)
 #if RTID_EST_N_TERMS > 0
     term_increments(e, sample->values);
 #endif
-    for (int k = 0; k < e->owed.n_open; k++)
-        block_increments(e, k, sample->t_us, sample->row);
+    for (int k = 0; k < e->owed.n_open; k++) {
+        block_increments(e, k, sample);
+    }
     rtid_est_remember(e, sample);
     e->cov += Q_FLOOR * e->dt_s;
-    if (sample->row)
+    if (sample->row != 0u) {
         make_row(e);
-    if (e->faded * e->d[RTID_EST_RING] < FORGET_AT)
+    }
+    if ((e->faded * e->d[RTID_EST_RING]) < FORGET_AT) {
         rtid_est_forget(e);
-    if (e->d[RTID_EST_RING] < RING_LIMIT)
+    }
+    if (e->d[RTID_EST_RING] < RING_LIMIT) {
         rtid_est_renew(e);
+    }
 }
 
 void rtid_est_begin(rtid_estimator *e)
 {
-    e->running = 1;
-    for (int i = 0; i < RTID_EST_N_EDGES; i++)
+    e->running = 1u;
+    for (int i = 0; i < RTID_EST_N_EDGES; i++) {
         e->edge[i].w = commanded(e, i);
+    }
     start_whitener(e);
 }

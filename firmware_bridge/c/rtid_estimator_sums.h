@@ -3,6 +3,7 @@
 #define RTID_ESTIMATOR_SUMS_H
 
 #include <math.h>
+#include <stdbool.h>
 
 #include "rtid_estimator.h"
 
@@ -93,12 +94,12 @@ static inline rtid_sum sum_of(rtid_sum a, rtid_sum b)
     return a;
 }
 
-static inline int first_of(int k) { return RTID_EST_OPEN_AT + T * k; }
+static inline int first_of(int k) { return RTID_EST_OPEN_AT + (T * k); }
 
 /* Units of the unknowns: rated flow of an edge, m3/s; scale of a shared one; terms of a map. */
 double rtid_est_rated(int edge);
 double rtid_est_shared_scale(int shared);
-int rtid_est_has_term(int edge, int term);
+bool rtid_est_has_term(int edge, int term);
 
 /* Keep the sample: it is the start of the next interval. */
 void rtid_est_remember(rtid_estimator *e, const rtid_estimator_sample *sample);
@@ -124,8 +125,8 @@ void rtid_est_open(rtid_estimator *e, int k, int edge, int slot);
 /* Take the closed and cleared block k out of the open ones; the last one takes its place. */
 void rtid_est_remove_open(rtid_estimator *e, int k);
 
-/* 1 where the line is too long to go on. */
-int rtid_est_is_full(const rtid_estimator *e);
+/* The line is too long to go on. */
+bool rtid_est_is_full(const rtid_estimator *e);
 
 /* Work off tiles that are owed, as far as this tick's go. */
 void rtid_est_pay(rtid_estimator *e);
@@ -155,8 +156,8 @@ void rtid_est_take_left(rtid_estimator_owed *o, int k);
 /* Frozen sums become numbers, with what is owed to them. */
 void rtid_est_settle(rtid_estimator_work *w);
 
-/* 1 where the state of a closed visit counts still. */
-int rtid_est_rings(const rtid_estimator_visit *v);
+/* The state of a closed visit counts still. */
+bool rtid_est_rings(const rtid_estimator_visit *v);
 
 /* What turns left x d, each in units of its visit, into a product. */
 rtid_real rtid_est_units(const rtid_estimator_visit *later, const rtid_estimator_visit *earlier);

@@ -18,9 +18,9 @@
 #include "rtid_tables.h"
 
 #define RTID_EXTENDED 0x80000000u /* bit 31 of can_id: 29 bit identifier */
-#define RTID_BLOCK_MAX 22         /* can_id, t_us, 8 bytes of payload, CRC-16 */
-#define RTID_CODE_MAX (RTID_BLOCK_MAX + 1)
-#define RTID_WIRE_MAX (RTID_CODE_MAX + 2)
+#define RTID_BLOCK_MAX 22u         /* can_id, t_us, 8 bytes of payload, CRC-16 */
+#define RTID_CODE_MAX (RTID_BLOCK_MAX + 1u)
+#define RTID_WIRE_MAX (RTID_CODE_MAX + 2u)
 
 typedef struct {
     int64_t t_us; /* clock of the controller, 0 to 2^53 - 1 */
@@ -74,5 +74,7 @@ size_t rtid_wire_encode(const rtid_frame *frame, uint8_t *out);
 
 /* Take one received byte; 1 if it completed a frame, else 0. */
 int rtid_wire_push(rtid_decoder *decoder, uint8_t byte, rtid_frame *frame);
+
+extern const char rtid_frames_version[];
 
 #endif

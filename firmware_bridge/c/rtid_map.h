@@ -23,8 +23,8 @@ enum {
     RTID_MAP_OUTSIDE = 5,      /* beyond the nodes: the value at their edge */
     RTID_MAP_NONE = 6          /* no map, no number, or no single command gives this flow */
 };
-#define RTID_MAP_N_CELL_STATUS 5 /* those that a cell may have */
-#define RTID_MAP_RISING 0x80 /* with the status of the first cells: flows only rise (or only fall)
+#define RTID_MAP_N_CELL_STATUS 5u /* those that a cell may have */
+#define RTID_MAP_RISING 0x80u /* with the status of the first cells: flows only rise (or only fall)
                                 with the command at both nodes of s: then Q^-1 need not look at all */
 
 typedef struct {
@@ -49,5 +49,7 @@ int rtid_map_command(const rtid_map *map, float q, float dp, float *u);
 
 /* Whether RTID_MAP_RISING holds between nodes j and j + 1 of s. */
 int rtid_map_is_rising(const rtid_map *map, unsigned j);
+
+extern const char rtid_map_version[];
 
 #endif

@@ -26,4 +26,6 @@ int rtid_map_fixed_flow(const rtid_map_fixed *map, int32_t u, int32_t dp, int32_
 /* As rtid_map_command: u in uV for q in mm3/s, less than 2^30; what it stands on. */
 int rtid_map_fixed_command(const rtid_map_fixed *map, int32_t q, int32_t dp, int32_t *u);
 
+extern const char rtid_map_fixed_version[];
+
 #endif

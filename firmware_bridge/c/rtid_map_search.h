@@ -15,7 +15,7 @@
 typedef struct {
     unsigned cell;
     number share;
-    int outside;
+    bool outside;
 } place;
 
 /* A flow that is looked for, in the sign in which flows rise with the command. */
@@ -32,66 +32,73 @@ static number flow_at(const wanted *q, unsigned k) { return q->sign * along_s(q-
 
 static int status_of(const table *map, const place *u, const place *s)
 {
-    if (u->outside || s->outside)
-        return RTID_MAP_OUTSIDE;
-    return map->status[(size_t)u->cell * (map->ns - 1u) + s->cell] & ~RTID_MAP_RISING;
+    const size_t at = ((size_t)u->cell * (map->ns - 1u)) + s->cell;
+    unsigned found = RTID_MAP_OUTSIDE;
+    if ((!u->outside) && (!s->outside)) {
+        found = map->status[at] & (uint8_t)~RTID_MAP_RISING;
+    }
+    return (int)found;
 }
 
 /* The first node always counts as below the wanted flow, the last never.  Where flows rise there is
  * one cell between a node below and one that is not; the command lies in it. */
 static unsigned bisect(const wanted *q)
 {
-    unsigned low = 0, high = q->map->nu - 1u;
-    while (high - low > 1) {
-        const unsigned middle = (low + high) / 2;
-        if (flow_at(q, middle) < q->count)
+    unsigned low = 0u, high = q->map->nu - 1u;
+    while ((high - low) > 1u) {
+        const unsigned middle = (low + high) / 2u;
+        if (flow_at(q, middle) < q->count) {
             low = middle;
-        else
+        } else {
             high = middle;
+        }
     }
     return low;
 }
 
-/* The same where flows may fall: 0 if there are several such cells, else 1. */
-static int scan(const wanted *q, unsigned *cell)
+/* The same where flows may fall: false if there are several such cells. */
+static bool scan(const wanted *q, unsigned *cell)
 {
-    unsigned crossings = 0;
-    int was_below = 1;
-    for (unsigned k = 1; k < q->map->nu; k++) {
-        const int is_below = k < q->map->nu - 1u && flow_at(q, k) < q->count;
-        if (was_below && !is_below)
-            *cell = k - 1;
-        crossings += was_below != is_below;
+    unsigned crossings = 0u;
+    bool was_below = true;
+    for (unsigned k = 1u; k < q->map->nu; k++) {
+        const bool is_below = (k < (q->map->nu - 1u)) && (flow_at(q, k) < q->count);
+        if (was_below && !is_below) {
+            *cell = k - 1u;
+        }
+        crossings += (was_below != is_below) ? 1u : 0u;
         was_below = is_below;
     }
-    return crossings == 1;
+    return crossings == 1u;
 }
 
 /* Whether one command alone gives the flow: the cell of u in which it lies.  Else the node of u
  * that comes closest, or the shut valve's.  Turns q to the sign in which flows rise, and holds it
  * to the map's ends. */
-static int search(wanted *q, unsigned *cell)
+static bool search(wanted *q, unsigned *cell)
 {
     const unsigned end = q->map->nu - 1u;
-    number first = flow_at(q, 0), last = flow_at(q, end);
+    number first = flow_at(q, 0u), last = flow_at(q, end);
     if (last < first) { /* as they do where dp < 0 */
         q->sign = -1;
         q->count = -q->count;
         first = -first;
         last = -last;
     }
-    *cell = q->count > last ? end : 0;
-    if (q->count < first - ROUNDING || q->count > last + ROUNDING)
-        return 0;
-    q->count = q->count < first ? first : q->count > last ? last : q->count;
-    if (q->map->status[q->s->cell] & RTID_MAP_RISING) {
-        *cell = bisect(q);
-        return 1;
+    *cell = (q->count > last) ? end : 0u;
+    if ((q->count < (first - ROUNDING)) || (q->count > (last + ROUNDING))) {
+        return false;
     }
-    if (scan(q, cell))
-        return 1;
-    *cell = 0;
-    return 0;
+    q->count = (q->count < first) ? first : ((q->count > last) ? last : q->count);
+    if ((q->map->status[q->s->cell] & RTID_MAP_RISING) != 0u) {
+        *cell = bisect(q);
+        return true;
+    }
+    if (scan(q, cell)) {
+        return true;
+    }
+    *cell = 0u;
+    return false;
 }
 
 #endif

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.c_tables import HEADER
+from firmware_bridge.c_tables import HEADER, bill
 from firmware_bridge.lookup import NO_SAFE_BAND, RISING, STATUS, Table
 from rtid.errors import RtidError
 from rtid.estimator.flowmap import FlowMap
@@ -32,6 +32,7 @@ BESIDE = (
     "rtid_map_fixed.h",
     "rtid_map_fixed.c",
     "rtid_map_search.h",
+    "rtid_version.h",
 )
 MICROVOLT, ROOT, FLOW = 1e6, 64.0, 1e9 * 65_536  # units of the fixed tables
 INT32_MAX = 2**31 - 1
@@ -76,6 +77,7 @@ def _lines(path: Path, sampled: Iterable[Sampled], provenance: Mapping[str, Any]
     yield " * What a flow stands on: " + ", ".join(f"{k} {word}" for k, word in enumerate(STATUS))
     yield " * NAME_u: V; NAME_s: sign(dp) sqrt |dp|, sqrt(Pa); NAME_q: m3/s over the scale"
     yield f" * {origin}"
+    yield f" * Bill of material: {bill(HEADER.with_name(name) for name in BESIDE)}"
     yield " */"
     yield f"#ifndef {guard}"
     yield f"#define {guard}"

@@ -41,7 +41,7 @@ SUFFIX, IDENTIFIER = ".fmu", "rtid_machine"
 VERSIONS = (2, 3)
 SOURCES = Path(__file__).with_name("fmu_c")
 OURS = ("rtid_machine.h", "rtid_machine.c", "rtid_fmi.c")
-MAPS = ("rtid_map.h", "rtid_map.c", "rtid_map_search.h")
+MAPS = ("rtid_map.h", "rtid_map.c", "rtid_map_search.h", "rtid_version.h")
 COMPILED = ("rtid_fmi.c", "rtid_machine.c", "rtid_map.c")
 SYSTEMS = {  # of platform.system(): by FMI 2.0, by FMI 3.0, suffix
     "Linux": ("linux", "linux", ".so"),

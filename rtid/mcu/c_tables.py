@@ -7,9 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from firmware_bridge.c_tables import HEADER, VERSION, bill
 from rtid.estimator.limits import most_open
 from rtid.estimator.state import Weights, build
 from rtid.kernels import layout
@@ -20,6 +22,12 @@ ALWAYS = 1e30  # stands for no limit: nothing that large passes the gate
 FOREVER_S = 1e9
 MOST_CELLS = 32_000  # numbers of cells and blocks are kept in 16 bits
 MOST_BLOCKS = 2_000
+SOURCES = HEADER.parent
+
+
+def sources() -> list[Path]:
+    """The estimator's files, without the tables."""
+    return [*sorted(SOURCES.glob("rtid_estimator*.[ch]")), VERSION]
 
 
 @dataclass(frozen=True)
@@ -73,11 +81,13 @@ def tables(model: Machine, blocks: int = 0, weights: Weights | None = None, titl
     sizes = sizes_of(model, blocks)
     state = build(model, weights)
     e = state.engine[0]
+    learns = f"chamber {_c_name(model.chambers[0].name)}{title}"
     parts = [
-        f"/* Chamber {_c_name(model.chambers[0].name)}{title}: written by `rtid mcu`. */",
+        f"/* Written by `rtid mcu`.  Bill of material: {bill(sources())} */",
         "#ifndef RTID_ESTIMATOR_TABLES_H",
         "#define RTID_ESTIMATOR_TABLES_H",
         "",
+        f'#define RTID_EST_LEARNS "{learns}"',
         *_sizes(sizes),
         *_signals(model),
         *_chamber(e, model),
@@ -171,7 +181,7 @@ def _edge_rows(e: np.void, model: Machine) -> Iterator[str]:
         numbers += [e["scale_m3s"][i], e["dp_var_pa2"][i]]
         nu, nd = edge.grid.shape
         words = [str(min(column, nothing)) for column in columns]
-        words += [_number(value) for value in numbers]
+        words += [_real(value) for value in numbers]
         words += [str(n) for n in (nu, nd, int(e["masked"][i]))]
         words += [str(n) for n in (first, first + nu + 1, int(e["first_cell"][i]))]
         yield f"/* {_c_name(edge.name)} */ {{{', '.join([*words, _row(e['mask'][i])])}}}"
@@ -180,8 +190,8 @@ def _edge_rows(e: np.void, model: Machine) -> Iterator[str]:
 
 def _borders(e: np.void) -> Iterator[str]:
     for i in range(int(e["n_edges"])):
-        yield ", ".join(_number(x) for x in e["u_border"][i, : int(e["n_u"][i]) + 1])
-        yield ", ".join(_number(x) for x in e["dp_border"][i, : int(e["n_dp"][i]) + 1])
+        yield ", ".join(_real(x) for x in e["u_border"][i, : int(e["n_u"][i]) + 1])
+        yield ", ".join(_real(x) for x in e["dp_border"][i, : int(e["n_dp"][i]) + 1])
 
 
 def _cells(cells: np.ndarray) -> Iterator[str]:
@@ -201,7 +211,7 @@ def _term_rows(e: np.void, model: Machine) -> Iterator[str]:
         shape, volume = int(e["term_shape"][k]), int(e["term_volume"][k])
         words = [str(shape), str(int(volume != layout.FLOW)), str(int(volume >= 0))]
         numbers = e["term_scale"][k], e["term_sign"][k, 0], e["term_constant"][k]
-        words += [_number(value) for value in numbers]
+        words += [_real(value) for value in numbers]
         weights = _row(e["term_weight"][k, : len(model.signals)])
         yield f"/* {_c_name(term.name)} */ {{{', '.join([*words, weights])}}}"
 
@@ -214,7 +224,12 @@ def _rows(name: str, what: str, rows: Iterable[str]) -> Iterator[str]:
 
 
 def _row(values: Iterable[float]) -> str:
-    return "{" + ", ".join(_number(value) for value in values) + "}"
+    return "{" + ", ".join(_real(value) for value in values) + "}"
+
+
+def _real(value: float) -> str:
+    """A number of the type that the estimator computes with."""
+    return f"R({_number(value)})"
 
 
 def _number(value: float) -> str:

@@ -77,10 +77,11 @@ class Layout:
         visit += [("left", total, (TERMS,)), ("ring", total), ("shared", total, (2 + n.terms,))]
         opened = [(name, _I2) for name in ("edge", "slot", "visit", "u", "dp")]
         fields: list[Field] = [("local", total, (self._width, self._width))]
-        fields += [(name, _U2) for name in ("memory", "n_open", "n_line", "n_paid", "last_begun")]
+        fields += [("memory", _U2)]
+        fields += [(name, _I2) for name in ("n_open", "n_line", "n_paid", "last_begun")]
         fields += [("epoch", _U4), ("open", _record(opened), (n.open,))]
         return _record(
-            [*fields, ("visit", _record(visit), (n.visits,)), ("line", _U2, (n.visits,))]
+            [*fields, ("visit", _record(visit), (n.visits,)), ("line", _I2, (n.visits,))]
         )
 
     @property
@@ -93,13 +94,13 @@ class Layout:
         real, total, n = self._real, self._sum, self.sizes
         edge = [(name, real) for name in ("w", "m1", "var", "mt", "dp0", "dp1")]
         edge += [(name, _I2) for name in ("u", "dp", "to_u", "to_dp", "place")]
-        fields: list[Field] = [("d", real, (self._width,)), ("width", _U2), ("faded", real)]
+        fields: list[Field] = [("d", real, (self._width,)), ("width", _I2), ("faded", real)]
         fields += [("owed", self.owed)]
         fields += [(name, real) for name in ("cov", "echo")] + [("noise", total)]
         fields += [(name, _I8) for name in ("t_us", "ready_us", "dt_us")]
         fields += [("values", real, (n.signals + 1,)), ("dt_s", real), ("lag_decay", real)]
         fields += [("running", _U1), ("edge", _record(edge), (n.edges,))]
-        fields += [(name, _U2) for name in ("n_closed", "n_slots", "tiles")]
+        fields += [(name, _I2) for name in ("n_closed", "n_slots", "tiles")]
         fields += [("slot", _I2, (n.cells,)), ("block", self.block, (n.blocks,))]
         fields += [("sums", total, (n.sums,))]
         if not self.single:
@@ -114,7 +115,7 @@ class Layout:
         fields: list[Field] = [("matrix", np.float64, (n.sums,))]
         fields += [(name, np.float64, (n.unknowns,)) for name in ("scale", "theta", "basis")]
         fields += [(name, np.float64) for name in ("noise", "rows", "cov_change")]
-        fields += [("now_us", _I8), ("n_slots", _U2), ("owed", self.owed)]
+        fields += [("now_us", _I8), ("n_slots", _I2), ("owed", self.owed)]
         fields += [("block", self.block, (n.blocks,))]
         return _record([*fields, ("map", MAP, (n.blocks,))])
 

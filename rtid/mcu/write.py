@@ -5,18 +5,11 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-import firmware_bridge
 from rtid.estimator.state import Weights
-from rtid.mcu.c_tables import tables
+from rtid.mcu.c_tables import sources, tables
 from rtid.model import Machine
 
-SOURCES = Path(firmware_bridge.__file__).parent / "c"
 TABLES = "rtid_estimator_tables.h"
-
-
-def sources() -> list[Path]:
-    """The files of the package, without the tables."""
-    return sorted(SOURCES.glob("rtid_estimator*.[ch]"))
 
 
 def write_sources(

@@ -21,7 +21,7 @@ from tests.left import shared_folder
 
 HERE = Path(__file__).parent
 SOURCES = Path(c_tables.HEADER).parent
-STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-Wconversion")
 COMPILER = next((name for name in ("cc", "gcc", "clang") if shutil.which(name)), None)
 FILES = ("rtid_map.c", "rtid_download.c")
 SANITISE = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")

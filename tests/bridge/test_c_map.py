@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +12,7 @@ from hypothesis import strategies as st
 from firmware_bridge import lookup
 from firmware_bridge.download import Image, Session, download
 from firmware_bridge.lookup import NONE, OUTSIDE, SHUT, STATUS, ImageError, Table
-from tests.bridge.controller import SOURCES, Controller, Line
+from tests.bridge.controller import Controller, Line
 from tests.bridge.tables import a_table
 
 
@@ -135,14 +134,3 @@ def test_what_is_too_large_is_refused() -> None:
         lookup.image(a_table(300, 3), 0)
     with pytest.raises(ImageError, match="1 to 255"):
         lookup.numbers_image([], 0)
-
-
-def test_uses_no_heap_and_little_of_the_library() -> None:
-    for name in ("rtid_map", "rtid_map_fixed", "rtid_download"):
-        files = [SOURCES / f"{name}{end}" for end in (".h", ".c")] + [SOURCES / "rtid_map_search.h"]
-        text = "".join(file.read_text() for file in files)
-        included = set(re.findall(r"#include <(.*)>", text))
-        assert included <= {"stddef.h", "stdint.h", "string.h", "math.h", "float.h"}
-        assert not re.search(r"\b(malloc|calloc|realloc|free|alloca|double)\b", text)
-        called = {name for name in re.findall(r"\b(\w+f)\(", text) if "_" not in name}
-        assert called <= {"sqrtf", "fabsf", "if"} | {"sizeof"}

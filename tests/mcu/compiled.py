@@ -20,7 +20,7 @@ from rtid.plain import FloatArray
 
 HERE = Path(__file__).parent
 SOURCES = Path(firmware_bridge.__file__).parent / "c"
-STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-Wconversion")
 OPTIMISED = ("-O2",)
 SANITISED = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 COMPILER = next((name for name in ("cc", "gcc", "clang") if shutil.which(name)), None)

@@ -21,6 +21,7 @@ from rtid.mcu.c_tables import sizes_of
 from rtid.mcu.memory import COUNTS, Layout
 from rtid.mcu.write import write_sources
 from rtid.model import Machine
+from tests.mcu.compiled import STRICT
 from tests.mcu.machine import Record
 
 HERE = Path(__file__).parent / "target"
@@ -28,7 +29,7 @@ GCC, QEMU = "arm-none-eabi-gcc", "qemu-system-arm"
 PER_COUNT = 40  # instructions
 M4 = ("mps2-an386", ("-mcpu=cortex-m4", "-mfpu=fpv4-sp-d16"))
 M7 = ("mps2-an500", ("-mcpu=cortex-m7", "-mfpu=fpv5-d16"))
-FLAGS = ("-mthumb", "-mfloat-abi=hard", "-std=c99", "-O2", "-Wall", "-Wextra", "-Werror")
+FLAGS = ("-mthumb", "-mfloat-abi=hard", "-O2", *STRICT)
 
 
 @dataclass(frozen=True)
