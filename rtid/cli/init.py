@@ -60,16 +60,6 @@ def init(
             print(f"  {problem}")
 
 
-def write_new(output: Path | None, text: str) -> None:
-    """Write a project file where there is none yet; nothing without a name."""
-    if output is None:
-        return
-    if output.exists():
-        raise RtidError(f"{output} exists", "give another -o", Exit.USAGE)
-    output.write_text(text, "utf-8")
-    print(f"wrote {output}")
-
-
 def _write_rate(table: Path, output: Path, given: Mapping[str, RoleCandidate]) -> bool:
     """The file of a plant without pressures; False where the table is of none."""
     from rtid.study.quick_rate import pairs_of, rate_text

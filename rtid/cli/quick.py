@@ -9,9 +9,24 @@ from typing import Annotated
 import typer
 
 from rtid.cli.exits import Exit, refuse_truncated
-from rtid.cli.init import write_new
 from rtid.cli.options import AsJson, RoleOption, UnitsOption, by_role
 from rtid.units import System
+
+
+def _volumes(text: str | None) -> str | None:
+    """One volume, or those of a and b."""
+    try:
+        if text is not None and min(_both(text)) <= 0.0:
+            raise ValueError
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is not one or two volumes, 0.6 or 0.6,0.5") from None
+    return text
+
+
+def _both(text: str) -> tuple[float, float]:
+    """Volumes of a and b, m3."""
+    a, b = (float(word) for word in (text.split(",") if "," in text else (text, text)))
+    return 1e-3 * a, 1e-3 * b
 
 
 def quick(
@@ -27,23 +42,36 @@ def quick(
         float | None, typer.Option("--stroke", min=1.0, help="Stroke, mm.")
     ] = None,
     dead_volume_l: Annotated[
+        str | None,
+        typer.Option(
+            "--dead-volume",
+            callback=_volumes,
+            help="Volume left at the ends, with hoses, L: one, or A,B.",
+        ),
+    ] = None,
+    safe_band: Annotated[
         float | None,
-        typer.Option("--dead-volume", min=1e-4, help="Volume left at either end, hoses too, L."),
+        typer.Option(min=0.0, help="Command up to which the valves are shut for sure."),
+    ] = None,
+    lag_ms: Annotated[
+        float | None, typer.Option("--lag", min=0.0, help="Lag of the spools, data sheet, ms.")
     ] = None,
     role: RoleOption = None,
-    output: Annotated[
+    save: Annotated[
         Path | None,
-        typer.Option("-o", "--output", help="Write the project of a plant without pressures."),
+        typer.Option("--save", "-o", "--output", help="Write the project file of what was found."),
     ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
     as_json: AsJson = False,
     units: UnitsOption = System.DISPLAY,
 ) -> None:
     """Say within a minute whether this data is good enough, and which effect is missing.
 
     Guesses the roles of the signals by name, unit and range, takes the grids from the data, and
-    states what it assumes of the machine.  A table without pressures is one of a plant whose rate
-    follows a command: its neutral, dead band, gains and delay are found.  Exit code 3: the file
-    cannot be read, or is of no kind of plant; 4: it is read, and too little for a verdict.
+    states what it assumes of the machine; --save writes the project of it, with which every other
+    command gives the same answer.  A table without pressures is one of a plant whose rate follows a
+    command: its neutral, dead band, gains and delay are found.  Exit code 3: the file cannot be
+    read, or is of no kind of plant; 4: it is read, and too little for a verdict.
     """
     from rtid.errors import RtidError
     from rtid.study.quick import quick as look
@@ -52,23 +80,26 @@ def quick(
     from rtid.tell.quick import lines, rate_lines
     from rtid.tell.replay import progress_bar
 
+    if save is not None and save.exists() and not force:
+        raise RtidError(f"{save} exists", "give another --save, or --force", Exit.USAGE)
     if bore_mm is not None and rod_mm is not None and rod_mm >= bore_mm:
         raise RtidError("--rod is not thinner than --bore", "give diameters in mm", Exit.USAGE)
-    bore_m, rod_m, stroke_m, dead_volume_m3 = (
-        None if value is None else 1e-3 * value
-        for value in (bore_mm, rod_mm, stroke_mm, dead_volume_l)
+    bore_m, rod_m, stroke_m, lag_s = (
+        None if value is None else 1e-3 * value for value in (bore_mm, rod_mm, stroke_mm, lag_ms)
     )
-    given = Given(bore_m, rod_m, stroke_m, dead_volume_m3)
+    volumes_m3 = _both(dead_volume_l) if dead_volume_l else None
+    given = Given(bore_m, rod_m, stroke_m, volumes_m3, safe_band, lag_s)
     with progress_bar() as progress:
         looked = look(file, dbc, given, progress, by_role(role or []))
-    if as_json:
-        print(json.dumps(looked.as_json()))
-    else:
-        of = rate_lines(looked) if isinstance(looked, QuickRate) else lines(looked)
-        print("\n".join(of))
     if isinstance(looked, QuickRate):
-        write_new(output, looked.text)
+        text, told, document, refused = looked.text, rate_lines(looked, save), looked.as_json(), {}
     else:
-        refuse_truncated(file, {"truncated": int(looked.truncated)})
+        text, told = looked.text_for(save or file), lines(looked, save)
+        document = looked.as_json(save)
+        refused = {"truncated": int(looked.truncated)}
+    if save is not None:
+        save.write_text(text, "utf-8")
+    print(json.dumps(document) if as_json else "\n".join(told))
+    refuse_truncated(file, refused)
     if not looked.is_enough:
         raise typer.Exit(Exit.NEGATIVE)

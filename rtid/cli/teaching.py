@@ -14,7 +14,7 @@ PANELS = {
 
 EXAMPLES = {
     "demo": "rtid demo --pictures pictures",
-    "quick": "rtid quick run.blf --dbc machine.dbc --bore 63 --rod 36 --stroke 500",
+    "quick": "rtid quick run.blf --dbc machine.dbc --bore 63 --rod 36 --stroke 500 --save m.toml",
     "init": "rtid init machine.dbc -o machine.toml",
     "check": "rtid check machine.toml run.blf",
     "simulate": "rtid simulate run.blf --plant 3 --motion rich_record --hide backlash=middle",

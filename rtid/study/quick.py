@@ -6,6 +6,7 @@ diagnosis then do with it what they do with any other.
 
 from __future__ import annotations
 
+import shlex
 import tempfile
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
@@ -15,8 +16,9 @@ from typing import Any
 
 import numpy as np
 
+from firmware_bridge.catalog import BUILTIN, places
 from rtid.diagnose.report import Diagnosis
-from rtid.diagnose.verdict import INSUFFICIENT, UNKNOWN
+from rtid.diagnose.verdict import INSUFFICIENT, MATCHES, MISSING, UNKNOWN
 from rtid.effects import catalogue
 from rtid.errors import RtidError
 from rtid.plain import Progress, silent
@@ -31,7 +33,7 @@ from rtid.study.quick_machine import (
     first_machine,
     fitted_machine,
 )
-from rtid.study.quick_project import DEAD_VOLUME, of_channels, of_missing, project_text
+from rtid.study.quick_project import DEAD_VOLUME, head_of, of_channels, of_missing, project_text
 from rtid.study.quick_rate import QuickRate, quick_rate
 from rtid.study.study import diagnose_trace
 from rtid.trace import Report, judge
@@ -51,21 +53,20 @@ NOBODY: Mapping[str, str] = MappingProxyType({})
 class Quick:
     """What a file tells without a project file.
 
-    unused: signals that play no role; level: good, fair or bad; diagnosis: None where the data are
-    too bad for one; dead_volume_m3: as given or assumed, beside which it says what was fitted.
+    level: good, fair or bad; diagnosis: None where the data are too bad for one; options: of the
+    command line that said the rest.
     """
 
     path: Path
-    dbc: str
+    source: Source
     roles: dict[str, RoleCandidate]
-    unused: tuple[str, ...]
-    assumptions: tuple[Assumption, ...]
+    machine: MachineSizes
     points: tuple[Point, ...]
     level: str
     diagnosis: Diagnosis | None
     cautions: tuple[str, ...]
-    dead_volume_m3: float
     truncated: bool
+    options: str = ""
 
     @property
     def is_enough(self) -> bool:
@@ -73,13 +74,45 @@ class Quick:
         return self.diagnosis is not None and self.diagnosis.verdict != INSUFFICIENT
 
     @property
-    def next_command(self) -> str:
-        """What to do now."""
-        what = self.dbc or str(self.path)
-        return f"rtid init {what} -o machine.toml"
+    def unused(self) -> tuple[str, ...]:
+        """Signals that play no role."""
+        return tuple(candidate.full_name for candidate in unused(self.source.signals, self.roles))
 
-    def as_json(self) -> dict[str, Any]:
-        """Plain JSON types; numbers that are not finite are null."""
+    @property
+    def assumptions(self) -> tuple[Assumption, ...]:
+        """Whatever nobody has said."""
+        missing, channels = of_missing(self.roles), of_channels(self.source, self.roles)
+        return (*missing, *channels, *self.machine.assumptions)
+
+    def text_for(self, file: Path) -> str:
+        """The project file that was judged, with its assumptions, as it is written to a file."""
+        source, dbc = self.source, self.source.keys.get("dbc", "")
+        if dbc and not dbc.startswith(BUILTIN):
+            near = (
+                place.named(proposal.relative(place.file, file.parent)) for place in places(dbc)
+            )
+            source = replace(source, keys=source.keys | {"dbc": ", ".join(near)})
+        return head_of(self.assumptions) + project_text(file.stem, source, self.roles, self.machine)
+
+    @property
+    def next_command(self) -> str:
+        """What writes the project."""
+        return f"rtid quick {self.path}{self.options} --save machine.toml"
+
+    def after(self, project: Path) -> str:
+        """What to do with the project once it is written."""
+        verdict = self.diagnosis.verdict if self.diagnosis else INSUFFICIENT
+        trace = f"{self.path} -p {project}"
+        if verdict == MISSING:
+            return f"rtid add {trace}"
+        if verdict == MATCHES:
+            return f"rtid export {self.path} maps.csv -p {project}"
+        if verdict == INSUFFICIENT:
+            return f"rtid quick ANOTHER_FILE{self.options}"
+        return f"rtid report {trace}"
+
+    def as_json(self, saved: Path | None = None) -> dict[str, Any]:
+        """Plain JSON types; numbers that are not finite are null.  saved: where its project is."""
         return {
             "schema": SCHEMA,
             "file": str(self.path),
@@ -92,8 +125,8 @@ class Quick:
             },
             "diagnosis": self.diagnosis.as_json() if self.diagnosis else None,
             "cautions": list(self.cautions),
-            "dead_volume_m3": self.dead_volume_m3,
-            "next": self.next_command,
+            "dead_volumes_m3": dict(zip("ab", self.machine.dead_volumes_m3, strict=True)),
+            "next": self.after(saved) if saved else self.next_command,
         }
 
 
@@ -116,7 +149,23 @@ def quick(
     guessed = proposal.with_named(proposal.propose(source.signals), named)
     if "time_column" in source.keys and not CHAMBERS & guessed.keys():
         return quick_rate(path, source, named, progress)
-    return _of_cylinder(path, source, roles_of(path, source, named), given, progress)
+    looked = _of_cylinder(path, source, roles_of(path, source, named), given, progress)
+    return replace(looked, options=_options(dbc, given, roles))
+
+
+def _options(dbc: Path | None, given: Given, roles: Mapping[str, str]) -> str:
+    """The words that say the same on the command line."""
+    lengths = {"bore": given.bore_m, "rod": given.rod_m, "stroke": given.stroke_m}
+    words = [("dbc", str(dbc))] if dbc else []
+    words += [(name, f"{1e3 * size:g}") for name, size in lengths.items() if size is not None]
+    if given.dead_volumes_m3 is not None:
+        words.append(("dead-volume", ",".join(f"{1e3 * v:g}" for v in given.dead_volumes_m3)))
+    if given.safe_band is not None:
+        words.append(("safe-band", f"{given.safe_band:g}"))
+    if given.lag_s is not None:
+        words.append(("lag", f"{1e3 * given.lag_s:g}"))
+    words += [("role", f"{role}={name}") for role, name in roles.items()]
+    return "".join(f" --{name} {shlex.quote(value)}" for name, value in words)
 
 
 def _of_cylinder(
@@ -137,19 +186,13 @@ def _of_cylinder(
             diagnosis = _diagnosed(arranged.project, path, progress)
     return Quick(
         path,
-        source.keys.get("dbc", ""),
+        source,
         arranged.roles,
-        tuple(candidate.full_name for candidate in unused(source.signals, arranged.roles)),
-        (
-            *of_missing(arranged.roles),
-            *of_channels(source, arranged.roles),
-            *arranged.machine.assumptions,
-        ),
+        arranged.machine,
         tuple(judged),
         level,
         diagnosis,
         tuple(_cautions(diagnosis, given)),
-        arranged.machine.dead_volume_m3,
         bool(arranged.trace.refused.get("truncated")),
     )
 
@@ -256,7 +299,7 @@ def _cautions(diagnosis: Diagnosis | None, given: Given) -> list[str]:
     pages = catalogue()
     stood_on = {size for name in names if name in pages for size in pages[name].stands_on}
     cautions = []
-    if given.dead_volume_m3 is None and DEAD_VOLUME in stood_on:
+    if given.dead_volumes_m3 is None and DEAD_VOLUME in stood_on:
         cautions.append(
             "Air and dead volume share what a chamber takes up: with --dead-volume (and the bore) "
             "the share of air is known, without it it may be twice too large."

@@ -14,27 +14,35 @@ from firmware_bridge.samples import ROW, Samples
 from rtid.plain import FloatArray
 from rtid.project.guess import RoleCandidate
 from rtid.project.template import EDGES, nice
+from rtid.study.spans import HELD_OUT_SHARE
+from rtid.trace.neutral import last_part_from
 from rtid.trace.quick_source import unit_of
 
 BORE_M, ROD_SHARE, DEAD_SHARE = 0.05, 0.7, 0.2  # a usual cylinder
 SUPPLY_PA = 7e6
-U_STEPS, DP_STEPS = 16, 12
+U_STEPS, DP_STEPS = 24, 12  # with 16 along u a healthy machine left 1.2 times its noise
+RATED_DP_PA = 5e5  # as data sheets have it
+WIDE = 0.5  # of the largest command beyond the dead band: from there on a valve is wide open
+LEAST_FLOW = 1e-7  # m3/s
 WINDOW_S = 0.02  # over which the speed is taken
 MOVES = 0.02  # of the top speed: below, the machine stands
 SPEED_BINS = 80
 LAG_MS, LAG_TOLERANCE_MS = 2.0, 5.0  # of a spool: every real one has some lag
+LAG_SHARE = 0.2  # by which a data sheet's lag may be off
 LONGEST_S = 1e6  # of a record, seconds: behind a damaged stamp nothing is looked for
 MOST_S = 120.0  # of a record: a diagnosis of more takes longer than a minute
 
 
 @dataclass(frozen=True)
 class Given:
-    """What the user has said, SI; None: nothing."""
+    """What the user has said, SI, the safe band in the command's unit; None: nothing."""
 
     bore_m: float | None = None
     rod_m: float | None = None
     stroke_m: float | None = None
-    dead_volume_m3: float | None = None
+    dead_volumes_m3: tuple[float, float] | None = None
+    safe_band: float | None = None
+    lag_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -47,24 +55,32 @@ class Assumption:
 
 @dataclass(frozen=True)
 class MachineSizes:
-    """Sizes and grids, SI; areas_m2 of the chambers a and b; reversed: roles to be turned round.
+    """Sizes and grids, SI; reversed: roles to be turned round.
 
-    span_s: the part of the record that is looked at.
+    spans_s: the part of the record that teaches, and the one that judges; empty: not looked at yet.
     """
 
-    areas_m2: tuple[float, float]
+    bore_m: float
+    rod_m: float
     stroke_m: float
-    dead_volume_m3: float
+    dead_volumes_m3: tuple[float, float]
     dead_is_fitted: bool
     x_zero_m: float
     u_grid: FloatArray
     dp_grid_pa: FloatArray
-    safe_band: float
+    safe_band: float | None
+    lag_s: float | None
     rated_flow_m3s: float
-    rated_dp_pa: float
-    span_s: tuple[float, float] | None = None
+    spans_s: tuple[tuple[float, float], ...] = ()
     reversed: frozenset[str] = frozenset()
     assumptions: tuple[Assumption, ...] = field(default=())
+
+
+def lag_of(machine: MachineSizes) -> tuple[float, float]:
+    """The spools' lag and its tolerance, ms."""
+    if machine.lag_s is None:
+        return LAG_MS, LAG_TOLERANCE_MS
+    return 1e3 * machine.lag_s, 1e3 * LAG_SHARE * machine.lag_s
 
 
 def first_machine(roles: dict[str, RoleCandidate], given: Given) -> MachineSizes:
@@ -75,21 +91,22 @@ def first_machine(roles: dict[str, RoleCandidate], given: Given) -> MachineSizes
     low, high = (unit_of(x).si(end) for end in (x.low, x.high))
     zero = min(low, 0.0)
     stroke = given.stroke_m or nice(high - zero, 1.0)
-    areas = math.pi / 4 * bore**2, math.pi / 4 * (bore**2 - rod**2)
+    swept = math.pi / 4 * bore**2 * stroke
     u_max = nice(max(abs(u.low), abs(u.high)) * unit_of(u).factor, 10.0)
     highest = max(unit_of(c).si(c.high) for r, c in roles.items() if r.startswith("p_"))
     top = nice(highest, SUPPLY_PA)
     return MachineSizes(
-        areas,
+        bore,
+        rod,
         stroke,
-        given.dead_volume_m3 or DEAD_SHARE * areas[0] * stroke,
-        given.dead_volume_m3 is None,
+        given.dead_volumes_m3 or (DEAD_SHARE * swept, DEAD_SHARE * swept),
+        given.dead_volumes_m3 is None,
         zero,
         np.linspace(0.0, u_max, U_STEPS + 1),
         top * np.linspace(-1.0, 1.0, DP_STEPS + 1),
-        0.0,
-        1e-3,
-        0.5e6,
+        given.safe_band,
+        given.lag_s,
+        LEAST_FLOW,
         assumptions=tuple(_of_geometry(given, bore, rod, stroke, zero)),
     )
 
@@ -109,7 +126,7 @@ def _of_geometry(
             "flows of chamber b are scaled against those of a: an internal leak would look partly "
             "like an external one",
         ))  # fmt: skip
-    fitted = given.dead_volume_m3 is None
+    fitted = given.dead_volumes_m3 is None
     volumes = (
         "the volume of b is off by a constant, which is fitted with it"
         if fitted
@@ -138,7 +155,7 @@ def fitted_machine(machine: MachineSizes, samples: Samples) -> MachineSizes:
     u, x = samples.column("u"), samples.column("x")
     speed = _speed(samples)
     span = _span(samples, x)
-    band = shut_band(u, speed)
+    band = shut_band(u, speed) if machine.safe_band is None else machine.safe_band
     top = float(np.abs(u).max())
     drops = [
         samples.column(source)[w > band] - samples.column(sink)[w > band]
@@ -147,30 +164,32 @@ def fitted_machine(machine: MachineSizes, samples: Samples) -> MachineSizes:
     ]
     dp = np.concatenate(drops) if any(len(d) for d in drops) else np.zeros(1)
     low, high = float(dp.min()), float(dp.max())
-    flow = 1.2 * machine.areas_m2[0] * float(np.quantile(speed, 0.999))
-    usual = float(np.median(dp[dp > 0])) if (dp > 0).any() else 0.5e6
     return replace(
         machine,
         u_grid=np.linspace(band, max(top, band + 1e-6) * 1.001, U_STEPS + 1),
         dp_grid_pa=dp_grid(low, high),
         safe_band=band,
-        rated_flow_m3s=max(flow, 1e-7),
-        rated_dp_pa=usual,
-        span_s=span,
-        assumptions=machine.assumptions + tuple(_of_samples(samples, band, span)),
+        rated_flow_m3s=rated_flow(machine, samples, speed, band),
+        spans_s=_teach_and_judge(samples, x, span),
+        assumptions=machine.assumptions + tuple(_of_samples(samples, machine, band, span)),
     )
 
 
 def _of_samples(
-    samples: Samples, band: float, span: tuple[float, float] | None
+    samples: Samples, machine: MachineSizes, band: float, span: tuple[float, float] | None
 ) -> list[Assumption]:
-    assumptions = [Assumption(
-        f"the valves are shut up to |u| = {band:.3g}, half of what it takes to move",
-        "a valve that opens earlier passes for a leak; give safe_band in the project file",
-    ), Assumption(
-        f"the spools lag {LAG_MS:g} ms, give or take {LAG_TOLERANCE_MS:g}: nothing missing",
-        "a smaller delay is counted as the spools' own; give dynamics.spool_lag",
-    )]  # fmt: skip
+    assumptions = []
+    if machine.safe_band is None:
+        assumptions.append(Assumption(
+            f"the valves are shut up to |u| = {band:.3g}, half of what it takes to move "
+            "(--safe-band)",
+            "a valve that opens earlier passes for a leak",
+        ))  # fmt: skip
+    if machine.lag_s is None:
+        assumptions.append(Assumption(
+            f"the spools lag {LAG_MS:g} ms, give or take {LAG_TOLERANCE_MS:g} (--lag)",
+            "a smaller delay is counted as the spools' own",
+        ))  # fmt: skip
     if span is not None:
         whole = float(samples.t_us[-1] - samples.t_us[0]) * 1e-6
         assumptions.append(Assumption(
@@ -179,6 +198,23 @@ def _of_samples(
             "what happens elsewhere in the record is not seen",
         ))  # fmt: skip
     return assumptions
+
+
+def rated_flow(machine: MachineSizes, samples: Samples, speed: FloatArray, band: float) -> float:
+    """Flow of the largest valve, fully open at RATED_DP_PA, m3/s: what a data sheet would say.
+
+    speed (n,) in m/s; machine: its grid still ends at the largest command that the signal can have.
+    """
+    u, full, flows = samples.column("u"), float(machine.u_grid[-1]), [LEAST_FLOW]
+    for name, (source, sink, way) in EDGES.items():
+        w, dp = way * u, samples.column(source) - samples.column(sink)
+        wide = (w > band + WIDE * (w.max() - band)) & (w > band) & (dp > 0.0)
+        if wide.any():
+            gain = speed[wide] / np.sqrt(dp[wide]) / (w[wide] - band)
+            rod = machine.rod_m if "b" in name else 0.0
+            area = math.pi / 4 * (machine.bore_m**2 - rod**2)
+            flows.append(area * float(np.median(gain)) * (full - band) * math.sqrt(RATED_DP_PA))
+    return max(flows)
 
 
 def _speed(samples: Samples) -> FloatArray:
@@ -221,6 +257,19 @@ def dp_grid(low: float, high: float) -> FloatArray:
         return np.concatenate([[low - 1e4], up[1:]]) if low < 0.0 else up
     down = -nice(-low, SUPPLY_PA) * np.linspace(1.0, 0.0, DP_STEPS // 2 + 1) ** 2
     return np.concatenate([down, up[1:]])
+
+
+def _teach_and_judge(
+    samples: Samples, x: FloatArray, span: tuple[float, float] | None
+) -> tuple[tuple[float, float], ...]:
+    """The parts that teach and judge, by motion; span: of the record, None for all of it."""
+    t = (samples.t_us - samples.t_us[0]) * 1e-6
+    begin, end = span or (0.0, math.floor(t[-1]) + 1.0)
+    inside = (t >= begin) & (t <= end)
+    if inside.sum() < 3:
+        return ()
+    split = round(last_part_from(t[inside], x[inside], HELD_OUT_SHARE), 3)
+    return (begin, split), (split, end)
 
 
 def _span(samples: Samples, x: FloatArray) -> tuple[float, float] | None:

@@ -1,7 +1,12 @@
-"""The project file of a machine that nobody has described, from guesses and assumptions."""
+"""The project file of a machine that nobody has described, from guesses and assumptions.
+
+In the units that people speak; what was assumed stands at its head, with what is wrong if it is not
+so.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import tomlkit
@@ -9,13 +14,13 @@ import tomlkit
 from rtid.effects import correcting
 from rtid.project.guess import RoleCandidate
 from rtid.project.template import EDGES, nice
-from rtid.study.quick_machine import LAG_MS, LAG_TOLERANCE_MS, SUPPLY_PA, Assumption, MachineSizes
+from rtid.study.quick_machine import RATED_DP_PA, SUPPLY_PA, Assumption, MachineSizes, lag_of
 from rtid.trace.quick_source import Source, unit_of
-from rtid.units import units_of
+from rtid.units import LPM, units_of
 
 DEAD_VOLUME = "dead volume"  # as the pages call the declared size
 TANK_PA = 1e5
-HELD_OUT = 0.25
+DIGITS = 6  # of what is written
 SLOW_MS, GAP_STEPS = 20.0, 2.5  # a table with longer steps than the usual gate lets through
 
 
@@ -32,19 +37,21 @@ def project_text(
         if any(c.message == message for c in roles.values())
     }
     raw["signals"] = _signals(source, roles, machine)
-    raw["geometry"] = {"stroke_m": machine.stroke_m}
+    raw["geometry"] = {"stroke_mm": _neat(1e3 * machine.stroke_m)}
+    bore = {"piston_diameter_mm": _neat(1e3 * machine.bore_m)}
+    room_a, room_b = ({"dead_volume_l": _neat(1e3 * v)} for v in machine.dead_volumes_m3)
+    rod = {"rod_diameter_mm": _neat(1e3 * machine.rod_m)}
     raw["chambers"] = {
-        chamber: {"pressure": f"p_{chamber}", "sign": sign, "area_m2": area,
-                  "dead_volume_m3": machine.dead_volume_m3}
-        for chamber, sign, area in zip("ab", (1, -1), machine.areas_m2, strict=True)
-    }  # fmt: skip
+        "a": {"pressure": "p_a", "sign": 1, **bore, **room_a},
+        "b": {"pressure": "p_b", "sign": -1, **bore, **rod, **room_b},
+    }
     raw["edge_defaults"] = {
         "command": "u",
-        f"u_grid_{key}": machine.u_grid.tolist(),
-        "dp_grid_pa": machine.dp_grid_pa.tolist(),
-        f"safe_band_{key}": machine.safe_band,
-        "rated_flow_m3s": machine.rated_flow_m3s,
-        "rated_dp_pa": machine.rated_dp_pa,
+        f"u_grid_{key}": [_neat(border) for border in machine.u_grid],
+        "dp_grid_mpa": [_neat(1e-6 * border) for border in machine.dp_grid_pa],
+        f"safe_band_{key}": _neat(machine.safe_band or 0.0),
+        "rated_flow_lpm": _neat(LPM * machine.rated_flow_m3s),
+        "rated_dp_mpa": _neat(1e-6 * RATED_DP_PA),
     }
     raw["edges"] = {
         edge: {"source": start, "sink": sink, "direction": way}
@@ -56,13 +63,24 @@ def project_text(
         raw["added"] = [
             {"effect": dead.name, "where": chamber, "parameters": volume} for chamber in "ab"
         ]
-    raw["dynamics"] = {"spool_lag": {"nominal_ms": LAG_MS, "tolerance_ms": LAG_TOLERANCE_MS}}
+    lag_ms, tolerance_ms = map(_neat, lag_of(machine))
+    raw["dynamics"] = {"spool_lag": {"nominal_ms": lag_ms, "tolerance_ms": tolerance_ms}}
     raw["gates"] = {"max_gap_ms": GAP_STEPS * source.step_ms} if source.step_ms > SLOW_MS else {}
-    if machine.span_s:
-        begin, end = machine.span_s
-        split = end - HELD_OUT * (end - begin)
-        raw["record"] = {"identification_s": [begin, split], "validation_s": [split, end]}
+    if machine.spans_s:
+        teaches, judges = machine.spans_s
+        raw["record"] = {"identification_s": list(teaches), "validation_s": list(judges)}
     return tomlkit.dumps({name: part for name, part in raw.items() if part})
+
+
+def _neat(value: float) -> float:
+    return float(f"{value:.{DIGITS}g}")
+
+
+def head_of(assumptions: Iterable[Assumption]) -> str:
+    """What a project file stands on, as its comment."""
+    text = "Written by `rtid quick`.  Assumed, and what is wrong if it is not so:"
+    lines = [text, *(f"* {a.what}: else {a.if_wrong}." for a in assumptions)]
+    return "".join(f"# {line}\n" for line in lines) + "\n"
 
 
 def _channel(source: Source, message: str) -> dict[str, int]:

@@ -26,8 +26,9 @@ from rtid.errors import RtidError
 from rtid.estimator.published import publish
 from rtid.plain import FloatArray, Progress, plain, silent
 from rtid.project.guess import ROLES, RoleCandidate, is_wanted, propose, with_unit
+from rtid.study.spans import HELD_OUT_SHARE
 from rtid.study.study import Study
-from rtid.trace.neutral import neutral_of, slope_of
+from rtid.trace.neutral import held_out_from, neutral_of, slope_of
 from rtid.trace.quick_source import Source
 from rtid.units import COMMAND_DIMENSIONS, find_unit, words_of
 
@@ -39,7 +40,6 @@ BINS = 24  # of the command, to see how much of the rate it explains
 LEAST_SHARE = 0.1  # of the rate's variance that a command must explain
 BLOCKS = 13  # of the map
 LEAST_ROWS, LEAST_VALUES = 15, 5  # samples that a block needs, and different commands
-HELD_OUT = 0.25  # of the motion
 GAP_STEPS = 5.0  # usual steps: a longer one is a gap
 MAX_SD_SHARE = 0.05  # of the largest rate: known worse than this is not valid
 
@@ -131,7 +131,7 @@ def rate_text(name: str, path: Path, source: Source, pair: RatePair) -> str:
     if _is_angle(pair.state):
         state["kind"] = "other"
     state |= {"noise": "estimate", "resolution": source.steps[pair.state.name]}
-    split = _split_s(t_s, x)
+    split = held_out_from(t_s, x, HELD_OUT_SHARE)
     raw: dict[str, dict[str, Any]] = {
         "project": {"name": name},
         "source": dict(source.keys),
@@ -198,13 +198,6 @@ def _joined(u: FloatArray, borders: list[float]) -> list[float]:
     return [round(border, 9) for border in kept]
 
 
-def _split_s(t_s: FloatArray, x: FloatArray) -> float:
-    """When all but the last HELD_OUT of the motion is over: a clock would hold out a standstill."""
-    moved = np.concatenate([[0.0], np.cumsum(np.abs(slope_of(t_s, x))[:-1] * np.diff(t_s))])
-    at = int(np.searchsorted(moved, (1.0 - HELD_OUT) * moved[-1]))
-    return round(float(t_s[min(max(at, 1), len(t_s) - 2)]), 6)
-
-
 def _three(value: float) -> float:
     return float(f"{value:.3g}")
 
@@ -250,7 +243,7 @@ class QuickRate:
     @property
     def next_command(self) -> str:
         """What to do now."""
-        return f"rtid quick {self.path} {self.pair.options} -o machine.toml"
+        return f"rtid quick {self.path} {self.pair.options} --save machine.toml"
 
     def as_json(self) -> dict[str, Any]:
         """Plain JSON types."""

@@ -9,6 +9,7 @@ from rtid.model import Machine
 from rtid.plain import FloatArray
 from rtid.project import Project
 from rtid.study.kept_record import within
+from rtid.trace.neutral import last_part_from
 from rtid.trace.reading import NoSamplesError, Trace
 
 HELD_OUT_SHARE = 0.25  # of a record without declared parts: its end
@@ -48,10 +49,10 @@ def parts(project: Project, model: Machine, trace: Trace) -> tuple[FloatArray, F
 
 
 def _whole(model: Machine, trace: Trace) -> tuple[FloatArray, float]:
-    """All samples, and when the last quarter begins."""
+    """All samples, and when the last quarter begins, of the motion where the machine rests then."""
     chunk = to_chunk(model, trace.samples, int(trace.samples.t_us[0]))
-    t_s = chunk[:, 0]
-    return chunk, float(t_s[0] + (1.0 - HELD_OUT_SHARE) * (t_s[-1] - t_s[0]))
+    x = chunk[:, 2 + model.column(model.position)]
+    return chunk, last_part_from(chunk[:, 0], x, HELD_OUT_SHARE)
 
 
 def _part(trace: Trace, chunk: FloatArray, span_s: tuple[float, float], name: str) -> FloatArray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 from rtid.compare.dead_band import DeadBand
 from rtid.effects import correcting
@@ -21,11 +22,14 @@ ANSWERS = {
     FAIR: "Is this data good enough?  With reservations.",
     BAD: "Is this data good enough?  No.",
 }
-FILL_IN = "[geometry] stroke, [chambers.*] area and dead volume, safe_band, rated flow, spool lag"
+SIZES = ("--bore", "--rod", "--stroke", "--dead-volume", "--safe-band", "--lag")
 
 
-def lines(quick: Quick) -> Iterator[str]:
-    """Everything, line by line: roles, assumptions, the data, the verdict, the next command."""
+def lines(quick: Quick, saved: Path | None = None) -> Iterator[str]:
+    """Everything, line by line: roles, assumptions, the data, the verdict, the next command.
+
+    saved: where its project was written.
+    """
     yield f"{quick.path.name}, without a project file.  Taken as:"
     for role, candidate in quick.roles.items():
         guessed = ", unit guessed from its range" if candidate.guessed_unit else ""
@@ -45,12 +49,15 @@ def lines(quick: Quick) -> Iterator[str]:
     yield ""
     yield from _verdict(quick)
     yield ""
+    if saved is not None:
+        yield f"wrote {saved}: every other command takes it, and says the same."
+        yield f"Next: {quick.after(saved)}"
+        return
     yield f"Next: {quick.next_command}"
-    yield f"  fill in {FILL_IN}; then"
-    yield f"  rtid check machine.toml {quick.path}  and  rtid diagnose {quick.path} -p machine.toml"
+    yield f"  writes the project with what is assumed; {' '.join(SIZES)} make it yours."
 
 
-def rate_lines(quick: QuickRate) -> Iterator[str]:
+def rate_lines(quick: QuickRate, saved: Path | None = None) -> Iterator[str]:
     """Of a table without pressures: the pair, its neutral, band and gains, the verdict."""
     pair, u, x = quick.pair, quick.pair.command, quick.pair.state
     yield f"{quick.path.name}, without a project file: a plant without pressures, d x / dt = f(u)."
@@ -70,9 +77,12 @@ def rate_lines(quick: QuickRate) -> Iterator[str]:
     for sentence in sentences(quick.diagnosis):
         yield f"  {sentence}"
     yield ""
+    if saved is not None:
+        yield f"wrote {saved}"
+        yield f"Next: rtid replay {quick.path} -p {saved}"
+        return
     yield f"Next: {quick.next_command}"
-    then = f"rtid replay {quick.path} -p machine.toml"
-    yield f"  writes the project with what was found; then  {then}"
+    yield "  writes the project with what was found."
 
 
 def band_lines(name: str, band: DeadBand, unit: str, command_unit: str) -> Iterator[str]:
@@ -100,8 +110,9 @@ def _verdict(quick: Quick) -> Iterator[str]:
     plain = replace(diagnosis, added=(), advice=advice)
     for sentence in (*sentences(plain), *quick.cautions):
         yield f"  {sentence}"
+    declared = dict(zip("ab", quick.machine.dead_volumes_m3, strict=True))
     volumes = [
-        f"{1e3 * (quick.dead_volume_m3 + a.parameters['volume'].value):.2f} L at {a.where}"
+        f"{1e3 * (declared[a.where] + a.parameters['volume'].value):.2f} L at {a.where}"
         for a in diagnosis.added
     ]
     if volumes and quick.is_enough:

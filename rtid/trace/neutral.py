@@ -16,6 +16,7 @@ from rtid.project import Project
 
 STILL = 0.03  # of the quickest motion: slower is standing still
 WINDOW_S = 0.4  # over which a motion is taken: longer than sensors jitter
+LITTLE = 0.5  # of its share of the motion: a part that has less is no fair judge
 COMMON = 0.2  # share of the still samples that one and the same command must have
 
 
@@ -48,6 +49,27 @@ def slope_of(t_s: FloatArray, state: FloatArray) -> FloatArray:
     k = np.arange(len(t_s))
     a, b = np.maximum(k - half, 0), np.minimum(k + half, len(k) - 1)
     return np.asarray((state[b] - state[a]) / np.maximum(t_s[b] - t_s[a], 1e-9))
+
+
+def held_out_from(t_s: FloatArray, state: FloatArray, share: float) -> float:
+    """When all but the last `share` of the motion is over, s: a clock would hold out a standstill.
+
+    t_s (n,), state (n,) in any unit; n > 2.
+    """
+    way = np.abs(slope_of(t_s, state))[:-1] * np.diff(t_s)
+    moved = np.concatenate([[0.0], np.cumsum(way)])
+    at = int(np.searchsorted(moved, (1.0 - share) * moved[-1]))
+    return round(float(t_s[min(max(at, 1), len(t_s) - 2)]), 6)
+
+
+def last_part_from(t_s: FloatArray, state: FloatArray, share: float) -> float:
+    """When the last `share` of the time begins, s; of the motion, where that holds little of it.
+
+    t_s (n,), state (n,) in any unit; n > 2.
+    """
+    split = float(t_s[0] + (1.0 - share) * (t_s[-1] - t_s[0]))
+    is_enough = np.ptp(state) == 0.0 or held_out_from(t_s, state, LITTLE * share) > split
+    return split if is_enough else held_out_from(t_s, state, share)
 
 
 def about_neutral(project: Project, samples: Samples) -> Samples:
