@@ -63,6 +63,7 @@ class Chamber:
 
     Without a pressure (NONE) it is xdot = ..., times area_m2.  disturbance: intensity of unmodelled
     flow, m3/s per sqrt(Hz), a white noise that the rows are weighed for.  unit: of the equation.
+    behind_s: a lag behind the maps (`rtid.effects.response`), whose noise stands behind it too.
     """
 
     name: str
@@ -72,6 +73,7 @@ class Chamber:
     v0_m3: float
     disturbance: float = 0.0
     unit: str = "m3/s"
+    behind_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,8 @@ class Edge:
     terms under the squares of these windows.  terms: BOTH, or DROP_ONLY, eq. (15), one function of
     dp per interval of w, or COMMAND_ONLY.  modes: working modes in which it may open, all when
     empty; in the others its command is zero.  signs: (chamber, +1 or -1) pairs, where the ends'
-    names do not tell which chambers it feeds and drains.
+    names do not tell which chambers it feeds and drains.  shares: an edge before it, whose map it
+    has as well: one map of several commands, such as the rotors of one aircraft.
     """
 
     name: str
@@ -102,6 +105,7 @@ class Edge:
     terms: str = BOTH
     modes: tuple[int, ...] = ()
     signs: tuple[tuple[str, int], ...] = ()
+    shares: str = NONE
 
     def sign(self, chamber: Chamber) -> int:
         """+1 where the edge feeds the chamber, -1 where it drains it, else 0."""
@@ -214,6 +218,8 @@ class Machine:
     # where a block is coupled to all that were visited within its memory, and cost information.
     recent_blocks: int = 64
     mode: str = NONE  # the signal that carries the number of the working mode
+    # Of a plant whose rate is measured itself, y = f(u): that signal; `position` is its integral.
+    measured: str = NONE
 
     @property
     def has_pressures(self) -> bool:
@@ -221,15 +227,29 @@ class Machine:
         return any(chamber.pressure for chamber in self.chambers)
 
     @property
+    def maps(self) -> tuple[Edge, ...]:
+        """The edges with a map of their own, in the order of their blocks."""
+        return tuple(edge for edge in self.edges if not edge.shares)
+
+    @property
+    def owners(self) -> tuple[int, ...]:
+        """Place among the edges of the one whose map each has: its own, unless it shares one."""
+        places = {edge.name: i for i, edge in enumerate(self.edges)}
+        return tuple(places[edge.shares or edge.name] for edge in self.edges)
+
+    @property
     def n_cells(self) -> int:
         """Number of blocks of all grids."""
-        return sum(edge.grid.shape[0] * edge.grid.shape[1] for edge in self.edges)
+        return sum(edge.grid.shape[0] * edge.grid.shape[1] for edge in self.maps)
 
     @property
     def first_cells(self) -> tuple[int, ...]:
-        """Number of each edge's first block among the blocks of all grids."""
-        sizes = [edge.grid.shape[0] * edge.grid.shape[1] for edge in self.edges]
-        return tuple(sum(sizes[:i]) for i in range(len(sizes)))
+        """Number of the first block of each edge's map among the blocks of all grids."""
+        first, at = dict[str, int](), 0
+        for edge in self.maps:
+            first[edge.name] = at
+            at += edge.grid.shape[0] * edge.grid.shape[1]
+        return tuple(first[edge.shares or edge.name] for edge in self.edges)
 
     @property
     def with_taylor_maps(self) -> Machine:

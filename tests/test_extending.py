@@ -19,6 +19,7 @@ from firmware_bridge.sources import formats, open_log
 from rtid.cli import main
 from rtid.cli.exits import Exit
 from rtid.effects import catalogue
+from rtid.effects.live import LiveFlow
 from rtid.maps.files import WRITERS
 from rtid.project import load
 from rtid.sim.hidden import hide_wish
@@ -121,6 +122,7 @@ def test_an_own_effect_in_python_is_added_and_runs_on_board(leaking: Path, tmp_p
     assert rtid("add", "worn_groove", leaking, "-p", file, "--force") == Exit.OK
     told: list[str] = []
     (flow,) = on_board(load(file), told.append).flows
+    assert isinstance(flow, LiveFlow)
     assert "its flow computed sample by sample" in told[0] and dict(flow.shape).keys() == {"x0"}
 
 

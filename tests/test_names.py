@@ -33,7 +33,7 @@ EHA = {
     "p_a": ("pA_bar", "bar"),
     "p_b": ("pB_bar", "bar"),
     "x": ("x_mm", "mm"),
-    "u": ("u", "%, unit guessed"),
+    "u": ("u", "PWM, unit guessed"),
 }
 STRANGERS = {
     **dict.fromkeys([f"eha_{n}.parquet" for n in ("1_1", "1_3", "2_2", "2_4", "3_1", "3_3")], EHA),
@@ -42,7 +42,8 @@ STRANGERS = {
     "excavator_manual_mitch_1101_2319.csv": BOOM,
     "excavator_manual_ol_1006_1648.csv": BOOM | {"x": ("x_boom_mm", "mm")},
     "mr_damper.csv": {"v": ("v_cm_s", "cm/s")},
-    "quadrotor_thrust.parquet": {},
+    "quadrotor_thrust.parquet": {f"u{k}": (f"motor_{k}", "PWM") for k in (1, 2, 3, 4)}
+    | {"x": ("acc_z_g", "g")},
     **{f"seal_oring_{p}bar.csv": {"x": ("x_mm", "mm")} for p in (1, 3, 5)},
 }
 

@@ -31,7 +31,7 @@ def objections(project: Project, applied: Applied, review: Review, prepared: Pre
     """What the limits of the project have against it; empty if nothing."""
     return [
         *_of_the_size(project, prepared),
-        *_of_the_table(project.sections.publish, prepared, project.model.edges),
+        *_of_the_table(project.sections.publish, prepared, project.model.maps),
         *_of_the_prior(project, prepared),
         *_of_the_change(project.sections.publish, review),
         *_of_the_time(project.sections.publish, applied),
@@ -115,7 +115,7 @@ def _of_the_prior(project: Project, prepared: Prepared) -> Iterator[str]:
 
 
 def _tables(project: Project, prepared: Prepared) -> Iterator[tuple[Edge, Table]]:
-    for edge, slot in zip(project.model.edges, slots(project), strict=False):
+    for edge, slot in zip(project.model.maps, slots(project), strict=False):
         yield edge, table_of(prepared.images[slot])
 
 

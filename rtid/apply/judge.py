@@ -126,8 +126,8 @@ def _candidate(model: Machine, known: KnownMap, terms: FloatArray | None) -> Can
 
 
 def _same_grids(model: Machine, flow_map: FlowMap) -> bool:
-    pairs = zip(model.edges, flow_map.edges, strict=False)
-    return len(model.edges) == len(flow_map.edges) and all(
+    pairs = zip(model.maps, flow_map.edges, strict=False)
+    return len(model.maps) == len(flow_map.edges) and all(
         mine.name == other.name
         and np.array_equal(mine.grid.u_v, other.grid.u_v)
         and np.array_equal(mine.grid.dp_pa, other.grid.dp_pa)

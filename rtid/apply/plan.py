@@ -84,7 +84,7 @@ class Review:
 def slots(project: Project) -> list[int]:
     """The slots of the edges, then that of the bulk moduli."""
     first = project.sections.publish.first_slot
-    return [first + k for k in range(len(project.model.edges) + 1)]
+    return [first + k for k in range(len(project.model.maps) + 1)]
 
 
 def refuse_few_slots(project: Project, room: Accepts) -> None:
@@ -110,7 +110,7 @@ def prepare(project: Project, known: KnownMap, sd_pa: FloatArray, room: Accepts)
 
     percent = project.sections.publish.error_percent
     sampled = tuple(
-        sample(edge, known.flow_map[edge.name], percent, fits) for edge in project.model.edges
+        sample(edge, known.flow_map[edge.name], percent, fits) for edge in project.model.maps
     )
     images = {
         slot: image(sampled.table, slot) for slot, sampled in zip(of[:-1], sampled, strict=True)
@@ -136,7 +136,7 @@ def review(
     *of_edges, of_beta = slots(project)
     differences = tuple(
         difference(edge, _table(before, slot), table_of(prepared.images[slot]))
-        for edge, slot in zip(project.model.edges, of_edges, strict=True)
+        for edge, slot in zip(project.model.maps, of_edges, strict=True)
     )
     old = numbers_of(before[of_beta])[::2] if of_beta in before else None
     new = numbers_of(prepared.images[of_beta])[::2]

@@ -88,9 +88,9 @@ def _judged(project: Project, path: Path, progress: Progress) -> Report:
     try:
         edges = Study(project, path, lambda t, share: progress(t, 0.4 + 0.6 * share)).map.edges
     except NoSamplesError:
-        return with_learned(report, {edge.name: 0 for edge in project.model.edges})
+        return with_learned(report, {edge.name: 0 for edge in project.model.maps})
     learned = {edge.name: int((edge.status == VALID).sum()) for edge in edges}
-    pairs = zip(edges, project.model.edges, strict=True)
+    pairs = zip(edges, project.model.maps, strict=True)
     finer = [edge.name for edge, given in pairs if edge.status.shape != given.grid.shape]
     return with_learned(report, learned, frozenset(finer))
 
@@ -264,8 +264,8 @@ def _print_project(project: Project, as_json: bool) -> None:
     counts = {
         "signals": len(model.signals),
         "chambers": len(model.chambers),
-        "edges": len(model.edges),
-        "blocks": sum(math.prod(edge.grid.shape) for edge in model.edges),
+        "edges": len(model.maps),
+        "blocks": sum(math.prod(edge.grid.shape) for edge in model.maps),
     }
     if as_json:
         print(json.dumps({"schema": SCHEMA, "ok": True, "digest": project.digest} | counts))

@@ -70,10 +70,10 @@ def _write_rate(table: Path, output: Path, given: Mapping[str, RoleCandidate]) -
     if not pairs:
         return False
     output.write_text(rate_text(output.stem, table, opened, pairs[0]), "utf-8")
-    print(f"wrote {output}: a plant without pressures, d x / dt = f(u)")
-    for name, signal in (("u", pairs[0].command), ("x", pairs[0].state)):
+    print(f"wrote {output}: a plant without pressures, {pairs[0].equation}")
+    for name, signal in pairs[0].roles.items():
         print(f"  {name:9} {signal.full_name} [{signal.unit}]")
-    used = {pairs[0].command.name, pairs[0].state.name}
+    used = {signal.name for signal in pairs[0].roles.values()}
     if rest := [s.full_name for s in opened.signals if s.name not in used]:
         print(f"Not used: {', '.join(rest)}")
     for other in pairs[1:]:

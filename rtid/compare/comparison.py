@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from rtid.compare.candidate import CandidateMap, itself
 from rtid.compare.reference import Reference
 from rtid.effects.extra import with_extra_flow
+from rtid.effects.laws.response import left_behind
 from rtid.estimator.flowmap import EXTRAPOLATED, LEARNING, PRIOR, SHUT, VALID
 from rtid.estimator.state import Weights, build
 from rtid.kernels.engine import GAP_FLAG
@@ -198,7 +199,8 @@ def _rows(model: Machine, sums: _Held, chunk: FloatArray | None = None) -> _Rows
     rate = sums.flow
     if chunk is not None:
         values = chunk[:, 2 : 2 + len(model.signals)]
-        rate = np.hstack([rate, 0.5 * (values[1:] + values[:-1])])
+        means = 0.5 * (values[1:] + values[:-1])
+        rate = np.hstack([_as_measured(model, sums, means), means])
     if len(sums.t_s) < 2:
         return _Rows(np.empty(0), *(np.empty((0, m)) for m in (c, c, len(model.signals))))
     span_s = sums.t_s[-1] - sums.t_s[0]
@@ -206,6 +208,19 @@ def _rows(model: Machine, sums: _Held, chunk: FloatArray | None = None) -> _Rows
     rows = filter_rows(sums.t_s, rate, f.wn_rad_s, f.zeta, 1.0 / f.rows_per_s, out)
     out = out[:rows]
     return _Rows(out[:, 0], out[:, 1 : 2 * c : 2], out[:, 2 : 2 * c + 1 : 2], out[:, 2 * c + 1 :])
+
+
+def _as_measured(model: Machine, sums: _Held, means: FloatArray) -> FloatArray:
+    """Flows (n - 1, 2 c) of a rate that is measured itself: as measured, and behind its lag.
+
+    means (n - 1, signals): of the intervals.
+    """
+    if not model.measured or not len(sums.flow):
+        return sums.flow
+    y, left = means[:, [model.column(model.measured)]], sums.flow[:, :1] - sums.flow[:, 1:]
+    step_s = float(np.median(np.diff(sums.t_s)))
+    left = left_behind(left, step_s, model.chambers[0].behind_s)
+    return np.hstack([np.where(np.isnan(left), np.nan, y), y - left])
 
 
 def _mean_squares(innovation: FloatArray) -> FloatArray:

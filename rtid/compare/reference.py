@@ -122,7 +122,7 @@ Flow = Callable[[str, FloatArray, FloatArray], FloatArray]
 def theta_cells(model: Machine, flow: Flow) -> FloatArray:
     """Taylor terms (cells, 6), m3/s, of a flow(edge, w, dp) for all cells of the model's grids."""
     parts = []
-    for edge in model.edges:
+    for edge in model.maps:
 
         def of_edge(w: FloatArray, dp: FloatArray, name: str = edge.name) -> FloatArray:
             return flow(name, w, dp)

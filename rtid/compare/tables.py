@@ -80,6 +80,8 @@ def block_rows(
     """
     model, table = solution.model, []
     for k, edge in enumerate(model.edges):
+        if edge.shares:
+            continue
         nd = edge.grid.shape[1]
         squares, count, total = _residual_by_cell(model, comparison, k)
         visited = {(b.i, b.j) for b in solution.blocks if b.edge == k}
@@ -87,7 +89,7 @@ def block_rows(
         for i, j in sorted(visited | here):
             b, at = solution.block(k, i, j), i * nd + j
             u, p = edge.grid.u_v[i : i + 2].tolist(), edge.grid.dp_pa[j : j + 2].tolist()
-            unknown = EMPTY if flowmap is None else str(flowmap.edges[k].status[i, j])
+            unknown = EMPTY if flowmap is None else str(flowmap[edge.name].status[i, j])
             table.append(
                 BlockRow(
                     edge.name,
@@ -114,17 +116,19 @@ def block_rows(
 def _residual_by_cell(
     model: Machine, comparison: Comparison, k: int
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Per cell of edge k: sum of squares of its chambers' residual, and their number; the total."""
+    """Per cell of edge k's map: sum of squares of its chambers' residual, their number; the total.
+
+    All commands of the map count.
+    """
     edge = model.edges[k]
     touched = [c for c, chamber in enumerate(model.chambers) if edge.sign(chamber) != 0]
     square = (comparison.residual_m3s[:, touched] ** 2).sum(axis=1)
-    cell, size = (
-        comparison.cell[:, k] - model.first_cells[k],
-        edge.grid.shape[0] * edge.grid.shape[1],
-    )
-    here = comparison.cell[:, k] >= 0
-    squares = np.bincount(cell[here], square[here], size)
-    count = len(touched) * np.bincount(cell[here], minlength=size)
+    size, users = edge.grid.shape[0] * edge.grid.shape[1], np.array(model.owners) == k
+    cells = comparison.cell[:, users]
+    row, which = np.nonzero(cells >= 0)
+    at = cells[row, which] - model.first_cells[k]
+    squares = np.bincount(at, square[row], size)
+    count = len(touched) * np.bincount(at, minlength=size)
     return np.asarray(squares, float), np.asarray(count, float), float(square.sum())
 
 

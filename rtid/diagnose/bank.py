@@ -47,7 +47,7 @@ def add_timing(
             if timing.where == SUPPLY:
                 columns.add(supply_change(view, -timing.change(demand(view), 1, dt_s, psi, j)))
             elif timing.of_sensor:
-                columns.add(late(view, timing))
+                columns.add(late(view, timing, psi))
             else:
                 change = {
                     name: change_of(u, d, dt_s, revision.timings, k, j)

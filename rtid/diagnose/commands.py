@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from rtid.effects.laws.pump import demand
+from rtid.effects.laws.response import behind_s
 from rtid.effects.laws.sensors import sensor_of
 from rtid.effects.laws.timing import COMMAND, SUPPLY, Psi, TimingLaw
 from rtid.effects.record_view import RecordView
@@ -63,8 +64,11 @@ def _put_right(model: Machine, chunk: FloatArray, timings: Timings) -> FloatArra
     chunk (n, 2 + signals), SI: changed in place.
     """
     dt_s = float(np.median(np.diff(chunk[:, 0])))
+    if lag_s := behind_s(timings):
+        behind = chunk[:, 2 + model.column(model.measured)]
+        chunk[:, 2 + model.column(model.position)] += lag_s * behind
     for timing, psi in timings:
-        if timing.of_sensor:
+        if timing.of_sensor and not model.measured:
             column = 2 + model.column(sensor_of(model, timing))
             chunk[:, column] = timing.apply(chunk[:, column].copy(), dt_s, psi)
     for timing, psi in timings:

@@ -146,8 +146,8 @@ def _halved(border: FloatArray) -> FloatArray:
 def _spread(machine: Machine, of_cells: FloatArray) -> FloatArray:
     """What every cell has (cells,), given to the four that it is cut into."""
     parts = []
-    for edge, first in zip(machine.edges, machine.first_cells, strict=True):
-        nu, nd = edge.grid.shape
-        here = of_cells[first : first + nu * nd].reshape(nu, nd)
+    sizes = [edge.grid.shape[0] * edge.grid.shape[1] for edge in machine.maps]
+    for edge, mine in zip(machine.maps, np.split(of_cells, np.cumsum(sizes)[:-1]), strict=True):
+        here = mine.reshape(edge.grid.shape)
         parts.append(here.repeat(2, axis=0).repeat(2, axis=1).ravel())
     return np.concatenate(parts)

@@ -44,12 +44,16 @@ def alike_ones(
 ) -> tuple[Key, ...]:
     """Causes that this record does not tell from the best one: all but as good.
 
-    One that leaves several times the misfit that the best one leaves is refuted.
+    One that leaves several times the misfit that the best one leaves is refuted.  Without
+    pressures what disturbs the plant was taken for as large as all that was left: all of it counts,
+    in units of what the best one leaves.
     """
-    dof = present.regression.dof
-    misfit = present.held.sse - dof
+    dof, sse = present.regression.dof, present.held.sse
     close = best.gain - TIE - TIE_SHARE * best.gain
-    refuted = misfit - REFUTED * max(misfit - best.gain, WITHIN * dof) - TIE
+    if state.model.has_pressures:
+        refuted = sse - dof - REFUTED * max(sse - dof - best.gain, WITHIN * dof) - TIE
+    else:
+        refuted = sse - (REFUTED + TIE / dof) * (sse - best.gain)
     return tuple(
         t.key
         for t in trials

@@ -7,8 +7,10 @@ import numpy as np
 from rtid.diagnose.evidence import Projected
 from rtid.diagnose.regression import Regression
 from rtid.diagnose.revision import Revision
-from rtid.effects.column import Candidate, Columns
+from rtid.effects.column import Columns
 from rtid.effects.laws import total_softness
+from rtid.effects.laws.response import behind_s
+from rtid.effects.laws.response import softness as behind_softness
 from rtid.effects.record_view import RecordView
 from rtid.estimator.factor import SHARED_PRIOR
 from rtid.estimator.state import Weights, variance
@@ -18,16 +20,17 @@ from rtid.plain import FloatArray
 HELD = 1e30  # information of a parameter that is held
 
 
-def softened(
-    model: Machine, chunk: FloatArray, weights: Weights, sizes: tuple[tuple[Candidate, float], ...]
-) -> FloatArray:
-    """What storage effects add to the white variance of each row's equation (n, chambers), m6.
+def softened(model: Machine, chunk: FloatArray, weights: Weights, revision: Revision) -> FloatArray:
+    """What a revision adds to the white variance of each row's equation (n, chambers), m6.
 
-    The noise of a pressure moves what is stored: sd_P times V / beta and the effects' own share.
+    The noise of a pressure moves what is stored: sd_P times V / beta and the effects' own share;
+    that of a measured rate stands behind its lag.
     """
     view = RecordView.without_map(model, chunk, weights.compliance)
     more = np.zeros((view.n, len(model.chambers)))
-    softness = total_softness(view, sizes)
+    if model.measured:
+        return more + behind_softness(model, behind_s(revision.timings), view.step_s)
+    softness = total_softness(view, revision.sizes)
     for c, chamber in enumerate(model.chambers):
         plain = view.volume(c) * view.compliance[c]
         noise = variance(model, chamber.pressure) * model.pressure_share

@@ -212,7 +212,7 @@ def _signs(model: Machine) -> FloatArray:
     """Sign with which the edge of each cell feeds each chamber (cells, 2)."""
     sign = np.zeros((model.n_cells, 2))
     at = 0
-    for edge in model.edges:
+    for edge in model.maps:
         n = edge.grid.shape[0] * edge.grid.shape[1]
         for c, chamber in enumerate(model.chambers):
             sign[at : at + n, c] = edge.sign(chamber)

@@ -190,7 +190,7 @@ def one_pass(
         weights = replace(weights, lag_s=0.0)
     declared, sent = model, transformed(model, chunk, revision.timings)
     model = split(declared)
-    soft = softened(model, sent, weights, revision.sizes)
+    soft = softened(model, sent, weights, revision)
     rows = _same_rows(start, sent, weights, soft) or rows_of(model, sent, weights, soft=soft)
     before = start.map if start else before or _map_alone(model, rows)
     view = RecordView.of(model, sent, weights, before)

@@ -24,7 +24,7 @@ from rtid.diagnose.diagnosis import Result
 from rtid.diagnose.equations import softened
 from rtid.diagnose.evidence import Projected, Rows, project, rows_of
 from rtid.diagnose.fit import NO_COV, Fit
-from rtid.diagnose.residual import effect_values, measured, modelled, through_filter
+from rtid.diagnose.residual import behind_lag, effect_values, measured, modelled, through_filter
 from rtid.diagnose.trials import physical
 from rtid.effects.column import Candidate
 from rtid.effects.law import Volumes
@@ -111,7 +111,7 @@ class _Bench:
     @classmethod
     def of(cls, result: Result) -> _Bench:
         fit = result.last
-        soft = softened(fit.model, fit.sent, fit.weights, fit.revision.sizes)
+        soft = softened(fit.model, fit.sent, fit.weights, fit.revision)
         rows = rows_of(fit.model, fit.sent, fit.weights, soft=soft)
         effects = {e.key: (e, cause_of(fit.view, e).column(e.shape)) for e in fit.revision.effects}
         for k, outcome_of in enumerate(fit.revision.timings):
@@ -173,7 +173,8 @@ class _Bench:
         before = after + self._given(named) * self._left_of(
             self.effects[named][1], list(others.values())
         )
-        _, parts = through_filter(view, [before, after, *x])
+        rates = [behind_lag(self.fit, view, rate) for rate in (before, after, *x)]
+        _, parts = through_filter(view, rates)
         acting = [c for c, v in volumes.items() if np.any(v != 0.0)]
         rest = [part.T[acting].ravel() for part in parts]
         name = f"{candidate.effect}:{candidate.where}"
@@ -227,7 +228,7 @@ def _changed(fit: Fit, k: int) -> Volumes:
     if timing.where == SUPPLY:
         return supply_change(view, -timing.apply(demand(view), view.step_s, psi))
     if timing.of_sensor:
-        return {c: psi[0] * series for c, series in late(view, timing).items()}
+        return {c: psi[0] * series for c, series in late(view, timing, psi).items()}
     others = timings[:k] + timings[k + 1 :]
     change = {}
     for name, (direction, u) in commands(fit.declared, fit.chunk).items():

@@ -15,6 +15,7 @@ from rtid.diagnose.commands import transformed
 from rtid.diagnose.fit import Fit
 from rtid.effects.column import Candidate
 from rtid.effects.laws import SEED, cause_of, total_softness
+from rtid.effects.laws.response import behind_s, left_behind
 from rtid.effects.record_view import RecordView
 from rtid.estimator.state import variance
 from rtid.kernels.explain import filter_rows
@@ -91,9 +92,24 @@ def residual(fit: Fit, chunk: FloatArray, leave_out: Candidate | None = None) ->
     sent = transformed_like(fit, chunk)
     view = RecordView.of(fit.model, sent, fit.weights, fit.map)
     flows = measured(view)
-    rates = [flows, flows - modelled(fit, view, leave_out), _noise(fit, view)]
+    left, noise = flows - modelled(fit, view, leave_out), _noise(fit, view)
+    rates = [seen_rates(view, flows), behind_lag(fit, view, left), behind_lag(fit, view, noise)]
     t_s, (moved, left, noise) = through_filter(view, rates)
     return Residual(t_s, moved, left, noise, fit.model.filter.rows_per_s)
+
+
+def seen_rates(view: RecordView, flows: FloatArray) -> FloatArray:
+    """The measured flows (n - 1, chambers), m3/s, or a rate that is measured itself."""
+    if not view.model.measured:
+        return flows
+    y = view.signal(view.model.measured)
+    return 0.5 * (y[1:] + y[:-1])[:, None]
+
+
+def behind_lag(fit: Fit, view: RecordView, rates: FloatArray) -> FloatArray:
+    """Errors of the equation (n - 1, chambers), m3/s, as they are seen behind a fit's lag."""
+    known = np.where(view.inside[:, None], rates, np.nan)
+    return left_behind(known, view.step_s, behind_s(fit.revision.timings))
 
 
 def measured(view: RecordView) -> FloatArray:

@@ -13,8 +13,10 @@ from typing import Any
 import numpy as np
 
 from rtid.diagnose.commands import Timings, commands, split, through, transformed
+from rtid.diagnose.equations import softened
 from rtid.diagnose.evidence import project, rows_of
 from rtid.diagnose.fit import Fit, columns_of_effects, prepare
+from rtid.diagnose.revision import Revision
 from rtid.diagnose.thinned import Thinning
 from rtid.effects.column import Columns
 from rtid.effects.law import Volumes
@@ -93,7 +95,9 @@ class Beside:
         weights = search.weights
         if any(t.replaces_lag for t, _ in timings):
             weights = replace(weights, lag_s=0.0)
-        rows = rows_of(search.split, search.sent(timings), weights, ROW_S, means=search.thinning.m)
+        sent = search.sent(timings)
+        soft = softened(search.split, sent, weights, Revision((), timings))
+        rows = rows_of(search.split, sent, weights, ROW_S, soft, search.thinning.m)
         self.most_rows = max(self.most_rows, rows.n)
         if rows.n < KEPT * self.most_rows:
             return float("inf")

@@ -10,12 +10,13 @@ from rtid.plain import FloatArray
 
 if TYPE_CHECKING:
     from rtid.effects.live import LiveFlow
+    from rtid.effects.summed import RunningSum
 
 
 class FlowSums:
     """The signals of live flows, made of samples in their order."""
 
-    def __init__(self, flows: tuple[LiveFlow, ...]) -> None:
+    def __init__(self, flows: tuple[LiveFlow | RunningSum, ...]) -> None:
         self.flows = flows
         self._last: FloatArray | None = None
         self._sums = np.zeros(len(flows))

@@ -32,6 +32,7 @@ MODULUS, LENGTH, BEGIN = "beta", "t_r", "t_m"  # what only a fit knows: oil, len
 BOTH, ALL_EDGES, EACH_EDGE = "both", "all valves", "edge"
 MAP = "Q of "  # before an edge's name: its flow by the fitted map
 LAGGED = "lag("  # before what is stored behind a port
+OF_RATES = ("map_lag",)  # laws by name of plants without pressures
 NO_SHAPE: Mapping[str, float] = MappingProxyType({})
 Nodes = Mapping[str, Node]
 Volumes = dict[int, FloatArray]  # chamber -> (n - 1,) m3
@@ -389,7 +390,7 @@ def _refuse_endless(
 def needs_no_pressure(effect: Effect) -> bool:
     """True where an effect can sit on a plant that has neither pressures nor volumes."""
     if effect.law:
-        return False
+        return effect.law in OF_RATES
     names = {name for line in lines_of(effect) for name in line.names}
     return bool(effect.into) or not any(n.startswith(("p_", "V_", "A_")) for n in names - {"A"})
 

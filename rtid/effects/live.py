@@ -48,6 +48,11 @@ class LiveFlow:
         return f"{self.placed.effect.name} {self.placed.where} {chambers}"
 
     @property
+    def key(self) -> tuple[object, ...]:
+        """What makes it one of a kind."""
+        return self.placed.effect.equation, self.size, self.shape
+
+    @property
     def signal(self) -> Signal:
         """What has flowed since the start, m3."""
         return Signal(self.name, VOLUME, "m3")

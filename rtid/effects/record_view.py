@@ -76,8 +76,8 @@ class RecordView:
     ) -> RecordView:
         """The record beside a fitted map; chunk (n, 2 + signals), SI."""
         rated = np.repeat(
-            [e.rated_q_m3s for e in model.edges],
-            [e.grid.shape[0] * e.grid.shape[1] for e in model.edges],
+            [e.rated_q_m3s for e in model.maps],
+            [e.grid.shape[0] * e.grid.shape[1] for e in model.maps],
         )
         theta, cov = np.zeros((model.n_cells, TERMS)), np.zeros((0, TERMS, TERMS))
         theta[flowmap.cells] = flowmap.terms * rated[flowmap.cells, None]

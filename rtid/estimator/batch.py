@@ -107,7 +107,7 @@ def column_rates(
         for c, chamber in enumerate(model.chambers):
             sign = dict(term.signs).get(chamber.name, 0)
             out[:, c, :, 1 + len(model.chambers) + number] = sign * flow
-    moments = _moments(track.opening, dt, weights.lag_s)
+    moments, owners = _moments(track.opening, dt, weights.lag_s), model.owners
     for i, edge in enumerate(model.edges):
         dp = pressure_drop(model, edge, values)
         for k in np.flatnonzero(track.cells[:, i, 0] >= 0):
@@ -118,10 +118,10 @@ def column_rates(
                     phi = _windowed_terms(edge, a, b, w, ends)
                 else:
                     phi = _terms(edge, a, b, moments[k, i], ends)
-                at = place[(i, a, b)]
+                at = place[(owners[i], a, b)]
                 for c, chamber in enumerate(model.chambers):
                     flow = edge.sign(chamber) * edge.rated_q_m3s * phi * MASKS[edge.terms]
-                    out[k, c, :, at : at + 6] = flow
+                    out[k, c, :, at : at + 6] += flow
     return out, blocks
 
 
@@ -168,7 +168,7 @@ def _visited(model: Machine, track: Track) -> Blocks:
         for i, edge in enumerate(model.edges):
             if interval[i, 0] >= 0:
                 for a, b in _windows(edge, interval[i]):
-                    seen.setdefault((i, a, b))
+                    seen.setdefault((model.owners[i], a, b))
     return tuple(seen)
 
 
@@ -259,15 +259,14 @@ def flow_noise(model: Machine, cells: IntArray, dt: float, weights: Weights) -> 
 
     (chambers, chambers), m6.  cells (edges, 2): the interval's block per edge, -1 when shut.
     """
-    q, first = np.diag(flow_noise_floor(model)) * dt, 0
-    for (a, b), edge in zip(cells, model.edges, strict=True):
+    q = np.diag(flow_noise_floor(model)) * dt
+    for (a, b), edge, first in zip(cells, model.edges, model.first_cells, strict=True):
         if a >= 0:
             at = first + a * edge.grid.shape[1] + b
             s = np.array([edge.sign(chamber) for chamber in model.chambers])
             noise = variance(model, edge.source) + variance(model, edge.sink)
             noise *= weights.slopes[at] ** 2 * (model.pressure_period_s or dt)
             q = q + np.outer(s, s) * (noise + weights.missed[at]) * dt
-        first += edge.grid.shape[0] * edge.grid.shape[1]
     return q
 
 

@@ -86,6 +86,9 @@ def _numbers(model: Machine) -> Iterator[Unfit]:
 def _edges(model: Machine) -> Iterator[Unfit]:
     for edge in model.edges:
         where = f"edges.{edge.name}"
+        if edge.shares and model.form != "integral":
+            problem = f"a shared map has no {model.form} form"
+            yield Unfit(where, problem, 'choose form = "integral" under [estimator]')
         if edge.modes and not model.mode:
             problem = "it has modes, but the model has no mode signal"
             yield Unfit(where, problem, 'add a signal with unit = "mode"')

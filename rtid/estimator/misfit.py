@@ -112,9 +112,9 @@ def _cells_of(model: Machine, cells: IntArray, unknowns: FloatArray) -> FloatArr
 
 
 def _rated(model: Machine) -> tuple[FloatArray, list[int]]:
-    """Rated flow and number of cells of each edge."""
-    rated = np.array([edge.rated_q_m3s for edge in model.edges])
-    return rated, [edge.grid.shape[0] * edge.grid.shape[1] for edge in model.edges]
+    """Rated flow and number of cells of each map."""
+    rated = np.array([edge.rated_q_m3s for edge in model.maps])
+    return rated, [edge.grid.shape[0] * edge.grid.shape[1] for edge in model.maps]
 
 
 def _residual(

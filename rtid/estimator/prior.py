@@ -48,7 +48,7 @@ class Prior:
 def reference_map(model: Machine, theta_cells: FloatArray) -> FlowMap:
     """A data sheet as a prior: terms (cells, 6) of all edges, m3/s; NaN where it has nothing."""
     edges, first = [], 0
-    for edge in model.edges:
+    for edge in model.maps:
         nu, nd = edge.grid.shape
         theta = theta_cells[first : first + nu * nd].reshape(nu, nd, TERMS)
         first += nu * nd

@@ -40,20 +40,21 @@ COLUMN_PRIOR = 0.05  # share of the rise of K over a column by which its shape m
 def publish(
     solution: Solution, prior: FlowMap | None = None, prior_sd: float = PRIOR_SHARE
 ) -> FlowMap:
-    """The map of all edges.
+    """The maps of all edges, a shared one once.
 
     prior: a map known before (see `prior.reference_map` for a data sheet), by the edges' names; its
     flows are believed to the share prior_sd, where this map does not know better.
     """
     edges = solution.model.edges
     of = [[b for b in solution.blocks if b.edge == i] for i in range(len(edges))]
+    own = [(e, b) for e, b in zip(edges, of, strict=True) if not e.shares]
     before = {} if prior is None else {e.name: e for e in prior.edges}
     return FlowMap(
         tuple(
             _publish_edge(e, b, before.get(e.name), prior_sd)
             if (e.source or e.sink) and not _over_command_alone(e)
             else _without_pressures(e, b)
-            for e, b in zip(edges, of, strict=True)
+            for e, b in own
         )
     )
 

@@ -137,7 +137,7 @@ def refined(model: Machine, sketched: Sketch, lag_s: float) -> Weights:
     A compliance outside its declared bounds tells that the motion did not show it.
     """
     slopes = nominal_weights(model).slopes.copy()
-    span = np.concatenate([_span(edge) for edge in model.edges])
+    span = np.concatenate([_span(edge) for edge in model.maps])
     known = np.isfinite(sketched.flow_m3s)
     cells = sketched.cells[known]
     proportional = 2.0 * np.maximum(sketched.flow_m3s[known], 0.0) / span[cells]

@@ -36,8 +36,13 @@ def halved(model: Machine, misfit: Misfit, clearly: float = CLEARLY) -> Machine:
 
     misfit: in units of the noise alone, nothing excused; clearly: standard deviations of excess.
     """
-    result = excesses(model, misfit)
-    edges = tuple(_halved(e, x, clearly) for e, x in zip(model.edges, result, strict=True))
+    result, owners = excesses(model, misfit), model.owners
+    for i, owner in enumerate(owners):  # what is missed of a shared map shows at all its commands
+        if i != owner:
+            mine, whole = result[i], result[owner]
+            result[owner] = Excess(whole.rows + mine.rows, whole.beyond + mine.beyond)
+    grids = [_halved(e, x, clearly).grid for e, x in zip(model.edges, result, strict=True)]
+    edges = tuple(replace(e, grid=grids[o]) for e, o in zip(model.edges, owners, strict=True))
     return replace(model, edges=edges)
 
 

@@ -156,7 +156,7 @@ class Weights:
 def nominal_weights(model: Machine) -> Weights:
     """Weights from the declared values alone: what a start without data has."""
     compliance = np.full(len(model.chambers), 1.0 / model.beta_nominal_pa)
-    slopes = np.concatenate([np.zeros(0), *(_edge_slopes(edge) for edge in model.edges)])
+    slopes = np.concatenate([np.zeros(0), *(_edge_slopes(edge) for edge in model.maps)])
     return Weights(slopes, compliance, model.lag.nominal_s)
 
 
@@ -221,9 +221,11 @@ def _configure(e: np.void, model: Machine) -> None:
         e["p_column"][c] = _column(model, chamber.pressure)
         e["p_var_pa2"][c] = variance(model, chamber.pressure) * model.pressure_share
         e["area_m2"][c], e["v0_m3"][c] = chamber.sign * chamber.area_m2, chamber.v0_m3
-    first = 0
-    for i, edge in enumerate(model.edges):
-        first = _configure_edge(e, model, i, edge, first)
+    for i, (edge, first) in enumerate(zip(model.edges, model.first_cells, strict=True)):
+        _configure_edge(e, model, i, edge, first)
+    for i, owner in enumerate(model.owners):
+        e["owner"][i] = owner
+        e["is_shared"][i] = model.owners.count(owner) > 1
     e["q_floor"][:n_chambers] = flow_noise_floor(model)
     e["mode_column"], e["max_open"] = _column(model, model.mode), most_open(model)
     e["hysteresis"], e["max_gap_s"] = model.gates.hysteresis, model.gates.max_gap_s
@@ -234,7 +236,7 @@ def _configure(e: np.void, model: Machine) -> None:
     e["p_period_s"] = model.pressure_period_s
 
 
-def _configure_edge(e: np.void, model: Machine, i: int, edge: Edge, first_cell: int) -> int:
+def _configure_edge(e: np.void, model: Machine, i: int, edge: Edge, first_cell: int) -> None:
     e["source"][i], e["sink"][i] = _column(model, edge.source), _column(model, edge.sink)
     e["command"][i], e["direction"][i] = model.column(edge.command), edge.direction
     e["modes"][i] = sum(1 << m for m in edge.modes) if edge.modes else -1
@@ -248,7 +250,6 @@ def _configure_edge(e: np.void, model: Machine, i: int, edge: Edge, first_cell: 
     e["u_border"][i, : nu + 1], e["dp_border"][i, : nd + 1] = edge.grid.u_v, edge.grid.dp_pa
     for c, chamber in enumerate(model.chambers):
         e["sign"][i, c] = edge.sign(chamber)
-    return first_cell + nu * nd
 
 
 def flow_noise_floor(model: Machine) -> FloatArray:

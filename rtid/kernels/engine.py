@@ -230,10 +230,13 @@ def _integrate(
     if e.n_terms > 0:
         term_increments(e, sample, dt)
     for k in range(e.n_open):
-        if e.map_basis[e.open_edge[k]] != TAYLOR:
-            windowed_increments(e, cells, blocks, k, sample[0], dt, row)
+        i = e.open_edge[k]
+        if e.is_shared[i] != 0:
+            _shared_increments(e, cells, blocks, k, sample[0], dt, row)
+        elif e.map_basis[i] != TAYLOR:
+            windowed_increments(e, cells, blocks, k, i, sample[0], dt, row)
         else:
-            block_increments(e, cells, blocks, k, sample[0], dt, row)
+            block_increments(e, cells, blocks, k, i, sample[0], dt, row)
     if e.form != INTEGRAL:
         carry_step(e)
         remember(e, sample)
@@ -247,6 +250,27 @@ def _integrate(
         _integral_step(e, blocks, row)
     if e.ring_det < RING_DET_LIMIT:
         rebase(e, closed, blocks, pairs, e.ring_floor)
+
+
+@part
+def _shared_increments(
+    e: Any, cells: Any, blocks: Any, k: int, t: float, dt: float, row: bool
+) -> None:
+    """Open block k of a map of several commands: each that is in it adds its own."""
+    for i in range(e.n_edges):
+        if e.owner[i] == e.open_edge[k] and _covers(e, i, e.open_cell[k, 0], e.open_cell[k, 1]):
+            if e.map_basis[i] != TAYLOR:
+                windowed_increments(e, cells, blocks, k, i, t, dt, row)
+            else:
+                block_increments(e, cells, blocks, k, i, t, dt, row)
+
+
+@inlined
+def _covers(e: Any, i: int, u: int, p: int) -> bool:
+    """True where block (u, p) is one of those that edge i is in."""
+    reach = 0 if e.map_basis[i] == TAYLOR else 1
+    a, b = u - e.cell[i, 0], p - e.cell[i, 1]
+    return bool(e.cell[i, 0] != SHUT and 0 <= a <= reach and 0 <= b <= reach)
 
 
 @inlined
@@ -300,7 +324,7 @@ def _change_blocks(e: Any, cells: Any, closed: Any, blocks: Any) -> None:
     for opening in range(2):
         for i in range(e.n_edges):
             if (e.target[i, 0] != SHUT) == (opening == 1) and _moved(e, i):
-                if e.map_basis[i] != TAYLOR:
+                if e.map_basis[i] != TAYLOR or e.is_shared[i] != 0:
                     _change_windows(e, cells, closed, blocks, i)
                 else:
                     _change(e, cells, closed, blocks, i)
@@ -332,21 +356,34 @@ def _change(e: Any, cells: Any, closed: Any, blocks: Any, i: int) -> None:
 
 @part
 def _change_windows(e: Any, cells: Any, closed: Any, blocks: Any, i: int) -> None:
-    """The same for the windows that share a point: up to two by two from the cell on."""
+    """The same for the windows that share a point, up to two by two from the cell on.
+
+    A block of a shared map stays open as long as any of its commands is in it.
+    """
     e.counters[BLOCK_CHANGES] += 1
-    u, p = e.target[i, 0], e.target[i, 1]
+    u, p, owner = e.target[i, 0], e.target[i, 1], e.owner[i]
     e.cell[i, 0], e.cell[i, 1] = u, p
     for k in range(e.n_open - 1, -1, -1):
-        a, b = e.open_cell[k, 0] - u, e.open_cell[k, 1] - p
-        if e.open_edge[k] == i and (u == SHUT or a < 0 or a > 1 or b < 0 or b > 1):
+        if e.open_edge[k] == owner and not _is_used(e, owner, e.open_cell[k, 0], e.open_cell[k, 1]):
             close_block(e, closed, blocks, k)
             remove_open(e, k)
     if u == SHUT:
         return
-    for a in range(u, min(u + 2, e.n_u[i])):
-        for b in range(p, min(p + 2, e.n_dp[i])):
-            if not _is_open(e, i, a, b):
-                open_block(e, closed, blocks, e.n_open, i, _slot(e, cells, blocks, i, a, b), a, b)
+    n = 1 if e.map_basis[i] == TAYLOR else 2
+    for a in range(u, min(u + n, e.n_u[i])):
+        for b in range(p, min(p + n, e.n_dp[i])):
+            if not _is_open(e, owner, a, b):
+                slot = _slot(e, cells, blocks, owner, a, b)
+                open_block(e, closed, blocks, e.n_open, owner, slot, a, b)
+
+
+@inlined
+def _is_used(e: Any, owner: int, u: int, p: int) -> bool:
+    """True where a command of this map is in block (u, p)."""
+    used = False
+    for i in range(e.n_edges):
+        used = used or (e.owner[i] == owner and _covers(e, i, u, p))
+    return used
 
 
 @inlined

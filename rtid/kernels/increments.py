@@ -119,10 +119,12 @@ def mean_terms(e: Any, i: int, iu: int, ip: int) -> tuple[float, float]:
 
 @part
 def block_increments(
-    e: Any, cells: Any, blocks: Any, k: int, t: float, dt: float, row: bool
+    e: Any, cells: Any, blocks: Any, k: int, i: int, t: float, dt: float, row: bool
 ) -> None:
-    """Integrals (carry form: end values) of open block k's Taylor terms over the interval."""
-    i = e.open_edge[k]
+    """Integrals (carry form: end values) of open block k's Taylor terms over the interval.
+
+    i: the edge whose command is in it.
+    """
     block = blocks[e.open_slot[k]]
     eta0, eta1 = mean_terms(e, i, e.open_cell[k, 0], e.open_cell[k, 1])
     _visit(e, block, t, dt, row)
@@ -137,10 +139,10 @@ def block_increments(
 
 @part
 def windowed_increments(
-    e: Any, cells: Any, blocks: Any, k: int, t: float, dt: float, row: bool
+    e: Any, cells: Any, blocks: Any, k: int, i: int, t: float, dt: float, row: bool
 ) -> None:
     """The same for a block under a window; the visit counts for the block that is home."""
-    i, iu, ip = e.open_edge[k], e.open_cell[k, 0], e.open_cell[k, 1]
+    iu, ip = e.open_cell[k, 0], e.open_cell[k, 1]
     block, at_home = blocks[e.open_slot[k]], iu == e.home[i, 0] and ip == e.home[i, 1]
     if at_home:
         mean_terms(e, i, iu, ip)

@@ -80,6 +80,8 @@ ENGINE = np.dtype(
         ("command", _I, (MAX_EDGES,)),
         ("mode_column", _I),
         ("modes", _I, (MAX_EDGES,)),  # bit m: the edge may open in mode m
+        ("owner", _I, (MAX_EDGES,)),  # the edge whose map it has
+        ("is_shared", _I, (MAX_EDGES,)),  # other edges have the same map
         ("map_basis", _I, (MAX_EDGES,)),
         ("masked", _I, (MAX_EDGES,)),
         ("mask", _F, (MAX_EDGES, TERMS)),  # 1 for the terms that the map has, eq. (15)

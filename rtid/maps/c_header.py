@@ -54,7 +54,7 @@ def write_header(
 
     Raises NoHeaderError, NoTableError, OSError.
     """
-    sampled = tuple(sample(e, flow_map[e.name], error_percent) for e in model.edges)
+    sampled = tuple(sample(e, flow_map[e.name], error_percent) for e in model.maps)
     _replace(path, "\n".join(_lines(path, sampled, provenance)) + "\n")
     for name in BESIDE:
         _replace(path.with_name(name), HEADER.with_name(name).read_text("utf-8"))

@@ -198,7 +198,8 @@ def _model(
 
 def deviations(edge: Edge, flowmap: FlowMap, error_percent: float = ERROR_PERCENT) -> Table:
     """The table of an edge's standard deviation, m3/s, at the nodes of its look-up table."""
-    published, flow = flowmap[edge.name], sample(edge, flowmap[edge.name], error_percent).table
+    published = flowmap[edge.shares or edge.name]
+    flow = sample(edge, published, error_percent).table
     w, s = np.clip(flow.w_v.astype(float), *published.grid.u_v[[0, -1]]), flow.s.astype(float)
     sd = np.nan_to_num(published.sd(w[:, None], drops(published.grid.dp_pa, s)[None, :]))
     scale = max(float(sd.max()) / MOST_COUNT, 1e-15)

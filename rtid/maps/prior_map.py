@@ -104,7 +104,7 @@ def _file(path: Path, digest: str) -> Path:
 
 
 def _refuse_foreign(path: Path, model: Machine, flowmap: FlowMap) -> None:
-    edges = {edge.name: edge for edge in model.edges}
+    edges = {edge.name: edge for edge in model.maps}
     foreign = [edge.name for edge in flowmap.edges if edge.name not in edges]
     if foreign:
         raise PriorError(

@@ -57,6 +57,8 @@ def _own_term(term: Term, chamber: Chamber) -> Term:
 
 def _faults(model: Machine) -> Iterator[str]:
     upkeep = model.upkeep
+    if model.measured:
+        yield f"rate.measured is {model.measured!r}, it knows a state, not its rate"
     if model.form != "integral":
         yield f"estimator.form is {model.form!r}, it knows 'integral'"
     if math.isfinite(upkeep.forget_s) or math.isfinite(upkeep.shared_forget_s):
@@ -73,6 +75,8 @@ def _edge_faults(edges: tuple[Edge, ...]) -> Iterator[str]:
     for edge in edges:
         if edge.basis != TAYLOR:
             yield f"edges.{edge.name}.basis is {edge.basis!r}, it knows 'taylor'"
+        if edge.shares:
+            yield f"edges.{edge.name}: it knows one command per map"
         if edge.modes:
             yield f"edges.{edge.name}: it knows no working modes"
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import fields, is_dataclass
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass, replace
 
 import numpy as np
 
 from firmware_bridge.catalog import Catalog
 from firmware_bridge.config import CYCLE, MULTIRATE, Assembly, MessageSource, SignalSource
+from rtid.effects.summed import RunningSum, sum_signal
 from rtid.model import (
     BOTH,
     COMMAND_ONLY,
@@ -42,6 +44,11 @@ NO_BORDERS = (-1.0, 1.0)  # of a second argument that a map has not
 def build_model(sections: Sections, catalog: Catalog | None) -> Machine:
     """The declared machine, SI."""
     signals = tuple(_signal(n, s, catalog) for n, s in sections.signals.items())
+    rate = sections.rate
+    measured = rate.measured if rate and rate.measured else NONE
+    if measured:
+        of = next(s for s in signals if s.name == measured)
+        signals = (*signals, sum_signal(of, max(e.rated_q_m3s for e in _edges(sections, ()))))
     gates, lag = sections.gates, sections.dynamics.spool_lag
     return Machine(
         signals=signals,
@@ -67,11 +74,20 @@ def build_model(sections: Sections, catalog: Catalog | None) -> Machine:
             stale_s=gates.stale_s or math.inf,
         ),
         upkeep=_upkeep(sections),
+        measured=measured,
         mode=next((signal.name for signal in signals if signal.kind == "mode"), NONE),
         form=sections.estimator.form,
         recent_blocks=sections.estimator.recent_blocks,
         pressure_period_s=_pressure_period_s(sections, catalog),
     )
+
+
+def sums_of(model: Machine) -> tuple[RunningSum, ...]:
+    """The running integral of a rate that is measured itself; () for all other plants."""
+    if not model.measured:
+        return ()
+    column, rated = model.column(model.measured), max(e.rated_q_m3s for e in model.edges)
+    return (RunningSum(model.signals[column], column, rated),)
 
 
 def build_assembly(
@@ -84,7 +100,7 @@ def build_assembly(
         mode=CYCLE if table else _mode(sections, catalog),
         signals=tuple(_source(n, s, catalog, table) for n, s in sections.signals.items()),
         messages=messages,
-        row_signal=model.position,
+        row_signal=model.measured or model.position,
         max_gap_s=model.gates.max_gap_s,
     )
 
@@ -290,7 +306,7 @@ def _open_in(edge: str, sections: Sections) -> tuple[int, ...]:
 
 def _position(sections: Sections, signals: tuple[Signal, ...]) -> str:
     if sections.rate:
-        return sections.rate.state
+        return sections.rate.state or signals[-1].name
     named = sections.geometry.position if sections.geometry else None
     return named or next(signal.name for signal in signals if signal.kind == "position")
 
@@ -299,10 +315,11 @@ def _chambers(sections: Sections, signals: tuple[Signal, ...]) -> tuple[Chamber,
     """The pressure equations, or the one of a rate, which is called like its state."""
     if sections.rate is None:
         return tuple(_chamber(name, sections) for name in sections.chambers)
-    state = next(s for s in signals if s.name == sections.rate.state)
+    state = next(s for s in signals if s.name == sections.rate.signal)
     known = sections.rate.disturbance or 0.0
     size = known * unit_of(sections.signals[state.name], None).factor
-    return (Chamber(state.name, NONE, 1.0, 1, 0.0, size, per_second(state.unit)),)
+    unit = state.unit if sections.rate.measured else per_second(state.unit)
+    return (Chamber(state.name, NONE, 1.0, 1, 0.0, size, unit),)
 
 
 def per_second(unit: str) -> str:
@@ -314,22 +331,29 @@ def _edges(sections: Sections, signals: tuple[Signal, ...]) -> tuple[Edge, ...]:
     """The metering edges, or the maps of a rate."""
     if sections.rate is None:
         return tuple(_edge(name, edge, sections, signals) for name, edge in sections.edges.items())
-    return tuple(_map(name, part, sections) for name, part in sections.maps.items())
+    return tuple(e for name, part in sections.maps.items() for e in _map(name, part, sections))
 
 
-def _map(name: str, part: MapSection, sections: Sections) -> Edge:
-    """f(command, over): an edge whose pressure drop is the other signal; all sizes become SI."""
+def _map(name: str, part: MapSection, sections: Sections) -> Iterator[Edge]:
+    """f(command, over): an edge whose pressure drop is the other signal; all sizes become SI.
+
+    Further commands have edges that share the first one's map.
+    """
     assert sections.rate is not None
-    factor = unit_of(sections.signals[sections.rate.state], None).factor
+    factor = unit_of(sections.signals[sections.rate.signal], None).factor
     over = unit_of(sections.signals[part.over], None) if part.over else None
     borders = NO_BORDERS if over is None else [over.si(v) for v in part.over_grid or ()]
     grid = Grid(np.array(part.u_grid_v), np.array(borders))
-    return Edge(
-        name=name, source=part.over or NONE, sink=NONE, command=part.command, direction=1,
+    first, *others = part.all_commands
+    edge = Edge(
+        name=name, source=part.over or NONE, sink=NONE, command=first, direction=1,
         grid=grid, safe_band_v=-math.inf, rated_q_m3s=factor * part.rated,
         rated_dp_pa=float(np.abs(grid.dp_pa).max()), basis=part.basis,
-        terms=BOTH if part.over else COMMAND_ONLY, signs=((sections.rate.state, 1),),
+        terms=BOTH if part.over else COMMAND_ONLY, signs=((sections.rate.signal, 1),),
     )  # fmt: skip
+    yield edge
+    for command in others:
+        yield replace(edge, name=f"{name}_{command}", command=command, shares=name)
 
 
 def _chamber(name: str, sections: Sections) -> Chamber:

@@ -23,6 +23,7 @@ _ELSEWHERE = {
     *("transmission", "trans", "clutch", "gear", "retarder", "battery", "ambient", "barometric"),
     *("accelerator", "accel", "pedal", "steering", "def", "scr", "filter", "cruise"),
 }
+MOST_PERCENT = 400.0  # a command of larger numbers counts
 _KIN = 0.25  # for each word that two signals of one cylinder share
 
 
@@ -201,7 +202,8 @@ def with_unit(candidate: RoleCandidate, role: Role) -> RoleCandidate:
     size = max(abs(candidate.low), abs(candidate.high))
     limits = {"pressure": (1e5, 50e6), "position": (0.02, 5.0), "velocity": (0.005, 5.0)}
     if role.kind == "command":
-        return replace(candidate, unit="V" if size <= 12 else "%", guessed_unit=True)
+        unit = "V" if size <= 12 else "%" if size <= MOST_PERCENT else "PWM"
+        return replace(candidate, unit=unit, guessed_unit=True)
     low, high = limits[role.kind]
     dimension = KIND_DIMENSIONS[role.kind][0]
     fitting = [u.name for u in units_of(dimension) if low <= size * u.factor <= high]

@@ -226,6 +226,7 @@ def _assemble(
     assembly = bus or table
     assert assembly is not None, "checked: without a DBC every signal has a column"
     edges = sections.edges.items()
+    running = build.sums_of(model)
     return Project(
         path=path,
         sections=sections,
@@ -243,6 +244,7 @@ def _assemble(
         digest=build.digest((model, build.feed(assembly, catalog if bus else None))),
         machine_digest=build.digest(model),
         effects=user_effects,
+        flows=running,
         untrusted=_untrusted(path.parent, sections.project.effects_module),
     )
 

@@ -41,6 +41,7 @@ from rtid.project.trust import NotTrustedError
 
 if TYPE_CHECKING:
     from rtid.effects.live import LiveFlow
+    from rtid.effects.summed import RunningSum
 
 
 @dataclass(frozen=True)
@@ -86,8 +87,8 @@ class Project:
     table, None unless every signal names a `column` or is constant.  `noise_unknown` and
     `offset_tolerance_s` list what the file leaves to be estimated.  `effects` are the user's own,
     of the file and of its trusted Python: candidates of the diagnosis, not part of the model;
-    `untrusted` is Python that was not run; `flows` are those of added effects that are
-    evaluated beside the kernels, on board.
+    `untrusted` is Python that was not run; `flows` are signals that are
+    made beside the kernels: a measured rate's integral and, on board, flows of added effects.
     `digest` is the restore key: it covers the machine and all that gives a sample its meaning;
     `machine_digest` the machine alone, as machines of one type share it.
     """
@@ -105,7 +106,7 @@ class Project:
     machine_digest: str
     effects: tuple[Effect, ...] = ()
     untrusted: Path | None = None
-    flows: tuple[LiveFlow, ...] = ()
+    flows: tuple[LiveFlow | RunningSum, ...] = ()
 
     @property
     def all_effects(self) -> tuple[Effect, ...]:

@@ -40,6 +40,7 @@ REFERENCES = {
 TEXT_KEYS = {
     *("dbc", "message", "signal", "column", "unit", "kind", "counter", "crc", "of"),
     *("pressure", "position", "source", "sink", "command", "reference_map", "state", "over"),
+    "measured",
 }
 EDGE_NEEDS = {
     "u_grid": "u_grid_v = [1.0, {start = 1.5, stop = 4.0, step = 0.25}, 7.0]",
@@ -106,8 +107,9 @@ def _signal(
     path: str, signal: Raw, kind: str | None, catalog: Catalog | None, raw: Raw
 ) -> Iterator[Problem]:
     yield from _signal_source(path, signal, catalog, raw)
-    if signal.get("offset") == "estimate" and (kind != "command" or "rate" not in raw or catalog):
-        remedy = "give a number; the neutral of a command is found in tables, beside [rate]"
+    is_found = kind == "command" and "state" in table(raw, "rate") and not catalog
+    if signal.get("offset") == "estimate" and not is_found:
+        remedy = "give a number; the neutral of a command is found in tables, beside [rate] state"
         yield Problem(f"{path}.offset", "cannot be estimated here", remedy)
     dbc_unit = find_dbc_unit(signal, catalog)
     name = signal.get("unit", dbc_unit)
@@ -186,24 +188,45 @@ def _position(raw: Raw, kinds: dict[str, str | None]) -> Iterator[Problem]:
 
 def _rate(raw: Raw, kinds: dict[str, str | None]) -> Iterator[Problem]:
     """The state of [rate], and what its maps are over."""
-    named: dict[str, str | None] = {"rate.state": table(raw, "rate").get("state")}
+    rate = table(raw, "rate")
+    named: dict[str, str | None] = {f"rate.{k}": rate.get(k) for k in ("state", "measured")}
+    if ("state" in rate) == ("measured" in rate):
+        problem = "given twice" if "state" in rate else "missing"
+        remedy = 'state = "x" where the maps give the rate of x, measured = "y" where y itself'
+        yield Problem("rate.state", problem, remedy)
     for name, part in tables(raw, "maps").items():
+        yield from _map_commands(f"maps.{name}", part, raw, kinds)
         named[f"maps.{name}.over"] = part.get("over")
         if ("over" in part) != ("over_grid" in part):
             remedy = "give both, or neither for a map over its command alone"
             yield Problem(f"maps.{name}.over", "over and over_grid belong together", remedy)
-        yield from _map_unit(f"maps.{name}", part, raw)
     for path, wanted in named.items():
         if wanted is not None and wanted not in kinds:
             yield Problem(path, f"there is no signal {wanted!r}", nearest(wanted, list(kinds)))
 
 
-def _map_unit(path: str, part: Raw, raw: Raw) -> Iterator[Problem]:
-    command = part.get("command")
-    signal = tables(raw, "signals").get(str(command))
-    unit = find_unit(str(signal.get("unit"))) if signal else None
-    if isinstance(command, str) and unit is not None:
-        yield from _command_unit(path, part, command, unit.dimension)
+def _map_commands(
+    path: str, part: Raw, raw: Raw, kinds: dict[str, str | None]
+) -> Iterator[Problem]:
+    """The one command of a map, or those that share it, and the unit of each."""
+    several = part.get("commands", [])
+    if ("command" in part) == bool(several):
+        problem = "given twice" if several else "missing"
+        remedy = 'write command = "u", or commands = ["u1", "u2"] where several share the map'
+        yield Problem(f"{path}.command", problem, remedy)
+    named = several if isinstance(several, list) else []
+    for k, name in enumerate(named):
+        yield from _reference(f"{path}.commands[{k}]", str(name), "command", kinds)
+        if name in named[:k]:
+            yield Problem(f"{path}.commands[{k}]", f"{name!r} is there twice", "name it once")
+        if f"{path}_{name}".removeprefix("maps.") in tables(raw, "maps"):
+            problem = f"its part of this map is called like another map, {path}_{name}"
+            yield Problem(f"{path}.commands[{k}]", problem, "rename that one")
+    for name in [*named, part.get("command")]:
+        signal = tables(raw, "signals").get(str(name))
+        unit = find_unit(str(signal.get("unit"))) if signal else None
+        if isinstance(name, str) and unit is not None:
+            yield from _command_unit(path, part, name, unit.dimension)
 
 
 def _chamber(path: str, chamber: Raw) -> Iterator[Problem]:

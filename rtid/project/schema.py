@@ -209,26 +209,40 @@ class ChamberSection(Section):
 class RateSection(Section):
     """[rate]: a plant without pressures, d state / dt = sum of its [maps]: a signal of any kind.
 
-    disturbance: what moves it beside, white, in the state's unit per second and sqrt(Hz); it is
-    found in the record unless given.
+    measured: that sum is measured itself, as an acceleration or a force is.  disturbance: what
+    moves it beside, white, in the unit of the sum per sqrt(Hz); it is found in the record unless
+    given.
     """
 
-    state: str = Field(description='state = "x", the signal whose rate the maps give')
+    state: str | None = None
+    measured: str | None = None
     disturbance: Estimable = Field(default=None, ge=0)
+
+    @property
+    def signal(self) -> str:
+        """The signal that the equation is about."""
+        return self.state or self.measured or ""
 
 
 class MapSection(Section):
     """[maps.NAME]: a part f(command) of the rate, or f(command, over) of a second signal.
 
-    over_grid is in the unit of that signal, rated, its usual size, in that of the state per second.
+    commands: several that share the map, each of which adds its own f.  over_grid is in the unit of
+    that signal, rated, its usual size, in that of the state per second, or of what is measured.
     """
 
-    command: str = Field(description='command = "u", a command of [signals]')
+    command: str | None = None
+    commands: Annotated[tuple[str, ...], BeforeValidator(_tuple)] = ()
     u_grid_v: Annotated[Borders, COMMAND] = Field(description="u_grid_v = [-10.0, 0.0, 10.0]")
     over: str | None = None
     over_grid: Borders | None = None
     rated: float = Field(gt=0, description="rated = 50, the usual size, state's unit per second")
     basis: Literal["taylor", "lapped", "blended"] = "taylor"
+
+    @property
+    def all_commands(self) -> tuple[str, ...]:
+        """The commands of the map."""
+        return self.commands or (self.command or "",)
 
 
 class EdgeDefaults(Section):

@@ -24,6 +24,7 @@ from rtid.model import Machine, Signal
 from rtid.plain import FloatArray, Progress
 from rtid.project import Project
 from rtid.trace.learner import Learner, catalog_of, listen, virtual_bus
+from rtid.trace.measured import with_sums
 from rtid.trace.reading import NoSamplesError, Trace, assemble
 
 if TYPE_CHECKING:
@@ -80,7 +81,7 @@ def as_on_board(project: Project, model: Machine, trace: Trace) -> Estimator:
         live = Estimator(model)
         live.update(trace.samples)
         return live
-    learner = Learner(model, catalog_of(project), project.assembly)
+    learner = Learner(model, catalog_of(project), project.assembly, project.flows)
     learner.push(trace.frames)
     learner.finish()
     return learner.estimator
@@ -92,7 +93,7 @@ def through_bus(
     """The estimate from the same frames, sent over a virtual bus."""
     if trace.frames is None:
         raise RtidError(f"{trace.path}: a table has no frames for a bus", "give a CAN log", 2)
-    learner = Learner(model, catalog_of(project), project.assembly)
+    learner = Learner(model, catalog_of(project), project.assembly, project.flows)
     n = max(1, len(trace.frames))
     with virtual_bus(trace.frames, speed) as (source, is_over):
         for state in listen(source, learner, is_over):
@@ -130,7 +131,8 @@ def aged(project: Project, model: Machine, trace: Trace) -> tuple[Trace, Message
 
     def shifted(offsets_s: FloatArray) -> Samples:
         changes = dict(zip(tolerance, offsets_s, strict=True))
-        return assemble(catalog, with_offsets(project.assembly, changes), frames)[0]
+        moved = with_offsets(project.assembly, changes)
+        return with_sums(project, assemble(catalog, moved, frames)[0])
 
     def chunk_of(offsets_s: FloatArray) -> FloatArray:
         return _chunk(model, shifted(offsets_s), span_s)

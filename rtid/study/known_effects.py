@@ -28,6 +28,7 @@ from rtid.diagnose.standing import fitted
 from rtid.effects.column import Candidate
 from rtid.effects.extra import with_extra_flow
 from rtid.effects.laws import cause_of
+from rtid.effects.laws.response import behind_s, with_lag
 from rtid.effects.record_view import MapTerms as KnownMap
 from rtid.effects.record_view import RecordView
 from rtid.effects.terms import terms_of
@@ -98,6 +99,10 @@ def acting(fit: Fit, chunk: FloatArray, published: FlowMap | None = None) -> Act
         model = with_positive_pressures(model, chunk) if fit.revision.effects else model
     if fit.revision.replaces_lag:
         model = replace(model, lag=Lag())
+    if lag_s := behind_s(fit.revision.timings):
+        if len(fit.revision.timings) == 1:  # nor to the commands: they are not split
+            model, sent = fit.declared, sent[:, : chunk.shape[1]]
+        model = with_lag(model, lag_s, view.step_s)
     of, measured = list[Candidate](), list[Candidate]()
     for effect, value in effect_values(fit):
         terms = terms_of(view.model, view.compliance, effect, value)
@@ -119,8 +124,8 @@ def _everywhere(model: Machine, published: FlowMap | None) -> KnownMap | None:
     """A published map as the diagnosis takes maps, all blocks known."""
     if published is None:
         return None
-    cells = [math.prod(edge.grid.shape) for edge in model.edges]
-    rated = np.repeat([edge.rated_q_m3s for edge in model.edges], cells)
+    cells = [math.prod(edge.grid.shape) for edge in model.maps]
+    rated = np.repeat([edge.rated_q_m3s for edge in model.maps], cells)
     return KnownMap(np.arange(model.n_cells), published.theta_cells() / rated[:, None], NO_COV)
 
 

@@ -19,10 +19,11 @@ import numpy as np
 
 from rtid.effects import Effect, catalogue
 from rtid.effects.page import title
+from rtid.effects.summed import RunningSum
 from rtid.errors import RtidError
 from rtid.estimator.estimator import Estimator
 from rtid.estimator.limits import refuse_unfit
-from rtid.model import PRESSURE, Term
+from rtid.model import PRESSURE, Machine, Term
 from rtid.project import Project
 from rtid.project.added import AddedSection, ParameterSection
 from rtid.project.build import digest
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
     from rtid.effects.live import LiveFlow
 
 LEAST_SD, USUAL_SD = 0.01, 0.1  # relative: an oil warms, a seal wears
+MAP_LAG = "map_lag"
+USUAL_DISTURBANCE = 0.01  # of the rated rate, per sqrt(Hz)
 
 
 class NoRoomOnBoardError(RtidError):
@@ -47,6 +50,10 @@ def on_board(project: Project, tell: Callable[[str], None]) -> Project:
     """
     model, flows = project.model, project.flows
     for added in project.sections.added:
+        if model.measured and added.effect == MAP_LAG:
+            model, flows = _behind(project, model, flows, added)
+            tell(f"{title(added.effect)} at {added.where} is part of the equation")
+            continue
         (terms, more), name = _live(project, added), f"{title(added.effect)} at {added.where}"
         signals = tuple(flow.signal for flow in more)
         model = replace(model, terms=(*model.terms, *terms), signals=(*model.signals, *signals))
@@ -59,15 +66,33 @@ def on_board(project: Project, tell: Callable[[str], None]) -> Project:
                 f"{name} is not in the model on board, {_why_not(project, added)}: the maps take "
                 "up what they can of it; replay and diagnosis know it"
             )
-    if len(model.terms) == len(project.model.terms):
+    if model is project.model:
         return project
     try:
         refuse_unfit(model)
     except ValueError as error:
         raise NoRoomOnBoardError(f"{project.path}: {error}", "drop an effect: rtid drop") from None
-    beside = tuple((flow.placed.effect.equation, flow.size, flow.shape) for flow in flows)
+    beside = tuple(flow.key for flow in flows)
     key, alone = digest((project.digest, model.terms, *beside)), digest(model)
     return replace(project, model=model, digest=key, machine_digest=alone, flows=flows)
+
+
+def _behind(
+    project: Project, model: Machine, flows: tuple[LiveFlow | RunningSum, ...], added: AddedSection
+) -> tuple[Machine, tuple[LiveFlow | RunningSum, ...]]:
+    """The machine and its running integral with a lag behind the maps.
+
+    What disturbs the plant is found in records: where it is not declared a usual one weighs rows.
+    """
+    from rtid.effects.laws.response import with_lag  # noqa: PLC0415
+
+    (lag,) = added.parameters.values()
+    if model.chambers[0].disturbance == 0.0:
+        usual = USUAL_DISTURBANCE * max(edge.rated_q_m3s for edge in model.edges)
+        model = replace(model, chambers=(replace(model.chambers[0], disturbance=usual),))
+    step_s = min((m.period_s for m in project.assembly.messages if m.period_s), default=1e-3)
+    late = (replace(f, behind_s=lag.value) if isinstance(f, RunningSum) else f for f in flows)
+    return with_lag(model, lag.value, step_s), tuple(late)
 
 
 def load_for(path: Path, project: Project) -> tuple[Estimator, tuple[AddedSection, ...]]:
@@ -81,7 +106,9 @@ def load_for(path: Path, project: Project) -> tuple[Estimator, tuple[AddedSectio
     except SnapshotError:
         if board is project:
             raise
-        live = tuple(a for a in project.sections.added if _live(project, a)[0])
+        live = tuple(
+            a for a in project.sections.added if a.effect == MAP_LAG or _live(project, a)[0]
+        )
         return load(path, board.model, board.digest), live
 
 

@@ -1,17 +1,19 @@
 """A table without pressures: which command moves which signal, and the project of its rate.
 
-    d state / dt = f(command)
+    d state / dt = f(command),   or   y = f(command),   y = sum of f over commands alike
 
 The pair is told by units, by the words that both names share and by how much of the rate the
-command explains; the neutral, the grid and the part that is held out come from the record.
+command explains; the neutral, the grid and the part that is held out come from the record.  An
+acceleration or a force is y itself; commands whose names differ in a number share one map.
 """
 
 from __future__ import annotations
 
+import re
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,7 @@ from rtid.compare.dead_band import DeadBand, dead_band
 from rtid.diagnose.report import Diagnosis
 from rtid.diagnose.verdict import INSUFFICIENT
 from rtid.errors import RtidError
+from rtid.estimator.flowmap import VALID, EdgeMap
 from rtid.estimator.published import publish
 from rtid.plain import FloatArray, Progress, plain, silent
 from rtid.project.guess import ROLES, RoleCandidate, is_wanted, propose, with_unit
@@ -33,13 +36,18 @@ from rtid.trace.quick_source import Source
 from rtid.units import COMMAND_DIMENSIONS, find_unit, words_of
 
 SCHEMA = 1
+MEASURED = ("acceleration", "force")
 STATES = ("length", "velocity", "angle", "rotation", "temperature")
 DRIVES = {"u", "cmd", "command", "valve", "spool", "pwm", "duty", "motor", "throttle", "lever"}
 MOVES = {"x", "pos", "position", "v", "speed", "velocity", "angle", "omega", "temp", "temperature"}
 BINS = 24  # of the command, to see how much of the rate it explains
+NUMBER = re.compile(r"[_ ]?\d+$")
+MOST_LOOKED = 20_000  # samples by which a pair is judged
 LEAST_SHARE = 0.1  # of the rate's variance that a command must explain
 BLOCKS = 13  # of the map
 LEAST_ROWS, LEAST_VALUES = 15, 5  # samples that a block needs, and different commands
+FAIR, ROOM = 0.05, 0.05  # share of the moving commands in a block; of the range, beyond it
+HELD_OUT_OF_MEASURED = 0.5  # of the motion: a measured rate has rows enough
 GAP_STEPS = 5.0  # usual steps: a longer one is a gap
 MAX_SD_SHARE = 0.05  # of the largest rate: known worse than this is not valid
 
@@ -48,18 +56,40 @@ MAX_SD_SHARE = 0.05  # of the largest rate: known worse than this is not valid
 class RatePair:
     """A command and the state that it moves, with units; neutral in the unit of the command.
 
-    share: of the rate's variance that the command explains; delay is not looked for.
+    share: of the rate's variance that the command explains; delay is not looked for.  more: further
+    commands with the same map.  is_measured: the state is what the map gives, not what it moves.
     """
 
     command: RoleCandidate
     state: RoleCandidate
     share: float
     neutral: float
+    more: tuple[RoleCandidate, ...] = ()
+    is_measured: bool = False
 
     @property
     def options(self) -> str:
         """What names this pair on the command line."""
         return f"--role u={self.command.name} --role x={self.state.name}"
+
+    @property
+    def commands(self) -> tuple[RoleCandidate, ...]:
+        """All commands of the map."""
+        return (self.command, *self.more)
+
+    @property
+    def roles(self) -> dict[str, RoleCandidate]:
+        """Who plays which role: u, or u1, u2 ..., and x."""
+        names = ["u"] if not self.more else [f"u{k + 1}" for k in range(len(self.commands))]
+        return dict(zip(names, self.commands, strict=True)) | {"x": self.state}
+
+    @property
+    def equation(self) -> str:
+        """What is learned, in short."""
+        given = "x" if self.is_measured else "d x / dt"
+        if not self.more:
+            return f"{given} = f(u)"
+        return f"{given} = f(u1) + ... + f(u{len(self.commands)}), one map for all of them"
 
 
 def pairs_of(path: Path, source: Source, given: Mapping[str, RoleCandidate]) -> list[RatePair]:
@@ -77,10 +107,54 @@ def pairs_of(path: Path, source: Source, given: Mapping[str, RoleCandidate]) -> 
                 alike = len(words_of(command.stem) & words_of(state.stem) - {"u", "x"})
                 is_first = {first.get("u"), first.get("x")} == {command, state}
                 made.append((alike, is_first, pair.share, pair))
-    best: dict[str, RatePair] = {}
+        for state in _candidates(source.signals, given.get("x"), MEASURED, set(), "x"):
+            group = alike_commands(command, source.signals)
+            for more in dict.fromkeys((group, ())):
+                pair = _measured_pair(table.columns, command, more, state)
+                if pair.share > LEAST_SHARE:
+                    made.append((0, False, pair.share, pair))
+    best: list[RatePair] = []
     for *_, pair in sorted(made, key=lambda m: m[:3], reverse=True):
-        best.setdefault(pair.command.name, pair)
-    return list(best.values())
+        taken = {command.name for other in best for command in other.commands}
+        if pair.command.name not in taken:
+            best.append(pair)
+    return best
+
+
+def alike_commands(
+    command: RoleCandidate, signals: list[RoleCandidate]
+) -> tuple[RoleCandidate, ...]:
+    """The commands whose names differ from this one's in a number at their end alone."""
+    kind = next(known for known in ROLES if known.name == "u")
+    stem = NUMBER.sub("", command.stem)
+    if stem == command.stem:
+        return ()
+    return tuple(
+        replace(with_unit(s, kind), unit=command.unit)
+        for s in signals
+        if s.name != command.name and NUMBER.search(s.stem) and NUMBER.sub("", s.stem) == stem
+    )
+
+
+def _measured_pair(
+    columns: Mapping[str, FloatArray],
+    command: RoleCandidate,
+    more: tuple[RoleCandidate, ...],
+    state: RoleCandidate,
+) -> RatePair:
+    """y as a sum of one piecewise linear map over all commands."""
+    u, y = np.stack([columns[c.name] for c in (command, *more)], axis=1), columns[state.name]
+    whole = np.isfinite(u).all(axis=1) & np.isfinite(y)
+    step = max(1, len(y) // MOST_LOOKED)
+    u, y = u[whole][::step], y[whole][::step]
+    share = 0.0
+    if len(y) and np.ptp(u) > 0.0 and np.ptp(y) > 0.0:
+        y = np.clip(y, *np.quantile(y, [0.01, 0.99]))  # a bump is not the command's
+        knots = np.linspace(u.min(), u.max(), BINS // 2)
+        phi = np.stack([np.interp(u, knots, hat).sum(axis=1) for hat in np.eye(len(knots))], axis=1)
+        left = y - phi @ np.linalg.lstsq(phi, y, rcond=1e-6)[0]
+        share = 1.0 - float(np.var(left) / max(np.var(y), 1e-300))
+    return RatePair(command, state, share, 0.0, more, is_measured=True)
 
 
 def _candidates(
@@ -120,9 +194,11 @@ def rate_text(name: str, path: Path, source: Source, pair: RatePair) -> str:
     """TOML of the project of a pair, complete."""
     table = read_table(path)
     t_s = table.seconds(source.keys["time_column"], source.keys["time_unit"])
-    u, x = table.columns[pair.command.name], table.columns[pair.state.name]
-    whole = np.isfinite(t_s) & np.isfinite(u) & np.isfinite(x)
-    t_s, u, x = t_s[whole] - t_s[whole][0], u[whole] - _neutral(pair), x[whole]
+    us = np.stack([table.columns[c.name] for c in pair.commands], axis=1)
+    x = table.columns[pair.state.name]
+    whole = np.isfinite(t_s) & np.isfinite(us).all(axis=1) & np.isfinite(x)
+    t_s, us, x = t_s[whole] - t_s[whole][0], us[whole] - _neutral(pair), x[whole]
+    u = us.ravel()
     step_s = float(np.median(np.diff(t_s)))
     unit = find_unit(pair.command.unit)
     key = unit.key if unit else "v"
@@ -131,20 +207,29 @@ def rate_text(name: str, path: Path, source: Source, pair: RatePair) -> str:
     if _is_angle(pair.state):
         state["kind"] = "other"
     state |= {"noise": "estimate", "resolution": source.steps[pair.state.name]}
-    split = held_out_from(t_s, x, HELD_OUT_SHARE)
+    moved, size = x, np.abs(slope_of(t_s, x))
+    if pair.is_measured:
+        state["noise"], moved, size = 0.0, us.sum(axis=1), np.abs(x) / us.shape[1]
+    held_out = HELD_OUT_OF_MEASURED if pair.is_measured else HELD_OUT_SHARE
+    split = held_out_from(t_s, moved, held_out)
+    commands = {name: c for name, c in pair.roles.items() if name != "x"}
+    offset: dict[str, Any] = {} if pair.is_measured else {"offset": "estimate"}
     raw: dict[str, dict[str, Any]] = {
         "project": {"name": name},
         "source": dict(source.keys),
         "signals": {
-            "u": {"column": pair.command.name, "unit": pair.command.unit, "offset": "estimate"},
+            **{
+                name: {"column": command.name, "unit": command.unit} | offset
+                for name, command in commands.items()
+            },
             "x": state,
         },
-        "rate": {"state": "x"},
+        "rate": {"measured" if pair.is_measured else "state": "x"},
         "maps": {
             "f": {
-                "command": "u",
-                f"u_grid_{key}": _grid(u),
-                "rated": _three(max(float(np.quantile(np.abs(slope_of(t_s, x)), 0.99)), 1e-9)),
+                **({"commands": list(commands)} if pair.more else {"command": "u"}),
+                f"u_grid_{key}": _grid_of_measured(us) if pair.is_measured else _grid(u),
+                "rated": _three(max(float(np.quantile(size, 0.99)), 1e-9)),
                 "basis": "blended",
             }
         },
@@ -155,6 +240,9 @@ def rate_text(name: str, path: Path, source: Source, pair: RatePair) -> str:
             "validation_s": [split, float(t_s[-1]) + step_s],
         },
     }
+    if pair.is_measured:
+        head = [f"# A plant without pressures, {pair.equation}, written by rtid"]
+        return "\n".join([*head, "", tomlkit.dumps(raw)])
     head = [
         "# A plant without pressures, d x / dt = f(u), written by rtid: u counts from its neutral",
         f"# ({pair.neutral:.6g} {pair.command.unit} here), which is found anew in every table.",
@@ -184,12 +272,30 @@ def _grid(u: FloatArray) -> list[float]:
     return [*(-border for border in reversed(below)), *above]
 
 
-def _joined(u: FloatArray, borders: list[float]) -> list[float]:
+def _grid_of_measured(us: FloatArray) -> list[float]:
+    """Borders between which each block holds a fair share of the commands (n, m) that move.
+
+    A command that rests at one end of its range has a narrow block there: at rest a machine may
+    stand against a floor or a stop, which bends no map beside it then.
+    """
+    moving = us[1:][np.diff(us, axis=0) != 0.0]
+    low, high = float(us.min()), float(us.max())
+    room = ROOM * (high - low)
+    rests = [float(np.mean(us == end)) > FAIR for end in (low, high)]
+    inside = low + room * rests[0], high - room * rests[1]
+    borders = np.linspace(inside[0], inside[1], BLOCKS + 1).tolist()
+    first, *between, last = _joined(moving, borders, max(LEAST_ROWS, round(FAIR * len(moving))))
+    below = [low - room] + [first] * rests[0]
+    above = [last] * rests[1] + [high + room]
+    return [round(border, 9) for border in (*below, *between, *above)]
+
+
+def _joined(u: FloatArray, borders: list[float], least: int = LEAST_ROWS) -> list[float]:
     """Those borders (m,) from the neutral outwards between which enough commands were sent."""
     kept = borders[:1]
     for border in borders[1:]:
         inside = u[(u > kept[-1]) & (u <= border)]
-        if len(inside) >= LEAST_ROWS and len(np.unique(inside)) >= LEAST_VALUES:
+        if len(inside) >= least and len(np.unique(inside)) >= LEAST_VALUES:
             kept.append(border)
     if len(kept) > 1:
         kept[-1] = borders[-1]
@@ -221,8 +327,9 @@ def no_plant(path: Path, signals: list[RoleCandidate]) -> RtidError:
 class QuickRate:
     """What a table without pressures tells: the pair that was looked at, others, the diagnosis.
 
-    text: the project file; maps: dead band (low, high) about the neutral and gains (below, above)
-    by map, in SI, NaN where the map does not tell.
+    text: the project file; bands: dead band (low, high) about the neutral and gains (below, above)
+    by map, in SI, NaN where the map does not tell; ranges: lowest and highest command that a map is
+    known at, and what it gives there, SI.
     """
 
     path: Path
@@ -231,6 +338,7 @@ class QuickRate:
     text: str
     diagnosis: Diagnosis
     bands: dict[str, DeadBand]
+    ranges: dict[str, tuple[float, float, float, float]]
     unused: tuple[str, ...]
     unit: str
     command_unit: str
@@ -253,7 +361,7 @@ class QuickRate:
                 "schema": SCHEMA,
                 "file": str(self.path),
                 "plant": "rate",
-                "roles": {"u": asdict(self.pair.command), "x": asdict(self.pair.state)},
+                "roles": {name: asdict(role) for name, role in self.pair.roles.items()},
                 "neutral": self.pair.neutral,
                 "others": pairs,
                 "unused": list(self.unused),
@@ -263,6 +371,17 @@ class QuickRate:
             }
         )
         return words
+
+
+def known_range(edge: EdgeMap) -> tuple[float, float, float, float] | None:
+    """Lowest and highest command between which a map is known, and what it gives; None: nowhere."""
+    at = np.flatnonzero((edge.status == VALID).any(axis=1))
+    if not len(at):
+        return None
+    u = edge.grid.u_v
+    ends = 0.5 * np.array([u[at[0]] + u[at[0] + 1], u[at[-1]] + u[at[-1] + 1]])
+    first, last = edge.flow(ends, np.zeros(2))
+    return float(ends[0]), float(ends[1]), float(first), float(last)
 
 
 def quick_rate(
@@ -285,8 +404,10 @@ def quick_rate(
             with suppress(RtidError):
                 study.add(f"{effect.effect}:{effect.where}", force=True)
         model, flowmap, text = study.machine, publish(study.fit.solution), file.read_text("utf-8")
-    used = {pair.command.name, pair.state.name}
+    used = {role.name for role in pair.roles.values()}
     unused = tuple(s.name for s in source.signals if s.name not in used)
     bands = {edge.name: dead_band(edge) for edge in flowmap.edges}
-    units = model.chambers[0].unit, model.signals[model.column("u")].unit
-    return QuickRate(path, pair, tuple(others), text, diagnosed.diagnosis, bands, unused, *units)
+    units = model.chambers[0].unit, model.signals[model.column(model.edges[0].command)].unit
+    ranges = {edge.name: known for edge in flowmap.edges if (known := known_range(edge))}
+    said = diagnosed.diagnosis
+    return QuickRate(path, pair, tuple(others), text, said, bands, ranges, unused, *units)

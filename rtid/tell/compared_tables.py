@@ -118,7 +118,7 @@ def directions(studies: Sequence[TraceComparison]) -> Table:
 def causes(comparison: TraceComparison) -> Table:
     """How many blocks of each edge are identified, and what the others lack."""
     rows = []
-    for edge in comparison.replay.model.edges:
+    for edge in comparison.replay.model.maps:
         count = Counter(cause_of(row) for row in comparison.blocks if row.edge == edge.name)
         visited = sum(count.values())
         count[CAUSES[-1]] += edge.grid.shape[0] * edge.grid.shape[1] - visited

@@ -59,9 +59,9 @@ def lines(quick: Quick, saved: Path | None = None) -> Iterator[str]:
 
 def rate_lines(quick: QuickRate, saved: Path | None = None) -> Iterator[str]:
     """Of a table without pressures: the pair, its neutral, band and gains, the verdict."""
-    pair, u, x = quick.pair, quick.pair.command, quick.pair.state
-    yield f"{quick.path.name}, without a project file: a plant without pressures, d x / dt = f(u)."
-    for role, candidate in (("u", u), ("x", x)):
+    pair, u = quick.pair, quick.pair.command
+    yield f"{quick.path.name}, without a project file: a plant without pressures, {pair.equation}."
+    for role, candidate in pair.roles.items():
         guessed = ", unit guessed from its range" if candidate.guessed_unit else ""
         yield f"  {role:9} {candidate.full_name} [{candidate.unit}{guessed}]"
     for other in quick.others:
@@ -69,9 +69,12 @@ def rate_lines(quick: QuickRate, saved: Path | None = None) -> Iterator[str]:
     if quick.unused:
         yield f"Not used: {', '.join(quick.unused)}"
     yield ""
-    yield f"The neutral of the command is {pair.neutral:.6g} {u.unit}: there x stands most."
-    for name, band in quick.bands.items():
-        yield from band_lines(name, band, quick.unit, quick.command_unit)
+    if pair.is_measured:
+        yield from _range_lines(quick)
+    else:
+        yield f"The neutral of the command is {pair.neutral:.6g} {u.unit}: there x stands most."
+        for name, band in quick.bands.items():
+            yield from band_lines(name, band, quick.unit, quick.command_unit)
     yield ""
     yield f"Verdict: {quick.diagnosis.verdict}."
     for sentence in sentences(quick.diagnosis):
@@ -83,6 +86,16 @@ def rate_lines(quick: QuickRate, saved: Path | None = None) -> Iterator[str]:
         return
     yield f"Next: {quick.next_command}"
     yield "  writes the project with what was found."
+
+
+def _range_lines(quick: QuickRate) -> Iterator[str]:
+    """What the map of a measured rate gives at both ends of what is known of it."""
+    scale = scale_of(quick.unit)
+    for name, (low, high, first, last) in quick.ranges.items():
+        yield (
+            f"Map {name} is known from {low:.4g} to {high:.4g} {quick.command_unit}: it gives "
+            f"{scale.factor * first:.4g} and {scale.factor * last:.4g} {scale.name} there."
+        )
 
 
 def band_lines(name: str, band: DeadBand, unit: str, command_unit: str) -> Iterator[str]:

@@ -169,7 +169,7 @@ class LearnedStory:
 
     def _grids(self) -> Iterator[str]:
         """Grids that the record needed finer than declared."""
-        for edge, used in zip(self.result.declared.edges, self.result.model.edges, strict=True):
+        for edge, used in zip(self.result.declared.maps, self.result.model.maps, strict=True):
             (nu, nd), (mu, md) = edge.grid.shape, used.grid.shape
             if (nu, nd) != (mu, md):
                 yield (

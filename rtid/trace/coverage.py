@@ -46,7 +46,7 @@ def coverage(model: Machine, samples: Samples) -> tuple[Coverage, ...]:
     is_row = (samples.flags & ROW) != 0
     t_us = samples.t_us[is_row]
     period_s = float(np.median(np.diff(t_us))) * 1e-6 if len(t_us) > 1 else 0.0
-    return tuple(_edge(model, edge, samples, is_row, period_s) for edge in model.edges)
+    return tuple(_edge(model, edge, samples, is_row, period_s) for edge in model.maps)
 
 
 def _edge(

@@ -39,6 +39,7 @@ from rtid.project import Project
 
 if TYPE_CHECKING:
     from rtid.effects.live import LiveFlow
+    from rtid.effects.summed import RunningSum
 
 QUIET_READS = 5  # the bus is over when its sender has ended and so many reads found nothing
 
@@ -66,7 +67,7 @@ class Learner:
         model: Machine,
         catalog: Catalog,
         assembly: Assembly,
-        flows: tuple[LiveFlow, ...] = (),
+        flows: tuple[LiveFlow | RunningSum, ...] = (),
     ) -> None:
         self.assembler = Assembler(catalog, assembly)
         self.network = Network(catalog, assembly.messages)

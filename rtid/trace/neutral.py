@@ -76,7 +76,7 @@ def about_neutral(project: Project, samples: Samples) -> Samples:
     """The samples with every command of `offset = "estimate"` counted from its neutral."""
     sections = project.sections
     unknown = [name for name, s in sections.signals.items() if s.offset is None]
-    if not unknown or sections.rate is None or len(samples) == 0:
+    if not unknown or sections.rate is None or not sections.rate.state or len(samples) == 0:
         return samples
     values, t_s = samples.values.copy(), np.asarray(1e-6 * samples.t_us, np.float64)
     for name in unknown:

@@ -18,6 +18,7 @@ from firmware_bridge.sources.table import Table, to_samples
 from rtid.errors import RtidError, door
 from rtid.project import Project
 from rtid.trace.learner import catalog_of
+from rtid.trace.measured import with_sums
 from rtid.trace.neutral import about_neutral
 from rtid.trace.table import declared
 
@@ -48,9 +49,10 @@ def read_trace(project: Project, path: str | Path) -> Trace:
     content = open_file(path)
     if isinstance(content, Table):
         samples, counters = to_samples(*declared(project, content))
-        samples = about_neutral(project, samples)
+        samples = with_sums(project, about_neutral(project, samples))
         return _not_empty(Trace(path, samples, counters, None), project)
     samples, counters = assemble(catalog_of(project), project.assembly, content)
+    samples = with_sums(project, samples)
     return _not_empty(Trace(path, samples, counters, content), project)
 
 

@@ -28,8 +28,9 @@ def present(misfit: float) -> Any:
     )
 
 
-def state(*negligible: str) -> Any:
-    return SimpleNamespace(negligible={(name, "a"): 0.0 for name in negligible})
+def state(*negligible: str, has_pressures: bool = True) -> Any:
+    model = SimpleNamespace(has_pressures=has_pressures)
+    return SimpleNamespace(negligible={(name, "a"): 0.0 for name in negligible}, model=model)
 
 
 def alike(misfit: float, *gains: float, known: Any = None) -> set[str]:
@@ -47,6 +48,13 @@ def test_one_that_leaves_several_times_the_misfit_is_refuted() -> None:
     """The best leaves nothing: 1 % of 100,000 is more than noise, though the gains are near."""
     left = REFUTED * 0.05 * DOF
     assert alike(100_000, 100_000, 100_000 - left + 1, 100_000 - left - TIE - 1) == {"cause 1"}
+
+
+def test_without_pressures_all_that_is_left_counts() -> None:
+    """The disturbance was as large as all: one that leaves several times the best's is out."""
+    gains = 0.99 * DOF, (1 - 0.01 * REFUTED) * DOF, (1 - 0.01 * (REFUTED + 1)) * DOF
+    assert alike(0, *gains, known=state(has_pressures=False)) == {"cause 1"}
+    assert alike(0, *gains) == {"cause 1", "cause 2"}
 
 
 def test_what_changes_next_to_nothing_is_no_rival() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -14,6 +15,7 @@ from rtid.estimator.factor import PRIOR_SD, SHARED_PRIOR, factorize
 from rtid.estimator.solution import solve
 from rtid.estimator.state import State, build
 from rtid.estimator.sums import Normal, normal_equations
+from rtid.model import BLENDED, TAYLOR
 from tests.estimator.cases import Case, draw_case, plant_case
 
 FORMS = ("integral", "carry")
@@ -136,3 +138,25 @@ def test_more_shared_columns(terms: int, form: str) -> None:
     case = draw_case(11 + terms, form, terms=terms)
     found = check(case)
     assert found["columns"] - 6 * found["blocks"] == 2 + terms
+
+
+@pytest.mark.parametrize("basis", [TAYLOR, BLENDED])
+@pytest.mark.parametrize("seed", range(3))
+def test_one_map_of_several_commands(seed: int, basis: str) -> None:
+    """Commands that are in the same blocks of one map, and in others, at the same time."""
+    case = draw_case(300 + seed, "integral", chambers=1, basis=basis)
+    edge, column = case.model.edges[0], case.model.column("u")
+    more = [replace(edge, name=f"{edge.name}{k}", command=f"u{k}", shares=edge.name) for k in "23"]
+    signals = [replace(case.model.signals[column], name=e.command) for e in more]
+    u = case.values[:, column]
+    commands = np.stack([np.roll(u, 11), 0.5 * (u + np.roll(u, 40))], axis=1)
+    model = replace(
+        case.model,
+        signals=(*case.model.signals, *signals),
+        edges=(edge, more[0], *case.model.edges[1:], more[1]),
+    )
+    shared = replace(case, model=model, values=np.hstack([case.values, commands]))
+    check(shared)
+    assert model.n_cells == case.model.n_cells
+    counted = {int(b["edge"]) for b in accumulated(shared)[1].blocks if b["rows"] > 0}
+    assert counted and not counted & {1, len(model.edges) - 1}

@@ -14,6 +14,7 @@ from rtid.effects.column import Candidate, Cause, by_equation
 from rtid.effects.law import needs_no_pressure, places_of
 from rtid.effects.laws.lines import lines
 from rtid.effects.laws.openings import opening
+from rtid.effects.laws.response import map_lag
 from rtid.effects.laws.sensors import late_position, late_pressure
 from rtid.effects.laws.storage import SEED, add_echoes, total_softness
 from rtid.effects.laws.supply import supply
@@ -32,6 +33,7 @@ NAMED: dict[str, Law] = {
     "pump": supply,
     "late_pressure": late_pressure,
     "late_position": late_position,
+    "map_lag": map_lag,
 }
 
 

@@ -16,6 +16,7 @@ from rtid.effects.column import Cause, fixed, of_page
 from rtid.effects.filtering import fitted
 from rtid.effects.law import Volumes
 from rtid.effects.laws.common import slope_to, stored
+from rtid.effects.laws.response import MAP_LAG, later, map_lag_of
 from rtid.effects.laws.timing import Psi, TimingLaw, of_law
 from rtid.effects.page import Effect
 from rtid.effects.record_view import RecordView
@@ -72,10 +73,12 @@ LATE_PRESSURE = of_law("late_pressure", quickened, where="")
 
 
 def sensor_timings(model: Machine) -> tuple[TimingLaw, ...]:
-    """The timings of a machine's sensors, each at its place.
+    """The timings of a machine's sensors, each at its place, and that of a rate that is measured.
 
     A plant without pressures has none: its position that is late is a command that is.
     """
+    if (behind := map_lag_of(model)) is not None:
+        return (behind,)
     if not (model.position and model.has_pressures):
         return ()
     slow = (replace(LATE_PRESSURE, where=chamber.name) for chamber in model.chambers)
@@ -88,8 +91,10 @@ def sensor_of(model: Machine, timing: TimingLaw) -> str:
     return pressures.get(timing.where, timing.where)
 
 
-def late(view: RecordView, timing: TimingLaw) -> Volumes:
+def late(view: RecordView, timing: TimingLaw, psi: Psi) -> Volumes:
     """Volumes per interval and chamber of a unit more of what a sensor is late by."""
+    if timing.effect == MAP_LAG.effect:
+        return later(view, psi[0])
     chambers = [chamber.name for chamber in view.model.chambers]
     if timing.where in chambers:
         return _slow_pressure(view, chambers.index(timing.where))

@@ -126,7 +126,7 @@ class BlockPlots:
         self._sources: dict[str, ColumnDataSource] = {}
         self._lit: dict[str, ColumnDataSource] = {}
         self._shown: dict[str, list[BlockRow]] = {}
-        plots = [self._plot(e, [b for b in blocks if b.edge == e.name]) for e in model.edges]
+        plots = [self._plot(e, [b for b in blocks if b.edge == e.name]) for e in model.maps]
         pairs = [plots[k : k + 2] for k in range(0, len(plots), 2)]
         rows = [beside(*pair, stacked_below_px=NARROWEST_PX) for pair in pairs]
         self.root: UIElement = column(*rows, sizing_mode="stretch_both")

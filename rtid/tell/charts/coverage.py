@@ -21,8 +21,8 @@ DOTS = 6000  # samples drawn per edge
 def coverage(model: Machine, flowmap: FlowMap, chunk: FloatArray) -> Figure:
     """Blocks by status and the samples in them; chunk (n, 2 + signals), SI."""
     with mpl.rc_context(STYLE):
-        figure, axes = panels(len(model.edges))
-        for axis, edge, learned in zip(axes, model.edges, flowmap.edges, strict=True):
+        figure, axes = panels(len(model.maps))
+        for axis, edge, learned in zip(axes, model.maps, flowmap.edges, strict=True):
             _blocks(axis, learned)
             w_v, dp_pa = working_points(model, edge, chunk)
             step = max(1, len(w_v) // DOTS)

@@ -30,11 +30,11 @@ def residual_map(model: Machine, rows: Sequence[BlockRow]) -> Figure:
     of their own are pale.
     """
     with mpl.rc_context(STYLE):
-        figure, axes = panels(len(model.edges), width=10.0, height=3.4)
+        figure, axes = panels(len(model.maps), width=10.0, height=3.4)
         values = np.array([row.residual_rms_m3s * lpm() for row in rows])
         top = float(np.nanquantile(values, 0.98)) if np.isfinite(values).any() else 1.0
         norm, colours = mpl.colors.Normalize(0.0, max(top, 1e-9)), mpl.colormaps["YlOrBr"]
-        for axis, edge in zip(axes, model.edges, strict=True):
+        for axis, edge in zip(axes, model.maps, strict=True):
             of_edge = [row for row in rows if row.edge == edge.name]
             _blocks(axis, edge, of_edge, norm, colours)
             axis.set_title(f"{edge.name}: {edge.source} → {edge.sink}")
