@@ -6,26 +6,29 @@
 
 const char rtid_estimator_version[] = "rtid_estimator " RTID_C_VERSION ", " RTID_EST_LEARNS;
 
+/* no range reaches what is no number */
+#define CAPPED(x) (((x) < -MOST) ? R(-MOST) : (((x) > MOST) ? R(MOST) : R(x)))
+
 static const rtid_real RANGES[][2] = {RTID_EST_RANGES};
 
 static bool on_clock(int64_t t_us) { return (t_us >= 0) && (t_us <= INT64_C(0x1FFFFFFFFFFFFF)); }
 
 static int acceptable(const rtid_estimator_sample *sample)
 {
+    int verdict = RTID_EST_TAKEN;
     if (!on_clock(sample->t_us)) {
         return RTID_EST_OUT_OF_RANGE;
     }
     for (int j = 0; j < RTID_EST_N_SIGNALS; j++) {
-        if (!(ABS(sample->values[j]) < INSANE)) {
-            return RTID_EST_NOT_FINITE;
+        const rtid_real value = sample->values[j];
+        if (!((value >= RANGES[j][0]) && (value <= RANGES[j][1]))) {
+            if (!(ABS(value) < INSANE)) {
+                return RTID_EST_NOT_FINITE;
+            }
+            verdict = RTID_EST_OUT_OF_RANGE;
         }
     }
-    for (int j = 0; j < RTID_EST_N_SIGNALS; j++) {
-        if ((sample->values[j] < RANGES[j][0]) || (sample->values[j] > RANGES[j][1])) {
-            return RTID_EST_OUT_OF_RANGE;
-        }
-    }
-    return RTID_EST_TAKEN;
+    return verdict;
 }
 
 void rtid_est_remember(rtid_estimator *e, const rtid_estimator_sample *sample)
@@ -80,12 +83,12 @@ static int take(rtid_estimator *e, const rtid_estimator_sample *sample)
     if ((!whole) || (verdict == RTID_EST_RESTART_GAP)) {
         e->ready_us = RTID_EST_RECOVERY_US + (on_clock(sample->t_us) ? sample->t_us : e->t_us);
     }
+    if (was_running && (verdict == RTID_EST_TAKEN)) {
+        rtid_est_integrate(e, sample); /* and remembers it */
+        return verdict;
+    }
     if (was_running) {
-        if (verdict == RTID_EST_TAKEN) {
-            rtid_est_integrate(e, sample);
-        } else {
-            stop(e);
-        }
+        stop(e);
     }
     if (!whole) {
         return verdict;

@@ -341,10 +341,36 @@ static void block_increments(rtid_estimator *e, int k, const rtid_estimator_samp
     e->cov += ((cell->slope * cell->slope * edge->dp_var * period) + cell->missed) * e->dt_s;
 }
 
+/* Products of the columns of a row, three lines of their triangle at a time: most of a tick. */
+static void add_row(rtid_sum (*local)[RTID_EST_WIDTH], const rtid_real *row, int n)
+{
+    int i = 0;
+    while ((i + 3) <= n) {
+        rtid_sum *first = local[i], *second = local[i + 1], *third = local[i + 2];
+        const rtid_real a = row[i], b = row[i + 1], c = row[i + 2];
+        for (int j = 0; j <= i; j++) {
+            const rtid_real x = row[j];
+            add_product(&first[j], a, x);
+            add_product(&second[j], b, x);
+            add_product(&third[j], c, x);
+        }
+        add_product(&second[i + 1], b, b);
+        add_product(&third[i + 1], c, b);
+        add_product(&third[i + 2], c, c);
+        i += 3;
+    }
+    while (i < n) {
+        for (int j = 0; j <= i; j++) {
+            add_product(&local[i][j], row[i], row[j]);
+        }
+        i++;
+    }
+}
+
 /* A row of all columns and their decay, by the Kalman whitener; see rtid/kernels/rows.py. */
 static void make_row(rtid_estimator *e)
 {
-    const rtid_real r = position_noise(e), s = e->cov + r, v = column_variance(e);
+    const rtid_real v = column_variance(e), r = (AREA * AREA * X_VAR) + v, s = e->cov + r;
     const rtid_real scale = R(1) / ROOT(s), keep = r / s, lost = R(1) - keep;
     const int n = e->width;
     rtid_real row[RTID_EST_WIDTH];
@@ -352,11 +378,7 @@ static void make_row(rtid_estimator *e)
         row[j] = scale * e->d[j];
         e->d[j] *= keep;
     }
-    for (int i = 0; i < n; i++) {
-        for (int j = 0; j <= i; j++) {
-            merge(&e->owed.local[i][j], product(row[i], row[j]));
-        }
-    }
+    add_row(e->owed.local, row, n);
     merge(&e->noise, as_sum((v + e->echo) / s));
     e->echo = (keep * keep * e->echo) + (lost * lost * v);
     e->cov *= keep;

@@ -229,14 +229,16 @@ bool rtid_est_is_full(const rtid_estimator *e)
     return (e->owed.n_line + e->owed.n_open + least) > RTID_EST_MAX_VISITS;
 }
 
-/* Take the n-th visit out of the line. */
-static void leave_line(rtid_estimator *e, int n)
+/* Take `many` visits out of the line, from the n-th on. */
+static void leave_line(rtid_estimator *e, int n, int many)
 {
     rtid_estimator_owed *o = &e->owed;
-    at_line(e, n)->status = FREE;
-    o->n_line--;
+    for (int a = n; a < (n + many); a++) {
+        at_line(e, a)->status = FREE;
+    }
+    o->n_line = (int16_t)(o->n_line - many);
     for (int a = n; a < o->n_line; a++) {
-        o->line[a] = o->line[a + 1];
+        o->line[a] = o->line[a + many];
     }
     if (n == 0) {
         o->n_paid = 0;
@@ -265,7 +267,7 @@ static void take_over(rtid_estimator *e, int n)
         for (int i = 0; i < T; i++) {
             merge(&v->left[i], scaled(before->left[i], power(apart)));
         }
-        leave_line(e, a);
+        leave_line(e, a, 1);
         return;
     }
 }
@@ -482,13 +484,23 @@ void rtid_est_remove_open(rtid_estimator *e, int k)
 static void leave_first(rtid_estimator *e)
 {
     settle_own(e, at_line(e, 0));
-    leave_line(e, 0);
+    leave_line(e, 0, 1);
     if (!any_rings(e)) {
         for (int k = 0; k < e->owed.n_open; k++) {
             rtid_est_take_left(&e->owed, k);
             begin_visit(e, open_visit(e, k)); /* it owes nothing to anybody */
         }
     }
+}
+
+/* Visits at the head of the line that went on as others. */
+static int count_ended(rtid_estimator *e)
+{
+    int n = 0;
+    while ((n < e->owed.n_line) && (at_line(e, n)->status == ENDED)) {
+        n++;
+    }
+    return n;
 }
 
 void rtid_est_pay(rtid_estimator *e)
@@ -505,8 +517,8 @@ void rtid_est_pay(rtid_estimator *e)
         const rtid_estimator_visit *first = at_line(e, 0);
         const int next = o->n_paid + 1;
         const bool now = first->memory == o->memory;
-        if (first->status == ENDED) {
-            leave_line(e, 0);
+        if (first->status == ENDED) { /* it owes nothing */
+            leave_line(e, 0, count_ended(e));
             continue;
         }
         if (now && (first->status != SILENT_NOW)) {

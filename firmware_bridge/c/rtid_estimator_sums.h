@@ -29,6 +29,7 @@ enum { MOST_APART = 40 };   /* epochs, in bits, between two that are merged */
 #define ABS fabsf
 /* No quantity in SI units is that large, and its square is still a number. */
 #define INSANE 1e9f
+#define MOST 9.99999e8
 #define FREXP frexpf
 #define LDEXP ldexpf
 #define SILENT 1e-7f /* a closed block whose state decayed to this share is forgotten */
@@ -54,6 +55,15 @@ static inline rtid_sum product(rtid_real a, rtid_real b)
 #endif
 }
 
+/* s += a b to the same bits, of an epoch: its few rows leave low small, and merge orders it. */
+static inline void add_product(rtid_sum *s, rtid_real a, rtid_real b)
+{
+    const rtid_sum x = product(a, b);
+    const rtid_real t = s->high + x.high, back = t - s->high;
+    s->low += ((s->high - (t - back)) + (x.high - back)) + x.low;
+    s->high = t;
+}
+
 static inline rtid_sum times(rtid_sum a, rtid_real b)
 {
     rtid_sum p = product(a.high, b);
@@ -74,12 +84,14 @@ static inline double exact(rtid_sum s) { return (double)s.high + (double)s.low; 
 #define EXP exp
 #define ABS fabs
 #define INSANE 1e30
+#define MOST 9.99999e29
 #define FREXP frexp
 #define LDEXP ldexp
 #define SILENT 1e-11
 
 static inline void merge(rtid_sum *s, rtid_sum x) { *s += x; }
 static inline rtid_sum product(rtid_real a, rtid_real b) { return a * b; }
+static inline void add_product(rtid_sum *s, rtid_real a, rtid_real b) { *s += a * b; }
 static inline rtid_sum times(rtid_sum a, rtid_real b) { return a * b; }
 static inline rtid_sum scaled(rtid_sum a, rtid_real b) { return a * b; }
 static inline rtid_sum as_sum(rtid_real x) { return x; }

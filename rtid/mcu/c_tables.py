@@ -123,7 +123,9 @@ def _signals(model: Machine) -> Iterator[str]:
         if names.count(name) > 1:
             raise ValveError(f"two signals would be {name} in C", "rename one of them")
     yield f"enum {{ {', '.join(names)} }};"
-    ranges = (_row([s.minimum, s.maximum]) for s in model.signals)
+    ranges = (
+        f"{{CAPPED({_number(s.minimum)}), CAPPED({_number(s.maximum)})}}" for s in model.signals
+    )
     yield from _rows("RANGES", "values outside are refused", ranges)
 
 
