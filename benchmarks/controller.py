@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from benchmarks.table import replace_between
-from tests.mcu.emulated import Board
+from rtid.mcu.emulated import Board
 from tests.mcu.records import ANYWHERE, CELLS, NAMES, record, valve
 
 PAGE = Path("docs/controller.md")

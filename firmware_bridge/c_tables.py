@@ -23,6 +23,7 @@ from firmware_bridge.jit import Record
 MESSAGES = ("ValveCommand", "Pressures", "Motion")
 HEADER = Path(__file__).with_name("c") / "rtid_tables.h"
 VERSION = HEADER.with_name("rtid_version.h")
+BOARD = Path(__file__).with_name("board")  # an emulated one
 MAX_BITS = 52  # a double holds every count
 
 

@@ -11,7 +11,9 @@ import typer
 from rtid.cli.options import ProjectOption
 
 if TYPE_CHECKING:
+    from rtid.mcu.budget import Limited
     from rtid.mcu.c_tables import Sizes
+    from rtid.model import Machine
     from rtid.project import Project
 
 
@@ -25,6 +27,12 @@ def mcu(
     blocks: Annotated[
         int, typer.Option(min=0, help="Blocks that fit in its memory; 0: all of the grids.")
     ] = 0,
+    budget: Annotated[
+        int, typer.Option(min=0, help="Instructions that no tick may exceed; 0: as declared.")
+    ] = 0,
+    trace: Annotated[
+        Path | None, typer.Option(help="With --budget: a log, to tell what the budget costs on it.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print a summary as JSON.")] = False,
 ) -> None:
     """Write the estimator of one chamber in C99, with tables from the project file.
@@ -32,6 +40,10 @@ def mcu(
     No heap, no globals; one double or, with -DRTID_ESTIMATOR_FLOAT32, one float per number in the
     update.  The same samples give the sums of `rtid run`.  It learns what the project declares in
     the integral form with Taylor blocks, for ever: no forgetting, no gate by a map held, no modes.
+
+    --budget chooses how many blocks may ring and how much a tick works off, by running the machine
+    on emulated Cortex-M boards through motion that no valve makes (a minute or two; needs
+    gcc-arm-none-eabi and qemu-system-arm); instructions are not cycles.
     """
     from rtid.mcu.c_tables import sizes_of
     from rtid.mcu.memory import Layout
@@ -43,7 +55,10 @@ def mcu(
     _refuse_estimated(loaded)
     model = one_valve(loaded.model, chamber or loaded.model.chambers[0].name, edge or ())
     title = f" of project {loaded.digest}"
-    written = write_sources(output, model, blocks, title=title)
+    limited = _limited(loaded, model, blocks, budget, trace) if budget else None
+    tiles = limited.chosen.tiles if limited else None
+    model = limited.chosen.model if limited else model
+    written = write_sources(output, model, blocks, title=title, tiles=tiles)
     sizes = sizes_of(model, blocks)
     ram = {
         name: [Layout(sizes, single).estimator.itemsize, Layout(sizes, single).work.itemsize]
@@ -53,9 +68,27 @@ def mcu(
     if as_json:
         document = {"schema": 1, "written": [str(path) for path in written], "ram_bytes": ram}
         document |= {"chamber": model.chambers[0].name, "blocks": sizes.blocks, "without": added}
-        print(json.dumps(document))
+        print(json.dumps(document | (limited.document() if limited else {})))
     else:
         _tell(output, model.chambers[0].name, sizes, ram, added)
+        if limited:
+            print("\n".join(limited.lines()))
+
+
+def _limited(
+    loaded: Project, model: Machine, blocks: int, budget: int, trace: Path | None
+) -> Limited:
+    from rtid.mcu.budget import limit
+    from rtid.mcu.emulated import Record
+    from rtid.trace.reading import read_trace
+
+    record = None
+    if trace is not None:
+        samples = read_trace(loaded, trace).samples
+        columns = [samples.names.index(signal.name) for signal in model.signals]
+        t_us = samples.t_us - samples.t_us[0]
+        record = Record(t_us, samples.values[:, columns], samples.flags.astype(float))
+    return limit(model, blocks, budget, record)
 
 
 def _refuse_estimated(project: Project) -> None:

@@ -76,7 +76,21 @@ def sizes_of(model: Machine, blocks: int = 0) -> Sizes:
     return Sizes(*counts, cells, wanted, opened, recent)
 
 
-def tables(model: Machine, blocks: int = 0, weights: Weights | None = None, title: str = "") -> str:
+@dataclass(frozen=True)
+class Tiles:
+    """Products of two blocks' terms that a tick may work off, in double and in float."""
+
+    double: int
+    single: int
+
+
+def tables(
+    model: Machine,
+    blocks: int = 0,
+    weights: Weights | None = None,
+    title: str = "",
+    tiles: Tiles | None = None,
+) -> str:
     """Text of rtid_estimator_tables.h for a machine of `one_valve`, nominal weights by default."""
     sizes = sizes_of(model, blocks)
     state = build(model, weights)
@@ -89,6 +103,7 @@ def tables(model: Machine, blocks: int = 0, weights: Weights | None = None, titl
         "",
         f'#define RTID_EST_LEARNS "{learns}"',
         *_sizes(sizes),
+        *_tiles(tiles),
         *_signals(model),
         *_chamber(e, model),
         *_edges(e, model),
@@ -112,6 +127,17 @@ def _sizes(sizes: Sizes) -> Iterator[str]:
     }
     for name, value in names.items():
         yield f"#define RTID_EST_{name} {value}"
+    yield ""
+
+
+def _tiles(tiles: Tiles | None) -> Iterator[str]:
+    if tiles is None:
+        return
+    yield "#ifdef RTID_ESTIMATOR_FLOAT32"
+    yield f"#define RTID_EST_TILES_PER_TICK {tiles.single}"
+    yield "#else"
+    yield f"#define RTID_EST_TILES_PER_TICK {tiles.double}"
+    yield "#endif"
     yield ""
 
 

@@ -6,20 +6,26 @@ import os
 from pathlib import Path
 
 from rtid.estimator.state import Weights
-from rtid.mcu.c_tables import sources, tables
+from rtid.mcu.c_tables import Tiles, sources, tables
 from rtid.model import Machine
 
 TABLES = "rtid_estimator_tables.h"
 
 
 def write_sources(
-    folder: Path, model: Machine, blocks: int = 0, weights: Weights | None = None, title: str = ""
+    folder: Path,
+    model: Machine,
+    blocks: int = 0,
+    weights: Weights | None = None,
+    title: str = "",
+    tiles: Tiles | None = None,
 ) -> list[Path]:
     """Write tables and sources for a machine of `one_valve`; the files, each whole or not there.
 
-    blocks: how many can be learned, 0: all of the grids.  Raises ValveError, OSError.
+    blocks: how many can be learned, 0: all of the grids; tiles: work of a tick.
+    Raises ValveError, OSError.
     """
-    texts = {TABLES: tables(model, blocks, weights, title)}
+    texts = {TABLES: tables(model, blocks, weights, title, tiles)}
     texts |= {path.name: path.read_text(encoding="utf-8") for path in sources()}
     folder.mkdir(parents=True, exist_ok=True)
     written = []

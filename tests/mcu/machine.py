@@ -7,12 +7,12 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rtid.estimator.factor import factorize
 from rtid.estimator.solution import Solution, solve
 from rtid.estimator.state import State, Weights, build
 from rtid.estimator.sums import Normal, normal_equations
+from rtid.mcu.emulated import Record
 from rtid.mcu.valve import one_valve
 from rtid.model import Grid, Machine
 from rtid.plain import FloatArray
@@ -31,20 +31,6 @@ EPS = float(np.finfo(float).eps)
 # Condition numbers of a block's information.  Its sums are rounded at least once on either side, so
 # its terms may differ by 2 EPS times the condition number: by 1e-10 at SURE.
 SURE, LIMIT = 1e-10 / (2 * EPS), 1e6
-
-
-@dataclass(frozen=True)
-class Record:
-    """Samples of a machine: t_us (n,), values (n, signals) in its order, flags (n,)."""
-
-    t_us: NDArray[np.int64]
-    values: FloatArray
-    flags: FloatArray
-
-    @property
-    def chunk(self) -> FloatArray:
-        """Rows as `State.advance` takes them."""
-        return np.column_stack([self.t_us * 1e-6, self.flags, self.values])
 
 
 def full_valve(chamber: str = "a") -> Machine:

@@ -6,13 +6,13 @@ from functools import cache
 
 import numpy as np
 
+from rtid.mcu.emulated import Record
 from rtid.mcu.valve import one_valve
 from rtid.model import Grid, Machine
 from rtid.plain import FloatArray
 from rtid.sim.declare import declared_model
 from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import SimulatedPlant
-from tests.mcu.machine import Record
 
 CELLS = {24: (4, 3), 96: (8, 6)}  # blocks of both edges: cells along u and dp of each
 RANGE_V, RANGE_PA = (1.0, 10.0), (-0.5e6, 9.5e6)

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rtid.mcu.emulated import Record
 from rtid.mcu.valve import one_valve
 from rtid.model import COMMAND_ONLY, DROP_ONLY, Machine
 from tests.estimator.cases import Case, draw_case
@@ -20,7 +21,6 @@ from tests.mcu.machine import (
     BLOCKS,
     EPS,
     LIMIT,
-    Record,
     Reference,
     full_valve,
     rig_record,

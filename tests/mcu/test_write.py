@@ -17,6 +17,7 @@ import pytest
 from rtid.cli.main import run
 from rtid.estimator.state import Weights, nominal_weights
 from rtid.mcu.c_tables import sizes_of, tables
+from rtid.mcu.emulated import Record
 from rtid.mcu.errors import ValveError
 from rtid.mcu.memory import Layout
 from rtid.mcu.valve import one_valve
@@ -24,7 +25,7 @@ from rtid.mcu.write import write_sources
 from rtid.model import LAPPED, Term, Upkeep
 from rtid.project import load
 from tests.mcu.compiled import COMPILER, STRICT, Program
-from tests.mcu.machine import BLOCKS, Record, Reference, small_valve, sums_apart
+from tests.mcu.machine import BLOCKS, Reference, small_valve, sums_apart
 from tests.rig import PROJECT
 
 
