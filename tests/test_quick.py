@@ -38,6 +38,7 @@ from rtid.study.study import Study
 from rtid.trace.quick_source import open_source, roles_of
 
 LEAK, TRUTH = "internal_leakage_laminar", 2e-12
+TWICE = ("--bore", 100, "--rod", 70)  # of what is assumed
 SIZES = ("--bore", 50, "--rod", 36, "--stroke", 500, "--dead-volume", 0.6)
 
 
@@ -51,6 +52,7 @@ def quick(*arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.CompletedProcess(words, int(code or 0), out.getvalue(), err.getvalue())
 
 
+@cache
 def told(*arguments: object, code: int = Exit.OK) -> dict[str, Any]:
     done = quick(*arguments, "--json")
     assert done.returncode == code, done.stdout + done.stderr
@@ -109,10 +111,7 @@ def test_a_clean_machine_misses_nothing_in_plain_sentences(folder: Path) -> None
 
 def test_an_area_only_scales(folder: Path) -> None:
     """Twice the bore: four times the leak, the same verdict."""
-    one, two = (
-        told(folder / "leak.parquet", "--bore", bore, "--rod", rod)
-        for bore, rod in ((50, 36), (100, 72))
-    )
+    one, two = told(folder / "leak.parquet"), told(folder / "leak.parquet", *TWICE)
     sizes = [d["diagnosis"]["found"][0]["parameters"]["coefficient"]["value"] for d in (one, two)]
     assert sizes[1] / sizes[0] == pytest.approx(4.0, rel=0.01)
     assert one["diagnosis"]["verdict"] == two["diagnosis"]["verdict"] == "missing"

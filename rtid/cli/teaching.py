@@ -25,7 +25,7 @@ EXAMPLES = {
     "drop": "rtid drop internal_leakage_laminar run.blf -p machine.toml",
     "undo": "rtid undo -p machine.toml",
     "history": "rtid history -p machine.toml",
-    "ui": "rtid ui machine.toml run.blf",
+    "ui": "rtid ui run.blf -p machine.toml",
     "report": "rtid report run.blf -p machine.toml -o run.html",
     "effects": "rtid effects internal_leakage_laminar",
     "excite": "rtid excite -p machine.toml --out motion.csv --see valve_seat_leakage",

@@ -8,15 +8,20 @@ from typing import Annotated
 
 import typer
 
-from rtid.cli.exits import refuse_without_bokeh
+from rtid.cli.exits import Exit, refuse_without_bokeh
 from rtid.errors import RtidError
 
 
 def ui(
-    project: Annotated[Path, typer.Argument(help="Project file.")],
-    trace: Annotated[
-        Path | None, typer.Argument(help="CAN log or table; without it, the live page alone.")
+    files: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="[TRACE] [PROJECT]",
+            help="CAN log or table, and project file.  Without a project the page makes one, "
+            "without a trace it is the live page.",
+        ),
     ] = None,
+    project: Annotated[Path | None, typer.Option("--project", "-p", help="Project file.")] = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="0: any that is free.")] = 5006,
     host: Annotated[str, typer.Option(help="Address to serve on.")] = "127.0.0.1",
     state: Annotated[
@@ -33,19 +38,21 @@ def ui(
 ) -> None:
     """Compare a record with its model in the browser: where it fails, why, and add what is missing.
 
+    Without a project, the page looks at a file that is dropped on it, and makes one.
     The page is served to this machine alone, to whoever has the printed address with its token,
     and loads nothing from anywhere else.  Of several browsers one works, the others follow.  From
     another machine: ssh -L 5006:127.0.0.1:5006 DEVICE.  Ctrl-C, SIGTERM and SIGHUP end it.
     """
+    trace, project = _told_apart(files or [], project)
     for path in (project, trace):
         if path is not None and not path.exists():
-            raise RtidError(f"{path}: no such file", "rtid ui PROJECT [TRACE]")
+            raise RtidError(f"{path}: no such file", "rtid ui TRACE -p PROJECT")
     refuse_without_bokeh()
     from rtid.project import load
     from rtid.project.folder import state_folder
     from rtid.ui.server import Workbench, serve
 
-    folder = state or state_folder(load(project))
+    folder = state or (state_folder(load(project)) if project else None)
 
     def ready(bench: Workbench) -> None:
         print(f"{bench.url}  (Ctrl-C ends it)", flush=True)
@@ -62,6 +69,15 @@ def ui(
             port=port,
             sheet=sheet,
         )
+
+
+def _told_apart(files: list[Path], project: Path | None) -> tuple[Path | None, Path | None]:
+    """Trace and project, whichever comes first."""
+    projects = [f for f in files if f.suffix.lower() == ".toml"] + ([project] if project else [])
+    traces = [f for f in files if f.suffix.lower() != ".toml"]
+    if len(projects) > 1 or len(traces) > 1:
+        raise RtidError("more than one trace or project", "rtid ui TRACE -p PROJECT", Exit.USAGE)
+    return next(iter(traces), None), next(iter(projects), None)
 
 
 def _doorstep(url: str, folder: Path) -> Path:

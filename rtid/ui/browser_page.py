@@ -15,6 +15,7 @@ from bokeh.model import DataModel
 from jinja2 import Environment, Template
 
 from rtid.tell.html import button, changed, cover, parsed, static
+from rtid.ui.arrival import DOES, fragments
 from rtid.ui.headline import record_line, strip, work_line
 from rtid.ui.live_page import Live
 from rtid.ui.shared import FAILED, ROLE, Session
@@ -58,7 +59,8 @@ class Page:
         self._is_open = self._is_gone = self._is_made = False
         self._turns, self._due = turns, set[str]()  # what is waiting for its turn
         self._seen, self._beats, self._moves = "", 0, 0
-        self._view = "live" if session.trace is None else "compare"
+        is_live = session.trace is None and session.arrival is None
+        self._view = "live" if is_live else "compare"
         self._channel = Channel(name="channel")
         self._rows = table()
         plots = [p for n, row in self._rows.items() for p in places_of(n, row) if p.kind == "plot"]
@@ -146,7 +148,15 @@ class Page:
                 "verdict": strip(session),
                 "cover": self._cover(),
             }
+            | self._arriving()
         )
+
+    def _arriving(self) -> dict[str, str]:
+        """The door, while there is no project."""
+        session = self.session
+        if session.arrival is None or self._view == "live":
+            return {}
+        return fragments(session, session.arrival)
 
     @property
     def _follows(self) -> bool:
@@ -190,13 +200,16 @@ class Page:
 
     def _take(self, asked: dict[str, str]) -> None:
         """Do what the page asks."""
-        what, self._is_open = asked.get("do", ""), True
+        what, self._is_open, session = asked.get("do", ""), True, self.session
         if what == "view":
             self._view = asked.get("name", "") if asked.get("name") in self._rows else self._view
             self._say()
             self._heard("view")
         elif what == "seen":
             self._seen = asked.get("number", "")
+        elif what in DOES:
+            if session.arrival is not None and not self._follows:
+                DOES[what](session, session.arrival, asked)
         elif what == "take_over":
             self.session.take_over(self._browser)
             self._say()

@@ -19,12 +19,19 @@ from rtid.project.added import AddedSection, text_with
 from rtid.project.history import ADD, DROP, text_of, write
 from rtid.study.compared import find_reference
 from rtid.study.look import Look, look
+from rtid.study.quick import quick
+from rtid.study.quick_machine import Given
+from rtid.study.quick_rate import QuickRate
 from rtid.study.revisions import change_of, undo_command, with_effect, without
 from rtid.study.study import Study
 from rtid.tell.charts.evidence import charts_of
+from rtid.tell.diagnosed import heading
+from rtid.tell.quick import lines, rate_lines
 from rtid.tell.report_file import report
 from rtid.tell.report_story import Ranked, ranked
 from rtid.tell.story import Chart
+from rtid.trace.glance import Glance, glance
+from rtid.ui.upload import free_name
 
 FORMATS = ("csv", "json", "npz")
 
@@ -63,6 +70,17 @@ class Addition:
 
 
 @dataclass(frozen=True)
+class Judged:
+    """The verdict of a file alone: kind for the colour, all lines, and the project as a text."""
+
+    kind: str
+    heading: str
+    lines: tuple[str, ...]
+    project: Path
+    text: str
+
+
+@dataclass(frozen=True)
 class Saved:
     """What was written to the project file."""
 
@@ -92,6 +110,22 @@ class Desk:
     def __init__(self, progress: Progress) -> None:
         self._progress = progress
         self._stack: list[_Revision] = []
+
+    def glance(self, file: Path, dbc: Path | None) -> Glance:
+        """What is in a file that has no project."""
+        self._progress(f"looking at {file.name}", 0.0)
+        return glance(file, dbc)
+
+    def judge(self, file: Path, dbc: Path | None, given: Given, roles: dict[str, str]) -> Judged:
+        """The verdict of a file without a project, and the project that would be saved."""
+        looked = quick(file, dbc, given, self._progress, roles)
+        project = free_name(file.with_suffix(".toml"))
+        if isinstance(looked, QuickRate):
+            told, project_text = rate_lines(looked, project), looked.text
+        else:
+            told, project_text = lines(looked, project), looked.text_for(project)
+        kind, words = ("bad", "No verdict") if not looked.diagnosis else heading(looked.diagnosis)
+        return Judged(kind, words, tuple(told)[:-2], project, project_text)
 
     def open(self, project: Path, trace: Path, sheet: Path | None) -> Opened:
         """Read and learn; the model has the effects that the project file has.

@@ -8,6 +8,11 @@ from rtid.project.history import ADD
 from rtid.tell.html import button, text
 from rtid.ui.shared import FAILED, Session, ShownRevision
 
+WELCOME = (
+    "A file, what its signals are, sizes of the cylinder: then whether the data is good enough, "
+    "what is missing in the model, and the project file for every other command."
+)
+
 
 def record_line(session: Session) -> str:
     """The machine, the record and what it holds."""
@@ -42,6 +47,8 @@ def work_line(session: Session) -> str:
 def strip(session: Session) -> str:
     """The verdict in one sentence, and the button that follows from it."""
     last = session.last
+    if session.arrival is not None:
+        return f"<h1>What is in it?</h1><p>{WELCOME}</p>"
     if session.state == FAILED or session.trace is None:
         return ""
     if last is not None and last.section is not None and (last.told is None or last.note):

@@ -17,6 +17,8 @@ from urllib.parse import unquote_to_bytes, urlsplit
 
 from tornado.httputil import HTTPServerRequest
 
+from rtid.ui.upload import PLACE
+
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
 COOKIE = "rtid-browser"  # and the port: browsers keep one jar for all ports of a host
 TOKEN = "token"
@@ -73,7 +75,7 @@ class Door:
 
     def refusal(self, request: HTTPServerRequest) -> Refusal | None:
         """Why a request is not served; None where it is."""
-        if request.method not in ("GET", "HEAD"):
+        if request.method not in ("GET", "HEAD") and not _is_upload(request):
             return Refusal(405, "only GET is served; actions need the page's own socket")
         host = request.headers.get("Host", "")
         if _name(host) not in self._names:
@@ -98,6 +100,11 @@ class Door:
 
     def _secret(self, request: HTTPServerRequest) -> str:
         return request.cookies[self.cookie].value if self.cookie in request.cookies else ""
+
+
+def _is_upload(request: HTTPServerRequest) -> bool:
+    """Whether a file of the page itself comes: a browser says from which page it posts."""
+    return request.method == "POST" and request.path == PLACE and "Origin" in request.headers
 
 
 def _strange(request: HTTPServerRequest) -> Refusal | None:

@@ -32,12 +32,14 @@ from tornado.netutil import bind_sockets
 from tornado.web import OutputTransform, RequestHandler
 
 from rtid.errors import RtidError
+from rtid.ui.arrival import Arrival, choose
 from rtid.ui.browser_page import build
 from rtid.ui.live_page import Live
 from rtid.ui.packing import Packed, Packing
 from rtid.ui.security import TOKEN, Door, Refusal
 from rtid.ui.shared import Session
 from rtid.ui.turns import Turns
+from rtid.ui.upload import PLACE, Upload
 from rtid.ui.worker import Worker
 
 if TYPE_CHECKING:
@@ -55,7 +57,7 @@ CSP = "Content-Security-Policy"
 WELCOME = """<!DOCTYPE html><meta charset="utf-8"><link rel="icon" href="data:,"><title>rtid</title>
 <noscript><meta http-equiv="refresh" content="0;url=/"></noscript>
 <script nonce="{nonce}">location.replace("/" + location.hash)</script>"""
-PATHS = ("/", "/ws", "/alive")
+PATHS = ("/", "/ws", "/alive", PLACE)
 HOST = re.compile(r"[\w.\-\[\]:]+")  # what may stand in a policy
 
 
@@ -264,7 +266,7 @@ class Workbench:
 
 
 def start(
-    project: Path,
+    project: Path | None,
     trace: Path | None = None,
     state: Path | None = None,
     host: str = "127.0.0.1",
@@ -273,14 +275,18 @@ def start(
 ) -> Workbench:
     """Begin to serve on the current event loop; port 0: any that is free.
 
-    state: folder in which a daemon keeps its state, for the live page.  Raises RtidError where the
+    project: None where there is none yet; state: folder in which a daemon keeps its state, for the
+    live page.  Raises RtidError where the
     port is taken.
     """
-    if trace is not None:
+    if trace is not None or project is None:
         import_module("rtid.ui.desk_views")  # now, not while somebody waits for a picture
     loop = IOLoop.current()
     worker = Worker(loop.add_callback)
-    session = Session(project, trace, worker, sheet)
+    session = Session(project or Path.cwd(), trace, worker, sheet)
+    if project is None:
+        folder = trace.resolve().parent if trace else Path.cwd()
+        session = Session(folder, None, worker, arrival=Arrival(folder, trace and trace.resolve()))
     try:
         sockets = bind_sockets(port, host)
     except OSError as error:
@@ -297,7 +303,7 @@ def start(
         door,
         app,
         turns,
-        extra_patterns=[("/alive", Alive)],
+        extra_patterns=[("/alive", Alive), *_uploads(session)],
         extra_websocket_origins=["*"],  # the door is stricter
         secret_key=secrets.token_bytes(32),
         sign_sessions=True,
@@ -327,6 +333,21 @@ def start(
     gc.freeze()
     url = f"http://{_in_url(host)}:{door.port}/?{TOKEN}={door.token}"
     return Workbench(server, guarded, session, url, turns)
+
+
+def _uploads(session: Session) -> list[tuple[str, type, dict[str, object]]]:
+    """Files come as long as there is no project."""
+    if session.arrival is None:
+        return []
+
+    def folder() -> Path | None:
+        return session.arrival.folder if session.arrival else None
+
+    def arrived(path: Path) -> None:
+        if session.arrival is not None:
+            choose(session, session.arrival, path)
+
+    return [(PLACE, Upload, {"folder": folder, "arrived": arrived})]
 
 
 def _in_url(host: str) -> str:

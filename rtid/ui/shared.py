@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from rtid.errors import RtidError
 from rtid.plain import Key
 from rtid.project.added import AddedSection
+from rtid.ui.arrival import Arrival, choose
 from rtid.ui.worker import Worker
 
 if TYPE_CHECKING:
@@ -58,16 +59,34 @@ class Session:
     prepared: set[tuple[int, Key]] = field(default_factory=set)
     pages: Counter[int] = field(default_factory=Counter)  # open ones by browser
     writer: int | None = None  # the browser that works on the record
+    arrival: Arrival | None = None  # before there is a project
     _is_adding: bool = False
 
     def open(self) -> None:
         """Read the record."""
+        if self.arrival is not None:
+            self.state, self.doing = READY, ""
+            if self.arrival.file is not None:
+                choose(self, self.arrival, self.arrival.file)
+            return
         if self.trace is None:
             self.state, self.doing = READY, ""
             return
-        self._ask(
+        self.ask(
             "open", self.project, self.trace, self.sheet, then=self._opened, failed=self._not_opened
         )
+
+    def begin(self, project: Path, text: str, trace: Path) -> None:
+        """Write the project of a file that had none, and open both."""
+        try:
+            with project.open("x", encoding="utf-8") as file:
+                file.write(text)
+        except OSError as error:
+            raise RtidError(f"{project}: {error.strerror}", "is the folder writable?") from None
+        self.project, self.trace, self.arrival = project, trace, None
+        self.state, self.doing = LOADING, "starting"
+        self.open()
+        self.note = f"wrote {project}"
 
     def join(self, browser: int) -> None:
         """A page was opened; the first browser works, the others follow."""
@@ -116,24 +135,24 @@ class Session:
         chosen = (effect, where) in [(f.effect, f.where) for f in named]
         reason = "named by the diagnosis" if chosen else "chosen by name"
         self._is_adding = True
-        self._ask("add", effect, where, reason, then=self._added("add"))
+        self.ask("add", effect, where, reason, then=self._added("add"))
 
     def drop(self, effect: str, where: str) -> None:
         """Take an effect out of the model."""
-        self._ask("drop", effect, where, then=self._added("drop"))
+        self.ask("drop", effect, where, then=self._added("drop"))
 
     def undo(self) -> None:
         """Take the last change of this session back."""
         if len(self.revisions) > 1 and not self.revisions[-1].is_saved:
-            self._ask("back", then=self._taken_back)
+            self.ask("back", then=self._taken_back)
 
     def save(self) -> None:
         """Write the changes of this session to the project file."""
-        self._ask("save", then=self._saved)
+        self.ask("save", then=self._saved)
 
     def export(self, what: str) -> None:
         """Write a map, a table or a report beside the record."""
-        self._ask("export", what, then=self._noted)
+        self.ask("export", what, then=self._noted)
 
     def is_prepared(self, key: Key) -> bool:
         """True where adding it takes no time."""
@@ -144,13 +163,15 @@ class Session:
         for listener in list(self.listeners):
             listener(what)
 
-    def _ask(
+    def ask(
         self,
         method: str,
         *arguments: object,
         then: Callable[..., None],
         failed: Callable[[RtidError], None] | None = None,
     ) -> None:
+        """Give the worker a job, and tell all pages how it goes."""
+
         def done(result: object) -> None:
             self.doing, self.share, self.trouble = "", 0.0, ("", "")
             then(result)
@@ -190,7 +211,7 @@ class Session:
             self.tell("told")
             self._prepare(revision)
 
-        self._ask("diagnose", then=words)
+        self.ask("diagnose", then=words)
 
     def _prepare(self, revision: ShownRevision) -> None:
         """Have the next revision ready before the user asks for it."""

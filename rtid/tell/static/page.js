@@ -93,9 +93,26 @@
     if (e.target.closest(".bk")) plots.move(shown(), { whole: true });
   });
   document.addEventListener("change", (e) => {
-    if (e.target.dataset && e.target.dataset.do)
-      ask(e.target.dataset.do, { name: e.target.value });
+    const { do: what, upload, ...more } = e.target.dataset || {};
+    if (upload) [...e.target.files].forEach(send);
+    else if (what) ask(what, { ...more, name: e.target.value });
   });
+
+  // -- files come by a drop, as long as there is a door
+  async function send(file) {
+    $("work").textContent = `taking ${file.name} ...`;
+    try {
+      const answer = await fetch("arrive?name=" + encodeURIComponent(file.name),
+        { method: "POST", body: file });
+      $("work").textContent = answer.ok ? "" : await answer.text();
+    } catch (error) { $("work").textContent = `${file.name} did not arrive`; }
+  }
+  for (const kind of ["dragover", "drop"])
+    document.addEventListener(kind, (e) => {
+      if (!document.querySelector(".arrival") || !e.dataTransfer.types.includes("Files")) return;
+      e.preventDefault();
+      if (kind === "drop") [...e.dataTransfer.files].forEach(send);
+    });
 
   function drawn() {  // something new has been drawn
     plots.follow();
