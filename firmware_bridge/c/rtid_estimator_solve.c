@@ -357,13 +357,19 @@ static double variance_of(const rtid_estimator_work *w, int at, int count, const
     return (variance > 0.0) ? variance : 0.0;
 }
 
+static double with_rounding(double sd, double rounding)
+{
+    return sqrt((sd * sd) + (rounding * rounding));
+}
+
 static void read_shared(const rtid_estimator_work *w, rtid_estimator_solution *s)
 {
     const double one = 1.0;
     for (int i = 0; i < RTID_EST_SHARED; i++) {
         const double scale = rtid_est_shared_scale(i);
         s->shared[i] = scale * w->theta[i];
-        s->shared_sd[i] = fabs(scale) * sqrt(variance_of(w, i, 1, &one));
+        s->shared_sd[i] = with_rounding(fabs(scale) * sqrt(variance_of(w, i, 1, &one)),
+                                        SHARED_ROUNDING * s->shared[i]);
     }
 }
 
@@ -382,7 +388,8 @@ static void read_map(rtid_estimator_work *w, int slot)
         map->theta[i] = scale * w->theta[at + i];
         map->mean_m3s += phi[i] * map->theta[i];
     }
-    map->mean_sd_m3s = scale * sqrt(variance_of(w, at, RTID_EST_TERMS, phi));
+    map->mean_sd_m3s = with_rounding(scale * sqrt(variance_of(w, at, RTID_EST_TERMS, phi)),
+                                     FLOW_ROUNDING * scale);
 }
 
 /* Largest block-mean flow of an edge, its rated flow where none is known. */

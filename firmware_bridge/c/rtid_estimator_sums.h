@@ -32,6 +32,10 @@ enum { MOST_APART = 40 };   /* epochs, in bits, between two that are merged */
 #define MOST 9.99999e8
 #define FREXP frexpf
 #define LDEXP ldexpf
+/* Rounding of the samples: of a block mean, in shares of the rated flow; of a shared unknown, of
+ * itself.  More data do not make it less. */
+#define FLOW_ROUNDING 3e-4
+#define SHARED_ROUNDING 4e-5
 #define SILENT 1e-7f /* a closed block whose state decayed to this share is forgotten */
 
 /* s += x to 48 bits: Knuth's sum of two numbers with what it rounded off, then brought in order */
@@ -87,6 +91,8 @@ static inline double exact(rtid_sum s) { return (double)s.high + (double)s.low; 
 #define MOST 9.99999e29
 #define FREXP frexp
 #define LDEXP ldexp
+#define FLOW_ROUNDING 0.0 /* below all deviations */
+#define SHARED_ROUNDING 0.0
 #define SILENT 1e-11
 
 static inline void merge(rtid_sum *s, rtid_sum x) { *s += x; }

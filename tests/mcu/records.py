@@ -40,6 +40,19 @@ def driven(motion: str, duration_s: float) -> Record:
     )
 
 
+def repeated(duration_s: float) -> Record:
+    """A minute of motion over and over, from the second time on with noise added."""
+    base, model, times = driven("rich", 60.0), valve(24), int(duration_s / 60.0)
+    rng, n = np.random.default_rng(0), len(base.values)
+    noise = np.array([signal.noise for signal in model.signals])
+    parts = [base.values]
+    parts += [base.values + noise * rng.normal(size=base.values.shape) for _ in range(1, times)]
+    low, high = (np.array([getattr(s, e) for s in model.signals]) for e in ("minimum", "maximum"))
+    flags = np.ones(n * times)
+    flags[n::n] = 3.0  # a gap where one ends
+    return Record(1000 * np.arange(n * times), np.clip(np.concatenate(parts), low, high), flags)
+
+
 def record(name: str, blocks: int, duration_s: float = 20.0) -> Record:
     """One of NAMES or ANYWHERE, for the machine with so many blocks."""
     base = driven("rich" if name == "rich" else "sweep", duration_s)
