@@ -9,18 +9,31 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numba import njit
 
+from rtid.kernels import look_up
 from rtid.plain import FloatArray
 from rtid.sim import working_modes
 from rtid.sim.robust import sampled
 from rtid.sim.sensing import P_A, P_B, P_S, P_T
 from rtid.sim.simulated_plant import AB, AT, BT, PA, PB, SimulatedPlant
-from rtid.sim.working_modes import LEAST_FLOW_M3S, flow_at, opening, regenerates
+from rtid.sim.working_modes import LEAST_FLOW_M3S, regenerates
 
 MAPS = sampled(SimulatedPlant().flow)
 SUPPLY, TANK = 8.5e6, 1e5
 ENDS = {PA: (P_S, P_A), AT: (P_A, P_T), PB: (P_S, P_B), BT: (P_B, P_T), AB: (P_A, P_B)}
 Commands = Callable[..., None]
+
+
+_flow_at, _opening = (njit(part.py_func) for part in (look_up.flow_at, look_up.opening))
+
+
+def flow_at(edge: int, w_v: float, dp_pa: float) -> float:
+    return float(_flow_at(MAPS.w_v[edge], MAPS.s[edge], MAPS.flow_m3s[edge], w_v, dp_pa))
+
+
+def opening(edge: int, q_m3s: float, dp_pa: float) -> float:
+    return float(_opening(MAPS.w_v[edge], MAPS.s[edge], MAPS.flow_m3s[edge], q_m3s, dp_pa))
 
 
 def seen(p_a: float, p_b: float) -> FloatArray:
@@ -38,10 +51,10 @@ def commands(request: pytest.FixtureRequest) -> Commands:
 @settings(deadline=None)  # the first call compiles
 @given(edge=st.sampled_from(sorted(ENDS)), share=st.floats(0.01, 0.99), dp=st.floats(1e5, 9e6))
 def test_opening_inverts_the_flow(edge: int, share: float, dp: float) -> None:
-    most = flow_at(MAPS, edge, MAPS.w_v[edge][-1], dp)
-    w = opening(MAPS, edge, share * most, dp)
-    assert flow_at(MAPS, edge, w, dp) == pytest.approx(share * most, rel=1e-9)
-    assert opening(MAPS, edge, 2 * most, dp) == MAPS.w_v[edge][-1]
+    most = flow_at(edge, MAPS.w_v[edge][-1], dp)
+    w = opening(edge, share * most, dp)
+    assert flow_at(edge, w, dp) == pytest.approx(share * most, rel=1e-9)
+    assert opening(edge, 2 * most, dp) == MAPS.w_v[edge][-1]
 
 
 @pytest.mark.parametrize(
@@ -63,7 +76,7 @@ def test_the_open_valves_carry_what_is_wanted(
     commands(MAPS, signals, q_a, q_b, True, w)
     assert set(np.flatnonzero(w)) == is_open
     flow = {
-        edge: flow_at(MAPS, edge, w[edge], signals[source] - signals[sink]) if w[edge] else 0.0
+        edge: flow_at(edge, w[edge], signals[source] - signals[sink]) if w[edge] else 0.0
         for edge, (source, sink) in ENDS.items()
     }
     if is_open:

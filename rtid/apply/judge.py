@@ -104,15 +104,18 @@ def _squares(
     model: Machine, chunk: FloatArray, known: KnownMap, terms: FloatArray | None
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Squared residual, squared motion and block of each row of H_f, summed over the chambers."""
-    part = compare(model, _candidate(model, known, terms), chunk)
+    part = compare(model, candidate(model, known, terms), chunk)
     residual, motion = part.residual_m3s, part.measured_m3s
     good = np.isfinite(residual).all(axis=1)
     block = np.floor((part.t_s[good] - part.t_s[:1]) / BLOCK_S) if len(part.t_s) else part.t_s
     return (residual[good] ** 2).sum(axis=1), (motion[good] ** 2).sum(axis=1), block
 
 
-def _candidate(model: Machine, known: KnownMap, terms: FloatArray | None) -> CandidateMap:
-    """With nominal weights: innovations are not asked for.  Another grid is projected on this."""
+def candidate(model: Machine, known: KnownMap, terms: FloatArray | None = None) -> CandidateMap:
+    """With nominal weights: innovations are not asked for.  Another grid is projected on this.
+
+    terms (terms,): coefficients of the shared terms in SI, zero where not given.
+    """
     flow_map = known.flow_map
     if _same_grids(model, flow_map):
         theta = flow_map.theta_cells()

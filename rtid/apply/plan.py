@@ -87,6 +87,12 @@ def slots(project: Project) -> list[int]:
     return [first + k for k in range(len(project.model.maps) + 1)]
 
 
+def edge_tables(project: Project, images: Mapping[int, bytes]) -> dict[str, Table]:
+    """The tables of all edges, by name, of images by slot."""
+    pairs = zip(project.model.edges, slots(project), strict=False)
+    return {edge.name: table_of(images[slot]) for edge, slot in pairs}
+
+
 def refuse_few_slots(project: Project, room: Accepts) -> None:
     """ApplyError where the controller has not a slot for everything."""
     of = slots(project)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from firmware_bridge.download import Progress, Session
+from firmware_bridge.lookup import numbers_of
 from firmware_bridge.protocol import Accepts, Held
 from firmware_bridge.verify import Verified, verify
 from rtid.apply import offer as offered
@@ -21,6 +22,7 @@ from rtid.apply.plan import (
     Prepared,
     Review,
     checked,
+    edge_tables,
     prepare,
     refuse_few_slots,
     review,
@@ -28,8 +30,9 @@ from rtid.apply.plan import (
     slots,
     stored,
 )
+from rtid.apply.tracking import TrackingForecast, told
 from rtid.apply.versions import DONE, UNCONFIRMED, UNVERIFIED, Applied, VersionRow
-from rtid.apply.wish import Wish, wished
+from rtid.apply.wish import Wish, chunk_of, wished
 from rtid.project import Project, load
 from rtid.project.folder import state_folder
 from rtid.trace.state_files import create
@@ -43,6 +46,8 @@ class Plan:
     """What would be sent, why, and what speaks against it.
 
     verified: of a map that the controller holds already, how far that could be asked.
+    tracking: what the map will do to it, where the project describes its controller, and why that
+    cannot be told.
     """
 
     prepared: Prepared
@@ -51,6 +56,7 @@ class Plan:
     objections: tuple[str, ...]
     provenance: dict[str, Any]
     verified: Verified | None = None
+    tracking: TrackingForecast | str | None = None
 
     @property
     def is_same(self) -> bool:
@@ -84,6 +90,10 @@ class Plan:
             for sampled in self.prepared.sampled
         }
         document = {"schema": 1, "why": self.why, "objections": list(self.objections)}
+        tracked = self.tracking
+        document["tracking"] = (
+            tracked.as_json() if isinstance(tracked, TrackingForecast) else tracked
+        )
         return document | self.review.as_json() | {"lookup": lookup, "is_same": self.is_same}
 
 
@@ -107,6 +117,7 @@ def apply_map(
             plan = _plan(
                 project, folder, wish, applied, _by_the_records(project, applied), ANY_ROOM
             )
+            plan = replace(plan, tracking=_tracking(project, wish, applied, plan))
             confirmed(plan)
             return plan, None
         interface, channel = reach.bus_of(project, wish.bus)
@@ -116,6 +127,24 @@ def apply_map(
             )
         bus = interface, channel
         return _over_the_bus(project, folder, wish, applied, confirmed, bus, progress)
+
+
+def _tracking(
+    project: Project, wish: Wish, applied: Applied, plan: Plan
+) -> TrackingForecast | str | None:
+    """What the map will do to tracking, or why that is not told; None where nobody asks."""
+    section = project.sections.controller
+    if section is None:
+        return None
+    if wish.against is None:
+        return "--against TRACE, a record of the usual work, tells what it will do to tracking"
+    content = plan.review.held_content
+    held = None if content is None else edge_tables(project, applied.images(content))
+    prepared = plan.prepared
+    sd_pa = numbers_of(prepared.images[slots(project)[-1]])[1::2]
+    new = edge_tables(project, prepared.images)
+    chunk = chunk_of(project, wish.against)
+    return told(project, section, chunk, prepared.known, sd_pa, new, held)
 
 
 def _over_the_bus(

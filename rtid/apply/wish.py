@@ -81,6 +81,12 @@ def _from_file(project: Project, wish: Wish, applied: Applied, content: int | No
     return new, sd_pa, why, dict(provenance) | {"judgement": judgement.as_json()}
 
 
+def chunk_of(project: Project, trace: Path) -> FloatArray:
+    """Samples of a trace (n, 2 + signals), SI, seconds from its first one."""
+    samples = read_trace(project, trace).samples
+    return to_chunk(project.model, samples, int(samples.t_us[0]))
+
+
 def _judge_on(
     project: Project,
     trace: Path | None,
@@ -91,8 +97,7 @@ def _judge_on(
     """Judge a map on a trace that it has not learned from, or on the trace's validation part."""
     if trace is None:
         raise RtidError("a map from a file must be judged first", "name a trace: --against", 2)
-    samples = read_trace(project, trace).samples
-    chunk = to_chunk(project.model, samples, int(samples.t_us[0]))
+    chunk = chunk_of(project, trace)
     if provenance.get("source") == trace.name:
         part = project.sections.record.validation_s
         if part is None:

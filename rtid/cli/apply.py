@@ -43,7 +43,10 @@ def apply(
     ] = None,
     against: Annotated[
         Path | None,
-        typer.Option(help="Trace to judge --map on; the map must not have learned from it."),
+        typer.Option(
+            help="Trace to judge --map on, which must not have learned from it; with --dry-run and "
+            "a section `controller`, the record on which tracking is foretold."
+        ),
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
     dry_run: Annotated[
@@ -199,6 +202,9 @@ def _show(plan: Plan) -> None:
         before = "none" if old is None else pressure.number(old, 1)
         after = f"{pressure.number(new, 1)} {pressure.name}"
         console.print(f"bulk modulus {chamber}: {before} -> {after}")
+    if plan.tracking is not None:
+        told = plan.tracking
+        console.print(told if isinstance(told, str) else told.sentence)
     if not plan.is_same:
         size = sum(len(data) for data in plan.prepared.images.values())
         console.print(f"would be version {review.version}: {size} bytes")

@@ -226,6 +226,46 @@ def _rates(
 
     now (signals + 1,): scratch for the signals at that time.
     """
+    x = x0 + s * (x1 - x0)
+    f0, f1, m00, m01, m10, m11, beyond = sides(
+        e, theta, theta_beta, overlap, foot, x, dt, s, p, now
+    )
+    f0 -= e.area_m2[0] * (x1 - x0) / dt
+    f1 -= e.area_m2[1] * (x1 - x0) / dt
+    rate0, rate1 = solved(m00, m01, m10, m11, f0, f1)
+    out[0] = dt * rate0
+    if e.n_chambers == 2:
+        out[1] = dt * rate1
+    return beyond
+
+
+@part
+def solved(
+    m00: float, m01: float, m10: float, m11: float, f0: float, f1: float
+) -> tuple[float, float]:
+    """The rates of both pressures, Pa/s, of the flows into both chambers; see `sides`."""
+    det = m00 * m11 - m01 * m10
+    return (m11 * f0 - m01 * f1) / det, (m00 * f1 - m10 * f0) / det
+
+
+@part
+def sides(
+    e: Any,
+    theta: FloatArray,
+    theta_beta: FloatArray,
+    overlap: float,
+    foot: FloatArray,
+    x: float,
+    dt: float,
+    s: float,
+    p: FloatArray,
+    now: FloatArray,
+) -> tuple[float, float, float, float, float, float, bool]:
+    """Flows into both chambers, m3/s, the piston's not among them, and the matrix M of the rates.
+
+    M (dP_a/dt, dP_b/dt) = flows less area x speed: M as (m00, m01, m10, m11), m3/Pa; whether a dp
+    is beyond its grid.  p (chambers,) Pa at the time s in [0, 1] of an interval of dt seconds.
+    """
     for j in range(e.n_signals):
         now[j] = e.values[j] + s * (e.sample[2 + j] - e.values[j])
     now[NOTHING] = 0.0
@@ -242,24 +282,16 @@ def _rates(
             q *= rise((w - e.safe_v[i]) / foot[i] - 1.0) if foot[i] > 0.0 else 1.0
             f0, f1 = f0 + e.sign[i, 0] * q, f1 + e.sign[i, 1] * q
             beyond = beyond or off
-    x = x0 + s * (x1 - x0)
-    f0 -= e.area_m2[0] * (x1 - x0) / dt
     m00, m01 = (e.v0_m3[0] + e.area_m2[0] * x) * theta_beta[0], 0.0
     m10, m11 = 0.0, 1.0
     if e.n_chambers == 2:
-        f1 -= e.area_m2[1] * (x1 - x0) / dt
         m11 = (e.v0_m3[1] + e.area_m2[1] * x) * theta_beta[1]
     for k in range(e.n_terms):
         flow, d0, d1 = _term(e, k, now, x, dt)
         f0, f1 = f0 + e.term_sign[k, 0] * flow, f1 + e.term_sign[k, 1] * flow
         m00, m01 = m00 + e.term_sign[k, 0] * d0, m01 + e.term_sign[k, 0] * d1
         m10, m11 = m10 + e.term_sign[k, 1] * d0, m11 + e.term_sign[k, 1] * d1
-    if e.n_chambers == 1:
-        out[0] = dt * f0 / m00
-        return beyond
-    det = m00 * m11 - m01 * m10
-    out[0], out[1] = dt * (m11 * f0 - m01 * f1) / det, dt * (m00 * f1 - m10 * f0) / det
-    return beyond
+    return f0, f1, m00, m01, m10, m11, beyond
 
 
 @part

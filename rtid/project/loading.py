@@ -35,6 +35,7 @@ SINGLE: dict[str, type[schema.Section]] = {
     "record": schema.RecordSection,
     "daemon": schema.DaemonSection,
     "excite": schema.ExciteSection,
+    "controller": schema.ControllerSection,
     "publish": schema.PublishSection,
 }
 NAMED: dict[str, type[schema.Section]] = {
@@ -177,6 +178,9 @@ def _across(parts: dict[str, Any]) -> list[Problem]:
         problems.append(
             Problem("beta", "nominal lies outside bounds", "give bounds around nominal, one unit")
         )
+    controller = parts.get("controller")
+    if controller and controller.law == "robust" and controller.mass_kg is None:
+        problems.append(Problem("controller.mass_kg", "missing", "law = 'robust' needs the mass"))
     problems += _publish(parts.get("publish") or schema.PublishSection(), parts)
     source = parts.get("source")
     unit = find_unit(source.time_unit) if source else None

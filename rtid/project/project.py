@@ -16,6 +16,7 @@ from rtid.project.added import AddedSection
 from rtid.project.schema import (
     BetaSection,
     ChamberSection,
+    ControllerSection,
     DaemonSection,
     DynamicsSection,
     EdgeDefaults,
@@ -68,6 +69,7 @@ class Sections:
     record: RecordSection = field(default_factory=RecordSection)
     daemon: DaemonSection = field(default_factory=DaemonSection)
     excite: ExciteSection | None = None
+    controller: ControllerSection | None = None
     prior: PriorSection | None = None
     publish: PublishSection = field(default_factory=PublishSection)
     effects: dict[str, EffectSection] = field(default_factory=dict)

@@ -92,6 +92,7 @@ def check(raw: Raw, catalog: Catalog | None, folder: Path) -> Iterator[Problem]:
     for name, signal in tables(raw, "signals").items():
         yield from _signal(f"signals.{name}", signal, kinds[name], catalog, raw)
     yield from _named_signals(raw, kinds)
+    yield from _controller(raw, kinds)
     yield from _rate(raw, kinds) if "rate" in raw else _position(raw, kinds)
     for name, chamber in tables(raw, "chambers").items():
         yield from _chamber(f"chambers.{name}", chamber)
@@ -172,6 +173,12 @@ def _named_signals(raw: Raw, kinds: dict[str, str | None]) -> Iterator[Problem]:
             yield from _reference(f"{section}.{name}.{key}", entry.get(key), kind, kinds)
     command = table(raw, "edge_defaults").get("command")
     yield from _reference("edge_defaults.command", command, "command", kinds)
+
+
+def _controller(raw: Raw, kinds: dict[str, str | None]) -> Iterator[Problem]:
+    named = table(raw, "controller").get("reference")
+    if isinstance(named, str):
+        yield from _reference("controller.reference", named, "position", kinds)
 
 
 def _position(raw: Raw, kinds: dict[str, str | None]) -> Iterator[Problem]:

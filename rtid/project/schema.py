@@ -390,6 +390,31 @@ class ExciteSection(Section):
     blend_mps: Annotated[float, VELOCITY] = Field(default=4e-3, gt=0)
 
 
+class ControllerSection(Section):
+    """[controller]: how the map is used; `rtid apply --dry-run` then foretells tracking.
+
+    law: "feedforward", the inverse map of v_ref + kp (x_ref - x) + ki times its integral, or
+    "robust", the adaptive robust controller of the paper with the gain kp, which needs the mass.
+    reference: signal of the record that is followed, else the recorded position.  mass: without it
+    the piston follows the recorded force.  rate: limit of a command, its unit per second; off_side:
+    what keeps chamber B at its pressure; lead: how far ahead the robust law looks.
+    """
+
+    law: Literal["feedforward", "robust"] = "feedforward"
+    reference: str | None = None
+    kp_per_s: float = Field(gt=0, description="kp_per_s = 5")
+    ki_per_s2: float = Field(default=0.0, ge=0)
+    rate_per_s: float | None = Field(default=None, gt=0)
+    mass_kg: float | None = Field(default=None, gt=0)
+    load_n: float = 0.0
+    load_slope_n_per_m: float = 0.0
+    friction_n: float = Field(default=0.0, ge=0)
+    friction_ns_per_m: float = Field(default=0.0, ge=0)
+    off_side_pa: Annotated[float, PRESSURE] = Field(default=1.5e6, gt=0)
+    off_side_gain_per_s: float = Field(default=80.0, ge=0)
+    lead_s: Annotated[float, TIME] = Field(default=0.0, ge=0)
+
+
 class DaemonSection(Section):
     """[daemon]: `rtid run`, its rates and what it keeps; `folder` is relative to the file."""
 

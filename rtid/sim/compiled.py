@@ -13,7 +13,9 @@ from typing import Any
 from firmware_bridge.kernel_cache import cache_folder, cached
 
 _HERE = Path(__file__).parent
-_FOLDER = cache_folder("sim", _HERE, _HERE.glob("*.py"))
+_KERNELS = _HERE.parent / "kernels"
+_SHARED = (_KERNELS / "look_up.py", _KERNELS / "control_law.py")  # what they call of the product
+_FOLDER = cache_folder("sim", _HERE, [*_HERE.glob("*.py"), *_SHARED])
 
 
 def compiled(function: Callable[..., Any]) -> Any:

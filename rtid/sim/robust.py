@@ -1,14 +1,6 @@
 """An adaptive robust controller of the boom (Liu and Yao), adaptation off.
 
-The product's neighbour.  Each of the five valves has a command of its own.  With z1 = x - x_d,
-v_r = v_d - k z1, z2 = v - v_r, and gains k:
-
-    F   = m (dv_r/dt - k z2) + gravity(x) + friction          force that is wanted of the cylinder
-    P_d = (F + A_B P_B) / A_A                                  by chamber A
-    Q_A = A_A v + V_A / beta (dP_d/dt - k (P_A - P_d)) + leak  flow into A
-    Q_B = - A_B v - V_B / beta k_off (P_B - P_off) - leak      keeps B at its low pressure
-    leak = c (P_A - P_B), c the internal leakage that the controller knows of
-
+The product's neighbour: its law is `kernels.control_law`, every valve has a command of its own, and
 `working_modes` says which valves carry them.  What the controller knows is all that differs.
 """
 
@@ -17,11 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from firmware_bridge.lookup import Table
+from rtid.kernels.control_law import Mechanics, RobustLaw, wanted_flows
 from rtid.plain import FloatArray
 from rtid.sim.closed_loop import LOAD, P_SUPPLY, P_TANK, PlainMachine, advance, new_spools, quantise
 from rtid.sim.compiled import compiled
@@ -32,7 +25,7 @@ from rtid.sim.extra_physics import parts_of
 from rtid.sim.run import at_rest, machine_of
 from rtid.sim.schedule import schedule
 from rtid.sim.sensing import P_A, P_B, P_S, P_T, Sensors, U, V, X
-from rtid.sim.simulated_plant import EDGES, PA, PB, Constants, SimulatedPlant, flow_gain
+from rtid.sim.simulated_plant import EDGES, PA, PB, SimulatedPlant, flow_gain
 from rtid.sim.working_modes import Maps, commands, regenerates
 
 GAIN_1PS = 16.0  # of the paper
@@ -56,17 +49,6 @@ class Knowledge:
     maps: Maps
     leak_m3spa: float = 0.0
     may_regenerate: bool = True
-
-
-class Law(NamedTuple):
-    """The numbers of the control law as the kernel takes them."""
-
-    c: Constants
-    gain_1ps: float
-    off_gain_1ps: float
-    off_side_pa: float
-    lead_s: float  # the flows are those of so much later, as far as the reference tells them
-    leak_m3spa: float
 
 
 @dataclass(frozen=True)
@@ -114,30 +96,6 @@ def _maps(parts: Any) -> Maps:
 
 
 @compiled
-def wanted_flows(law: Law, seen: FloatArray, ref: FloatArray) -> tuple[float, float]:
-    """Q_A and Q_B, m3/s, for measured signals (7,) and the reference's x, v, a, jerk (4,), SI."""
-    c, k = law.c, law.gain_1ps
-    x, v, p_a, p_b = seen[X], seen[V], seen[P_A], seen[P_B]
-    gravity = c.gravity_n + c.gravity_slope_npm * (x - 0.5 * c.stroke_m)
-    side = math.tanh(ref[1] / c.coulomb_width_mps)
-    friction = c.coulomb_n * side + c.viscous_nspm * v
-    a = (p_a * c.area_a_m2 - p_b * c.area_b_m2 - gravity - friction) / c.mass_kg
-    v_r, a_r = ref[1] - k * (x - ref[0]), ref[2] - k * (v - ref[1])
-    force = c.mass_kg * (a_r - k * (v - v_r)) + gravity + friction
-    j_r = ref[3] - k * (a - ref[2])
-    rate = c.mass_kg * (j_r - k * (a - a_r)) + c.gravity_slope_npm * v + c.viscous_nspm * a
-    rate += c.coulomb_n * (1.0 - side * side) / c.coulomb_width_mps * ref[2]
-    off = -law.off_gain_1ps * (p_b - law.off_side_pa)
-    p_d = (force + c.area_b_m2 * p_b) / c.area_a_m2
-    p_rate = (rate + c.area_b_m2 * off) / c.area_a_m2
-    volume_a = c.v0_a_m3 + c.area_a_m2 * x
-    volume_b = c.v0_b_m3 + c.area_b_m2 * (c.stroke_m - x)
-    soon, leak = v + law.lead_s * ref[2], law.leak_m3spa * (p_a - p_b)
-    q_a = c.area_a_m2 * soon + volume_a / c.beta_pa * (p_rate - k * (p_a - p_d)) + leak
-    return q_a, -c.area_b_m2 * soon + volume_b / c.beta_pa * off - leak
-
-
-@compiled
 def drawn_w(
     m: PlainMachine, e: Any, gains: FloatArray, drive: FloatArray, y: FloatArray, q: FloatArray
 ) -> float:
@@ -154,7 +112,7 @@ def drawn_w(
 def track(
     m: PlainMachine,
     e: Any,
-    law: Law,
+    law: RobustLaw,
     maps: Maps,
     may_regenerate: bool,
     ref: FloatArray,
@@ -179,7 +137,7 @@ def track(
         seen[P_A], seen[P_B], seen[X], seen[V] = y[0], y[1], y[2], y[3]
         for column in range(7):
             seen[column] = quantise(seen[column] + noise[i, column], steps[column])
-        q_a, q_b = wanted_flows(law, seen, ref[i])
+        q_a, q_b = wanted_flows(law, seen[X], seen[V], seen[P_A], seen[P_B], ref[i])
         regenerate = may_regenerate and regenerates(seen, regenerate)
         commands(maps, seen, q_a, q_b, regenerate, w)
         for edge in range(5):
@@ -204,7 +162,8 @@ def run(plant: SimulatedPlant, known: Knowledge, reference: FloatArray, seed: in
     drive[:, P_SUPPLY], drive[:, P_TANK], drive[:, LOAD] = plant.p_supply_pa, plant.p_tank_pa, 0.0
     drive[:, LOAD + 1 :] = schedule(plant.extra, n + 1, DT_S, np.random.default_rng([seed, 6]))
     lead_s = plant.lag_s + 0.5 * DT_S
-    law = Law(plant.constants, GAIN_1PS, OFF_GAIN_1PS, OFF_SIDE_PA, lead_s, known.leak_m3spa)
+    known_of = Mechanics(*plant.constants[:-1])
+    law = RobustLaw(known_of, GAIN_1PS, OFF_GAIN_1PS, OFF_SIDE_PA, lead_s, known.leak_m3spa)
     y = at_rest(plant, drive[0], float(reference[0, 0]), OFF_SIDE_PA)
     record = np.empty((n, 15))
     energy_j = track(

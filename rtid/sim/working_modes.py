@@ -14,8 +14,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-
+from rtid.kernels.look_up import flow_at, opening
 from rtid.plain import FloatArray
 from rtid.sim.compiled import compiled
 from rtid.sim.sensing import P_A, P_B, P_S, P_T
@@ -38,50 +37,12 @@ class Maps(NamedTuple):
 
 
 @compiled
-def cell(nodes: FloatArray, x: float) -> tuple[int, float]:
-    """The interval of nodes (n,) that holds x, and the share of it, 0 to 1, ends beyond."""
-    i = min(max(int(np.searchsorted(nodes, x)) - 1, 0), len(nodes) - 2)
-    share: float = (x - nodes[i]) / (nodes[i + 1] - nodes[i])
-    return i, min(max(share, 0.0), 1.0)
-
-
-@compiled
-def flow_at(maps: Maps, edge: int, w_v: float, dp_pa: float) -> float:
-    """Flow of one edge, m3/s."""
-    flow = maps.flow_m3s[edge]
-    i, a = cell(maps.w_v[edge], w_v)
-    j, b = cell(maps.s[edge], np.sqrt(max(dp_pa, 0.0)))
-    low: float = flow[i, j] + b * (flow[i, j + 1] - flow[i, j])
-    high: float = flow[i + 1, j] + b * (flow[i + 1, j + 1] - flow[i + 1, j])
-    return low + a * (high - low)
-
-
-@compiled
-def opening(maps: Maps, edge: int, q_m3s: float, dp_pa: float) -> float:
-    """The command of one edge for a wanted flow > 0; its highest where it cannot carry that."""
-    flow, w_v = maps.flow_m3s[edge], maps.w_v[edge]
-    j, b = cell(maps.s[edge], np.sqrt(max(dp_pa, 0.0)))
-    low, high = 0, len(w_v) - 1
-    while high - low > 1:
-        middle = (low + high) // 2
-        if flow[middle, j] + b * (flow[middle, j + 1] - flow[middle, j]) < q_m3s:
-            low = middle
-        else:
-            high = middle
-    below: float = flow[low, j] + b * (flow[low, j + 1] - flow[low, j])
-    above: float = flow[high, j] + b * (flow[high, j + 1] - flow[high, j])
-    part = (q_m3s - below) / (above - below) if above > below else 1.0
-    w: float = w_v[low] + min(max(part, 0.0), 1.0) * (w_v[high] - w_v[low])
-    return w
-
-
-@compiled
 def through_cross_port(maps: Maps, seen: FloatArray, q_a: float, q_b: float) -> float:
     """What A gives to B, m3/s, for wanted flows out of A and into B; seen (7,): the sensors, SI."""
     if q_a >= 0.0 or q_b <= 0.0:
         return 0.0
     top_v = CROSS_SHARE * maps.w_v[AB][-1]
-    most = flow_at(maps, AB, top_v, seen[P_A] - seen[P_B])
+    most = flow_at(maps.w_v[AB], maps.s[AB], maps.flow_m3s[AB], top_v, seen[P_A] - seen[P_B])
     q: float = min(q_b, -q_a, most)
     return q if q > LEAST_FLOW_M3S else 0.0
 
@@ -103,9 +64,10 @@ def commands(
     if regenerate:
         across = through_cross_port(maps, seen, q_a, q_b)
         if across > 0.0:
-            w[AB] = opening(maps, AB, across, p_a - p_b)
+            w[AB] = opening(maps.w_v[AB], maps.s[AB], maps.flow_m3s[AB], across, p_a - p_b)
             q_a, q_b = q_a + across, q_b - across
     for q, inlet, outlet, p in ((q_a, PA, AT, p_a), (q_b, PB, BT, p_b)):
         if abs(q) > LEAST_FLOW_M3S:
             edge, dp = (inlet, seen[P_S] - p) if q > 0 else (outlet, p - seen[P_T])
-            w[edge] = opening(maps, edge, abs(q), dp)
+            table = maps.w_v[edge], maps.s[edge], maps.flow_m3s[edge]
+            w[edge] = opening(*table, abs(q), dp)

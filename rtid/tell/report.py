@@ -68,6 +68,7 @@ def sections(story: ReportStory) -> tuple[Story, ...]:
         _flows(story),
         _dependences(story),
         Story("Flow maps", (maps(story.flowmap), slices(story.flowmap))),
+        *([Story("Tracking", (story.tracking,))] if story.tracking else []),
         _ranking(story),
         *_not_found(result.not_found, story.ranking),
         _negligible(story),

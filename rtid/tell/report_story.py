@@ -9,6 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from rtid.apply.judge import KnownMap
+from rtid.apply.plan import edge_tables
+from rtid.apply.tracking import told
+from rtid.apply.versions import Applied
 from rtid.compare import Dependence, against_signals, over_time
 from rtid.diagnose.clean import usable
 from rtid.diagnose.diagnosis import Result
@@ -21,9 +25,11 @@ from rtid.diagnose.trials import physical, scored
 from rtid.diagnose.verdict import LEAST_ROWS
 from rtid.effects.column import Candidate
 from rtid.estimator.flowmap import FlowMap
+from rtid.maps.lookup import sample
 from rtid.model import Machine
 from rtid.plain import FloatArray, Key, Progress, silent
 from rtid.project import Project
+from rtid.project.folder import state_folder
 from rtid.project.history import Change, read
 from rtid.study.study import Diagnosed, Study
 from rtid.tell.charts.evidence import charts_of
@@ -57,7 +63,8 @@ class Ranked:
 class ReportStory:
     """What a report tells: the diagnosis, the residual of both parts before and after, the ranking.
 
-    after is None, depends_after and evidence are empty where nothing was found.
+    after is None, depends_after and evidence are empty where nothing was found.  tracking: what the
+    map will do to it, "" without a section [controller].
     """
 
     diagnosed: Diagnosed
@@ -72,6 +79,7 @@ class ReportStory:
     history: tuple[Change, ...]
     trace_sha256: str
     date: str
+    tracking: str = ""
 
     @property
     def judges(self) -> int:
@@ -104,7 +112,28 @@ def tell(project: Project, trace: Path, progress: Progress = silent) -> ReportSt
         tuple(read(project.path)),
         _sha256(trace),
         datetime.now().astimezone().isoformat(" ", "seconds"),
+        _tracking(study),
     )
+
+
+def _tracking(study: Study) -> str:
+    """Tracking over the held-out part, or the record, with the held map and the learned one."""
+    project, solution = study.project, study.fit.solution
+    section = project.sections.controller
+    if section is None:
+        return ""
+    applied = Applied(state_folder(project))
+    last = applied.newest()
+    held = None if last is None else edge_tables(project, applied.images(last.content))
+    new = {edge.name: sample(edge, study.map[edge.name]).table for edge in project.model.edges}
+    known = KnownMap(study.map, solution.beta_pa)
+    foretold = ""
+    for span in reversed(study.spans):
+        result = told(project, section, span, known, solution.beta_sd_pa, new, held)
+        foretold = result if isinstance(result, str) else result.sentence
+        if not isinstance(result, str):
+            break
+    return foretold
 
 
 def _both(fit: Fit, chunks: list[FloatArray]) -> tuple[Residual, Residual]:
