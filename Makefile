@@ -5,7 +5,7 @@ PYTHON ?= python3
 PIP = .venv/bin/python -m pip --disable-pip-version-check
 READY = .venv/.ready
 
-.PHONY: demo check test bench lint campaign faults fuzz soak mutants paper pictures screenshots lock clean
+.PHONY: demo check test bench benchmark-missing lint campaign faults fuzz soak mutants paper pictures screenshots lock clean
 
 demo: $(READY)
 	.venv/bin/rtid demo
@@ -22,6 +22,14 @@ bench: $(READY)
 	@mkdir -p out
 	.venv/bin/python -m pytest -q -s benchmarks --benchmark-json=out/bench.json
 	.venv/bin/python -m benchmarks.table
+
+# Ours beside a dozen other methods, on the same records, into docs/benchmark.md: an hour on one core.
+# A second seed, on other simulators' machines, says whether the order of the methods holds.
+benchmark-missing: $(READY)
+	@$(PIP) install -qq --no-deps -r requirements-benchmark.lock
+	.venv/bin/python -m benchmarks.missing --seed 2026
+	.venv/bin/python -m benchmarks.missing --seed 2027 --plants exudyn_rig,modelica_rig
+	.venv/bin/python -m benchmarks.missing.page out/missing/2026/result.json out/missing/2027/result.json
 
 lint: $(READY)
 	.venv/bin/ruff check
