@@ -122,7 +122,7 @@ def test_what_is_kept_may_be_deleted_damaged_or_foreign(
     monkeypatch.setattr(kept, "_secret", lambda: b"of somebody else")
     read: list[object] = []
     with kept.keeping():
-        place = kept.Kept.of(load(project), trace)
+        place = kept.Kept.of(load(project), (trace,))
         assert place is not None
         read = [place.read(kind, classes) for kind, classes in CLASSES.items()]
     assert read == [None] * len(read)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from rtid.cli.exits import Exit, refuse_truncated
+from rtid.cli.exits import refuse_truncated
 from rtid.cli.options import AsJson, DryRun, NoCache, ProjectOption, Reason, UnitsOption
 from rtid.errors import RtidError
 from rtid.units import System
@@ -18,8 +18,9 @@ def add(
     words: Annotated[
         list[str],
         typer.Argument(
-            metavar="[EFFECT[:WHERE]] TRACE",
-            help="TRACE: CAN log or table.  EFFECT: without it what `rtid diagnose` names.",
+            metavar="[EFFECT[:WHERE]] TRACE...",
+            help="TRACE: CAN log or table, or several.  EFFECT: without it what `rtid diagnose` "
+            "names.",
         ),
     ],
     project: ProjectOption,
@@ -36,11 +37,12 @@ def add(
 
     The project file keeps its comments; `rtid undo` restores it byte for byte.
     """
-    if len(words) > 2:
-        raise RtidError(f"too many arguments: {' '.join(words[2:])}", "", Exit.USAGE)
-    name, trace = words if len(words) == 2 else ("", words[0])
-    if not Path(trace).exists():
-        raise RtidError(f"{trace}: no such file", "rtid add [EFFECT[:WHERE]] TRACE -p PROJECT")
+    name, traces = (
+        ("", words) if len(words) == 1 or Path(words[0]).exists() else (words[0], words[1:])
+    )
+    for trace in traces:
+        if not Path(trace).exists():
+            raise RtidError(f"{trace}: no such file", "rtid add [EFFECT[:WHERE]] TRACE -p PROJECT")
     from rtid.study.revisions import add as add_effect
     from rtid.tell.replay import progress_bar
     from rtid.tell.revised import as_json as plain
@@ -49,11 +51,11 @@ def add(
     effect, _, where = name.partition(":")
     with progress_bar() as progress:
         done = add_effect(
-            project, Path(trace), effect, where,
+            project, traces, effect, where,
             force=force, dry_run=dry_run, reason=reason, progress=progress,
         )  # fmt: skip
     if as_json:
-        print(json.dumps({"trace": trace} | plain(done)))
+        print(json.dumps({"trace": traces[0]} | plain(done)))
     else:
         show(done)
-    refuse_truncated(Path(trace), done.counters)
+    refuse_truncated(Path(traces[0]), done.counters)

@@ -10,15 +10,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rtid.cli.exits import refuse_truncated
-from rtid.cli.options import AsJson, NoCache, ProjectOption, UnitsOption
+from rtid.cli.options import AsJson, NoCache, ProjectOption, TracesArgument, UnitsOption
 from rtid.units import System
 
 if TYPE_CHECKING:
     from rtid.study.compared import TraceComparison
+    from rtid.study.study import RecordError
 
 
 def compare(
-    trace: Annotated[Path, typer.Argument(help="CAN log or table.")],
+    trace: TracesArgument,
     project: ProjectOption,
     maps: Annotated[
         list[Path] | None,
@@ -59,6 +60,7 @@ def compare(
     from rtid.project import load
     from rtid.study.compared import find_reference
     from rtid.study.study import Study, compare_two
+    from rtid.tell.records import record_lines, records_json
     from rtid.tell.replay import progress_bar
     from rtid.tell.residual_table import refuse_format, write_residuals
 
@@ -69,19 +71,31 @@ def compare(
     sheets: list[Path | None] = [*maps] if maps else [None]
     references = [find_reference(loaded, sheet) for sheet in sheets]
     studies: Sequence[TraceComparison]
+    errors: tuple[RecordError, ...] = ()
     with progress_bar() as progress:
         if against is None:
-            studies = [Study(loaded, trace, progress).comparison(*references)]
+            study = Study(loaded, trace, progress)
+            studies, errors = [study.comparison(*references)], study.record_errors
         else:
-            studies = compare_two(loaded, trace, against, *references, progress=progress)
+            studies = compare_two(loaded, _single(trace), against, *references, progress=progress)
     written = _draw(studies, pictures, picture_format) if pictures else []
     if table is not None:
         written.append(write_residuals(table, studies))
     if as_json:
-        print(json.dumps(_json(studies, place, when) | {"written": [str(p) for p in written]}))
+        more = {"written": [str(p) for p in written]} | records_json(errors)
+        print(json.dumps(_json(studies, place, when) | more))
     else:
         _print(studies, place, when, written)
-    refuse_truncated(trace, studies[0].replay.trace.counters)
+        for line in record_lines(errors):
+            print(line)
+    refuse_truncated(trace[0], studies[0].replay.trace.counters)
+
+
+def _single(traces: list[Path]) -> Path:
+    """The one record that another one, or another project, is held against."""
+    if len(traces) > 1:
+        raise typer.BadParameter("one record at a time", param_hint="--against")
+    return traces[0]
 
 
 Place = tuple[str, int, int]

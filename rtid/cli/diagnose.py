@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rtid.cli.exits import Exit, refuse_truncated
-from rtid.cli.options import AsJson, NoCache, ProjectOption, UnitsOption
+from rtid.cli.options import AsJson, NoCache, ProjectOption, TracesArgument, UnitsOption
 from rtid.units import System
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def diagnose(
-    trace: Annotated[Path, typer.Argument(help="CAN log or table.")],
+    trace: TracesArgument,
     project: ProjectOption,
     pictures: Annotated[
         Path | None, typer.Option(help="Folder for pictures of the evidence for what is named.")
@@ -36,6 +36,7 @@ def diagnose(
     from rtid.study.study import Study
     from rtid.tell.charts.evidence import charts_of
     from rtid.tell.diagnosed import story
+    from rtid.tell.records import record_lines, records_json
     from rtid.tell.replay import progress_bar
     from rtid.tell.terminal import make_console
 
@@ -46,12 +47,16 @@ def diagnose(
     written = _drawn(evidence, pictures, picture_format) if pictures else []
     if as_json:
         more = {"pictures": [str(path) for path in written]} if pictures else {}
-        print(json.dumps({"trace": str(trace)} | diagnosed.as_json() | more))
+        of = {"trace": str(study.path)} | records_json(study.record_errors)
+        print(json.dumps(of | diagnosed.as_json() | more))
     else:
-        make_console().print(story(diagnosed, evidence))
+        console = make_console()
+        console.print(story(diagnosed, evidence))
+        for line in record_lines(study.record_errors):
+            console.print(line)
         for path in written:
             print(f"wrote {path}")
-    refuse_truncated(trace, study.counters)
+    refuse_truncated(study.path, study.counters)
     if any(doubt.is_invalid for doubt in diagnosed.doubts):
         raise typer.Exit(Exit.NEGATIVE)
 

@@ -57,6 +57,13 @@ RoleOption = Annotated[
         help="ROLE=COLUMN where a guess fails: u, x, p_a, p_b, p_supply, p_tank, v.",
     ),
 ]
+TracesArgument = Annotated[
+    list[Path],
+    typer.Argument(
+        help="CAN log or table.  Of several, one fit: the last one judges, or those that "
+        "record.held_out of the project names."
+    ),
+]
 ProjectOption = Annotated[Path, typer.Option("--project", "-p", help="Project file.")]
 PriorOption = Annotated[
     Path | None,

@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rtid.cli.exits import Exit, refuse_truncated
-from rtid.cli.options import AsJson, NoCache, PriorOption, ProjectOption, UnitsOption
+from rtid.cli.options import (
+    AsJson,
+    NoCache,
+    PriorOption,
+    ProjectOption,
+    TracesArgument,
+    UnitsOption,
+)
 from rtid.units import System
 
 if TYPE_CHECKING:
@@ -17,9 +24,7 @@ if TYPE_CHECKING:
 
 
 def replay(
-    trace: Annotated[
-        Path, typer.Argument(help="CAN log (.blf .log .asc .trc .csv .mf4) or table.")
-    ],
+    trace: TracesArgument,
     project: ProjectOption,
     bus: Annotated[
         bool, typer.Option("--bus", help="Through python-can's virtual bus instead of the file.")
@@ -59,6 +64,7 @@ def replay(
     from rtid.study.compared import compare_trace, find_reference
     from rtid.study.known_effects import as_json as added_json
     from rtid.study.study import Study
+    from rtid.tell.records import record_lines, records_json
     from rtid.tell.replay import LearnedStory, progress_bar
     from rtid.trace.snapshot import save
 
@@ -66,19 +72,22 @@ def replay(
     prior = find_prior(loaded)  # refused before the work, not after it
     with progress_bar() as progress:
         pace = (speed or float("inf")) if bus else None
-        result = Study(loaded, trace, progress, pace).replay
+        study = Study(loaded, trace, progress, pace)
+        result = study.replay
     if snapshot is not None:
         save(snapshot, result.live, loaded.digest)
     learned = LearnedStory(compare_trace(result, find_reference(loaded, reference)))
     written = learned.draw(pictures, picture_format) if pictures else []
     if as_json:
         more = {"added": added_json(result.added), "pictures": [str(p) for p in written]}
-        print(json.dumps(learned.as_json() | more))
+        print(json.dumps(learned.as_json() | more | records_json(study.record_errors)))
     else:
         _show(learned, [*([snapshot] if snapshot else []), *written])
+        for line in record_lines(study.record_errors):
+            print(line)
         if prior is not None:
             print(said_of(prior, learned.compared.flowmap))
-    refuse_truncated(trace, result.trace.counters)
+    refuse_truncated(trace[0], result.trace.counters)
     if any(doubt.is_invalid for doubt in learned.doubts):
         raise typer.Exit(Exit.NEGATIVE)
 

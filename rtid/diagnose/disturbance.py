@@ -12,7 +12,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from rtid.diagnose.commands import Timings
 from rtid.diagnose.fit import one_pass, prepare
 from rtid.diagnose.parts import AddedEffect, recall
 from rtid.diagnose.revision import Revision
@@ -36,10 +35,9 @@ def with_disturbance(
     """
     if model.has_pressures or model.chambers[0].disturbance > 0.0:
         return model
-    timings: Timings = ()
+    revision = Revision()
     if parts:
-        timings = recall(model, chunk, prepare(model, chunk), parts, suspects).timings
-    revision = Revision((), timings)
+        revision = recall(model, chunk, prepare(model, chunk), parts, suspects)
 
     def excess(size: float) -> float:
         machine = disturbed(model, size)

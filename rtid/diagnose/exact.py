@@ -71,10 +71,17 @@ def _pumps(present: Fit) -> list[Psi]:
 def timing_trials(
     state: TrialState, present: Fit, scores: dict[Key, tuple[Candidate, Score]], other: float
 ) -> list[Trial]:
-    """Exact refits with one timing more, of those that may matter; scores: of the first order."""
+    """Exact refits with one timing more, of those that may matter; scores: of the first order.
+
+    Without pressures a disturbance as large as what is left hides how much that is: then a timing
+    may matter whose first order is clear, though it may point the wrong way.
+    """
     timings = (*timings_of(state.model, state.chunk[:, 0]), *sensor_timings(state.model))
     open_ = [t for t in timings if not present.revision.has(key_of(t))]
-    if present.rho < LARGE:
+    if not state.model.has_pressures:
+        stirred = {c.key for c, score in scored(present) if score.gain > GAIN}
+        open_ = [t for t in open_ if key_of(t) in stirred]
+    elif present.rho < LARGE:
         open_ = [t for t in open_ if key_of(t) in scores and scores[key_of(t)][1].gain > GAIN]
     if not open_ or not present.view.has_pressures:
         return []

@@ -50,7 +50,9 @@ def build(
     """All effects of the file and of its module, and what is wrong with them."""
     signals = references.tables(raw, "signals").items()
     kinds = {n: references.kind_of(s, references.find_dbc_unit(s, catalog)) for n, s in signals}
-    chambers = list(references.tables(raw, "chambers"))
+    rate = references.table(raw, "rate")
+    named = (*references.tables(raw, "chambers"), rate.get("state"), rate.get("measured"))
+    chambers = [str(name) for name in named if name]
     names = names_of(kinds, chambers)
     geometry = parts.get("geometry")
     constants = {"stroke": geometry.stroke_m} if geometry else {}

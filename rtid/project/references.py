@@ -99,6 +99,9 @@ def check(raw: Raw, catalog: Catalog | None, folder: Path) -> Iterator[Problem]:
     for name, edge in tables(raw, "edges").items():
         yield from _edge(f"edges.{name}", edge, raw, kinds, catalog, folder)
     yield from _prior(table(raw, "prior").get("map"), folder)
+    for k, name in enumerate(table(raw, "record").get("records") or []):
+        if not (folder / str(name)).is_file():
+            yield Problem(f"record.records[{k}]", f"no file {name!r}", "name a log or a table")
     yield from _modes(raw)
     yield from _mode_signals(raw, kinds)
     yield from _messages(raw, catalog)

@@ -350,10 +350,16 @@ class EffectSection(Section):
 
 
 class RecordSection(Section):
-    """[record]: parts of a trace, seconds from its first sample; None = not set apart."""
+    """[record]: parts of a trace, seconds from its first sample; None = not set apart.
+
+    records: others that one fit is made of, relative to this file; held_out: names of those, or
+    patterns, that judge as a whole.
+    """
 
     identification_s: Annotated[Interval | None, TIME] = None
     validation_s: Annotated[Interval | None, TIME] = None
+    records: Annotated[tuple[str, ...], BeforeValidator(_tuple)] = ()
+    held_out: Annotated[tuple[str, ...], BeforeValidator(_tuple)] = ()
 
 
 class ExciteSection(Section):

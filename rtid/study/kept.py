@@ -46,19 +46,24 @@ def keeping(wanted: bool = True) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Kept:
-    """What is kept of one trace under one project; every failure to read or write is silent."""
+    """What is kept of one trace, or of several in one fit, under one project.
+
+    Every failure to read or write is silent.
+    """
 
     key: str
     folders: tuple[Path, ...]  # the first that takes a file is written to
 
     @classmethod
-    def of(cls, project: Project, trace: Path) -> Kept | None:
+    def of(cls, project: Project, traces: tuple[Path, ...]) -> Kept | None:
         """None where nothing is to be kept, or where the user's own module may change unseen."""
         if not _IS_ON.get() or project.sections.project.effects_module:
             return None
         place = os.environ.get(PLACE)
-        folders = (Path(place),) if place else (trace.resolve().parent / FOLDER, user_folder())
-        return cls(f"{_of_file(trace)}-{_of_project(project)}", folders)
+        folders = (Path(place),) if place else (traces[0].resolve().parent / FOLDER, user_folder())
+        files = "".join(_of_file(trace) for trace in traces)
+        key = files if len(traces) == 1 else _hash(files.encode()).hexdigest()
+        return cls(f"{key}-{_of_project(project)}", folders)
 
     def read(self, kind: str, classes: tuple[type, ...]) -> Any:
         """What was kept of this kind; None where there is nothing of use."""

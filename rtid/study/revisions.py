@@ -25,6 +25,7 @@ from rtid.project.history import ADD, DROP, UNDO, Change, digest, read, standing
 from rtid.study.revised_sections import errors_between, extended, now, plain, refreshed, turned
 from rtid.study.spans import added_parts
 from rtid.study.study import Study
+from rtid.trace.records import TracePaths
 from rtid.units import nearest
 
 
@@ -45,7 +46,7 @@ class Revised:
 @door
 def add(
     project: str | Path,
-    trace: str | Path,
+    trace: TracePaths,
     effect: str = "",
     where: str = "",
     *,
@@ -59,7 +60,6 @@ def add(
     Raises RefusedError, with the figures, where an effect does not deserve its place (unless
     force), and where the diagnosis names none or a set.
     """
-    project, trace = Path(project), Path(trace)
     return added(
         Study(project, trace, progress), effect, where, force=force, dry_run=dry_run, reason=reason
     )

@@ -23,16 +23,17 @@ from rtid.diagnose.fit import Fit
 from rtid.diagnose.partial import Exhibit, exhibits
 from rtid.diagnose.parts import AddedEffect
 from rtid.diagnose.report import Diagnosis, diagnosis
+from rtid.diagnose.residual import Residual, residual
 from rtid.diagnose.standing import Standing, fitted, stand
 from rtid.effects import Effect
 from rtid.errors import door
-from rtid.estimator.estimator import Estimator
+from rtid.estimator.estimator import Estimator, to_chunk
 from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.record import RecordFit
 from rtid.estimator.solution import Solution
 from rtid.maps.prior_map import find_prior, published
 from rtid.model import Machine
-from rtid.plain import FloatArray, Progress, silent
+from rtid.plain import BoolArray, FloatArray, Progress, silent
 from rtid.project import Project, load
 from rtid.project.added import AddedSection
 from rtid.project.history import Change, read
@@ -44,6 +45,14 @@ from rtid.study.known_effects import KnownEffect, held_against, replayed
 from rtid.study.seed import CLASSES, EVIDENCE, FIT, FLOWS, LEARNED, SAID, Learned, Said, Seed
 from rtid.study.spans import HELD_OUT_SHARE, added_parts, judged, taught
 from rtid.trace.reading import NoSamplesError, Trace, read_trace
+from rtid.trace.records import (
+    RecordSpan,
+    TracePaths,
+    read_records,
+    records_of,
+    rows_by_record,
+    with_spans,
+)
 
 if TYPE_CHECKING:
     from rtid.study.revisions import Revised
@@ -62,11 +71,28 @@ class Diagnosed:
     diagnosis: Diagnosis
 
 
+@dataclass(frozen=True)
+class RecordError:
+    """What a model leaves of one record of several behind H_f, rms, and the flow itself, SI."""
+
+    path: Path
+    is_held_out: bool
+    left: float
+    flow: float
+
+
+def _sizes(of: Residual, rows: BoolArray) -> tuple[float, float]:
+    """Root mean squares of the rows (rows,) of a residual, and of their flow, SI."""
+    rest, flow = (float(np.sqrt(np.mean(v[rows] ** 2))) for v in (of.left, of.measured))
+    return rest, flow
+
+
 class Study:
     """One trace under one project, with all effects that the project has added.
 
-    project: as loaded, or its file.  path: a CAN log or a table.  progress: hears what is being
-    done and the share that is done.  Raises the errors of project, trace and NoSamplesError when
+    project: as loaded, or its file.  path: a CAN log or a table, or several, of which those that
+    the project holds out judge, or the last one.  progress: hears what is being done and the share
+    that is done.  Raises the errors of project, trace and NoSamplesError when
     something is asked for that needs them.
     """
 
@@ -74,12 +100,28 @@ class Study:
     def __init__(
         self,
         project: Project | str | Path,
-        path: str | Path,
+        path: TracePaths,
         progress: Progress = silent,
         bus_speed: float | None = None,
     ) -> None:
-        self.project = project if isinstance(project, Project) else load(project)
-        self.path, self.progress, self.bus_speed = Path(path), progress, bus_speed
+        loaded = project if isinstance(project, Project) else load(project)
+        self._take(loaded, records_of(loaded, path), progress, bus_speed)
+
+    def _take(
+        self,
+        project: Project,
+        paths: tuple[Path, ...],
+        progress: Progress,
+        bus_speed: float | None,
+    ) -> None:
+        """Begin with a project and its records; several are read, to know where each begins."""
+        self.project, self.paths, self.path = project, paths, paths[0]
+        self.progress, self.bus_speed = progress, bus_speed
+        self.records: tuple[RecordSpan, ...] = ()
+        if len(paths) > 1:
+            progress("reading", 0.0)
+            vars(self)["read"], self.records = read_records(project, paths)
+            self.project = with_spans(project, self.records)
 
     @cached_property
     def machine(self) -> Machine:
@@ -184,6 +226,18 @@ class Study:
         return examined(replay, *references)
 
     @cached_property
+    def record_errors(self) -> tuple[RecordError, ...]:
+        """What the model leaves of each of several records; () of one."""
+        if not self.records:
+            return ()
+        model, chunk = self.fitted.declared, to_chunk(self.machine, self.trace.samples, 0)
+        left = residual(self.fitted, usable(model, chunk))
+        return tuple(
+            RecordError(span.path, span.is_held_out, *_sizes(left, here))
+            for span, here in rows_by_record(self.records, left.t_s)
+        )
+
+    @cached_property
     def diagnosed(self) -> Diagnosed:
         """The search for what is missing, with every fit."""
         result = searched(self.standing, self.progress)
@@ -241,9 +295,11 @@ class Study:
         and all else is made anew, as by whoever opens the project next.
         """
         project = replace(self.project, sections=replace(self.project.sections, added=sections))
-        other = Study(project, self.path, self.progress, self.bus_speed)
+        other = object.__new__(Study)
         shared = {"read", "_aged", "machine", "taught", "spans"} & vars(self).keys()
+        shared |= {"paths", "path", "progress", "bus_speed", "records"}
         vars(other).update({name: vars(self)[name] for name in shared}, _place=None)
+        other.project = project
         final = {"standing": standing, "fitted": standing.fit.light()}
         vars(other).update(final if is_final else {"_onward": standing})
         return other
@@ -264,10 +320,9 @@ class Study:
         name, _, where = effect.partition(":")
         done = revisions.added(self, name, where, force=force, dry_run=dry_run)
         if done.is_written:
-            kept = self.path, self.progress, self.bus_speed
+            kept = self.paths, self.progress, self.bus_speed
             vars(self).clear()
-            self.project = load(done.project)
-            self.path, self.progress, self.bus_speed = kept
+            self._take(load(done.project), *kept)
         return done
 
     @cached_property
@@ -278,7 +333,7 @@ class Study:
 
     @cached_property
     def _place(self) -> Kept | None:
-        return Kept.of(self.project, self.path)
+        return Kept.of(self.project, self.paths)
 
     def _known(self, kind: str) -> Any:
         """What is kept of a kind, looked up once."""
@@ -301,7 +356,7 @@ class Study:
 
 
 @door
-def diagnose_trace(project: Project, path: str | Path, progress: Progress = silent) -> Diagnosed:
+def diagnose_trace(project: Project, path: TracePaths, progress: Progress = silent) -> Diagnosed:
     """Diagnose one trace.  Raises NoSamplesError where there is nothing to learn from."""
     return Study(project, path, progress).diagnosed
 

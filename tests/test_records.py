@@ -1,0 +1,116 @@
+"""Several records in one fit: each with its own start and neutral, some held out as a whole."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rtid.errors import RtidError
+from rtid.project import ProjectError, load
+from rtid.study.study import Study
+from rtid.units import show_flow_as
+from tests.test_rate import Crane, said
+
+
+@pytest.fixture(autouse=True)
+def _shown_as_flows() -> Any:
+    """Another test's machine is hydraulic."""
+    yield
+    show_flow_as("m3/s")
+
+
+@pytest.fixture(scope="module")
+def days(tmp_path_factory: pytest.TempPathFactory) -> tuple[Crane, list[Path], Path]:
+    """A crane on three days, its radio trimmed anew on each, and the project of the first."""
+    folder, rng = tmp_path_factory.mktemp("days"), np.random.default_rng(30)
+    crane, tables = Crane.drawn(rng), []
+    for k, moved in enumerate((0.0, 2.5, -1.5)):
+        today = Crane(**(vars(crane) | {"neutral": round(crane.neutral + moved, 2)}))
+        tables.append(today.recorded(folder / f"day{k}.csv", rng, seconds=110.0))
+    said("init", tables[0], "-o", folder / "jib.toml")
+    text = (folder / "jib.toml").read_text().partition("[record]")[0]
+    (folder / "jib.toml").write_text(text + '[record]\nheld_out = ["*2.csv"]\n')
+    return crane, tables, folder / "jib.toml"
+
+
+def test_two_days_teach_and_the_third_judges(days: tuple[Crane, list[Path], Path]) -> None:
+    crane, tables, project = days
+    study = Study(project, [tables[2], *tables[:2]])
+    assert [span.path for span in study.records] == tables, "those held out stand last"
+    assert [span.is_held_out for span in study.records] == [False, False, True]
+    taught, judging = study.spans
+    assert len(taught) + len(judging) == len(study.trace.samples)
+    (found,) = study.diagnosis().found
+    assert found.effect == "input_delay"
+    assert found.parameters["delay"].value == pytest.approx(crane.delay_s, abs=0.03)
+    said("add", f"{found.effect}:command", *tables, "-p", project, "--force")
+    learned = Study(project, tables)
+    w = np.linspace(-5, 5, 41)
+    error = 1e3 * learned.map["f"].flow(w, np.zeros(len(w))) - crane.rate(w)
+    assert np.sqrt(np.mean(error**2)) < 0.03 * np.abs(crane.rate(w)).max()
+    assert [e.path for e in learned.record_errors] == tables
+    assert max(e.left / e.flow for e in learned.record_errors) < 0.25
+    said("undo", "-p", project)
+
+
+def test_more_records_tell_more(days: tuple[Crane, list[Path], Path]) -> None:
+    """Two days know the map better than one: no block's interval gets wider, most narrower."""
+    _, tables, project = days
+    both, alone = (Study(project, t).map["f"] for t in (tables, [tables[0], tables[2]]))
+    w = np.linspace(-4, 4, 33)
+    ratio = both.sd(w, np.zeros(33)) / alone.sd(w, np.zeros(33))
+    assert np.median(ratio) < 0.85
+
+
+def test_commands_tell_the_error_of_each_record(days: tuple[Crane, list[Path], Path]) -> None:
+    _, tables, project = days
+    words = said("replay", *tables, "-p", project)
+    assert all(table.name in words for table in tables) and words.count("held out") == 1
+    assert said("compare", *tables, "-p", project).count("taught") == 2
+    told = json.loads(said("diagnose", *tables, "-p", project, "--json"))
+    assert [r["held_out"] for r in told["records"]] == [False, False, True]
+    assert "one record at a time" in said(
+        "compare", *tables, "-p", project, "--against", tables[0], code=2
+    )
+
+
+def test_the_project_names_records(days: tuple[Crane, list[Path], Path]) -> None:
+    """The same fit, whether they are given or named; one that is both counts once."""
+    _, tables, project = days
+    named = project.with_name("named.toml")
+    records = 'records = ["day0.csv", "day1.csv"]\nheld_out'
+    named.write_text(project.read_text().replace("held_out", records))
+    given, by_name = Study(project, tables), Study(named, [tables[2], tables[0]])
+    assert [s.path.name for s in by_name.records] == [t.name for t in tables]
+    np.testing.assert_array_equal(given.taught, by_name.taught)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('"*2.csv"', '"night*"', "no record is called 'night*'"),
+        ('"*2.csv"', '"*.csv"', "none teaches"),
+        ("[record]", "[record]\nidentification_s = [0, 9]", "cuts one record into parts"),
+    ],
+)
+def test_what_cannot_be_is_said(
+    days: tuple[Crane, list[Path], Path], old: str, new: str, words: str
+) -> None:
+    _, tables, project = days
+    wrong = project.with_name("wrong.toml")
+    wrong.write_text(project.read_text().replace(old, new))
+    with pytest.raises(RtidError, match=words.replace("*", r"\*")):
+        Study(wrong, tables)
+
+
+def test_a_record_that_is_not_there_is_said_with_its_place(
+    days: tuple[Crane, list[Path], Path],
+) -> None:
+    wrong = days[2].with_name("lost.toml")
+    wrong.write_text(days[2].read_text().replace("held_out", 'records = ["lost.csv"]\nheld_out'))
+    with pytest.raises(ProjectError, match=r"lost\.csv"):
+        load(wrong)
