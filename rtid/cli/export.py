@@ -50,6 +50,8 @@ def export(
     miss no more than 0.1 % of the largest flow, with deviation and status; a C99 header holds
     look-up tables, float and fixed point, with their functions beside it; an FMU (co-simulation by
     FMI 2.0 or 3.0) holds the machine with its effects, bulk moduli and lag; packages bring more.
+    A map of acceleration over pedal and speed is written as accel_map.csv, with brake_map.csv
+    beside it, for Autoware.
     .mf4 and .mcap hold the record: signals, residual, block and status over time, estimates.
     From a trace the maps are learned beside the effects that `rtid add` has added, whose flow is
     not in them; a snapshot holds the maps as they were learned, on board beside those that can run

@@ -27,6 +27,7 @@ from rtid.maps.a2l import write_a2l
 from rtid.maps.calibration import write_cdfx, write_dcm
 from rtid.maps.matlab import write_m, write_mat
 from rtid.maps.modelica import write_mo
+from rtid.maps.pedals import ACCEL, BRAKE, write_pedals
 from rtid.maps.plc import write_st
 from rtid.model import Grid
 from rtid.plain import FloatArray, plain
@@ -51,6 +52,9 @@ class MapFileError(RtidError):
 def write_map(path: str | Path, flowmap: FlowMap, provenance: Mapping[str, Any]) -> None:
     """Write the map in the format that the file's suffix names; whole or not at all."""
     path = Path(path)
+    if path.name in (ACCEL, BRAKE):
+        write_pedals(path, flowmap, provenance)
+        return
     write = writer_of(path.suffix.lower())
     if write is None:
         raise MapFileError(f"{path}: unknown format", f"end the name in {', '.join(formats())}")
