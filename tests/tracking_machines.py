@@ -42,7 +42,7 @@ class Tried:
     held: dict[str, Table]
 
 
-def machine(seed: int, seconds: float = 60.0, law: str = "orifice") -> Tried:
+def machine(seed: int, seconds: float = 40.0, law: str = "orifice") -> Tried:
     """Machine `seed`, learned from a rich record; it holds maps that are off by up to 12 %."""
     plant = draw(seed, law=law)
     model = declared_model(plant, seed=seed)

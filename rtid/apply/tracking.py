@@ -5,13 +5,12 @@ record's own load (`rtid.kernels.tracked`) follows the recorded reference under 
 once with the tables that it holds and once with the new ones.  What the machine's model misses on
 the record is carried along as a flow.  DRAWS machines are drawn
 from the map's and the bulk moduli's covariance, each with sensor noise of its own, every other one
-with what the model misses at another time.  With m the median of log e over the draws, s its spread
-(1.4826 times the median deviation, at least REPEATED), and b = log(recorded error) - m of the held
-map, where the record holds a reference and was made with that map, the 95 % intervals are
+with what the model misses at another time.  m is the median of log e over the draws, s its spread
+(1.4826 times the median deviation, at least REPEATED).  Where the record holds a reference and was
+made with the held map, it tells what the model gets wrong: b = log(recorded error) - m, and d, the
+rms of recorded less foretold error over time, which no rms can be off by more than:
 
-    held: exp(m + b +- t sqrt(s^2 + b^2 / 4)),    new: exp(m + b/2 +- t sqrt(s^2 + b^2 / 4)):
-
-what the model gets wrong with the one map it may, or may not, get wrong with the other.
+    held: exp(m + b +- t hypot(s, d / 2e)),    new: exp(m + b/2 +- t hypot(s, d / 2e)).
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ from rtid.kernels.control_law import Mechanics, RobustLaw, resistance
 from rtid.kernels.engine import GAP_FLAG
 from rtid.kernels.tracked import ROLES, Steering, Tables, track
 from rtid.model import Edge, Machine
-from rtid.plain import FloatArray
+from rtid.plain import BoolArray, FloatArray
 from rtid.project import Project
 from rtid.project.schema import ControllerSection
 from rtid.units import range_of, with_unit
@@ -97,14 +96,14 @@ class TrackingForecast:
 class FollowedPath:
     """A stretch of the record without a gap: samples (n, 2 + signals), path (n, 4), load_n (n,).
 
-    path: x, v, a and jerk, SI.  recorded_m: see `TrackingForecast`.
+    path: x, v, a and jerk, SI.  recorded_m: (n,) x less its reference, None without one.
     """
 
     name: str
     samples: FloatArray
     path: FloatArray
     load_n: FloatArray
-    recorded_m: float | None
+    recorded_m: FloatArray | None
 
 
 def foretell(
@@ -127,27 +126,32 @@ def foretell(
     mechanics = _mechanics(model, stroke_m, section)
     reference = reference_of(model, mechanics, section.reference, chunk)
     missed = _missed(model, candidate(model, machine), reference.samples)
-    errors: dict[str, list[float]] = {"new": [], "held": []}
+    errors: dict[str, list[FloatArray]] = {"new": [], "held": []}
     both = {"new": new} if present is None else {"new": new, "held": present}
     for k in range(DRAWS):
         rng = np.random.default_rng([seed, k])
         drawn = _drawn(model, machine, beta_sd_pa, rng)
         noise = rng.standard_normal((len(reference.samples), len(model.signals)))
-        shift = 0 if k % 2 == 0 else int(rng.integers(len(missed)))  # as it was, or at another time
-        moved = np.roll(missed, shift, axis=0)
+        later = 0 if k % 2 == 0 else int(rng.integers(len(missed)))  # as it was, or at another time
+        moved = np.roll(missed, later, axis=0)
         for name, tables in both.items():
             errors[name].append(
                 tracking_error(model, section, mechanics, drawn, tables, reference, moved, noise)
             )
-    wrong = 0.0
-    if reference.recorded_m is not None and present is not None:
-        wrong = float(np.log(reference.recorded_m) - np.median(np.log(errors["held"])))
+    counts = reference.samples[:, 0] > reference.samples[0, 0] + SETTLED_S
+    shift, doubt = 0.0, 0.0
+    recorded: float | None = None
+    if reference.recorded_m is not None:
+        recorded = _rms(reference.recorded_m[counts])
+        if present is not None:
+            shift = float(np.log(recorded) - np.median(_logs(errors["held"], counts)))
+            doubt = _rms((reference.recorded_m - errors["held"][0])[counts])
     return TrackingForecast(
         float(np.ptp(reference.samples[:, 0])),
         reference.name,
-        _interval(errors["new"], wrong, 0.5),
-        None if present is None else _interval(errors["held"], wrong, 1.0),
-        reference.recorded_m,
+        _interval(_logs(errors["new"], counts), 0.5 * shift, doubt),
+        None if present is None else _interval(_logs(errors["held"], counts), shift, doubt),
+        recorded,
     )
 
 
@@ -209,7 +213,7 @@ def reference_of(
         force -= mechanics.mass_kg * np.gradient(v, t_s) + resistance(mechanics, x, v)
     recorded = None
     if named is not None:
-        recorded = float(np.sqrt(np.mean((x - wanted)[t_s > t_s[0] + SETTLED_S] ** 2)))
+        recorded = x - wanted
     name = "the recorded motion" if named is None else f"the reference {named}"
     return FollowedPath(name, samples, np.stack(path, axis=1), force, recorded)
 
@@ -262,8 +266,8 @@ def tracking_error(
     reference: FollowedPath,
     missed_m3s: FloatArray,
     noise: FloatArray,
-) -> float:
-    """Root mean square of x less its reference, m, behind SETTLED_S.
+) -> FloatArray:
+    """The piston's x less its reference (n,), m.
 
     missed_m3s (n - 1, chambers), noise (n, signals) in standard deviations.  NoTrackingError where
     a pressure runs away.
@@ -300,8 +304,7 @@ def tracking_error(
             f"under this controller a pressure of the learned machine runs away after {at:.1f} s",
             "check kp_per_s, the mass and the reference in [controller]",
         )
-    counts = samples[:, 0] > samples[0, 0] + SETTLED_S
-    return float(np.sqrt(np.mean((states[counts, 2] - reference.path[counts, 0]) ** 2)))
+    return np.asarray(states[:, 2] - reference.path[:, 0])
 
 
 def _mechanics(model: Machine, stroke_m: float, section: ControllerSection) -> Mechanics:
@@ -380,10 +383,19 @@ def _moved(edge: EdgeMap, z: FloatArray) -> FloatArray:
     return np.asarray(moved * np.minimum(1.0, most)[:, None])
 
 
-def _interval(errors: list[float], wrong: float, share: float) -> ErrorInterval:
-    """Of the errors of all draws, m; wrong: b of the file's head, which counts by this share."""
-    log = np.log(np.maximum(errors, 1e-12))
+def _rms(error_m: FloatArray) -> float:
+    return float(np.sqrt(np.mean(error_m**2)))
+
+
+def _logs(errors_m: list[FloatArray], counts: BoolArray) -> FloatArray:
+    """Logarithms of the rms errors of all draws (draws,)."""
+    return np.log([max(_rms(error[counts]), 1e-12) for error in errors_m])
+
+
+def _interval(log: FloatArray, shift: float, doubt_m: float) -> ErrorInterval:
+    """Of the logarithms of the draws' errors (draws,); shift, doubt_m: see the head of the file."""
     middle = float(np.median(log))
     spread = max(1.4826 * float(np.median(np.abs(log - middle))), REPEATED)
-    wide, middle = T_975 * np.hypot(spread, 0.5 * wrong), middle + share * wrong
+    middle += shift
+    wide = T_975 * np.hypot(spread, 0.5 * doubt_m / np.exp(middle))
     return ErrorInterval(*(float(x) for x in np.exp([middle, middle - wide, middle + wide])))

@@ -23,6 +23,7 @@ from rtid.apply.tracking import (
 )
 from rtid.cli import main
 from rtid.kernels.control_law import Mechanics
+from rtid.plain import FloatArray
 from rtid.project import load
 from rtid.project.errors import ProjectError
 from rtid.project.schema import ControllerSection
@@ -44,6 +45,10 @@ SECONDS = 8.0
 @pytest.fixture(scope="module")
 def tried() -> Tried:
     return machine(3, 30.0)
+
+
+def rms(error: FloatArray) -> float:
+    return float(np.sqrt(np.mean(error[len(error) // 2 :] ** 2)))
 
 
 def mechanics(tried: Tried) -> Mechanics:
@@ -75,7 +80,7 @@ def test_a_map_that_is_wrong_by_a_tenth_is_behind_by_a_tenth_of_the_speed(
     known = candidate(quiet, tried.learned)
     wrong = {k: replace(t, scale=0.9 * t.scale) for k, t in tried.new.items()}
     of = [
-        tracking_error(quiet, SECTION, mechanics(tried), known, tables, steady, missed, noise)
+        rms(tracking_error(quiet, SECTION, mechanics(tried), known, tables, steady, missed, noise))
         for tables in (tried.new, wrong)
     ]
     assert of[0] < 0.02 * abs(speed_mps) / KP_1PS
@@ -141,12 +146,12 @@ def test_what_cannot_be_run_is_said(tried: Tried, change: dict[str, Any], says: 
 
 def test_an_interval_contains_what_the_model_got_wrong() -> None:
     """Recorded 1 mm, foretold 2 mm: the held map's is that of the record, the new one's may be."""
-    log = float(np.log(0.5))
-    held = tracking._interval([2e-3] * 16, log, 1.0)
-    new = tracking._interval([1e-3] * 16, log, 0.5)
+    of = [np.log([rms_m] * 16) for rms_m in (2e-3, 1e-3)]
+    held = tracking._interval(of[0], -np.log(2), 1e-3)
+    new = tracking._interval(of[1], -0.5 * np.log(2), 1e-3)
     assert held.rms_m == pytest.approx(1e-3) and held.low_m < 1e-3 < held.high_m
     assert new.low_m < 0.5e-3 and new.high_m > 1e-3
-    plain = tracking._interval([1e-3] * 16, 0.0, 0.5)
+    plain = tracking._interval(of[1], 0.0, 0.0)
     assert [plain.rms_m, plain.low_m, plain.high_m] == pytest.approx(
         [1e-3, 1e-3 / 1.0435, 1.0435e-3], rel=1e-3
     )
