@@ -12,7 +12,7 @@ import pytest
 from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.published import publish
 from rtid.maps.datasheet import read_reference
-from rtid.maps.files import SAYS_FLOW, SCHEMA, MapFileError, read_map, write_map
+from rtid.maps.files import SCHEMA, TABLE_WRITERS, MapFileError, read_map, write_map
 from tests.flow_maps import machine, orifice, solved
 
 PROVENANCE = {"trace": "run.blf", "digest": "abc"}
@@ -49,7 +49,7 @@ def test_a_map_without_safe_band_round_trips(tmp_path: Path, suffix: str) -> Non
     assert read_map(tmp_path / f"map{suffix}")[0][0].safe_band_v == -np.inf
 
 
-@pytest.mark.parametrize("suffix", SAYS_FLOW)
+@pytest.mark.parametrize("suffix", TABLE_WRITERS)
 def test_a_format_that_cannot_say_the_unit_of_a_rate_is_refused(
     flowmap: FlowMap, tmp_path: Path, suffix: str
 ) -> None:

@@ -18,6 +18,7 @@ from firmware_bridge.samples import ROW, Samples
 from firmware_bridge.sources import read_table
 from rtid.cli.exits import Exit
 from rtid.cli.main import run
+from rtid.maps.flashed import read_flashed
 from rtid.project import load
 from rtid.project.guess import RoleCandidate
 from rtid.sim.hidden import hide_wish
@@ -142,7 +143,10 @@ def test_the_saved_project_says_the_same_in_every_other_command(
     run_ok("add", trace, "-p", project)
     assert [s.key for s in load(project).sections.added] == [(LEAK, "a-b")]
     run_ok("check", project, trace)
-    run_ok("export", trace, tmp_path / "maps.csv", "-p", project)
+    room = ("--bytes", 8000, "--sheet", tmp_path / "sheet.html")
+    run_ok("export", trace, tmp_path / "maps.dcm", "-p", project, *room)
+    assert sum(8 + m.flow_m3s.size for m in read_flashed(tmp_path / "maps.dcm")) < 4000
+    assert "internal_leakage_laminar" in (tmp_path / "sheet.html").read_text()
 
 
 def run_ok(*words: object) -> None:

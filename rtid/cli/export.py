@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -15,12 +16,28 @@ if TYPE_CHECKING:
     from rtid.estimator.flowmap import FlowMap
     from rtid.estimator.solution import Solution
     from rtid.estimator.validity import Doubt
+    from rtid.maps.gridded import Gridded, Tables
+    from rtid.maps.release import Room
     from rtid.project import Project
     from rtid.study.study import Study
 
 SNAPSHOT = ".npz"
 COMPLETE = (".json", ".npz", ".csv")  # for programs that read what a map stands on
 RECORDED = (".mf4", ".mcap")
+
+
+def _nodes(text: str | None) -> str | None:
+    """Two numbers with an x between them."""
+    if text is not None and (re.fullmatch(r"\d+x\d+", text) is None or min(_pair(text) or ()) < 2):
+        raise typer.BadParameter(f"{text!r} is no COMMANDSxDROPS, 16x12, of 2 or more each")
+    return text
+
+
+def _pair(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    commands, drops = text.split("x")
+    return int(commands), int(drops)
 
 
 def export(
@@ -40,14 +57,42 @@ def export(
     map_alone: Annotated[
         bool, typer.Option("--map", help="An FMU of the maps alone: pressures are its inputs.")
     ] = False,
+    tolerance: Annotated[
+        float | None,
+        typer.Option(
+            min=0.01,
+            max=50.0,
+            help="Per cent of the largest flow that a table may miss the map by (0.2).",
+        ),
+    ] = None,
+    nodes: Annotated[
+        str | None,
+        typer.Option(callback=_nodes, help="Most nodes of a table, commands x drops: 16x12."),
+    ] = None,
+    n_bytes: Annotated[
+        int | None,
+        typer.Option("--bytes", min=64, help="Most bytes of all tables, as 16-bit numbers."),
+    ] = None,
+    axes: Annotated[
+        Path | None,
+        typer.Option(help="Take the axes of these maps: .dcm, .cdfx or .csv."),
+    ] = None,
+    flashed: Annotated[
+        Path | None,
+        typer.Option(help="Tell the difference to these maps; --axes does it too."),
+    ] = None,
+    sheet: Annotated[
+        Path | None, typer.Option(help="Write a sheet to be signed (.html) of what is released.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print a summary as JSON.")] = False,
     no_cache: NoCache = False,
 ) -> None:
     """Write the learned maps: flow, standard deviation and status over command and pressure drop.
 
     CSV is a long table at the nodes and centres of the grid; JSON and npz hold everything; .mat, .m
-    (Simulink.LookupTable), .dcm and .cdfx (calibration tools) hold grids on which straight lines
-    miss no more than 0.1 % of the largest flow, with deviation and status; a C99 header holds
+    (Simulink.LookupTable), .dcm, .cdfx and .a2l (calibration tools), .mo and .st hold the smallest
+    grids on which straight lines miss no more than 0.2 % of the largest flow, with deviation and
+    status: --tolerance, --nodes, --bytes or --axes say otherwise; a C99 header holds
     look-up tables, float and fixed point, with their functions beside it; an FMU (co-simulation by
     FMI 2.0 or 3.0) holds the machine with its effects, bulk moduli and lag; packages bring more.
     A map of acceleration over pedal and speed is written as accel_map.csv, with brake_map.csv
@@ -58,59 +103,122 @@ def export(
     live.  Exit code 4: what was learned is impossible, or no block stands on data (but in .json,
     .npz and .csv), and nothing is written without --force.
     """
-    from rtid.errors import RtidError
-    from rtid.maps.c_header import SUFFIX, write_header
-    from rtid.maps.files import formats, provenance, write_map
-    from rtid.maps.fmu import SUFFIX as FMU
+    from rtid.maps.files import provenance
+    from rtid.maps.flashed import differences, read_flashed
     from rtid.maps.fmu import check_version
     from rtid.maps.prior_map import find_prior, said_of, with_prior
+    from rtid.maps.release import Room
+    from rtid.plain import plain
     from rtid.project import load
+    from rtid.tell.released import said
+    from rtid.tell.released import sheet as sheet_of
 
-    known = (*formats(), SUFFIX, FMU, *RECORDED)
-    if output.suffix.lower() not in known:
-        remedy = f"end its name in {', '.join(known)}"
-        raise RtidError(f"{output}: unknown format", remedy, exit_code=2)
+    there = axes or flashed
+    maps = read_flashed(there) if there else ()
+    share = 0.01 * tolerance if tolerance else None
+    room = Room(share, _pair(nodes), n_bytes, maps if axes else ())
+    _refuse_format(output, room.is_asked or sheet is not None)
     check_version(fmi)
     loaded = with_prior(load(project), prior_map)
     prior = find_prior(loaded)
     learned = _learned(loaded, source)
-    solution, flowmap, effects, invalid = learned[:4]
-    if invalid and not force:
+    solution, flowmap, effects = learned[:3]
+    cells = {e.name: int((e.status == "valid").sum()) for e in flowmap.edges}
+    if not force:
+        _refuse_unknown(source, output, learned, any(cells.values()) or prior is not None)
+    origin = provenance(solution, loaded.name, loaded.digest, source.name, effects)
+    tables = _written(output, loaded, learned, origin, room, fmi, map_alone)
+    changes = differences(flowmap, maps) if maps else []
+    if sheet is not None:
+        sheet.write_text(sheet_of(output.name, tables, changes, origin), "utf-8")
+    if as_json:
+        document = {"schema": 1, "written": str(output), "valid_blocks": cells, "effects": effects}
+        document |= {"tables": [_facts(g) for g in tables], "changed": plain(changes)}
+        print(json.dumps(document))
+        return
+    text = ", ".join(f"{name} {count}" for name, count in cells.items())
+    print(f"wrote {output}; valid blocks: {text}")
+    for line in said(tables, changes):
+        print(line)
+    print(_beside(effects, loaded))
+    if prior is not None:
+        print(said_of(prior, flowmap))
+
+
+def _refuse_format(output: Path, is_sized: bool) -> None:
+    """RtidError for a suffix that is none, or that holds no table whose size can be asked for."""
+    from rtid.errors import RtidError
+    from rtid.maps.c_header import SUFFIX
+    from rtid.maps.files import TABLE_WRITERS, formats
+    from rtid.maps.fmu import SUFFIX as FMU
+
+    suffix, known = output.suffix.lower(), (*formats(), SUFFIX, FMU, *RECORDED)
+    if suffix not in known:
+        remedy = f"end its name in {', '.join(known)}"
+        raise RtidError(f"{output}: unknown format", remedy, exit_code=2)
+    if is_sized and suffix not in TABLE_WRITERS:
+        remedy = (
+            f"end its name in {', '.join(TABLE_WRITERS)}; a header's tables follow "
+            "publish.error_percent of the project file"
+        )
+        raise RtidError(f"{output}: this format has no table of such a size", remedy, exit_code=2)
+
+
+def _refuse_unknown(source: Path, output: Path, learned: Exported, is_known: bool) -> None:
+    """RtidError for maps that are impossible, or that know nothing."""
+    from rtid.errors import RtidError
+
+    if learned.invalid:
         raise RtidError(
-            f"{source}: not exported, {'; '.join(doubt.text for doubt in invalid)}",
+            f"{source}: not exported, {'; '.join(doubt.text for doubt in learned.invalid)}",
             "--force writes it all the same",
             exit_code=4,
         )
-    cells = {e.name: int((e.status == "valid").sum()) for e in flowmap.edges}
-    if not (any(cells.values()) or prior or force or output.suffix.lower() in COMPLETE):
+    if not is_known and output.suffix.lower() not in COMPLETE:
         raise RtidError(
             f"{source}: not exported, no block of its maps stands on data",
             f"`rtid check` says what motion is missing; {', '.join(COMPLETE)} or --force write it",
             exit_code=4,
         )
-    origin = provenance(solution, loaded.name, loaded.digest, source.name, effects)
-    if output.suffix.lower() == SUFFIX:
-        percent = loaded.sections.publish.error_percent
-        write_header(output, loaded.model, flowmap, origin, percent)
-    elif output.suffix.lower() == FMU:
+
+
+def _written(
+    output: Path,
+    project: Project,
+    learned: Exported,
+    origin: dict[str, Any],
+    room: Room,
+    fmi: int,
+    map_alone: bool,
+) -> Tables:
+    """Write the file; the tables in it, none where its format has no plain ones."""
+    from rtid.errors import RtidError
+    from rtid.maps.c_header import SUFFIX, write_header
+    from rtid.maps.files import TABLE_WRITERS, write_map
+    from rtid.maps.fmu import SUFFIX as FMU
+    from rtid.maps.release import tables_for
+
+    suffix, tables = output.suffix.lower(), None
+    if suffix == SUFFIX:
+        percent = project.sections.publish.error_percent
+        write_header(output, project.model, learned.flowmap, origin, percent)
+    elif suffix == FMU:
         _write_fmu(output, learned, origin, fmi, map_alone)
-    elif output.suffix.lower() in RECORDED:
+    elif suffix in RECORDED:
         from rtid.tell.recorded import write_recorded
 
         if learned.study is None:
-            raise RtidError(f"{source}: holds no record over time", "export from a trace")
+            raise RtidError("a snapshot holds no record over time", "export from a trace")
         write_recorded(output, learned.study, origin)
     else:
-        write_map(output, flowmap, origin)
-    if as_json:
-        document = {"schema": 1, "written": str(output), "valid_blocks": cells, "effects": effects}
-        print(json.dumps(document))
-    else:
-        text = ", ".join(f"{name} {count}" for name, count in cells.items())
-        print(f"wrote {output}; valid blocks: {text}")
-        print(_beside(effects, loaded))
-        if prior is not None:
-            print(said_of(prior, flowmap))
+        tables = tables_for(learned.flowmap, room) if suffix in TABLE_WRITERS else None
+        write_map(output, learned.flowmap, origin, tables)
+    return tables or ()
+
+
+def _facts(table: Gridded) -> dict[str, Any]:
+    shape = {"nodes": list(table.flow_m3s.shape), "bytes": table.n_bytes}
+    return {"map": table.name, **shape, "off_by": table.miss}
 
 
 def _beside(effects: list[dict[str, Any]], project: Project) -> str:

@@ -14,8 +14,8 @@ from typing import Any
 
 from firmware_bridge.lookup import STATUS
 from rtid.errors import RtidError
-from rtid.estimator.flowmap import FlowMap
 from rtid.maps.calibration import CalibrationMap, calibration_maps, calibration_values
+from rtid.maps.gridded import Tables
 from rtid.plain import FloatArray
 
 LAYOUT_MAP, LAYOUT_VALUE = "rtid_map", "rtid_value"
@@ -28,12 +28,12 @@ class NoA2lError(RtidError):
     """Maps that an A2L cannot describe; the text names the map."""
 
 
-def write_a2l(path: Path, flowmap: FlowMap, provenance: Mapping[str, Any]) -> None:
+def write_a2l(path: Path, tables: Tables, provenance: Mapping[str, Any]) -> None:
     """Write the fragment.  Raises NoA2lError, OSError."""
-    path.write_text("\n".join(_lines(flowmap, provenance)) + "\n", encoding="utf-8")
+    path.write_text("\n".join(_lines(tables, provenance)) + "\n", encoding="utf-8")
 
 
-def _lines(flowmap: FlowMap, provenance: Mapping[str, Any]) -> Iterator[str]:
+def _lines(tables: Tables, provenance: Mapping[str, Any]) -> Iterator[str]:
     said = json.dumps(dict(provenance), sort_keys=True).replace("*/", "* /")
     yield "ASAP2_VERSION 1 71"
     yield f"/* Flow maps learned by rtid: {said} */"
@@ -58,7 +58,7 @@ def _lines(flowmap: FlowMap, provenance: Mapping[str, Any]) -> Iterator[str]:
         about = "effective bulk modulus"
         head = _head(_symbol(name, taken), about, "VALUE", LAYOUT_VALUE, unit, 0.0, 2 * value)
         yield f"{head} /end CHARACTERISTIC"
-    for table in calibration_maps(flowmap):
+    for table in calibration_maps(tables):
         yield from _map(table, _symbol(table.name, taken))
     yield "/end MODULE"
     yield "/end PROJECT"

@@ -16,8 +16,7 @@ from xml.etree import ElementTree as ET
 
 import rtid
 from firmware_bridge.lookup import STATUS
-from rtid.estimator.flowmap import FlowMap
-from rtid.maps.gridded import gridded
+from rtid.maps.gridded import Tables
 from rtid.plain import FloatArray
 from rtid.units import LPM, MPA
 
@@ -40,12 +39,12 @@ class CalibrationMap:
     y_v: FloatArray
 
 
-def write_dcm(path: Path, flowmap: FlowMap, provenance: Mapping[str, Any]) -> None:
+def write_dcm(path: Path, tables: Tables, provenance: Mapping[str, Any]) -> None:
     """Write a DCM file; values to seven digits."""
-    path.write_text("\n".join(_dcm(flowmap, provenance)) + "\n", encoding="utf-8")
+    path.write_text("\n".join(_dcm(tables, provenance)) + "\n", encoding="utf-8")
 
 
-def write_cdfx(path: Path, flowmap: FlowMap, provenance: Mapping[str, Any]) -> None:
+def write_cdfx(path: Path, tables: Tables, provenance: Mapping[str, Any]) -> None:
     """Write a CDF 2.0 file; values to seven digits."""
     root = ET.Element("MSRSW", {"CREATOR": "rtid", "CREATOR-VERSION": rtid.__version__})
     _text(root, "SHORT-NAME", "flow_maps")
@@ -60,17 +59,17 @@ def write_cdfx(path: Path, flowmap: FlowMap, provenance: Mapping[str, Any]) -> N
     _text(tree, "CATEGORY", "NO_VCD")
     for name, unit, value in calibration_values(provenance):
         _instance(tree, name, "effective bulk modulus", "VALUE", unit, [value])
-    for table in calibration_maps(flowmap):
+    for table in calibration_maps(tables):
         _map_instance(tree, table)
     ET.indent(root)
     body = ET.tostring(root, encoding="unicode")
     path.write_text(f'<?xml version="1.0" encoding="utf-8"?>\n{DOCTYPE}\n{body}\n', "utf-8")
 
 
-def calibration_maps(flowmap: FlowMap) -> Iterator[CalibrationMap]:
+def calibration_maps(tables: Tables) -> Iterator[CalibrationMap]:
     """Flow, deviation and status of every edge."""
     codes = ", ".join(f"{k} {word}" for k, word in enumerate(STATUS))
-    for g in gridded(flowmap):
+    for g in tables:
         name, axes = f"{g.name}_flow", (MPA * g.dp_pa, g.u_v)
         yield CalibrationMap(name, f"flow of {g.name}", "L/min", LPM * g.flow_m3s, *axes)
         about = f"standard deviation of {name}"
@@ -89,7 +88,7 @@ def _number(x: float) -> str:
     return f"{x:.7g}"
 
 
-def _dcm(flowmap: FlowMap, provenance: Mapping[str, Any]) -> Iterator[str]:
+def _dcm(tables: Tables, provenance: Mapping[str, Any]) -> Iterator[str]:
     yield "* Flow maps learned by rtid, bilinear between the nodes"
     for key, value in sorted(provenance.items()):
         yield f"* {key}: {json.dumps(value)}"
@@ -101,7 +100,7 @@ def _dcm(flowmap: FlowMap, provenance: Mapping[str, Any]) -> Iterator[str]:
         yield f'   EINHEIT_W "{unit}"'
         yield f"   WERT {_number(value)}"
         yield "END"
-    for table in calibration_maps(flowmap):
+    for table in calibration_maps(tables):
         yield ""
         yield f"KENNFELD {table.name} {len(table.x_mpa)} {len(table.y_v)}"
         yield f'   LANGNAME "{table.about}"'

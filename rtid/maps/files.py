@@ -25,6 +25,7 @@ from rtid.estimator.flowmap import VALID, EdgeMap, FlowMap
 from rtid.estimator.solution import Solution
 from rtid.maps.a2l import write_a2l
 from rtid.maps.calibration import write_cdfx, write_dcm
+from rtid.maps.gridded import Tables, gridded
 from rtid.maps.matlab import write_m, write_mat
 from rtid.maps.modelica import write_mo
 from rtid.maps.pedals import ACCEL, BRAKE, write_pedals
@@ -36,7 +37,6 @@ from rtid.trace.state_files import read_bytes
 SCHEMA = "rtid-flowmap/1"
 PLUGINS = "rtid.export"  # entry points of other packages: suffix = function, as in WRITERS
 FLOW_UNIT = "m3/s"
-SAYS_FLOW = (".mat", ".m", ".dcm", ".cdfx", ".a2l", ".mo", ".st")  # these cannot say another unit
 MAP_FILES = (".json", ".npz")  # what comes back with `read_map`
 UNITS = {"u_v": "V", "dp_pa": "Pa", "theta_m3s": "m3/s", "cov_m6s2": "m6/s2"}
 BASIS = "Taylor: 1, xi, eta, xi^2, eta^2, xi eta; xi and eta run from -1 to 1 over each block"
@@ -49,24 +49,36 @@ class MapFileError(RtidError):
 
 
 @door
-def write_map(path: str | Path, flowmap: FlowMap, provenance: Mapping[str, Any]) -> None:
-    """Write the map in the format that the file's suffix names; whole or not at all."""
+def write_map(
+    path: str | Path,
+    flowmap: FlowMap,
+    provenance: Mapping[str, Any],
+    tables: Tables | None = None,
+) -> None:
+    """Write the map in the format that the file's suffix names; whole or not at all.
+
+    tables: what a format of TABLE_WRITERS holds of it; None: the smallest that are close enough.
+    """
     path = Path(path)
     if path.name in (ACCEL, BRAKE):
         write_pedals(path, flowmap, provenance)
         return
-    write = writer_of(path.suffix.lower())
-    if write is None:
+    write_tables = TABLE_WRITERS.get(path.suffix.lower())
+    write = None if write_tables else writer_of(path.suffix.lower())
+    if write is None and write_tables is None:
         raise MapFileError(f"{path}: unknown format", f"end the name in {', '.join(formats())}")
     unit = provenance.get("flow_unit", FLOW_UNIT)
-    if unit != FLOW_UNIT and path.suffix.lower() in SAYS_FLOW:
+    if unit != FLOW_UNIT and write_tables is not None:
         raise MapFileError(
             f"{path}: this format says L/min or m3/s, and the map is in {unit}",
             "write .csv, .json, .npz or .fmu",
         )
     temporary = path.with_name(path.name + ".part")
     try:
-        write(temporary, flowmap, provenance)
+        if write_tables is not None:
+            write_tables(temporary, tables or gridded(flowmap), provenance)
+        elif write is not None:
+            write(temporary, flowmap, provenance)
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -74,7 +86,7 @@ def write_map(path: str | Path, flowmap: FlowMap, provenance: Mapping[str, Any])
 
 def formats() -> tuple[str, ...]:
     """Suffixes that can be written: the built-in ones, and those of plug-ins."""
-    return tuple(dict.fromkeys([*WRITERS, *entry_points(group=PLUGINS).names]))
+    return tuple(dict.fromkeys([*WRITERS, *TABLE_WRITERS, *entry_points(group=PLUGINS).names]))
 
 
 def writer_of(suffix: str) -> Writer | None:
@@ -245,6 +257,8 @@ WRITERS: dict[str, Writer] = {
     ".csv": _write_csv,
     ".json": _write_json,
     ".npz": _write_npz,
+}
+TABLE_WRITERS: dict[str, Callable[[Path, Tables, Mapping[str, Any]], None]] = {
     ".mat": write_mat,
     ".m": write_m,
     ".dcm": write_dcm,

@@ -13,30 +13,29 @@ from pathlib import Path
 from typing import Any
 
 from firmware_bridge.lookup import STATUS
-from rtid.estimator.flowmap import FlowMap
-from rtid.maps.gridded import Gridded, gridded
+from rtid.maps.gridded import Gridded, Tables
 from rtid.plain import FloatArray
 
 PER_LINE = 8
 
 
-def write_mat(path: Path, flowmap: FlowMap, provenance: Mapping[str, Any]) -> None:
+def write_mat(path: Path, tables: Tables, provenance: Mapping[str, Any]) -> None:
     """Write a MATLAB 5 file with one struct `maps`, a field per edge."""
     from scipy.io import savemat  # noqa: PLC0415 - only where a .mat file is wanted
 
-    edges = {_name(g.name): _arrays(g) for g in gridded(flowmap)}
+    edges = {_name(g.name): _arrays(g) for g in tables}
     texts = {"provenance": json.dumps(dict(provenance)), "status_codes": list(STATUS)}
     savemat(str(path), {"maps": edges | texts}, appendmat=False, oned_as="column")
 
 
-def write_m(path: Path, flowmap: FlowMap, provenance: Mapping[str, Any]) -> None:
+def write_m(path: Path, tables: Tables, provenance: Mapping[str, Any]) -> None:
     """Write a script that makes a Simulink.LookupTable per edge, and its deviation as a matrix."""
     lines = [
         "% Flow maps learned by rtid: command in V, pressure drop in Pa, flow in m3/s; "
         "NAME_flow_sd: its standard deviation, m3/s",
         f"% {json.dumps(dict(provenance), sort_keys=True)}",
     ]
-    for g in gridded(flowmap):
+    for g in tables:
         lines += _table(g)
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 

@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rtid.errors import RtidError
-from rtid.estimator.flowmap import FlowMap
-from rtid.maps.gridded import Gridded, gridded
+from rtid.maps.gridded import Gridded, Tables
 from rtid.plain import FloatArray
 
 PER_LINE = 8
@@ -38,19 +37,19 @@ class NoModelicaError(RtidError):
     """Maps that cannot become Modelica; the text names the edge."""
 
 
-def write_mo(path: Path, flowmap: FlowMap, provenance: Mapping[str, Any]) -> None:
+def write_mo(path: Path, tables: Tables, provenance: Mapping[str, Any]) -> None:
     """Write the package, called as its file.  Raises NoModelicaError, OSError."""
     name = _word(path.name.partition(".")[0])
-    lines = list(_lines(name, flowmap, provenance))
+    lines = list(_lines(name, tables, provenance))
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _lines(name: str, flowmap: FlowMap, provenance: Mapping[str, Any]) -> Iterator[str]:
+def _lines(name: str, tables: Tables, provenance: Mapping[str, Any]) -> Iterator[str]:
     said = json.dumps(dict(provenance), sort_keys=True).replace("\\", "\\\\").replace('"', '\\"')
     yield f'package {name} "Flow maps learned by rtid"'
     yield INDEX
     taken: set[str] = set()
-    for g in gridded(flowmap):
+    for g in tables:
         edge = _word(g.name)
         if edge in taken:
             raise NoModelicaError(f"edge {g.name}: another one is called {edge} too", "rename it")

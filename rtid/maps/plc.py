@@ -18,8 +18,7 @@ import numpy as np
 
 from firmware_bridge.lookup import OUTSIDE, SHUT, STATUS
 from rtid.errors import RtidError
-from rtid.estimator.flowmap import FlowMap
-from rtid.maps.gridded import Gridded, gridded
+from rtid.maps.gridded import Gridded, Tables
 from rtid.plain import FloatArray
 
 PER_LINE = 8
@@ -36,20 +35,20 @@ class NoPlcError(RtidError):
     """Maps that a PLC cannot hold; the text names the edge."""
 
 
-def write_st(path: Path, flowmap: FlowMap, provenance: Mapping[str, Any]) -> None:
+def write_st(path: Path, tables: Tables, provenance: Mapping[str, Any]) -> None:
     """Write the function blocks, and the tables beside.  Raises NoPlcError, OSError."""
     stem = path.name.partition(".")[0]
     said = json.dumps(dict(provenance), sort_keys=True).replace("*)", "* )")
-    blocks, tables = [f"(* Flow maps learned by rtid: {said} *)"], dict[str, str]()
-    for g in gridded(flowmap):
+    blocks, beside = [f"(* Flow maps learned by rtid: {said} *)"], dict[str, str]()
+    for g in tables:
         name = re.sub(r"\W", "_", g.name, flags=re.ASCII)
         if g.flow_m3s.size > MOST_ELEMENTS:
             raise NoPlcError(f"edge {g.name}: {g.flow_m3s.size} nodes", "a coarser grid has fewer")
-        if f"{stem}_{name}.csv" in tables:
+        if f"{stem}_{name}.csv" in beside:
             raise NoPlcError(f"edge {g.name}: another one is called {name} too", "rename it")
         blocks += _block(name, g)
-        tables[f"{stem}_{name}.csv"] = "\n".join(_table(g)) + "\n"
-    for name, text in tables.items():
+        beside[f"{stem}_{name}.csv"] = "\n".join(_table(g)) + "\n"
+    for name, text in beside.items():
         part = path.with_name(name + ".part")
         part.write_text(text, "utf-8")
         os.replace(part, path.with_name(name))
