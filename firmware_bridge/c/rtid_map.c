@@ -23,6 +23,7 @@ static place locate(const float *node, unsigned n, float x)
         at.cell += (node[at.cell + half] <= within) ? half : 0u;
         left -= half;
     }
+    at.cell = inner(at.cell, n);
     at.share = (within - node[at.cell]) / (node[at.cell + 1u] - node[at.cell]);
     return at;
 }
@@ -84,6 +85,7 @@ int rtid_map_command(const rtid_map *map, float q, float dp, float *u)
         *u = (float)map->direction * map->u[at_u.cell];
         return RTID_MAP_NONE;
     }
+    at_u.cell = inner(at_u.cell, map->nu);
     low = flow_at(&flow, at_u.cell);
     high = flow_at(&flow, at_u.cell + 1u);
     at_u.share = (high > low) ? ((flow.count - low) / (high - low)) : 0.0f;

@@ -26,6 +26,7 @@ static place locate(const int32_t *node, unsigned n, int32_t x)
         at.cell += (node[at.cell + half] <= within) ? half : 0u;
         left -= half;
     }
+    at.cell = inner(at.cell, n);
     width = (int64_t)node[at.cell + 1u] - node[at.cell];
     at.share = (((int64_t)within - node[at.cell]) * ONE) / width;
     return at;
@@ -50,6 +51,7 @@ static int32_t root(int32_t dp)
             found >>= 1;
         }
     }
+    found &= 0x3FFFFFu; /* the root of 2^43 has 22 bits */
     return (dp < 0) ? -(int32_t)found : (int32_t)found;
 }
 
@@ -100,6 +102,7 @@ int rtid_map_fixed_command(const rtid_map_fixed *map, int32_t q, int32_t dp, int
         *u = map->direction * map->u[at_u.cell];
         return RTID_MAP_NONE;
     }
+    at_u.cell = inner(at_u.cell, map->nu);
     low = flow_at(&flow, at_u.cell);
     high = flow_at(&flow, at_u.cell + 1u);
     w = (high > low) ? (((flow.count - low) * ONE) / (high - low)) : 0;

@@ -25,6 +25,9 @@ typedef struct {
     number sign, count;
 } wanted;
 
+/* A cell of n nodes: it is one already, and with this line any reader sees it, a prover too. */
+static unsigned inner(unsigned cell, unsigned n) { return (cell < (n - 2u)) ? cell : (n - 2u); }
+
 /* The flow at node k of u, between two nodes of s. */
 static number along_s(const table *map, unsigned k, const place *s);
 
