@@ -3,7 +3,7 @@
 
 #include <string.h>
 
-enum { SYS_OPEN = 0x01, SYS_WRITE = 0x05, SYS_READ = 0x06, SYS_EXIT_EXTENDED = 0x20 };
+enum { SYS_OPEN = 0x01, SYS_CLOSE = 0x02, SYS_WRITE = 0x05, SYS_READ = 0x06, SYS_EXIT_EXTENDED = 0x20 };
 enum { APPLICATION_EXIT = 0x20026 };
 
 extern uint32_t stack_end, data_load, data_start, data_end, bss_start, bss_end;
@@ -36,6 +36,12 @@ void board_write(int file, const void *bytes, size_t n)
     (void)host(SYS_WRITE, words);
 }
 
+void board_close(int file)
+{
+    const uint32_t words[] = {(uint32_t)file};
+    (void)host(SYS_CLOSE, words);
+}
+
 void board_exit(int code)
 {
     const uint32_t words[] = {APPLICATION_EXIT, (uint32_t)code};
@@ -52,6 +58,16 @@ void board_count(void)
     systick[0] = 5; /* on, from the processor's clock */
 }
 
+void board_every_ms(void)
+{
+    volatile uint32_t *systick = (volatile uint32_t *)0xE000E010u;
+    systick[1] = BOARD_MS;
+    systick[2] = 0;
+    systick[0] = 7; /* and an interrupt at zero */
+}
+
+__attribute__((weak)) void board_tick(void) {} /* for programs that have none */
+
 static void fault(void) { board_exit(99); }
 
 void reset(void)
@@ -67,4 +83,5 @@ void reset(void)
 __attribute__((section(".vectors"), used)) static const void *const VECTORS[16] = {
     &stack_end,          (void *)(uintptr_t)reset, (void *)(uintptr_t)fault, (void *)(uintptr_t)fault,
     (void *)(uintptr_t)fault, (void *)(uintptr_t)fault, (void *)(uintptr_t)fault,
+    [15] = (void *)(uintptr_t)board_tick,
 };
