@@ -41,7 +41,7 @@ STRANGERS = {
     "excavator_manual_1016_1735.csv": BOOM,
     "excavator_manual_mitch_1101_2319.csv": BOOM,
     "excavator_manual_ol_1006_1648.csv": BOOM | {"x": ("x_boom_mm", "mm")},
-    "mr_damper.csv": {"v": ("v_cm_s", "cm/s")},
+    "mr_damper.csv": {"u": ("v_cm_s", "cm/s"), "x": ("F_N", "N")},
     "quadrotor_thrust.parquet": {f"u{k}": (f"motor_{k}", "PWM") for k in (1, 2, 3, 4)}
     | {"x": ("acc_z_g", "g")},
     **{f"seal_oring_{p}bar.csv": {"x": ("x_mm", "mm")} for p in (1, 3, 5)},

@@ -14,7 +14,7 @@ from rtid.kernels import engine as kernel
 from rtid.kernels import housekeeping, layout
 from rtid.kernels.engine import ROW_FLAG
 from rtid.kernels.recent import move_pairs
-from rtid.model import BASES, BOTH, COMMAND_ONLY, DROP_ONLY, SHAPES, Edge, Machine
+from rtid.model import BASES, BOTH, COMMAND, COMMAND_ONLY, DROP_ONLY, SHAPES, Edge, Machine
 from rtid.plain import FloatArray, IntArray
 
 RecordArray = NDArray[np.void]
@@ -239,6 +239,7 @@ def _configure(e: np.void, model: Machine) -> None:
 def _configure_edge(e: np.void, model: Machine, i: int, edge: Edge, first_cell: int) -> None:
     e["source"][i], e["sink"][i] = _column(model, edge.source), _column(model, edge.sink)
     e["command"][i], e["direction"][i] = model.column(edge.command), edge.direction
+    e["is_sampled"][i] = model.signals[model.column(edge.command)].kind != COMMAND
     e["modes"][i] = sum(1 << m for m in edge.modes) if edge.modes else -1
     e["map_basis"][i] = BASES.index(edge.basis)
     e["mask"][i] = MASKS[edge.terms]

@@ -12,7 +12,7 @@ import numpy as np
 
 from rtid.estimator.state import Weights, build
 from rtid.kernels.layout import RESTART_MEMORY
-from rtid.model import TAYLOR, Edge, Machine
+from rtid.model import COMMAND, TAYLOR, Edge, Machine
 from rtid.plain import BoolArray, FloatArray, IntArray
 
 ROW, GAP = 1, 2  # flags of a sample, as in firmware_bridge.samples
@@ -59,7 +59,7 @@ def follow(
             stamped = t_s[k] if np.isfinite(t_s[k]) else _last_usable(t_s, usable, k)
             ready = stamped + model.gates.recovery_s
         if running and not broken:
-            command = _held(model, values[k - 1])
+            command = _held(model, values[k - 1], values[k])
             mean, last = _lagged(command, w, weights.lag_s, t_s[k] - t_s[k - 1])
             before = cell
             cell, home, inside = _cells(model, values[k - 1 : k + 1], mean, cell)
@@ -101,9 +101,15 @@ def _last_usable(t_s: FloatArray, usable: BoolArray, k: int) -> float:
     return float(t_s[before[-1]]) if len(before) else 0.0
 
 
-def _held(model: Machine, sample: FloatArray) -> FloatArray:
-    """Command of each edge (edges,); zero in a mode that keeps it shut."""
+def _held(model: Machine, sample: FloatArray, after: FloatArray | None = None) -> FloatArray:
+    """Command of each edge (edges,); zero in a mode that keeps it shut.
+
+    after (signals,): the next sample, to which a command that is a measurement goes straight.
+    """
     mode = int(sample[model.column(model.mode)]) if model.mode else 0
+    if after is not None:
+        is_held = np.array([signal.kind == COMMAND for signal in model.signals])
+        sample = np.where(is_held, sample, 0.5 * (sample + after))
     return np.array(
         [
             0.0

@@ -294,6 +294,9 @@ def working_points(e: Any, sample: FloatArray, dt: float) -> tuple[bool, bool]:
     inside, moved, moments, dp, target = True, False, e.moments, e.dp_pa, e.target
     for i in range(e.n_edges):
         u = commanded(e, i)
+        if e.is_sampled[i] != 0:
+            j = e.command[i]
+            u += 0.5 * e.direction[i] * (sample[2 + j] - e.values[j])
         end, m1, m2, mt = lagged_moments(u, e.w_v[i], e.lag_s, e.lag_decay, dt)
         e.held_v[i], e.start_v[i], e.w_v[i] = u, e.w_v[i], end
         iu, ip = SHUT, e.cell[i, 1]

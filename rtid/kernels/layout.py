@@ -78,6 +78,7 @@ ENGINE = np.dtype(
         ("source", _I, (MAX_EDGES,)),
         ("sink", _I, (MAX_EDGES,)),
         ("command", _I, (MAX_EDGES,)),
+        ("is_sampled", _I, (MAX_EDGES,)),  # its command is a measurement: linear between samples
         ("mode_column", _I),
         ("modes", _I, (MAX_EDGES,)),  # bit m: the edge may open in mode m
         ("owner", _I, (MAX_EDGES,)),  # the edge whose map it has

@@ -343,7 +343,9 @@ def _map(name: str, part: MapSection, sections: Sections) -> Iterator[Edge]:
     factor = unit_of(sections.signals[sections.rate.signal], None).factor
     over = unit_of(sections.signals[part.over], None) if part.over else None
     borders = NO_BORDERS if over is None else [over.si(v) for v in part.over_grid or ()]
-    grid = Grid(np.array(part.u_grid_v), np.array(borders))
+    of = unit_of(sections.signals[part.all_commands[0]], None)
+    along = part.u_grid_v or [of.si(v) for v in part.grid or ()]
+    grid = Grid(np.array(along), np.array(borders))
     first, *others = part.all_commands
     edge = Edge(
         name=name, source=part.over or NONE, sink=NONE, command=first, direction=1,

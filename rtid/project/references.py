@@ -35,7 +35,6 @@ REFERENCES = {
     ("edges", "source"): "pressure",
     ("edges", "sink"): "pressure",
     ("edges", "command"): "command",
-    ("maps", "command"): "command",
 }
 TEXT_KEYS = {
     *("dbc", "message", "signal", "column", "unit", "kind", "counter", "crc", "of"),
@@ -225,8 +224,18 @@ def _map_commands(
         remedy = 'write command = "u", or commands = ["u1", "u2"] where several share the map'
         yield Problem(f"{path}.command", problem, remedy)
     named = several if isinstance(several, list) else []
+    written = key_of(part, "u_grid")
+    if (written in part) == ("grid" in part):
+        problem = "given twice" if "grid" in part else "missing"
+        remedy = "add u_grid_v = [-10.0, 0.0, 10.0], or grid in the unit of what is no command"
+        yield Problem(f"{path}.u_grid", problem, remedy)
+    places = {f"{path}.commands[{k}]": str(name) for k, name in enumerate(named)}
+    if isinstance(part.get("command"), str):
+        places[f"{path}.command"] = str(part["command"])
+    for place, name in places.items():
+        kind = kinds.get(name) if "grid" in part else None
+        yield from _reference(place, name, kind or "command", kinds)
     for k, name in enumerate(named):
-        yield from _reference(f"{path}.commands[{k}]", str(name), "command", kinds)
         if name in named[:k]:
             yield Problem(f"{path}.commands[{k}]", f"{name!r} is there twice", "name it once")
         if f"{path}_{name}".removeprefix("maps.") in tables(raw, "maps"):

@@ -227,13 +227,15 @@ class RateSection(Section):
 class MapSection(Section):
     """[maps.NAME]: a part f(command) of the rate, or f(command, over) of a second signal.
 
-    commands: several that share the map, each of which adds its own f.  over_grid is in the unit of
-    that signal, rated, its usual size, in that of the state per second, or of what is measured.
+    commands: several that share the map, each of which adds its own f.  grid: borders of a command
+    that is none, a velocity for instance, in its own unit.  over_grid is in the unit of that
+    signal, rated, its usual size, in that of the state per second, or of what is measured.
     """
 
     command: str | None = None
     commands: Annotated[tuple[str, ...], BeforeValidator(_tuple)] = ()
-    u_grid_v: Annotated[Borders, COMMAND] = Field(description="u_grid_v = [-10.0, 0.0, 10.0]")
+    u_grid_v: Annotated[Borders | None, COMMAND] = None
+    grid: Borders | None = None
     over: str | None = None
     over_grid: Borders | None = None
     rated: float = Field(gt=0, description="rated = 50, the usual size, state's unit per second")

@@ -36,7 +36,7 @@ from rtid.trace.quick_source import Source
 from rtid.units import COMMAND_DIMENSIONS, find_unit, words_of
 
 SCHEMA = 1
-MEASURED = ("acceleration", "force")
+MEASURED, FLOWING = ("acceleration", "force"), ("velocity",)  # forces over a velocity: a damper's
 STATES = ("length", "velocity", "angle", "rotation", "temperature")
 DRIVES = {"u", "cmd", "command", "valve", "spool", "pwm", "duty", "motor", "throttle", "lever"}
 MOVES = {"x", "pos", "position", "v", "speed", "velocity", "angle", "omega", "temp", "temperature"}
@@ -47,7 +47,7 @@ LEAST_SHARE = 0.1  # of the rate's variance that a command must explain
 BLOCKS = 13  # of the map
 LEAST_ROWS, LEAST_VALUES = 15, 5  # samples that a block needs, and different commands
 FAIR, ROOM = 0.05, 0.05  # share of the moving commands in a block; of the range, beyond it
-HELD_OUT_OF_MEASURED = 0.5  # of the motion: a measured rate has rows enough
+HELD_OUT_OF_MEASURED, LONG_S = 0.5, 40.0  # of the motion: a measured rate has rows enough by then
 GAP_STEPS = 5.0  # usual steps: a longer one is a gap
 MAX_SD_SHARE = 0.05  # of the largest rate: known worse than this is not valid
 
@@ -113,6 +113,11 @@ def pairs_of(path: Path, source: Source, given: Mapping[str, RoleCandidate]) -> 
                 pair = _measured_pair(table.columns, command, more, state)
                 if pair.share > LEAST_SHARE:
                     made.append((0, False, pair.share, pair))
+    for command in _candidates(source.signals, given.get("u"), FLOWING, set(), "v"):
+        for state in _candidates(source.signals, given.get("x"), MEASURED, set(), "x"):
+            pair = _measured_pair(table.columns, command, (), state)
+            if pair.share > LEAST_SHARE:
+                made.append((0, False, pair.share, pair))
     best: list[RatePair] = []
     for *_, pair in sorted(made, key=lambda m: m[:3], reverse=True):
         taken = {command.name for other in best for command in other.commands}
@@ -201,7 +206,8 @@ def rate_text(name: str, path: Path, source: Source, pair: RatePair) -> str:
     u = us.ravel()
     step_s = float(np.median(np.diff(t_s)))
     unit = find_unit(pair.command.unit)
-    key = unit.key if unit else "v"
+    key = f"u_grid_{unit.key}" if unit else "u_grid_v"
+    key = "grid" if unit and unit.dimension in FLOWING else key
     rows_hz = min(50.0, 1.0 / step_s)
     state: dict[str, Any] = {"column": pair.state.name, "unit": pair.state.unit}
     if _is_angle(pair.state):
@@ -210,7 +216,8 @@ def rate_text(name: str, path: Path, source: Source, pair: RatePair) -> str:
     moved, size = x, np.abs(slope_of(t_s, x))
     if pair.is_measured:
         state["noise"], moved, size = 0.0, us.sum(axis=1), np.abs(x) / us.shape[1]
-    held_out = HELD_OUT_OF_MEASURED if pair.is_measured else HELD_OUT_SHARE
+    is_long = pair.is_measured and t_s[-1] > LONG_S
+    held_out = HELD_OUT_OF_MEASURED if is_long else HELD_OUT_SHARE
     split = held_out_from(t_s, moved, held_out)
     commands = {name: c for name, c in pair.roles.items() if name != "x"}
     offset: dict[str, Any] = {} if pair.is_measured else {"offset": "estimate"}
@@ -228,7 +235,7 @@ def rate_text(name: str, path: Path, source: Source, pair: RatePair) -> str:
         "maps": {
             "f": {
                 **({"commands": list(commands)} if pair.more else {"command": "u"}),
-                f"u_grid_{key}": _grid_of_measured(us) if pair.is_measured else _grid(u),
+                key: _grid_of_measured(us) if pair.is_measured else _grid(u),
                 "rated": _three(max(float(np.quantile(size, 0.99)), 1e-9)),
                 "basis": "blended",
             }

@@ -15,7 +15,7 @@ from rtid.estimator.factor import PRIOR_SD, SHARED_PRIOR, factorize
 from rtid.estimator.solution import solve
 from rtid.estimator.state import State, build
 from rtid.estimator.sums import Normal, normal_equations
-from rtid.model import BLENDED, TAYLOR
+from rtid.model import BLENDED, TAYLOR, VELOCITY
 from tests.estimator.cases import Case, draw_case, plant_case
 
 FORMS = ("integral", "carry")
@@ -160,3 +160,11 @@ def test_one_map_of_several_commands(seed: int, basis: str) -> None:
     assert model.n_cells == case.model.n_cells
     counted = {int(b["edge"]) for b in accumulated(shared)[1].blocks if b["rows"] > 0}
     assert counted and not counted & {1, len(model.edges) - 1}
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_map_over_a_measurement(seed: int) -> None:
+    """A velocity, say, is linear between its samples, where a command is held."""
+    case = draw_case(400 + seed, "integral", chambers=1)
+    kinds = [replace(s, kind=VELOCITY) if s.name == "u" else s for s in case.model.signals]
+    check(replace(case, model=replace(case.model, signals=tuple(kinds))))

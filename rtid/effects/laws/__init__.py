@@ -12,6 +12,7 @@ from importlib import import_module
 
 from rtid.effects.column import Candidate, Cause, by_equation
 from rtid.effects.law import needs_no_pressure, places_of
+from rtid.effects.laws.friction import dahl
 from rtid.effects.laws.lines import lines
 from rtid.effects.laws.openings import opening
 from rtid.effects.laws.response import map_lag
@@ -34,6 +35,7 @@ NAMED: dict[str, Law] = {
     "late_pressure": late_pressure,
     "late_position": late_position,
     "map_lag": map_lag,
+    "dahl": dahl,
 }
 
 
