@@ -76,6 +76,34 @@ def test_wrong_usage(arguments: list[str]) -> None:
     assert ends(arguments) == Exit.USAGE
 
 
+ORDERS = {
+    "replay run.blf -p m.toml": "replay run.blf -p m.toml",
+    "replay m.toml -p run.blf": "replay run.blf -p m.toml",
+    "diagnose m.toml run.blf --json": "diagnose run.blf --json -p m.toml",
+    "add --project run.blf leak m.toml": "add --project m.toml leak run.blf",
+    "compare run.blf -p a.toml --against b.toml": "compare run.blf -p a.toml --against b.toml",
+    "compare run.blf --against b.toml": "compare run.blf --against b.toml",
+    "run m.toml": "run m.toml",
+    "refit plant.toml t.csv": "refit plant.toml t.csv",
+    "": "",
+}
+
+
+@pytest.mark.parametrize("words", ORDERS)
+def test_a_project_in_a_trace_s_place_is_recognised(words: str) -> None:
+    assert " ".join(main.in_order(words.split())) == ORDERS[words]
+
+
+@pytest.mark.parametrize("words", ["check run.blf", "check a.toml b.toml", "ui a.csv b.csv"])
+def test_what_is_no_trace_and_project_is_told_so(
+    words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main.run(words.split())
+    assert ended.value.code == Exit.USAGE
+    assert "-p PROJECT" in capsys.readouterr().err
+
+
 def test_every_listed_command_has_its_function() -> None:
     for name in main.COMMANDS:
         if find_spec(f"rtid.cli.{name}"):

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rtid.cli.exits import Exit, refuse_truncated
-from rtid.cli.options import AsJson, NoCache, UnitsOption
+from rtid.cli.options import AsJson, NoCache, UnitsOption, told_apart
+from rtid.errors import RtidError
 from rtid.plain import Progress, plain
 from rtid.units import System, scale_of, with_unit
 
@@ -29,8 +30,14 @@ TIMING_HEADS = ("count|", "median|", "1 %|", "99 %|", "worst|", "gaps|")
 
 
 def check(
-    project: Annotated[Path, typer.Argument(help="Project file; with --bus-only the capture.")],
-    trace: Annotated[Path | None, typer.Argument(help="CAN log or table to judge it by.")] = None,
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="[TRACE] [PROJECT]",
+            help="CAN log or table, and project file; with --bus-only the capture.",
+        ),
+    ],
+    project: Annotated[Path | None, typer.Option("--project", "-p", help="Project file.")] = None,
     bus_only: Annotated[
         bool, typer.Option("--bus-only", help="No project: judge a raw capture, id by id.")
     ] = False,
@@ -45,10 +52,16 @@ def check(
     excite.  Exit code 4 if the trace would be learnt wrongly.
     """
     if bus_only:
-        _check_bus(project, dbc, as_json)
+        _check_bus(files[0], dbc, as_json)
         return
     from rtid.project import load
 
+    trace, project = told_apart(files, project, "check")
+    if project is None:
+        remedy = (
+            f"rtid check {trace} -p PROJECT; `rtid quick {trace} --save machine.toml` writes one"
+        )
+        raise RtidError(f"{trace}: judged by which project?", remedy, Exit.USAGE)
     loaded = load(project)
     if trace is None:
         _print_project(loaded, as_json)
@@ -272,7 +285,7 @@ def _print_project(project: Project, as_json: bool) -> None:
         return
     declared = ", ".join(f"{n} {what}" for what, n in counts.items())
     print(f"{project.path}: {project.name} is valid: {declared}.")
-    print("Name a trace to judge it by: rtid check PROJECT TRACE")
+    print("Name a trace to judge it by: rtid check TRACE -p PROJECT")
 
 
 def _print_report(report: Report, project: Project) -> None:

@@ -53,7 +53,7 @@ def init(
         print(f"Not used: {', '.join(c.full_name for c in rest)}")
     try:
         load(output)
-        print("It is complete. Next: rtid check PROJECT TRACE")
+        print("It is complete. Next: rtid check TRACE -p PROJECT")
     except ProjectError as error:
         print("Still missing:")
         for problem in error.problems:

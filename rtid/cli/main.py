@@ -20,6 +20,7 @@ import rtid
 from rtid.cli.exits import Exit
 from rtid.cli.teaching import EXAMPLES, GUIDE, panel
 
+TAKE_BOTH = ("replay", "compare", "diagnose", "add", "drop", "report", "export")
 COMMANDS = {
     "demo": "Learn the maps of a simulated machine from its CAN frames: the whole story.",
     "quick": "Judge a file without a project file: good enough, and what is missing.",
@@ -106,9 +107,28 @@ def _refuse(message: str, remedy: str, code: int) -> NoReturn:
     sys.exit(code)
 
 
+def in_order(words: Sequence[str]) -> list[str]:
+    """The words of a command as `TRACE -p PROJECT`, where a project stands in a trace's place."""
+    kept = list(words)
+    if not kept or kept[0] not in TAKE_BOTH:
+        return kept
+    tomls = [k for k in range(1, len(kept)) if _is_project(kept[k]) and kept[k - 1][:1] != "-"]
+    named = [k + 1 for k, word in enumerate(kept[:-1]) if word in ("-p", "--project")]
+    if len(tomls) != 1 or any(_is_project(kept[k]) for k in named):
+        return kept
+    if named:
+        kept[tomls[0]], kept[named[0]] = kept[named[0]], kept[tomls[0]]
+        return kept
+    return [*kept[: tomls[0]], *kept[tomls[0] + 1 :], "-p", kept[tomls[0]]]
+
+
+def _is_project(word: str) -> bool:
+    return word.lower().endswith(".toml")
+
+
 def run(arguments: Sequence[str]) -> NoReturn:
     """Run one command line of `rtid` and exit; an argument `-` is the standard input."""
-    with _with_stdin(arguments) as words:
+    with _with_stdin(in_order(arguments)) as words:
         carry_out(build(words), words, "rtid")
 
 

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from rtid.cli.exits import Exit
+from rtid.errors import RtidError
 from rtid.units import System, show_in
 
 
@@ -64,6 +66,20 @@ TracesArgument = Annotated[
         "record.held_out of the project names."
     ),
 ]
+
+
+def told_apart(
+    files: list[Path], project: Path | None, command: str
+) -> tuple[Path | None, Path | None]:
+    """Trace and project of a command, whichever comes first: a project is a .toml."""
+    projects = [f for f in files if f.suffix.lower() == ".toml"] + ([project] if project else [])
+    traces = [f for f in files if f.suffix.lower() != ".toml"]
+    if len(projects) > 1 or len(traces) > 1:
+        remedy = f"rtid {command} TRACE -p PROJECT, the project a .toml"
+        raise RtidError("more than one trace or project", remedy, Exit.USAGE)
+    return next(iter(traces), None), next(iter(projects), None)
+
+
 ProjectOption = Annotated[Path, typer.Option("--project", "-p", help="Project file.")]
 PriorOption = Annotated[
     Path | None,

@@ -16,7 +16,7 @@ EXAMPLES = {
     "demo": "rtid demo --pictures pictures",
     "quick": "rtid quick run.blf --dbc machine.dbc --bore 63 --rod 36 --stroke 500 --save m.toml",
     "init": "rtid init machine.dbc -o machine.toml",
-    "check": "rtid check machine.toml run.blf",
+    "check": "rtid check run.blf -p machine.toml",
     "simulate": "rtid simulate run.blf --plant 3 --motion rich_record --hide backlash=middle",
     "replay": "rtid replay run.blf -p machine.toml --pictures pictures",
     "compare": "rtid compare run.blf -p machine.toml --map data_sheet.csv --span 12:15",

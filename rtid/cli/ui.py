@@ -8,7 +8,8 @@ from typing import Annotated
 
 import typer
 
-from rtid.cli.exits import Exit, refuse_without_bokeh
+from rtid.cli.exits import refuse_without_bokeh
+from rtid.cli.options import told_apart
 from rtid.errors import RtidError
 
 
@@ -43,7 +44,7 @@ def ui(
     and loads nothing from anywhere else.  Of several browsers one works, the others follow.  From
     another machine: ssh -L 5006:127.0.0.1:5006 DEVICE.  Ctrl-C, SIGTERM and SIGHUP end it.
     """
-    trace, project = _told_apart(files or [], project)
+    trace, project = told_apart(files or [], project, "ui")
     for path in (project, trace):
         if path is not None and not path.exists():
             raise RtidError(f"{path}: no such file", "rtid ui TRACE -p PROJECT")
@@ -69,15 +70,6 @@ def ui(
             port=port,
             sheet=sheet,
         )
-
-
-def _told_apart(files: list[Path], project: Path | None) -> tuple[Path | None, Path | None]:
-    """Trace and project, whichever comes first."""
-    projects = [f for f in files if f.suffix.lower() == ".toml"] + ([project] if project else [])
-    traces = [f for f in files if f.suffix.lower() != ".toml"]
-    if len(projects) > 1 or len(traces) > 1:
-        raise RtidError("more than one trace or project", "rtid ui TRACE -p PROJECT", Exit.USAGE)
-    return next(iter(traces), None), next(iter(projects), None)
 
 
 def _doorstep(url: str, folder: Path) -> Path:
