@@ -36,6 +36,8 @@ def lines(quick: Quick, saved: Path | None = None) -> Iterator[str]:
         yield f"  {role:9} {candidate.full_name} [{candidate.unit}{guessed}]"
     if quick.unused:
         yield f"Not used: {', '.join(quick.unused)}"
+    nu, nd = len(quick.machine.u_grid) - 1, len(quick.machine.dp_grid_pa) - 1
+    yield f"Maps on {nu} x {nd} blocks a valve, over what the record reaches."
     yield ""
     yield "Assumed, and what is wrong if it is not so:"
     for assumption in quick.assumptions:
