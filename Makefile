@@ -23,7 +23,7 @@ bench: $(READY)
 	.venv/bin/python -m pytest -q -s benchmarks --benchmark-json=out/bench.json
 	.venv/bin/python -m benchmarks.table
 
-# Ours beside a dozen other methods, on the same records, into docs/benchmark.md: an hour on one core.
+# Ours beside a dozen other methods, on the same records, into docs/benchmark.md: 40 minutes on a core of its own.
 # A second seed, on other simulators' machines, says whether the order of the methods holds.
 benchmark-missing: $(READY)
 	@$(PIP) install -qq --no-deps -r requirements-benchmark.lock

@@ -54,10 +54,10 @@ def write_records(folder: Path, seed: int, size: str, plants: Iterable[str]) -> 
     return cases
 
 
-def run_method(folder: Path, name: str) -> None:
+def run_method(folder: Path, name: str, most: int) -> None:
     """One method in a process of its own, on one thread."""
     single = {f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "MKL", "OMP", "NUMBA")}
-    command = [sys.executable, "-m", "benchmarks.missing.collect", str(folder), name]
+    command = [sys.executable, "-m", "benchmarks.missing.collect", str(folder), name, str(most)]
     subprocess.run(command, check=True, timeout=MOST_S, env=os.environ | single)
 
 
@@ -126,13 +126,16 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("out/missing"))
     parser.add_argument("--files", default=",".join(FILES), help="of benchmarks/missing/methods")
     parser.add_argument("--plants", default=",".join(PLANTS), help="of benchmarks/missing/plants")
+    parser.add_argument(
+        "--most", type=int, default=1000, help="records, of those drawn by lot; 0: what is there"
+    )
     given = parser.parse_args()
     folder, began = given.out / str(given.seed), time.monotonic()
     cases = write_records(folder, given.seed, given.size, given.plants.split(","))
     print(f"{len(cases)} records, {time.monotonic() - began:.0f} s", flush=True)
     names = list(methods_of(tuple(given.files.split(","))))
-    for name in names:
-        run_method(folder, name)
+    for name in names if given.most else ():
+        run_method(folder, name, given.most)
         print(f"{name}: done, {time.monotonic() - began:.0f} s", flush=True)
     result = gathered(folder, given.seed, given.size, cases, names, tuple(given.files.split(",")))
     (folder / "result.json").write_text(json.dumps(result, indent=1))

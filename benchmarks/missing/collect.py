@@ -1,11 +1,11 @@
 """Run methods on records, one process per method: answers, scores, processor time, memory.
 
-    python -m benchmarks.missing.collect FOLDER METHOD     what a child of `__main__` does
+    python -m benchmarks.missing.collect FOLDER METHOD MOST     what a child of `__main__` does
 
 A method is warmed up on a cut of the first record (compilers, caches), then every record's `learn`
-and `predict` are timed by the process's own clock, on one thread.  Memory is the peak of the whole
-child above what it had with the record loaded.  What was done is not done again: results are
-lines of JSON.
+and `predict` are timed by the process's own clock, on one thread.  Memory is the peak of the
+child so far above what it had with the first record loaded.  What was done is not done again:
+results are lines of JSON.
 """
 
 from __future__ import annotations
@@ -59,19 +59,22 @@ def digest(case: Case) -> str:
     return whole.hexdigest()
 
 
-def run_all(folder: Path, method: Method, warm: bool = True) -> Iterator[dict[str, Any]]:
-    """Results of a method on all records of a folder that lack one, one by one."""
+def run_all(folder: Path, method: Method, most: int) -> Iterator[dict[str, Any]]:
+    """Results of a method on the first `most` records of a folder that lack one, one by one."""
+    warm, base_mib = True, 0.0
     done = {line["case"] for line in results(folder, method.name())}
-    for stem, for_all in json.loads((folder / ORDER).read_text()):
+    for stem, for_all in json.loads((folder / ORDER).read_text())[:most]:
         if stem in done or not (for_all or says_names(method)):
             continue
         path = folder / "records" / f"{stem}.pickle"
         case: Case = pickle.loads(path.read_bytes())
+        base_mib = base_mib or _now_mib()
         try:
             if warm:
                 _warm_up(method, case.train)
                 warm = False
-            yield {"case": path.stem, "method": method.name()} | one_case(case, method)
+            line = {"case": path.stem, "method": method.name()} | one_case(case, method)
+            yield line | {"memory_mib": _peak_mib() - base_mib}
         except NotForThisError:
             continue
 
@@ -94,8 +97,8 @@ def _warm_up(method: Method, record: Record) -> None:
 
 
 def one_case(case: Case, method: Method) -> dict[str, Any]:
-    """Score, times in s of the processor, and memory in MiB; a method that fails is told so."""
-    before, began = _peak_mib(), time.process_time()
+    """Score and times in s of the processor; a method that fails is told so."""
+    began = time.process_time()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -108,8 +111,7 @@ def one_case(case: Case, method: Method) -> dict[str, Any]:
         learn_s, failed = time.process_time() - began, f"{type(error).__name__}: {error}"[:200]
         score = failed_score(method)
     times = {"learn_s": learn_s, "judge_s": time.process_time() - began - learn_s}
-    said = {"memory_mib": _peak_mib() - before, "failed": failed}
-    return plain(asdict(score)) | times | said
+    return plain(asdict(score)) | times | {"failed": failed}
 
 
 def failed_score(method: Method) -> Score:
@@ -120,6 +122,11 @@ def failed_score(method: Method) -> Score:
 
 def _peak_mib() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / MIB
+
+
+def _now_mib() -> float:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 2**20
 
 
 def file_of(folder: Path, method: str) -> Path:
@@ -134,16 +141,16 @@ def results(folder: Path, method: str) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
-def main(folder: Path, name: str) -> None:
+def main(folder: Path, name: str, most: int) -> None:
     """One method on all records, its lines appended as they come."""
     method = methods_of(FILES)[name]
     path = file_of(folder, name)
     path.parent.mkdir(exist_ok=True)
     with path.open("a") as file, threadpool_limits(1):
-        for line in run_all(folder, method):
+        for line in run_all(folder, method, most):
             file.write(json.dumps(line) + "\n")
             file.flush()
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), sys.argv[2])
+    main(Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]))

@@ -64,10 +64,10 @@ def _map(case: Case, learned: Learned) -> tuple[float, float]:
     errors, inside = [], []
     for edge, (w, dp) in case.truth.points.items():
         true = case.truth.flow(edge, w, dp)
-        off = learned.flow(edge, w, dp) - true
+        off = np.nan_to_num(learned.flow(edge, w, dp)) - true  # no number: as if it were shut
         errors.append(off / np.abs(true).max())
         if learned.flow_sd is not None:
-            inside.append(np.abs(off) <= Z95 * learned.flow_sd(edge, w, dp))
+            inside.append(np.abs(off) <= Z95 * np.nan_to_num(learned.flow_sd(edge, w, dp)))
     cover = float(np.mean(np.concatenate(inside))) if inside else float("nan")
     return float(np.sqrt(np.mean(np.concatenate(errors) ** 2))), cover
 
