@@ -152,6 +152,11 @@ def test_an_interval_contains_what_the_model_got_wrong() -> None:
     assert held.rms_m == pytest.approx(1e-3) and held.low_m < 1e-3 < held.high_m
     assert new.low_m < 0.5e-3 and new.high_m > 1e-3
     plain = tracking._interval(of[1], 0.0, 0.0)
+    assert tracking._interval(of[1], 0.0, 10.0).low_m == 0.0
+    some = np.append(np.log([1e-3] * 13), [np.inf] * 3)
+    assert tracking._interval(some, 0.0, 0.0) == plain
+    with pytest.raises(NoTrackingError, match="runs away in 5 of 16"):
+        tracking._refuse_runaways("held", 5)
     assert [plain.rms_m, plain.low_m, plain.high_m] == pytest.approx(
         [1e-3, 1e-3 / 1.0435, 1.0435e-3], rel=1e-3
     )
