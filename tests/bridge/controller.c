@@ -66,10 +66,10 @@ void controller_hold(controller *c, int hold) { c->d.hold = (uint8_t)hold; }
 
 int controller_held(const controller *c, unsigned k, uint32_t *version, uint32_t *crc)
 {
-    const unsigned side = c->d.side >> k & 1u;
+    const unsigned side = (unsigned)c->d.side >> k & 1u;
     *version = c->slots[k].version[side];
     *crc = c->slots[k].crc[side];
-    return c->d.present >> k & 1;
+    return (int)((unsigned)c->d.present >> k & 1u);
 }
 
 void controller_flow(const controller *c, unsigned k, size_t n, const float *u, const float *dp,
