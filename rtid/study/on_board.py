@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rtid.effects import Effect, catalogue
+from rtid.effects.law import BEHIND_MAPS
 from rtid.effects.page import title
 from rtid.effects.summed import RunningSum
 from rtid.errors import RtidError
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
     from rtid.effects.live import LiveFlow
 
 LEAST_SD, USUAL_SD = 0.01, 0.1  # relative: an oil warms, a seal wears
-MAP_LAG = "map_lag"
 USUAL_DISTURBANCE = 0.01  # of the rated rate, per sqrt(Hz)
 
 
@@ -50,15 +50,15 @@ def on_board(project: Project, tell: Callable[[str], None]) -> Project:
     """
     model, flows = project.model, project.flows
     for added in project.sections.added:
-        if model.measured and added.effect == MAP_LAG:
+        if model.measured and _is_behind(added):
             model, flows = _behind(project, model, flows, added)
             tell(f"{title(added.effect)} at {added.where} is part of the equation")
             continue
         (terms, more), name = _live(project, added), f"{title(added.effect)} at {added.where}"
-        signals = tuple(flow.signal for flow in more)
-        model = replace(model, terms=(*model.terms, *terms), signals=(*model.signals, *signals))
-        flows = (*flows, *more)
         if terms:
+            signals = tuple(flow.signal for flow in more)
+            model = replace(model, terms=(*model.terms, *terms), signals=(*model.signals, *signals))
+            flows = (*flows, *more)
             how = ", its flow computed sample by sample" if more else ""
             tell(f"{name} is learned beside the maps{how}")
         else:
@@ -75,6 +75,12 @@ def on_board(project: Project, tell: Callable[[str], None]) -> Project:
     beside = tuple(flow.key for flow in flows)
     key, alone = digest((project.digest, model.terms, *beside)), digest(model)
     return replace(project, model=model, digest=key, machine_digest=alone, flows=flows)
+
+
+def _is_behind(added: AddedSection) -> bool:
+    """Whether it is a lag behind the maps of a plant whose rate is measured."""
+    page = catalogue().get(added.effect)
+    return page is not None and page.law == BEHIND_MAPS
 
 
 def _behind(
@@ -106,9 +112,7 @@ def load_for(path: Path, project: Project) -> tuple[Estimator, tuple[AddedSectio
     except SnapshotError:
         if board is project:
             raise
-        live = tuple(
-            a for a in project.sections.added if a.effect == MAP_LAG or _live(project, a)[0]
-        )
+        live = tuple(a for a in project.sections.added if _is_behind(a) or _live(project, a)[0])
         return load(path, board.model, board.digest), live
 
 

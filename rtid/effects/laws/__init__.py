@@ -11,7 +11,7 @@ from functools import partial
 from importlib import import_module
 
 from rtid.effects.column import Candidate, Cause, by_equation
-from rtid.effects.law import needs_no_pressure, places_of
+from rtid.effects.law import BEHIND_MAPS, needs_no_pressure, places_of
 from rtid.effects.laws.friction import dahl
 from rtid.effects.laws.lines import lines
 from rtid.effects.laws.openings import opening
@@ -34,7 +34,7 @@ NAMED: dict[str, Law] = {
     "pump": supply,
     "late_pressure": late_pressure,
     "late_position": late_position,
-    "map_lag": map_lag,
+    BEHIND_MAPS: map_lag,
     "dahl": dahl,
 }
 

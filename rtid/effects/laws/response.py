@@ -17,7 +17,7 @@ import numpy as np
 
 from rtid.effects.column import Cause, of_page
 from rtid.effects.filtering import filtered
-from rtid.effects.law import Shape, Volumes
+from rtid.effects.law import BEHIND_MAPS, Shape, Volumes
 from rtid.effects.laws.timing import Psi, TimingLaw, of_law
 from rtid.effects.page import Effect
 from rtid.model import Machine
@@ -31,7 +31,7 @@ def _as_it_is(values: FloatArray, _dt_s: float, _psi: Psi) -> FloatArray:
     return values
 
 
-MAP_LAG = of_law("map_lag", _as_it_is, where="")
+MAP_LAG = of_law(BEHIND_MAPS, _as_it_is, where="")
 
 
 def map_lag_of(model: Machine) -> TimingLaw | None:
