@@ -93,7 +93,7 @@ def part(function: Callable[..., Any], **options: Any) -> Any:
     linked = {"forceinline": False} | UNCOUNTED | options  # else it takes them from its caller
     dispatcher = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **linked)(function)
     if is_jitted(dispatcher):  # not where NUMBA_DISABLE_JIT is set
-        compiled = dispatcher.compile
+        compiled, alone = dispatcher.compile, njit(**options)(function)
 
         def compile_linked(signature: Any) -> Any:
             with compiled_as(LINKED):
@@ -101,7 +101,7 @@ def part(function: Callable[..., Any], **options: Any) -> Any:
 
         def compile_alone(*arguments: Any) -> Any:
             with global_compiler_lock, compiled_as(numba_codegen.JITCodeLibrary):
-                return njit(**options)(function)._compile_for_args(*arguments)
+                return alone._compile_for_args(*arguments)  # compiles once for each signature
 
         def keep(result: Any) -> None:
             dispatcher.overloads[tuple(result.signature.args)] = result
