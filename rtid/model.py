@@ -63,7 +63,8 @@ class Chamber:
 
     Without a pressure (NONE) it is xdot = ..., times area_m2.  disturbance: intensity of unmodelled
     flow, m3/s per sqrt(Hz), a white noise that the rows are weighed for.  unit: of the equation.
-    behind_s: a lag behind the maps (`rtid.effects.laws.response`), whose noise stands behind it too.
+    behind_s: a lag behind the maps, whose noise stands behind it too; see
+    `rtid.effects.laws.response`.
     """
 
     name: str

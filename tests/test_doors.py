@@ -113,7 +113,7 @@ def test_a_wrong_type_is_refused_by_the_argument_s_name(
 def test_a_path_of_a_wrong_type_is_refused(project: Project) -> None:
     functions: list[Callable[..., Any]] = [read_trace, replay, diagnose_trace]
     for function in functions:
-        with pytest.raises(ArgumentError, match="path must be str or Path.*, not int"):
+        with pytest.raises(ArgumentError, match=r"path must be str or Path.*, not int"):
             function(project, 3)
 
 
