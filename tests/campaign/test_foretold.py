@@ -37,7 +37,7 @@ def judged(seed: int) -> tuple[bool, bool, float, float]:
 
 @pytest.mark.campaign
 def test_machines_do_what_was_foretold() -> None:
-    """Nine of ten errors lie in their 95 % intervals.
+    """Nine of ten errors lie in their 95 % intervals, with either map: missed, new 26 of 30.
 
     Machines that oscillate as they lower their load are among them, where the mass, which nobody
     declares here, decides: what is missed is missed there.
@@ -49,7 +49,7 @@ def test_machines_do_what_was_foretold() -> None:
     leave(
         "Tracking as foretold",
         f"{figure}, half-width {wide:.1%} (medians)",
-        "54 of 60",
+        "27 each",
         "30 plants",
     )
-    assert held + new >= 0.9 * 2 * MACHINES, rows
+    assert min(held, new) >= 0.9 * MACHINES, rows

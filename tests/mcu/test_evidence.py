@@ -30,6 +30,8 @@ def test_misra() -> None:
     assert not [f for f in found if f.rule in misra.MANDATORY]
     assert not [f for f in found if f.required and not f.reason]
     assert len({(f.file, f.line) for f in found if f.required}) <= MOST_RECORDED
+    if f"cppcheck {misra.version()} reads" not in misra.PAGE.read_text("utf-8"):
+        return  # the table, and the reasons that are needed, are those of one version
     told = misra.PAGE.read_text("utf-8").split("<!-- misra:begin -->\n")[1].split("\n<!--")[0]
     assert told.split("\n") == list(misra.rows(found)), "renew it: python -m tests.mcu.misra"
     at = {(f.file, f.rule, f.line - above) for f in found for above in range(misra.ABOVE + 1)}
