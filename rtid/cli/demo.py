@@ -137,15 +137,15 @@ def _print_next(console: Console, machine: Demo, worn: tuple[Path, Path]) -> Non
     console.print(
         "\n[bold]3  Your turn[/bold]  The trace and its project file are yours to try:", markup=True
     )
-    _print_command(console, "check", project, trace)
-    _print_command(console, "replay", trace, "--project", project, "--pictures", trace.parent)
-    _print_command(console, "export", trace, trace.parent / "map.csv", "--project", project)
+    _print_command(console, "check", trace, "-p", project)
+    _print_command(console, "replay", trace, "-p", project, "--pictures", trace.parent)
+    _print_command(console, "export", trace, trace.parent / "map.csv", "-p", project)
     console.print(
         "\n[bold]4  What is missing?[/bold]  Years later something in this machine has worn out, "
         "and the model\n   does not know.  See it in the browser: where it fails, why, and add it:",
         markup=True,
     )
-    _print_command(console, "ui", worn[1], worn[0])
+    _print_command(console, "ui", worn[0], "-p", worn[1])
     console.print()
 
 
