@@ -21,6 +21,7 @@ CLEARLY = 4.0  # standard deviations above unit variance
 LEAST_ROWS = 200  # in an interval: fewer cannot tell a misfit from a few odd rows
 WHOLE = (0, DROP_ONLY), (1, COMMAND_ONLY)  # axes along which such maps do not change: never halved
 LEAST_SHARE = 0.2  # of an edge's excess that an interval must hold
+ALONE = 8.0  # times the excess per row of an edge's other commands, from which one holds a jump
 
 
 @dataclass(frozen=True)
@@ -36,14 +37,22 @@ def halved(model: Machine, misfit: Misfit, clearly: float = CLEARLY) -> Machine:
 
     misfit: in units of the noise alone, nothing excused; clearly: standard deviations of excess.
     """
-    result, owners = excesses(model, misfit), model.owners
-    for i, owner in enumerate(owners):  # what is missed of a shared map shows at all its commands
-        if i != owner:
-            mine, whole = result[i], result[owner]
-            result[owner] = Excess(whole.rows + mine.rows, whole.beyond + mine.beyond)
-    grids = [_halved(e, x, clearly).grid for e, x in zip(model.edges, result, strict=True)]
-    edges = tuple(replace(e, grid=grids[o]) for e, o in zip(model.edges, owners, strict=True))
-    return replace(model, edges=edges)
+    result = _excesses_of_maps(model, misfit)
+    pairs = zip(model.edges, result, strict=True)
+    return _on(model, [_halved(edge, excess, clearly).grid for edge, excess in pairs])
+
+
+def halved_at_a_jump(model: Machine, misfit: Misfit) -> Machine:
+    """The machine with the interval of each command halved that alone misses the flow.
+
+    Of a map that jumps, six terms miss as much however short the interval; only the time that is
+    spent in it halves.  What is missing from the model is missed at many commands.
+    """
+    grids = []
+    for edge, excess in zip(model.edges, _excesses_of_maps(model, misfit), strict=True):
+        at = _jump(excess) if edge.terms != DROP_ONLY else []
+        grids.append(Grid(_split(edge.grid.u_v, at), edge.grid.dp_pa))
+    return _on(model, grids)
 
 
 def in_halved(model: Machine, finer: Machine, misfit: Misfit) -> BoolArray:
@@ -72,6 +81,22 @@ def excesses(model: Machine, misfit: Misfit) -> list[Excess]:
     return result
 
 
+def _on(model: Machine, grids: list[Grid]) -> Machine:
+    """The machine on these grids of its edges; commands that share a map share its owner's."""
+    pairs = zip(model.edges, model.owners, strict=True)
+    return replace(model, edges=tuple(replace(e, grid=grids[o]) for e, o in pairs))
+
+
+def _excesses_of_maps(model: Machine, misfit: Misfit) -> list[Excess]:
+    """As `excesses`; what is missed of a shared map shows at all its commands."""
+    result = excesses(model, misfit)
+    for i, owner in enumerate(model.owners):
+        if i != owner:
+            mine, whole = result[i], result[owner]
+            result[owner] = Excess(whole.rows + mine.rows, whole.beyond + mine.beyond)
+    return result
+
+
 def _halved(edge: Edge, excess: Excess, clearly: float) -> Edge:
     """The edge with its worst intervals halved; as it is where none is clearly above the noise."""
     axes = [_worst(excess, axis, clearly) if edge.terms != whole else [] for axis, whole in WHOLE]
@@ -82,10 +107,24 @@ def _halved(edge: Edge, excess: Excess, clearly: float) -> Edge:
 def _worst(excess: Excess, axis: int, clearly: float) -> list[int]:
     """Intervals along an axis whose excess is clear and holds a fair share of all of it."""
     rows, beyond = excess.rows.sum(axis=1 - axis), excess.beyond.sum(axis=1 - axis)
-    clear = (rows >= LEAST_ROWS) & (beyond > clearly * np.sqrt(2.0 * rows))
+    clear = _is_clear(rows, beyond, clearly)
     share = beyond > LEAST_SHARE * max(float(beyond[beyond > 0].sum()), 1e-12)
     worst = np.argsort(-beyond)[: min(AT_ONCE, MAX_BORDERS - 2 - len(rows))]
     return [int(k) for k in worst if clear[k] and share[k]]
+
+
+def _jump(excess: Excess) -> list[int]:
+    """The interval of the command whose excess per row is many times that of all others."""
+    rows, beyond = excess.rows.sum(axis=1), np.maximum(excess.beyond.sum(axis=1), 0.0)
+    k = int(np.argmax(beyond))
+    others = (beyond.sum() - beyond[k]) / max(1.0, rows.sum() - rows[k])
+    is_alone = beyond[k] > ALONE * others * rows[k] and len(rows) < MAX_BORDERS - 2
+    return [k] if is_alone and _is_clear(rows, beyond, CLEARLY)[k] else []
+
+
+def _is_clear(rows: FloatArray, beyond: FloatArray, clearly: float) -> BoolArray:
+    """Intervals (n,) of enough rows whose excess is more than so many standard deviations."""
+    return np.asarray((rows >= LEAST_ROWS) & (beyond > clearly * np.sqrt(2.0 * rows)))
 
 
 def _split(border: FloatArray, intervals: list[int]) -> FloatArray:

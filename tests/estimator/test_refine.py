@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from rtid.diagnose.standing import fitted
+from rtid.diagnose.trials import MATCH_RHO
 from rtid.estimator.estimator import to_chunk
 from rtid.estimator.record import fit_record
 from rtid.model import Grid, Machine
 from rtid.plain import FloatArray
 from rtid.sim.declare import declared_model, default_grid
-from rtid.sim.random_plants import draw
+from rtid.sim.random_plants import draw, draw_hidden
 from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import SimulatedPlant
 
@@ -48,3 +49,24 @@ def test_a_coarse_grid_is_refined_where_the_dead_band_ends(seed: int) -> None:
 def test_a_grid_that_is_fine_enough_stays() -> None:
     _, model, chunk = machine(5, coarse=False)
     assert fitted(model, chunk).declared.n_cells <= 1.1 * model.n_cells
+
+
+def test_a_valve_that_opens_with_a_jump_is_followed_to_where_it_jumps() -> None:
+    """Half the width leaves half of what is missed there; on this grid rho was 2.9."""
+    plant = draw(5007, law="jump")
+    model = declared_model(plant, seed=5007)
+    chunk = to_chunk(model, simulate(plant, "sweep_record", 5007, 44.0).samples, 0)[:32_000]
+    fit = fitted(model, chunk)
+    added = np.setdiff1d(fit.declared.edges[0].grid.u_v, model.edges[0].grid.u_v)
+    bands_v = np.array([valve.deadband_v for valve in plant.valves])
+    assert (np.abs(added[:, None] - bands_v).min(axis=1) < 0.1).sum() >= 2, (added, bands_v)
+    assert fit.rho < MATCH_RHO
+
+
+def test_what_is_missing_is_no_jump() -> None:
+    plant = draw_hidden(5007, "external_leakage_laminar")
+    model = declared_model(plant, seed=5007)
+    chunk = to_chunk(model, simulate(plant, "sweep_record", 5007, 44.0).samples, 0)[:32_000]
+    fit = fitted(model, chunk)
+    assert fit.declared.n_cells == model.n_cells
+    assert fit.rho > 2.0
