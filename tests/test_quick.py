@@ -273,7 +273,7 @@ def test_a_machine_that_rests_at_the_end_is_judged_by_the_end_of_its_motion(
     path, project = as_csv(tmp_path / "t.csv", **values), tmp_path / "m.toml"
     diagnosis = told(path, "--save", project)["diagnosis"]
     assert diagnosis["held_out_judged"] and not diagnosis["found"]
-    assert diagnosis["verdict"] == ("matches" if is_noisy else "unknown")  # of no known noise
+    assert diagnosis["verdict"] == "matches"
     split, end = load(project).sections.record.validation_s or (0.0, 0.0)
     assert 15.0 < split < c["t"][begin] < end
 

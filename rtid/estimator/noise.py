@@ -25,6 +25,7 @@ ROUNDING = 1e-8  # share of the largest value below which steps are rounding err
 FEW_LEVELS = 6
 HELD_SHARE = 0.3  # of equal neighbours, from which on repeats are looked at
 EVEN = 0.01  # scatter of the sampling intervals up to which plain differences do
+FINEST = 2.0**-24  # of a signal's span, that its sensor tells at best; what is less is no noise
 SINGLE_RUNS = 0.2  # share of values that come once, up to which a signal is held
 
 
@@ -134,6 +135,7 @@ def _floor(t_s: FloatArray, values: FloatArray, order: int) -> _Floor | None:
     squares = _windows(t_s, values, order)
     if len(squares) < 4:
         return None
+    squares = _of_a_sensor(squares, values)
     # A correlated sum of squares scatters like one of fewer, independent ones.
     correlation = comb(4 * order, 2 * order) / comb(2 * order, order) ** 2
     dof = WINDOW / correlation
@@ -146,6 +148,15 @@ def _floor(t_s: FloatArray, values: FloatArray, order: int) -> _Floor | None:
             break
     n = len(quiet) * WINDOW
     return _Floor(float(np.sqrt(floor)), float(np.sqrt(correlation / (2 * max(n, 1)))), n)
+
+
+def _of_a_sensor(squares: FloatArray, values: FloatArray) -> FloatArray:
+    """Windows in which a sensor can have measured; all where that leaves few.
+
+    A value that is held, or computed at a standstill, says nothing of the noise of the motion.
+    """
+    shown = squares[squares > (FINEST * np.ptp(values)) ** 2]
+    return shown if len(shown) > max(4, QUIET * len(squares)) else squares
 
 
 def _windows(t_s: FloatArray, values: FloatArray, order: int) -> FloatArray:

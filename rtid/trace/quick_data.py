@@ -16,6 +16,7 @@ from rtid.model import Machine
 from rtid.plain import FloatArray
 from rtid.trace import Report
 from rtid.trace.quick_source import NEEDED
+from rtid.trace.series import SignalReport
 from rtid.trace.signals import Recording
 
 LEAST_S, FEW_S = 10.0, 30.0
@@ -27,6 +28,8 @@ HELD_STILL = 0.05  # share of the time with shut valves that tells leaks from ma
 VARIED = 0.05  # of its mean: from which on a supply is said to vary
 STEP_SHARE, STEP_S = 0.1, 0.02  # a step: so much of the command's range within so long
 FEW_STEPS = 5
+FROZEN = "is frozen"  # in a finding of `rtid check`
+SETTLES_S = 0.1  # of frozen samples before which a command may still have moved
 
 GOOD, FAIR, BAD = "good", "fair", "bad"
 
@@ -45,7 +48,7 @@ def points(model: Machine, trace: Recording, report: Report) -> list[Point]:
     return [
         *_size(trace, report),
         *_frozen(trace),
-        *_objections(report),
+        *_objections(trace, report),
         *_ends(model, trace),
         *_coverage(report),
         *_excitation(model, trace),
@@ -80,13 +83,27 @@ def _frozen(trace: Recording) -> Iterator[Point]:
             yield Point(BAD, f"{name} never changes", "check its sensor, and what was taken for it")
 
 
-def _objections(report: Report) -> Iterator[Point]:
-    """What `rtid check` finds, less what is the grid's fault, said above, or said of nothing."""
+def _objections(trace: Recording, report: Report) -> Iterator[Point]:
+    """What `rtid check` finds, less what is the grid's fault, said above, or said of nothing.
+
+    A signal that is frozen while the command rests too has been held, or computed: it stands
+    still, as the machine does.
+    """
+    resting = {s.name for s in report.signals if _is_commanded_to_rest(trace, s)}
     apart = ("outside the grid", "never changes", "of about nan")
     for finding in report.findings:
         if not any(known in finding.text for known in apart):
-            level = BAD if finding.level == "error" else FAIR
+            is_rest = FROZEN in finding.text and finding.subject in resting
+            level = BAD if finding.level == "error" and not is_rest else FAIR
             yield Point(level, f"{finding.subject}: {finding.text}", finding.remedy)
+
+
+def _is_commanded_to_rest(trace: Recording, signal: SignalReport) -> bool:
+    """True where the command stands still over the longest span in which a signal is frozen."""
+    samples = trace.samples
+    at_s = 1e-6 * (samples.t_us - samples.t_us[0]) - signal.frozen_from_s
+    u = samples.column("u")[(at_s > SETTLES_S) & (at_s < signal.frozen_s)]
+    return len(u) > 0 and float(np.ptp(u)) == 0.0
 
 
 def _ends(model: Machine, trace: Recording) -> Iterator[Point]:

@@ -8,6 +8,7 @@ beside, and must be named.
 from __future__ import annotations
 
 import os
+from collections import Counter
 from functools import cache
 
 import numpy as np
@@ -83,8 +84,10 @@ def test_figures_of_a_law(law: str) -> None:
     error = np.abs(np.concatenate([o.valid.error for o in found]))
     near = [o.near for o in found if len(o.near.z)]
     shares, widths = [covered(p.z) for p in near], [np.median(p.half) for p in near]
+    said = Counter(o.verdict for o in found).most_common()
     words = (
-        f"rho {np.median(rho):.3f}, {100 * in_band:.0f} % within 3 sqrt(2/dof); beta "
+        f"{', '.join(f'{verdict} {n}' for verdict, n in said)}; rho {np.median(rho):.3f}, "
+        f"{100 * in_band:.0f} % within 3 sqrt(2/dof); beta "
         f"{100 * covered(beta):.1f} % (largest z {np.abs(beta).max():.1f}, half-width "
         f"{100 * np.median(half):.2f} %); valid points {100 * covered(valid):.1f} % (error "
         f"{100 * error.mean():.2f} %); extrapolated {100 * np.mean(shares):.1f} % (half-width "

@@ -153,6 +153,14 @@ def test_steps_and_gaps_do_not_count() -> None:
     assert estimate_noise(gaps, y).sd == pytest.approx(0.1, rel=0.05)
 
 
+@pytest.mark.parametrize("quiet", [0.0, 1e-6])
+def test_a_standstill_without_noise_says_nothing_of_the_motion_s(quiet: float) -> None:
+    values = np.sin(T_S) + white(1e-3, n=len(T_S))
+    half = len(T_S) // 2
+    values[half:] = values[half] + quiet * 1e-3 * white(1.0, n=len(T_S) - half)
+    assert estimate_noise(T_S, values).sd == pytest.approx(1e-3, rel=0.05)
+
+
 def test_where_nothing_is_known_it_says_so() -> None:
     assert estimate_noise(T_S[:20], white(1.0, n=20)).relative_sd == np.inf
     assert estimate_noise(T_S, np.zeros(len(T_S))).relative_sd == np.inf
