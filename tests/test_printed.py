@@ -18,6 +18,7 @@ from rtid.daemon import status
 from rtid.daemon.status import (
     BusHealth,
     ChamberStatus,
+    EffectStatus,
     EstimateStatus,
     LoopHealth,
     MessageHealth,
@@ -191,15 +192,19 @@ def test_si_is_what_the_option_says_and_json_does_not_change(story: Told) -> Non
 @pytest.mark.usefixtures("eighty")
 def test_the_status_tells_95_percent_and_is_whole(tmp_path: Path, story: Told) -> None:
     chambers = ChamberStatus("a", 900e6, 1e6), ChamberStatus("b", 900e6, 2e6)
-    name = "a_message_with_a_very_long_name_"
+    name, leak = (
+        "a_message_with_a_very_long_name_",
+        EffectStatus("leak a-b", 5e-12, 1e-13, "m3/s/Pa"),
+    )
     written = Status(
         "boom", 7, 1.0, 2.0, LoopHealth(1000.0, 10, 1, 0, {"late": 1}), BusHealth("virtual", "x"),
         messages=(MessageHealth(name, 0x101, 998.0, 1000.0, 0.002, 0.004, "damaged",
                                 {"crc": 7, "counter": 12, "length": 3, "not_available": 123}),),
         signals=(SignalHealth("p_a", "pressure", "Pa", name, 2.5e6, 1e5, 12345678.0),),
-        estimate=EstimateStatus(chambers=chambers),
+        estimate=EstimateStatus(chambers=chambers, effects=(leak,)),
     )  # fmt: skip
     status.write(tmp_path, written)
     shown = story(f"status {tmp_path}", Exit.NEGATIVE)
     assert "a 900.0 ± 2.0 MPa, b 900.0 ± 3.9 MPa" in shown
+    assert "effects leak a-b 0.3000 ± 0.0118 L/min/MPa" in shown
     assert shown.count(CONVENTION) == 1 and "12.3457" in shown

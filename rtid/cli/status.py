@@ -74,7 +74,10 @@ def _show(daemon_status: Status, age_s: float) -> None:
     )
     maps = _maps(daemon_status)
     console.print(f"maps    {maps}")
-    if "±" in maps:
+    effects = _effects(daemon_status)
+    if effects:
+        console.print(f"effects {effects}")
+    if "±" in maps + effects:
         console.print(f"        {CONVENTION}")
     saved = "never" if store.age_s is None else f"{store.age_s:.0f} s ago"
     console.print(f"state   {store.state}, last {saved}, began {store.restored}. {store.reason}")
@@ -109,6 +112,12 @@ def _maps(daemon_status: Status) -> str:
         f"{estimate.state} {estimate.reason}, {estimate.samples} samples, newest {age} old{stale}; "
         f"blocks {text}; beta {beta or 'unknown'}"
     )
+
+
+def _effects(daemon_status: Status) -> str:
+    """What is learned on board of the sizes of added effects."""
+    sizes = ((e, scale_of(e.unit)) for e in daemon_status.estimate.effects)
+    return ", ".join(f"{e.name} {s.known(e.size, e.sd, 4)} {s.name}" for e, s in sizes)
 
 
 def _messages(daemon_status: Status) -> Table:

@@ -32,7 +32,7 @@ from rtid.daemon.offering import Offering
 from rtid.daemon.pipe import Pipe
 from rtid.daemon.recorder import Recorder
 from rtid.daemon.shadow import Shadow
-from rtid.daemon.status import EdgeHealth
+from rtid.daemon.status import EdgeHealth, EffectStatus
 from rtid.errors import RtidError
 from rtid.estimator.estimator import Estimator
 from rtid.estimator.flowmap import FlowMap
@@ -41,7 +41,7 @@ from rtid.maps.files import provenance, write_map
 from rtid.maps.prior_map import find_prior, published
 from rtid.plain import FloatArray
 from rtid.project import Project, load
-from rtid.study.on_board import on_board
+from rtid.study.on_board import learned_sizes, on_board
 from rtid.trace.snapshot import Generations
 
 T = TypeVar("T")
@@ -49,8 +49,8 @@ NICE = 5
 MAP_FILE = "map.npz"
 KEPT = 3  # handovers that can be recalled
 CLEAN_S = 2.0  # a handover must be older than a suspicion by the piece in which that began
-CALM_S, CALM = 6.0, 2  # before a judgement; seconds of them that the guard has judged, a piece late
-FIRST_S = 60.0  # of samples that a first map is checked by
+JUDGED_S, JUDGED = 6.0, 2  # before a judgement; seconds that the guard has judged, a piece late
+FIRST_S = 60.0  # of samples that a first map, or a later one, is checked by
 QUEUED_BYTES = 16 << 20  # of jobs taken from the pipe while one is in work
 FLOOD_S = 10.0  # the same refusal of the disk is told at most this often
 
@@ -107,8 +107,10 @@ class Analyst:
         self._baseline: Estimator | None = None
         self._is_named = True  # what contradicts the baseline, by what came behind the alarm
         self._next: tuple[jobs.Handover, CandidateMap] | None = None  # to become the baseline
+        self._behind: deque[FloatArray] = deque()  # samples behind that one
         self._waiting_s: float | None = None  # newest sample of a snapshot not yet trusted
         self._trusted_s = -math.inf  # ... of the one on the disk that is
+        self._saved = 0  # number of the newest handover that was to be written
         self._first: deque[FloatArray] = deque()  # samples of a first map
         self._shadow: Shadow | None = None  # of a baseline that is lost
 
@@ -130,7 +132,14 @@ class Analyst:
         self._guard = Guard(self._project.model, candidate, known, "proving", share)
         if proof := self._generations.shadow(self._project.model).notes.get("proof"):
             self._guard.resume(proof)
+        self._resume_trust(result.estimator)
         self._answer(jobs.Foretold("proving"))
+
+    def _resume_trust(self, baseline: Estimator) -> None:
+        """What a run before had saved waits on: killed again and again, none would ever be."""
+        kept = self._generations.waiting(self._project.model).estimator
+        if kept is not None and kept.origin_us == baseline.origin_us:
+            self._waiting_s = _newest_s(kept) if _newest_s(kept) > self._trusted_s else None
 
     def take(self, job: jobs.Job) -> None:
         """Do one job; what is to be saved of it is for `save`.  What cannot be done is told."""
@@ -162,10 +171,12 @@ class Analyst:
 
     def save(self, job: jobs.Handover) -> None:
         """Write the snapshot, in any thread."""
+        path = None
         with self._disk:
-            path = self._guarded("snapshot", lambda: self._save(job))
+            if job.number >= self._saved:  # else one that had to be on the disk has overtaken it
+                path, self._saved = self._guarded("snapshot", lambda: self._save(job)), job.number
         if path is not None:
-            self._answer(jobs.SavedSnapshot(job.number, str(path)))
+            self._answer(jobs.SavedSnapshot(job.number, str(path), job.made_s))
         self._answer(jobs.Ready(to_solve=False))
 
     def _save(self, job: jobs.Handover) -> Path:
@@ -223,9 +234,7 @@ class Analyst:
         """Hold the baseline against the samples; a map that foretells as well takes its place."""
         guard = self._guard
         if guard is None:
-            self._first.append(chunk)
-            while self._first[0][0, 0] < chunk[-1, 0] - FIRST_S:
-                self._first.popleft()
+            _keep(self._first, chunk)
             return
         had_level = guard.level is not None
         if self._shadow is not None and self._lead(guard, self._shadow, chunk):
@@ -243,14 +252,22 @@ class Analyst:
         if waiting_s is not None and guard.is_calm_behind(waiting_s, TRUST):
             self._trust(waiting_s)
         if self._next is not None:
-            job, candidate = self._next
-            if guard.is_calm_behind(_newest_s(job.estimator), PROOF):
-                self._next, self._baseline = None, job.estimator
+            self._follow(guard, chunk, *self._next)
+
+    def _follow(
+        self, guard: Guard, chunk: FloatArray, job: jobs.Handover, candidate: CandidateMap
+    ) -> None:
+        """Make a later map the baseline, once both have foretold the motion behind it."""
+        _keep(self._behind, chunk)
+        if guard.is_calm_behind(_newest_s(job.estimator), PROOF):
+            self._next = None
+            if guard.foretells(candidate, np.concatenate(self._behind)):
+                self._baseline = job.estimator
                 guard.follow(candidate)
 
-    def _is_calm(self, t_s: float) -> bool:
-        """Whether the guard has judged some of the seconds before a time and objects to none."""
-        return self._guard is not None and self._guard.is_calm_behind(t_s - CALM_S, CALM)
+    def _is_judged(self, t_s: float) -> bool:
+        """Whether the guard answers for the seconds before a time."""
+        return self._guard is not None and self._guard.answers_for(t_s - JUDGED_S, JUDGED)
 
     def _is_trusted(self, estimator: Estimator) -> bool:
         """Whether the motion behind what it has learned shows no fault."""
@@ -259,10 +276,11 @@ class Analyst:
     def _trust(self, newest_s: float) -> None:
         """What was saved before this motion goes on being published after a kill."""
         with self._disk:
-            if self._waiting_s == newest_s:  # no other one was saved meanwhile
-                self._guarded("baseline", self._generations.trust)
-                self._guarded("points", lambda: self._generations.keep("publish"))
-                self._trusted_s, self._waiting_s = newest_s, None
+            if self._waiting_s != newest_s:  # another one was saved meanwhile
+                return
+            self._guarded("baseline", self._generations.trust)
+            self._trusted_s, self._waiting_s = newest_s, None
+        self._guarded("points", lambda: self._generations.keep("publish"))
 
     def _lead(self, guard: Guard, shadow: Shadow, chunk: FloatArray) -> bool:
         """Whether what was learned in the shadow takes the place of a baseline that is lost."""
@@ -303,10 +321,9 @@ class Analyst:
         baseline, notes = self._baseline, _notes(self._guard)
         if baseline is None:
             return
-        with self._disk:
-            self._trusted_s = _newest_s(baseline)
-            self._guarded("baseline", lambda: self._generations.save_baseline(baseline, notes))
-            self._guarded("points", lambda: self._generations.keep("publish"))
+        self._trusted_s = _newest_s(baseline)
+        self._guarded("baseline", lambda: self._generations.save_baseline(baseline, notes))
+        self._guarded("points", lambda: self._generations.keep("publish"))
 
     def _is_fit(self, job: jobs.Handover, solution: Solution) -> bool:
         """Whether a first map may be published; from then on it is the baseline."""
@@ -323,7 +340,7 @@ class Analyst:
         if self._judge is not None:
             judgement = self._judge.push(batch.chunk)
             if judgement is not None:
-                self._answer(replace(judgement, is_calm=self._is_calm(judgement.t_s)))
+                self._answer(replace(judgement, is_guarded=self._is_judged(judgement.t_s)))
         if len(batch.chunk):
             self._watch(batch.chunk)
         self._guarded("offer", lambda: self._offering.push(batch.chunk))
@@ -364,6 +381,7 @@ class Analyst:
             self._guard.follow(candidate)
         elif self._next is None:
             self._next = job, candidate
+            self._behind.clear()
 
     def _tell(self, job: jobs.Handover) -> CandidateMap | None:
         """Solve, judge from now on, and publish; None for a first map that cannot be."""
@@ -384,6 +402,7 @@ class Analyst:
             _newest_s(job.estimator),
             edges_of(job.estimator, solution, flow_map),
             time.monotonic() - start_s,
+            tuple(EffectStatus(*size) for size in learned_sizes(self._project, solution)),
         )
         self._answer(result)
         self._offering.published(result, solution)
@@ -452,6 +471,13 @@ def _foretold(
     return jobs.Foretold(state, guard.since_s, text, of_sensor)
 
 
+def _keep(chunks: deque[FloatArray], chunk: FloatArray) -> None:
+    """Add samples (n, 2 + signals), and let go what is older than FIRST_S."""
+    chunks.append(chunk)
+    while chunks[0][0, 0] < chunk[-1, 0] - FIRST_S:
+        chunks.popleft()
+
+
 def _newest_s(estimator: Estimator) -> float:
     """Time of the newest sample that was learned."""
     return float(estimator.state.engine[0]["t_s"])
@@ -486,16 +512,17 @@ def main() -> None:
         with one_at_a_time:
             pipe.send(reply)
 
+    begun, waiting = Queue[Analyst](), Waiting(QUEUED_BYTES)
+    receiver = threading.Thread(target=lambda: _receive(pipe, begun.get(), waiting), daemon=True)
+    receiver.start()  # before this thread, and all that it starts, is nice: to save does not wait
     os.nice(NICE)
     loaded = on_board(load(project), lambda _: None)
     Estimator(loaded.model).solution()  # compiles
     analyst = Analyst(loaded, Path(folder), answer)
-    waiting = Waiting(QUEUED_BYTES)
-    receiver = threading.Thread(target=_receive, args=(pipe, analyst, waiting), daemon=True)
     try:
         analyst.begin()
         answer(jobs.Ready())
-        receiver.start()
+        begun.put(analyst)
         while (job := waiting.get()) is not None:
             analyst.take(job)
     except OSError:

@@ -47,6 +47,7 @@ class Core:
         self.swap: Estimator | None = None
         self.is_proving = False  # the map held has still to foretell: what is learned is a shadow
         self.is_solving = self.is_saving = True  # the analyst, or it is not ready yet
+        self.save_s = 0.0  # what the last snapshot took until it was on the disk
         self._kept = 0
         self._collector = Collector(2 + len(learner.estimator.model.signals), daemon.record_mb > 0)
         self._publish_ns, self._store_ns = (
@@ -154,7 +155,9 @@ class Core:
         if publish:
             self._due_publish_ns = now_ns + self._publish_ns
         if store:
-            self._due_store_ns = now_ns + self._store_ns
+            # what is on the disk is not to be older than that: the next one takes its time as well
+            early_ns = min(round(1e9 * self.save_s), self._store_ns // 2)
+            self._due_store_ns = now_ns + self._store_ns - early_ns
         self.hand_over(publish, store)
         return HANDOVER
 

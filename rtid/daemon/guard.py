@@ -97,6 +97,15 @@ class Guard:
         self._pieces: list[FloatArray] = []
         self._recent: list[FloatArray] = []  # samples for the causes
 
+    def foretells(self, candidate: CandidateMap, chunk: FloatArray) -> bool:
+        """Whether another map foretells samples (n, 2 + signals), SI, that it has not learned, too.
+
+        One of two oils has one compliance for both, and flows between theirs: it may not.
+        """
+        rows = in_motion(self._model, residuals(self._model, candidate, chunk))
+        judged = seconds(self._model, rows, self._level)
+        return judged.foretold and not judged.contradicts
+
     def follow(self, candidate: CandidateMap) -> None:
         """Another map, which has foretold the motion as well, takes the place of the baseline.
 
@@ -178,6 +187,16 @@ class Guard:
             return False
         window = self._window()
         return window.cusum[0] == 0.0 and int((window.t_s >= t_s).sum()) >= n
+
+    def answers_for(self, t_s: float, n: int) -> bool:
+        """Whether what so many seconds of motion behind a time mean is the baseline's to say.
+
+        It knows what a healthy day may change, and what matters.  One without a level can only say
+        that it does not mind.
+        """
+        if self.level is None:
+            return self.is_calm_behind(t_s, n)
+        return self.state == "proven" and int((self._window().t_s >= t_s).sum()) >= n
 
     @property
     def known_share(self) -> float:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field
 from typing import Literal
 
 from firmware_bridge.frames import Frames
 from rtid.daemon.acceptance import Acceptance
-from rtid.daemon.status import Advice, Alarm, EdgeHealth, Verdict
+from rtid.daemon.status import Advice, Alarm, EdgeHealth, EffectStatus, Verdict
 from rtid.estimator.estimator import Estimator
 from rtid.estimator.flowmap import FlowMap
 from rtid.model import Machine
@@ -19,7 +20,8 @@ class Handover:
     """The estimator as it was at one moment, without its ring of samples: solve it, and store it.
 
     number: grows by one; publish = False only stores; is_last: stored also where nothing is new;
-    is_proving: the baseline has still to foretell the motion, so that this is its shadow.
+    is_proving: the baseline has still to foretell the motion, so that this is its shadow; made_s:
+    on the monotonic clock of all processes.
     """
 
     number: int
@@ -28,6 +30,7 @@ class Handover:
     store: bool
     is_last: bool = False
     is_proving: bool = False
+    made_s: float = field(default_factory=time.monotonic)
 
 
 @dataclass(frozen=True)
@@ -121,21 +124,22 @@ class Publication:
     t_s: float  # of the newest sample in it, as in `to_chunk`
     edges: tuple[EdgeHealth, ...]
     solved_s: float  # how long that took
+    effects: tuple[EffectStatus, ...] = ()
 
 
 @dataclass(frozen=True)
 class HandoverJudgement:
     """How well the map of handover `number` foretells the samples that came behind it.
 
-    surprise: mean square of whitened innovations over `rows` of them; 1 is noise.  is_calm: the
-    baseline, held against the same motion by what would matter, has nothing against it.
+    surprise: mean square of whitened innovations over `rows` of them; 1 is noise.  is_guarded:
+    the baseline is held against the same motion by what would matter, and answers for it.
     """
 
     number: int
     surprise: float
     rows: int
     t_s: float
-    is_calm: bool = False
+    is_guarded: bool = False
 
 
 @dataclass(frozen=True)
@@ -163,10 +167,11 @@ class Recalled:
 
 @dataclass(frozen=True)
 class SavedSnapshot:
-    """A snapshot is on the disk."""
+    """A snapshot is on the disk.  made_s: of the handover; what came behind it would be lost."""
 
     number: int
     path: str
+    made_s: float
 
 
 @dataclass(frozen=True)

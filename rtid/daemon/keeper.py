@@ -109,6 +109,8 @@ class Keeper:
                     self._plant_changed()
             elif isinstance(answer, jobs.SavedSnapshot | jobs.NotSaved | jobs.SavedAgain):
                 self._saving.hear(answer)
+                if isinstance(answer, jobs.SavedSnapshot):
+                    self._core.save_s = time.monotonic() - answer.made_s
             elif isinstance(answer, jobs.RecorderState):
                 self._recording = answer.path
                 for name, folder in answer.kept.items():

@@ -3,8 +3,8 @@
 The level of a healthy plant is learned: its median surprise, at least 1.  Five of eight judgements
 beyond FACTOR times that level are a change; ten in a row that are not, and it is over.  A slow
 drift moves the level and the map with it.  Innovations show what is far too small to matter: warm
-oil, another motion.  So none is held against the plant while the baseline's guard, which weighs
-what matters, has judged the same motion and is calm.
+oil, another motion.  So none is held against the plant where the baseline's guard, which weighs
+what matters and knows what a healthy day may change, has judged the same motion: it answers.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class PlantWatch:
         if self.contradicted:
             return False
         is_large = judgement.surprise > FACTOR * self.level
-        bad = self.is_ready and is_large and not judgement.is_calm
+        bad = self.is_ready and is_large and not judgement.is_guarded
         if self.changed:
             return self._await_health(bad)
         self._follow(judgement)

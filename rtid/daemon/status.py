@@ -132,6 +132,16 @@ class ChamberStatus:
 
 
 @dataclass(frozen=True)
+class EffectStatus:
+    """What is learned on board of the size of an added effect, with its standard deviation, SI."""
+
+    name: str
+    size: float
+    sd: float
+    unit: str
+
+
+@dataclass(frozen=True)
 class EstimateStatus:
     """What was learned by the last publication; `stale` while its samples are older than allowed.
 
@@ -150,6 +160,7 @@ class EstimateStatus:
     surprise: float | None = None  # mean square of the last rows against the map held, in noise
     chambers: tuple[ChamberStatus, ...] = ()
     edges: tuple[EdgeHealth, ...] = ()
+    effects: tuple[EffectStatus, ...] = ()
     refused: dict[str, int] = field(default_factory=dict)  # all gates: bridge, watch, estimator
 
 

@@ -55,7 +55,7 @@ class Saving:
         if isinstance(answer, SavedAgain):
             self.refused.pop(answer.what, None)
         elif isinstance(answer, SavedSnapshot):
-            self.saved_s = time.monotonic()
+            self.saved_s = answer.made_s
             with contextlib.suppress(OSError):
                 self.needed = max(LEAST_FREE, os.stat(answer.path).st_size)
         else:
@@ -185,4 +185,5 @@ class Teller:
         names = [chamber.name for chamber in self._facts.project.model.chambers]
         rows = zip(names, publication.beta_pa, publication.beta_sd_pa, strict=True)
         chambers = tuple(st.ChamberStatus(name, float(beta), float(sd)) for name, beta, sd in rows)
-        return replace(shown, rho=publication.rho, chambers=chambers, edges=publication.edges)
+        edges, effects = publication.edges, publication.effects
+        return replace(shown, rho=publication.rho, chambers=chambers, edges=edges, effects=effects)

@@ -24,6 +24,7 @@ from rtid.effects.summed import RunningSum
 from rtid.errors import RtidError
 from rtid.estimator.estimator import Estimator
 from rtid.estimator.limits import refuse_unfit
+from rtid.estimator.solution import Solution
 from rtid.model import PRESSURE, Machine, Term
 from rtid.project import Project
 from rtid.project.added import AddedSection, ParameterSection
@@ -99,6 +100,19 @@ def _behind(
     step_s = min((m.period_s for m in project.assembly.messages if m.period_s), default=1e-3)
     late = (replace(f, behind_s=lag.value) if isinstance(f, RunningSum) else f for f in flows)
     return with_lag(model, lag.value, step_s), tuple(late)
+
+
+def learned_sizes(board: Project, solution: Solution) -> list[tuple[str, float, float, str]]:
+    """Of each term of an added effect: its name, learned size and standard deviation, SI, unit."""
+    terms, sds, sizes = board.model.terms, np.sqrt(np.diag(solution.terms_cov)), []
+    for added in board.sections.added:
+        effect, key = _effect(board, added), f"{added.effect} {added.where}"
+        size = added.parameters.get(effect.size.name) if effect is not None else None
+        for term, theta, sd in zip(terms, solution.terms_theta, sds, strict=True):
+            if size is not None and f"{term.name} ".startswith(f"{key} "):
+                sd_si = float(sd / term.scale * abs(size.value))
+                sizes.append((term.name, float(theta * size.value), sd_si, size.unit))
+    return sizes
 
 
 def load_for(path: Path, project: Project) -> tuple[Estimator, tuple[AddedSection, ...]]:

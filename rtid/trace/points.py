@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rtid.errors import RtidError
-from rtid.trace.state_files import made_folder, read_bytes, write_whole
+from rtid.trace.state_files import made_folder, name_also
 
 FOLDER = "points"
 REASONS = ("start", "publish", "accept", "alarm", "project", "fresh", "restore")
@@ -42,23 +42,23 @@ def points_of(folder: Path) -> list[KeptPoint]:
     return sorted(points, key=lambda point: point.unix_s)
 
 
-def keep(folder: Path, snapshot: Path, reason: str, now_s: float) -> KeptPoint | None:
+def is_due(folder: Path, reason: str, now_s: float) -> bool:
+    """Whether no point of that reason, one of REASONS, is young enough."""
+    alike = [point.unix_s for point in points_of(folder) if point.reason == reason]
+    return not alike or not 0.0 <= now_s - alike[-1] < PAUSE_S.get(reason, 0.0)
+
+
+def keep(folder: Path, snapshot: Path, reason: str, now_s: float) -> KeptPoint:
     """Make a point of a whole snapshot file, and let the surplus go; OSError.
 
-    None where there is one of that reason that is young enough.
-
-    reason: one of REASONS.
+    It is another name of that file, which is only ever replaced: no byte is written again.
     """
-    alike = [point.unix_s for point in points_of(folder) if point.reason == reason]
-    if alike and 0.0 <= now_s - alike[-1] < PAUSE_S.get(reason, 0.0):
-        return None
     path = folder / FOLDER / f"{round(1e3 * now_s)}-{reason}.npz"
     made_folder(path.parent)
-    content = read_bytes(snapshot)
-    write_whole(path, content)
+    name_also(snapshot, path)
     for point in surplus(points_of(folder), now_s):
         point.path.unlink()
-    return KeptPoint(now_s, reason, path, len(content))
+    return KeptPoint(now_s, reason, path, path.stat().st_size)
 
 
 def named(folder: Path, name: str) -> KeptPoint:

@@ -1,8 +1,9 @@
 """Snapshots: the estimator's whole memory in one file, with schema, restore key and CRC.
 
 A snapshot continues bit for bit; it is refused where it belongs to another project or schema, or
-where a single byte of it is wrong.  The file is an npz with its CRC-32 behind it.  `Generations`
-keeps the last two: whatever happens while one is written, the other one is whole.
+where a single byte of it is wrong.  The file is an npz without its words of zeros, with its CRC-32
+behind it.  `Generations` keeps the last two: whatever happens while one is written, the other one
+is whole.
 """
 
 from __future__ import annotations
@@ -29,11 +30,12 @@ from rtid.estimator.state import State, Weights
 from rtid.estimator.sums import Sums
 from rtid.model import Machine
 from rtid.trace import points
+from rtid.trace.squeezed import squeezed, unsqueezed
 from rtid.trace.state_files import made_folder, name_also, read_bytes, rename, write_whole
 
 SCHEMA = 4
 RELEARN = "learn again with `rtid replay` or `rtid run`"
-SEAL = struct.Struct("<4sL")  # behind the npz: mark, CRC-32 of all bytes before
+SEAL = struct.Struct("<4sL")  # behind the content: mark, CRC-32 of all bytes before
 MARK = b"RTID"
 FOLD = ("shared", "blocks", "pairs", "tiles", "noise", "rows", "compliance", "innovation")
 WEIGHTS = ("slopes", "compliance", "missed")
@@ -78,8 +80,8 @@ def save(
         arrays |= {f"history_{k}": a for k, a in estimator.history.to_arrays().items()}
     arrays["header"] = np.array(json.dumps(header))
     memory = io.BytesIO()
-    np.savez_compressed(memory, **arrays)
-    content = memory.getvalue()
+    np.savez(memory, **arrays)
+    content = squeezed(memory.getvalue())
     write_whole(Path(path), content + SEAL.pack(MARK, zlib.crc32(content)))
 
 
@@ -132,7 +134,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     if len(seal) < SEAL.size or SEAL.unpack(seal) != (MARK, zlib.crc32(content)):
         raise SnapshotError(f"{path}: not a snapshot of rtid, or damaged", RELEARN)
     try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as file:
+        with np.load(io.BytesIO(unsqueezed(content)), allow_pickle=False) as file:
             header = json.loads(str(file["header"]))
             return header, {name: file[name] for name in file.files if name != "header"}
     except (ValueError, KeyError, OSError, EOFError, BadZipFile) as error:
@@ -258,6 +260,10 @@ class Generations:
         """Keep a snapshot, which is soon written over, until it is known whether to trust it."""
         name_also(path, self._waiting_path)
 
+    def waiting(self, model: Machine) -> Restored:
+        """The snapshot that a run before has kept so."""
+        return self._beside(self._waiting_path, model)
+
     def trust(self) -> None:
         """Make the snapshot that is kept so the baseline: no byte is written again; OSError."""
         rename(self._waiting_path, self.baseline_path)
@@ -293,11 +299,10 @@ class Generations:
 
         None where there is none, or a young point of that reason.
         """
-        path = self.newest()
-        if path is None:
+        now_s = time.time()
+        if not points.is_due(self.folder, reason, now_s) or (path := self.newest()) is None:
             return None
-        point = points.keep(self.folder, path, reason, time.time())
-        return None if point is None else point.path
+        return points.keep(self.folder, path, reason, now_s).path
 
     def set_aside(self, reason: str) -> None:
         """Keep what there is as a point in time: the next start finds nothing.  OSError."""

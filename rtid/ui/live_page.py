@@ -238,6 +238,11 @@ def _learning(status: Status) -> str:
         for c in result.chambers
         if c.beta_pa is not None
     )
+    betas += "".join(
+        f"<dt>{text(e.name)}</dt><dd>{scale.known(e.size, e.sd, 4)} {text(scale.name)}</dd>"
+        for e in result.effects
+        for scale in (scale_of(e.unit),)
+    )
     betas += "<dt>±</dt><dd>95 % interval</dd>" if betas else ""
     stale = ' <b class="open">stale</b>' if result.stale else ""
     rho = (

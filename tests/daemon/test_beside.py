@@ -22,7 +22,7 @@ from rtid.sim.hidden import hide_wish
 from rtid.sim.run import simulate
 from rtid.sim.run_files import START_US
 from rtid.sim.simulated_plant import SimulatedPlant
-from rtid.study.on_board import load_for, on_board
+from rtid.study.on_board import learned_sizes, load_for, on_board
 from rtid.trace.learner import Learner, catalog_of
 from rtid.trace.snapshot import SnapshotError, save
 from tests.faults.harness import drift, machine
@@ -61,6 +61,9 @@ def test_a_leak_is_learned_beside_the_maps() -> None:
           f"{drift(clean, plain):.4f} without the effect")  # fmt: skip
     assert found == pytest.approx(leak, rel=0.1)  # the simulated gap widens with pressure
     assert drift(clean, beside) < 0.01 < 0.1 < drift(clean, plain)
+    ((name, size, sd, unit),) = learned_sizes(board, beside)
+    assert name == f"{LEAK} a-b" and unit == "1"
+    assert size == pytest.approx(found) and sd == pytest.approx(np.sqrt(beside.terms_cov[0, 0]))
 
 
 def test_what_the_motion_does_not_show_stays_as_it_was_found() -> None:

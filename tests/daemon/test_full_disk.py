@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from rtid.daemon.helper import Helper
 from rtid.daemon.recorder import MOST_SEGMENTS, RETRY_S, Recorder
 from rtid.daemon.teller import Saving
 from rtid.trace import state_files
+from rtid.trace.snapshot import Generations
 from tests.daemon.disk import fill, mounted
 from tests.daemon.test_parts import Clock, frames
 from tests.faults.harness import machine
@@ -95,7 +97,7 @@ def test_a_disk_without_room_is_told_before_a_save_fails(disk: Path) -> None:
     saving = Saving(30.0, disk)
     snapshot = disk / "state.npz"
     snapshot.write_bytes(bytes(300_000))
-    saving.hear(jobs.SavedSnapshot(1, str(snapshot)))
+    saving.hear(jobs.SavedSnapshot(1, str(snapshot), time.monotonic()))
     assert saving.why_not(True) == ""
     (disk / "other").write_bytes(bytes(600_000))
     assert "a snapshot needs 292 KB" in saving.why_not(True)
@@ -200,6 +202,27 @@ def test_what_must_be_on_the_disk_goes_ahead(monkeypatch: pytest.MonkeyPatch) ->
     urgent = jobs.Handover(3, None, publish=False, store=True)  # type: ignore[arg-type]
     helper.put(urgent, first=True)
     assert helper._next() is urgent and helper.queued == 100
+
+
+def test_what_was_overtaken_does_not_replace_what_is_newer(tmp_path: Path) -> None:
+    """What must be on the disk goes ahead of a snapshot that waits, and a restart has it."""
+    heard: list[jobs.Answer] = []
+    analyst = Analyst(machine().project, tmp_path, heard.append)
+    learner = machine().learner()
+    handed = []
+    for number, part in enumerate(machine().frames[:6000].chunks(3000), 1):
+        learner.push(part)
+        handed.append(
+            jobs.Handover(number, learner.estimator.copy(with_history=False), False, True)
+        )
+    for handover in reversed(handed):
+        analyst.save(handover)
+    found = Generations(tmp_path, machine().project.digest).restore(machine().project.model)
+    assert found.estimator is not None
+    assert found.estimator.counters["samples"] == learner.estimator.counters["samples"]
+    assert [a.number for a in heard if isinstance(a, jobs.SavedSnapshot)] == [2]
+    assert sum(isinstance(answer, jobs.Ready) for answer in heard) == 2
+    analyst.close()
 
 
 def test_a_status_keeps_its_meaning_with_room_behind_it(tmp_path: Path) -> None:

@@ -268,6 +268,50 @@ def test_a_proof_goes_on_where_a_kill_has_ended_it(
     assert not generations.shadow_path.exists()
 
 
+@pytest.mark.parametrize("gain", [1.0, 1.1])
+def test_a_later_map_is_the_baseline_only_where_it_foretells_as_well(
+    bench: Bench, tmp_path: Path, gain: float
+) -> None:
+    """What was learned of two oils may foretell neither: held against it, any day is a fault."""
+    project, answers = machine().project, list[jobs.Answer]()
+    analyst, solution = Analyst(project, tmp_path, answers.append), fault_free()
+    held = candidate_of(solution, publish(solution))
+    guard = Guard(project.model, held, np.full(2, 0.003 * rated_m3s(project.model)), "proven")
+    learned: Estimator = machine().learned(machine().frames[:3000]).estimator
+    later = replace(held, theta=gain * held.theta)
+    analyst._guard = guard
+    analyst._next = jobs.Handover(2, learned, publish=True, store=False), later
+    chunk = chunk_of(bench.run(30.0, 3))
+    chunk[:, 0] += learned.state.engine[0]["t_s"] + 0.001 - chunk[0, 0]
+    for piece in np.array_split(chunk, 15):
+        analyst.take(jobs.Batch(piece, None))
+    assert guard.state == "proven"
+    assert guard._candidate is (later if gain == 1.0 else held)
+    assert analyst._baseline is (learned if gain == 1.0 else None)
+
+
+def test_what_waited_to_be_trusted_waits_on_after_a_kill(
+    bench: Bench, state: Path, tmp_path: Path
+) -> None:
+    """Else the baseline of a machine that is killed each half minute would never grow younger."""
+    folder, project = tmp_path / "state", machine().project
+    shutil.copytree(state, folder)
+    generations = Generations(folder, project.digest)
+    estimator = generations.restore(project.model).estimator
+    assert estimator is not None
+    last_s = estimator.state.engine[0]["t_s"]
+    chunk = chunk_of(bench.run(5.0, 7))
+    chunk[:, 0] += last_s + 0.001 - chunk[0, 0]
+    estimator.advance(chunk)
+    level = [0.003 * rated_m3s(project.model)] * 2
+    generations.await_trust(generations.save(estimator, notes={"level_m3s": level}))
+    daemon = Simulated(bench, folder, 100.0)
+    daemon.hear(bench.run(26.0, 5))  # it is killed before its own first snapshot is due
+    kept = generations.baseline(project.model)
+    assert kept.estimator is not None and kept.notes["level_m3s"] == level
+    assert kept.estimator.state.engine[0]["t_s"] == chunk[-1, 0]
+
+
 def test_a_cause_that_healthy_samples_hide_is_named_later(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -25,6 +25,7 @@ from rtid.daemon.diagnosing import newest
 from rtid.daemon.helper import Helper
 from rtid.daemon.jobs import Answer, Batch, HandoverJudgement, Publication, Ready
 from rtid.daemon.lag import LagMeter
+from rtid.daemon.pipe import Pipe, pair
 from rtid.daemon.plant_watch import PlantWatch
 from rtid.daemon.recorder import Recorder
 from rtid.daemon.status import Alarm, BusHealth, ChamberStatus, EstimateStatus, LoopHealth, Status
@@ -124,11 +125,11 @@ def test_single_surprises_and_a_slow_drift_are_no_change() -> None:
     assert watch([float(x) for x in np.linspace(1.2, 6.0, 600)]) == []
 
 
-def test_what_the_guard_of_the_good_map_does_not_mind_is_no_change() -> None:
+def test_what_the_guard_of_the_good_map_answers_for_is_not_the_watchs_to_say() -> None:
     """Another oil moves the innovations far more than it moves the map."""
     plant = PlantWatch()
     for k in range(60):
-        plant.push(HandoverJudgement(1, 1.5 if k < 40 else 9.0, 1000, float(k), is_calm=True))
+        plant.push(HandoverJudgement(1, 1.5 if k < 40 else 9.0, 1000, float(k), is_guarded=True))
     assert not plant.changed
     for k in range(60, 65):
         plant.push(HandoverJudgement(1, 40.0, 1000, float(k)))
@@ -263,6 +264,24 @@ def echo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     )
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
     return "echo_helper"
+
+
+@pytest.mark.parametrize("sizes", [(), (3, 0, 5), (20_000, 7, 0, 50), (1_000_001,)])
+def test_arrays_go_through_a_pipe_as_they_lie(sizes: tuple[int, ...]) -> None:
+    """Small ones in the socket, large ones in memory that both ends see; the receiver owns them."""
+    ours, theirs = (Pipe(fd) for fd in pair())
+    sent = [np.arange(n, dtype=float) for n in sizes]
+    for _ in range(2):
+        ours.send(sent)
+        found = theirs.receive()
+        assert all(np.array_equal(a, b) for a, b in zip(sent, found, strict=True))
+        for array in found:
+            array[:] = 1.0  # the receiver's own
+            assert array.ctypes.data % 8 == 0
+    ours.close()
+    with pytest.raises(EOFError):
+        theirs.receive()
+    theirs.close()
 
 
 def until(true: Callable[[], bool], limit_s: float = 30.0) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import os
 import random
 import signal
 import time
+import zlib
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -16,6 +18,7 @@ import pytest
 from rtid.estimator.estimator import Estimator
 from rtid.trace import snapshot as store
 from rtid.trace.snapshot import Generations
+from rtid.trace.squeezed import unsqueezed
 from tests.faults.conftest import Figure
 from tests.faults.harness import drift, machine
 
@@ -58,6 +61,18 @@ def test_what_is_restored_goes_on_bit_for_bit(tmp_path: Path) -> None:
         learner.estimator = estimator
         learner.push(rest)
     assert whole.estimator.state.memory.tobytes() == again.estimator.state.memory.tobytes()
+
+
+def test_a_snapshot_of_a_program_before_is_read(tmp_path: Path) -> None:
+    """It was an npz that was deflated."""
+    _, (_, newest) = fill(tmp_path)
+    whole = newest.read_bytes()
+    with np.load(io.BytesIO(unsqueezed(whole[: -store.SEAL.size]))) as file:
+        deflated = io.BytesIO()
+        np.savez_compressed(deflated, **file)
+    content = deflated.getvalue()
+    newest.write_bytes(content + store.SEAL.pack(store.MARK, zlib.crc32(content)))
+    assert same(restored(tmp_path)) and len(whole) < 1.2 * len(content)
 
 
 def test_row_17_cut_every_512_bytes(tmp_path: Path, figure: Figure) -> None:
