@@ -79,7 +79,9 @@ def test_one_beta_and_one_rho_in_every_command(
     monkeypatch.setattr(studies, "replayed", None)
     monkeypatch.setattr(studies, "searched", None)
     compare = call(capsys, "compare", trace, "-p", project)
-    call(capsys, "export", trace, folder / "map.json", "-p", project)
+    with monkeypatch.context() as blind:
+        blind.setattr(studies, "read_trace", None)  # the maps are kept: the record is not read
+        call(capsys, "export", trace, folder / "map.json", "-p", project)
     origin = read_map(folder / "map.json")[1]
     again = call(capsys, "diagnose", trace, "-p", project)
     learned = call(capsys, "check", project, trace)["learned"]

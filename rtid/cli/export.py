@@ -14,8 +14,10 @@ from rtid.cli.options import NoCache, PriorOption, ProjectOption
 
 if TYPE_CHECKING:
     from rtid.estimator.flowmap import FlowMap
+    from rtid.estimator.prior import Prior
     from rtid.estimator.solution import Solution
     from rtid.estimator.validity import Doubt
+    from rtid.maps.flashed import FlashedDifference, FlashedMap
     from rtid.maps.gridded import Gridded, Tables
     from rtid.maps.release import Room
     from rtid.project import Project
@@ -104,45 +106,83 @@ def export(
     .npz and .csv), and nothing is written without --force.
     """
     from rtid.maps.files import provenance
-    from rtid.maps.flashed import differences, read_flashed
     from rtid.maps.fmu import check_version
-    from rtid.maps.prior_map import find_prior, said_of, with_prior
-    from rtid.maps.release import Room
-    from rtid.plain import plain
+    from rtid.maps.prior_map import with_prior
     from rtid.project import load
-    from rtid.tell.released import said
     from rtid.tell.released import sheet as sheet_of
 
-    there = axes or flashed
-    maps = read_flashed(there) if there else ()
-    share = 0.01 * tolerance if tolerance else None
-    room = Room(share, _pair(nodes), n_bytes, maps if axes else ())
+    room, there = _room(tolerance, nodes, n_bytes, axes, flashed)
     _refuse_format(output, room.is_asked or sheet is not None)
     check_version(fmi)
     loaded = with_prior(load(project), prior_map)
-    prior = find_prior(loaded)
     learned = _learned(loaded, source)
-    solution, flowmap, effects = learned[:3]
-    cells = {e.name: int((e.status == "valid").sum()) for e in flowmap.edges}
     if not force:
-        _refuse_unknown(source, output, learned, any(cells.values()) or prior is not None)
-    origin = provenance(solution, loaded.name, loaded.digest, source.name, effects)
+        _refuse_unknown(source, output, learned)
+    identity = loaded.name, loaded.digest, source.name, learned.effects
+    origin = provenance(learned.solution, *identity)
     tables = _written(output, loaded, learned, origin, room, fmi, map_alone)
-    changes = differences(flowmap, maps) if maps else []
+    changes = _changes(learned, there)
     if sheet is not None:
         sheet.write_text(sheet_of(output.name, tables, changes, origin), "utf-8")
-    if as_json:
-        document = {"schema": 1, "written": str(output), "valid_blocks": cells, "effects": effects}
-        document |= {"tables": [_facts(g) for g in tables], "changed": plain(changes)}
-        print(json.dumps(document))
-        return
-    text = ", ".join(f"{name} {count}" for name, count in cells.items())
+    tell = _print_json if as_json else _print
+    tell(output, loaded, learned, tables, changes)
+
+
+def _room(
+    tolerance: float | None,
+    nodes: str | None,
+    n_bytes: int | None,
+    axes: Path | None,
+    flashed: Path | None,
+) -> tuple[Room, tuple[FlashedMap, ...]]:
+    """How large tables may be, and the maps that are there already."""
+    from rtid.maps.flashed import read_flashed
+    from rtid.maps.release import Room
+
+    file = axes or flashed
+    there = read_flashed(file) if file else ()
+    share = 0.01 * tolerance if tolerance else None
+    return Room(share, _pair(nodes), n_bytes, there if axes else ()), there
+
+
+def _changes(learned: Exported, there: tuple[FlashedMap, ...]) -> list[FlashedDifference]:
+    from rtid.maps.flashed import differences
+
+    return differences(learned.flowmap, there) if there else []
+
+
+def _print_json(
+    output: Path,
+    project: Project,
+    learned: Exported,
+    tables: Tables,
+    changes: list[FlashedDifference],
+) -> None:
+    from rtid.plain import plain
+
+    document = {"schema": 1, "written": str(output), "valid_blocks": learned.cells}
+    document |= {"effects": learned.effects}
+    document |= {"tables": [_facts(g) for g in tables], "changed": plain(changes)}
+    print(json.dumps(document))
+
+
+def _print(
+    output: Path,
+    project: Project,
+    learned: Exported,
+    tables: Tables,
+    changes: list[FlashedDifference],
+) -> None:
+    from rtid.maps.prior_map import said_of
+    from rtid.tell.released import said
+
+    text = ", ".join(f"{name} {count}" for name, count in learned.cells.items())
     print(f"wrote {output}; valid blocks: {text}")
     for line in said(tables, changes):
         print(line)
-    print(_beside(effects, loaded))
-    if prior is not None:
-        print(said_of(prior, flowmap))
+    print(_beside(learned.effects, project))
+    if learned.prior is not None:
+        print(said_of(learned.prior, learned.flowmap))
 
 
 def _refuse_format(output: Path, is_sized: bool) -> None:
@@ -164,7 +204,7 @@ def _refuse_format(output: Path, is_sized: bool) -> None:
         raise RtidError(f"{output}: this format has no table of such a size", remedy, exit_code=2)
 
 
-def _refuse_unknown(source: Path, output: Path, learned: Exported, is_known: bool) -> None:
+def _refuse_unknown(source: Path, output: Path, learned: Exported) -> None:
     """RtidError for maps that are impossible, or that know nothing."""
     from rtid.errors import RtidError
 
@@ -174,6 +214,7 @@ def _refuse_unknown(source: Path, output: Path, learned: Exported, is_known: boo
             "--force writes it all the same",
             exit_code=4,
         )
+    is_known = any(learned.cells.values()) or learned.prior is not None
     if not is_known and output.suffix.lower() not in COMPLETE:
         raise RtidError(
             f"{source}: not exported, no block of its maps stands on data",
@@ -247,7 +288,13 @@ class Exported(NamedTuple):
     invalid: list[Doubt]
     lag_s: float
     timings: list[str]
+    prior: Prior | None
     study: Study | None = None
+
+    @property
+    def cells(self) -> dict[str, int]:
+        """Valid blocks by edge."""
+        return {e.name: int((e.status == "valid").sum()) for e in self.flowmap.edges}
 
 
 def _write_fmu(
@@ -268,15 +315,15 @@ def _write_fmu(
 def _learned(project: Project, source: Path) -> Exported:
     """From a snapshot as it is, from a trace by the record path; effects beside, what is wrong."""
     from rtid.estimator.validity import doubts_of
+    from rtid.maps.prior_map import find_prior, published
 
-    timings, study = list[str](), None
+    timings, study, prior = list[str](), None, find_prior(project)
     if source.suffix.lower() == SNAPSHOT:
-        from rtid.maps.prior_map import find_prior, published
         from rtid.study.on_board import load_for
 
         estimator, live = load_for(source, project)
         solution, lag = estimator.solution(), (0.0, 0.0)
-        flowmap = published(solution, find_prior(project))
+        flowmap = published(solution, prior)
         effects = [{"effect": a.effect, "where": a.where} for a in live]
         lag_s = solution.model.lag.nominal_s
     else:
@@ -287,8 +334,8 @@ def _learned(project: Project, source: Path) -> Exported:
         with progress_bar() as progress:
             study = Study(project, source, progress)
             fit, flowmap = study.fit, study.map
-            timings = [timing.effect for timing, _ in study.fitted.revision.timings]
+            timings = study.timings
         solution, lag = fit.solution, (fit.lag_s, fit.lag_sd_s)
         effects, lag_s = as_json(study.effects), fit.lag_s
     invalid = [doubt for doubt in doubts_of(solution, *lag) if doubt.is_invalid]
-    return Exported(solution, flowmap, effects, invalid, lag_s, timings, study)
+    return Exported(solution, flowmap, effects, invalid, lag_s, timings, prior, study)

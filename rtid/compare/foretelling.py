@@ -22,7 +22,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import lsq_linear
 
 from rtid.compare.candidate import CandidateMap
 from rtid.compare.comparison import Comparison, compare
@@ -120,6 +119,8 @@ def rated_m3s(model: Machine) -> float:
 
 def without_day(rows: Residuals, sigma: FloatArray) -> FloatArray:
     """The residual (n, chambers) in units of sigma (chambers,), without what a day may change."""
+    from scipy.optimize import lsq_linear  # noqa: PLC0415 - takes long to import
+
     scaled = rows.residual / sigma
     if not len(scaled):
         return scaled

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import lsq_linear
 
 from rtid.compare.candidate import CandidateMap
 from rtid.compare.comparison import compare
@@ -118,6 +117,8 @@ class _Trial:
 
     def _better(self, suspect: Suspect, size: float, rows: Residuals) -> float:
         """One step of Gauss-Newton."""
+        from scipy.optimize import lsq_linear  # noqa: PLC0415 - takes long to import
+
         low, high = suspect.bounds
         step = suspect.step if size + suspect.step <= high else -suspect.step
         chunk, flow = suspect.change(self._chunk, size + step)

@@ -145,7 +145,7 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
         if now.rho >= most_rho(now) and not trial.is_timing and is_at_a_bound(now):
             continue
         after = residual(now, state.held_out)
-        own = own_share(now, trial, state.held_out)
+        own = own_share(now, trial, state.held_out, after)
         share = min(material_share(last, after), BENT * own)
         is_shown = share >= MATERIAL
         does = None

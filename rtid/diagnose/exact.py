@@ -8,7 +8,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from rtid.diagnose.fit import Fit, fit, tried
+from rtid.diagnose.fit import Fit, fit, tried, with_rows_of
 from rtid.diagnose.regression import Score
 from rtid.diagnose.search import Beside
 from rtid.diagnose.trials import GAIN, Trial, TrialState, scored
@@ -133,7 +133,7 @@ def carried_on(state: TrialState, present: Fit, trial: Trial) -> Fit:
     """The fit with a trial's revision, to the end."""
     revision, weights, start = trial.revision, present.weights, present
     if trial.fit is not None:
-        weights, start = trial.fit.weights, trial.fit
+        weights, start = trial.fit.weights, with_rows_of(present, trial.fit)
     return fit(state.model, state.chunk, weights, revision, start, bank=False)
 
 

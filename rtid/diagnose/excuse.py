@@ -64,6 +64,8 @@ def _excused(present: Fit, most: float, rest: Misfit | None = None) -> Fit:
 
 def left_over(present: Fit) -> Misfit:
     """What the maps of a fit leave of its record beside its effects."""
+    if present.rest is not None:
+        return present.rest
     model, chunk = _machine(present)
     weights = present.weights
     return residual_of(model, chunk, weights, sketch(model, run(model, chunk, weights)))

@@ -61,8 +61,9 @@ def limits(fit: Fit) -> Limits:
     if chunk is None or not fit.columns.candidates:
         return {}
     other = one_pass(
-        fit.declared, chunk, fit.weights, fit.revision, fit, True, suspects=fit.suspects
-    )
+        fit.declared, chunk, fit.weights, fit.revision, fit, True, thorough=False,
+        suspects=fit.suspects,
+    )  # fmt: skip
     limits_of: Limits = {}
     for k, candidate in enumerate(fit.columns.candidates):
         if candidate in fit.revision.effects or candidate not in other.columns.candidates:

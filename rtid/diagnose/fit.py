@@ -26,6 +26,7 @@ from rtid.effects.laws import add_echoes, cause_of
 from rtid.effects.page import Effect
 from rtid.effects.record_view import MapTerms, RecordView
 from rtid.estimator.factor import PRIOR_SD, SHARED_PRIOR
+from rtid.estimator.misfit import Misfit
 from rtid.estimator.record import refined, run
 from rtid.estimator.solution import sketch
 from rtid.estimator.state import Weights
@@ -51,6 +52,7 @@ class Fit:
     where they are, to which `map` belongs and which everything else is judged by.
     shapes: (effect, nonlinear parameter) of each column of shapes.  rows: of the record, for
     another fit with the same commands and weights; large.  suspects: scored beside the catalogue.
+    rest: what the maps leave of the record where nothing was added, if somebody has asked before.
     """
 
     declared: Machine
@@ -67,6 +69,7 @@ class Fit:
     shapes: tuple[tuple[int, int], ...] = ()
     rows: Rows | None = None
     suspects: tuple[Effect, ...] = ()
+    rest: Misfit | None = None
 
     @cached_property
     def model(self) -> Machine:
@@ -188,10 +191,11 @@ def one_pass(
     """
     if revision.replaces_lag:
         weights = replace(weights, lag_s=0.0)
-    declared, sent = model, transformed(model, chunk, revision.timings)
+    declared, sent = model, _sent(start, model, chunk, revision)
     model = split(declared)
     soft = softened(model, sent, weights, revision)
-    rows = _same_rows(start, sent, weights, soft) or rows_of(model, sent, weights, soft=soft)
+    known = _same_rows(start, sent, weights, soft)
+    rows = known or rows_of(model, sent, weights, soft=soft)
     before = start.map if start else before or _map_alone(model, rows)
     view = RecordView.of(model, sent, weights, before)
     columns = Columns(rows.condensed)
@@ -212,7 +216,9 @@ def one_pass(
     fixed = regression.fit((*range(1, 1 + len(model.chambers)), *at))
     flowmap = MapTerms(rows.cells, projected.terms(list(fixed.used), fixed.theta), NO_COV)
     parts = chunk, weights, revision, before, columns, regression, estimate, fixed
-    fitted = Fit(declared, *parts, flowmap, first, shapes, rows, suspects)
+    is_same = start is not None and known is not None and start.revision == revision
+    rest = start.rest if start is not None and is_same and not revision.effects else None
+    fitted = Fit(declared, *parts, flowmap, first, shapes, rows, suspects, rest)
     vars(fitted).update(model=model, sent=sent, view=view)  # what is made when it is missing
     return with_covariances(fitted) if thorough else fitted
 
@@ -275,7 +281,24 @@ def _same_rows(
         (start.rows.soft, soft),
         (start.sent, sent),
     )
-    return start.rows if all(np.array_equal(a, b) for a, b in pairs) else None
+    return start.rows if all(a is b or np.array_equal(a, b) for a, b in pairs) else None
+
+
+def _sent(
+    start: Fit | None, declared: Machine, chunk: FloatArray, revision: Revision
+) -> FloatArray:
+    """The record with the commands as they reach the spools; a fit's with the same timings."""
+    is_same = start is not None and start.chunk is chunk and start.declared is declared
+    if start is not None and is_same and start.revision.timings == revision.timings:
+        return start.sent
+    return transformed(declared, chunk, revision.timings)
+
+
+def with_rows_of(known: Fit, fitted: Fit) -> Fit:
+    """A light fit with the rows of another one, where they are its own."""
+    soft = softened(fitted.model, fitted.sent, fitted.weights, fitted.revision)
+    rows = _same_rows(known, fitted.sent, fitted.weights, soft)
+    return replace(fitted, rows=rows) if rows is not None and fitted.rows is None else fitted
 
 
 def columns_of_effects(fitted: Fit) -> list[Volumes]:

@@ -311,6 +311,7 @@ def _experiment(result: Result, unseen: tuple[Unseen, ...]) -> list[str]:
     """What a wandering supply would show, computed from this record's own motion."""
     closed = {(u.effect, u.where) for u in unseen if not u.visible}
     closed |= {key for f in result.found for key in (f.key, *f.alike) if f.alike}
+    closed &= {candidate.key for candidate in result.last.columns.candidates}
     best: dict[Key, tuple[float, float]] = {}
     for candidate, (before, after) in (limits(result.last) if closed else {}).items():
         if candidate.key in closed and np.isfinite(after) and after > 0:

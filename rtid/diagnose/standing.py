@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 from rtid.diagnose.clean import as_measured, usable
@@ -41,7 +41,7 @@ def fitted(
     parts: tuple[AddedEffect, ...] = (),
     suspects: tuple[Effect, ...] = (),
 ) -> Fit:
-    """The one fit of a model with its parts to a record, chunk (n, 2 + signals), SI, light.
+    """The one fit of a model with its parts to a record, chunk (n, 2 + signals), SI.
 
     Replay, compare, export, diagnosis and page read this one; its `declared` has the grid that the
     record needs.  suspects: effects of the user's, of which parts may be.  Raises PartError where
@@ -50,9 +50,12 @@ def fitted(
     model, chunk = as_measured(model, chunk), usable(model, chunk)
     weights = prepare(model, chunk)
     revision = recall(model, chunk, weights, parts, suspects)
-    first = few_excused(*fine_enough(fit(model, chunk, weights, revision, bank=False)))
+    fine, rest = fine_enough(fit(model, chunk, weights, revision, bank=False))
+    first = few_excused(fine, rest)
+    if first is fine:
+        first = replace(first, rest=rest)
     record = first.declared, chunk, first.weights, first.revision
-    return one_pass(*record, first, bank=False).light()
+    return one_pass(*record, first, bank=False)
 
 
 def stand(

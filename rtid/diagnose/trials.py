@@ -197,15 +197,14 @@ def material_share(before: Residual, after: Residual) -> float:
     return float(np.sqrt(max(0.0, gone)) / max(before.flow_m3s, 1e-12))
 
 
-def own_share(now: Fit, trial: Trial, held_out: FloatArray) -> float:
+def own_share(now: Fit, trial: Trial, held_out: FloatArray, whole: Residual) -> float:
     """Size of an effect's own flow on the held-out part, as a share of the rms flow.
 
-    held_out (n, 2 + signals), SI.  inf for a timing.
+    held_out (n, 2 + signals), SI; whole: what the fit leaves of it.  inf for a timing.
     """
     if trial.is_timing:
         return float("inf")
     effect = now.revision.effects[-1]
-    whole = residual(now, held_out)
     without = residual(now, held_out, leave_out=effect)
     change = whole.left - without.left
     return float(np.sqrt(np.mean(change**2)) / max(whole.flow_m3s, 1e-12)) if change.size else 0.0

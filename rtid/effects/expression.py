@@ -39,7 +39,7 @@ class Expression:
     @property
     def names(self) -> tuple[str, ...]:
         """Names that it uses, in the order of their first appearance."""
-        return tree.names_of(self.root)
+        return self.root.names
 
     def __call__(self, **values: ArrayLike) -> FloatArray:
         """Value for these values of the names, broadcast together; other names are ignored."""

@@ -23,7 +23,7 @@ from rtid.effects.expression import Expression
 from rtid.effects.filtering import filtered
 from rtid.effects.page import FUNCTION, Effect, EffectError
 from rtid.effects.record_view import RecordView, supply_of, tank_of
-from rtid.effects.tree import NAME, ZERO, Node, derivative, evaluate, names_of, number, substituted
+from rtid.effects.tree import NAME, ZERO, Node, derivative, evaluate, number, substituted
 from rtid.effects.view import View as Seen
 from rtid.model import Chamber, Edge, Machine
 from rtid.plain import FloatArray
@@ -60,7 +60,7 @@ class LawLine:
     @property
     def names(self) -> set[str]:
         """All names in it."""
-        return {n for node in (self.outer, self.inner) if node is not None for n in names_of(node)}
+        return {n for node in (self.outer, self.inner) if node is not None for n in node.names}
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ def _line(rest: str, right: str, coefficient: str, known: Nodes) -> LawLine | No
     if inner.startswith(LAGGED):
         inner, _, late = inner.removeprefix(LAGGED).removesuffix(")").rpartition(",")
     line = LawLine(rest, _tree(outer), _tree(inner) if has_rate else None, late.strip()).put(known)
-    if line.inner is not None and coefficient in names_of(line.inner):
+    if line.inner is not None and coefficient in line.inner.names:
         line = replace(line, inner=derivative(line.inner, coefficient))
     else:
         line = replace(line, outer=derivative(line.outer, coefficient))
@@ -169,6 +169,13 @@ def places_of(effect: Effect, model: Machine, compliance: FloatArray) -> Iterato
         placed = tuple((c, line.put(by).put(fixed)) for c, line, by in at)
         _refuse_unknown(effect, model, placed)
         yield Placed(effect, where, placed)
+
+
+def placed_on(view: RecordView, effect: Effect) -> tuple[Placed, ...]:
+    """An effect wherever its equation can act on the machine of a record, found once a record."""
+    if effect not in view.placed:
+        view.placed[effect] = tuple(places_of(effect, view.model, view.compliance))
+    return view.placed[effect]
 
 
 Meant = Iterator[tuple[int, LawLine, dict[str, Node]]]  # chamber, line, meaning of its symbols
@@ -283,7 +290,7 @@ def _refuse_unknown(
 
 def _evaluated(node: Node, value: Callable[[str], FloatArray]) -> FloatArray:
     with np.errstate(all="ignore"):
-        arrays = {name: value(name) for name in names_of(node)}
+        arrays = {name: value(name) for name in node.names}
         return np.asarray(evaluate(node, arrays), dtype=np.float64)
 
 
@@ -312,7 +319,7 @@ class Values:
             outer, lag_s = self.at_samples(line.outer), self.values.get(line.late, 0.0)
             inside = lagged(self.at_samples(line.inner), self.view.step_s, lag_s)
             return np.asarray(0.5 * (outer[1:] + outer[:-1]) * np.diff(inside))
-        names, view = names_of(line.outer), self.view
+        names, view = line.outer.names, self.view
         if FUNCTION not in names and not any(n in view.held or n.startswith(MAP) for n in names):
             return view.over_intervals(self.at_samples(line.outer))
         start, end = (_evaluated(line.outer, at) for at in (self._at_start, self._at_end))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -88,9 +89,9 @@ class RecordView:
         along = np.empty((5, len(model.edges), len(chunk) - 1)).transpose(2, 1, 0)
         cell = np.empty(along.shape[:2], np.int64)
         follow_map(state.engine, state.cells, theta, cov, chunk, along, cell)
-        return cls(
-            model, chunk, weights.compliance, np.nan_to_num(along), np.isfinite(along[:, 0, 0])
-        )
+        inside = np.isfinite(along[:, 0, 0])
+        along[~inside] = 0.0
+        return cls(model, chunk, weights.compliance, along, inside)
 
     @classmethod
     def without_map(
@@ -154,6 +155,11 @@ class RecordView:
     def held(self) -> frozenset[str]:
         """Signals that are held between their samples, and not linear."""
         return frozenset(s.name for s in self.model.signals if s.kind in (COMMAND, MODE))
+
+    @cached_property
+    def placed(self) -> dict[Any, Any]:
+        """What `law.placed_on` has found, by the effect's page."""
+        return {}
 
     @property
     def supply_name(self) -> str:

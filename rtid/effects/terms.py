@@ -18,7 +18,7 @@ import numpy as np
 from rtid.effects.column import Candidate
 from rtid.effects.expression import Expression
 from rtid.effects.law import LawLine, Placed, places_of
-from rtid.effects.tree import NAME, NEG, Node, derivative, names_of, number
+from rtid.effects.tree import NAME, NEG, Node, derivative, number
 from rtid.model import POSITION, PRESSURE, Machine, Term
 from rtid.plain import FloatArray
 
@@ -90,8 +90,8 @@ def _forms(model: Machine, chamber: str, line: LawLine) -> list[tuple[_Form, str
         form = _form(model, line.outer)
         return [(form, "")] if form else []
     size, room = without_factor(line.outer)
-    volume = chamber if names_of(room) == (f"V_{chamber}",) and room.op == NAME else ""
-    if names_of(room) and not volume:
+    volume = chamber if room.names == (f"V_{chamber}",) and room.op == NAME else ""
+    if room.names and not volume:
         return []
     form = _form(model, line.inner)
     forms = [form] if form and form.shape != "root" else _of_one_pressure(model, line.inner)
@@ -109,16 +109,16 @@ def _form(model: Machine, node: Node) -> _Form | None:
 
 def without_factor(node: Node) -> tuple[float, Node]:
     """Constant factor of a product, and what it multiplies: 1 where that is all."""
-    if not names_of(node):
+    if not node.names:
         return float(Expression("", node)()), number(1.0)
     if node.op == NEG:
         size, inner = without_factor(node.args[0])
         return -size, inner
-    if node.op in ("*", "/") and not names_of(node.args[1]):
+    if node.op in ("*", "/") and not node.args[1].names:
         size, inner = without_factor(node.args[0])
         factor = float(Expression("", node.args[1])())
         return (size * factor if node.op == "*" else size / factor), inner
-    if node.op == "*" and not names_of(node.args[0]):
+    if node.op == "*" and not node.args[0].names:
         size, inner = without_factor(node.args[1])
         return size * float(Expression("", node.args[0])()), inner
     return 1.0, node
@@ -145,7 +145,7 @@ def _of_one_pressure(model: Machine, node: Node) -> list[_Form]:
 
     No sum either where a declared range lets the pressure reach zero.
     """
-    names, kinds = names_of(node), {s.name: s for s in model.signals}
+    names, kinds = node.names, {s.name: s for s in model.signals}
     if len(names) != 1 or kinds[names[0]].kind != PRESSURE:
         return []
     weights = ((names[0], 1.0),)

@@ -12,7 +12,7 @@ At a corner (abs, sign, pos, min, max) the derivative is the mean of both sides.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -23,13 +23,25 @@ NUMBER, NAME, NEG = "number", "name", "neg"
 
 @dataclass(frozen=True)
 class Node:
-    """One node; `column` is its place in the text that it was read from."""
+    """One node; `column` is its place in the text that it was read from.
+
+    names: those in the tree, in the order of their first appearance.
+    """
 
     op: str
     args: tuple[Node, ...] = ()
     value: float = 0.0
     name: str = ""
     column: int = field(default=0, compare=False)
+    names: tuple[str, ...] = field(init=False, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        """Note the names in the tree: a deep one is not gone through again."""
+        if self.op == NAME:
+            names = [self.name]
+        else:
+            names = [name for arg in self.args for name in arg.names]
+        object.__setattr__(self, "names", tuple(dict.fromkeys(names)))
 
 
 def _ssqrt(z: FloatArray) -> FloatArray:
@@ -75,13 +87,6 @@ def evaluate(node: Node, values: Mapping[str, FloatArray]) -> FloatArray:
     return function(*(evaluate(arg, values) for arg in node.args))
 
 
-def names_of(node: Node) -> tuple[str, ...]:
-    """Names in the tree, in the order of their first appearance."""
-    if node.op == NAME:
-        return (node.name,)
-    return tuple(dict.fromkeys(name for arg in node.args for name in names_of(arg)))
-
-
 def number(value: float) -> Node:
     """A number as it would be read: a negative one is the negation of its size."""
     return Node(NEG, (Node(NUMBER, value=-value),)) if value < 0 else Node(NUMBER, value=value)
@@ -120,7 +125,7 @@ def _call(function: str, *args: Node) -> Node:
 
 def derivative(node: Node, name: str) -> Node:
     """The tree of d node / d name."""
-    if name not in names_of(node):
+    if name not in node.names:
         return ZERO
     if node.op == NAME:
         return ONE
@@ -192,10 +197,12 @@ def substituted(node: Node, by: Mapping[str, Node]) -> Node:
     """The tree with names replaced by trees."""
     if node.op == NAME:
         return by.get(node.name, node)
+    if not any(name in by for name in node.names):
+        return node
     args = tuple(substituted(arg, by) for arg in node.args)
     if node.op == "-" and args[1] == ZERO:
         return args[0]
-    return replace(node, args=args)
+    return Node(node.op, args, node.value, node.name, node.column)
 
 
 _LEVEL = {"+": 1, "-": 1, "*": 2, "/": 2, NEG: 3, "**": 4}

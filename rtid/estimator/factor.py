@@ -39,8 +39,9 @@ class Factor:
         about the square of condition number x rounding.
         """
         right = right * self.scale
-        theta = cho_solve((self.lower, True), right)
-        theta += cho_solve((self.lower, True), residual(self.matrix, theta, right))
+        theta = cho_solve((self.lower, True), right, check_finite=False)
+        rest = residual(self.matrix, theta, right)
+        theta += cho_solve((self.lower, True), rest, check_finite=False)
         return np.asarray(theta * self.scale)
 
     def columns(self, m: int) -> FloatArray:
@@ -58,7 +59,8 @@ def factorize(normal: Normal, n_shared: int) -> Factor:
     """Factor of information + prior."""
     prior = np.full(len(normal.right), PRIOR_SD**-2)
     prior[:n_shared] = SHARED_PRIOR
-    matrix = normal.gram + np.diag(prior)
+    matrix = normal.gram.copy()
+    matrix[np.diag_indices(len(prior))] += prior
     scale = np.ldexp(1.0, -(np.frexp(np.maximum(np.diag(matrix), np.finfo(float).tiny))[1] // 2))
     matrix *= scale[:, None]
     matrix *= scale

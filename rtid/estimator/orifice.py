@@ -21,10 +21,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.linalg import cho_solve, cholesky, solve_triangular
-from scipy.optimize import OptimizeResult, minimize
 
 from rtid.model import Edge
 from rtid.plain import FloatArray
@@ -165,7 +165,9 @@ def _descend(
     surprise: Callable[[FloatArray], float],
     start: tuple[float, ...],
     bounds: tuple[tuple[float, float], ...],
-) -> OptimizeResult:
+) -> Any:
+    from scipy.optimize import minimize  # noqa: PLC0415 - takes long to import
+
     steps = np.diag([1.5, 1.5, 1.5, 0.2][: len(start)])
     simplex = np.vstack([start, np.array(start) + steps])
     return minimize(

@@ -127,6 +127,7 @@ def solve(
         effective = np.einsum("ij,ij->i", cov, normal.gram)
         leverage = leverage_of(model, sums, effective)
         corrected = correct(normal, factor, leverage)
+        del factor  # two matrices as large as cov
         cov += corrected.basis @ corrected.cov_change @ corrected.basis.T
     influence, m = cov[:n_c].copy(), len(sums.blocks)
     tiles = cov[ns:, ns:].reshape(m, TERMS, m, TERMS)[np.arange(m), :, np.arange(m)]

@@ -21,7 +21,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from rtid.effects import Effect, Expression
-from rtid.effects.tree import NAME, NEG, Node, named, names_of, number, substituted
+from rtid.effects.tree import NAME, NEG, Node, named, number, substituted
 from rtid.plants.entries import (
     GAP,
     INPUT,
@@ -82,10 +82,10 @@ def places(plant: Plant, name: str) -> tuple[str, ...]:
     if form == "play":
         kinds = {s.name: s.quantity for s in plant.states}
         return tuple(
-            o.name for o in plant.outputs if {kinds.get(n) for n in names_of(o.value)} & {*fitting}
+            o.name for o in plant.outputs if {kinds.get(n) for n in o.value.names} & {*fitting}
         )
     states = tuple(s for s in plant.states if s.quantity in fitting and not s.follows)
-    if form == "force" and "z" in names_of(_right(page)):
+    if form == "force" and "z" in _right(page).names:
         states = tuple(s for s in states if _position(plant, s))
     elif form == "force":  # a force has no say in x' = v
         states = tuple(s for s in states if s.rate.op != NAME)
@@ -236,7 +236,7 @@ def _spilled(
     added: list[EffectParameter] = []
     for state in before.states:
         alike = state.quantity == plant_state.quantity and not state.follows
-        if state.name == where or not alike or where not in names_of(state.rate):
+        if state.name == where or not alike or where not in state.rate.names:
             continue
         share = EffectParameter(
             _own(name, where, f"into_{state.name}"), SHARE, f"into {state.name}", 1

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rtid.effects.tree import Node, derivative, evaluate, named, names_of, number, substituted
+from rtid.effects.tree import Node, derivative, evaluate, named, number, substituted
 from rtid.plain import FloatArray
 from rtid.plants.entries import AMPLITUDE, GAP, INPUT, LIMIT, RATE, SHARE, SPEED, STATE, TIME
 from rtid.plants.insertion import EffectParameter, Insertion
@@ -111,7 +111,7 @@ def _amplitude(insertion: Insertion, added: EffectParameter, present: PlantFit) 
     along |= {a.name: np.asarray(_shape(a, insertion, present)) for a in insertion.added}
     rate = substituted(plant.state(insertion.where).rate, acts)
     unit = _rms(evaluate(derivative(rate, added.name), along))
-    terms = [t for t in _terms(rate) if added.name not in names_of(t)]
+    terms = [t for t in _terms(rate) if added.name not in t.names]
     size = max([_rms(evaluate(t, along)) for t in terms], default=0.0) / max(unit, 1e-300)
     high = LARGEST * size if 0 < size < 1e290 else LARGEST
     return Range(0.0 if added.sign else -high, high, (high * 1e-3, high * 0.1), logarithmic=True)

@@ -28,7 +28,6 @@ from rtid.trace.measured import with_sums
 from rtid.trace.reading import NoSamplesError, Trace, assemble
 
 if TYPE_CHECKING:
-    from rtid.diagnose.fit import Fit
     from rtid.study.known_effects import KnownEffect
 
 
@@ -37,15 +36,13 @@ class Replay:
     """A replayed trace: what was learned from it, by the one fit of its record.
 
     declared: the machine with the noise of its sensors; added: effects of the model beside which
-    `fit` was learned; model and chunk are those of the machine with them; steady: the fit of all
-    that its maps share.
+    `fit` was learned; model and chunk are those of the machine with them.
     """
 
     project: Project
     declared: Machine
     model: Machine
     trace: Trace
-    steady: Fit
     fit: RecordFit
     chunk: FloatArray
     identification_s: tuple[float, float]

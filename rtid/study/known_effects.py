@@ -91,12 +91,14 @@ def acting(fit: Fit, chunk: FloatArray, published: FlowMap | None = None) -> Act
     published: a map that also knows blocks which the fit has not visited, for effects that act on
     the valves' flows.  Raises TooManyEffectsError.
     """
+    if not (fit.revision.effects or fit.revision.timings):
+        return Acting(fit.declared, chunk, (), ())
     sent = transformed_like(fit, chunk)
     model = with_positive_pressures(fit.model, sent)
     view = RecordView.of(model, sent, fit.weights, _everywhere(model, published) or fit.map)
     if not fit.revision.timings:  # nothing was done to the commands
         model, sent = fit.declared, chunk
-        model = with_positive_pressures(model, chunk) if fit.revision.effects else model
+        model = with_positive_pressures(model, chunk)
     if fit.revision.replaces_lag:
         model = replace(model, lag=Lag())
     if lag_s := behind_s(fit.revision.timings):
@@ -171,10 +173,11 @@ def learn_beside(fit: Fit, machine: Acting, chunk: FloatArray) -> RecordFit:
 
 def replayed(
     project: Project, present: Fit, machine: Machine, trace: Trace, ages: MessageAges
-) -> Replay:
+) -> tuple[Replay, Fit]:
     """A record learned from beside its one fit, with the effects that its project has added.
 
-    machine: as declared, with the noise of its sensors.
+    With it the steady fit, of all that its maps share.  machine: as declared, with the noise of its
+    sensors.
     """
     fit = steady(present)
     whole = to_chunk(machine, trace.samples, int(trace.samples.t_us[0]))
@@ -182,7 +185,8 @@ def replayed(
     record = _record_of(present, fit, acts, within(acts.chunk, taught_s(project)))
     added = known_effects(present, acts, [section.key for section in project.sections.added])
     record = replace(record, offsets_s=ages.offsets_s, offsets_sd_s=ages.sd_s)
-    return held_against(project, fit, machine, trace, record, added)
+    made = held_against(project, fit.declared, fit, machine, trace, record, added)
+    return made, fit
 
 
 def learned(model: Machine, chunk: FloatArray) -> RecordFit:
@@ -201,21 +205,25 @@ def _record_of(present: Fit, fit: Fit, acts: Acting, chunk: FloatArray) -> Recor
 
 def held_against(
     project: Project,
-    fit: Fit,
+    fine: Machine,
+    fit: Fit | None,
     machine: Machine,
     trace: Trace,
     record: RecordFit,
     added: tuple[KnownEffect, ...],
 ) -> Replay:
-    """A record beside what was learned from it; fit: its steady one."""
+    """A record beside what was learned from it.
+
+    fine: the machine on the grids of the fit; fit: the steady one, None where it has no effects.
+    """
     whole = to_chunk(machine, trace.samples, int(trace.samples.t_us[0]))
-    chunk = usable(fit.declared, whole)
-    acts = acting(fit, chunk)
-    if acts.measured:  # they may act on flows where the fit has none, and the map now has
+    chunk = usable(fine, whole)
+    acts = acting(fit, chunk) if fit is not None else Acting(fine, chunk, (), ())
+    if fit is not None and acts.measured:  # on flows that the map knows where the fit has none
         acts = acting(fit, chunk, publish(record.solution))
     held_out_s = project.sections.record.validation_s
     spans = taught_s(project), held_out_s
-    return Replay(project, machine, acts.model, trace, fit, record, acts.chunk, *spans, added)
+    return Replay(project, machine, acts.model, trace, record, acts.chunk, *spans, added)
 
 
 def as_json(added: tuple[KnownEffect, ...]) -> list[dict[str, Any]]:

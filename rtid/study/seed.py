@@ -64,11 +64,22 @@ class Seed:
         grids = tuple(edge.grid for edge in fit.declared.edges)
         return cls(grids, fit.weights, effects, timings, sizes, map_.cells, map_.terms)
 
-    def fit(self, model: Machine, chunk: FloatArray, own_effects: tuple[Page, ...] = ()) -> Fit:
-        """The fit of the usable record that it was taken from, light.
+    @property
+    def is_bare(self) -> bool:
+        """True where nothing was added to the machine."""
+        return not (self.effects or self.timings)
+
+    def fit(
+        self,
+        model: Machine,
+        chunk: FloatArray,
+        own_effects: tuple[Page, ...] = (),
+        thorough: bool = True,
+    ) -> Fit:
+        """The fit of the usable record that it was taken from, with its rows.
 
         chunk (n, 2 + signals), SI: that record.  own_effects: pages of the user's effects, which
-        the catalogue does not have.
+        the catalogue does not have.  thorough: with the covariances of its maps.
         """
         pages = {effect.name: effect for effect in own_effects}
 
@@ -89,8 +100,9 @@ class Seed:
             revision,
             None,
             bank=False,
+            thorough=thorough,
             before=before,
-        ).light()
+        )
 
 
 @dataclass(frozen=True)

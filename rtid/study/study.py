@@ -19,6 +19,7 @@ from rtid.diagnose.clean import as_measured, usable
 from rtid.diagnose.diagnosis import Result, search, searched
 from rtid.diagnose.disturbance import with_disturbance
 from rtid.diagnose.extend import Extension, extend
+from rtid.diagnose.finer import on_grids
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.partial import Exhibit, exhibits
 from rtid.diagnose.parts import AddedEffect
@@ -150,7 +151,7 @@ class Study:
 
     @cached_property
     def fitted(self) -> Fit:
-        """The one fit of the part that teaches: what all else is made of."""
+        """The one fit of the part that teaches, what all else is made of; with rows at first."""
         seed, chunk = self._known(FIT), self.taught
         self.progress("fitting", 0.2)
         if seed is not None:
@@ -160,6 +161,11 @@ class Study:
         made = fitted(self.machine, chunk, given, suspects)
         self._keep(FIT, Seed.of(made))
         return made
+
+    def _light(self) -> Fit:
+        """The one fit; its rows, which are large, are let go."""
+        vars(self)["fitted"] = self.fitted.light()
+        return self.fitted
 
     @cached_property
     def replay(self) -> Replay:
@@ -172,11 +178,11 @@ class Study:
         return made
 
     def _learned(self) -> Replay:
-        present = self.fitted
+        present = self._light()
         self.progress("learning the maps", 0.5)
-        made = replayed(self.project, present, self.machine, *self._aged)
+        made, steady = replayed(self.project, present, self.machine, *self._aged)
         counters = self.trace.counters
-        self._keep(LEARNED, Learned.of(made.fit, made.added, made.steady, counters))
+        self._keep(LEARNED, Learned.of(made.fit, made.added, steady, counters))
         return made
 
     def _relearned(self) -> Replay | None:
@@ -185,8 +191,12 @@ class Study:
         if kept is None:
             return None
         model = as_measured(self.machine, self.taught)
-        steady = kept.steady.fit(model, usable(model, self.taught), self.project.effects)
-        return held_against(self.project, steady, self.machine, self.trace, kept.record, kept.added)
+        seed, fine, steady = kept.steady, on_grids(model, kept.steady.grids), None
+        if not seed.is_bare:
+            chunk = usable(model, self.taught)
+            steady = seed.fit(model, chunk, self.project.effects, thorough=False).light()
+        known = self.machine, self.trace, kept.record, kept.added
+        return held_against(self.project, fine, steady, *known)
 
     @property
     def kept(self) -> Learned | None:
@@ -202,6 +212,13 @@ class Study:
     def effects(self) -> tuple[KnownEffect, ...]:
         """The effects of the model, beside which the maps were learned."""
         return self.kept.added if self.kept else self.replay.added
+
+    @property
+    def timings(self) -> list[str]:
+        """Effects of the model that act on times of signals."""
+        if self.kept:
+            return [name for name, *_ in self.kept.steady.timings]
+        return [timing.effect for timing, _ in self.fitted.revision.timings]
 
     @cached_property
     def map(self) -> FlowMap:
@@ -275,7 +292,9 @@ class Study:
         """The model as it is, fitted, with every candidate beside it: what `add` begins with."""
         known, given = self.fitted, added_parts(self.project)
         suspects = self.project.all_effects
-        return stand(self.machine, *self.spans, given, self.progress, known, suspects)
+        made = stand(self.machine, *self.spans, given, self.progress, known, suspects)
+        self._light()
+        return made
 
     def tried(self, effect: str, where: str = "") -> Extension:
         """The model with one effect more, fitted once.  Raises RefusedError."""

@@ -11,7 +11,7 @@ from functools import partial
 from importlib import import_module
 
 from rtid.effects.column import Candidate, Cause, by_equation
-from rtid.effects.law import BEHIND_MAPS, needs_no_pressure, places_of
+from rtid.effects.law import BEHIND_MAPS, needs_no_pressure, placed_on
 from rtid.effects.laws.friction import dahl
 from rtid.effects.laws.lines import lines
 from rtid.effects.laws.openings import opening
@@ -60,7 +60,7 @@ def _of(view: RecordView, effect: Effect) -> Iterator[Cause]:
     if effect.law:
         yield from law_of(effect)(view, effect)
         return
-    for placed in places_of(effect, view.model, view.compliance):
+    for placed in placed_on(view, effect):
         yield by_equation(view, placed)
 
 

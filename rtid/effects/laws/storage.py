@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from rtid.effects.column import Candidate, Cause, Columns
-from rtid.effects.law import Placed, Shape, Volumes, lagged, places_of
+from rtid.effects.law import Placed, Shape, Volumes, lagged, placed_on
 from rtid.effects.laws.common import stored
 from rtid.effects.record_view import RecordView
 from rtid.estimator.state import variance
@@ -62,7 +62,7 @@ def _placed(view: RecordView, candidate: Candidate) -> Placed | None:
     """An effect by its equation where it sits; None for a law by name."""
     if candidate.law.law:
         return None
-    places = places_of(candidate.law, view.model, view.compliance)
+    places = placed_on(view, candidate.law)
     return next((placed for placed in places if placed.where == candidate.where), None)
 
 
