@@ -7,7 +7,6 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,16 +15,11 @@ import typer
 from rtid.cli.exits import Exit
 from rtid.cli.options import UnitsOption
 from rtid.errors import RtidError
-from rtid.units import System, scale_of, with_unit
-
-NOT_ASKED = (
-    "its receiver is older than the question for a flow: compile firmware_bridge/c anew to be sure"
-)
+from rtid.units import System
 
 if TYPE_CHECKING:
     from rtid.apply.session import Plan
     from rtid.apply.versions import VersionRow
-    from rtid.tell.story import Table
 
 
 def apply(
@@ -80,6 +74,8 @@ def apply(
     """
     from rtid.apply.session import apply_map
     from rtid.apply.wish import Wish
+    from rtid.tell.applied import story
+    from rtid.tell.terminal import make_console
 
     if log:
         _list(project, state, as_json)
@@ -88,7 +84,7 @@ def apply(
 
     def confirmed(plan: Plan) -> bool:
         if not as_json:
-            _show(plan)
+            make_console().print(story(plan))
         if plan.objections or plan.is_same or dry_run:
             return False
         if yes:
@@ -106,19 +102,14 @@ def _list(project: Path, state: Path | None, as_json: bool) -> None:
     """All applies, the oldest first."""
     from rtid.apply.versions import Applied
     from rtid.project.folder import state_of
+    from rtid.tell.applied import logged
 
     rows = Applied(state or state_of(project)).rows()
     if as_json:
         print(json.dumps([asdict(row) for row in rows]))
         return
     for row in rows:
-        when = datetime.fromtimestamp(row.unix_s, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
-        changes = [abs(e["largest_m3s"]) for e in row.told.get("edges", ()) if e["largest_m3s"]]
-        largest = "the first"
-        if changes:
-            largest = f"largest change {with_unit(max(changes), 'm3/s')}"
-        again = "" if row.content == row.version else f", the maps of version {row.content}"
-        print(f"{when}  version {row.version}{again}: {row.outcome}, by {row.who}, {largest}")
+        print(logged(row))
 
 
 @contextmanager
@@ -145,19 +136,15 @@ def _bar() -> Iterator[Callable[[int, int], None]]:
 
 
 def _end(plan: Plan, row: VersionRow | None, as_json: bool, dry_run: bool) -> None:
+    from rtid.tell.applied import ending
+
     if as_json:
         document: dict[str, Any] = plan.as_json()
         document |= {"applied": None if row is None else _applied(row)}
         document |= {"verified": None if plan.verified is None else asdict(plan.verified)}
         print(json.dumps(document))
-    elif row is not None:
-        print(_active(row))
-    elif plan.is_same:
-        is_whole = plan.verified is None or plan.verified.is_whole
-        doubt = "" if is_whole else f"  NOT VERIFIED: {NOT_ASKED}."
-        print(f"The controller holds exactly this: nothing to send.{doubt}")
-    elif not plan.objections:
-        print("Nothing was sent.")
+    elif text := ending(plan, row):
+        print(text)
     for text in plan.objections:
         print(f"rtid: refused: {text}", file=sys.stderr)
     is_short = not plan.is_same if row is None else not row.is_verified
@@ -169,73 +156,3 @@ def _applied(row: VersionRow) -> dict[str, Any]:
     """What was done, for `--json`."""
     verified = row.told.get("verified")
     return {"version": row.version, "who": row.who, "outcome": row.outcome, "verified": verified}
-
-
-def _active(row: VersionRow) -> str:
-    """What is active now, how far that was asked, and what nobody can ask."""
-    back = "Back with `rtid apply --undo`."
-    if not row.is_verified:
-        what = f"active, as the controller says: version {row.version}, NOT VERIFIED"
-        return f"{what}: {NOT_ASKED}.  {back}"
-    verified = row.told["verified"]
-    return (
-        f"active: version {row.version}; version and CRC of {verified['slots']} slots read back, "
-        f"{verified['points']} flows asked and right.  {back}\n"
-        "not verified: flows that were not asked, and what the firmware does with them"
-    )
-
-
-def _show(plan: Plan) -> None:
-    from rtid.tell.terminal import make_console
-
-    console = make_console()
-    review = plan.review
-    console.print(plan.why)
-    console.print(plan.held_text)
-    console.print(_changes(plan))
-    console.print(
-        "on data: largest change where the old or the new map stands on data, and its share of the "
-        "rated flow; valid: share of the plane of u and dp; table: what the look-up table is off by"
-    )
-    pressure = scale_of("Pa")
-    for chamber, old, new in review.beta_pa:
-        before = "none" if old is None else pressure.number(old, 1)
-        after = f"{pressure.number(new, 1)} {pressure.name}"
-        console.print(f"bulk modulus {chamber}: {before} -> {after}")
-    if plan.tracking is not None:
-        told = plan.tracking
-        console.print(told if isinstance(told, str) else told.sentence)
-    if not plan.is_same:
-        size = sum(len(data) for data in plan.prepared.images.values())
-        console.print(f"would be version {review.version}: {size} bytes")
-
-
-def _changes(plan: Plan) -> Table:
-    """What would change, valve by valve."""
-    from rtid.tell.story import Table
-
-    flow, pressure = scale_of("m3/s"), scale_of("Pa")
-    errors = {sampled.edge: sampled for sampled in plan.prepared.sampled}
-    rows = []
-    for sampled in plan.review.differences:
-        error = errors.get(sampled.edge)
-        rows.append((
-            sampled.edge,
-            _number(flow.factor * sampled.largest_m3s, "+.4g"),
-            _number(sampled.u_v, ".2f"),
-            _number(pressure.factor * sampled.dp_pa, ".4g"),
-            _number(flow.factor * sampled.rms_m3s, ".3g"),
-            _number(flow.factor * sampled.believed_m3s, "+.4g"),
-            _number(sampled.believed_percent, ".1f"),
-            f"{100 * sampled.valid_before:.0f} -> {100 * sampled.valid:.0f}",
-            "-" if error is None else f"{100 * error.error_max_m3s / sampled.rated_m3s:.3f}",
-        ))  # fmt: skip
-    heads = (
-        "valve", f"largest {flow.name}|", "at V|", f"{pressure.name}|", "rms|", "on data|",
-        "% rated|", "valid %|", "table %|",
-    )  # fmt: skip
-    return Table("", heads, rows)
-
-
-def _number(value: float, form: str) -> str:
-    return format(value, form) if value == value else "-"  # noqa: PLR0124

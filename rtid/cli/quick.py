@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
 from rtid.cli.exits import Exit, refuse_truncated
 from rtid.cli.options import AsJson, RoleOption, UnitsOption, by_role
+from rtid.errors import RtidError
 from rtid.units import System
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from rtid.study.quick import Quick
+    from rtid.study.quick_machine import Given
+    from rtid.study.quick_rate import QuickRate
 
 
 def _volumes(text: str | None) -> str | None:
@@ -73,33 +81,57 @@ def quick(
     command: its neutral, dead band, gains and delay are found.  Exit code 3: the file cannot be
     read, or is of no kind of plant; 4: it is read, and too little for a verdict.
     """
-    from rtid.errors import RtidError
     from rtid.study.quick import quick as look
-    from rtid.study.quick_machine import Given
-    from rtid.study.quick_rate import QuickRate
-    from rtid.tell.quick import lines, rate_lines
     from rtid.tell.replay import progress_bar
 
     if save is not None and save.exists() and not force:
         raise RtidError(f"{save} exists", "give another --save, or --force", Exit.USAGE)
+    given = _given(bore_mm, rod_mm, stroke_mm, dead_volume_l, safe_band, lag_ms)
+    with progress_bar() as progress:
+        looked = look(file, dbc, given, progress, by_role(role or []))
+    answer = _answer(looked, file, save)
+    if save is not None:
+        save.write_text(answer.project, "utf-8")
+    print(json.dumps(answer.document) if as_json else "\n".join(answer.lines))
+    refuse_truncated(file, {"truncated": int(answer.is_truncated)})
+    if not looked.is_enough:
+        raise typer.Exit(Exit.NEGATIVE)
+
+
+def _given(
+    bore_mm: float | None,
+    rod_mm: float | None,
+    stroke_mm: float | None,
+    dead_volume_l: str | None,
+    safe_band_v: float | None,
+    lag_ms: float | None,
+) -> Given:
+    """What the user says of the machine, in SI."""
+    from rtid.study.quick_machine import Given
+
     if bore_mm is not None and rod_mm is not None and rod_mm >= bore_mm:
         raise RtidError("--rod is not thinner than --bore", "give diameters in mm", Exit.USAGE)
     bore_m, rod_m, stroke_m, lag_s = (
         None if value is None else 1e-3 * value for value in (bore_mm, rod_mm, stroke_mm, lag_ms)
     )
     volumes_m3 = _both(dead_volume_l) if dead_volume_l else None
-    given = Given(bore_m, rod_m, stroke_m, volumes_m3, safe_band, lag_s)
-    with progress_bar() as progress:
-        looked = look(file, dbc, given, progress, by_role(role or []))
+    return Given(bore_m, rod_m, stroke_m, volumes_m3, safe_band_v, lag_s)
+
+
+class _Answer(NamedTuple):
+    """What is said of a file, in words and as JSON, and the text of its project."""
+
+    project: str
+    lines: Iterable[str]
+    document: dict[str, Any]
+    is_truncated: bool
+
+
+def _answer(looked: Quick | QuickRate, file: Path, save: Path | None) -> _Answer:
+    from rtid.study.quick_rate import QuickRate
+    from rtid.tell.quick import lines, rate_lines
+
     if isinstance(looked, QuickRate):
-        text, told, document, refused = looked.text, rate_lines(looked, save), looked.as_json(), {}
-    else:
-        text, told = looked.text_for(save or file), lines(looked, save)
-        document = looked.as_json(save)
-        refused = {"truncated": int(looked.truncated)}
-    if save is not None:
-        save.write_text(text, "utf-8")
-    print(json.dumps(document) if as_json else "\n".join(told))
-    refuse_truncated(file, refused)
-    if not looked.is_enough:
-        raise typer.Exit(Exit.NEGATIVE)
+        return _Answer(looked.text, rate_lines(looked, save), looked.as_json(), False)
+    text, document = looked.text_for(save or file), looked.as_json(save)
+    return _Answer(text, lines(looked, save), document, looked.truncated)
