@@ -5,7 +5,7 @@ PYTHON ?= python3
 PIP = .venv/bin/python -m pip --disable-pip-version-check
 READY = .venv/.ready
 
-.PHONY: demo check test bench benchmark-missing lint campaign faults fuzz soak mutants paper pictures screenshots lock clean
+.PHONY: demo check test bench speed benchmark-missing lint campaign faults fuzz soak mutants paper pictures screenshots lock clean
 
 demo: $(READY)
 	.venv/bin/rtid demo
@@ -22,6 +22,11 @@ bench: $(READY)
 	@mkdir -p out
 	.venv/bin/python -m pytest -q -s benchmarks --benchmark-json=out/bench.json
 	.venv/bin/python -m benchmarks.table
+
+# The part of it that has gates, wide ones: a factor that is lost is seen (a minute or two).
+speed: $(READY)
+	ROUNDS=1 .venv/bin/python -m pytest -q benchmarks/test_update.py benchmarks/test_commands.py \
+	  -k "not cold and not libraries and not same_sums"
 
 # Ours beside a dozen other methods, on the same records, into docs/benchmark.md: 40 minutes on a core of its own.
 # A second seed, on other simulators' machines, says whether the order of the methods holds.

@@ -1,7 +1,8 @@
 """Measure several jobs in one run, A B C A B C ..., so that a drifting clock rate hits all alike.
 
 The same code was seen to drift by 1.6 x between two runs one after the other; the ratio of two
-jobs within one round does not.  Medians and ratios go to pytest-benchmark's `extra_info`, where
+jobs within one round does not.  Times are of the processor, all threads together: what else the
+computer does is not in them.  Medians and ratios go to pytest-benchmark's `extra_info`, where
 `benchmarks.table` finds them.
 """
 
@@ -11,7 +12,7 @@ import gc
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from statistics import median
-from time import perf_counter
+from time import process_time
 from typing import Any
 
 
@@ -34,9 +35,9 @@ def interleave(jobs: Sequence[Job], rounds: int) -> dict[str, list[float]]:
     try:
         for _ in range(rounds):
             for job in jobs:
-                start = perf_counter()
+                start = process_time()
                 job.run()
-                times[job.name].append((perf_counter() - start) / job.items)
+                times[job.name].append((process_time() - start) / job.items)
     finally:
         gc.enable()
     return times

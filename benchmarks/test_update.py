@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from benchmarks import rls
 from benchmarks.compiler import compile_c
-from benchmarks.interleave import Job, report, side_by_side
+from benchmarks.interleave import Job, ratio, report, side_by_side
 from benchmarks.machine import chunk, empty, model, one_block, one_chamber, record, warmed
 from benchmarks.reference import Reference
 from rtid.estimator.state import State
@@ -28,6 +28,8 @@ PER_SAMPLE, KERNEL = "rtid, State.advance per sample", "rtid, kernel called per 
 ALL = len(record())
 FEW = 2000  # samples for the slow ones
 BLOCK = 3000  # samples of the calls one by one
+# wide gates, for computers of all kinds: a factor that is lost is seen
+LOST, AHEAD = 2.2, 40.0
 
 
 def normal_equations(state: State) -> tuple[FloatArray, FloatArray]:
@@ -101,7 +103,8 @@ def one_by_one(take: Callable[[FloatArray], object], rows: list[FloatArray]) -> 
 
 def test_update_of_one_chamber(benchmark: Any) -> None:
     title = "Update, one chamber, two edges, one shared parameter, 30 x 20 blocks per edge"
-    side_by_side(benchmark, title, "sample", joint_jobs(one_chamber(model())), C_BY_HAND)
+    times = side_by_side(benchmark, title, "sample", joint_jobs(one_chamber(model())), C_BY_HAND)
+    assert ratio(times, ARRAYS, C_BY_HAND) <= LOST
 
 
 def test_update_of_one_block(benchmark: Any) -> None:
@@ -118,19 +121,23 @@ def test_update_of_one_block(benchmark: Any) -> None:
         Job("filterpy", lambda: rls.by_filterpy(few), FEW),
     ]
     title = "The same job, one chamber, one block, 7 parameters: filter, basis, update"
-    side_by_side(benchmark, title, "sample", jobs, ARRAYS)
+    times = side_by_side(benchmark, title, "sample", jobs, ARRAYS)
+    assert min(ratio(times, name, ARRAYS) for name in ("padasip", "filterpy")) >= AHEAD
 
 
 def test_update_of_two_chambers(benchmark: Any) -> None:
     title = "Update, two chambers whitened jointly, four edges, 30 x 20 blocks per edge"
-    side_by_side(benchmark, title, "sample", joint_jobs(model()), C_BY_HAND)
+    times = side_by_side(benchmark, title, "sample", joint_jobs(model()), C_BY_HAND)
+    assert ratio(times, ARRAYS, C_BY_HAND) <= LOST
 
 
 @pytest.mark.parametrize("chambers", [1, 2])
 def test_update_without_changes_of_block(benchmark: Any, chambers: int) -> None:
     machine = model() if chambers == 2 else one_chamber(model())
     title = f"Update without changes of block, chambers: {chambers}"
-    side_by_side(benchmark, title, "sample", standing_jobs(machine), C_BY_HAND, rounds=60)
+    jobs = standing_jobs(machine)
+    times = side_by_side(benchmark, title, "sample", jobs, C_BY_HAND, rounds=60)
+    assert ratio(times, ARRAYS, C_BY_HAND) <= LOST
 
 
 def test_update_cold_inside_a_1_khz_loop(benchmark: Any) -> None:

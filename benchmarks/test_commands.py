@@ -1,0 +1,82 @@
+"""Whole commands on 110 s at 1 kHz, as processes: processor time and memory, beside the imports.
+
+A command in a fresh process loads Python, numpy, numba and scipy before it does anything: the first
+row is that alone, and what the others are held against.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import median
+from typing import Any, NamedTuple
+
+from benchmarks.interleave import report
+from rtid.sim.recording import write_run
+from rtid.sim.run import simulate
+from rtid.sim.simulated_plant import SimulatedPlant
+
+DURATION_S, ROUNDS = 110.0, int(os.environ.get("ROUNDS", "3"))
+BARE = "import numpy, numba, scipy.linalg, typer"
+# wide gates, as multiples of the bare imports: a factor that is lost is seen
+MOST = {"replay": 12.0, "export": 4.0, "compare": 9.0, "diagnose": 12.0}
+
+
+class Spent(NamedTuple):
+    """Processor time, all threads, and the largest memory of a process."""
+
+    seconds: float
+    peak_mb: float
+
+
+def spent(*arguments: str, code: str = "") -> Spent:
+    """Run Python code, or a command of rtid without what it says."""
+    words = ("-c", code) if code else ("-m", "rtid", *arguments)
+    null = [(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)]
+    child = os.posix_spawn(sys.executable, [sys.executable, *words], os.environ, file_actions=null)
+    _, status, used = os.wait4(child, 0)
+    assert status == 0, words
+    return Spent(used.ru_utime + used.ru_stime, used.ru_maxrss / 1024)
+
+
+def test_commands(benchmark: Any, tmp_path: Path) -> None:
+    """After one another, the first ones without anything that is kept."""
+    run = simulate(SimulatedPlant(), "rich", 1, DURATION_S)
+    write_run(tmp_path / "run.blf", run, 1, "rich")
+    given = str(tmp_path / "run.blf"), "-p", str(tmp_path / "run.toml")
+    steps: dict[str, Sequence[str]] = {
+        "replay, learned anew": ("replay", *given, "--no-cache"),
+        "diagnose, learned anew": ("diagnose", *given, "--no-cache"),
+        "replay": ("replay", *given),
+        "export after a replay": ("export", given[0], str(tmp_path / "map.json"), *given[1:]),
+        "diagnose after a replay": ("diagnose", *given),
+        "compare after a replay": ("compare", *given),
+        "diagnose again": ("diagnose", *given),
+    }
+
+    def rounds() -> dict[str, list[Spent]]:
+        times: dict[str, list[Spent]] = {name: [] for name in (BARE, *steps)}
+        for k in range(1 + ROUNDS):  # one before them compiles
+            for kept in tmp_path.glob(".rtid/*"):
+                kept.unlink()
+            one = {BARE: spent(code=BARE)} | {name: spent(*s) for name, s in steps.items()}
+            for name in one if k else ():
+                times[name].append(one[name])
+        return times
+
+    times = benchmark.pedantic(rounds, rounds=1)
+    bare = median(t.seconds for t in times[BARE])
+    rows = [_row(name, spent, bare) for name, spent in times.items()]
+    report(
+        benchmark, f"Whole commands, a fresh process, {DURATION_S:g} s at 1 kHz", "command", rows
+    )
+    for row in rows[1:]:
+        assert row["ratio"] <= MOST[row["name"].split(",")[0].split()[0]], row
+
+
+def _row(name: str, times: list[Spent], bare: float) -> dict[str, Any]:
+    seconds = median(t.seconds for t in times)
+    text = f"{seconds:.2f} s, {max(t.peak_mb for t in times):.0f} MB"
+    return {"name": name, "seconds": seconds, "text": text, "ratio": seconds / bare}
