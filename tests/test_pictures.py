@@ -29,10 +29,11 @@ from rtid.estimator.published import publish
 from rtid.kernels.free_run import GAP, INSIDE
 from rtid.model import Machine
 from rtid.tell.charts.correlation import correlogram, cusum
-from rtid.tell.charts.coverage import coverage, working_points
+from rtid.tell.charts.coverage import coverage
 from rtid.tell.charts.dependence import dependences
 from rtid.tell.charts.maps import maps, slices
 from rtid.tell.charts.over_time import beside, pressures, residual
+from rtid.tell.charts.points import working_points
 from rtid.tell.charts.where import HATCHES, residual_map
 from rtid.tell.stills import draw, save, thin
 from tests.flow_maps import machine, orifice, solved

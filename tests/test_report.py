@@ -125,8 +125,23 @@ def test_every_picture_has_a_sentence_below(leaking: Reported) -> None:
     assert len(captions) == 7
     assert text.count("data-root-id=") == 5  # drawn by Bokeh; the other two are HTML
     assert all(unescape(c).strip().endswith(".") for c in captions)
-    for heading in ("not found", "cannot show", "negligible", "Where this comes from"):
+    for heading in ("not found", "cannot show", "Coverage", "Parameters", "Where this comes from"):
         assert heading in words
+    assert "Present but negligible" not in words  # there is nothing
+
+
+def test_coverage_and_parameters_are_those_of_the_fit(leaking: Reported) -> None:
+    told = leaking.told
+    _, words = read(leaking.path)
+    for edge in told.flowmap.edges:
+        known = int((edge.status == "valid").sum())
+        assert f"{edge.name}{known} of {edge.status.size}" in words.replace(
+            f"{edge.name} ", edge.name
+        )
+        assert len(told.points[edge.name]) > 20
+    beta, sd = told.diagnosed.diagnosis.beta_pa[0], told.beta_sd_pa[0]
+    assert 0.0 < sd < 0.01 * beta
+    assert f"bulk modulus, chamber a{1e-6 * beta:.0f} ± {1.96e-6 * sd:.1f} MPa" in words
 
 
 def test_it_says_where_it_comes_from(leaking: Reported) -> None:

@@ -9,7 +9,8 @@ from benchmarks.paper.result import Measure, Part, Table, at_most
 from rtid.estimator.flowmap import VALID
 from rtid.model import Grid
 from rtid.sim.boom import boom, grid
-from rtid.tell.charts.coverage import coverage, working_points
+from rtid.tell.charts.coverage import coverage
+from rtid.tell.charts.points import working_points
 
 NEAR_V = (1.0, 4.0)  # where the dead band may end
 EVERY = 20  # samples between two points at which maps are compared

@@ -19,7 +19,7 @@ from rtid.sim.boom import boom
 from rtid.sim.closed_loop import P_SUPPLY, X_REF
 from rtid.sim.demand import DT_S, standstill
 from rtid.sim.simulated_plant import SimulatedPlant
-from rtid.tell.charts.coverage import working_points
+from rtid.tell.charts.points import working_points
 
 COMMANDS_V = (3.0, 4.0, 5.0, 6.0)
 HALF_WIDTH_V = 0.02

@@ -20,7 +20,7 @@ def diagnose(
     trace: TracesArgument,
     project: ProjectOption,
     pictures: Annotated[
-        Path | None, typer.Option(help="Folder for pictures of the evidence for what is named.")
+        Path | None, typer.Option(help="Folder for pictures of the evidence.")
     ] = None,
     picture_format: Annotated[str, typer.Option(help="png or svg.")] = "png",
     as_json: AsJson = False,
@@ -43,7 +43,8 @@ def diagnose(
     with progress_bar() as progress:
         study = Study(project, trace, progress)
         diagnosed = study.diagnosis()
-        evidence = charts_of(study.evidence) if pictures or not as_json else ()
+        told = pictures or not as_json
+        evidence = charts_of(study.evidence, study.remainder) if told else ()
     written = _drawn(evidence, pictures, picture_format) if pictures else []
     if as_json:
         more = {"pictures": [str(path) for path in written]} if pictures else {}

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from rtid.study.study import Study
 
 SNAPSHOT = ".npz"
-COMPLETE = (".json", ".npz", ".csv")  # for programs that read what a map stands on
 RECORDED = (".mf4", ".mcap")
 
 
@@ -108,6 +107,7 @@ def export(
     from rtid.maps.files import provenance
     from rtid.maps.fmu import check_version
     from rtid.maps.prior_map import with_prior
+    from rtid.maps.release import refuse_unfounded
     from rtid.project import load
     from rtid.tell.released import sheet as sheet_of
 
@@ -117,7 +117,10 @@ def export(
     loaded = with_prior(load(project), prior_map)
     learned = _learned(loaded, source)
     if not force:
-        _refuse_unknown(source, output, learned)
+        has_prior = learned.prior is not None
+        refuse_unfounded(
+            str(source), output.suffix, learned.invalid, learned.flowmap, has_prior=has_prior
+        )
     identity = loaded.name, loaded.digest, source.name, learned.effects
     origin = provenance(learned.solution, *identity)
     tables = _written(output, loaded, learned, origin, room, fmi, map_alone)
@@ -204,25 +207,6 @@ def _refuse_format(output: Path, is_sized: bool) -> None:
         raise RtidError(f"{output}: this format has no table of such a size", remedy, exit_code=2)
 
 
-def _refuse_unknown(source: Path, output: Path, learned: Exported) -> None:
-    """RtidError for maps that are impossible, or that know nothing."""
-    from rtid.errors import RtidError
-
-    if learned.invalid:
-        raise RtidError(
-            f"{source}: not exported, {'; '.join(doubt.text for doubt in learned.invalid)}",
-            "--force writes it all the same",
-            exit_code=4,
-        )
-    is_known = any(learned.cells.values()) or learned.prior is not None
-    if not is_known and output.suffix.lower() not in COMPLETE:
-        raise RtidError(
-            f"{source}: not exported, no block of its maps stands on data",
-            f"`rtid check` says what motion is missing; {', '.join(COMPLETE)} or --force write it",
-            exit_code=4,
-        )
-
-
 def _written(
     output: Path,
     project: Project,
@@ -235,11 +219,10 @@ def _written(
     """Write the file; the tables in it, none where its format has no plain ones."""
     from rtid.errors import RtidError
     from rtid.maps.c_header import SUFFIX, write_header
-    from rtid.maps.files import TABLE_WRITERS, write_map
     from rtid.maps.fmu import SUFFIX as FMU
-    from rtid.maps.release import tables_for
+    from rtid.maps.release import write_release
 
-    suffix, tables = output.suffix.lower(), None
+    suffix = output.suffix.lower()
     if suffix == SUFFIX:
         percent = project.sections.publish.error_percent
         write_header(output, project.model, learned.flowmap, origin, percent)
@@ -252,9 +235,8 @@ def _written(
             raise RtidError("a snapshot holds no record over time", "export from a trace")
         write_recorded(output, learned.study, origin)
     else:
-        tables = tables_for(learned.flowmap, room) if suffix in TABLE_WRITERS else None
-        write_map(output, learned.flowmap, origin, tables)
-    return tables or ()
+        return write_release(output, learned.flowmap, origin, room)
+    return ()
 
 
 def _facts(table: Gridded) -> dict[str, Any]:

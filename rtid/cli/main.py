@@ -10,6 +10,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import wraps
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Annotated, Any, NoReturn
@@ -18,7 +19,7 @@ import typer
 
 import rtid
 from rtid.cli.exits import Exit
-from rtid.cli.teaching import EXAMPLES, GUIDE, panel
+from rtid.cli.teaching import EXAMPLES, GUIDE, next_step, panel
 
 TAKE_BOTH = ("replay", "compare", "diagnose", "add", "drop", "report", "export")
 COMMANDS = {
@@ -77,8 +78,16 @@ def _unloaded() -> None:
 
 
 def _function(name: str) -> Callable[..., Any]:
+    """The function of a command, which says at its end what to do next."""
     function: Callable[..., Any] = getattr(import_module(f"rtid.cli.{name}"), name)
-    return function
+
+    @wraps(function)
+    def told(**given: Any) -> None:
+        function(**given)
+        if step := next_step(name, given):
+            print(step)
+
+    return told
 
 
 def build(arguments: Sequence[str]) -> typer.Typer:

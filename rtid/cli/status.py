@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -22,18 +23,33 @@ def status(
     metrics: Annotated[
         bool, typer.Option("--metrics", help="Print it as Prometheus metrics.")
     ] = False,
+    serve: Annotated[
+        str | None,
+        typer.Option(help="Serve the metrics over HTTP until Ctrl-C: PORT or HOST:PORT."),
+    ] = None,
+    board: Annotated[
+        bool, typer.Option("--board", help="Print a Grafana board for these metrics.")
+    ] = False,
     units: UnitsOption = System.DISPLAY,
 ) -> None:
     """Tell how the daemon is: bus, signals, loop, maps, storage, alarms, verdict, coach.
 
-    Exit code 4 if it does not run, or an alarm is on.
+    Exit code 4 if it does not run, or an alarm is on.  --serve answers a scraper beside the daemon,
+    which itself opens no port.
     """
     from rtid.apply.offer import as_text
+    from rtid.daemon import metrics as metrics_module
     from rtid.daemon.metrics import exposition
     from rtid.daemon.status import OLD_S, read
     from rtid.project.folder import state_of
 
+    if board:
+        print(Path(metrics_module.__file__).with_name("board.json").read_text("utf-8"), end="")
+        return
     folder = state_of(where)
+    if serve is not None:
+        _serve(folder, serve)
+        return
     daemon_status = read(folder)
     age_s = time.time() - daemon_status.now_unix_s
     on = [alarm for alarm in daemon_status.alarms if alarm.until_unix_s is None]
@@ -47,6 +63,18 @@ def status(
             print(f"offered `rtid apply`: {text}")
     if on or age_s > OLD_S:
         raise typer.Exit(Exit.NEGATIVE)
+
+
+def _serve(folder: Path, place: str) -> None:
+    """Answer scrapers until interrupted."""
+    from rtid.daemon.scrape import server
+
+    with server(folder, place) as answers:
+        print(
+            f"http://{answers.server_name}:{answers.server_port}/metrics  (Ctrl-C ends it)",
+            flush=True,
+        )
+        answers.serve_forever()
 
 
 def _show(daemon_status: Status, age_s: float) -> None:

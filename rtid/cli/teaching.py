@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
+from shlex import quote
+from typing import Any
+
 PANELS = {
     "First steps": ("demo", "quick", "init", "check", "simulate"),
     "With a recorded trace: learn, see where the model fails, find out why, add it": (
@@ -40,9 +45,46 @@ EXAMPLES = {
     "trust": "rtid trust machine.toml",
     "fleet": "rtid fleet traces -o results -p machine.toml",
 }
+# What to do behind a command that has gone well; {trace}, {project}: its own files.
+NEXT = {
+    "check": "rtid diagnose {trace} -p {project}",
+    "simulate": "rtid diagnose {trace} -p {project}",
+    "replay": "rtid diagnose {trace} -p {project}",
+    "compare": "rtid diagnose {trace} -p {project}",
+    "diagnose": "rtid add {trace} -p {project} adds what is named; rtid ui {trace} -p {project}",
+    "add": "rtid report {trace} -p {project}; rtid export {trace} maps.dcm -p {project}",
+    "drop": "rtid diagnose {trace} -p {project}",
+    "undo": "rtid history -p {project}",
+    "history": "rtid diagnose TRACE -p {project}; rtid undo -p {project} takes a change back",
+    "report": "open it and print it; rtid export {trace} maps.dcm -p {project}",
+    "excite": "drive it, record it, and rtid check RECORD -p {project}",
+    "status": "rtid ui {project} shows it in the browser",
+    "accept": "rtid status {project}",
+    "restore": "rtid run {project}",
+    "apply": "rtid status {project}",
+    "export": "rtid report {trace} -p {project} says what the maps stand on",
+    "trust": "rtid check TRACE -p {project}",
+    "fleet": "rtid diagnose TRACE -p {project} of the machine that leads the ranking",
+}
+FILES = ("trace", "files", "source", "words", "project", "where", "file")  # that name them
+QUIET = ("as_json", "metrics", "board", "serve")  # parameters behind which a program reads
 GUIDE = "Where to begin, by task: docs/guide.md in the repository."
 
 
 def panel(command: str) -> str:
     """The heading under which a command is listed."""
     return next(title for title, names in PANELS.items() if command in names)
+
+
+def next_step(command: str, given: Mapping[str, Any]) -> str:
+    """What to do behind a command, with the files that it was given; "" for nothing."""
+    if command not in NEXT or any(given.get(name) for name in QUIET):
+        return ""
+    words = [given[name] for name in FILES if given.get(name)]
+    every = [str(one) for word in words for one in (word if isinstance(word, list) else [word])]
+    project = next((w for w in every if w.endswith(".toml")), None)
+    trace = next((w for w in every if "." in w and not w.endswith(".toml")), "TRACE")
+    if command == "simulate":
+        project = str(Path(trace).with_suffix(".toml"))
+    beside = str(given.get("where") or "PROJECT")  # a state folder
+    return f"Next: {NEXT[command].format(trace=quote(trace), project=quote(project or beside))}"

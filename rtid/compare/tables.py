@@ -66,9 +66,14 @@ _BEGINS = {"condition": 2, "flow known": 3, "the machine": 4, "not visited": 4, 
 
 def cause_of(row: BlockRow) -> str:
     """One of CAUSES for a block."""
-    if row.status == VALID:
+    return cause_of_block(row.status, row.reason)
+
+
+def cause_of_block(status: str, reason: str) -> str:
+    """One of CAUSES for a block of this status, and the reason for it."""
+    if status == VALID:
         return CAUSES[0]
-    return CAUSES[next((k for text, k in _BEGINS.items() if row.reason.startswith(text)), 1)]
+    return CAUSES[next((k for text, k in _BEGINS.items() if reason.startswith(text)), 1)]
 
 
 def block_rows(

@@ -32,13 +32,14 @@ from rtid.daemon.offering import Offering
 from rtid.daemon.pipe import Pipe
 from rtid.daemon.recorder import Recorder
 from rtid.daemon.shadow import Shadow
-from rtid.daemon.status import EdgeHealth, EffectStatus
+from rtid.daemon.status import BlockPlane, EdgeHealth, EffectStatus
 from rtid.errors import RtidError
 from rtid.estimator.estimator import Estimator
-from rtid.estimator.flowmap import FlowMap
+from rtid.estimator.flowmap import LEARNING, VALID, EdgeMap, FlowMap
 from rtid.estimator.solution import Solution
 from rtid.maps.files import provenance, write_map
 from rtid.maps.prior_map import find_prior, published
+from rtid.model import Edge
 from rtid.plain import FloatArray
 from rtid.project import Project, load
 from rtid.study.on_board import learned_sizes, on_board
@@ -499,8 +500,19 @@ def edges_of(estimator: Estimator, solution: Solution, flow_map: FlowMap) -> tup
         cells = Counter(str(status) for status in flow_map.edges[i].status.ravel())
         progress = sum(block.progress for block in mine) / max(1, len(mine))
         blocks = Counter(block.status for block in mine)
-        edge_health.append(EdgeHealth(edge.name, dict(blocks), dict(cells), progress))
+        plane = plane_of(edge, flow_map.edges[i])
+        edge_health.append(EdgeHealth(edge.name, dict(blocks), dict(cells), progress, plane))
     return tuple(edge_health)
+
+
+def plane_of(edge: Edge, learned: EdgeMap) -> BlockPlane | None:
+    """What became of every block of a map; None of one over no pressure drop."""
+    if not (edge.source and edge.sink):
+        return None
+    letters = {VALID: "v", LEARNING: "l"}
+    codes = "".join(letters.get(str(word), ".") for word in learned.status.ravel())
+    ends = tuple(learned.grid.u_v.tolist()), tuple(learned.grid.dp_pa.tolist())
+    return BlockPlane(*ends, codes, edge.command, edge.source, edge.sink, int(edge.direction))
 
 
 def main() -> None:

@@ -18,6 +18,7 @@ from rtid.daemon.helper import Helper
 from rtid.daemon.jobs import Handover
 from rtid.daemon.lag import LagMeter
 from rtid.daemon.notify import Notifier
+from rtid.daemon.scope import ScopeKeeper
 from rtid.estimator.estimator import Estimator
 from rtid.project import Project
 from rtid.trace.learner import Learner
@@ -44,6 +45,7 @@ class Core:
         self.frames = self.samples = 0
         self.newest_s = 0.0  # time of the newest sample, as in `to_chunk`
         self.last: deque[Frames] = deque()
+        self.scope = ScopeKeeper([s.name for s in learner.estimator.model.signals])
         self.swap: Estimator | None = None
         self.is_proving = False  # the map held has still to foretell: what is learned is a shadow
         self.is_solving = self.is_saving = True  # the analyst, or it is not ready yet
@@ -119,6 +121,7 @@ class Core:
     def _send_batch(self) -> None:
         batch = self._collector.take()
         if batch is not None:
+            self.scope.add(batch.chunk)
             self._analyst.put(batch)
 
     def _take(self, frames: Frames, now_ns: int) -> str:

@@ -1,7 +1,7 @@
 """A status as Prometheus metrics (text exposition format 0.0.4).
 
-For a scraper: `rtid status FOLDER --metrics` in a timer, into node_exporter's textfile folder.  The
-daemon itself serves nobody.
+For a scraper: `rtid status FOLDER --serve PORT` beside the daemon, or `--metrics` in a timer, into
+node_exporter's textfile folder.  The daemon itself serves nobody.  `board.json` shows them.
 """
 
 from __future__ import annotations
@@ -60,6 +60,10 @@ def _lines(status: Status, age_s: float) -> Iterator[Line]:
     for chamber in estimate.chambers:
         labels = machine | {"chamber": chamber.name}
         yield "bulk_modulus_pascals", "gauge", "Effective", labels, chamber.beta_pa
+        yield "bulk_modulus_sd_pascals", "gauge", "Its deviation", labels, chamber.beta_sd_pa
+    if (said := status.verdict) is not None:
+        labels = machine | {"verdict": said.verdict, "effects": " ".join(said.effects)}
+        yield "verdict", "gauge", "1: the last diagnosis", labels, 1.0
     for edge in estimate.edges:
         for state, count in edge.blocks.items():
             labels = machine | {"edge": edge.name, "state": state}

@@ -113,6 +113,32 @@ class SignalHealth:
 
 
 @dataclass(frozen=True)
+class BlockPlane:
+    """The blocks of a map: borders, SI, and what became of each, the drops of a command together.
+
+    codes: "v" valid, "l" learning, "." neither; command, source, sink: signals of the working
+    point; direction: of the command that opens.
+    """
+
+    u_v: tuple[float, ...]
+    dp_pa: tuple[float, ...]
+    codes: str
+    command: str
+    source: str
+    sink: str
+    direction: int = 1
+
+
+@dataclass(frozen=True)
+class Scope:
+    """Signals over the last second: smallest and largest value, SI, of each tenth from t_s on."""
+
+    t_s: tuple[float, ...] = ()
+    low: dict[str, tuple[float, ...]] = field(default_factory=dict)
+    high: dict[str, tuple[float, ...]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class EdgeHealth:
     """The map of one edge: cells by status, of the blocks and of the published map."""
 
@@ -120,6 +146,7 @@ class EdgeHealth:
     blocks: dict[str, int] = field(default_factory=dict)  # learning, valid, stale, invalid
     cells: dict[str, int] = field(default_factory=dict)  # valid, learning, extrapolated, ...
     progress: float = 0.0  # mean share of the way to valid, over visited blocks
+    plane: BlockPlane | None = None
 
 
 @dataclass(frozen=True)
@@ -235,6 +262,7 @@ class Status:
     advice: Advice | None = None
     alarms: tuple[Alarm, ...] = ()  # those that are on, then the last that are over
     rss_anon_mb: float = 0.0
+    scope: Scope = Scope()
     schema: int = SCHEMA
 
     def has(self, alarm: str) -> bool:

@@ -139,6 +139,7 @@ class Teller:
             advice=advice,
             alarms=alarms.all,
             rss_anon_mb=resident_mb(),
+            scope=self._core.scope.take(),
         )
 
     def _bus(self, counters: dict[str, int]) -> st.BusHealth:

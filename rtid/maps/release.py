@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 from rtid.errors import RtidError
-from rtid.estimator.flowmap import FlowMap
+from rtid.estimator.flowmap import VALID, FlowMap
+from rtid.estimator.validity import Doubt
+from rtid.maps.files import TABLE_WRITERS, write_map
 from rtid.maps.flashed import FlashedMap, of_edge
 from rtid.maps.gridded import ERROR_SHARE, Tables, best_that_fits, gridded, on_nodes
+
+COMPLETE = (".json", ".npz", ".csv")  # for programs that read what a map stands on
 
 
 @dataclass(frozen=True)
@@ -50,3 +57,43 @@ def tables_for(flowmap: FlowMap, room: Room) -> Tables:
         most = room.n_bytes
         return best_that_fits(flowmap, lambda tables: sum(g.n_bytes for g in tables) <= most)
     return gridded(flowmap, room.share or ERROR_SHARE)
+
+
+def write_release(path: Path, flowmap: FlowMap, origin: Mapping[str, Any], room: Room) -> Tables:
+    """Write a map; the tables in it, none where its format has no plain ones.
+
+    Raises RtidError where it has none and a room is asked for.
+    """
+    has_tables = path.suffix.lower() in TABLE_WRITERS
+    if room.is_asked and not has_tables:
+        remedy = (
+            f"end its name in {', '.join(TABLE_WRITERS)}; a header's tables follow "
+            "publish.error_percent of the project file"
+        )
+        raise RtidError(f"{path}: this format has no table of such a size", remedy, exit_code=2)
+    tables = tables_for(flowmap, room) if has_tables else None
+    write_map(path, flowmap, origin, tables)
+    return tables or ()
+
+
+def refuse_unfounded(
+    source: str,
+    suffix: str,
+    invalid: Sequence[Doubt],
+    flowmap: FlowMap,
+    has_prior: bool = False,
+) -> None:
+    """RtidError for maps that are impossible, or that know nothing."""
+    if invalid:
+        raise RtidError(
+            f"{source}: not exported, {'; '.join(doubt.text for doubt in invalid)}",
+            "`rtid export --force` writes it all the same",
+            exit_code=4,
+        )
+    is_known = has_prior or any((edge.status == VALID).any() for edge in flowmap.edges)
+    if not is_known and suffix.lower() not in COMPLETE:
+        raise RtidError(
+            f"{source}: not exported, no block of its maps stands on data",
+            f"`rtid check` says what motion is missing; {', '.join(COMPLETE)} or --force write it",
+            exit_code=4,
+        )

@@ -9,6 +9,7 @@ from rtid.diagnose.clean import Cut
 from rtid.diagnose.finer import on_grids
 from rtid.diagnose.fit import NO_COV, Fit, one_pass
 from rtid.diagnose.partial import AddedVariable, Exhibit, Rise
+from rtid.diagnose.remains import Remainder
 from rtid.diagnose.report import (
     Diagnosis,
     FittedEffect,
@@ -138,6 +139,7 @@ class Said:
 
 
 FIT, LEARNED, FLOWS, SAID, EVIDENCE = "fit", "record", "map", "diagnosis", "evidence"
+REMAINDER = "remainder"
 _SEED = (Seed, Grid, Weights, Candidate)
 _MODEL = (Machine, Signal, Chamber, Edge, Grid, Term, Lag, Filter, Gates, Upkeep)
 CLASSES: dict[str, tuple[type, ...]] = {
@@ -157,4 +159,5 @@ CLASSES: dict[str, tuple[type, ...]] = {
         Cut,
     ),
     EVIDENCE: (Exhibit, AddedVariable, Rise, Dependence),
+    REMAINDER: (Remainder, Dependence),
 }

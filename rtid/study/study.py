@@ -23,9 +23,11 @@ from rtid.diagnose.finer import on_grids
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.partial import Exhibit, exhibits
 from rtid.diagnose.parts import AddedEffect
+from rtid.diagnose.remains import Remainder, remainder
 from rtid.diagnose.report import Diagnosis, diagnosis
 from rtid.diagnose.residual import Residual, residual
 from rtid.diagnose.standing import Standing, fitted, stand
+from rtid.diagnose.verdict import UNKNOWN
 from rtid.effects import Effect
 from rtid.errors import door
 from rtid.estimator.estimator import Estimator, to_chunk
@@ -43,7 +45,18 @@ from rtid.study.compared import study as examined
 from rtid.study.kept import Kept
 from rtid.study.kept_record import MessageAges, Replay, aged, model_for, through_bus
 from rtid.study.known_effects import KnownEffect, held_against, replayed
-from rtid.study.seed import CLASSES, EVIDENCE, FIT, FLOWS, LEARNED, SAID, Learned, Said, Seed
+from rtid.study.seed import (
+    CLASSES,
+    EVIDENCE,
+    FIT,
+    FLOWS,
+    LEARNED,
+    REMAINDER,
+    SAID,
+    Learned,
+    Said,
+    Seed,
+)
 from rtid.study.spans import HELD_OUT_SHARE, added_parts, judged, taught
 from rtid.trace.reading import NoSamplesError, Trace, read_trace
 from rtid.trace.records import (
@@ -279,6 +292,17 @@ class Study:
         if known is None:
             known = exhibits(self.diagnosed.result)
             self._keep(EVIDENCE, known)
+        return known
+
+    @cached_property
+    def remainder(self) -> Remainder | None:
+        """What is left and no known effect explains; None unless that is the verdict."""
+        if self.diagnosis().verdict != UNKNOWN:
+            return None
+        known = cast("Remainder | None", self._known(REMAINDER))
+        if known is None:
+            known = remainder(self.diagnosed.result.last)
+            self._keep(REMAINDER, known)
         return known
 
     @property

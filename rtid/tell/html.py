@@ -135,7 +135,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") ->
     """
     kinds = [' class="n"' if word.endswith("|") else "" for word in head]
     top = "".join(
-        f"<th{k}>{text(word.rstrip('|'))}</th>" for k, word in zip(kinds, head, strict=True)
+        f"<th{k}>{text(word.rstrip('|~'))}</th>" for k, word in zip(kinds, head, strict=True)
     )
     body = "".join(
         "<tr>" + "".join(f"<td{k}>{c}</td>" for k, c in zip(kinds, row, strict=True)) + "</tr>"

@@ -20,14 +20,16 @@ from bokeh.plotting import figure
 
 from rtid.plain import FloatArray
 from rtid.tell.charts.lines import Lines
-from rtid.tell.charts.theme import INK_TAG, NARROWEST_PX, NOTE_TAG, beside, plot, styled
+from rtid.tell.charts.theme import INK_TAG, NARROW_PX, NARROWEST_PX, NOTE_TAG, beside, plot, styled
 from rtid.tell.charts.time_plots import TimePlots
 from rtid.tell.colours import GREY, INK
 from rtid.tell.story import Chart, Dots, Line, Panel, Plane, Planes, Strip
 
 ROOM = 0.06  # of the span, free at either end
 INCH_PX = 90.0  # of a chart's heights
-PLANE_PX = 280.0  # height of a plane
+PLANE_PX = 240.0  # height of a plane
+PAIR = 2  # pictures that stand side by side on a narrow page too
+BESIDE = 4  # pictures of a row at most
 MARKERS = {"o": "circle", "s": "square", "c": "circle"}
 YELLOWS = list(interp_palette(tuple(reversed(YlOrBr9)), 256))[8:232]
 PALETTES = {"flow": list(Cividis256), "doubt": YELLOWS, "change": list(RdBu11)}
@@ -104,6 +106,9 @@ class PanelPlot:
         self._remarks.data = {k: [getattr(r, k) for r in labels] for k in ("x", "y", "text")}
         for note, points in zip(self._notes, panel.points, strict=False):
             note.text = f"{points.name}: {points.note}"
+        if panel.ticks:
+            self.root.xaxis.ticker = list(range(len(panel.ticks)))
+            self.root.xaxis.major_label_overrides = dict(enumerate(panel.ticks))
         self._x.update(**_across(panel))
         self._y.update(**_reach(_ends([panel, *on_scale])))
         self.root.title.text = panel.title
@@ -123,6 +128,8 @@ def _around(strip: Strip) -> dict[str, list[FloatArray]]:
 
 def _across(panel: Panel) -> dict[str, float]:
     """Of x: its points, or its lines from end to end with room for words behind them."""
+    if panel.ticks:
+        return {"start": -0.5, "end": len(panel.ticks) - 0.5}
     if not panel.strips:
         return _reach(points.x for points in panel.points)
     every = np.concatenate([strip.x for strip in panel.strips])
@@ -166,6 +173,10 @@ class PlanePlot:
         self._outline = ColumnDataSource({"x0": [], "y0": [], "x1": [], "y1": []})
         for look in ({"line_color": "#ffffff", "line_width": 2.4}, {"line_color": "#22272b"}):
             self.root.segment("x0", "y0", "x1", "y1", source=self._outline, **look)
+        if plane.points is not None:
+            at = ColumnDataSource({"x": plane.points[:, 0], "y": plane.points[:, 1]})
+            white = {"line_color": None, "fill_color": "#ffffff", "fill_alpha": 0.75}
+            self.root.scatter("x", "y", source=at, size=2, **white)
         bar = ColorBar(color_mapper=self._mapper, width=9, padding=4, label_standoff=4)
         bar.major_label_text_font_size, bar.bar_line_color = "10px", None
         self.root.add_layout(bar, "right")
@@ -193,8 +204,7 @@ def draw(chart: Chart | Planes) -> UIElement:
 
 def _planes(chart: Planes) -> UIElement:
     made = [PlanePlot(plane, chart.x_label, chart.y_label).root for plane in chart.planes]
-    pairs = [made[k : k + 2] for k in range(0, len(made), 2)]
-    rows = [_framed(pair, PLANE_PX) for pair in pairs]
+    rows = [_framed(made[k : k + BESIDE], PLANE_PX) for k in range(0, len(made), BESIDE)]
     return column(*rows, sizing_mode="stretch_width")
 
 
@@ -237,11 +247,12 @@ def _over_time(chart: Chart) -> UIElement:
 
 def _framed(made: Sequence[UIElement], height_px: float) -> UIElement:
     """Side by side in a height; one below the other, each as high, where there is no room."""
+    narrow_px = NARROWEST_PX if len(made) <= PAIR else NARROW_PX
     whole_px = f"{height_px * len(made):.0f}px !important"
     stacked = f":host {{ height: {whole_px}; flex-basis: {whole_px}; }}"
     return column(
-        beside(*made, stacked_below_px=NARROWEST_PX),
+        beside(*made, stacked_below_px=narrow_px),
         height=round(height_px),
         sizing_mode="stretch_width",
-        stylesheets=[f"@media (max-width: {NARROWEST_PX}px) {{ {stacked} }}"],
+        stylesheets=[f"@media screen and (max-width: {narrow_px}px) {{ {stacked} }}"],
     )

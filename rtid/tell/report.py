@@ -13,7 +13,7 @@ from rtid.diagnose.report import Unseen, Value
 from rtid.diagnose.trials import GAIN
 from rtid.diagnose.verdict import MATERIAL
 from rtid.effects.page import title
-from rtid.project.history import Change
+from rtid.project.history import Change, standing
 from rtid.tell import stills as still_pictures
 from rtid.tell.charts.dependence import before_and_after
 from rtid.tell.charts.maps import maps, slices
@@ -23,6 +23,7 @@ from rtid.tell.history import history_table
 from rtid.tell.html import rendered
 from rtid.tell.report_page import embedded, key_figures, page_of
 from rtid.tell.report_story import Ranked, ReportStory
+from rtid.tell.report_tables import coverage, parameters, settings
 from rtid.tell.story import Bar, Bars, Chart, Planes, Story, StoryPart, Table
 from rtid.tell.words import named, quantity
 from rtid.units import CONVENTION, MPA, flow_name, limit, lpm
@@ -67,11 +68,15 @@ def sections(story: ReportStory) -> tuple[Story, ...]:
         *(Story(chart.title, (chart,)) for chart in story.evidence),
         _flows(story),
         _dependences(story),
-        Story("Flow maps", (maps(story.flowmap), slices(story.flowmap))),
+        Story(
+            "Flow maps",
+            (maps(story.flowmap, story.points), slices(story.flowmap), coverage(story)),
+        ),
+        Story("", (parameters(story),)),
         *([Story("Tracking", (story.tracking,))] if story.tracking else []),
         _ranking(story),
         *_not_found(result.not_found, story.ranking),
-        _negligible(story),
+        *_negligible(story),
         *_history(story.history),
         _provenance(story),
     )
@@ -108,7 +113,7 @@ def _steps(story: ReportStory) -> list[tuple[str, float]]:
     """Error behind each addition, in per cent of the rms flow."""
     result = story.diagnosed.diagnosis
     start = BEFORE if not result.added else "model with what was added before"
-    made = [(start, _share(story, result.heldout_residual_before_m3s))]
+    made = [*_saved(story), (start, _share(story, result.heldout_residual_before_m3s))]
     made += [
         (f"+ {named((e.effect, e.where))}", _share(story, e.heldout_residual_after_m3s))
         for e in result.found
@@ -119,6 +124,14 @@ def _steps(story: ReportStory) -> list[tuple[str, float]]:
     return made
 
 
+def _saved(story: ReportStory) -> list[tuple[str, float]]:
+    """Error before what was added and saved, as its history has it; [] without one."""
+    kind = "heldout_pct" if story.judges else "identification_pct"
+    alive = standing(story.history)
+    before = alive[0].errors.get(kind, {}).get("before") if alive else None
+    return [] if before is None else [("before anything was added", float(before))]
+
+
 def _errors(story: ReportStory) -> Story:
     diagnosis, steps, part = story.diagnosed.diagnosis, _steps(story), PARTS[story.judges]
     floor = _share(story, diagnosis.noise_floor_m3s)
@@ -127,7 +140,7 @@ def _errors(story: ReportStory) -> Story:
     caption = (
         f"Root mean square of measured less modelled chamber flow on the {part} of the record, "
         f"in per cent of the rms flow of {lpm() * diagnosis.rms_flow_m3s:.3g} "
-        f"{flow_name()}: {steps[0][1]:.2f} % for the model as it is"
+        f"{flow_name()}: {steps[len(_saved(story))][1]:.2f} % for the model as it is"
     )
     caption += f", {steps[-1][1]:.2f} % with everything that was found." if diagnosis.found else "."
     caption += f" Dashed: what the sensors' noise alone leaves, {floor:.2f} %."
@@ -232,10 +245,10 @@ def _not_found(unseen: tuple[Unseen, ...], ranking: tuple[Ranked, ...]) -> tuple
     ]  # fmt: skip
     blind = [(title(u.effect), u.where, u.reason) for u in hidden]
     says = (
-        f"An effect of the size below would have stood out by {LIMIT_SD:g} standard deviations "
-        "of this record."
+        f"An effect of the smallest size below would have stood out by {LIMIT_SD:g} standard "
+        "deviations of this record."
     )
-    head = ("effect", "where", "smallest size that would have shown", "remark")
+    head = ("effect", "where", "would have shown", "remark")
     parts: list[StoryPart] = [says, Table("", head, rows)]
     if hidden:
         parts.append(Table("What this record cannot show", ("effect", "where", "why"), blind))
@@ -247,18 +260,18 @@ def _why_not(clear: Ranked | None) -> str:
     if clear is None:
         return ""
     if not clear.is_possible:
-        return f"{clear.after:.0f} sd, with a sign or size that is not possible"
-    return f"{clear.after:.0f} sd, but immaterial or no explanation of what is left"
+        return f"{clear.after:.0f} sd, of an impossible sign or size"
+    return f"{clear.after:.0f} sd, immaterial or no explanation"
 
 
-def _negligible(story: ReportStory) -> Story:
-    """Effects that are present and change next to nothing."""
+def _negligible(story: ReportStory) -> tuple[Story, ...]:
+    """Effects that are present and change next to nothing; nothing where there is none."""
     rows = [
         (title(s.effect), s.where, f"{100 * s.heldout_share_of_rms_flow:.2g} % of the rms flow")
         for s in story.diagnosed.diagnosis.negligible
     ]
     head = ("effect", "where", "what it changes")
-    return Story("Present but negligible", (Table("", head, rows) if rows else "None.",))
+    return (Story("Present but negligible", (Table("", head, rows),)),) if rows else ()
 
 
 def _history(changes: tuple[Change, ...]) -> tuple[Story, ...]:
@@ -275,6 +288,7 @@ def _provenance(story: ReportStory) -> Story:
         ("counted while reading", refused or "nothing refused"),
         ("project", f"{project.path.name} ({project.sections.project.name})"),
         ("digest of the project", project.digest),
+        *settings(story),
         ("written", f"{story.date} by rtid {rtid.__version__}"),
     ]
     return Story("Where this comes from", (Table("", ("", ""), rows),))

@@ -16,6 +16,7 @@ from rtid.apply.versions import Applied
 from rtid.compare import Dependence, against_signals, over_time
 from rtid.diagnose.clean import usable
 from rtid.diagnose.diagnosis import Result
+from rtid.diagnose.excuse import steady
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.regression import Score
 from rtid.diagnose.remains import filtered
@@ -33,9 +34,11 @@ from rtid.project.folder import state_folder
 from rtid.project.history import Change, read
 from rtid.study.study import Diagnosed, Study
 from rtid.tell.charts.evidence import charts_of
+from rtid.tell.charts.points import spread_points
 from rtid.tell.story import Chart
 
 SIGNALS = 5  # against which the residual is shown
+POINTS = 400  # of the data, on a map
 
 
 @dataclass(frozen=True)
@@ -63,8 +66,9 @@ class Ranked:
 class ReportStory:
     """What a report tells: the diagnosis, the residual of both parts before and after, the ranking.
 
-    after is None, depends_after and evidence are empty where nothing was found.  tracking: what the
-    map will do to it, "" without a section [controller].
+    after is None and depends_after is empty where nothing was found.  tracking: what the
+    map will do to it, "" without a section [controller].  points: of the data that taught each map,
+    (n, 2) in V and MPa; beta_sd_pa: of the bulk moduli with everything that was found.
     """
 
     diagnosed: Diagnosed
@@ -79,7 +83,9 @@ class ReportStory:
     history: tuple[Change, ...]
     trace_sha256: str
     date: str
-    tracking: str = ""
+    tracking: str
+    points: dict[str, FloatArray]
+    beta_sd_pa: tuple[float, ...]
 
     @property
     def judges(self) -> int:
@@ -107,12 +113,22 @@ def tell(project: Project, trace: Path, progress: Progress = silent) -> ReportSt
         after,
         *depends,
         ranked(diagnosed.result, diagnosed.diagnosis),
-        charts_of(study.evidence),
+        charts_of(study.evidence, study.remainder),
         study.map,
         tuple(read(project.path)),
         _sha256(trace),
         datetime.now().astimezone().isoformat(" ", "seconds"),
         _tracking(study),
+        {e.name: spread_points(study.machine, e, study.taught, POINTS) for e in study.machine.maps},
+        _beta_sd(steady(last)),
+    )
+
+
+def _beta_sd(fit: Fit) -> tuple[float, ...]:
+    """Standard deviations of the bulk moduli, Pa."""
+    sd = np.sqrt(np.diag(fit.compliance_cov))
+    return tuple(
+        float(s / c**2) if c else float("nan") for s, c in zip(sd, fit.compliance, strict=True)
     )
 
 

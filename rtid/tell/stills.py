@@ -149,6 +149,8 @@ def _plane(axis: Axes, plane: Plane) -> AxesImage:
     cells = [Rectangle((x, y), width, height) for x, y, width, height in plane.veiled]
     style: dict[str, Any] = {"facecolor": VEIL, "edgecolor": HATCH, "hatch": "////"}
     axis.add_collection(PatchCollection(cells, linewidth=0.0, **style))
+    if plane.points is not None:
+        axis.plot(*plane.points.T, ".", color="white", ms=1.6, alpha=0.75, mew=0)
     ends = plane.outline.reshape(-1, 2, 2)
     axis.add_collection(LineCollection(list(ends), colors=INK, linewidths=1.0, capstyle="round"))
     axis.set_title(plane.title)

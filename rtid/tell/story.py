@@ -145,7 +145,8 @@ class Plane:
     """Values (rows, columns) over y and x as colours, each in the middle of its own small field.
 
     x, y: both ends of an axis; low, high: ends of the scale; outline (m, 4): lines, from x, y to
-    x, y; veiled (k, 4): fields, x, y, width and height, that do not stand on data of their own.
+    x, y; veiled (k, 4): fields, x, y, width and height, that do not stand on data of their own;
+    points (n, 2): x and y of the data, where they are shown.
     """
 
     title: str
@@ -157,6 +158,7 @@ class Plane:
     palette: Palette
     outline: FloatArray
     veiled: FloatArray
+    points: FloatArray | None = None
 
 
 @dataclass(frozen=True)

@@ -59,6 +59,7 @@ class Page:
         self._is_open = self._is_gone = self._is_made = False
         self._turns, self._due = turns, set[str]()  # what is waiting for its turn
         self._seen, self._beats, self._moves = "", 0, 0
+        self._asked = ""  # what the user has to confirm on the live page
         is_live = session.trace is None and session.arrival is None
         self._view = "live" if is_live else "compare"
         self._channel = Channel(name="channel")
@@ -213,12 +214,14 @@ class Page:
         elif what == "take_over":
             self.session.take_over(self._browser)
             self._say()
-        elif what in ("add", *SESSION_ACTIONS) and self._follows:
+        elif what in ("add", "release", *SESSION_ACTIONS, *LIVE_ACTIONS) and self._follows:
             self._say()
         elif what == "add":
             self._add(asked)
         elif what in SESSION_ACTIONS:
             SESSION_ACTIONS[what](self.session, asked)
+        elif what in LIVE_ACTIONS:
+            LIVE_ACTIONS[what](self, asked)
         elif self._desk is not None:
             self._desk.take(what, asked)
 
@@ -235,14 +238,27 @@ class Page:
         self._channel.show = f"add {self._moves}"
         self._heard("view")
 
+    def ask_first(self, what: str) -> None:
+        """Ask whether it is meant."""
+        self._asked = what
+
+    def go_ahead(self) -> None:
+        """Do what was asked for."""
+        what, self._asked = self._asked, ""
+        if what == "accept":
+            self.session.say(self.live.accept())
+        elif what == "apply":
+            self.session.apply()
+
     def _beat(self) -> None:
         """Five times a second: the live page, where it is looked at.
 
         The next update is made when the page has drawn the one before: a slow reader misses some,
         and nothing piles up.
         """
+        self.live.hear()
         if self._view == "live" and self._sent.get("seen", "") == self._seen:
-            now = self.live.fragments()
+            now = self.live.fragments(ASKED.get(self._asked, self._asked))
             if any(self._sent.get(place) != html for place, html in now.items()):
                 self._beats += 1
                 self._put(now | {"seen": str(self._beats)})
@@ -253,4 +269,18 @@ SESSION_ACTIONS: dict[str, Callable[[Session, dict[str, str]], None]] = {
     "undo": lambda s, a: s.undo(),
     "save": lambda s, a: s.save(),
     "export": lambda s, a: s.export(a.get("what", "")),
+}
+ASKED = {
+    "accept": "Take the machine as it is now for the new normal? What was learned before is kept "
+    "aside, and the maps begin anew with the samples since the change.",
+    "apply": "Send the learned maps to the controller, all or nothing? `rtid apply --undo` sends "
+    "back what was there.",
+}
+LIVE_ACTIONS: dict[str, Callable[[Page, dict[str, str]], None]] = {
+    "accept": lambda page, a: page.ask_first("accept"),
+    "apply": lambda page, a: page.ask_first("apply"),
+    "sure": lambda page, a: page.go_ahead(),
+    "not_sure": lambda page, a: page.ask_first(""),
+    "days": lambda page, a: page.live.compare(a.get("name", "")),
+    "look": lambda page, a: page.session.look_at(a.get("name", "")),
 }

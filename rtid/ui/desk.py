@@ -5,14 +5,15 @@ It holds the fits; what it returns is plain and small enough to be sent.
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
+from subprocess import run
 
 from rtid.compare import Reference
 from rtid.diagnose.report import Diagnosis
 from rtid.errors import RtidError
-from rtid.estimator.validity import doubts_of
-from rtid.maps.files import provenance, write_map
+from rtid.maps.files import formats
 from rtid.plain import Progress
 from rtid.project import load
 from rtid.project.added import AddedSection, text_with
@@ -31,9 +32,10 @@ from rtid.tell.report_file import report
 from rtid.tell.report_story import Ranked, ranked
 from rtid.tell.story import Chart
 from rtid.trace.glance import Glance, glance
+from rtid.ui.release_form import Released, ReleaseWish, release
 from rtid.ui.upload import free_name
 
-FORMATS = ("csv", "json", "npz")
+APPLY_S = 600.0  # that a transfer may take
 
 
 @dataclass(frozen=True)
@@ -153,7 +155,7 @@ class Desk:
         study = self._stack[-1].study
         said = study.diagnosis()
         return RankedDiagnosis(
-            said, ranked(study.diagnosed.result, said), charts_of(study.evidence)
+            said, ranked(study.diagnosed.result, said), charts_of(study.evidence, study.remainder)
         )
 
     def prepare(self, effect: str, where: str) -> None:
@@ -213,23 +215,28 @@ class Desk:
         return Saved(f"wrote {path}; `{undo_command(path)}` takes the last change back")
 
     def export(self, what: str) -> str:
-        """Write the map of the newest revision (csv, json, npz) or a report beside the record."""
+        """Write a report beside the record."""
+        if what != "report":
+            raise RtidError(f"{what!r} is no format", "report; maps are released")
+        study = self._stack[-1].study
+        path = study.path.with_suffix(".report.html")
+        report(load(study.project.path), study.path, path, self._progress)
+        return f"wrote {path}: the story of the project file as it is saved"
+
+    def release(self, wish: ReleaseWish) -> Released:
+        """Write the maps of the newest revision as a controller or a tool takes them."""
+        if wish.suffix not in formats():
+            raise RtidError(f"{wish.suffix!r} is no format", f"one of {', '.join(formats())}")
+        self._progress("laying out the tables", 0.5)
         last = self._stack[-1]
-        trace, project = last.study.path, last.study.project
-        if what == "report":
-            path = trace.with_suffix(".report.html")
-            report(load(project.path), trace, path, self._progress)
-            return f"wrote {path}: the story of the project file as it is saved"
-        if what not in FORMATS:
-            raise RtidError(f"{what!r} is no format", f"one of {', '.join(FORMATS)}")
-        path, solution = trace.with_suffix(f".map.{what}"), last.study.fit.solution
-        invalid = [doubt.text for doubt in doubts_of(solution) if doubt.is_invalid]
-        if invalid:
-            raise RtidError(
-                f"not exported, {'; '.join(invalid)}",
-                "`rtid export --force` writes it all the same",
-            )
-        write_map(
-            path, last.look.flowmap, provenance(solution, project.name, project.digest, trace.name)
-        )
-        return f"wrote {path}"
+        return release(last.study, last.look, wish)
+
+    def apply(self, project: Path) -> str:
+        """`rtid apply` in a process of its own: what it says last.  RtidError where it refuses."""
+        self._progress("sending the maps", 0.5)
+        words = [sys.executable, "-m", "rtid", "apply", str(project), "--yes"]
+        done = run(words, capture_output=True, text=True, timeout=APPLY_S, check=False)
+        said = (done.stdout if done.returncode == 0 else done.stderr).strip().splitlines()
+        if done.returncode:
+            raise RtidError(said[0] if said else "rtid apply failed", " ".join(said[1:]))
+        return said[-1] if said else "applied"

@@ -7,11 +7,14 @@ stale.
 
 from __future__ import annotations
 
+import getpass
 import time
 from collections.abc import Callable, Iterable
 from math import log10
 from pathlib import Path
 
+from rtid.daemon.acceptance import Acceptance, ask
+from rtid.daemon.calendar import calendar_table, notes, side_by_side, trend, two_spans
 from rtid.daemon.status import (
     Advice,
     Distribution,
@@ -22,11 +25,17 @@ from rtid.daemon.status import (
     StatusError,
     read,
 )
-from rtid.tell.html import table, text
+from rtid.errors import RtidError
+from rtid.tell.html import button, choice, table, text
 from rtid.tell.words import VERDICTS
+from rtid.ui.live_scope import Recent, trends
 from rtid.units import scale_of
 
 STALE_S = 3.0
+HISTORY_S = 10.0  # between looks at the history
+TREND_S = 24 * 3600.0
+DAYS = ("1", "7", "30")
+CHANGED = "plant_changed"
 MOST_ALARMS = 6
 COUNTED = ("samples", "rows", "block_changes")
 DOTS = {"ok": "ok", "open": "ok", "late": "warn", "reopening": "warn", "suspended": "warn"}
@@ -41,24 +50,67 @@ class Live:
         self._status: Status | None = None
         self._trouble = ""
         self._stamp = -1
+        self._recent, self._history, self._history_s = Recent(), "", -HISTORY_S
+        self.days = DAYS[1]
 
-    def fragments(self) -> dict[str, str]:
-        """HTML by place, from the newest status."""
-        self._read()
+    def fragments(self, asking: str = "") -> dict[str, str]:
+        """HTML by place, from the newest status; asking: what the user has to confirm."""
+        self.hear()
         status = self._status
         if status is None:
             return {"live_health": _nothing(self._trouble), "live_learning": ""}
         age_s = max(0.0, self._clock() - status.now_unix_s)
-        health = _head(status, age_s) + _alarms(status, self._clock()) + _loop(status)
+        health = _head(status, age_s) + _alarms(status, self._clock()) + _decisions(status, asking)
+        health += self._recent.scopes(status.signals) + self._trends() + _loop(status)
         health += _signals(status.signals) + _messages(status.messages)
-        learning = _learning(status) + _coach(status.advice) + _verdict(status)
+        planes = "".join(self._recent.plane(edge) for edge in status.estimate.edges)
+        learning = _learning(status) + f'<div class="planes">{planes}</div>'
+        learning += _coach(status.advice) + _verdict(status)
         css = "stale" if age_s > STALE_S else ""
         return {
             "live_health": f'<div class="{css}">{health}</div>',
             "live_learning": f'<div class="{css}">{learning}</div>',
         }
 
-    def _read(self) -> None:
+    def accept(self) -> str:
+        """Take the changed machine for the new normal; what came of it, in words."""
+        if self._folder is None or self._status is None or not self._status.has(CHANGED):
+            return "nothing to accept: the machine does what the map says"
+        try:
+            ask(self._folder, Acceptance(self._clock(), getpass.getuser(), "on the page"))
+        except OSError as error:
+            return f"{self._folder}: {error.strerror}"
+        return "asked the daemon to accept the changed machine"
+
+    def compare(self, days: str) -> None:
+        """How many days are held beside as many before."""
+        if days in DAYS:
+            self.days, self._history_s = days, -HISTORY_S
+
+    def _trends(self) -> str:
+        """From the daemon's history, looked at now and then."""
+        if self._folder is None or self._clock() - self._history_s < HISTORY_S:
+            return self._history
+        now_s = self._history_s = self._clock()
+        try:
+            series = trend(self._folder, now_s - TREND_S)
+            before, now = two_spans(float(self.days), now_s)
+            rows, noted = side_by_side(self._folder, before, now), notes(self._folder, now)
+        except RtidError:
+            self._history = ""  # none is written yet
+            return ""
+        told = calendar_table(float(self.days), rows)
+        cells = [[text(cell) for cell in row] for row in told.rows]
+        said = "".join(f"<p>{text(f'{note.who}: {note.text}')}</p>" for note in noted)
+        self._history = (
+            f"<h3>Trends</h3>{trends(series, 'Pa')}<h3>Calendar</h3><p>The last "
+            f"{choice('days', DAYS, self.days)} days beside as many before.</p>"
+            f"{table(told.heads, cells)}{said}"
+        )
+        return self._history
+
+    def hear(self) -> None:
+        """Take the newest status, where there is another one."""
         if self._folder is None:
             self._trouble = "no state folder was named"
             return
@@ -66,6 +118,7 @@ class Live:
             stamp = (self._folder / "status.json").stat().st_mtime_ns
             if stamp != self._stamp:
                 self._status, self._stamp = read(self._folder), stamp
+                self._recent.take(self._status.scope)
         except StatusError as error:
             self._trouble = str(error)
         except OSError as error:
@@ -124,11 +177,31 @@ def _alarms(status: Status, now_s: float) -> str:
     for alarm in status.alarms[:MOST_ALARMS]:
         is_on = alarm.until_unix_s is None
         since = _age(max(0.0, now_s - alarm.since_unix_s))
-        word = f"for {since}" if is_on else "over"
+        clock = time.strftime("%H:%M:%S", time.localtime(alarm.since_unix_s))
+        word = f"since {clock}, for {since}" if is_on else f"at {clock}, over"
         dot = _dot("failed" if is_on else "ok")
-        lines.append(f"<li>{dot}<b>{text(alarm.name)}</b> {text(alarm.text)} ({word})</li>")
+        seconds = _seconds(alarm.trace)
+        lines.append(
+            f"<li>{dot}<b>{text(alarm.name)}</b> {text(alarm.text)} ({word}){seconds}</li>"
+        )
     shown = "".join(lines) or '<li><span class="dot ok"></span>none</li>'
     return f'<h3>Alarms</h3><ul style="list-style:none;padding:0;margin:0">{shown}</ul>'
+
+
+def _seconds(trace: str) -> str:
+    """A button that opens the recorded seconds around an alarm."""
+    if not trace:
+        return ""
+    return " " + button("look at its seconds", "look", kind="link", name=trace)
+
+
+def _decisions(status: Status, asking: str) -> str:
+    """What somebody may decide: to accept a changed machine, to send the maps; twice asked."""
+    if asking:
+        sure = button("Yes, do it", "sure", kind="main") + " " + button("No", "not_sure")
+        return f'<div class="card"><p>{text(asking)}</p>{sure}</div>'
+    accept = button("Accept the changed machine", "accept", off=not status.has(CHANGED))
+    return f"<p>{accept} {button('Apply the maps', 'apply')}</p>"
 
 
 def _loop(status: Status) -> str:

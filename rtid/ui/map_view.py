@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from rtid.compare import PAPER_DP_PA, PAPER_U_V, LearnedReference, Reference, deviations
 from rtid.estimator.flowmap import VALID, EdgeMap, FlowMap
+from rtid.maps.files import formats
 from rtid.plain import FloatArray
 from rtid.tell.charts.maps import (
     COMMAND,
@@ -21,10 +22,11 @@ from rtid.tell.charts.maps import (
     slice_panel,
 )
 from rtid.tell.charts.theme import beside
-from rtid.tell.html import button, choice, select, table, text
+from rtid.tell.html import choice, select, table, text
 from rtid.tell.live import PanelPlot, PlanePlot
 from rtid.tell.story import Panel
 from rtid.ui.desk_views import Bench
+from rtid.ui.release_form import FLASHED, MOST_FILES, ReleaseWish, controls, shown
 from rtid.ui.views import PageView
 from rtid.units import MPA, Z95, flow_name, lpm
 
@@ -46,7 +48,9 @@ class _Other(LearnedReference):
 
 
 class MapView(PageView):
-    """Two planes, flow and its interval or difference, and the slices."""
+    """Two planes, flow and its interval or difference, the slices, and the release."""
+
+    places = ("tools", "tools release", "plot", "says")
 
     def __init__(self, bench: Bench) -> None:
         super().__init__(bench)
@@ -61,7 +65,10 @@ class MapView(PageView):
         )
         self._slices = PanelPlot(self._cut(edge, None))
         self.roots = {"plot": beside(self._flow.root, self._second.root, self._slices.root)}
+        self.wish = ReleaseWish()
         self.actions = {what: partial(self.choose, what) for what in CHOICES}
+        self.actions |= {f.name: partial(self.want, f.name) for f in fields(ReleaseWish)}
+        self.actions |= {"release": lambda _: bench.session.release(self.wish)}
 
     @property
     def flowmap(self) -> FlowMap:
@@ -93,6 +100,10 @@ class MapView(PageView):
             self.second = name
         self.refresh()
 
+    def want(self, what: str, asked: dict[str, str]) -> None:
+        """Another format, room, size or flashed file of a release."""
+        self.wish = replace(self.wish, **{what: asked.get("name", "")})
+
     def refresh(self) -> None:
         """Draw what is chosen."""
         if self.beside not in self.others:
@@ -118,18 +129,25 @@ class MapView(PageView):
             + select("beside", [NOTHING, *self.others], self.beside, "beside")
             + select("second", list(SECOND), self.second, "second plane")
             + select("along", list(ALONG), self.along, "slices")
-            + "<span>"
-            + "".join(button(f"export {w}", "export", what=w) for w in ("csv", "json", "npz"))
-            + "</span>"
         )
         valid = float(np.mean(self.flowmap[self.edge].status == VALID))
         says = (
             f"Valve <b>{text(self.edge)}</b>: outlined blocks ({100 * valid:.0f} % of the grid) "
             "stand on their own data; the others (dashed in the slices, in brackets in the table) "
             "follow the orifice law from these, and their interval says how far to trust them. "
-            "Next: hold it beside a reference or another valve, or export it."
+            "Next: hold it beside a reference or another valve, or release it."
         )
-        return {"tools": tools, "says": says + self._table()}
+        released = self.bench.session.released
+        below = shown(released) if released else self._table()
+        asked = controls(self.wish, formats(), self._there())
+        return {"tools": tools, "release": asked, "says": says + below}
+
+    def _there(self) -> list[str]:
+        """Files of the record's folder that may be what is flashed, the newest first."""
+        trace = self.bench.session.trace
+        paths = [p for s in FLASHED for p in trace.parent.glob(f"*{s}")] if trace else []
+        recent = sorted(paths, key=lambda p: -p.stat().st_mtime)
+        return [p.name for p in recent if p != trace][:MOST_FILES]
 
     def _table(self) -> str:
         """Table 1 of the paper for this valve."""

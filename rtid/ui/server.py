@@ -25,6 +25,7 @@ from bokeh.server.tornado import BokehTornado
 from bokeh.server.views.doc_handler import DocHandler
 from bokeh.server.views.static_handler import StaticHandler
 from bokeh.util.token import check_token_signature, get_session_id, get_token_payload
+from tornado.escape import url_escape
 from tornado.httpserver import HTTPServer
 from tornado.httputil import HTTPHeaders, HTTPMessageDelegate, HTTPServerRequest
 from tornado.ioloop import IOLoop
@@ -36,6 +37,7 @@ from rtid.ui.arrival import Arrival, choose
 from rtid.ui.browser_page import build
 from rtid.ui.live_page import Live
 from rtid.ui.packing import Packed, Packing
+from rtid.ui.release_form import PLACE as RELEASED
 from rtid.ui.security import TOKEN, Door, Refusal
 from rtid.ui.shared import Session
 from rtid.ui.turns import Turns
@@ -57,7 +59,7 @@ CSP = "Content-Security-Policy"
 WELCOME = """<!DOCTYPE html><meta charset="utf-8"><link rel="icon" href="data:,"><title>rtid</title>
 <noscript><meta http-equiv="refresh" content="0;url=/"></noscript>
 <script nonce="{nonce}">location.replace("/" + location.hash)</script>"""
-PATHS = ("/", "/ws", "/alive", PLACE)
+PATHS = ("/", "/ws", "/alive", PLACE, RELEASED)
 HOST = re.compile(r"[\w.\-\[\]:]+")  # what may stand in a policy
 
 
@@ -95,6 +97,27 @@ class Alive(RequestHandler):
     def get(self) -> None:
         """Nothing but the answer itself."""
         self.set_status(204)
+
+
+class Download(RequestHandler):
+    """Gives the files of the last release, by their names, and no others."""
+
+    def initialize(self, session: Session) -> None:
+        """Whose."""
+        self._session = session
+
+    def get(self) -> None:
+        """One file, to be saved."""
+        released, name = self._session.released, self.get_query_argument("name", "")
+        path = next((p for p in released.files if p.name == name), None) if released else None
+        if path is None or not path.is_file():
+            self.set_status(404)
+            self.finish("rtid: no such file was released\n")
+            return
+        self.set_header("Content-Type", "application/octet-stream")
+        self.set_header("Content-Disposition", f"attachment; filename*=UTF-8''{url_escape(name)}")
+        self.set_header("Cache-Control", "no-store")
+        self.finish(path.read_bytes())
 
 
 class Welcome(RequestHandler):
@@ -303,7 +326,11 @@ def start(
         door,
         app,
         turns,
-        extra_patterns=[("/alive", Alive), *_uploads(session)],
+        extra_patterns=[
+            ("/alive", Alive),
+            (RELEASED, Download, {"session": session}),
+            *_uploads(session),
+        ],
         extra_websocket_origins=["*"],  # the door is stricter
         secret_key=secrets.token_bytes(32),
         sign_sessions=True,

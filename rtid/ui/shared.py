@@ -16,6 +16,7 @@ from rtid.errors import RtidError
 from rtid.plain import Key
 from rtid.project.added import AddedSection
 from rtid.ui.arrival import Arrival, choose
+from rtid.ui.release_form import Released, ReleaseWish
 from rtid.ui.worker import Worker
 
 if TYPE_CHECKING:
@@ -60,6 +61,7 @@ class Session:
     pages: Counter[int] = field(default_factory=Counter)  # open ones by browser
     writer: int | None = None  # the browser that works on the record
     arrival: Arrival | None = None  # before there is a project
+    released: Released | None = None  # that can be taken from the page
     _is_adding: bool = False
 
     def open(self) -> None:
@@ -151,8 +153,29 @@ class Session:
         self.ask("save", then=self._saved)
 
     def export(self, what: str) -> None:
-        """Write a map, a table or a report beside the record."""
-        self.ask("export", what, then=self._noted)
+        """Write a report beside the record."""
+        self.ask("export", what, then=self.say)
+
+    def release(self, wish: ReleaseWish) -> None:
+        """Write the maps as a controller or a tool takes them, to be taken from the page."""
+
+        def done(released: Released) -> None:
+            self.released = released
+            self.tell("looks")
+            self.say(f"wrote {released.files[0]}")
+
+        self.ask("release", wish, then=done)
+
+    def apply(self) -> None:
+        """Send the learned maps to the controller, as `rtid apply` does."""
+        self.ask("apply", self.project, then=self.say)
+
+    def look_at(self, name: str) -> None:
+        """Open the recorded seconds around an alarm."""
+        recorded = sorted(Path(name).glob("*.blf"))
+        if self.trace is None and recorded:
+            self.trace, self.state = recorded[:2][-1], LOADING  # that it came in
+            self.open()
 
     def is_prepared(self, key: Key) -> bool:
         """True where adding it takes no time."""
@@ -244,8 +267,9 @@ class Session:
     def _saved(self, saved: Saved) -> None:
         for revision in self.revisions:
             revision.is_saved = True
-        self._noted(saved.note)
+        self.say(saved.note)
 
-    def _noted(self, note: str) -> None:
+    def say(self, note: str) -> None:
+        """Tell all pages what came of something."""
         self.note = note
         self.tell("state")

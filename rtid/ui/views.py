@@ -70,7 +70,7 @@ VIEWS = {
     "where": ViewRow("rtid.ui.where_view:WhereView", ("tools", "plot maps", "plot time", "says")),
     "why": ViewRow("rtid.ui.why_view:WhyView", ("plot", "says", "scroll ranking", "scroll page")),
     "add": ViewRow("rtid.ui.add_view:AddView", ("scroll bars", "plot", "says")),
-    "map": ViewRow("rtid.ui.map_view:MapView"),
+    "map": ViewRow("rtid.ui.map_view:MapView", ("tools", "tools release", "plot", "says")),
     "live": ViewRow("", ("scroll health", "scroll learning")),
 }
 

@@ -51,7 +51,7 @@ class WhereView(PageView):
         top = round_up(float(np.quantile(values, LARGEST))) if values else 1.0
         self._quantities = quantities(top)
         self.planes = BlockPlots(look.model, every, bench.mark_block)
-        self.signal = self._depends[0].signal if self._depends else ""
+        self.signal = max(self._depends, key=_explains).signal if self._depends else ""
         self._over = PanelPlot(self._panel)
         self._lines = Lines()
         self.side = self._side()
@@ -192,3 +192,8 @@ class WhereView(PageView):
             "its time spans light up here and in Compare; drag a span: its blocks are outlined. "
             f"A map that fails everywhere alike lacks an effect, not data: see <b>Why</b>.{hatched}"
         )
+
+
+def _explains(depends: Dependence) -> float:
+    """The share of the residual's variance that a signal explains, in the chamber that has most."""
+    return float(depends.explained.max(initial=0.0))

@@ -71,12 +71,15 @@ class WhyView(PageView):
 
 
 def drawn(chart: Chart) -> UIElement:
-    """The panels of a chart side by side, on one scale; stacked where the page is narrow."""
-    panels = [panel for panels in chart.panels for panel in panels]
-    plots = [PanelPlot(panel) for panel in panels]
-    for plot, panel in zip(plots, panels, strict=True):
-        plot.show(panel, panels)
-    return beside(*(plot.root for plot in plots), stacked_below_px=NARROWEST_PX)
+    """The panels of a chart in their rows; one below the other where the page is narrow."""
+    every = [panel for panels in chart.panels for panel in panels]
+    rows = []
+    for panels in chart.panels:
+        plots = [PanelPlot(panel) for panel in panels]
+        for plot, panel in zip(plots, panels, strict=True):
+            plot.show(panel, every if chart.common == "all" else ())
+        rows.append(beside(*(plot.root for plot in plots), stacked_below_px=NARROWEST_PX))
+    return column(*rows, sizing_mode="stretch_both")
 
 
 def fragments(ranked: RankedDiagnosis | None, page: str, may_add: bool) -> dict[str, str]:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+import sqlite3
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,13 +16,15 @@ from typing import TYPE_CHECKING
 import pytest
 
 from benchmarks.live_page import growth, memory
-from rtid.daemon.status import Advice, ChamberStatus, EdgeHealth, Verdict, write
+from rtid.daemon.acceptance import taken
+from rtid.daemon.chronicle import FILE, Chronicle
+from rtid.daemon.status import Advice, Alarm, ChamberStatus, EdgeHealth, Verdict, write
 from rtid.sim.random_plants import draw
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from rtid.ui.server import Workbench
 from tests.browser.conftest import Opened, open_page
-from tests.browser.geometry import assert_clear
+from tests.browser.geometry import SIZES, assert_clear
 from tests.ui.served import served
 from tests.ui.test_live_page import status
 
@@ -105,6 +108,10 @@ def test_the_page_follows_a_daemon(opened: Opened) -> None:
     assert "Hz" in signals
     assert "blocks valid" in page.locator("#live_learning").inner_text()
     assert page.locator("#live_learning >> text=To learn more").count() == 1
+    assert page.locator("#live_health .scope polygon").count() >= 5  # command, pressures, position
+    points = page.locator("#live_health .scope polygon").first.get_attribute("points") or ""
+    assert len(points.split()) >= 2 * 5 * SHORT_S  # ten values a second, less what is not told yet
+    assert page.locator("#live_learning .plane circle").count() > 10
 
 
 @pytest.mark.soak
@@ -170,6 +177,37 @@ def test_words_from_outside_are_shown_as_they_are(
             assert words.count("<script>alert(1)</script>") >= 15
             assert opened.page.locator("#live img, #live script").count() == 0
             assert_clear(opened.page, "#live_health h2")
+
+
+def test_a_repaired_machine_is_accepted_and_weeks_are_compared_in_three_clicks(
+    browser: Browser, project: Path, tmp_path: Path
+) -> None:
+    now_s, known = time.time(), status()
+    Chronicle(tmp_path).close()
+    with closing(sqlite3.connect(tmp_path / FILE)) as base:
+        for days in range(14):
+            beta = 1e9 if days > 7 else 8e8
+            row = (now_s - 86_400.0 * (days + 0.1), "a", beta + 1e6 * (days % 2), 1e6)
+            base.execute("INSERT INTO estimate VALUES (?, ?, ?, ?)", row)
+        base.commit()
+    changed = Alarm("plant_changed", "the map foretells no more", now_s - 60, None, "plant")
+    write(tmp_path, replace(known, now_unix_s=now_s + 600.0, alarms=(changed,)))
+    with served(project=project, state=tmp_path) as bench:
+        for opened in open_page(browser, bench):
+            opened.go()
+            page = opened.page
+            page.click("#live_health [data-do=accept]")
+            page.wait_for_selector("#live_health >> text=for the new normal?")
+            assert taken(tmp_path) is None
+            assert_clear(page, "#live_health [data-do=sure]", sizes=SIZES[-1:])
+            page.click("#live_health [data-do=sure]")
+            page.wait_for_selector("#work >> text=asked the daemon to accept")
+            request = taken(tmp_path)
+            assert request is not None and request.reason == "on the page"
+            page.wait_for_selector("#live_health >> text=bulk modulus a MPa")
+            assert "more than both scatter" in page.locator("#live_health").inner_text()
+            page.click("#live_health [data-do=days][data-name='1']")
+            page.wait_for_selector("#days_0[aria-pressed=true]")
 
 
 def test_the_page_of_a_machine_without_a_daemon_says_what_to_do(

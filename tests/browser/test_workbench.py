@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rtid.maps.files import read_map
+from rtid.maps.flashed import read_flashed
 from rtid.project import load
 from rtid.study.look import look
 from rtid.study.study import Study
@@ -230,11 +230,20 @@ def test_from_the_verdict_to_the_falling_bar_and_back(
     page.wait_for_selector("#add_bars button[data-do=save]:disabled")
     assert [a.effect for a in load(project).sections.added] == ["internal_leakage_laminar"]
     page.keyboard.press("5")
-    page.click("#map_tools >> text=export json")
-    page.wait_for_selector("#work >> text=.map.json")
-    flowmap, provenance = read_map(trace.with_suffix(".map.json"))
-    assert len(flowmap.edges) == 4
-    assert provenance["source"] == trace.name
+    page.select_option("#room_select", "bytes")
+    page.fill("#amount", "8192")
+    page.keyboard.press("Tab")
+    page.wait_for_selector("#map_release [data-do=release][data-amount='8192']")
+    page.click("#map_release [data-do=release]")
+    link = "#map_says a[download] >> text=.map.dcm"
+    page.wait_for_selector(link)
+    with page.expect_download() as taken:
+        page.click(link)
+    tables = read_flashed(Path(taken.value.path()).rename(trace.with_name("taken.dcm")))
+    assert len(tables) == 4
+    assert 4000 < sum(2 * (m.flow_m3s.size + len(m.u_v) + len(m.dp_pa)) for m in tables) <= 8192
+    assert_clear(page, "#map_release")
+    assert "released, date" in trace.with_suffix(".map.sheet.html").read_text("utf-8")
     page.reload()
     page.wait_for_selector("body[data-ready=yes]")
     page.wait_for_selector("#map.shown")

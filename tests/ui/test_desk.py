@@ -21,6 +21,7 @@ from rtid.sim.run import simulate
 from rtid.study.look import Look
 from rtid.study.revisions import undo
 from rtid.ui.desk import Desk
+from rtid.ui.release_form import ReleaseWish
 from rtid.ui.worker import in_words
 from tests.replays import shared_replays  # noqa: F401
 
@@ -88,7 +89,7 @@ def test_the_whole_way_of_an_effect(worn: tuple[Path, Path]) -> None:
     ]
     assert [a.key for a in load(project).sections.added] == [LEAK]
     assert [change.change for change in read(project)] == [ADD]
-    desk.export("npz")
+    desk.release(ReleaseWish(".npz"))
     flowmap, _ = read_map(trace.with_suffix(".map.npz"))
     assert np.array_equal(flowmap.edges[0].theta, again.look.flowmap.edges[0].theta)
     reopened = Desk(silent).open(project, trace, None)
@@ -125,3 +126,5 @@ def test_a_wrong_format_or_record_is_refused_in_words(
     desk.open(project, trace, None)
     with pytest.raises(RtidError, match="no format"):
         desk.export("../../etc/passwd")
+    with pytest.raises(RtidError, match="no format"):
+        desk.release(ReleaseWish("/../../etc/passwd"))

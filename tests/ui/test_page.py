@@ -28,7 +28,10 @@ class Ticking:
     def __init__(self) -> None:
         self.looks = 0
 
-    def fragments(self) -> dict[str, str]:
+    def hear(self) -> None:
+        """A status is read whatever is looked at: the last minute is there when somebody looks."""
+
+    def fragments(self, asking: str = "") -> dict[str, str]:
         self.looks += 1
         return {"live_health": f"<p>{self.looks}</p>", "live_learning": ""}
 
@@ -81,7 +84,7 @@ def test_whatever_a_page_asks_is_read_without_failing(asked: str) -> None:
 )
 def test_a_page_asks_for_nonsense_and_nothing_happens(asked: dict[str, str]) -> None:
     shown, _ = page()
-    if asked.get("do") not in ("add", "drop", "undo", "save", "export"):
+    if asked.get("do") not in ("add", "drop", "undo", "save", "export", "release"):
         shown._take(parsed(json.dumps(asked)))
     assert shown.session.revisions == []
 
@@ -154,7 +157,7 @@ def test_a_follower_changes_nothing_until_it_takes_over() -> None:
     session.join(7)
     session.take_over(7)
     jobs = session.worker.jobs  # type: ignore[attr-defined]
-    for what in ("add", "drop", "undo", "save", "export"):
+    for what in ("add", "drop", "undo", "save", "export", "release"):
         shown._take({"do": what, "effect": "leak", "where": "a-b"})
     assert not jobs and "following another browser" in shown._channel.parts["work"]
     shown._take({"do": "take_over"})

@@ -20,6 +20,7 @@ from tornado.httputil import HTTPHeaders, HTTPServerRequest, RequestStartLine
 from tornado.websocket import WebSocketClientConnection, websocket_connect
 
 from rtid.errors import RtidError
+from rtid.ui.release_form import Released
 from rtid.ui.security import Door
 from rtid.ui.server import MOST_PAGES, MOST_SOCKETS, Workbench, policy
 from tests.ui.served import project_file, served
@@ -83,6 +84,22 @@ def token_of(page: str) -> str:
 def socket_request(bench: Workbench, token: str, **headers: str) -> HTTPRequest:
     known = {"Sec-WebSocket-Protocol": f"bokeh, {token}", "Cookie": cookie_of(bench)} | headers
     return HTTPRequest(f"ws://127.0.0.1:{port_of(bench)}/ws", headers=HTTPHeaders(known))
+
+
+def test_only_released_files_are_given_and_only_to_friends(
+    bench: Workbench, tmp_path: Path
+) -> None:
+    (tmp_path / "a.dcm").write_bytes(b"table")
+    (tmp_path / "b.dcm").write_bytes(b"secret")
+    assert ask(bench, path="/release?name=a.dcm")[0] == 404
+    bench.session.released = Released((tmp_path / "a.dcm",), (), ())
+    status, body, headers = ask(bench, path="/release?name=a.dcm")
+    assert (status, body) == (200, "table")
+    assert headers["Content-Disposition"].startswith("attachment")
+    for name in ("b.dcm", "../a.dcm", "", "%2e%2e%2fb.dcm"):
+        assert ask(bench, path=f"/release?name={name}")[0] == 404
+    assert ask(bench, path="/release?name=a.dcm", Cookie="")[0] == 401
+    bench.session.released = None
 
 
 def test_it_is_bound_to_this_machine_alone(bench: Workbench) -> None:

@@ -9,8 +9,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from rtid.estimator.flowmap import EdgeMap, FlowMap
-from rtid.model import Edge, Machine
+from rtid.model import Machine
 from rtid.plain import FloatArray
+from rtid.tell.charts.points import spread_points
 from rtid.tell.colours import GREY, INK, LINE
 from rtid.tell.stills import FILL, LABELS, STYLE, label_outer, panels
 from rtid.units import MPA
@@ -24,24 +25,12 @@ def coverage(model: Machine, flowmap: FlowMap, chunk: FloatArray) -> Figure:
         figure, axes = panels(len(model.maps))
         for axis, edge, learned in zip(axes, model.maps, flowmap.edges, strict=True):
             _blocks(axis, learned)
-            w_v, dp_pa = working_points(model, edge, chunk)
-            step = max(1, len(w_v) // DOTS)
-            axis.plot(w_v[::step], dp_pa[::step] * MPA, ".", color=INK, ms=1.8, alpha=0.45, mew=0)
+            w_v, dp_pa = spread_points(model, edge, chunk, DOTS).T
+            axis.plot(w_v, dp_pa, ".", color=INK, ms=1.8, alpha=0.45, mew=0)
             axis.set_title(f"{edge.name}: {edge.source} → {edge.sink}")
         label_outer(axes, "opening command w in V", "pressure drop in MPa")
         _legend(figure, flowmap)
     return figure
-
-
-def working_points(model: Machine, edge: Edge, chunk: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Opening command, V, and pressure drop, Pa, (m,) of the samples with the edge open.
-
-    chunk (n, 2 + signals), SI.
-    """
-    w_v = edge.direction * chunk[:, 2 + model.column(edge.command)]
-    dp_pa = chunk[:, 2 + model.column(edge.source)] - chunk[:, 2 + model.column(edge.sink)]
-    is_open = w_v > max(edge.safe_band_v, float(edge.grid.u_v[0]))
-    return w_v[is_open], dp_pa[is_open]
 
 
 def _blocks(axis: Axes, edge: EdgeMap) -> None:

@@ -59,20 +59,24 @@ def before_and_after(
     floor_m3s: float,
     caption: str,
 ) -> Chart:
-    """One row per signal, one column per chamber; models: the same signals for one or two models.
+    """Two signals per row, one panel per chamber; models: the same signals for one or two models.
 
     floor_m3s: rms of the sensors' noise, shown as a band.
     """
     limit = _scale([result for every in models.values() for result in every])
-    rows = tuple(
-        tuple(
+    pairs = [
+        [
             _compared(name, c, dict(zip(models, result, strict=True)), floor_m3s, limit)
             for c, name in enumerate(chambers)
-        )
+        ]
         for result in zip(*models.values(), strict=True)
+    ]
+    rows = tuple(
+        tuple(panel for pair in pairs[k : k + COLUMNS] for panel in pair)
+        for k in range(0, len(pairs), COLUMNS)
     )
     band, heading = "± rms of the sensors' noise", "What the residual depends on"
-    return Chart("dependences", heading, rows, caption, "all", band, (5.2, 2.2))
+    return Chart("dependences", heading, rows, caption, "all", band, (4.2, 2.2))
 
 
 def _compared(

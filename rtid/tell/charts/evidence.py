@@ -1,4 +1,7 @@
-"""The evidence for a named effect: what is left over its regressor, without it and with it."""
+"""The picture of a verdict: what is left over the regressor of a named effect, before and after it.
+
+Where no effect has a name: over what the rest follows most, time, direction of motion, frequency.
+"""
 
 from __future__ import annotations
 
@@ -7,22 +10,62 @@ from collections.abc import Sequence
 from dataclasses import replace
 from math import floor, inf, log10
 
+import numpy as np
+
+from rtid.compare import Dependence
 from rtid.diagnose.partial import AddedVariable, Exhibit, Rise
+from rtid.diagnose.remains import Remainder, band_name
 from rtid.effects import catalogue
 from rtid.effects.page import readable, title
-from rtid.tell.colours import BLUE, ORANGE
+from rtid.plain import FloatArray
+from rtid.tell.charts.dependence import over_signal
+from rtid.tell.colours import BLUE, CHAMBERS, GREY, MARKERS, ORANGE
 from rtid.tell.story import Chart, Dots, Line, Panel
 from rtid.tell.words import named
-from rtid.units import Z95, scale_of
+from rtid.units import Z95, flow_name, lpm, scale_of
 
-NAME = "evidence"
+NAME, REMAINDER = "evidence", "remainder"
 MOST_DIGITS = 7  # behind the point
 
 
-def charts_of(shown: Sequence[Exhibit]) -> tuple[Chart, ...]:
-    """One for the exhibit of each effect that a diagnosis has found."""
+def charts_of(shown: Sequence[Exhibit], rest: Remainder | None = None) -> tuple[Chart, ...]:
+    """One for each effect that a diagnosis has found, or one for what no effect explains."""
     names = [NAME if k == 0 else f"{NAME}_{k + 1}" for k in range(len(shown))]
-    return tuple(replace(evidence(e), name=name) for e, name in zip(shown, names, strict=True))
+    charts = (replace(evidence(e), name=name) for e, name in zip(shown, names, strict=True))
+    return *charts, *([] if rest is None else [left_over(rest)])
+
+
+def left_over(rest: Remainder) -> Chart:
+    """What no effect explains: over the signal that it follows most, time, direction, frequency."""
+    names = rest.chambers
+    shown = (*rest.signals[:1], rest.time, rest.direction)
+    panels = (*(replace(over_signal(names, d), title=_says(d)) for d in shown), _spectrum(rest))
+    rows = tuple(panels[k : k + 2] for k in range(0, len(panels), 2))
+    heading = "What is left, and no known effect explains"
+    return Chart(REMAINDER, heading, rows, rest.text, "none", size_in=(5.2, 2.4))
+
+
+def _says(depends: Dependence) -> str:
+    return f"over {depends.signal}: explains {100 * float(depends.explained.max()):.0f} %"
+
+
+def _spectrum(rest: Remainder) -> Panel:
+    """What is left in each band of frequencies, beside what the sensors' noise leaves there."""
+    known = np.flatnonzero(rest.rms_m3s.max(axis=1) > 0.0)
+    at = np.arange(len(known), dtype=float)
+
+    def points(name: str, sizes: FloatArray, colour: str, marker: str) -> Dots:
+        return Dots(name, at, lpm() * sizes[known], None, colour, marker)
+
+    series = [
+        points(f"chamber {name}", rest.rms_m3s[:, c], CHAMBERS[c], MARKERS[c])
+        for c, name in enumerate(rest.chambers)
+    ]
+    noise = points("noise", rest.noise_m3s.max(axis=1), GREY, "c")
+    ticks = tuple(band_name(k, k + 1).replace("at ", "").replace(" Hz", "") for k in known.tolist())
+    title = "size by frequency; circles: noise"
+    label = f"rms in {flow_name()}"
+    return Panel(title, "frequency in Hz", label, points=(*series, noise), ticks=ticks)
 
 
 def evidence(exhibit: Exhibit) -> Chart:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from rtid.tell.story import Chart, Dots, Line, Palette, Panel, Plane, Planes, Re
 from rtid.units import MPA, Z95, flow_name, lpm
 
 FIELDS = 96, 120  # of a plane: over the pressure drop, over the command
-SLICES = 5
+SLICES, ROW = 5, 4  # of a map, and pictures beside each other
 POINTS, DOTS = 200, 25  # of a slice, and of a reference beside it
 LEAST_FLOW = 0.02  # of the largest: what a row of blocks passes that is worth a slice
 SURE = 0.98  # quantile of what two maps differ by at which its scale ends
@@ -26,17 +27,24 @@ def _flow() -> str:
     return f"flow in {flow_name()}"
 
 
-def maps(flowmap: FlowMap) -> Planes:
-    """Q in L/min, one scale for all valves; veiled where a block is not valid."""
+def maps(flowmap: FlowMap, points: Mapping[str, FloatArray] | None = None) -> Planes:
+    """Q in L/min, one scale for all valves; veiled where a block is not valid.
+
+    points: of the data by valve, (n, 2) in V and MPa.
+    """
     largest = max((np.nan_to_num(edge.q_max_m3s) for edge in flowmap.edges), default=0.0) * lpm()
     top = 1.25 * max(largest, 1e-3)
     planes = tuple(
-        _plane(edge, edge.name, _flow_on(edge), (0.0, top), "flow") for edge in flowmap.edges
+        replace(
+            _plane(edge, edge.name, _flow_on(edge), (0.0, top), "flow"),
+            points=(points or {}).get(edge.name),
+        )
+        for edge in flowmap.edges
     )
     caption = (
         "Learned flow over opening command and pressure drop. Outlined blocks stand on their own "
         "data, the others follow the valve's law from these."
-    )
+    ) + (" Dots: where the record was." if points else "")
     words = "valid", "not valid: from the orifice law"
     return Planes("maps", "Flow maps", planes, COMMAND, DROP, _flow(), caption, *words)
 
@@ -123,12 +131,12 @@ def slices(
     panels = [
         slice_panel(edge, edge.name, "dp", u_v, reference, reference_name) for edge in flowmap.edges
     ]
-    rows = tuple(tuple(panels[k : k + 2]) for k in range(0, len(panels), 2))
+    rows = tuple(tuple(panels[k : k + ROW]) for k in range(0, len(panels), ROW))
     caption = (
         "Slices through the maps with their 95 % band; dashed where a block does not stand on its "
         "own data."
     )
-    return Chart("slices", "Slices through the maps", rows, caption, "all", "", (4.5, 3.2))
+    return Chart("slices", "Slices through the maps", rows, caption, "all", "", (3.6, 2.6))
 
 
 def slice_panel(

@@ -60,6 +60,6 @@ def styled(title: Title) -> Title:
 
 def beside(*made: UIElement, stacked_below_px: int = NARROW_PX) -> Row:
     """Side by side; one below the other where the page is narrower than that."""
-    narrow = f"@media (max-width: {stacked_below_px}px)"
+    narrow = f"@media screen and (max-width: {stacked_below_px}px)"
     stacked = ":host { flex-direction: column !important; }"
     return row(*made, sizing_mode="stretch_both", stylesheets=[f"{narrow} {{ {stacked} }}"])

@@ -1,0 +1,163 @@
+"""What the history says of two spans of the calendar: this week beside the last one.
+
+A mean of n estimates has the scatter of their values as its deviation: they are published from one
+growing estimate and are not independent, so that it is not divided by sqrt(n).
+"""
+
+from __future__ import annotations
+
+import sqlite3
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from rtid.daemon.chronicle import DAY_S, FILE
+from rtid.errors import RtidError
+from rtid.tell.story import Table
+from rtid.units import scale_of
+
+NOTES = "CREATE TABLE IF NOT EXISTS note (from_s REAL, until_s REAL, who TEXT, text TEXT)"
+MOST_POINTS = 400  # of a trend
+
+
+@dataclass(frozen=True)
+class Span:
+    """Seconds since 1970."""
+
+    from_s: float
+    until_s: float
+
+
+@dataclass(frozen=True)
+class Row:
+    """One quantity in the span before and in this one: mean and scatter, None where there is none.
+
+    unit: SI, "" for a count or a share.
+    """
+
+    name: str
+    unit: str
+    before: tuple[float, float] | None
+    now: tuple[float, float] | None
+
+
+@dataclass(frozen=True)
+class SpanNote:
+    """What somebody has written about a span."""
+
+    from_s: float
+    until_s: float
+    who: str
+    text: str
+
+
+@contextmanager
+def _opened(folder: Path, may_write: bool = False) -> Iterator[sqlite3.Connection]:
+    path = folder / FILE
+    if not path.is_file():
+        raise RtidError(f"{path}: there is no history", "`rtid run` writes it while it learns")
+    mode = "rw" if may_write else "ro"
+    try:
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode={mode}", uri=True)) as base:
+            yield base
+            base.commit()
+    except sqlite3.Error as error:
+        raise RtidError(f"{path}: {error}", "is it the history of a daemon?") from None
+
+
+def two_spans(days: float, until_s: float | None = None) -> tuple[Span, Span]:
+    """The last days, and as many before them: (before, now)."""
+    end = time.time() if until_s is None else until_s
+    length = days * DAY_S
+    return Span(end - 2 * length, end - length), Span(end - length, end)
+
+
+def side_by_side(folder: Path, before: Span, now: Span) -> list[Row]:
+    """Every quantity of the history in two spans.  Raises RtidError where there is none."""
+    with _opened(folder) as base:
+        both = [_values(base, span) for span in (before, now)]
+    names = sorted({*both[0], *both[1]})
+    return [Row(*name, both[0].get(name), both[1].get(name)) for name in names]
+
+
+def _values(base: sqlite3.Connection, span: Span) -> dict[tuple[str, str], tuple[float, float]]:
+    """Mean and scatter by name and unit."""
+    ends = (span.from_s, span.until_s)
+    mean = "avg({0}), sqrt(max(0, avg({0} * {0}) - avg({0}) * avg({0})))"
+    found: dict[tuple[str, str], tuple[float, float]] = {}
+    for table, key, column, name, unit in (
+        ("estimate", "chamber", "beta_pa", "bulk modulus {}", "Pa"),
+        ("map", "edge", "valid * 1.0", "blocks known, valve {}", ""),
+    ):
+        rows = base.execute(
+            f"SELECT {key}, {mean.format(column)} FROM {table} "
+            f"WHERE unix_s >= ? AND unix_s < ? GROUP BY {key}", ends,
+        )  # fmt: skip
+        found |= {(name.format(k), unit): (v, sd) for k, v, sd in rows if v is not None}
+    for v, sd in base.execute(
+        f"SELECT {mean.format('rho')} FROM map WHERE unix_s >= ? AND unix_s < ?", ends
+    ):
+        if v is not None:
+            found["residual variance, of the noise", ""] = (v, sd)
+    for name, n in base.execute(
+        "SELECT name, count(*) FROM alarm WHERE over = 0 AND unix_s >= ? AND unix_s < ? "
+        "GROUP BY name", ends,
+    ):  # fmt: skip
+        found[f"alarm {name}", "times"] = (float(n), 0.0)
+    return found
+
+
+def trend(folder: Path, since_s: float) -> dict[str, list[tuple[float, float, float]]]:
+    """Bulk moduli by chamber since a time: (unix_s, Pa, its standard deviation), thinned."""
+    with _opened(folder) as base:
+        rows = base.execute(
+            "SELECT chamber, unix_s, beta_pa, beta_sd_pa FROM estimate WHERE unix_s >= ? "
+            "ORDER BY unix_s", (since_s,),
+        ).fetchall()  # fmt: skip
+    by_name: dict[str, list[tuple[float, float, float]]] = {}
+    for name, *values in rows:
+        if all(isinstance(v, float) for v in values):
+            by_name.setdefault(name, []).append((values[0], values[1], values[2]))
+    return {name: every[:: -(-len(every) // MOST_POINTS)] for name, every in by_name.items()}
+
+
+def notes(folder: Path, span: Span) -> list[SpanNote]:
+    """What was written about spans that touch this one, oldest first."""
+    with _opened(folder) as base:
+        if not base.execute("SELECT 1 FROM sqlite_master WHERE name = 'note'").fetchone():
+            return []
+        rows = base.execute(
+            "SELECT from_s, until_s, who, text FROM note WHERE until_s >= ? AND from_s < ? "
+            "ORDER BY from_s", (span.from_s, span.until_s),
+        )  # fmt: skip
+        return [SpanNote(*row) for row in rows]
+
+
+def write_note(folder: Path, note: SpanNote) -> None:
+    """Keep what somebody says of a span.  Raises RtidError where there is no history."""
+    with _opened(folder, may_write=True) as base:
+        base.execute(NOTES)
+        row = (note.from_s, note.until_s, note.who, note.text)
+        base.execute("INSERT INTO note VALUES (?, ?, ?, ?)", row)
+
+
+def calendar_table(days: float, rows: Sequence[Row]) -> Table:
+    """One line per quantity; ± is the scatter of its estimates within the span."""
+    title = f"the last {days:g} days beside as many before; ± is the scatter within a span"
+    heads = ("", "before|", "now|", "change|", "")
+    return Table(title, heads, [_calendar_row(row) for row in rows])
+
+
+def _calendar_row(row: Row) -> tuple[str, ...]:
+    scale = scale_of(row.unit)
+    words = [
+        "-" if pair is None else f"{scale.factor * pair[0]:.4g} ± {scale.factor * pair[1]:.2g}"
+        for pair in (row.before, row.now)
+    ]
+    if row.before is None or row.now is None:
+        return f"{row.name} {scale.name}".rstrip(), *words, "", ""
+    change, spread = row.now[0] - row.before[0], row.before[1] + row.now[1]
+    remark = "more than both scatter" if abs(change) > spread and change else ""
+    return f"{row.name} {scale.name}".rstrip(), *words, f"{scale.factor * change:+.3g}", remark

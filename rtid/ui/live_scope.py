@@ -1,0 +1,168 @@
+"""The instruments of the live page as SVG: scope, planes of the valves, trends over hours."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+
+from rtid.daemon.status import BlockPlane, EdgeHealth, Scope, SignalHealth
+from rtid.model import COMMAND, POSITION, PRESSURE
+from rtid.tell.html import text
+from rtid.units import MPA, Z95, scale_of
+
+KEPT_S = 60.0
+WIDE, HIGH, PAD = 600.0, 88.0, 8.0
+COLOURS = ("var(--bar)", "var(--before)", "var(--good)", "var(--lit)", "var(--open)")
+KINDS = {COMMAND: "command", PRESSURE: "pressures", POSITION: "position"}
+MOST_DOTS = 240
+Ends = tuple[float, float]
+
+
+class Recent:
+    """The last minute of a daemon's scope; take() is told every status, once."""
+
+    def __init__(self) -> None:
+        self._bins: deque[tuple[float, dict[str, Ends]]] = deque()
+
+    def take(self, scope: Scope) -> None:
+        """One second more; a clock that went back begins anew."""
+        if scope.t_s and self._bins and scope.t_s[0] < self._bins[0][0]:
+            self._bins.clear()
+        newest = self._bins[-1][0] if self._bins else -1.0
+        for k, t in enumerate(scope.t_s):
+            if t > newest:
+                values = {n: (scope.low[n][k], scope.high[n][k]) for n in scope.low}
+                self._bins.append((t, values))
+        while self._bins and self._bins[-1][0] - self._bins[0][0] > KEPT_S:
+            self._bins.popleft()
+
+    def __len__(self) -> int:
+        return len(self._bins)
+
+    def scopes(self, signals: Iterable[SignalHealth]) -> str:
+        """One plot of each kind of signal, smallest to largest value of every tenth of a second."""
+        if len(self) < 2:
+            return ""
+        parts = []
+        for kind, title in KINDS.items():
+            mine = [s for s in signals if s.kind == kind and s.name in self._bins[-1][1]]
+            if mine:
+                parts.append(self._plot(title, mine))
+        return "".join(parts)
+
+    def _plot(self, title: str, signals: Sequence[SignalHealth]) -> str:
+        scale = scale_of(signals[0].unit)
+        names = [s.name for s in signals]
+        ends = [e for _, values in self._bins for n in names for e in values.get(n, ())]
+        low, high = _reach(ends)
+        end = self._bins[-1][0]
+        drawn = ""
+        for name, colour in zip(names, COLOURS, strict=False):
+            points = [
+                (WIDE * (1 + (t - end) / KEPT_S), *v[name]) for t, v in self._bins if name in v
+            ]
+            drawn += _band(points, low, high, colour)
+        keys = ", ".join(
+            f'<span style="color:{c}">■</span> {text(n)}'
+            for n, c in zip(names, COLOURS, strict=False)
+        )
+        words = f"{scale.factor * low:.3g} to {scale.factor * high:.3g} {scale.name}"
+        return (
+            f'<p class="key">{title}: {keys}; {text(words)}, last {KEPT_S:.0f} s</p>'
+            f"{_svg(drawn, f'{title} over the last minute', HIGH)}"
+        )
+
+    def plane(self, edge: EdgeHealth) -> str:
+        """Blocks of a valve's map by what became of them, and where the machine was just now."""
+        plane = edge.plane
+        if plane is None:
+            return ""
+        u0, u1, p0, p1 = plane.u_v[0], plane.u_v[-1], plane.dp_pa[0], plane.dp_pa[-1]
+
+        def x(u: float) -> float:
+            return 180.0 * (u - u0) / (u1 - u0)
+
+        def y(p: float) -> float:
+            return 120.0 * (p1 - p) / (p1 - p0)
+
+        blocks, n = "", len(plane.dp_pa) - 1
+        for k, code in enumerate(plane.codes):
+            i, j = divmod(k, n)
+            if code in FILLS:
+                at = x(plane.u_v[i]), y(plane.dp_pa[j + 1])
+                size = x(plane.u_v[i + 1]) - at[0], y(plane.dp_pa[j]) - at[1]
+                blocks += (
+                    f'<rect x="{at[0]:.1f}" y="{at[1]:.1f}" width="{size[0]:.1f}" '
+                    f'height="{size[1]:.1f}" fill="{FILLS[code]}" fill-opacity=".45"/>'
+                )
+        dots = "".join(
+            f'<circle cx="{x(u):.1f}" cy="{y(p):.1f}" r="1.6" fill="var(--ink)"/>'
+            for u, p in self._points(plane)
+            if u0 <= u <= u1 and p0 <= p <= p1
+        )
+        frame = '<rect width="180" height="120" fill="none" stroke="var(--line)"/>'
+        words = f"{u0:g} to {u1:g} V, {MPA * p0:.3g} to {MPA * p1:.3g} MPa"
+        return (
+            f'<figure class="plane"><svg viewBox="0 0 180 120" role="img" aria-label="plane of '
+            f'{text(edge.name)}">{blocks}{frame}{dots}</svg><figcaption class="key"><b>'
+            f"{text(edge.name)}</b> {text(words)}</figcaption></figure>"
+        )
+
+    def _points(self, plane: BlockPlane) -> list[tuple[float, float]]:
+        """Opening command and pressure drop in the middle of each tenth of a second."""
+        asked = (plane.command, plane.source, plane.sink)
+        made = []
+        for _, values in list(self._bins)[-MOST_DOTS:]:
+            if all(name in values for name in asked):
+                u, source, sink = (0.5 * sum(values[name]) for name in asked)
+                made.append((plane.direction * u, source - sink))
+        return made
+
+
+FILLS = {"v": "var(--bar)", "l": "var(--open)"}
+
+
+def trends(series: Mapping[str, Sequence[tuple[float, float, float]]], unit: str) -> str:
+    """Values over hours with their 95 % bands: (unix_s, value, sd) by name."""
+    known = {name: every for name, every in series.items() if len(every) > 1}
+    if not known:
+        return ""
+    t0 = min(every[0][0] for every in known.values())
+    t1 = max(every[-1][0] for every in known.values())
+    low, high = _reach([e for every in known.values() for _, v, sd in every
+                        for e in (v - Z95 * sd, v + Z95 * sd)])  # fmt: skip
+    drawn = ""
+    for (_, every), colour in zip(known.items(), COLOURS, strict=False):
+        points = [(WIDE * (t - t0) / max(t1 - t0, 1.0), v - Z95 * sd, v + Z95 * sd)
+                  for t, v, sd in every]  # fmt: skip
+        drawn += _band(points, low, high, colour)
+    scale, hours = scale_of(unit), (t1 - t0) / 3600.0
+    keys = ", ".join(
+        f'<span style="color:{c}">■</span> {text(n)}' for n, c in zip(known, COLOURS, strict=False)
+    )
+    words = f"{scale.factor * low:.4g} to {scale.factor * high:.4g} {scale.name}, {hours:.2g} h"
+    return f'<p class="key">{keys}; {text(words)}, bands: 95 %</p>{_svg(drawn, "trends", HIGH)}'
+
+
+def _reach(values: Sequence[float]) -> Ends:
+    low, high = min(values, default=0.0), max(values, default=1.0)
+    room = 0.05 * (high - low) or 0.5 * abs(high) or 1.0
+    return low - room, high + room
+
+
+def _band(points: Sequence[tuple[float, float, float]], low: float, high: float, ink: str) -> str:
+    """The ground between two lines: x, lower and upper end."""
+
+    def y(value: float) -> float:
+        return PAD / 2 + (HIGH - PAD) * (high - value) / (high - low)
+
+    above = [f"{x:.1f},{y(b) - 0.5:.1f}" for x, _, b in points]
+    below = [f"{x:.1f},{y(a) + 0.5:.1f}" for x, a, _ in reversed(points)]
+    return f'<polygon points="{" ".join(above + below)}" fill="{ink}" fill-opacity=".8"/>'
+
+
+def _svg(content: str, label: str, high: float) -> str:
+    return (
+        f'<svg class="scope" viewBox="0 0 {WIDE:.0f} {high:.0f}" preserveAspectRatio="none" '
+        f'role="img" aria-label="{label}">{content}</svg>'
+    )

@@ -1,0 +1,106 @@
+"""The instruments of the live page: a minute of signals, planes, trends, decisions asked twice."""
+
+from __future__ import annotations
+
+import re
+import sqlite3
+import time
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from rtid.daemon.acceptance import taken
+from rtid.daemon.chronicle import FILE, Chronicle
+from rtid.daemon.status import Alarm, BlockPlane, EdgeHealth, Scope, SignalHealth, write
+from rtid.ui.live_page import Live
+from rtid.ui.live_scope import KEPT_S, Recent, trends
+from tests.ui.test_live_page import NOW, status
+
+SIGNALS = tuple(
+    SignalHealth(name, kind, unit, "m")
+    for name, kind, unit in (
+        ("u", "command", "V"), ("p_a", "pressure", "Pa"), ("p_s", "pressure", "Pa"),
+        ("x", "position", "m"),
+    )
+)  # fmt: skip
+PLANE = BlockPlane((0.0, 1.0, 2.0), (0.0, 1e6, 4e6), "vl..", "u", "p_s", "p_a")
+
+
+def second(t_s: float) -> Scope:
+    """A second at u = 1.5 V and 3 MPa of pressure drop."""
+    values = {"u": 1.5, "p_a": 1e6, "p_s": 4e6, "x": 0.1}
+    bins = tuple(t_s + 0.1 * k for k in range(10))
+    return Scope(
+        bins,
+        {n: (v,) * 10 for n, v in values.items()},
+        {n: (1.01 * v,) * 10 for n, v in values.items()},
+    )
+
+
+def test_the_last_minute_is_drawn_at_ten_values_a_second() -> None:
+    recent = Recent()
+    for k in range(90):
+        recent.take(second(float(k)))
+        recent.take(second(float(k)))  # told twice
+    assert abs(len(recent) - 10 * KEPT_S) <= 2
+    drawn = recent.scopes(SIGNALS)
+    assert drawn.count("<svg") == 3 and drawn.count("<polygon") == 4
+    points = re.findall(r'points="([^"]+)"', drawn)[0].split()
+    assert len(points) == 2 * len(recent)
+    recent.take(second(3.0))  # the daemon was started again
+    assert len(recent) == 10
+
+
+def test_a_plane_shows_its_blocks_and_where_the_machine_is() -> None:
+    recent, edge = Recent(), EdgeHealth("pa", plane=PLANE)
+    recent.take(second(0.0))
+    drawn = recent.plane(edge)
+    assert drawn.count('fill="var(--bar)"') == 1 and drawn.count('fill="var(--open)"') == 1
+    assert drawn.count("<circle") == 10
+    x, y = re.findall(r'cx="([\d.]+)" cy="([\d.]+)"', drawn)[0]
+    assert float(x) == pytest.approx(180 * 1.5 / 2, rel=0.02)
+    assert float(y) == pytest.approx(120 * (4 - 3) / 4, rel=0.02)
+    assert recent.plane(EdgeHealth("pa")) == ""
+
+
+def test_trends_have_their_bands() -> None:
+    drawn = trends({"a": [(0.0, 1e9, 1e7), (7200.0, 9e8, 1e7)], "b": []}, "Pa")
+    assert drawn.count("<polygon") == 1 and "2 h" in drawn and "MPa" in drawn
+    assert trends({}, "Pa") == ""
+
+
+def test_the_history_is_shown_and_compared(tmp_path: Path) -> None:
+    write(tmp_path, status())
+    Chronicle(tmp_path).close()
+    with closing(sqlite3.connect(tmp_path / FILE)) as base:
+        for hours in (60.0, 40.0, 20.0, 1.0):
+            row = (NOW - 3600.0 * hours, "a", 1e9 - 1e6 * hours, 1e6)
+            base.execute("INSERT INTO estimate VALUES (?, ?, ?, ?)", row)
+        base.commit()
+    live = Live(tmp_path, lambda: NOW)
+    live.compare("1")
+    health = live.fragments()["live_health"]
+    assert "Trends" in health and "bulk modulus a MPa" in health
+    live.compare("30")
+    assert 'data-name="30" id="days_2" aria-pressed="true"' in live.fragments()["live_health"]
+
+
+def test_a_changed_machine_is_accepted_when_it_is_meant(tmp_path: Path) -> None:
+    changed = Alarm("plant_changed", "the map foretells no more", NOW - 9, None, "plant", "seconds")
+    write(tmp_path, replace(status(), alarms=(changed,)))
+    live = Live(tmp_path, lambda: NOW)
+    health = live.fragments()["live_health"]
+    since = time.strftime("%H:%M:%S", time.localtime(NOW - 9))
+    assert f"since {since}, for 9.0 s" in health and 'data-do="look"' in health
+    assert 'data-do="accept"' in health and 'data-do="sure"' not in health
+    assert taken(tmp_path) is None
+    assert 'data-do="sure"' in live.fragments("Really?")["live_health"]
+    assert live.accept().startswith("asked")
+    request = taken(tmp_path)
+    assert request is not None and request.reason == "on the page"
+    write(tmp_path, status())
+    quiet = Live(tmp_path, lambda: NOW)
+    quiet.fragments()
+    assert quiet.accept().startswith("nothing") and taken(tmp_path) is None
