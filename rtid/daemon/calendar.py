@@ -19,6 +19,7 @@ from rtid.tell.story import Table
 from rtid.units import scale_of
 
 NOTES = "CREATE TABLE IF NOT EXISTS note (from_s REAL, until_s REAL, who TEXT, text TEXT)"
+KNOWN = "1e100"  # what is not known yet is infinite
 MOST_POINTS = 400  # of a trend
 
 
@@ -93,13 +94,13 @@ def _values(base: sqlite3.Connection, span: Span) -> dict[tuple[str, str], tuple
     ):
         rows = base.execute(
             f"SELECT {key}, {mean.format(column)} FROM {table} "
-            f"WHERE unix_s >= ? AND unix_s < ? GROUP BY {key}", ends,
+            f"WHERE unix_s >= ? AND unix_s < ? AND abs({column}) < {KNOWN} GROUP BY {key}", ends,
         )  # fmt: skip
-        found |= {(name.format(k), unit): (v, sd) for k, v, sd in rows if v is not None}
+        found |= {(name.format(k), unit): (v, sd) for k, v, sd in rows if None not in (v, sd)}
     for v, sd in base.execute(
         f"SELECT {mean.format('rho')} FROM map WHERE unix_s >= ? AND unix_s < ?", ends
     ):
-        if v is not None:
+        if v is not None and sd is not None:
             found["residual variance, of the noise", ""] = (v, sd)
     for name, n in base.execute(
         "SELECT name, count(*) FROM alarm WHERE over = 0 AND unix_s >= ? AND unix_s < ? "
@@ -118,7 +119,7 @@ def trend(folder: Path, since_s: float) -> dict[str, list[tuple[float, float, fl
         ).fetchall()  # fmt: skip
     by_name: dict[str, list[tuple[float, float, float]]] = {}
     for name, *values in rows:
-        if all(isinstance(v, float) for v in values):
+        if all(isinstance(v, float) and abs(v) < float(KNOWN) for v in values):
             by_name.setdefault(name, []).append((values[0], values[1], values[2]))
     return {name: every[:: -(-len(every) // MOST_POINTS)] for name, every in by_name.items()}
 

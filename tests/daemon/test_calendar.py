@@ -44,6 +44,8 @@ def history(tmp_path: Path) -> Path:
                 row = (at_s, name, beta + (k % 2) * 1e6, 1e6)
                 base.execute("INSERT INTO estimate VALUES (?, ?, ?, ?)", row)
             base.execute("INSERT INTO map VALUES (?, 'pa', ?, 40, 1.0)", (at_s, 10 + k // 10))
+        for row in ((NOW_S - 9.0, "b", 1e9, float("inf")), (NOW_S - 8.0, "b", float("inf"), 1e6)):
+            base.execute("INSERT INTO estimate VALUES (?, ?, ?, ?)", row)  # not known yet
         alarm = (NOW_S - DAY_S, "plant_changed", "plant", "said", 0)
         base.execute("INSERT INTO alarm VALUES (?, ?, ?, ?, ?)", alarm)
         base.commit()
