@@ -6,7 +6,9 @@ row is that alone, and what the others are held against.
 
 from __future__ import annotations
 
+import json
 import os
+import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -31,14 +33,25 @@ class Spent(NamedTuple):
     peak_mb: float
 
 
+# Between us and the command: a child's largest memory begins with that of the process it left.
+METER = """
+import json, os, sys
+null = [(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)]
+words = [sys.executable, *sys.argv[1:]]
+child = os.posix_spawn(words[0], words, os.environ, file_actions=null)
+_, status, used = os.wait4(child, 0)
+print(json.dumps([status, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024]))
+"""
+
+
 def spent(*arguments: str, code: str = "") -> Spent:
     """Run Python code, or a command of rtid without what it says."""
     words = ("-c", code) if code else ("-m", "rtid", *arguments)
-    null = [(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)]
-    child = os.posix_spawn(sys.executable, [sys.executable, *words], os.environ, file_actions=null)
-    _, status, used = os.wait4(child, 0)
+    meter = [sys.executable, "-S", "-c", METER, *words]
+    done = subprocess.run(meter, stdout=subprocess.PIPE, check=True)
+    status, seconds, peak_mb = json.loads(done.stdout)
     assert status == 0, words
-    return Spent(used.ru_utime + used.ru_stime, used.ru_maxrss / 1024)
+    return Spent(seconds, peak_mb)
 
 
 def test_commands(benchmark: Any, tmp_path: Path) -> None:
