@@ -62,3 +62,4 @@ class Assembly:
     messages: tuple[MessageSource, ...]
     row_signal: str
     max_gap_s: float = 0.05
+    average_s: float = 0.0

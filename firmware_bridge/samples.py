@@ -6,6 +6,7 @@ commands as held from t_us[k] on, sensors as measured at (or interpolated to) t_
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,3 +41,13 @@ class Samples:
         t = (self.t_us - self.t_us[0]) * 1e-6 if len(self) else self.t_us
         keep = (t >= start_s) & (t < stop_s)
         return Samples(self.names, self.t_us[keep], self.values[keep], self.flags[keep])
+
+
+def join(parts: Sequence[Samples]) -> Samples:
+    """Runs of samples of the same signals, one after the other."""
+    return Samples(
+        parts[0].names,
+        np.concatenate([p.t_us for p in parts]),
+        np.concatenate([p.values for p in parts]),
+        np.concatenate([p.flags for p in parts]),
+    )

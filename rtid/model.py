@@ -25,7 +25,7 @@ from rtid.plain import FloatArray
 COMMAND, PRESSURE, POSITION, VELOCITY = "command", "pressure", "position", "velocity"
 MODE = "mode"  # kind of the signal that carries the number of the working mode
 OTHER = "other"  # kind of a signal of any other quantity: a force, a temperature
-TAYLOR, LAPPED, BLENDED = BASES = "taylor", "lapped", "blended"
+TAYLOR, LAPPED, BLENDED, PROPORTIONAL = BASES = "taylor", "lapped", "blended", "proportional"
 BOTH, COMMAND_ONLY, DROP_ONLY = "both", "command", "drop"
 MOST_MODE = 62  # a set of modes is kept as bits of one integer
 NONE = ""  # in place of a signal's name: a quantity that is always zero
@@ -64,7 +64,8 @@ class Chamber:
     Without a pressure (NONE) it is xdot = ..., times area_m2.  disturbance: intensity of unmodelled
     flow, m3/s per sqrt(Hz), a white noise that the rows are weighed for.  unit: of the equation.
     behind_s: a lag behind the maps, whose noise stands behind it too; see
-    `rtid.effects.laws.response`.
+    `rtid.effects.laws.response`.  ports: of a rate that a pump drives, the pressure signals behind
+    its ports, each with the sign of the command that puts it under pressure.
     """
 
     name: str
@@ -75,6 +76,7 @@ class Chamber:
     disturbance: float = 0.0
     unit: str = "m3/s"
     behind_s: float = 0.0
+    ports: tuple[tuple[str, int], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -85,8 +87,8 @@ class Edge:
     `command`; for w <= safe_band_v it passes nothing (prior knowledge, can be -inf to switch off).
     The grid is in terms of w.  rated_* give the size of the flow for scaling and first weights.
 
-    basis: TAYLOR, eq. (6), LAPPED, local cosines under the windows of (12), or BLENDED, Taylor
-    terms under the squares of these windows.  terms: BOTH, or DROP_ONLY, eq. (15), one function of
+    basis: TAYLOR, eq. (6), LAPPED, local cosines under the windows of (12), BLENDED, Taylor terms
+    under the squares of these windows, or PROPORTIONAL, D w with a D per block.  terms: BOTH, or DROP_ONLY, eq. (15), one function of
     dp per interval of w, or COMMAND_ONLY.  modes: working modes in which it may open, all when
     empty; in the others its command is zero.  signs: (chamber, +1 or -1) pairs, where the ends'
     names do not tell which chambers it feeds and drains.  shares: an edge before it, whose map it

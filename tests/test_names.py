@@ -33,7 +33,7 @@ EHA = {
     "p_a": ("pA_bar", "bar"),
     "p_b": ("pB_bar", "bar"),
     "x": ("x_mm", "mm"),
-    "u": ("u", "PWM, unit guessed"),
+    "u": ("n_rpm", "rpm"),
 }
 STRANGERS = {
     **dict.fromkeys([f"eha_{n}.parquet" for n in ("1_1", "1_3", "2_2", "2_4", "3_1", "3_3")], EHA),

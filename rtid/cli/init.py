@@ -40,8 +40,9 @@ def init(
     keys, candidates = _read(source, output.parent)
     given = named(candidates, by_role(role or []))
     roles = with_named(propose(candidates), given)
-    is_rate = "time_column" in keys and not {"p_a", "p_b"} & roles.keys()
-    if is_rate and _write_rate(Path(source), output, given):
+    if "time_column" in keys and _write_rate(
+        Path(source), output, given, bool({"p_a", "p_b"} & roles.keys())
+    ):
         return
     rest = unused(candidates, roles)
     output.write_text(project_text(output.stem, keys, roles, rest), "utf-8")
@@ -60,17 +61,19 @@ def init(
             print(f"  {problem}")
 
 
-def _write_rate(table: Path, output: Path, given: Mapping[str, RoleCandidate]) -> bool:
-    """The file of a plant without pressures; False where the table is of none."""
-    from rtid.study.quick_rate import pairs_of, rate_text
+def _write_rate(
+    table: Path, output: Path, given: Mapping[str, RoleCandidate], has_pressures: bool
+) -> bool:
+    """The file of a plant without pressures, or of a pump that drives; False where it is none."""
+    from rtid.study.quick_rate import driven_pairs, pairs_of, rate_text
     from rtid.trace.quick_source import open_source
 
     opened = open_source(table, None)
-    pairs = pairs_of(table, opened, given)
+    pairs = (driven_pairs if has_pressures else pairs_of)(table, opened, given)
     if not pairs:
         return False
     output.write_text(rate_text(output.stem, table, opened, pairs[0]), "utf-8")
-    print(f"wrote {output}: a plant without pressures, {pairs[0].equation}")
+    print(f"wrote {output}: {pairs[0].kind}, {pairs[0].equation}")
     for name, signal in pairs[0].roles.items():
         print(f"  {name:9} {signal.full_name} [{signal.unit}]")
     used = {signal.name for signal in pairs[0].roles.values()}

@@ -47,6 +47,13 @@ def dead_band(edge: EdgeMap) -> DeadBand:
     return DeadBand(-low, high, gain_below, gain_above)
 
 
+def per_direction(edge: EdgeMap) -> DeadBand:
+    """Of a map that is straight on either side of zero: no band, and a gain for each side."""
+    ends = edge.grid.u_v[[0, -1]]
+    below, above = edge.flow(ends, np.zeros(2)) / ends
+    return DeadBand(0.0, 0.0, float(below), float(above))
+
+
 def _broken_line(w: FloatArray, flow: FloatArray, weight: FloatArray) -> tuple[float, float]:
     """End of the band and gain beyond of one side; w > 0, flow and weight (m,)."""
     ends = np.linspace(0.0, float(w.max()), ENDS)

@@ -11,12 +11,14 @@ from rtid.diagnose.fit import Fit
 from rtid.diagnose.residual import Residual
 from rtid.diagnose.trials import MATCH_RHO, TrialState
 from rtid.estimator.validity import Doubt, doubts
+from rtid.model import PROPORTIONAL, Machine
 
 MATERIAL = 0.003  # of the rms flow: what an effect must change of the held-out residual
 NAMED = 0.8  # of the misfit that effects must explain to be named where something else remains
 MOST_CUT = 0.5  # of the record, that may be lost to pressures at an end of their range
 LEAST_ROWS = 50  # filtered rows that a part must have to be judged by
 LEAST_EVIDENCE = 1000  # scalar rows of the record
+ROWS_PER_UNKNOWN = 50
 MOVES = 5.0  # times the sensors' floor that the measured flow of a part must reach to judge by it
 
 MATCHES, MISSING, AMBIGUOUS = "matches", "missing", "ambiguous"
@@ -39,6 +41,13 @@ def most_rho(fit: Fit) -> float:
     return max(MATCH_RHO, 1.0 + BAND_SD * float(np.sqrt(2.0 / max(1.0, fit.regression.dof))))
 
 
+def least_evidence(model: Machine) -> int:
+    """Scalar rows that a record must have: fewer for maps that are straight, D w, in each block."""
+    if any(edge.basis != PROPORTIONAL for edge in model.edges):
+        return LEAST_EVIDENCE
+    return min(LEAST_EVIDENCE, ROWS_PER_UNKNOWN * model.n_cells)
+
+
 def doubts_about(fit: Fit) -> tuple[Doubt, ...]:
     """Compliances that are impossible, or contradict each other: no model that matches has them."""
     return doubts(fit.declared, fit.compliance, fit.compliance_cov)
@@ -51,7 +60,7 @@ def verdict(
 
     is_unseen: the part is not the one that taught the maps, which may have taken an effect in.
     """
-    has_moved = last.regression.rows >= LEAST_EVIDENCE and len(last.map.cells) > 0
+    has_moved = last.regression.rows >= least_evidence(last.declared) and len(last.map.cells) > 0
     is_whole = float(np.mean(saturated(last.declared, last.chunk))) <= MOST_CUT
     if not (has_moved and is_whole and can_judge(after)):
         return INSUFFICIENT

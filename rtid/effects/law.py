@@ -30,6 +30,7 @@ from rtid.plain import FloatArray
 
 MODULUS, LENGTH, BEGIN = "beta", "t_r", "t_m"  # what only a fit knows: oil, length of the record
 BOTH, ALL_EDGES, EACH_EDGE = "both", "all valves", "edge"
+PORT = "port"  # the pressure behind a port of what drives a rate
 MAP = "Q of "  # before an edge's name: its flow by the fitted map
 LAGGED = "lag("  # before what is stored behind a port
 BEHIND_MAPS = "behind_maps"
@@ -202,6 +203,10 @@ def _places(
                 yield edge.name, _through(model, line, (edge,))
         else:
             yield ALL_EDGES, _through(model, line, model.edges)
+    elif PORT in lines[0].names:
+        for c, chamber in enumerate(chambers):
+            for port, way in chamber.ports:
+                yield port, _behind_port(model, lines[0], c, port, way)
     else:
         for where, at in chambers_by_place(model).items():
             if ("both chambers" if where == BOTH else "chamber") in effect.places:
@@ -236,6 +241,13 @@ def _across(model: Machine, lines: tuple[LawLine, ...]) -> Meant:
 def _alone(model: Machine, line: LawLine, at: tuple[int, ...]) -> Meant:
     for c in at:
         yield c, line, _of_chamber(model.chambers[c], "c") | _of_machine(model)
+
+
+def _behind_port(model: Machine, line: LawLine, c: int, port: str, way: int) -> Meant:
+    """Into the rate, while its command puts this port under pressure."""
+    others = [name for name, _ in model.chambers[c].ports if name != port]
+    by = {PORT: _signal(port), "other": _signal(others[0] if others else "")}
+    yield c, line, by | {"way": number(float(way))} | _of_machine(model)
 
 
 def _through(model: Machine, line: LawLine, edges: tuple[Edge, ...]) -> Meant:

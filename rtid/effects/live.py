@@ -31,7 +31,8 @@ class LiveFlow:
 
     model: the machine as the bus tells of it; placed: the effect at its place; node: the flow for a
     coefficient of 1; signs: the chambers that it enters and leaves; size: the coefficient; shape:
-    the nonlinear parameters, as its function takes them.
+    the nonlinear parameters, as its function takes them; stored: what the flow is the rate of,
+    times the node.
     """
 
     model: Machine
@@ -40,6 +41,7 @@ class LiveFlow:
     signs: tuple[tuple[str, int], ...]
     size: float
     shape: tuple[tuple[str, float], ...] = ()
+    stored: Node | None = None
 
     @property
     def name(self) -> str:
@@ -78,7 +80,7 @@ class LiveFlow:
         view = RecordView.without_map(self.model, chunk)
         try:
             values = Values(self.placed.effect, view, dict(self.shape))
-            volume = self.size * values.volume(LawLine("", self.node, None))
+            volume = self.size * values.volume(LawLine("", self.node, self.stored))
         except EffectError:
             return np.zeros(len(chunk) - 1)
         return np.where(np.isfinite(volume), volume, 0.0)
@@ -101,10 +103,11 @@ def live_flows(
     flows: dict[tuple[float, Node], LiveFlow] = {}
     for c, line in placed.lines:
         factor, node = without_factor(line.outer)
-        if line.inner is not None or not _is_known(model, line.names, placed):
+        if line.late or not _is_known(model, line.names, placed):
             return ()
         sign, alike = (1 if factor > 0 else -1), (abs(factor), node)
-        known = flows.get(alike, LiveFlow(model, placed, node, (), size * abs(factor), shape))
+        made = LiveFlow(model, placed, node, (), size * abs(factor), shape, line.inner)
+        known = flows.get(alike, made)
         flows[alike] = replace(known, signs=(*known.signs, (model.chambers[c].name, sign)))
     return tuple(flows.values())
 

@@ -16,9 +16,15 @@ from numpy.typing import ArrayLike
 from scipy.linalg import expm
 
 from rtid.errors import door
-from rtid.estimator.state import MASKS, Weights, flow_noise_floor, nominal_weights, variance
+from rtid.estimator.state import (
+    Weights,
+    fitted_terms,
+    flow_noise_floor,
+    nominal_weights,
+    variance,
+)
 from rtid.estimator.track import ROW, Track, follow, pressure_drop
-from rtid.model import BLENDED, TAYLOR, Edge, Machine, Term
+from rtid.model import LAPPED, PROPORTIONAL, TAYLOR, Edge, Machine, Term
 from rtid.plain import FloatArray, IntArray
 
 Blocks = tuple[tuple[int, int, int], ...]
@@ -120,7 +126,7 @@ def column_rates(
                     phi = _terms(edge, a, b, moments[k, i], ends)
                 at = place[(owners[i], a, b)]
                 for c, chamber in enumerate(model.chambers):
-                    flow = edge.sign(chamber) * edge.rated_q_m3s * phi * MASKS[edge.terms]
+                    flow = edge.sign(chamber) * edge.rated_q_m3s * phi * fitted_terms(edge)
                     out[k, c, :, at : at + 6] += flow
     return out, blocks
 
@@ -182,8 +188,9 @@ def _at_gauss_points(opening: FloatArray, dt: float, lag_s: float) -> FloatArray
 def _windowed_terms(edge: Edge, i: int, j: int, w: FloatArray, dp: FloatArray) -> FloatArray:
     """(2, 6): windowed terms at both ends of an interval, on the line through two Gauss points."""
     drop = dp[0] + GAUSS_POINTS * (dp[1] - dp[0])
-    axis = _blended if edge.basis == BLENDED else _local_cosines
-    a, b = axis(edge.grid.u_v, i, w), axis(edge.grid.dp_pa, j, drop)
+    axis = _local_cosines if edge.basis == LAPPED else _blended
+    along_u = _proportional if edge.basis == PROPORTIONAL else axis
+    a, b = along_u(edge.grid.u_v, i, w), axis(edge.grid.dp_pa, j, drop)
     phi = np.stack([a[k] * b[m] for k, m in ((0, 0), (1, 0), (0, 1), (2, 0), (0, 2), (1, 1))])
     slope = (phi[:, 1] - phi[:, 0]) / (GAUSS_POINTS[1] - GAUSS_POINTS[0])
     return np.stack([phi.mean(axis=1) - 0.5 * slope, phi.mean(axis=1) + 0.5 * slope])
@@ -213,6 +220,14 @@ def _blended(border: FloatArray, i: int, at: FloatArray) -> FloatArray:
     """(3, points): the window's square times 1, xi and xi^2."""
     xi = (2 * at - border[i] - border[i + 1]) / (border[i + 1] - border[i])
     return _window(border, i, at) ** 2 * np.stack([np.ones(len(at)), xi, xi**2])
+
+
+def _proportional(border: FloatArray, i: int, at: FloatArray) -> FloatArray:
+    """(3, points): w within block i as a share of its far end, and nothing else."""
+    last = i == len(border) - 2
+    inside = (at >= border[i]) & ((at <= border[i + 1]) if last else (at < border[i + 1]))
+    share = np.where(inside, at / np.abs(border[i : i + 2]).max(), 0.0)
+    return np.stack([share, 0.0 * share, 0.0 * share])
 
 
 def _moments(opening: FloatArray, dt: FloatArray, lag_s: float) -> FloatArray:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rtid.estimator.state import MASKS, RecordArray
+from rtid.estimator.state import RecordArray, fitted_terms
 from rtid.estimator.sums import Sums
 from rtid.kernels.layout import TERMS
 from rtid.model import Gates, Machine
@@ -103,7 +103,7 @@ def read_blocks(
         columns, edge = slice(at, at + TERMS), int(record["edge"])
         shape, rated = model.edges[edge].grid.shape, model.edges[edge].rated_q_m3s
         i, j = divmod(int(record["cell"]) - first[edge], shape[1])
-        used = at + np.flatnonzero(MASKS[model.edges[edge].terms])
+        used = at + np.flatnonzero(fitted_terms(model.edges[edge]))
         condition = _condition(gram[used[:, None], used])
         variance = float(means[place] @ cov[columns, columns] @ means[place])
         sd_share = rated / largest[edge] * max(0.0, variance) ** 0.5

@@ -14,7 +14,17 @@ from rtid.kernels import engine as kernel
 from rtid.kernels import housekeeping, layout
 from rtid.kernels.engine import ROW_FLAG
 from rtid.kernels.recent import move_pairs
-from rtid.model import BASES, BOTH, COMMAND, COMMAND_ONLY, DROP_ONLY, SHAPES, Edge, Machine
+from rtid.model import (
+    BASES,
+    BOTH,
+    COMMAND,
+    COMMAND_ONLY,
+    DROP_ONLY,
+    PROPORTIONAL,
+    SHAPES,
+    Edge,
+    Machine,
+)
 from rtid.plain import FloatArray, IntArray
 
 RecordArray = NDArray[np.void]
@@ -242,8 +252,8 @@ def _configure_edge(e: np.void, model: Machine, i: int, edge: Edge, first_cell: 
     e["is_sampled"][i] = model.signals[model.column(edge.command)].kind != COMMAND
     e["modes"][i] = sum(1 << m for m in edge.modes) if edge.modes else -1
     e["map_basis"][i] = BASES.index(edge.basis)
-    e["mask"][i] = MASKS[edge.terms]
-    e["masked"][i] = edge.terms != BOTH
+    e["mask"][i] = fitted_terms(edge)
+    e["masked"][i] = not e["mask"][i].all()
     e["safe_v"][i], e["scale_m3s"][i] = edge.safe_band_v, edge.rated_q_m3s
     e["dp_var_pa2"][i] = variance(model, edge.source) + variance(model, edge.sink)
     nu, nd = edge.grid.shape
@@ -313,3 +323,9 @@ MASKS = {
     COMMAND_ONLY: np.array([1.0, 1.0, 0.0, 1.0, 0.0, 0.0]),
     DROP_ONLY: np.array([1.0, 0.0, 1.0, 0.0, 1.0, 0.0]),
 }
+
+
+def fitted_terms(edge: Edge) -> FloatArray:
+    """1 for each of six terms (6,) that a map has in its own basis, else 0; dimensionless."""
+    along_u = np.array([1.0, 0.0, 1.0, 0.0, 1.0, 0.0]) if edge.basis == PROPORTIONAL else 1.0
+    return np.asarray(MASKS[edge.terms] * along_u)

@@ -12,16 +12,16 @@ from __future__ import annotations
 import numpy as np
 
 from rtid.estimator.cells import quadrature, terms
-from rtid.estimator.state import MASKS
+from rtid.estimator.state import MASKS, fitted_terms
 from rtid.estimator.sums import Sums
 from rtid.kernels.basis import window_terms_at
 from rtid.kernels.layout import TERMS
-from rtid.model import BASES, BLENDED, LAPPED, TAYLOR, Edge, Machine
+from rtid.model import BASES, BLENDED, LAPPED, PROPORTIONAL, TAYLOR, Edge, Machine
 from rtid.plain import FloatArray
 
 # Standard deviation of what a block's terms cannot follow, in shares of the rated flow: six local
 # cosines miss about 1 % of a valve's flow on a usual grid, as measured on simulated plants.
-TRUNCATION = {LAPPED: 1e-2, BLENDED: 1e-3}
+TRUNCATION = {LAPPED: 1e-2, BLENDED: 1e-3, PROPORTIONAL: 1e-6}
 
 
 def overlaps(model: Machine) -> bool:
@@ -92,4 +92,4 @@ def _values(edge: Edge, block: tuple[int, int], cell: list[int]) -> FloatArray:
     points, out = np.stack([w[cell[1]], dp[cell[1]]], axis=1), np.empty((w.shape[1], TERMS))
     basis = BASES.index(edge.basis)
     window_terms_at(basis, edge.grid.u_v, edge.grid.dp_pa, *block, points, out)
-    return out * MASKS[edge.terms]
+    return out * fitted_terms(edge)

@@ -11,6 +11,8 @@ With this profile and the largest overlap the first cosines of equal blocks sum 
 
 And the blended basis: Taylor terms under the squares of the same windows, which sum to one, so that
 any quadratic flow is met exactly and the map has no jumps; not orthogonal.
+
+And the proportional one, of a pump: D w with one D per block, nothing where w = 0.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ import math
 import numpy as np
 
 from rtid.kernels.jit import inlined, kernel, part
-from rtid.kernels.layout import BLENDED
+from rtid.kernels.layout import BLENDED, PROPORTIONAL
 from rtid.plain import FloatArray
 
 
@@ -91,6 +93,11 @@ def window_axis(
     even about its end instead of odd.
     """
     width = border[i + 1] - border[i]
+    if basis == PROPORTIONAL:
+        is_inside = locate(border, n, value) == i
+        out[0] = value / max(abs(border[i]), abs(border[i + 1])) if is_inside else 0.0
+        out[1], out[2] = 0.0, 0.0
+        return
     g, shift = 1.0, 0.5
     if i > 0:
         eta = OVERLAP * min(width, border[i] - border[i - 1])
@@ -137,5 +144,5 @@ def window_terms_at(
     a, b = np.empty(3), np.empty(3)
     for k in range(len(points)):
         window_axis(u, len(u) - 1, i, points[k, 0], basis, a)
-        window_axis(dp, len(dp) - 1, j, points[k, 1], basis, b)
+        window_axis(dp, len(dp) - 1, j, points[k, 1], min(basis, BLENDED), b)
         window_terms(a, b, phi[k])

@@ -318,6 +318,14 @@ def working_points(e: Any, sample: FloatArray, dt: float) -> tuple[bool, bool]:
     return inside, moved
 
 
+@inlined
+def home_of(e: Any, i: int) -> tuple[int, int]:
+    """The block that holds the working point of edge i; SHUT while it is shut."""
+    if e.target[i, 0] == SHUT:
+        return SHUT, e.target[i, 1]
+    return e.home[i, 0], e.home[i, 1]
+
+
 @part
 def _change_blocks(e: Any, cells: Any, closed: Any, blocks: Any) -> None:
     """Close the blocks that the working points left, open those that they entered.

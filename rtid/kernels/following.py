@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from rtid.kernels.engine import ROW_FLAG, SHUT, remember
+from rtid.kernels.engine import ROW_FLAG, SHUT, home_of, remember
 from rtid.kernels.increments import mean_terms
 from rtid.kernels.jit import kernel, part
-from rtid.kernels.layout import TERMS
+from rtid.kernels.layout import PROPORTIONAL, TERMS
 from rtid.kernels.taking import begin, take
 from rtid.plain import FloatArray, IntArray
 
@@ -52,7 +52,7 @@ def follow_map(
 def _map_at(e: Any, theta: FloatArray, cov: FloatArray, along: FloatArray, cell: IntArray) -> None:
     """Q and its slopes at the mean working point of each edge, by the terms of its block."""
     for i in range(e.n_edges):
-        e.cell[i, 0], e.cell[i, 1] = e.target[i, 0], e.target[i, 1]
+        e.cell[i, 0], e.cell[i, 1] = home_of(e, i)
         along[i] = 0.0
         along[i, 0] = e.direction[i] * e.values[e.command[i]]
         cell[i] = SHUT
@@ -74,5 +74,7 @@ def _map_at(e: Any, theta: FloatArray, cov: FloatArray, along: FloatArray, cell:
         along[i, 0] = e.moments[i, 0]
         along[i, 1] = q
         along[i, 2] = hu * (th[1] + 2.0 * th[3] * phi[1] + th[5] * phi[2])
+        if e.map_basis[i] == PROPORTIONAL:
+            along[i, 2] = q / e.moments[i, 0] if e.moments[i, 0] != 0.0 else 0.0
         along[i, 3] = hp * (th[2] + 2.0 * th[4] * phi[2] + th[5] * phi[1])
         along[i, 4] = math.sqrt(max(0.0, variance))

@@ -12,10 +12,12 @@ from rtid.kernels.basis import window_axis, window_terms
 from rtid.kernels.holds import GAUSS
 from rtid.kernels.jit import inlined, part
 from rtid.kernels.layout import (
+    BLENDED,
     FLOW,
     HINGE,
     INTEGRAL,
     INVERSE,
+    PROPORTIONAL,
     RATE,
     ROOT,
     TERMS,
@@ -98,7 +100,7 @@ def term_increments(e: Any, sample: FloatArray, dt: float) -> None:
 def mean_terms(e: Any, i: int, iu: int, ip: int) -> tuple[float, float]:
     """Means over the interval of the six Taylor terms of edge i's block (iu, ip), into e.phi.
 
-    Exact for the lagged command and linear dp.  Returns the local dp at both ends.
+    Of a proportional map its own.  Exact for the lagged command and linear dp.  Returns the local dp at both ends.
     """
     u, p, phi = e.u_border[i], e.dp_border[i], e.phi
     hu, hp = 2.0 / (u[iu + 1] - u[iu]), 2.0 / (p[ip + 1] - p[ip])
@@ -111,6 +113,9 @@ def mean_terms(e: Any, i: int, iu: int, ip: int) -> tuple[float, float]:
     phi[3] = (m2 - 2.0 * uc * m1 + uc * uc) * hu * hu
     phi[4] = (eta0 * eta0 + eta0 * eta1 + eta1 * eta1) / 3.0
     phi[5] = phi[1] * phi[2] + mt * hu * (eta1 - eta0)
+    if e.map_basis[i] == PROPORTIONAL:
+        phi[0] = m1 / max(abs(u[iu]), abs(u[iu + 1]))
+        phi[2], phi[4] = phi[0] * phi[2], phi[0] * phi[4]
     if e.masked[i] != 0:
         for j in range(TERMS):
             phi[j] *= e.mask[i, j]
@@ -166,7 +171,7 @@ def mean_windowed(e: Any, i: int, iu: int, ip: int) -> None:
         w = e.held_v[i] + (e.start_v[i] - e.held_v[i]) * e.gauss_decay[g]
         dp = e.dp_pa[i, 0] + at * (e.dp_pa[i, 1] - e.dp_pa[i, 0])
         window_axis(e.u_border[i], e.n_u[i], iu, w, e.map_basis[i], e.axis[0])
-        window_axis(e.dp_border[i], e.n_dp[i], ip, dp, e.map_basis[i], e.axis[1])
+        window_axis(e.dp_border[i], e.n_dp[i], ip, dp, min(e.map_basis[i], BLENDED), e.axis[1])
         window_terms(e.axis[0], e.axis[1], e.phi_at[g])
     for j in range(TERMS):
         e.phi[j] = 0.5 * (e.phi_at[0, j] + e.phi_at[1, j])

@@ -29,7 +29,7 @@ MAX_RECENT = 64  # blocks that are open or still ring
 NOTHING = MAX_SIGNALS  # the column of a signal that is not there: always zero
 
 INTEGRAL, CARRY, RESTART = 0, 1, 2  # the forms of the regression
-TAYLOR, LAPPED, BLENDED = 0, 1, 2  # the bases of a map
+TAYLOR, LAPPED, BLENDED, PROPORTIONAL = 0, 1, 2, 3  # the bases of a map
 
 # counters[...]: how often a sample was refused or an estimate restarted, by reason
 COUNTERS = (

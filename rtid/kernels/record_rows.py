@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from rtid.kernels.engine import ROW_FLAG, SHUT, remember
+from rtid.kernels.engine import ROW_FLAG, SHUT, home_of, remember
 from rtid.kernels.increments import flow_noise, mean_terms
 from rtid.kernels.jit import inlined, kernel, part
 from rtid.kernels.layout import TERMS
@@ -149,7 +149,7 @@ def _add_blocks(
 ) -> None:
     """What the interval adds to the terms of the blocks that the working points are in."""
     for i in range(e.n_edges):
-        e.cell[i, 0], e.cell[i, 1] = e.target[i, 0], e.target[i, 1]
+        e.cell[i, 0], e.cell[i, 1] = home_of(e, i)
         if e.cell[i, 0] == SHUT:
             continue
         at = e.first_cell[i] + e.cell[i, 0] * e.n_dp[i] + e.cell[i, 1]

@@ -65,7 +65,7 @@ def build_model(sections: Sections, catalog: Catalog | None) -> Machine:
         ),
         gates=Gates(
             condition_limit=gates.condition_limit,
-            max_gap_s=_max_gap_s(sections, catalog),
+            max_gap_s=max(_max_gap_s(sections, catalog), 2.5 * sections.source.average_s),
             hysteresis=gates.hysteresis,
             min_rows=gates.min_rows,
             max_sd_share=gates.max_sd_share,
@@ -101,7 +101,8 @@ def build_assembly(
         signals=tuple(_source(n, s, catalog, table) for n, s in sections.signals.items()),
         messages=messages,
         row_signal=model.measured or model.position,
-        max_gap_s=model.gates.max_gap_s,
+        max_gap_s=_max_gap_s(sections, catalog),
+        average_s=sections.source.average_s,
     )
 
 
@@ -319,7 +320,8 @@ def _chambers(sections: Sections, signals: tuple[Signal, ...]) -> tuple[Chamber,
     known = sections.rate.disturbance or 0.0
     size = known * unit_of(sections.signals[state.name], None).factor
     unit = state.unit if sections.rate.measured else per_second(state.unit)
-    return (Chamber(state.name, NONE, 1.0, 1, 0.0, size, unit),)
+    ports = tuple(sections.rate.ports.items())
+    return (Chamber(state.name, NONE, 1.0, 1, 0.0, size, unit, ports=ports),)
 
 
 def per_second(unit: str) -> str:

@@ -90,6 +90,7 @@ def check(raw: Raw, catalog: Catalog | None, folder: Path) -> Iterator[Problem]:
     kinds = {n: kind_of(s, find_dbc_unit(s, catalog)) for n, s in tables(raw, "signals").items()}
     for name, signal in tables(raw, "signals").items():
         yield from _signal(f"signals.{name}", signal, kinds[name], catalog, raw)
+    yield from _averaged(raw, kinds)
     yield from _named_signals(raw, kinds)
     yield from _controller(raw, kinds)
     yield from _rate(raw, kinds) if "rate" in raw else _position(raw, kinds)
@@ -104,6 +105,15 @@ def check(raw: Raw, catalog: Catalog | None, folder: Path) -> Iterator[Problem]:
     yield from _modes(raw)
     yield from _mode_signals(raw, kinds)
     yield from _messages(raw, catalog)
+
+
+def _averaged(raw: Raw, kinds: dict[str, str | None]) -> Iterator[Problem]:
+    """A command or a mode is held from sample to sample: its mean over a window is no value."""
+    written = key_of(table(raw, "source"), "average")
+    held = [name for name, kind in kinds.items() if kind in ("command", "mode")]
+    if written in table(raw, "source") and held:
+        problem = f"the {kinds[held[0]]} {held[0]!r} is held from sample to sample"
+        yield Problem(f"source.{written}", problem, "leave it out, averages are of measurements")
 
 
 def _signal(
@@ -203,6 +213,9 @@ def _rate(raw: Raw, kinds: dict[str, str | None]) -> Iterator[Problem]:
         problem = "given twice" if "state" in rate else "missing"
         remedy = 'state = "x" where the maps give the rate of x, measured = "y" where y itself'
         yield Problem("rate.state", problem, remedy)
+    ports = rate.get("ports", {})
+    for name in ports if isinstance(ports, dict) else ():
+        yield from _reference(f"rate.ports.{name}", name, "pressure", kinds)
     for name, part in tables(raw, "maps").items():
         yield from _map_commands(f"maps.{name}", part, raw, kinds)
         named[f"maps.{name}.over"] = part.get("over")

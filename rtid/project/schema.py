@@ -126,7 +126,10 @@ class ProjectSection(Section):
 
 
 class SourceSection(Section):
-    """[source]: where frames or tables come from.  `builtin:controller.dbc` is rtid's own DBC."""
+    """[source]: where frames or tables come from.  `builtin:controller.dbc` is rtid's own DBC.
+
+    average: windows over which all samples are averaged, 0 for as they come.
+    """
 
     dbc: str | None = None
     time_column: str | None = None
@@ -136,6 +139,7 @@ class SourceSection(Section):
     bitrate: int | None = Field(default=None, gt=0)
     fd: bool = False
     mode: Literal["cycle", "multirate"] | None = None
+    average_s: Annotated[float, TIME] = Field(default=0.0, ge=0)
 
 
 class MessageSection(Section):
@@ -211,12 +215,14 @@ class RateSection(Section):
 
     measured: that sum is measured itself, as an acceleration or a force is.  disturbance: what
     moves it beside, white, in the unit of the sum per sqrt(Hz); it is found in the record unless
-    given.
+    given.  ports: of a cylinder or a motor that a pump drives, the pressure behind each port and
+    the sign of the command that puts it under pressure.
     """
 
     state: str | None = None
     measured: str | None = None
     disturbance: Estimable = Field(default=None, ge=0)
+    ports: dict[str, Sign] = Field(default_factory=dict)
 
     @property
     def signal(self) -> str:
@@ -239,7 +245,7 @@ class MapSection(Section):
     over: str | None = None
     over_grid: Borders | None = None
     rated: float = Field(gt=0, description="rated = 50, the usual size, state's unit per second")
-    basis: Literal["taylor", "lapped", "blended"] = "taylor"
+    basis: Literal["taylor", "lapped", "blended", "proportional"] = "taylor"
 
     @property
     def all_commands(self) -> tuple[str, ...]:

@@ -95,7 +95,10 @@ def acting(fit: Fit, chunk: FloatArray, published: FlowMap | None = None) -> Act
         return Acting(fit.declared, chunk, (), ())
     sent = transformed_like(fit, chunk)
     model = with_positive_pressures(fit.model, sent)
-    view = RecordView.of(model, sent, fit.weights, _everywhere(model, published) or fit.map)
+    view = RecordView.of(model, sent, fit.weights, fit.map)
+    if published is not None:
+        of_terms = model.with_taylor_maps
+        view = RecordView.of(of_terms, sent, fit.weights, everywhere(of_terms, published))
     if not fit.revision.timings:  # nothing was done to the commands
         model, sent = fit.declared, chunk
         model = with_positive_pressures(model, chunk)
@@ -122,10 +125,8 @@ def acting(fit: Fit, chunk: FloatArray, published: FlowMap | None = None) -> Act
     return Acting(model, sent, tuple(of), tuple(measured))
 
 
-def _everywhere(model: Machine, published: FlowMap | None) -> KnownMap | None:
+def everywhere(model: Machine, published: FlowMap) -> KnownMap:
     """A published map as the diagnosis takes maps, all blocks known."""
-    if published is None:
-        return None
     cells = [math.prod(edge.grid.shape) for edge in model.maps]
     rated = np.repeat([edge.rated_q_m3s for edge in model.maps], cells)
     return KnownMap(np.arange(model.n_cells), published.theta_cells() / rated[:, None], NO_COV)

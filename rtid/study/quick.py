@@ -34,7 +34,7 @@ from rtid.study.quick_machine import (
     fitted_machine,
 )
 from rtid.study.quick_project import DEAD_VOLUME, head_of, of_channels, of_missing, project_text
-from rtid.study.quick_rate import QuickRate, quick_rate
+from rtid.study.quick_rate import QuickRate, driven_pairs, quick_rate
 from rtid.study.study import diagnose_trace
 from rtid.trace import Report, judge
 from rtid.trace.quick_data import BAD, Point, level_of, points
@@ -147,7 +147,8 @@ def quick(
     source = open_source(path, dbc)
     named = proposal.named(source.signals, roles)
     guessed = proposal.with_named(proposal.propose(source.signals), named)
-    if "time_column" in source.keys and not CHAMBERS & guessed.keys():
+    is_table = "time_column" in source.keys
+    if is_table and (not CHAMBERS & guessed.keys() or driven_pairs(path, source, named)):
         return quick_rate(path, source, named, progress)
     looked = _of_cylinder(path, source, roles_of(path, source, named), given, progress)
     return replace(looked, options=_options(dbc, given, roles))

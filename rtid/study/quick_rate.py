@@ -4,7 +4,8 @@
 
 The pair is told by units, by the words that both names share and by how much of the rate the
 command explains; the neutral, the grid and the part that is held out come from the record.  An
-acceleration or a force is y itself; commands whose names differ in a number share one map.
+acceleration or a force is y itself; commands whose names differ in a number share one map.  A speed
+of rotation that gives nearly all of the rate is a pump that drives (`rtid.study.quick_drive`).
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import numpy as np
 import tomlkit
 
 from firmware_bridge.sources import read_table
-from rtid.compare.dead_band import DeadBand, dead_band
+from rtid.compare.dead_band import DeadBand, dead_band, per_direction
 from rtid.diagnose.report import Diagnosis
 from rtid.diagnose.verdict import INSUFFICIENT
 from rtid.errors import RtidError
@@ -29,6 +30,7 @@ from rtid.estimator.flowmap import VALID, EdgeMap
 from rtid.estimator.published import publish
 from rtid.plain import FloatArray, Progress, plain, silent
 from rtid.project.guess import ROLES, RoleCandidate, is_wanted, propose, with_unit
+from rtid.study.quick_drive import Drive, drive_of, drive_text
 from rtid.study.spans import HELD_OUT_SHARE
 from rtid.study.study import Study
 from rtid.trace.neutral import held_out_from, neutral_of, slope_of
@@ -37,6 +39,7 @@ from rtid.units import COMMAND_DIMENSIONS, find_unit, words_of
 
 SCHEMA = 1
 MEASURED, FLOWING = ("acceleration", "force"), ("velocity",)  # forces over a velocity: a damper's
+TURNING, DRIVEN = ("rotation",), 0.7  # share of the rate's variance that a pump's speed gives
 STATES = ("length", "velocity", "angle", "rotation", "temperature")
 DRIVES = {"u", "cmd", "command", "valve", "spool", "pwm", "duty", "motor", "throttle", "lever"}
 MOVES = {"x", "pos", "position", "v", "speed", "velocity", "angle", "omega", "temp", "temperature"}
@@ -58,6 +61,7 @@ class RatePair:
 
     share: of the rate's variance that the command explains; delay is not looked for.  more: further
     commands with the same map.  is_measured: the state is what the map gives, not what it moves.
+    drive: of a pump that moves it without valves.
     """
 
     command: RoleCandidate
@@ -66,6 +70,7 @@ class RatePair:
     neutral: float
     more: tuple[RoleCandidate, ...] = ()
     is_measured: bool = False
+    drive: Drive | None = None
 
     @property
     def options(self) -> str:
@@ -81,12 +86,20 @@ class RatePair:
     def roles(self) -> dict[str, RoleCandidate]:
         """Who plays which role: u, or u1, u2 ..., and x."""
         names = ["u"] if not self.more else [f"u{k + 1}" for k in range(len(self.commands))]
-        return dict(zip(names, self.commands, strict=True)) | {"x": self.state}
+        known = dict(zip(names, self.commands, strict=True)) | {"x": self.state}
+        return known | (self.drive.roles if self.drive else {})
+
+    @property
+    def kind(self) -> str:
+        """Of plant, in words."""
+        return "a cylinder without valves" if self.drive else "a plant without pressures"
 
     @property
     def equation(self) -> str:
         """What is learned, in short."""
         given = "x" if self.is_measured else "d x / dt"
+        if self.drive:
+            return f"{given} = D u, moved by a pump, a D for each direction"
         if not self.more:
             return f"{given} = f(u)"
         return f"{given} = f(u1) + ... + f(u{len(self.commands)}), one map for all of them"
@@ -97,7 +110,7 @@ def pairs_of(path: Path, source: Source, given: Mapping[str, RoleCandidate]) -> 
     table = read_table(path)
     t_s = table.seconds(source.keys["time_column"], source.keys["time_unit"])
     first = propose(source.signals)
-    made = []
+    made = [(2, True, pair.share, pair) for pair in driven_pairs(path, source, given)]
     for command in _candidates(source.signals, given.get("u"), COMMAND_DIMENSIONS, DRIVES, "u"):
         for state in _candidates(source.signals, given.get("x"), STATES, MOVES, "x"):
             if command.name == state.name:
@@ -124,6 +137,23 @@ def pairs_of(path: Path, source: Source, given: Mapping[str, RoleCandidate]) -> 
         if pair.command.name not in taken:
             best.append(pair)
     return best
+
+
+def driven_pairs(path: Path, source: Source, given: Mapping[str, RoleCandidate]) -> list[RatePair]:
+    """What a pump moves without valves: by its speed, which gives nearly all of the rate."""
+    table = read_table(path)
+    t_s = table.seconds(source.keys["time_column"], source.keys["time_unit"])
+    pairs = []
+    for command in _candidates(source.signals, given.get("u"), TURNING, set(), "n"):
+        unit = find_unit(command.unit)
+        if unit is None or unit.dimension not in TURNING or is_wanted(command):
+            continue
+        for state in _candidates(source.signals, given.get("x"), ("length", "angle"), MOVES, "x"):
+            pair = _pair(t_s, table.columns, command, state)
+            if pair.share > DRIVEN:
+                drive = drive_of(table.columns, t_s, command, propose(source.signals))
+                pairs.append(replace(pair, neutral=0.0, drive=drive))
+    return sorted(pairs, key=lambda pair: pair.share)[-1:]
 
 
 def alike_commands(
@@ -172,7 +202,7 @@ def _candidates(
     if given is not None:
         yield given
         return
-    kind = next(known for known in ROLES if known.name == role)
+    kind = next((known for known in ROLES if known.name == role), ROLES[-1])
     for signal in signals:
         unit = find_unit(signal.unit)
         fits = unit.dimension in dimensions if unit else bool(words_of(signal.stem) & words)
@@ -207,7 +237,7 @@ def rate_text(name: str, path: Path, source: Source, pair: RatePair) -> str:
     step_s = float(np.median(np.diff(t_s)))
     unit = find_unit(pair.command.unit)
     key = f"u_grid_{unit.key}" if unit else "u_grid_v"
-    key = "grid" if unit and unit.dimension in FLOWING else key
+    key = "grid" if unit and unit.dimension in FLOWING + TURNING else key
     rows_hz = min(50.0, 1.0 / step_s)
     state: dict[str, Any] = {"column": pair.state.name, "unit": pair.state.unit}
     if _is_angle(pair.state):
@@ -250,6 +280,8 @@ def rate_text(name: str, path: Path, source: Source, pair: RatePair) -> str:
     if pair.is_measured:
         head = [f"# A plant without pressures, {pair.equation}, written by rtid"]
         return "\n".join([*head, "", tomlkit.dumps(raw)])
+    if pair.drive:
+        return drive_text(raw, pair.drive, u, step_s)
     head = [
         "# A plant without pressures, d x / dt = f(u), written by rtid: u counts from its neutral",
         f"# ({pair.neutral:.6g} {pair.command.unit} here), which is found anew in every table.",
@@ -407,13 +439,15 @@ def quick_rate(
         file.write_text(text, "utf-8")
         study = Study(file, path, progress)
         diagnosed = study.diagnosed
-        for effect in diagnosed.diagnosis.found[:1]:  # the maps are those beside it
+        found = diagnosed.diagnosis.found
+        for effect in found if pair.drive else found[:1]:  # the maps are those beside it
             with suppress(RtidError):
                 study.add(f"{effect.effect}:{effect.where}", force=True)
         model, flowmap, text = study.machine, publish(study.fit.solution), file.read_text("utf-8")
     used = {role.name for role in pair.roles.values()}
     unused = tuple(s.name for s in source.signals if s.name not in used)
-    bands = {edge.name: dead_band(edge) for edge in flowmap.edges}
+    gains = dead_band if pair.drive is None else per_direction
+    bands = {edge.name: gains(edge) for edge in flowmap.edges}
     units = model.chambers[0].unit, model.signals[model.column(model.edges[0].command)].unit
     ranges = {edge.name: known for edge in flowmap.edges if (known := known_range(edge))}
     said = diagnosed.diagnosis

@@ -58,6 +58,7 @@ from rtid.study.seed import (
     Seed,
 )
 from rtid.study.spans import HELD_OUT_SHARE, added_parts, judged, taught
+from rtid.study.state_run import run_error
 from rtid.trace.reading import NoSamplesError, Trace, read_trace
 from rtid.trace.records import (
     RecordSpan,
@@ -87,12 +88,16 @@ class Diagnosed:
 
 @dataclass(frozen=True)
 class RecordError:
-    """What a model leaves of one record of several behind H_f, rms, and the flow itself, SI."""
+    """What a model leaves of one record of several behind H_f, rms, and the flow itself, SI.
+
+    run: rms error of the state's free run, nan for what is no rate.
+    """
 
     path: Path
     is_held_out: bool
     left: float
     flow: float
+    run: float
 
 
 def _sizes(of: Residual, rows: BoolArray) -> tuple[float, float]:
@@ -263,9 +268,19 @@ class Study:
         model, chunk = self.fitted.declared, to_chunk(self.machine, self.trace.samples, 0)
         left = residual(self.fitted, usable(model, chunk))
         return tuple(
-            RecordError(span.path, span.is_held_out, *_sizes(left, here))
+            RecordError(
+                span.path, span.is_held_out, *_sizes(left, here), self._run_off(span, chunk)
+            )
             for span, here in rows_by_record(self.records, left.t_s)
         )
+
+    def _run_off(self, span: RecordSpan, chunk: FloatArray) -> float:
+        """What the free run of a state is off by on one record of a chunk, rms, SI."""
+        if self.machine.has_pressures or self.machine.measured:
+            return float("nan")
+        part = chunk[(chunk[:, 0] >= span.start_s) & (chunk[:, 0] <= span.end_s)]
+        error = run_error(self.fitted, self.map, part)
+        return float(np.sqrt(np.mean(error**2)))
 
     @cached_property
     def diagnosed(self) -> Diagnosed:

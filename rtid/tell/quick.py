@@ -62,7 +62,7 @@ def lines(quick: Quick, saved: Path | None = None) -> Iterator[str]:
 def rate_lines(quick: QuickRate, saved: Path | None = None) -> Iterator[str]:
     """Of a table without pressures: the pair, its neutral, band and gains, the verdict."""
     pair, u = quick.pair, quick.pair.command
-    yield f"{quick.path.name}, without a project file: a plant without pressures, {pair.equation}."
+    yield f"{quick.path.name}, without a project file: {pair.kind}, {pair.equation}."
     for role, candidate in pair.roles.items():
         guessed = ", unit guessed from its range" if candidate.guessed_unit else ""
         yield f"  {role:9} {candidate.full_name} [{candidate.unit}{guessed}]"
@@ -73,6 +73,13 @@ def rate_lines(quick: QuickRate, saved: Path | None = None) -> Iterator[str]:
     yield ""
     if pair.is_measured:
         yield from _range_lines(quick)
+    elif pair.drive:
+        scale = scale_of(quick.unit.removesuffix("/s"))
+        for band in quick.bands.values():
+            below, above = (
+                math.tau * scale.factor * gain for gain in (band.gain_below, band.gain_above)
+            )
+            yield f"A turn of the pump moves x by {above:.4g} {scale.name}, back by {below:.4g}."
     else:
         yield f"The neutral of the command is {pair.neutral:.6g} {u.unit}: there x stands most."
         for name, band in quick.bands.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +21,15 @@ def record_lines(errors: Sequence[RecordError]) -> Iterator[str]:
         part = "held out" if error.is_held_out else "taught"
         share = 100 * error.left / error.flow if error.flow else float("nan")
         left = f"{lpm() * error.left:.4g} {flow_name()} = {share:.3g} %"
+        if math.isfinite(error.run):
+            left += f", free run off by {lpm() * error.run:.3g} {_state_unit()}"
         yield f"  {error.path.name:{width}}  {part:8}  {left}"
+
+
+def _state_unit() -> str:
+    """Of what the plant's rate is the rate of: mm of mm/s, m/s of m/s2."""
+    name = flow_name()
+    return name.removesuffix("2") if name.endswith("/s2") else name.removesuffix("/s")
 
 
 def records_json(errors: Sequence[RecordError]) -> dict[str, Any]:
@@ -32,6 +41,7 @@ def records_json(errors: Sequence[RecordError]) -> dict[str, Any]:
             "residual_rms": error.left,
             "flow_rms": error.flow,
         }
+        | ({"free_run_rms": error.run} if math.isfinite(error.run) else {})
         for error in errors
     ]
     return {"records": rows} if rows else {}

@@ -1,6 +1,6 @@
 """Learning from a live bus: frames as they arrive through the same Assembler and Estimator.
 
-    frames -> Network -> Senders -> Assembler -> Frozen -> Estimator
+    frames -> Network -> Senders -> Assembler -> Frozen -> Averaged -> Estimator
 
 A trace can be fed through python-can's virtual bus, at any pace; the recorded stamps are kept, so
 the result equals the one from the log bit for bit.
@@ -19,6 +19,7 @@ import can
 import numpy as np
 
 from firmware_bridge.assemble import Assembler
+from firmware_bridge.averaged import Averaged
 from firmware_bridge.catalog import Catalog, load
 from firmware_bridge.config import CYCLE, Assembly
 from firmware_bridge.frames import Frames, add_counts, empty, to_messages
@@ -73,6 +74,7 @@ class Learner:
         self.network = Network(catalog, assembly.messages)
         self.senders = Senders(self.assembler.declared)
         self.frozen = Frozen(_run_limits(model, assembly))
+        self.averaged = Averaged(round(1e6 * assembly.average_s))
         self.estimator = Estimator(model)
         self.learns = True
         self.frames = 0
@@ -99,7 +101,7 @@ class Learner:
 
     def _take(self, samples: Samples) -> FloatArray:
         estimator = self.estimator
-        samples = self.frozen.push(samples)
+        samples = self.averaged.push(self.frozen.push(samples))
         if estimator.origin_us is None and len(samples):
             estimator.origin_us = int(samples.t_us[0])
         chunk = to_chunk(self._bus, samples, estimator.origin_us or 0)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from firmware_bridge.averaged import Averaged
 from firmware_bridge.samples import Samples
 from rtid.effects.flow_sums import FlowSums
 from rtid.estimator.estimator import to_chunk
@@ -13,7 +14,8 @@ from rtid.project import Project
 
 
 def with_sums(project: Project, samples: Samples) -> Samples:
-    """The samples with a column for each of the project's running sums."""
+    """Averaged as the project asks, with a column for each of its running sums."""
+    samples = Averaged(round(1e6 * project.assembly.average_s)).push(samples)
     flows, model = project.flows, project.model
     if not flows:
         return samples

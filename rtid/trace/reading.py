@@ -12,7 +12,7 @@ from firmware_bridge.catalog import Catalog
 from firmware_bridge.config import Assembly
 from firmware_bridge.frames import Frames
 from firmware_bridge.j1939 import Network, known_as
-from firmware_bridge.samples import Samples
+from firmware_bridge.samples import Samples, join
 from firmware_bridge.sources import open_file
 from firmware_bridge.sources.table import Table, to_samples
 from rtid.errors import RtidError, door
@@ -79,16 +79,6 @@ def _refuse_mixed(frames: Frames, catalog: Catalog, assembly: Assembly) -> None:
                 f"name one, channel = {channels[counts.argmax()]} under [messages.{message.name}]; "
                 f'another may be a message of its own, with of = "{message.name}"',
             )
-
-
-def join(parts: list[Samples]) -> Samples:
-    """Runs of samples, one after the other."""
-    return Samples(
-        parts[0].names,
-        np.concatenate([p.t_us for p in parts]),
-        np.concatenate([p.values for p in parts]),
-        np.concatenate([p.flags for p in parts]),
-    )
 
 
 def _not_empty(trace: Trace, project: Project) -> Trace:

@@ -16,11 +16,11 @@ from fnmatch import fnmatch
 from pathlib import Path
 
 from firmware_bridge.frames import add_counts
-from firmware_bridge.samples import GAP
+from firmware_bridge.samples import GAP, join
 from rtid.errors import RtidError
 from rtid.plain import BoolArray, FloatArray
 from rtid.project import Project
-from rtid.trace.reading import Trace, join, read_trace
+from rtid.trace.reading import Trace, read_trace
 
 TracePaths = str | Path | Sequence[str | Path]
 BETWEEN_S = 10.0  # longer than any step within a record

@@ -18,6 +18,7 @@ import numpy as np
 from rtid.effects.filtering import filtered, held_second_order
 from rtid.effects.page import catalogue
 from rtid.kernels.jit import kernel
+from rtid.model import COMMAND as SENT
 from rtid.model import Machine
 from rtid.plain import FloatArray
 
@@ -186,6 +187,10 @@ def timings_of(model: Machine, t_s: FloatArray) -> tuple[TimingLaw, ...]:
     """The timings that a command of this machine can have in a record with these instants (n,), s.
 
     A plant without pressures has no spools of their own: its maps are over the signed command.
+    Between what is measured, a pump's speed or a piston's, and what it does there is no spool.
     """
+    kinds = {s.name: s.kind for s in model.signals}
+    if not any(kinds[edge.command] == SENT for edge in model.edges):
+        return ()
     step_s = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
     return tuple(t.at_step(step_s) for t in TIMINGS if model.has_pressures or not t.own_spools)
