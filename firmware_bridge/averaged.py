@@ -55,7 +55,7 @@ def _means(run: Samples, first: NDArray[np.intp], sizes: NDArray[np.intp]) -> Sa
         return _rows(run, 0, 0)
     at, until, begun_us = first[:-1], int(first[-1]), run.t_us[first[:-1]]
     since_us = run.t_us[:until] - np.repeat(begun_us, sizes)
-    t_us = begun_us + np.add.reduceat(since_us, at) // sizes
+    t_us = np.asarray(begun_us + np.add.reduceat(since_us, at) // sizes, np.int64)
     values = np.add.reduceat(run.values[:until], at, axis=0) / sizes[:, None]
     flags = np.bitwise_or.reduceat(run.flags[:until], at) & ~np.uint8(GAP)
     return Samples(run.names, t_us, values, flags)

@@ -100,7 +100,8 @@ def term_increments(e: Any, sample: FloatArray, dt: float) -> None:
 def mean_terms(e: Any, i: int, iu: int, ip: int) -> tuple[float, float]:
     """Means over the interval of the six Taylor terms of edge i's block (iu, ip), into e.phi.
 
-    Of a proportional map its own.  Exact for the lagged command and linear dp.  Returns the local dp at both ends.
+    Of a proportional map its own.  Exact for the lagged command and linear dp.  Returns the local
+    dp at both ends.
     """
     u, p, phi = e.u_border[i], e.dp_border[i], e.phi
     hu, hp = 2.0 / (u[iu + 1] - u[iu]), 2.0 / (p[ip + 1] - p[ip])

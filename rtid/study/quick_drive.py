@@ -83,7 +83,7 @@ def drive_text(raw: dict[str, Any], drive: Drive, n: FloatArray, step_s: float) 
     raw["gates"]["max_gap_ms"] = 1e3 * max(2.5 * window_s, 5.0 * step_s)
     head = (
         "# A cylinder that a pump moves without valves, d x / dt = D n, written by rtid: D is the",
-        "# displacement of a radian over the area, one for each direction; ports are under pressure",
-        "# while the pump turns that way.",
+        "# displacement of a radian over the area, one for each direction; ports are the pressures",
+        "# behind the pump, each with the way it turns to put it under pressure.",
     )
     return "\n".join([*head, "", tomlkit.dumps(raw)])

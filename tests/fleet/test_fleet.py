@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from firmware_bridge.samples import join
 from rtid.cli import main
 from rtid.cli.exits import Exit
 from rtid.compare.reference import ReferenceMap
@@ -31,7 +32,7 @@ from rtid.maps.prior_map import SHARE_OF_TYPICAL, find_prior, with_prior
 from rtid.plain import FloatArray
 from rtid.project import load
 from rtid.tell.fleet import tell
-from rtid.trace.reading import join, read_trace
+from rtid.trace.reading import read_trace
 from tests.eighty import eighty  # noqa: F401
 from tests.fleet.conftest import MACHINES, WORN
 
