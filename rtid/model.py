@@ -89,10 +89,11 @@ class Edge:
 
     basis: TAYLOR, eq. (6), LAPPED, local cosines under the windows of (12), BLENDED, Taylor terms
     under the squares of these windows, or PROPORTIONAL, D w with a D per block.  terms: BOTH, or
-    DROP_ONLY, eq. (15), one function of dp per interval of w, or COMMAND_ONLY.  modes: working modes in which it may open, all when
-    empty; in the others its command is zero.  signs: (chamber, +1 or -1) pairs, where the ends'
-    names do not tell which chambers it feeds and drains.  shares: an edge before it, whose map it
-    has as well: one map of several commands, such as the rotors of one aircraft.
+    DROP_ONLY, eq. (15), one function of dp per interval of w, or COMMAND_ONLY.  modes: working
+    modes in which it may open, all when empty; in the others its command is zero. signs: (chamber,
+    +1 or -1) pairs, where the ends' names do not tell which chambers it feeds and drains. shares:
+    an edge before it, whose map it has as well: one map of several commands, such as the rotors of
+    one aircraft.
     """
 
     name: str
