@@ -67,7 +67,8 @@ NEXT = {
     "fleet": "rtid diagnose TRACE -p {project} of the machine that leads the ranking",
 }
 FILES = ("trace", "files", "source", "words", "project", "where", "file")  # that name them
-QUIET = ("as_json", "metrics", "board", "serve")  # parameters behind which a program reads
+# parameters behind which a program reads, or which need no project
+QUIET = ("as_json", "metrics", "board", "serve", "bus_only")
 GUIDE = "Where to begin, by task: docs/guide.md in the repository."
 
 

@@ -64,7 +64,7 @@ class Live:
         health += self._recent.scopes(status.signals) + self._trends() + _loop(status)
         health += _signals(status.signals) + _messages(status.messages)
         planes = "".join(self._recent.plane(edge) for edge in status.estimate.edges)
-        learning = _learning(status) + f'<div class="planes">{planes}</div>'
+        learning = _learning(status) + f'<div class="udp">{planes}</div>'
         learning += _coach(status.advice) + _verdict(status)
         css = "stale" if age_s > STALE_S else ""
         return {

@@ -398,7 +398,8 @@ def test_the_command(
         capsys.readouterr()
         assert ends(["apply", str(path), "--log"]) == Exit.OK
         listed = capsys.readouterr().out.splitlines()
-        assert len(listed) == 3 and "version 3, the maps of version 1: done, by " in listed[2]
+        assert "version 3, the maps of version 1: done, by " in listed[2]
+        assert listed[3:] == [f"Next: rtid status {path}"]
         assert ends(["apply", str(path), "--log", "--json"]) == Exit.OK
         assert [row["version"] for row in json.loads(capsys.readouterr().out)] == [1, 2, 3]
         assert ends([*call, "--yes"]) == Exit.NEGATIVE  # no offer

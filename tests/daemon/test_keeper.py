@@ -23,6 +23,7 @@ from rtid.daemon.health import Health
 from rtid.daemon.keeper import BEGINS_S, Keeper
 from rtid.daemon.lag import LagMeter
 from rtid.daemon.loop import Loop
+from rtid.daemon.scope import ScopeKeeper
 from rtid.daemon.status import Advice, read, write
 from rtid.daemon.teller import Facts
 from rtid.estimator.estimator import Estimator
@@ -41,7 +42,7 @@ def keeper(tmp_path: Path) -> Keeper:
         learner=learner, source=SimpleNamespace(is_down=False, is_over=False, queued=0),
         health=Health(machine().project, learner), lag=LagMeter(), frames=30_000,
         samples=len(chunk), newest_s=float(chunk[-1, 0]), busy=False, swap=None, is_proving=False,
-        notifier=SimpleNamespace(tell=lambda *_: None),
+        notifier=SimpleNamespace(tell=lambda *_: None), scope=ScopeKeeper(()),
     )  # fmt: skip
     diagnosing = SimpleNamespace(
         verdict=None, is_of_change=False, is_acquitted=False, implausible=(), is_running=False,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from rtid.estimator.track import pressure_drop
 from rtid.model import Edge, Machine
 from rtid.plain import FloatArray
 from rtid.units import MPA
@@ -15,7 +16,7 @@ def working_points(model: Machine, edge: Edge, chunk: FloatArray) -> tuple[Float
     chunk (n, 2 + signals), SI.
     """
     w_v = edge.direction * chunk[:, 2 + model.column(edge.command)]
-    dp_pa = chunk[:, 2 + model.column(edge.source)] - chunk[:, 2 + model.column(edge.sink)]
+    dp_pa = pressure_drop(model, edge, chunk[:, 2:])
     is_open = w_v > max(edge.safe_band_v, float(edge.grid.u_v[0]))
     return w_v[is_open], dp_pa[is_open]
 
