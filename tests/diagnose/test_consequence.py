@@ -9,9 +9,16 @@ import pytest
 
 from rtid.diagnose import consequence as evidence
 from rtid.diagnose.consequence import Consequence, finer, is_stable
-from rtid.diagnose.diagnosis import Result, is_form_of_another, search
+from rtid.diagnose.diagnosis import (
+    Result,
+    beside_its_line,
+    is_form_of_another,
+    is_seen_again,
+    search,
+)
 from rtid.diagnose.experiment import FLOW, would_separate
 from rtid.diagnose.report import Diagnosis, diagnosis
+from rtid.diagnose.residual import Residual
 from rtid.diagnose.trials import Trial, TrialState
 from rtid.diagnose.verdict import MATERIAL
 from rtid.plain import silent
@@ -87,6 +94,34 @@ def test_a_size_must_be_that_of_both_halves_and_of_a_finer_grid(
     monkeypatch.setattr(evidence, "_size", lambda *_: next(told))
     last, accepted = result.last, result.found[0]
     assert is_stable(last, Trial(accepted.key, accepted.gain, last.revision)) == is_believed
+
+
+@pytest.mark.parametrize(
+    ("begins", "before", "after", "is_seen"),
+    [
+        (1.0, 2.0, 1.1, True),
+        (1.0, 2.0, 1.7, False),
+        (1.0, 1.1, 1.0, False),
+        (-1.0, 2.0, 1.1, False),
+    ],
+)
+def test_what_unseen_data_show_again_is_believed(
+    result: Result, begins: float, before: float, after: float, is_seen: bool
+) -> None:
+    """Most of a clear misfit is gone, in data that have not taught the effect."""
+    last, noise = result.last, np.ones((100, 2))
+    t_s = last.chunk[-1, 0] + begins + 0.02 * np.arange(100)
+    parts = (Residual(t_s, noise, size * noise, noise) for size in (before, after))
+    assert is_seen_again(last, *parts) == is_seen
+
+
+@pytest.mark.parametrize("where", ["a", "b"])
+def test_what_a_line_s_own_oil_stores_is_not_told_from_the_line(result: Result, where: str) -> None:
+    line, volume = ("line_dynamics", where), ("extra_dead_volume", "a")
+    found = [replace(result.found[0], key=key, alike=()) for key in (volume, line)]
+    state = TrialState(result.last.declared, result.last.chunk, result.last.chunk, silent, found)
+    assert beside_its_line(state, found[0]).alike == ((line,) if where == "a" else ())
+    assert beside_its_line(state, found[1]).alike == ()
 
 
 def test_the_form_of_what_was_found_is_no_effect_of_its_own(result: Result) -> None:
