@@ -44,7 +44,7 @@ INVISIBLE = {
     *("valve_seat_leakage", "deadband_shift", "load_compensated_valve"),
     *("pressure_sensor_bias", "velocity_scale"),
 }
-SIGNALS = {"u", "x", "v", "t", "p_a", "p_b", "p_c", "p_supply", "p_tank", "state", "input"}
+SIGNALS = {"u", "x", "v", "t", "p_a", "p_b", "p_c", "p_supply", "p_tank", "state", "input", "port"}
 FLOWS = {"q_a", "q_b", "q_c", "q_e"}
 
 

@@ -10,7 +10,7 @@ from benchmarks.paper.fig3_picture import draw
 from benchmarks.paper.function import THETA, grid, record
 from benchmarks.paper.result import Measure, Part, Table, at_most
 from benchmarks.paper.surface import errors, excess, jumps, learn, rms
-from rtid.model import BASES, LAPPED, TAYLOR
+from rtid.model import BLENDED, LAPPED, TAYLOR
 from rtid.plain import FloatArray
 
 KNOWN = 0.01  # share of full scale
@@ -22,12 +22,13 @@ SPACINGS = (  # name, spacing between u = 1 and 2, elsewhere
     ("fine from 1 to 2", 0.125, 1.0),
     ("equal, fine", 0.25, 0.25),
 )
+SURFACES = (TAYLOR, LAPPED, BLENDED)  # bases of a function of two variables
 
 
 def reproduce(seed: int = 0, spacings: Sequence[tuple[str, float, float]] = SPACINGS) -> Part:
     """Fig. 3 with its numbers; spacings: (name, spacing between 1 and 2, elsewhere) to compare."""
     chunk = record(seed)
-    estimates = {basis: learn(chunk, grid(FINE), basis) for basis in BASES}
+    estimates = {basis: learn(chunk, grid(FINE), basis) for basis in SURFACES}
     taylor, lapped = estimates[TAYLOR], estimates[LAPPED]
     raw, windowed = taylor.unwindowed, taylor.published.flow
     without = rms(jumps(taylor.grid, raw))

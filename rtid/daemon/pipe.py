@@ -7,7 +7,6 @@ process that this one has started.
 
 from __future__ import annotations
 
-import mmap
 import os
 import pickle
 import socket
@@ -57,14 +56,17 @@ class Pipe:
         return pickle.loads(head, buffers=buffers)
 
     def _shared(self, sizes: list[int]) -> list[memoryview]:
+        """Copies of what is shared: a mapping would keep the file open as long as it is used."""
         _, fds, _, _ = socket.recv_fds(self._socket, 1, 1)
         if not fds:
             raise EOFError
         begins = [0, *accumulate(size + -size % ALIGNED for size in sizes)]
-        try:
-            whole = memoryview(mmap.mmap(fds[0], begins.pop(), flags=mmap.MAP_PRIVATE))
-        finally:
-            os.close(fds[0])
+        whole = memoryview(bytearray(begins.pop()))
+        with open(fds[0], "rb", buffering=0) as file:
+            file.seek(0)
+            at = 0
+            while at < len(whole) and (count := file.readinto(whole[at:])):
+                at += count
         return [whole[at : at + size] for at, size in zip(begins, sizes, strict=True)]
 
     def close(self) -> None:

@@ -32,7 +32,7 @@ from rtid.diagnose.trials import (
 )
 from rtid.diagnose.verdict import MATERIAL, NAMED, UNKNOWN, can_judge, most_rho, verdict
 from rtid.effects.column import Candidate
-from rtid.effects.page import Effect
+from rtid.effects.page import Effect, catalogue, correcting
 from rtid.model import Machine
 from rtid.plain import FloatArray, Key, Progress, silent
 
@@ -40,7 +40,7 @@ LATER_GAIN = 25.0  # chi2 of every effect behind the first
 # chi2 of what the maps have taken in: ten standard deviations of its size.  On a clean sweep the
 # inertance of a line that was not there reached 56, stable, and moved a modulus by 3 %
 HIDDEN_GAIN = 100.0
-LINE, OF_LINES = "line_dynamics", ("extra_dead_volume", "hose_compliance")
+LINE, OF_LINES = "line", "dead volume"  # the law of a line; the declared size that its oil adds to
 MOST = 6  # effects that are added at most
 WORSE = 1.02  # held-out residual, as a share, that an immaterial effect may not raise
 CLEAR = 1.5  # times the variance of the sensors' noise, from which unseen data show a misfit ...
@@ -115,9 +115,12 @@ def beside_its_line(state: TrialState, stored: AcceptedEffect) -> AcceptedEffect
     The line of 1.2 m that left 1.61e-4 m3 was named a dead volume of 1.70e-4 m3 and an inertance.
     """
     name, where = stored.key
-    lines = {f.key for f in state.found} | {part.key for part in state.given}
-    is_of_line = name in OF_LINES and (LINE, where) in lines - set(stored.alike)
-    return replace(stored, alike=(*stored.alike, (LINE, where))) if is_of_line else stored
+    if name not in {page.name for page in correcting(OF_LINES)}:
+        return stored
+    lines_of_any = {page.name for page in catalogue().values() if page.law == LINE}
+    beside = [f.key for f in state.found] + [part.key for part in state.given]
+    lines = [key for key in beside if key[1] == where and key[0] in lines_of_any]
+    return replace(stored, alike=tuple(dict.fromkeys((*stored.alike, *lines))))
 
 
 def _extended(state: TrialState, first: Fit, before: Residual) -> tuple[Fit, Residual]:

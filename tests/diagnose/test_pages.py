@@ -55,7 +55,11 @@ def test_every_column_is_that_of_its_page() -> None:
     model, chunk, _ = record()
     weights = prepare(model, chunk)
     found = causes(RecordView.of(model, chunk, weights, first_map(model, chunk, weights)))
-    of_pressures = {n: page for n, page in catalogue().items() if page.law not in OF_RATES}
+    of_pressures = {
+        n: page
+        for n, page in catalogue().items()
+        if page.law not in OF_RATES and page.places != ("port",)  # of a pump without valves
+    }
     by_law = {n for n, page in of_pressures.items() if lines_of(page) or page.law in NAMED}
     assert {c.candidate.effect for c in found} == by_law
     for cause in found:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.paper.fig3 import FINE
+from benchmarks.paper.fig3 import FINE, SURFACES
 from benchmarks.paper.function import THETA, declared, grid, record, true_value
 from benchmarks.paper.surface import Estimate, errors, excess, full_scale, jumps, learn, rms
-from rtid.model import BASES, LAPPED, TAYLOR
+from rtid.model import LAPPED, TAYLOR
 from rtid.plain import FloatArray
 
 
@@ -19,7 +19,7 @@ def chunk() -> FloatArray:
 
 @pytest.fixture(scope="module")
 def estimates(chunk: FloatArray) -> dict[str, Estimate]:
-    return {basis: learn(chunk, grid(FINE), basis) for basis in BASES}
+    return {basis: learn(chunk, grid(FINE), basis) for basis in SURFACES}
 
 
 def test_the_function_is_not_smooth_and_its_dead_band_ends_between_1_and_2() -> None:
@@ -41,7 +41,7 @@ def test_frames_carry_the_record(chunk: FloatArray) -> None:
         assert high - 0.1 < column.max() <= high
 
 
-@pytest.mark.parametrize("basis", BASES)
+@pytest.mark.parametrize("basis", SURFACES)
 def test_rms_error_is_at_most_one_percent(estimates: dict[str, Estimate], basis: str) -> None:
     assert estimates[basis].valid_share > 0.9
     assert rms(errors(estimates[basis])) < 0.01
