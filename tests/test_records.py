@@ -114,3 +114,32 @@ def test_a_record_that_is_not_there_is_said_with_its_place(
     wrong.write_text(days[2].read_text().replace("held_out", 'records = ["lost.csv"]\nheld_out'))
     with pytest.raises(ProjectError, match=r"lost\.csv"):
         load(wrong)
+
+
+def test_quick_takes_several_records(days: tuple[Crane, list[Path], Path], tmp_path: Path) -> None:
+    """One command from tables to the file of them all; a logger that was set to cm on a day too."""
+    crane, (first, second, last), _ = days
+    rows = [line.split(",") for line in second.read_text().splitlines()[1:]]
+    in_cm = "\n".join(f"{t},{u},{float(x) / 10:.2f}" for t, u, x in rows)
+    other = tmp_path / "other.csv"
+    other.write_text(f"t_ms,u_jib_pct,x_jib_cm\n{in_cm}\n")
+    file = tmp_path / "jib.toml"
+    words = said("quick", first, last, other, "--held-out", "day2*", "--save", file)
+    neutrals = words.partition("found anew: ")[2].split(" %")[0].split(", ")
+    expected = [crane.neutral, crane.neutral - 1.5, crane.neutral + 2.5]
+    assert [float(n) for n in neutrals] == pytest.approx(expected, abs=0.02)
+    assert words.count("held out") == 1 and words.count("taught") == 2
+    study = Study(file, first)
+    assert [span.path.name for span in study.records] == [first.name, other.name, last.name]
+    assert max(e.left / e.flow for e in study.record_errors) < 0.25
+    delay = study.project.sections.added[0].parameters["delay"].value
+    assert delay < crane.delay_s < delay + 0.05, "what a held command hides is said"
+    assert f"the delay is {1e3 * delay:.0f} to " in said("diagnose", first, "-p", file) + words
+
+
+def test_a_cylinder_with_valves_is_looked_at_alone(
+    days: tuple[Crane, list[Path], Path], tmp_path: Path
+) -> None:
+    table = tmp_path / "cylinder.csv"
+    table.write_text("t_s,u_V,x_mm,pA_bar,pB_bar\n0,1,2,3,4\n1,2,3,4,5\n")
+    assert "takes one record" in said("quick", table, days[1][0], code=2)

@@ -38,7 +38,10 @@ def _both(text: str) -> tuple[float, float]:
 
 
 def quick(
-    file: Annotated[Path, typer.Argument(help="Table (.csv .parquet .mat) or CAN log.")],
+    files: Annotated[
+        list[Path],
+        typer.Argument(help="Table (.csv .parquet .mat) or CAN log; tables of a rate: one fit."),
+    ],
     dbc: Annotated[
         Path | None, typer.Option(help="DBC of a CAN log; the built-in one without it.")
     ] = None,
@@ -65,6 +68,10 @@ def quick(
         float | None, typer.Option("--lag", min=0.0, help="Lag of the spools, data sheet, ms.")
     ] = None,
     role: RoleOption = None,
+    held_out: Annotated[
+        list[str] | None,
+        typer.Option("--held-out", help="Name or pattern of records that judge; else the last."),
+    ] = None,
     save: Annotated[
         Path | None,
         typer.Option("--save", "-o", "--output", help="Write the project file of what was found."),
@@ -87,8 +94,9 @@ def quick(
     if save is not None and save.exists() and not force:
         raise RtidError(f"{save} exists", "give another --save, or --force", Exit.USAGE)
     given = _given(bore_mm, rod_mm, stroke_mm, dead_volume_l, safe_band, lag_ms)
+    file, *more = files
     with progress_bar() as progress:
-        looked = look(file, dbc, given, progress, by_role(role or []))
+        looked = look(file, dbc, given, progress, by_role(role or []), more, held_out or ())
     answer = _answer(looked, file, save)
     if save is not None:
         save.write_text(answer.project, "utf-8")
@@ -132,6 +140,8 @@ def _answer(looked: Quick | QuickRate, file: Path, save: Path | None) -> _Answer
     from rtid.tell.quick import lines, rate_lines
 
     if isinstance(looked, QuickRate):
-        return _Answer(looked.text, rate_lines(looked, save), looked.as_json(), False)
+        return _Answer(
+            looked.text_for(save or file), rate_lines(looked, save), looked.as_json(), False
+        )
     text, document = looked.text_for(save or file), looked.as_json(save)
     return _Answer(text, lines(looked, save), document, looked.truncated)

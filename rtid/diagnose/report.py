@@ -23,12 +23,13 @@ from rtid.diagnose.trials import AcceptedEffect, detection_limit, physical
 from rtid.diagnose.verdict import MATERIAL, UNKNOWN, doubts_about, most_rho
 from rtid.effects import catalogue
 from rtid.effects.column import Candidate
-from rtid.effects.laws.timing import RATE
+from rtid.effects.laws.timing import COMMAND, RATE
 from rtid.estimator.validity import Doubt
 from rtid.plain import Key, plain
 from rtid.units import limit
 
 SCHEMA = 1
+LONG_STEP = 0.2  # share of the delay: a shorter step changes little
 WORTH = 2.0  # times better that an experiment must be to be proposed
 NOBODY_LOOKED = "Not examined: the diagnosis has no column for it here."
 VISIBLE = 2e-3  # share of a column that must be left beside the maps
@@ -224,7 +225,7 @@ def parameters(fit: Fit, key: Key) -> dict[str, Value]:
             for name, unit, value, j in zip(
                 timing.parameters, timing.units, psi, fit.timing_columns(k), strict=True
             ):
-                values[name] = Value(value, fit.estimate.sd(j) * spread, unit)
+                values[name] = Value(value, fit.estimate.sd(j) * spread, _of_command(fit, unit))
     for effect in fit.revision.effects:
         if effect.key == key:
             column = fit.column(effect)
@@ -236,6 +237,12 @@ def parameters(fit: Fit, key: Key) -> dict[str, Value]:
                 sd = fit.estimate.sd(free[k]) * spread / abs(value) if k in free else float("nan")
                 values[name] = Value(effect.shape[k], sd, effect.shape_units[k])
     return values
+
+
+def _of_command(fit: Fit, unit: str) -> str:
+    """A unit; V, in which pages count a command, as that of the machine's own."""
+    model = fit.declared
+    return model.signals[model.column(model.edges[0].command)].unit if unit == "V" else unit
 
 
 def _not_found(result: Result) -> tuple[Unseen, ...]:
@@ -264,7 +271,8 @@ def _limit(result: Result, candidate: Candidate, score: Score) -> Unseen:
     fit, unit = result.last, candidate.unit
     limit = physical(fit, candidate, detection_limit(score, fit.rho))
     if candidate.parameter == "share":  # of a timing: times the value that its column was made for
-        limit, unit = _of_timing(candidate, limit), candidate.shape_units[0]
+        limit = _of_timing(candidate, limit)
+        unit = _of_command(fit, candidate.shape_units[0])
         pages = catalogue()[candidate.effect].parameters
         (page,) = [p for p in pages if p.name in candidate.shape_names]
         is_possible = page.low < limit if page.unit == RATE else limit < page.high
@@ -294,6 +302,7 @@ def advice(result: Result, unseen: tuple[Unseen, ...]) -> tuple[str, ...]:
     """What an unknown residual follows; which motion would tell more of what is open."""
     pages = catalogue()
     lines = list(described(result.last)) if result.verdict == UNKNOWN else []
+    lines += _of_held_commands(result.last)
     for f in result.found:
         for key in f.alike:
             page = pages.get(f.key[0])
@@ -305,6 +314,20 @@ def advice(result: Result, unseen: tuple[Unseen, ...]) -> tuple[str, ...]:
         if page is not None and page.visible_when:
             lines.append(f"{name} cannot be seen in this record: {page.visible_when}")
     return tuple(dict.fromkeys(lines + _experiment(result, unseen)))
+
+
+def _of_held_commands(fit: Fit) -> list[str]:
+    """How much longer a delay is where a command may have changed long before its row."""
+    step_s = float(np.median(np.diff(fit.chunk[:, 0])))
+    timings = [(t, psi) for t, psi in fit.revision.timings if t.where == COMMAND]
+    delays = [psi[0] for timing, psi in timings if timing.parameters == ("delay",)]
+    return [
+        f"A row comes each {1e3 * step_s:.0f} ms, and the command may have changed up to that long "
+        f"before it: from the command itself the delay is {1e3 * delay:.0f} to "
+        f"{1e3 * (delay + step_s):.0f} ms."
+        for delay in delays
+        if step_s > LONG_STEP * delay
+    ]
 
 
 def _experiment(result: Result, unseen: tuple[Unseen, ...]) -> list[str]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import shlex
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -136,11 +136,14 @@ def quick(
     given: Given | None = None,
     progress: Progress = silent,
     roles: Mapping[str, str] = NOBODY,
+    more: Sequence[Path] = (),
+    held_out: Sequence[str] = (),
 ) -> Quick | QuickRate:
     """Judge a table or a CAN log; roles: names of signals by role, where guesses would fail.
 
-    A table without pressures is one of a plant that is a rate.  Raises RtidError where the file
-    cannot be read, or is of no kind of plant.
+    A table without pressures is one of a plant that is a rate.  more: further records of such a
+    plant, of which those named held_out judge, or the last.  Raises RtidError where the file cannot
+    be read, or is of no kind of plant.
     """
     given = given or Given()
     progress("reading", 0.0)
@@ -149,7 +152,12 @@ def quick(
     guessed = proposal.with_named(proposal.propose(source.signals), named)
     is_table = "time_column" in source.keys
     if is_table and (not CHAMBERS & guessed.keys() or driven_pairs(path, source, named)):
-        return quick_rate(path, source, named, progress)
+        return quick_rate(path, source, named, progress, more, held_out)
+    if more:
+        remedy = (
+            f"rtid quick {path} --save machine.toml, its [record] taken out, and `rtid diagnose`"
+        )
+        raise RtidError(f"{path}: of a cylinder with valves quick takes one record", remedy, 2)
     looked = _of_cylinder(path, source, roles_of(path, source, named), given, progress)
     return replace(looked, options=_options(dbc, given, roles))
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -22,6 +22,7 @@ import numpy as np
 import tomlkit
 
 from firmware_bridge.sources import read_table
+from firmware_bridge.sources.table import to_samples
 from rtid.compare.dead_band import DeadBand, dead_band, per_direction
 from rtid.diagnose.report import Diagnosis
 from rtid.diagnose.verdict import INSUFFICIENT
@@ -29,12 +30,14 @@ from rtid.errors import RtidError
 from rtid.estimator.flowmap import VALID, EdgeMap
 from rtid.estimator.published import publish
 from rtid.plain import FloatArray, Progress, plain, silent
-from rtid.project.guess import ROLES, RoleCandidate, is_wanted, propose, with_unit
+from rtid.project import Project
+from rtid.project.guess import ROLES, RoleCandidate, is_wanted, propose, relative, with_unit
 from rtid.study.quick_drive import Drive, drive_of, drive_text
 from rtid.study.spans import HELD_OUT_SHARE
-from rtid.study.study import Study
-from rtid.trace.neutral import held_out_from, neutral_of, slope_of
+from rtid.study.study import RecordError, Study
+from rtid.trace.neutral import held_out_from, neutral_of, neutrals, slope_of
 from rtid.trace.quick_source import Source
+from rtid.trace.table import declared
 from rtid.units import COMMAND_DIMENSIONS, find_unit, words_of
 
 SCHEMA = 1
@@ -368,7 +371,8 @@ class QuickRate:
 
     text: the project file; bands: dead band (low, high) about the neutral and gains (below, above)
     by map, in SI, NaN where the map does not tell; ranges: lowest and highest command that a map is
-    known at, and what it gives there, SI.
+    known at, and what it gives there, SI.  Of several records: their files, the neutral of the
+    command in each, where one is looked for, and what the model leaves of each.
     """
 
     path: Path
@@ -381,6 +385,9 @@ class QuickRate:
     unused: tuple[str, ...]
     unit: str
     command_unit: str
+    records: tuple[Path, ...] = ()
+    neutrals: tuple[float, ...] = ()
+    errors: tuple[RecordError, ...] = ()
 
     @property
     def is_enough(self) -> bool:
@@ -390,7 +397,16 @@ class QuickRate:
     @property
     def next_command(self) -> str:
         """What to do now."""
-        return f"rtid quick {self.path} {self.pair.options} --save machine.toml"
+        held_out = [f"--held-out {error.path.name}" for error in self.errors if error.is_held_out]
+        words = [*map(str, self.records or [self.path]), self.pair.options, *held_out]
+        return f"rtid quick {' '.join(words)} --save machine.toml"
+
+    def text_for(self, file: Path) -> str:
+        """The project as it is written to a file: its records relative to it where they can be."""
+        text = self.text
+        for path in self.records:
+            text = text.replace(f'"{path.resolve()}"', f'"{relative(path, file.parent)}"')
+        return text
 
     def as_json(self) -> dict[str, Any]:
         """Plain JSON types."""
@@ -402,12 +418,14 @@ class QuickRate:
                 "plant": "rate",
                 "roles": {name: asdict(role) for name, role in self.pair.roles.items()},
                 "neutral": self.pair.neutral,
+                "neutrals": self.neutrals,
                 "others": pairs,
                 "unused": list(self.unused),
                 "maps": {name: asdict(band) for name, band in self.bands.items()},
                 "diagnosis": self.diagnosis.as_json(),
                 "next": self.next_command,
             }
+            | ({"records": [asdict(error) for error in self.errors]} if self.errors else {})
         )
         return words
 
@@ -423,26 +441,45 @@ def known_range(edge: EdgeMap) -> tuple[float, float, float, float] | None:
     return float(ends[0]), float(ends[1]), float(first), float(last)
 
 
+def _of_records(text: str, records: Sequence[Path], held_out: Sequence[str]) -> str:
+    """The project of the first record as that of several; held_out judge, or else the last one."""
+    raw = tomlkit.parse(text)
+    names = list(held_out) or [records[-1].name]
+    raw["record"] = {"records": [str(path.resolve()) for path in records], "held_out": names}
+    return tomlkit.dumps(raw)
+
+
 def quick_rate(
-    path: Path, source: Source, given: Mapping[str, RoleCandidate], progress: Progress = silent
+    path: Path,
+    source: Source,
+    given: Mapping[str, RoleCandidate],
+    progress: Progress = silent,
+    more: Sequence[Path] = (),
+    held_out: Sequence[str] = (),
 ) -> QuickRate:
-    """Judge a table without pressures.  RtidError, with a page of help, where no command moves."""
+    """Judge a table without pressures.  RtidError, with a page of help, where no command moves.
+
+    more: further records of the same fit; held_out: names of those that judge, else the last one.
+    """
     if source.periods_ms or "time_column" not in source.keys:
         raise no_plant(path, source.signals)
     pairs = pairs_of(path, source, given)
     if not pairs:
         raise no_plant(path, source.signals)
     pair, *others = pairs
-    text = rate_text(path.stem or "machine", path, source, pair)
+    text, records = rate_text(path.stem or "machine", path, source, pair), (path, *more)
+    if more:
+        text = _of_records(text, records, held_out)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "machine.toml"
         file.write_text(text, "utf-8")
-        study = Study(file, path, progress)
+        study = Study(file, records, progress)
         diagnosed = study.diagnosed
         found = diagnosed.diagnosis.found
         for effect in found if pair.drive else found[:1]:  # the maps are those beside it
             with suppress(RtidError):
                 study.add(f"{effect.effect}:{effect.where}", force=True)
+        errors, at_rest = study.record_errors, _at_rest(study.project, records)
         model, flowmap, text = study.machine, publish(study.fit.solution), file.read_text("utf-8")
     used = {role.name for role in pair.roles.values()}
     unused = tuple(s.name for s in source.signals if s.name not in used)
@@ -451,4 +488,12 @@ def quick_rate(
     units = model.chambers[0].unit, model.signals[model.column(model.edges[0].command)].unit
     ranges = {edge.name: known for edge in flowmap.edges if (known := known_range(edge))}
     said = diagnosed.diagnosis
-    return QuickRate(path, pair, tuple(others), text, said, bands, ranges, unused, *units)
+    several = records if more else ()
+    seen = said, bands, ranges, unused
+    return QuickRate(path, pair, tuple(others), text, *seen, *units, several, at_rest, errors)
+
+
+def _at_rest(project: Project, records: Sequence[Path]) -> tuple[float, ...]:
+    """The neutral of the first command in each record, in its own unit; none where it has none."""
+    samples = [to_samples(*declared(project, read_table(path)))[0] for path in records]
+    return tuple(u for each in samples for u in list(neutrals(project, each).values())[:1])

@@ -13,6 +13,7 @@ from rtid.study.quick import Quick
 from rtid.study.quick_project import DEAD_VOLUME
 from rtid.study.quick_rate import QuickRate
 from rtid.tell.diagnosed import sentences
+from rtid.tell.records import record_lines
 from rtid.trace.quick_data import BAD, FAIR, GOOD
 from rtid.units import scale_of
 
@@ -82,12 +83,16 @@ def rate_lines(quick: QuickRate, saved: Path | None = None) -> Iterator[str]:
             yield f"A turn of the pump moves x by {above:.4g} {scale.name}, back by {below:.4g}."
     else:
         yield f"The neutral of the command is {pair.neutral:.6g} {u.unit}: there x stands most."
+        if len(quick.records) > 1:
+            each = ", ".join(f"{neutral:.6g}" for neutral in quick.neutrals)
+            yield f"In each record it is found anew: {each} {u.unit}."
         for name, band in quick.bands.items():
             yield from band_lines(name, band, quick.unit, quick.command_unit)
     yield ""
     yield f"Verdict: {quick.diagnosis.verdict}."
     for sentence in sentences(quick.diagnosis):
         yield f"  {sentence}"
+    yield from record_lines(quick.errors)
     yield ""
     if saved is not None:
         yield f"wrote {saved}"

@@ -72,15 +72,20 @@ def last_part_from(t_s: FloatArray, state: FloatArray, share: float) -> float:
     return split if is_enough else held_out_from(t_s, state, share)
 
 
-def about_neutral(project: Project, samples: Samples) -> Samples:
-    """The samples with every command of `offset = "estimate"` counted from its neutral."""
+def neutrals(project: Project, samples: Samples) -> dict[str, float]:
+    """The neutral of every command of `offset = "estimate"`, by signal; 0 where it never stands."""
     sections = project.sections
     unknown = [name for name, s in sections.signals.items() if s.offset is None]
     if not unknown or sections.rate is None or not sections.rate.state or len(samples) == 0:
-        return samples
-    values, t_s = samples.values.copy(), np.asarray(1e-6 * samples.t_us, np.float64)
-    for name in unknown:
-        column = samples.names.index(name)
-        neutral = neutral_of(t_s, values[:, column], samples.column(sections.rate.state))
-        values[:, column] -= neutral if np.isfinite(neutral) else 0.0
+        return {}
+    t_s, state = 1e-6 * samples.t_us.astype(np.float64), samples.column(sections.rate.state)
+    found = {name: neutral_of(t_s, samples.column(name), state) for name in unknown}
+    return {name: u if np.isfinite(u) else 0.0 for name, u in found.items()}
+
+
+def about_neutral(project: Project, samples: Samples) -> Samples:
+    """The samples with every command of `offset = "estimate"` counted from its neutral."""
+    values = samples.values.copy()
+    for name, neutral in neutrals(project, samples).items():
+        values[:, samples.names.index(name)] -= neutral
     return replace(samples, values=values)

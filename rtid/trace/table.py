@@ -5,6 +5,7 @@ The names of the columns and their units are read by `rtid.units.split_name`.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 from firmware_bridge.config import Assembly
@@ -13,7 +14,7 @@ from rtid.errors import RtidError
 from rtid.project.guess import unit_said
 from rtid.project.project import Project
 from rtid.project.schema import SourceSection
-from rtid.units import Unit, find_unit, said
+from rtid.units import Unit, find_unit, said, split_name
 
 
 def declared(project: Project, table: Table) -> tuple[Table, Assembly]:
@@ -26,12 +27,29 @@ def declared(project: Project, table: Table) -> tuple[Table, Assembly]:
     if assembly is None:
         remedy = 'add column = "..." to every signal, or give a CAN log'
         raise RtidError(f"{table.path} is a table, but the project names no columns", remedy)
+    declared_units = {s.column: s.unit for s in project.sections.signals.values() if s.column}
+    table = _in_units(table, declared_units)
     for name, signal in project.sections.signals.items():
         # a scale that is given insists, as it does against a DBC
         if signal.column and signal.constant is None and signal.scale is None:
             insist = "give scale = 1.0 to insist"
             refuse_other_unit(table, signal.column, signal.unit or "", f"signals.{name}", insist)
     return _with_time(table, project.sections.source), assembly
+
+
+def _in_units(table: Table, units: Mapping[str, str | None]) -> Table:
+    """The table with x_cm, wanted in cm, from its x_mm: a logger's names move with their units."""
+    columns = dict(table.columns)
+    for wanted, unit in units.items():
+        (stem, written), meant = split_name(wanted), find_unit(unit or "")
+        if wanted in columns or meant is None or find_unit(written) != meant:
+            continue
+        for name, values in table.columns.items():
+            there = find_unit(split_name(name)[1])
+            if there and there.dimension == meant.dimension and split_name(name)[0] == stem:
+                in_si = there.factor * values + there.offset
+                columns[wanted] = (in_si - meant.offset) / meant.factor
+    return replace(table, columns=columns)
 
 
 def _with_time(table: Table, source: SourceSection) -> Table:
