@@ -17,22 +17,25 @@ from rtid.cli.compare import compare
 from rtid.cli.export import export
 from rtid.cli.replay import replay as replay_command
 from rtid.compare import FREE_RUN
+from rtid.diagnose.diagnosis import searched
+from rtid.diagnose.excuse import steady
 from rtid.diagnose.fit import fit, prepare
 from rtid.diagnose.revision import Revision
+from rtid.diagnose.standing import stand
 from rtid.effects.column import Candidate
 from rtid.effects.laws import causes
 from rtid.effects.record_view import RecordView
 from rtid.effects.terms import LEAST_PA, MOST_PA, SHIFTS_PA, shares, terms_of
-from rtid.estimator.batch import column_rates
+from rtid.estimator.batch import column_rates, term_rates
 from rtid.estimator.factor import misfit
 from rtid.estimator.flowmap import VALID, FlowMap
 from rtid.estimator.record import run
 from rtid.estimator.solution import solve
 from rtid.estimator.state import nominal_weights
 from rtid.estimator.sums import Sums
-from rtid.estimator.track import follow
+from rtid.estimator.track import follow, stored_per_pressure
 from rtid.maps.files import read_map
-from rtid.model import Machine
+from rtid.model import Machine, Term
 from rtid.plain import FloatArray
 from rtid.sim.hidden import hide_wish
 from rtid.sim.recording import write_run
@@ -44,6 +47,7 @@ from rtid.study.revisions import add
 from rtid.study.study import Study
 from rtid.tell.added import sentences
 from tests.diagnose.records import record
+from tests.estimator.cases import draw_case
 from tests.replays import shared_replays  # noqa: F401
 
 SEEN_S, ALL_S = 30.0, 40.0
@@ -164,6 +168,36 @@ def test_an_effect_that_cannot_follow_is_taken_from_the_measured_pressures() -> 
     terms, leak_value = learned.solution.terms, fitted.held.value(fitted.column(leak))
     np.testing.assert_allclose(terms, [leak_value, 1.0, 1.0], rtol=1e-3)
     np.testing.assert_allclose(learned.solution.compliance, fitted.compliance, rtol=1e-5)
+
+
+def test_maps_beside_air_are_weighed_by_what_the_air_makes_of_the_pressures_noise() -> None:
+    """At low pressure air makes a chamber thirty times as soft, and the noise as large."""
+    model, chunk, held_out = record("entrained_air", 0.06)
+    last = searched(stand(model, chunk, held_out)).last
+    assert [effect.effect for effect in last.revision.effects] == ["entrained_air"]
+    calm = steady(last)
+    acts = acting(calm, calm.chunk)
+    assert learn_beside(calm, acts, acts.chunk).solution.rho < 2.0 * max(last.rho, 1.0)
+
+
+def test_what_terms_store_per_pressure_is_the_slope_of_their_columns() -> None:
+    model = draw_case(630, terms=6).model
+    values = np.array([1.0, 2e6, 3e6, 8e6, 1e5, 0.2])
+    soft = stored_per_pressure(model, values, np.zeros(2))
+    for c, chamber in enumerate(model.chambers):
+        moved = values.copy()
+        moved[model.column(chamber.pressure)] += 1.0
+        at = np.stack([values, moved])
+        flows = (dict(t.signs).get(chamber.name, 0) * stored(model, t, at) for t in model.terms)
+        assert soft[c] == pytest.approx(sum(flows), rel=1e-6, abs=1e-22)
+
+
+def stored(model: Machine, term: Term, values: FloatArray) -> float:
+    """What a term of a rate takes up between two samples, m3, with the volume of the first."""
+    if not term.rate:
+        return 0.0
+    taken = term_rates(model, term, values, np.array([1]), np.ones(1))
+    return -float(taken[0, 0])
 
 
 HIDDEN = {"clean": "", "leak": LEAK, "delay": DELAY, "drift": DRIFT}

@@ -23,7 +23,7 @@ from rtid.estimator.state import (
     nominal_weights,
     variance,
 )
-from rtid.estimator.track import ROW, Track, follow, pressure_drop
+from rtid.estimator.track import ROW, Track, follow, pressure_drop, stored_per_pressure
 from rtid.model import LAPPED, PROPORTIONAL, TAYLOR, Edge, Machine, Term
 from rtid.plain import FloatArray, IntArray
 
@@ -109,7 +109,7 @@ def column_rates(
             out[:, c, side, 0] = area * rate
             out[:, c, side, 1 + c] = -(chamber.v0_m3 + area * x[instants]) * pdot
     for number, term in enumerate(model.terms):
-        flow = _term_rates(model, term, values, end, dt)
+        flow = term_rates(model, term, values, end, dt)
         for c, chamber in enumerate(model.chambers):
             sign = dict(term.signs).get(chamber.name, 0)
             out[:, c, :, 1 + len(model.chambers) + number] = sign * flow
@@ -139,7 +139,7 @@ _SHAPES: dict[str, Callable[[FloatArray], FloatArray]] = {
 }
 
 
-def _term_rates(
+def term_rates(
     model: Machine, term: Term, values: FloatArray, end: IntArray, dt: FloatArray
 ) -> FloatArray:
     """(intervals, 2): flow of a shared term for theta = 1 at the start and end of each interval."""
@@ -260,12 +260,14 @@ def _terms(edge: Edge, i: int, j: int, moments: FloatArray, dp: FloatArray) -> F
     return np.stack([mean - half, mean + half])
 
 
-def position_noise(model: Machine, x_m: float, weights: Weights) -> FloatArray:
-    """Covariance (chambers, chambers) of the white noise of one pair of rows, m6."""
+def position_noise(model: Machine, values: FloatArray, weights: Weights) -> FloatArray:
+    """Covariance (chambers, chambers) of the white noise of one pair of rows at values, m6.
+
+    values (signals,), SI, of the sample at which the rows end.
+    """
     a = np.array([c.sign * c.area_m2 for c in model.chambers])
-    v = np.array([c.v0_m3 + c.sign * c.area_m2 * x_m for c in model.chambers])
     p = np.array([variance(model, c.pressure) * model.pressure_share for c in model.chambers])
-    white = np.diag((v * weights.compliance[: len(a)]) ** 2 * p)
+    white = np.diag(stored_per_pressure(model, values, weights.compliance) ** 2 * p)
     return np.asarray(np.outer(a, a) * variance(model, model.position) + white)
 
 
@@ -294,17 +296,16 @@ def _integral_rows(
     weights: Weights,
 ) -> FloatArray:
     """Whitened rows of the integral form: the Kalman whitener on y and all columns alike."""
-    x = values[:, model.column(model.position)]
     cov, gap = np.zeros((rates.shape[1],) * 2), np.zeros(rates.shape[1::2])
     rows = [np.empty((0, rates.shape[3]))]
     for k, end in enumerate(track.end):
         if track.fresh[k]:
-            cov, gap = position_noise(model, x[end - 1], weights), np.zeros_like(gap)
+            cov, gap = position_noise(model, values[end - 1], weights), np.zeros_like(gap)
         dt = t_s[end] - t_s[end - 1]
         gap = gap + rates[k].mean(axis=1) * dt
         cov = cov + flow_noise(model, track.home[k], dt, weights)
         if track.row[k]:
-            s = cov + position_noise(model, x[end], weights)
+            s = cov + position_noise(model, values[end], weights)
             rows.append(np.linalg.solve(np.linalg.cholesky(s), gap))
             gain = cov @ np.linalg.inv(s)
             gap = gap - gain @ gap
@@ -333,7 +334,6 @@ def _carry_rows(
     wn, zeta = model.filter.wn_rad_s, model.filter.zeta
     a = np.array([[0.0, 1.0], [-wn * wn, -2 * zeta * wn]])
     period, due, since = 1 / model.filter.rows_per_s, 0.0, np.nan
-    x = values[:, model.column(model.position)]
     state = np.zeros((2, *rates.shape[1::2]))
     rows = [np.empty((0, rates.shape[3]))]
     for k, end in enumerate(track.end):
@@ -349,6 +349,6 @@ def _carry_rows(
         state += step[:2, 2, None, None] * start + step[:2, 3, None, None] * change
         if t_s[end] > due - 0.5 * dt:
             due += period * max(1.0, np.ceil((t_s[end] - due) / period))
-            scale = np.linalg.cholesky(position_noise(model, x[end], weights))
+            scale = np.linalg.cholesky(position_noise(model, values[end], weights))
             rows.append(np.linalg.solve(scale, state[0]))
     return np.concatenate(rows)

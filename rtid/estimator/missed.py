@@ -17,6 +17,7 @@ import numpy as np
 from rtid.estimator.misfit import Misfit, residual_of
 from rtid.estimator.solution import Solution
 from rtid.estimator.state import Weights, variance
+from rtid.estimator.track import stored_per_pressure
 from rtid.model import Chamber, Machine
 from rtid.plain import BoolArray, FloatArray, IntArray
 
@@ -130,11 +131,9 @@ def _stays(
 def _position_noise(model: Machine, chunk: FloatArray, weights: Weights, c: int) -> FloatArray:
     """White noise of one row of a chamber at each sample (n,), m6."""
     chamber: Chamber = model.chambers[c]
-    area = chamber.sign * chamber.area_m2
-    volume = chamber.v0_m3 + area * chunk[:, 2 + model.column(model.position)]
-    stiff = volume * weights.compliance[c]
+    stiff = stored_per_pressure(model, chunk[:, 2:], weights.compliance)[:, c]
     position, pressure = (variance(model, s) for s in (model.position, chamber.pressure))
-    return np.asarray(area**2 * position + stiff**2 * pressure * model.pressure_share)
+    return np.asarray(chamber.area_m2**2 * position + stiff**2 * pressure * model.pressure_share)
 
 
 def _pressure_noise(model: Machine, weights: Weights, i: int) -> FloatArray:

@@ -6,13 +6,14 @@ it began a new memory because too many blocks rang at once, which depends on its
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from rtid.estimator.state import Weights, build
 from rtid.kernels.layout import RESTART_MEMORY
-from rtid.model import COMMAND, TAYLOR, Edge, Machine
+from rtid.model import COMMAND, TAYLOR, Chamber, Edge, Machine
 from rtid.plain import BoolArray, FloatArray, IntArray
 
 ROW, GAP = 1, 2  # flags of a sample, as in firmware_bridge.samples
@@ -118,6 +119,35 @@ def _held(model: Machine, sample: FloatArray, after: FloatArray | None = None) -
             for edge in model.edges
         ]
     )
+
+
+_SLOPES: dict[str, Callable[[FloatArray], FloatArray]] = {
+    "linear": np.ones_like,
+    "root": lambda z: 0.5 / np.sqrt(np.maximum(np.abs(z), 1e-12)),
+    "hinge": lambda z: (z > 0.0).astype(float),
+    "inverse": lambda z: 1.0 / z**2,
+}
+
+
+def stored_per_pressure(model: Machine, values: FloatArray, compliance: FloatArray) -> FloatArray:
+    """V / beta and what terms of a rate store at theta = 1 (..., chambers), m3/Pa.
+
+    values (..., signals), SI; compliance (chambers,), 1/Pa.
+    """
+    x = values[..., model.column(model.position)]
+    volume = {c.name: c.v0_m3 + c.sign * c.area_m2 * x for c in model.chambers}
+    soft = {c.name: volume[c.name] * compliance[i] for i, c in enumerate(model.chambers)}
+    for term in (term for term in model.terms if term.rate):
+        z = term.constant + sum(w * values[..., model.column(name)] for name, w in term.weights)
+        slope = term.scale * _SLOPES[term.shape](np.asarray(z)) * volume.get(term.volume, 1.0)
+        for name, sign in term.signs:
+            weight = dict(term.weights).get(_chamber(model, name).pressure, 0.0)
+            soft[name] = soft[name] + sign * weight * slope
+    return np.stack([np.asarray(soft[c.name]) for c in model.chambers], axis=-1)
+
+
+def _chamber(model: Machine, name: str) -> Chamber:
+    return next(c for c in model.chambers if c.name == name)
 
 
 def pressure_drop(model: Machine, edge: Edge, values: FloatArray) -> FloatArray:

@@ -20,6 +20,7 @@ from rtid.kernels.holds import GAUSS, lagged_moments, second_order
 from rtid.kernels.increments import (
     block_increments,
     shared_increments,
+    soften,
     term_increments,
     windowed_increments,
 )
@@ -151,6 +152,8 @@ def remember(e: Any, sample: FloatArray) -> None:
     e.t_s = sample[0]
     for j in range(e.n_signals):
         e.values[j] = sample[2 + j]
+    if e.n_terms > 0:
+        soften(e)
 
 
 @inlined

@@ -24,6 +24,7 @@ from rtid.kernels.layout import (
 )
 from rtid.plain import FloatArray
 
+LEAST_Z = 1e-12  # below which a root is no steeper
 HELD_MISFIT = 5e-4  # of an edge's scale: what six terms miss of a flow at the borders of a block
 
 
@@ -50,12 +51,18 @@ def shared_increments(e: Any, sample: FloatArray, dt: float) -> None:
 
 
 @inlined
-def shaped(e: Any, k: int, values: FloatArray, first: int) -> float:
-    """Shape of shared term k, SI; its signals stand in values (m,) from `first` on."""
+def argument(e: Any, k: int, values: FloatArray, first: int) -> float:
+    """z of shared term k, SI; its signals stand in values (m,) from `first` on."""
     z = e.term_constant[k]
     for j in range(e.n_signals):
         z += e.term_weight[k, j] * values[first + j]
-    shape = e.term_shape[k]
+    return float(z)
+
+
+@inlined
+def shaped(e: Any, k: int, values: FloatArray, first: int) -> float:
+    """f(z) of shared term k, SI; values (m,) as in `argument`."""
+    z, shape = argument(e, k, values, first), e.term_shape[k]
     if shape == ROOT:
         return math.copysign(math.sqrt(abs(z)), z)
     if shape == HINGE:
@@ -78,6 +85,33 @@ def term_rates(e: Any, k: int, sample: FloatArray, dt: float) -> tuple[float, fl
     v0 = e.v0_m3[volume] + e.area_m2[volume] * e.values[e.x_column]
     v1 = e.v0_m3[volume] + e.area_m2[volume] * sample[2 + e.x_column]
     return rate * v0, rate * v1
+
+
+@inlined
+def steepness(e: Any, k: int) -> float:
+    """df/dz of shared term k at the last sample."""
+    z, shape = argument(e, k, e.values, 0), e.term_shape[k]
+    if shape == ROOT:
+        return 0.5 / math.sqrt(max(abs(z), LEAST_Z))
+    if shape == HINGE:
+        return 1.0 if z > 0.0 else 0.0
+    if shape == INVERSE:
+        return 1.0 / (z * z)
+    return 1.0
+
+
+@part
+def soften(e: Any) -> None:
+    """What the rate terms, at theta = 1, store per pressure of their chamber: V scale df/dp."""
+    for c in range(e.n_chambers):
+        e.softness[c] = 0.0
+        for k in range(e.n_terms):
+            weight, volume = e.term_weight[k, e.p_column[c]], e.term_volume[k]
+            if volume != FLOW and weight != 0.0:
+                v = 1.0
+                if volume != RATE:
+                    v = e.v0_m3[volume] + e.area_m2[volume] * e.values[e.x_column]
+                e.softness[c] += e.term_sign[k, c] * e.term_scale[k] * weight * v * steepness(e, k)
 
 
 @part

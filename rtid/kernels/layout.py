@@ -157,6 +157,7 @@ ENGINE = np.dtype(
         ("open_recent", _I, (MAX_OPEN,)),  # its position among the recent blocks
         ("cov", _F, (MAX_CHAMBERS, MAX_CHAMBERS)),  # Kalman whitener: variance of the gap, m6
         ("innovation", _F, (3,)),  # S: upper triangle
+        ("softness", _F, (MAX_CHAMBERS,)),  # what the rate terms store per pressure now, m3/Pa
         ("echo", _F, (MAX_CHAMBERS, 3)),  # pressure noise in the prediction of column -V dP
         ("moments", _F, (MAX_EDGES, 3)),  # of the opening command over the interval
         ("dp_pa", _F, (MAX_EDGES, 2)),  # at its start and end

@@ -2,8 +2,8 @@
 
 Integral form (design: one row per measured position).  The gap d = z - m between a column's
 integral and its prediction is followed by a Kalman whitener: position noise (with the pressure
-noise that enters through V dP) is white with covariance R, flow noise (pressure noise through
-dQ/ddp) is a random walk with covariance Q per step:
+noise that enters through V dP and through what the terms store) is white with covariance R, flow
+noise (pressure noise through dQ/ddp) is a random walk with covariance Q per step:
 
     P <- P + Q;  S = P + R;  row = L^-1 d, S = L L';  d <- R S^-1 d;  P <- P S^-1 R
 
@@ -40,7 +40,7 @@ def position_noise(e: Any, a: int, b: int) -> float:
     r = e.area_m2[a] * e.area_m2[b] * e.x_var_m2
     if a == b:
         v = e.v0_m3[a] + e.area_m2[a] * e.values[e.x_column]
-        r += (v * e.compliance[a]) ** 2 * e.p_var_pa2[a]
+        r += (v * e.compliance[a] + e.softness[a]) ** 2 * e.p_var_pa2[a]
     return r
 
 

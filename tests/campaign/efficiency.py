@@ -203,15 +203,22 @@ def covariance(p: Problem, back: FloatArray) -> FloatArray:
     return np.asarray(inverse @ middle @ inverse)
 
 
+def noise_at(p: Problem, x_m: float, weights: Weights) -> FloatArray:
+    """Covariance (2, 2) of the white noise at a position; there are no terms."""
+    values = np.zeros(len(p.model.signals))
+    values[p.model.column(p.model.position)] = x_m
+    return position_noise(p.model, values, weights)
+
+
 def whitened(p: Problem, weights: Weights, steps: FloatArray) -> FloatArray:
     """W' W steps of the Kalman whitener: forwards, then its adjoint backwards."""
     count = len(p.x_m)
-    cov = position_noise(p.model, p.x_m[0], weights)
+    cov = noise_at(p, p.x_m[0], weights)
     gap, keep, rows = np.zeros(steps.shape[1:]), [], []
     for k in range(count - 1):
         gap = gap + steps[k]
         cov = cov + flow_noise(p.model, p.track.cells[k], p.dt_s, weights)
-        s = cov + position_noise(p.model, p.x_m[k + 1], weights)
+        s = cov + noise_at(p, p.x_m[k + 1], weights)
         keep.append(np.eye(2) - cov @ np.linalg.inv(s))
         rows.append(np.linalg.solve(s, gap))
         gap = keep[-1] @ gap
@@ -230,7 +237,7 @@ def windowed(p: Problem, steps: FloatArray, window_s: float = 1.5) -> FloatArray
     z = np.concatenate([np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)])
     out = np.zeros_like(z)
     size = round(window_s / p.dt_s)
-    inverse = np.linalg.inv(position_noise(p.model, float(p.x_m.mean()), weights))
+    inverse = np.linalg.inv(noise_at(p, float(p.x_m.mean()), weights))
     for first in range(0, count, size):
         part = z[first : first + size]
         out[first : first + size] = np.einsum("ab,kbi->kai", inverse, part - part.mean(axis=0))
@@ -245,7 +252,7 @@ def filtered(p: Problem, steps: FloatArray) -> FloatArray:
     gain = b.sum(axis=1) / p.dt_s
     every = round(1 / p.model.filter.rows_per_s / p.dt_s)
     weights = nominal_weights(p.model)
-    inverse = np.linalg.inv(position_noise(p.model, float(p.x_m.mean()), weights))
+    inverse = np.linalg.inv(noise_at(p, float(p.x_m.mean()), weights))
     state, rows = np.zeros((2, *steps.shape[1:])), {}
     for k in range(count - 1):
         state = np.einsum("rs,sci->rci", a, state) + gain[:, None, None] * steps[k]
