@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
+import pytest
+
 from tests.faults.elsewhere import ELSEWHERE, IN_SOAK, NOT_TESTED, files
-from tests.faults.table import NAMES, table
+from tests.faults.table import NAMES, main, table
 
 ROOT = Path(__file__).parents[1]
 
@@ -45,3 +48,22 @@ def test_a_test_that_failed_elsewhere_is_seen() -> None:
     assert "1 of 2 tests pass" in line and "NOT MET" in line
     line = next(t for t in table(figures[:1]).splitlines() if t.startswith("| 31 "))
     assert "1 of 1 tests pass" in line and line.endswith("| ok |")
+
+
+def test_a_row_whose_tests_did_not_run_is_no_success(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor one of whose files none ran; the paths are those of the folder that make began in."""
+    passed = [{"test": f"{file}::a", "passed": True} for file in files()]
+    figures = [{"row": row, "what": "x", "value": 0.0, "wanted": "<= 1", "unit": "", "met": True,
+                "test": "b"} for row in NAMES]  # fmt: skip
+    noted = tmp_path / "figures.jsonl"
+    monkeypatch.setattr("sys.argv", ["table", str(noted), "--all"])
+    noted.write_text("\n".join(json.dumps(entry) for entry in [*figures, *passed]))
+    main()
+    for short in (figures[1:] + passed[1:], [*figures, *passed[:-1]], [*figures, *passed[1:]]):
+        noted.write_text("\n".join(json.dumps(entry) for entry in short))
+        with pytest.raises(SystemExit, match="1"):
+            main()
+    makefile = (ROOT / "Makefile").read_text("utf-8")
+    assert makefile.count("RTID_FAULTS=$(CURDIR)/") == makefile.count("RTID_FAULTS=") == 2

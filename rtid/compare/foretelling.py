@@ -5,9 +5,13 @@ Of every second of motion the mean square of the equation residual of a map is h
     sigma_c^2 = level_c^2 + (TOLERANCE rated flow)^2,    s = mean_c of r_c^2 / sigma_c^2,
 
 level: what the map leaves on nine of ten seconds of the healthy machine.  What a healthy day
-changes is taken out before, bounded: the compliance of each chamber (oil and temperature) and one
-common gain (density).  A second counts as one observation per chamber: what a map misses belongs to
-the place where the machine is.  So with c chambers
+changes is taken out before, bounded: the compliance of each chamber (oil and temperature), one
+common gain (density) and where all edges turn laminar (viscosity),
+
+    Q ~ (dp^2 + p^2)^(-1/4) dp,     p from LAMINAR_DP_PA / THICKER to LAMINAR_DP_PA THICKER.
+
+A second counts as one observation per chamber: what a map misses belongs to the place where the
+machine is.  So with c chambers
 
     log likelihood ratio of "four times the variance" = c / 2 (0.75 min(s, CLIP) - log 4),
 
@@ -26,13 +30,14 @@ from numpy.typing import NDArray
 from rtid.compare.candidate import CandidateMap
 from rtid.compare.comparison import Comparison, compare
 from rtid.estimator.flowmap import SHUT, VALID
+from rtid.estimator.orifice import LAMINAR_DP_PA
 from rtid.model import Machine
 from rtid.plain import BoolArray, FloatArray
 
-TOLERANCE = (
-    0.003  # of the rated flow: a sensor's drift, a valve's repeatability, cold oil at low dp
-)
+TOLERANCE = 0.003  # of the rated flow: a sensor's drift, a valve's repeatability
 COMPLIANCE, GAIN = 0.2, 0.02  # twice what 20 K do: 0.5 % and 0.035 % per K
+THICKER = 2.0  # the viscosity of 20 K: the transition goes with its square, by 4 in all
+COMMON = 2  # nuisances beside those of the chambers: gain, viscosity
 LEAST_MOTION = 0.05  # share of the largest rated flow by which a second counts as motion
 LEAST_ROWS = 10  # known ones, of a second that is judged
 FALSE, MISSED = 1e-6, 1e-3
@@ -92,7 +97,19 @@ def _of_a_day(model: Machine, candidate: CandidateMap) -> list[CandidateMap]:
         compliance = candidate.compliance.copy()
         compliance[k] *= 1 + COMPLIANCE
         softer.append(replace(candidate, compliance=compliance))
-    return [*softer, replace(candidate, theta=(1 + GAIN) * candidate.theta)]
+    gains = (1 + GAIN, 1 + _of_colder(model)[:, None])
+    return [*softer, *(replace(candidate, theta=gain * candidate.theta) for gain in gains)]
+
+
+def _of_colder(model: Machine) -> FloatArray:
+    """What 20 K less change of the flow of each cell (cells,), relative: most at low pressure."""
+    changes = []
+    for edge in model.maps:
+        dp_pa = 0.5 * (edge.grid.dp_pa[1:] + edge.grid.dp_pa[:-1])
+        warm, cold = (np.hypot(dp_pa, LAMINAR_DP_PA * f) for f in (1 / THICKER, THICKER))
+        change = np.sqrt(warm / cold) - 1 if edge.source and edge.sink else np.zeros(len(dp_pa))
+        changes.append(np.broadcast_to(change, edge.grid.shape).ravel())
+    return np.concatenate(changes)
 
 
 def _known(base: Comparison, candidate: CandidateMap) -> BoolArray:

@@ -24,6 +24,7 @@ import numpy as np
 
 from rtid.compare import CandidateMap
 from rtid.compare.foretelling import (
+    COMMON,
     WARM_S,
     Residuals,
     Seconds,
@@ -148,7 +149,8 @@ class Guard:
         """Go on with the `progress` of a process that was ended; times are those of its samples."""
         self._moved = int(progress["moved"])
         self._counts.extend((int(moved), int(known)) for moved, known in progress["counts"])
-        if parts := progress["rows"]:
+        parts, c = progress["rows"], len(self._model.chambers)
+        if parts and np.shape(parts["columns"])[1:] == (c, c + COMMON):  # of this program, and any
             self._rows = Residuals(**{name: np.array(part) for name, part in parts.items()})
 
     def causes(self) -> list[LikelyCause]:

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.samples import ROW, Samples
+from firmware_bridge.samples import GAP, ROW, Samples
 from rtid.model import Chamber, Machine
-from rtid.plain import FloatArray
+from rtid.plain import BoolArray, FloatArray
 from rtid.units import Unit, units_of
 
 WINDOW_S = 0.02
@@ -50,15 +50,16 @@ class Motion:
 
 @dataclass(frozen=True)
 class Windows:
-    """Means of all signals over windows (n, m), and the position's and pressures' change."""
+    """Of windows without a gap: means of all signals, first values and changes (n, m)."""
 
     mean: FloatArray
-    start: FloatArray  # the samples at the windows' borders (n + 1, m)
+    start: FloatArray
+    change: FloatArray
 
 
 def motion(model: Machine, samples: Samples) -> Motion:
     """Judge signs and stiffness from the samples of a trace."""
-    windows = _windows(samples)
+    windows = _windows(model, samples)
     if len(windows.mean) < MIN_WINDOWS:
         nothing = Spring(float("nan"), float("nan"))
         return Motion(float("nan"), {c.name: nothing for c in model.chambers}, float("nan"))
@@ -66,16 +67,25 @@ def motion(model: Machine, samples: Samples) -> Motion:
     return Motion(_u_to_v(model, windows), springs, _v_slope(model, samples))
 
 
-def _windows(samples: Samples) -> Windows:
+def _windows(model: Machine, samples: Samples) -> Windows:
     """Windows of 20 ms, but of two rows at least; each border lies on a row."""
     rows = np.flatnonzero(samples.flags & ROW)
     if len(rows) < 3:
-        return Windows(np.empty((0, len(samples.names))), np.empty((1, len(samples.names))))
+        return Windows(*(np.empty((0, len(samples.names))) for _ in range(3)))
     period_s = float(np.median(np.diff(samples.t_us[rows]))) * 1e-6
     border = rows[:: max(2, round(WINDOW_S / period_s))]
     total = np.concatenate([np.zeros((1, len(samples.names))), np.cumsum(samples.values, axis=0)])
     mean = np.diff(total[border], axis=0) / np.diff(border)[:, None]
-    return Windows(mean, samples.values[border])
+    whole, values = _unbroken(model, samples, border), samples.values[border]
+    return Windows(mean[whole], values[:-1][whole], np.diff(values, axis=0)[whole])
+
+
+def _unbroken(model: Machine, samples: Samples, border: NDArray[np.intp]) -> BoolArray:
+    """Whether the samples between two borders follow one another without a gap, bool (n - 1,)."""
+    step_s = np.diff(samples.t_us) * 1e-6
+    joined = (step_s > 0) & (step_s <= model.gates.max_gap_s) & ((samples.flags[1:] & GAP) == 0)
+    gaps = np.concatenate([[0], np.cumsum(~joined)])
+    return np.asarray(np.diff(gaps[border]) == 0)
 
 
 def _u_to_v(model: Machine, windows: Windows) -> float:
@@ -85,18 +95,17 @@ def _u_to_v(model: Machine, windows: Windows) -> float:
         extends = signs.get(edge.sink, 0) - signs.get(edge.source, 0)
         w = edge.direction * windows.mean[:, model.column(edge.command)]
         push += extends * np.maximum(w, 0.0)
-    moved = np.diff(windows.start[:, model.column(model.position)])
+    moved = windows.change[:, model.column(model.position)]
     size = float(np.sqrt(np.dot(push, push) * np.dot(moved, moved)))
     return float(np.dot(push, moved)) / size if size > 0 else float("nan")
 
 
 def _spring(model: Machine, chamber: Chamber, windows: Windows) -> Spring:
     """Regress the swept volume on V dP and P, each about its mean at equal command."""
-    x = windows.start[:, model.column(model.position)]
-    p = windows.start[:, model.column(chamber.pressure)]
-    volume = chamber.v0_m3 + chamber.sign * chamber.area_m2 * x[:-1]
-    swept = chamber.sign * chamber.area_m2 * np.diff(x)
-    columns = (-volume * np.diff(p), windows.mean[:, model.column(chamber.pressure)], swept)
+    x, p = model.column(model.position), model.column(chamber.pressure)
+    volume = chamber.v0_m3 + chamber.sign * chamber.area_m2 * windows.start[:, x]
+    swept = chamber.sign * chamber.area_m2 * windows.change[:, x]
+    columns = (-volume * windows.change[:, p], windows.mean[:, p], swept)
     stored, level, y = (_about_bin_mean(c, _command_bin(model, windows)) for c in columns)
     phi = np.stack([stored, level], axis=1)
     scale = np.linalg.norm(phi, axis=0)
@@ -132,7 +141,9 @@ def _v_slope(model: Machine, samples: Samples) -> float:
         return float("nan")
     v, dt_s = samples.column(names[0]), np.diff(samples.t_us) * 1e-6
     travelled = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * dt_s)])
-    dx, dv = np.diff(samples.column(model.position)[rows]), np.diff(travelled[rows])
+    whole = _unbroken(model, samples, rows)
+    x = samples.column(model.position)[rows]
+    dx, dv = np.diff(x)[whole], np.diff(travelled[rows])[whole]
     size = float(np.dot(dx, dx))
     return float(np.dot(dx, dv)) / size if size > 0 else float("nan")
 

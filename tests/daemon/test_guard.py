@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from firmware_bridge.samples import GAP
 from rtid.compare.foretelling import (
     FALSE,
     Seconds,
@@ -23,6 +24,7 @@ from rtid.compare.suspects import causes
 from rtid.daemon import guard as guards
 from rtid.daemon import jobs
 from rtid.daemon.analyst import Analyst
+from rtid.daemon.first import against_first
 from rtid.daemon.guard import Guard, State, candidate_of
 from rtid.estimator.estimator import Estimator, to_chunk
 from rtid.estimator.published import publish
@@ -30,7 +32,7 @@ from rtid.plain import FloatArray
 from rtid.sim.run import Run
 from rtid.sim.simulated_plant import SimulatedPlant
 from rtid.trace.snapshot import WATCH_FILE, Generations
-from tests.campaign.guarding import FAULTS, Bench, Simulated
+from tests.campaign.guarding import FAULTS, Bench, Simulated, oil
 from tests.faults.harness import fault_free, machine
 
 
@@ -74,6 +76,44 @@ def test_a_leak_of_two_percent_is_told_from_a_healthy_machine_and_named(bench: B
     assert judged.contradicts and not judged.foretold
     first = causes(model, candidate, sick, level)[0]
     assert first.text.startswith("a leak from a to b") and not first.of_sensor
+
+
+def test_cold_oil_that_turns_laminar_earlier_is_a_healthy_day(bench: Bench) -> None:
+    """At a low supply most of the flow passes at a low pressure: 20 K less take a tenth of it."""
+    model, solution = machine().project.model, fault_free()
+    candidate, level = candidate_of(solution, publish(solution)), 0.003 * rated_m3s(model)
+    cold = replace(oil(bench.plant, -20.0), p_supply_pa=0.8 * bench.plant.p_supply_pa)
+    rows = residuals(model, candidate, chunk_of(bench.run(12.0, 3, "dither", plant=cold)))
+    judged = seconds(model, in_motion(model, rows), np.full(2, level))
+    assert len(judged.t_s) >= 10 and (judged.squares.mean(axis=0) < 0.3).all()
+
+
+@pytest.mark.parametrize("flag", [0, GAP])
+def test_a_gap_speaks_against_no_sensor(bench: Bench, flag: int) -> None:
+    """The bus was off for 8 of 20 s: what a velocity would have moved meanwhile, it has not."""
+    model, chunk = machine().project.model, chunk_of(bench.run(20.0, 3))
+    heard = np.concatenate([chunk[:8000], chunk[16000:]])
+    heard[8000, 1] = int(heard[8000, 1]) | flag
+    assert against_first(model, heard, fault_free()) == ()
+
+
+def test_a_proof_goes_on_behind_a_kill_whatever_it_had_seen(bench: Bench) -> None:
+    """Nothing in motion yet, or what a program before has counted with other nuisances."""
+    model, solution = machine().project.model, fault_free()
+    candidate, chunk = candidate_of(solution, publish(solution)), chunk_of(bench.run(8.0, 3))
+    level = np.full(2, 0.003 * rated_m3s(model))
+    still, others = (Guard(model, candidate, level, "proving") for _ in range(2))
+    at_rest = np.repeat(chunk[:1], 4000, axis=0)
+    at_rest[:, 0] += 1e-3 * np.arange(4000)
+    pushed(still, at_rest)
+    pushed(others, chunk)
+    assert others.progress["moved"] > 0
+    earlier = others.progress
+    earlier["rows"]["columns"] = np.array(earlier["rows"]["columns"])[..., :-1].tolist()
+    for progress in (still.progress, earlier):
+        again = Guard(model, candidate, level, "proving")
+        again.resume(progress)
+        assert pushed(again, chunk)[-1] == "proving"
 
 
 def test_the_sequential_test_keeps_its_word() -> None:

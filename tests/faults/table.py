@@ -1,6 +1,7 @@
-"""All faults as one table: `python -m tests.faults.table FIGURES.jsonl` (see `make faults`).
+"""All faults as one table: `python -m tests.faults.table FIGURES.jsonl [--all]`; `make faults`.
 
-Each row has its figures, or how many of its tests passed elsewhere, or says why it has none.
+Each row has its figures, or how many of its tests passed elsewhere, or says why it has none.  With
+--all it ends with 1 where a row has missed a figure, or tests of its did not run.
 """
 
 from __future__ import annotations
@@ -29,6 +30,9 @@ NAMES = {
 }  # fmt: skip
 
 
+NOT_MET, NOT_RUN = "**NOT MET**", "**NOT RUN**"
+
+
 def table(figures: list[dict[str, object]]) -> str:
     """Markdown: per row its figures, what passed elsewhere, or why there is nothing."""
     passed = _passed(figures)
@@ -42,7 +46,7 @@ def _of(row: int, figures: list[dict[str, object]], passed: dict[str, list[bool]
     """What is said of one row, each in the last four columns."""
     lines = []
     for entry in (entry for entry in figures if entry.get("row") == row):
-        met = "ok" if entry["met"] else "**NOT MET**"
+        met = "ok" if entry["met"] else NOT_MET
         lines.append(
             f"{entry['what']} | {float(str(entry['value'])):.4g} {entry['unit']} | "
             f"{entry['wanted']} | {met if entry['wanted'] else ''}"
@@ -50,13 +54,14 @@ def _of(row: int, figures: list[dict[str, object]], passed: dict[str, list[bool]
     if row in ELSEWHERE:
         what, where = ELSEWHERE[row]
         outcomes = [outcome for file in where for outcome in passed.get(file, ())]
-        met = "ok" if outcomes and all(outcomes) else "**NOT MET**" if outcomes else "not run"
+        is_whole = all(passed.get(file) for file in where)
+        met = NOT_MET if not all(outcomes) else "ok" if is_whole else NOT_RUN
         count = f"{sum(outcomes)} of {len(outcomes)} tests pass"
         lines.append(f"{what} ({', '.join(where)}) | {count} | all | {met}")
     if row in IN_SOAK and not lines:
         lines.append(f"{IN_SOAK[row]} | | | in `make soak`")
     if not lines:
-        lines.append(f"{NOT_TESTED.get(row, 'its test did not run')} | | | not tested")
+        lines.append(f"{NOT_TESTED.get(row, 'its test did not run')} | | | {NOT_RUN}")
     return lines
 
 
@@ -70,10 +75,13 @@ def _passed(figures: list[dict[str, object]]) -> dict[str, list[bool]]:
 
 
 def main() -> None:
-    """Print the table."""
+    """Print the table; with --all, end with 1 where it is not as it must be."""
     path = Path(sys.argv[1])
     text = path.read_text("utf-8") if path.exists() else ""
-    print(table([json.loads(line) for line in text.splitlines()]))
+    told = table([json.loads(line) for line in text.splitlines()])
+    print(told)
+    if "--all" in sys.argv and (NOT_MET in told or NOT_RUN in told):
+        sys.exit(1)
 
 
 if __name__ == "__main__":
