@@ -142,7 +142,7 @@ _SHAPES: dict[str, Callable[[FloatArray], FloatArray]] = {
 def term_rates(
     model: Machine, term: Term, values: FloatArray, end: IntArray, dt: FloatArray
 ) -> FloatArray:
-    """(intervals, 2): flow of a shared term for theta = 1 at the start and end of each interval."""
+    """(intervals, 2), m3/s: flow of a shared term, theta = 1, at both ends of each interval."""
     z = np.full(len(values), term.constant)
     for name, weight in term.weights:
         z += weight * values[:, model.column(name)]
