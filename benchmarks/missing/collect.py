@@ -3,9 +3,9 @@
     python -m benchmarks.missing.collect FOLDER METHOD MOST     what a child of `__main__` does
 
 A method is warmed up on a cut of the first record (compilers, caches), then every record's `learn`
-and `predict` are timed by the process's own clock, on one thread.  Memory is the peak of the
-child so far above what it had with the first record loaded.  What was done is not done again:
-results are lines of JSON.
+and `predict` are timed by the process's own clock, on one thread.  Memory is the child's peak over
+what it had with that record loaded (Linux: VmHWM, which a 5 in clear_refs sets back; ru_maxrss
+begins at the parent's).  What was done is not done again: results are lines of JSON.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from __future__ import annotations
 import hashlib
 import json
 import pickle
-import resource
 import sys
 import time
 import warnings
@@ -61,20 +60,20 @@ def digest(case: Case) -> str:
 
 def run_all(folder: Path, method: Method, most: int) -> Iterator[dict[str, Any]]:
     """Results of a method on the first `most` records of a folder that lack one, one by one."""
-    warm, base_mib = True, 0.0
+    warm = True
     done = {line["case"] for line in results(folder, method.name())}
     for stem, for_all in json.loads((folder / ORDER).read_text())[:most]:
         if stem in done or not (for_all or says_names(method)):
             continue
         path = folder / "records" / f"{stem}.pickle"
         case: Case = pickle.loads(path.read_bytes())
-        base_mib = base_mib or _now_mib()
         try:
             if warm:
                 _warm_up(method, case.train)
                 warm = False
+            before = _from_here_mib()
             line = {"case": path.stem, "method": method.name()} | one_case(case, method)
-            yield line | {"memory_mib": _peak_mib() - base_mib}
+            yield line | {"memory_mib": _peak_mib() - before}
         except NotForThisError:
             continue
 
@@ -121,12 +120,15 @@ def failed_score(method: Method) -> Score:
 
 
 def _peak_mib() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / MIB
+    """The largest resident memory since `_from_here_mib`, MiB."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / MIB
 
 
-def _now_mib() -> float:
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * resource.getpagesize() / 2**20
+def _from_here_mib() -> float:
+    """Begin the peak anew: what is resident now, MiB."""
+    Path("/proc/self/clear_refs").write_text("5")
+    return _peak_mib()
 
 
 def file_of(folder: Path, method: str) -> Path:

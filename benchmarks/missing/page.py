@@ -12,11 +12,15 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.text import Text
+from matplotlib.transforms import Bbox
 from scipy.stats import spearmanr
 
 from benchmarks.missing.record import OUTSIDE
@@ -37,7 +41,8 @@ from tools.readme_pictures import shrink
 ROOT = Path(__file__).parents[2]
 PAGE, PICTURE = ROOT / "docs" / "benchmark.md", ROOT / "tools" / "pictures" / "benchmark.png"
 EQUATIONS = "equations"
-LABEL = 0.07  # height of a label in the picture, decades
+AWAY, TURNS = (10, 20, 32, 48, 64), np.radians([0, 20, -20, 160, 200, 50, -50, 130, -130])
+LEADER = {"arrowstyle": "-", "lw": 0.5, "color": "0.5"}
 OURS = ("rtid", "rtid, map alone")
 Line = dict[str, Any]
 Keep = Callable[[Line], bool]
@@ -199,7 +204,7 @@ def of_simulators(measured: Measured) -> Iterator[str]:
 def of_equations(measured: Measured) -> Iterator[str]:
     """Plants by equations: free run on other inputs, in per cent of the output's spread."""
     lines = common(measured.where(lambda r: r["simulator"] == EQUATIONS))
-    kinds = list(dict.fromkeys((r["law"], bool(r["hidden"])) for r in lines))
+    kinds = sorted({(r["law"], bool(r["hidden"])) for r in lines})
     rows = []
     for method in measured.methods(lines):
         of = [r for r in lines if r["method"] == method]
@@ -217,9 +222,8 @@ def of_equations(measured: Measured) -> Iterator[str]:
 def of_losses(measured: Measured) -> Iterator[str]:
     """Records on which another method is as good as rtid or better, by what is measured."""
     keys = {"unseen": "unseen", "map_error": "map", "beta_error": "beta"}
-    lines, rows, asked = measured.where(valves_for_all), [], Counter[str]()
-    equations = measured.where(lambda r: r["simulator"] == EQUATIONS)
-    for case in dict.fromkeys(r["case"] for r in [*lines, *equations]):
+    rows, asked = [], Counter[str]()
+    for case in dict.fromkeys(r["case"] for r in measured.lines):
         for key, word in keys.items():
             of = {r["method"]: r[key] for r in measured.lines if r["case"] == case}
             peers = {m: v for m, v in of.items() if m not in OURS and v is not None}
@@ -266,23 +270,42 @@ def of_seeds(first: Measured, others: list[Measured]) -> Iterator[str]:
 def picture(measured: Measured, path: Path) -> None:
     """Error on unseen motion against processor time, one point per method."""
     lines = common(measured.where(lambda r: valves_for_all(r) and not r["hidden"]))
-    figure, axes = plt.subplots(figsize=(8.4, 4.6))
-    labels: list[tuple[float, float]] = []
-    for method in sorted(measured.methods(lines), key=lambda m: m not in OURS):
-        of = [r for r in lines if r["method"] == method]
-        x, y = max(median(of, "learn_s"), 1e-2), 100 * median(of, "unseen")
-        axes.plot(x, y, "k*" if method in OURS else "o", ms=12 if method in OURS else 5)
-        at = np.log10(x) + 0.03, np.log10(y) + 0.03
-        while any(abs(at[0] - q[0]) < 0.9 and abs(at[1] - q[1]) < LABEL for q in labels):
-            at = at[0], at[1] - LABEL
-        labels.append(at)
-        axes.annotate(method, (x, y), xytext=(10 ** at[0], 10 ** at[1]), fontsize=8)
+    figure, axes = plt.subplots(figsize=(8.4, 4.8))
     axes.set(xscale="log", yscale="log", xlabel="processor time to learn 32 s of record, s",
              ylabel="error on unseen motion, % of the flow")  # fmt: skip
     axes.grid(alpha=0.3, which="both")
     axes.margins(0.14)
+    points: dict[str, tuple[float, float]] = {}
+    for method in measured.methods(lines):
+        of = [r for r in lines if r["method"] == method]
+        points[method] = max(median(of, "learn_s"), 1e-2), 100 * median(of, "unseen")
+        ours = method in OURS
+        axes.plot(*points[method], "k*" if ours else "C0o", ms=12 if ours else 5)
+    _label(axes, points)
     figure.savefig(path, dpi=110, bbox_inches="tight")
     plt.close(figure)
+
+
+def _label(axes: Axes, points: dict[str, tuple[float, float]]) -> None:
+    """Each name at the nearest place, AWAY points off, that nothing else has taken."""
+    renderer = axes.figure.canvas.get_renderer()  # type: ignore[attr-defined]
+    axes.figure.draw(renderer)
+    taken = [Bbox.from_bounds(x - 7, y - 7, 14, 14)
+             for x, y in axes.transData.transform(list(points.values()))]  # fmt: skip
+    for method, at in points.items():
+        for far, turn in product(AWAY, TURNS):
+            offset, leader = (far * np.cos(turn), far * np.sin(turn)), far > AWAY[0]
+            text = axes.annotate(
+                method, at, offset, textcoords="offset points", fontsize=8, va="center",
+                ha="left" if offset[0] > 0 else "right", arrowprops=LEADER if leader else None,
+            )  # fmt: skip
+            text.update_positions(renderer)
+            box = Text.get_window_extent(text)  # without its leader
+            inside = axes.bbox.x0 < box.x0 and box.x1 < axes.bbox.x1
+            if inside and not any(box.overlaps(other) for other in taken):
+                taken.append(box)
+                break
+            text.remove()
 
 
 def head(measured: Measured) -> Iterator[str]:

@@ -39,6 +39,7 @@ from rtid.plants.fitted import PlantModel
 from rtid.plants.plant import PlantRecord
 from rtid.plants.validation import on_record
 from rtid.study.known_effects import acting, learn_beside
+from rtid.study.quick_machine import dp_grid
 
 COARSE_V = np.array([1.0, 1.4, 1.8, 2.2, 2.6, 3.2, 4.0, 5.0, 6.5, 8.0, 10.0])
 COARSE_PA = 1e6 * np.array([-0.3, 0.0, 0.25, 0.7, 1.5, 2.5, 4.0, 6.0])
@@ -121,6 +122,20 @@ def beside(fit: Fit, chunk: FloatArray) -> Asked:
     return Asked(record, publish(record.solution), calm)
 
 
+def on_its_grid(record: Record) -> Machine:
+    """The declared machine with the drops that the record has, as `rtid quick` lays its grids.
+
+    The declared commands stay, up to a largest one that the sensor has rounded up.
+    """
+    machine, edges = record.machine, []
+    for edge in record.machine.edges:
+        w = edge.direction * record.column(edge.command)
+        dp = (record.column(edge.source) - record.column(edge.sink))[w > edge.safe_band_v]
+        u = np.append(edge.grid.u_v[:-1], max(edge.grid.u_v[-1], 1.001 * w.max()))
+        edges.append(replace(edge, grid=Grid(u, dp_grid(dp.min(), dp.max()))))
+    return replace(machine, edges=tuple(edges))
+
+
 class RtidMap:
     """What `rtid replay` learns: no diagnosis, nothing is added."""
 
@@ -129,9 +144,9 @@ class RtidMap:
         return "rtid, map alone"
 
     def learn(self, train: Record) -> Learned:
-        """The map of the declared machine."""
+        """The map on a grid of the record."""
         chunk = train.chunk
-        return beside(fitted(train.machine, chunk), chunk).learned(None)
+        return beside(fitted(on_its_grid(train), chunk), chunk).learned(None)
 
 
 class Rtid:
@@ -146,7 +161,7 @@ class Rtid:
     def learn(self, train: Record) -> Learned:
         """The map, the effects, and their names."""
         try:
-            model, chunk = train.machine, train.chunk
+            model, chunk = on_its_grid(train), train.chunk
         except NotForThisError:
             return _equations(train)
         taught = round(JUDGING * len(chunk))
