@@ -29,7 +29,8 @@ from rtid.effects.terms import LEAST_PA, MOST_PA, SHIFTS_PA, shares, terms_of
 from rtid.estimator.batch import column_rates, term_rates
 from rtid.estimator.factor import misfit
 from rtid.estimator.flowmap import VALID, FlowMap
-from rtid.estimator.record import run
+from rtid.estimator.published import publish
+from rtid.estimator.record import RecordFit, run
 from rtid.estimator.solution import solve
 from rtid.estimator.state import nominal_weights
 from rtid.estimator.sums import Sums
@@ -38,14 +39,17 @@ from rtid.maps.files import read_map
 from rtid.model import Machine, Term
 from rtid.plain import FloatArray
 from rtid.sim.hidden import hide_wish
+from rtid.sim.random_plants import draw
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import SimulatedPlant
 from rtid.study.compared import TraceComparison, study
-from rtid.study.known_effects import acting, learn_beside, told
+from rtid.study.known_effects import acting, learn_acting, learn_beside, told
 from rtid.study.revisions import add
 from rtid.study.study import Study
 from rtid.tell.added import sentences
+from rtid.tell.charts.points import spread_points
+from rtid.units import MPA
 from tests.diagnose.records import record
 from tests.estimator.cases import draw_case
 from tests.replays import shared_replays  # noqa: F401
@@ -198,6 +202,29 @@ def stored(model: Machine, term: Term, values: FloatArray) -> float:
         return 0.0
     taken = term_rates(model, term, values, np.array([1]), np.ones(1))
     return -float(taken[0, 0])
+
+
+def test_a_drift_acts_on_blocks_as_well_that_the_fit_had_to_leave_out() -> None:
+    """The fit is of a third of the record, the maps are of all of it."""
+    model, chunk, _ = record("valve_gain_drift", 0.09)
+    third, plant = len(chunk) // 3, draw(3)
+    drift = Candidate("valve_gain_drift", "all valves", "relative_change", "1", 1.0, sign=0)
+    weights = prepare(model, chunk[:third])
+    seen = fit(model, chunk[:third], weights, Revision((drift,)), bank=False)
+    acts = acting(seen, chunk)
+    once, twice = learn_beside(seen, acts, acts.chunk), learn_acting(seen, chunk)[1]
+
+    def error(learned: RecordFit) -> float:
+        """Mean of all valves at the points of the record, of the largest flow."""
+        flowmap, shares = publish(learned.solution), []
+        for edge in model.edges:
+            points = spread_points(model, edge, chunk, 300).T
+            true = plant.flow(edge.name, points[0], points[1] / MPA)
+            off = flowmap.flow(edge.name, points[0], points[1] / MPA) - true
+            shares.append(np.nanmean(np.abs(off)) / np.abs(true).max())
+        return float(np.mean(shares))
+
+    assert error(twice) < 0.7 * error(once)
 
 
 HIDDEN = {"clean": "", "leak": LEAK, "delay": DELAY, "drift": DRIFT}

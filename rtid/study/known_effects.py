@@ -48,6 +48,7 @@ from rtid.project import Project
 from rtid.study.kept_record import MessageAges, Replay, taught_s, within
 from rtid.trace.reading import Trace
 
+ALL = (-math.inf, math.inf)
 ALONE = 1e-4  # share by which the terms of one effect may differ from each other
 
 
@@ -172,6 +173,22 @@ def learn_beside(fit: Fit, machine: Acting, chunk: FloatArray) -> RecordFit:
     return RecordFit(solution, weights, lag_sd_s, np.zeros(0), np.zeros(0))
 
 
+def learn_acting(
+    fit: Fit, chunk: FloatArray, taught: tuple[float, float] = ALL
+) -> tuple[Acting, RecordFit]:
+    """The machine with the effects of a steady fit, and the maps that the taught span gives it.
+
+    chunk (n, 2 + signals), SI, as declared; taught: s.  Twice where an effect acts on the valves'
+    flows: the maps know blocks that the fit had to leave out, and the effect acts there as well.
+    """
+    acts = acting(fit, chunk)
+    record = learn_beside(fit, acts, within(acts.chunk, taught))
+    if acts.measured:
+        acts = acting(fit, chunk, publish(record.solution))
+        record = learn_beside(fit, acts, within(acts.chunk, taught))
+    return acts, record
+
+
 def replayed(
     project: Project, present: Fit, machine: Machine, trace: Trace, ages: MessageAges
 ) -> tuple[Replay, Fit]:
@@ -182,8 +199,8 @@ def replayed(
     """
     fit = steady(present)
     whole = to_chunk(machine, trace.samples, int(trace.samples.t_us[0]))
-    acts = acting(fit, usable(fit.declared, whole))
-    record = _record_of(present, fit, acts, within(acts.chunk, taught_s(project)))
+    acts, record = learn_acting(fit, usable(fit.declared, whole), taught_s(project))
+    record = _judged(present, record)
     added = known_effects(present, acts, [section.key for section in project.sections.added])
     record = replace(record, offsets_s=ages.offsets_s, offsets_sd_s=ages.sd_s)
     made = held_against(project, fit.declared, fit, machine, trace, record, added)
@@ -194,12 +211,11 @@ def learned(model: Machine, chunk: FloatArray) -> RecordFit:
     """What a record, chunk (n, 2 + signals), SI, tells of a machine that nothing was added to."""
     present = fitted(model, chunk)
     fit = steady(present)
-    return _record_of(present, fit, acting(fit, fit.chunk), fit.chunk)
+    return _judged(present, learn_acting(fit, fit.chunk)[1])
 
 
-def _record_of(present: Fit, fit: Fit, acts: Acting, chunk: FloatArray) -> RecordFit:
+def _judged(present: Fit, record: RecordFit) -> RecordFit:
     """The maps beside the steady fit, judged by the one that excuses few blocks."""
-    record = learn_beside(fit, acts, chunk)
     solution = replace(record.solution, rho=present.rho, dof=round(present.freedom))
     return replace(record, solution=solution)
 

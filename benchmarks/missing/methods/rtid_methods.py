@@ -38,7 +38,7 @@ from rtid.plants import diagnose
 from rtid.plants.fitted import PlantModel
 from rtid.plants.plant import PlantRecord
 from rtid.plants.validation import on_record
-from rtid.study.known_effects import acting, learn_beside
+from rtid.study.known_effects import acting, learn_acting
 from rtid.study.quick_machine import dp_grid
 
 COARSE_V = np.array([1.0, 1.4, 1.8, 2.2, 2.6, 3.2, 4.0, 5.0, 6.5, 8.0, 10.0])
@@ -117,8 +117,7 @@ def _softness(fit: Fit, chunk: FloatArray) -> FloatArray:
 def beside(fit: Fit, chunk: FloatArray) -> Asked:
     """The published map of a record, chunk (n, 2 + signals), beside the effects of a fit."""
     calm = steady(fit)
-    acts = acting(calm, usable(calm.declared, chunk))
-    record = learn_beside(calm, acts, acts.chunk)
+    _, record = learn_acting(calm, usable(calm.declared, chunk))
     return Asked(record, publish(record.solution), calm)
 
 
