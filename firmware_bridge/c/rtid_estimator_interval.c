@@ -197,6 +197,61 @@ static void change_block(rtid_estimator *e, int i)
     }
 }
 
+#if RTID_EST_N_TERMS > 0
+static rtid_real argument(const term_row *row, const rtid_real *values)
+{
+    rtid_real z = row->constant;
+    for (int j = 0; j < RTID_EST_N_SIGNALS; j++) {
+        z += row->weight[j] * values[j];
+    }
+    return z;
+}
+
+static rtid_real shaped(const term_row *row, const rtid_real *values)
+{
+    rtid_real z = argument(row, values);
+    switch (row->shape) {
+    case SIGNED_ROOT: z = (z < R(0)) ? -ROOT(-z) : ROOT(z); break;
+    case HINGE: z = (z > R(0)) ? z : R(0); break;
+    case INVERSE: z = R(-1) / z; break;
+    default: break; /* LINEAR */
+    }
+    return z;
+}
+#endif
+
+#if RTID_EST_SOFT_TERMS > 0
+static const rtid_real LEAST_Z = R(1e-12); /* below which a root is no steeper */
+
+static rtid_real steepness(const term_row *row, const rtid_real *values)
+{
+    const rtid_real z = argument(row, values), size = (z < R(0)) ? -z : z;
+    rtid_real slope = R(1);
+    switch (row->shape) {
+    case SIGNED_ROOT: slope = R(0.5) / ROOT((size > LEAST_Z) ? size : LEAST_Z); break;
+    case HINGE: slope = (z > R(0)) ? R(1) : R(0); break;
+    case INVERSE: slope = R(1) / (z * z); break;
+    default: break; /* LINEAR */
+    }
+    return slope;
+}
+
+/* What the rate terms, at theta = 1, store per pressure of the chamber: V scale df/dp. */
+static rtid_real softness(const rtid_estimator *e)
+{
+    rtid_real sum = R(0);
+    for (int k = 0; k < RTID_EST_N_TERMS; k++) {
+        const term_row *row = &TERMS[k];
+        const rtid_real weight = row->weight[RTID_EST_P];
+        if ((row->rate != 0u) && (weight != R(0))) {
+            const rtid_real v = (row->volume != 0u) ? volume(e->values[RTID_EST_X]) : R(1);
+            sum += row->sign * row->scale * weight * v * steepness(row, e->values);
+        }
+    }
+    return sum;
+}
+#endif
+
 static rtid_real column_variance(const rtid_estimator *e)
 {
     const rtid_real w = volume(e->values[RTID_EST_X]) * COMPLIANCE;
@@ -205,7 +260,11 @@ static rtid_real column_variance(const rtid_estimator *e)
 
 static rtid_real position_noise(const rtid_estimator *e)
 {
-    return (AREA * AREA * X_VAR) + column_variance(e);
+    rtid_real stored = volume(e->values[RTID_EST_X]) * COMPLIANCE;
+#if RTID_EST_SOFT_TERMS > 0
+    stored += softness(e);
+#endif
+    return (AREA * AREA * X_VAR) + (stored * stored * P_VAR);
 }
 
 static void start_whitener(rtid_estimator *e)
@@ -266,21 +325,6 @@ static void shared_increments(rtid_estimator *e, const rtid_real *now)
 }
 
 #if RTID_EST_N_TERMS > 0
-static rtid_real shaped(const term_row *row, const rtid_real *values)
-{
-    rtid_real z = row->constant;
-    for (int j = 0; j < RTID_EST_N_SIGNALS; j++) {
-        z += row->weight[j] * values[j];
-    }
-    switch (row->shape) {
-    case SIGNED_ROOT: z = (z < R(0)) ? -ROOT(-z) : ROOT(z); break;
-    case HINGE: z = (z > R(0)) ? z : R(0); break;
-    case INVERSE: z = R(-1) / z; break;
-    default: break; /* LINEAR */
-    }
-    return z;
-}
-
 static void term_increments(rtid_estimator *e, const rtid_real *now)
 {
     for (int k = 0; k < RTID_EST_N_TERMS; k++) {
@@ -370,7 +414,7 @@ static void add_row(rtid_sum (*local)[RTID_EST_WIDTH], const rtid_real *row, int
 /* A row of all columns and their decay, by the Kalman whitener; see rtid/kernels/rows.py. */
 static void make_row(rtid_estimator *e)
 {
-    const rtid_real v = column_variance(e), r = (AREA * AREA * X_VAR) + v, s = e->cov + r;
+    const rtid_real v = column_variance(e), r = position_noise(e), s = e->cov + r;
     const rtid_real scale = R(1) / ROOT(s), keep = r / s, lost = R(1) - keep;
     const int n = e->width;
     rtid_real row[RTID_EST_WIDTH];

@@ -23,6 +23,7 @@ from rtid.diagnose.trials import AcceptedEffect, detection_limit, physical
 from rtid.diagnose.verdict import MATERIAL, UNKNOWN, doubts_about, most_rho
 from rtid.effects import catalogue
 from rtid.effects.column import Candidate
+from rtid.effects.law import is_of_rates
 from rtid.effects.laws.timing import COMMAND, RATE
 from rtid.estimator.validity import Doubt
 from rtid.plain import Key, plain
@@ -259,10 +260,13 @@ def _not_found(result: Result) -> tuple[Unseen, ...]:
         if key not in listed
     ]
     named = {u.effect for u in seen} | {key[0] for key in listed}
+    has_pressures = result.last.declared.has_pressures
     absent = [
         Unseen(name, "", None, "", False, f"{NOBODY_LOOKED} {page.visible_when}", examined=False)
         for name, page in (dict(catalogue()) | {s.name: s for s in result.last.suspects}).items()
-        if page.kind in HYDRAULIC and name not in named
+        if page.kind in HYDRAULIC
+        and name not in named
+        and not (has_pressures and is_of_rates(page))
     ]
     return tuple(seen + absent)
 

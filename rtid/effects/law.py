@@ -415,6 +415,11 @@ def needs_no_pressure(effect: Effect) -> bool:
     return bool(effect.into) or not any(n.startswith(("p_", "V_", "A_")) for n in names - {"A"})
 
 
+def is_of_rates(effect: Effect) -> bool:
+    """True for an effect between a command and a rate: no machine with pressures has it."""
+    return effect.law in OF_RATES or PORT in effect.places
+
+
 def fitted_names(effect: Effect) -> frozenset[str]:
     """Which of MODULUS and LENGTH multiply the coefficient: a fit knows them better than a column.
 

@@ -228,6 +228,10 @@ def _cells(cells: np.ndarray) -> Iterator[str]:
 
 
 def _terms(e: np.void, model: Machine) -> Iterator[str]:
+    soft = sum(
+        bool(t.rate and dict(t.weights).get(model.chambers[0].pressure)) for t in model.terms
+    )
+    yield f"#define RTID_EST_SOFT_TERMS {soft}"
     if not model.terms:
         return
     what = "shape, rate, times V; scale, sign, constant, weights of the columns"
