@@ -63,7 +63,8 @@ def test_offer_apply_and_undo_beside_a_running_daemon(tmp_path: Path) -> None:
         for _ in at.patiently():
             if offered.exists(at.folder):
                 break
-        sending.kill()  # so that no other offer follows
+        sending.kill()  # so that no other offer follows what was on its way
+        at.wait(lambda status: all(message.verdict == "silent" for message in status.messages))
         assert listener.heard == [], "a daemon that is not armed has sent something"
 
         it = Neighbour(at.group, Controller(), lambda data, _: [data], "udp_multicast")
