@@ -20,7 +20,7 @@ from firmware_bridge.sources.formats import suffixes
 from rtid.cli import main
 from rtid.cli.exits import Exit
 from rtid.cli.export import RECORDED
-from rtid.cli.teaching import EXAMPLES, PANELS
+from rtid.cli.teaching import EXAMPLES, PANELS, next_step
 from rtid.daemon import wording
 from rtid.diagnose import verdict
 from rtid.effects import Effect
@@ -202,3 +202,15 @@ def test_the_notebook_tells_its_story(
     assert "internal_leakage_laminar at a-b" in printed
     assert len(kept) == len(printed.splitlines()), "run it again and keep its outputs"
     assert space["after"].held[0].beta_pa == pytest.approx(space["worn"].beta_pa, rel=0.02)
+
+
+@pytest.mark.parametrize("outcome", [
+    verdict.MATCHES, verdict.MISSING, verdict.AMBIGUOUS, verdict.UNKNOWN, verdict.INSUFFICIENT,
+])  # fmt: skip
+def test_what_is_next_goes_by_the_verdict(outcome: str) -> None:
+    given = {"trace": Path("run.blf"), "project": Path("machine.toml")}
+    step = next_step("diagnose", given, outcome)
+    assert ("rtid add " in step) == (outcome == verdict.MISSING)
+    commands = re.findall(r"rtid (\w+)", step)
+    assert commands
+    assert set(commands) <= set(EXAMPLES)

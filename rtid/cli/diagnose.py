@@ -26,7 +26,7 @@ def diagnose(
     as_json: AsJson = False,
     units: UnitsOption = System.DISPLAY,
     no_cache: NoCache = False,
-) -> None:
+) -> str:
     """Say which physical effect is missing, how large it is, and what could not be seen.
 
     Verdicts: matches, missing (an effect has a name), ambiguous (one of a set), unknown (something
@@ -60,6 +60,7 @@ def diagnose(
     refuse_truncated(study.path, study.counters)
     if any(doubt.is_invalid for doubt in diagnosed.doubts):
         raise typer.Exit(Exit.NEGATIVE)
+    return diagnosed.verdict
 
 
 def _drawn(charts: tuple[Chart, ...], folder: Path, suffix: str) -> list[Path]:

@@ -83,8 +83,8 @@ def _function(name: str) -> Callable[..., Any]:
 
     @wraps(function)
     def told(**given: Any) -> None:
-        function(**given)
-        if step := next_step(name, given):
+        outcome = function(**given)
+        if step := next_step(name, given, outcome):
             print(step)
 
     return told

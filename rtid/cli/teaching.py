@@ -51,12 +51,21 @@ NEXT = {
     "simulate": "rtid diagnose {trace} -p {project}",
     "replay": "rtid diagnose {trace} -p {project}",
     "compare": "rtid diagnose {trace} -p {project}",
-    "diagnose": "rtid add {trace} -p {project} adds what is named; rtid ui {trace} -p {project}",
-    "add": "rtid report {trace} -p {project}; rtid export {trace} maps.dcm -p {project}",
+    "diagnose": "rtid ui {trace} -p {project}",
+    "diagnose missing": "rtid add {trace} -p {project} adds what is named; "
+    "rtid ui {trace} -p {project} shows it",
+    "diagnose ambiguous": "rtid excite -p {project} --out motion.csv designs a motion that tells "
+    "them apart; rtid ui {trace} -p {project} shows them",
+    "diagnose matches": "rtid export {trace} maps.csv -p {project}; "
+    "rtid report {trace} -p {project}",
+    "diagnose unknown": "rtid ui {trace} -p {project} shows where the model fails, and over what",
+    "diagnose insufficient_data": "rtid excite -p {project} --out motion.csv designs a motion that "
+    "shows more",
+    "add": "rtid report {trace} -p {project}; rtid export {trace} maps.csv -p {project}",
     "drop": "rtid diagnose {trace} -p {project}",
     "undo": "rtid history -p {project}",
     "history": "rtid diagnose TRACE -p {project}; rtid undo -p {project} takes a change back",
-    "report": "open it and print it; rtid export {trace} maps.dcm -p {project}",
+    "report": "open it and print it; rtid export {trace} maps.csv -p {project}",
     "excite": "drive it, record it, and rtid check RECORD -p {project}",
     "status": "rtid ui {project} shows it in the browser",
     "accept": "rtid status {project}",
@@ -77,8 +86,11 @@ def panel(command: str) -> str:
     return next(title for title, names in PANELS.items() if command in names)
 
 
-def next_step(command: str, given: Mapping[str, Any]) -> str:
-    """What to do behind a command, with the files that it was given; "" for nothing."""
+def next_step(command: str, given: Mapping[str, Any], outcome: str | None = None) -> str:
+    """What to do behind a command, with the files that it was given; "" for nothing.
+
+    outcome: what the command has found, where that decides.
+    """
     if command not in NEXT or any(given.get(name) for name in QUIET):
         return ""
     words = [given[name] for name in FILES if given.get(name)]
@@ -88,4 +100,5 @@ def next_step(command: str, given: Mapping[str, Any]) -> str:
     if command == "simulate":
         project = str(Path(trace).with_suffix(".toml"))
     beside = str(given.get("where") or "PROJECT")  # a state folder
-    return f"Next: {NEXT[command].format(trace=quote(trace), project=quote(project or beside))}"
+    step = NEXT.get(f"{command} {outcome}", NEXT[command])
+    return f"Next: {step.format(trace=quote(trace), project=quote(project or beside))}"
