@@ -10,6 +10,7 @@ from __future__ import annotations
 import getpass
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from math import log10
 from pathlib import Path
 
@@ -42,6 +43,15 @@ DOTS = {"ok": "ok", "open": "ok", "late": "warn", "reopening": "warn", "suspende
 Clock = Callable[[], float]
 
 
+@dataclass(frozen=True)
+class Question:
+    """What the user has to confirm: of what, in HTML, and whether yes may be said."""
+
+    about: str
+    html: str
+    may_go: bool = True
+
+
 class Live:
     """The status of a daemon that keeps its state in a folder; None: there is none."""
 
@@ -53,14 +63,15 @@ class Live:
         self._recent, self._history, self._history_s = Recent(), "", -HISTORY_S
         self.days = DAYS[1]
 
-    def fragments(self, asking: str = "") -> dict[str, str]:
-        """HTML by place, from the newest status; asking: what the user has to confirm."""
+    def fragments(self, asking: Question | None = None, follows: bool = False) -> dict[str, str]:
+        """HTML by place, from the newest status; follows: another browser decides."""
         self.hear()
         status = self._status
         if status is None:
             return {"live_health": _nothing(self._trouble), "live_learning": ""}
         age_s = max(0.0, self._clock() - status.now_unix_s)
-        health = _head(status, age_s) + _alarms(status, self._clock()) + _decisions(status, asking)
+        health = _head(status, age_s) + _alarms(status, self._clock())
+        health += _decisions(status, asking, follows)
         health += self._recent.scopes(status.signals) + self._trends() + _loop(status)
         health += _signals(status.signals) + _messages(status.messages)
         planes = "".join(self._recent.plane(edge) for edge in status.estimate.edges)
@@ -195,13 +206,16 @@ def _seconds(trace: str) -> str:
     return " " + button("look at its seconds", "look", kind="link", name=trace)
 
 
-def _decisions(status: Status, asking: str) -> str:
+def _decisions(status: Status, asking: Question | None, follows: bool) -> str:
     """What somebody may decide: to accept a changed machine, to send the maps; twice asked."""
     if asking:
-        sure = button("Yes, do it", "sure", kind="main") + " " + button("No", "not_sure")
-        return f'<div class="card"><p>{text(asking)}</p>{sure}</div>'
-    accept = button("Accept the changed machine", "accept", off=not status.has(CHANGED))
-    return f"<p>{accept} {button('Apply the maps', 'apply')}</p>"
+        words = "No" if asking.may_go else "Close"
+        no = button(words, "not_sure", off=follows, name=asking.about)
+        sure = button("Yes, do it", "sure", kind="main", off=follows, name=asking.about)
+        return f'<div class="card">{asking.html}{f"{sure} " if asking.may_go else ""}{no}</div>'
+    has_changed = status.has(CHANGED)
+    accept = button("Accept the changed machine", "accept", off=follows or not has_changed)
+    return f"<p>{accept} {button('Apply the maps', 'apply', off=follows)}</p>"
 
 
 def _loop(status: Status) -> str:

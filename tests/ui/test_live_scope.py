@@ -14,7 +14,7 @@ import pytest
 from rtid.daemon.acceptance import taken
 from rtid.daemon.chronicle import FILE, Chronicle
 from rtid.daemon.status import Alarm, BlockPlane, EdgeHealth, Scope, SignalHealth, write
-from rtid.ui.live_page import Live
+from rtid.ui.live_page import Live, Question
 from rtid.ui.live_scope import KEPT_S, Recent, trends
 from tests.ui.test_live_page import NOW, status
 
@@ -96,7 +96,10 @@ def test_a_changed_machine_is_accepted_when_it_is_meant(tmp_path: Path) -> None:
     assert f"since {since}, for 9.0 s" in health and 'data-do="look"' in health
     assert 'data-do="accept"' in health and 'data-do="sure"' not in health
     assert taken(tmp_path) is None
-    assert 'data-do="sure"' in live.fragments("Really?")["live_health"]
+    asked = live.fragments(Question("accept", "<p>Really?</p>"))["live_health"]
+    assert '<p>Really?</p><button class="main" data-do="sure" data-name="accept">' in asked
+    refused = live.fragments(Question("apply", "", may_go=False))["live_health"]
+    assert 'data-do="sure"' not in refused and 'data-do="not_sure"' in refused
     assert live.accept().startswith("asked")
     request = taken(tmp_path)
     assert request is not None and request.reason == "on the page"
@@ -104,3 +107,15 @@ def test_a_changed_machine_is_accepted_when_it_is_meant(tmp_path: Path) -> None:
     quiet = Live(tmp_path, lambda: NOW)
     quiet.fragments()
     assert quiet.accept().startswith("nothing") and taken(tmp_path) is None
+
+
+def test_a_follower_cannot_decide(tmp_path: Path) -> None:
+    changed = Alarm("plant_changed", "the map foretells no more", NOW - 9, None, "plant")
+    write(tmp_path, replace(status(), alarms=(changed,)))
+    live = Live(tmp_path, lambda: NOW)
+    for asking in (None, Question("apply", "")):
+        shown = live.fragments(asking, follows=True)["live_health"]
+        buttons = re.findall(r'<button [^>]*data-do="(?:accept|apply|sure|not_sure)"[^>]*>', shown)
+        assert len(buttons) == 2 and all(" disabled" in button for button in buttons)
+        shown = live.fragments(asking)["live_health"]
+        assert " disabled" not in "".join(re.findall(r"<button [^>]*data-do[^>]*>", shown))
