@@ -55,7 +55,7 @@ def told(*named: tuple[str, str], alike: tuple[str, ...] = ()) -> Any:
     )
     said = Diagnosis(
         "missing" if named else "matches", (), found, 100.0, 1.0, 2e-6, 2e-7, 1e-7, 1e-4, (1e9,),
-        0.0, False, True, (), (), (),
+        0.0, NAN, False, True, (), (), (),
     )  # fmt: skip
     return SimpleNamespace(diagnosis=said, ranking=())
 
