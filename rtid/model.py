@@ -28,6 +28,7 @@ OTHER = "other"  # kind of a signal of any other quantity: a force, a temperatur
 TAYLOR, LAPPED, BLENDED, PROPORTIONAL = BASES = "taylor", "lapped", "blended", "proportional"
 BOTH, COMMAND_ONLY, DROP_ONLY = "both", "command", "drop"
 MOST_MODE = 62  # a set of modes is kept as bits of one integer
+FLOW, VOLUME = "m3/s", "m3"  # units of a machine with pressures
 NONE = ""  # in place of a signal's name: a quantity that is always zero
 
 
@@ -74,7 +75,7 @@ class Chamber:
     sign: int  # +1: the volume grows with x, -1: it shrinks
     v0_m3: float
     disturbance: float = 0.0
-    unit: str = "m3/s"
+    unit: str = FLOW
     behind_s: float = 0.0
     ports: tuple[tuple[str, int], ...] = ()
 
@@ -224,6 +225,8 @@ class Machine:
     mode: str = NONE  # the signal that carries the number of the working mode
     # Of a plant whose rate is measured itself, y = f(u): that signal; `position` is its integral.
     measured: str = NONE
+    # The samples are of several records one after the other: no clock tells of the time in between.
+    joined: bool = False
 
     @property
     def has_pressures(self) -> bool:
@@ -254,6 +257,21 @@ class Machine:
             first[edge.name] = at
             at += edge.grid.shape[0] * edge.grid.shape[1]
         return tuple(first[edge.shares or edge.name] for edge in self.edges)
+
+    def unit_here(self, unit: str) -> str:
+        """An SI unit as effects have it, as it is on this machine.
+
+        V is that of its command, m3/s that of its equations: of a force that is measured, N.
+        """
+        rate = self.chambers[0].unit
+        if unit == "V":
+            return self.signals[self.column(self.edges[0].command)].unit
+        if unit == FLOW or unit.startswith(f"{FLOW}/"):
+            return rate + unit.removeprefix(FLOW)
+        if self.has_pressures or not (unit == VOLUME or unit.startswith(f"{VOLUME}/")):
+            return unit
+        whole = rate.removesuffix("/s") if rate.endswith("/s") else f"{rate} s"
+        return whole + unit.removeprefix(VOLUME)
 
     @property
     def with_taylor_maps(self) -> Machine:

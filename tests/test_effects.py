@@ -45,6 +45,7 @@ INVISIBLE = {
     *("pressure_sensor_bias", "velocity_scale"),
 }
 SIGNALS = {"u", "x", "v", "t", "p_a", "p_b", "p_c", "p_supply", "p_tank", "state", "input", "port"}
+SIGNALS |= {"v_y", "press"}
 FLOWS = {"q_a", "q_b", "q_c", "q_e"}
 
 

@@ -48,10 +48,11 @@ def dead_band(edge: EdgeMap) -> DeadBand:
 
 
 def per_direction(edge: EdgeMap) -> DeadBand:
-    """Of a map that is straight on either side of zero: no band, and a gain for each side."""
+    """Of a map that is straight on either side of zero: no band, a gain for each side."""
     ends = edge.grid.u_v[[0, -1]]
-    below, above = edge.flow(ends, np.zeros(2)) / ends
-    return DeadBand(0.0, 0.0, float(below), float(above))
+    flow = edge.flow(ends, np.zeros(2))
+    below, above = (float(q / u) if u else NOTHING for q, u in zip(flow, ends, strict=True))
+    return DeadBand(0.0, 0.0, below, above)
 
 
 def _broken_line(w: FloatArray, flow: FloatArray, weight: FloatArray) -> tuple[float, float]:

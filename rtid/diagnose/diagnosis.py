@@ -98,7 +98,7 @@ def searched(standing: Standing, progress: Progress = silent) -> Result:
     present, first, last = first, first.light(), before
     if can_judge(before):
         present, last = _extended(state, present, before)
-    state.found = [beside_its_line(state, effect) for effect in state.found]
+    state.found = [beside_its_line(state, told_apart(state, effect)) for effect in state.found]
     said = verdict(state, first, present, last, judged)
     if said == UNKNOWN:  # what explains a part of it only is not named, and not counted
         present, last, state.found = first, before, []
@@ -107,6 +107,12 @@ def searched(standing: Standing, progress: Progress = silent) -> Result:
         first, present.light(), result, negligible, scored(present), before, last, said, parts,
         held_out_judged=judged,
     )  # fmt: skip
+
+
+def told_apart(state: TrialState, effect: AcceptedEffect) -> AcceptedEffect:
+    """What was found as well, beside an effect, is no rival of it: both are needed."""
+    found = {other.key for other in state.found}
+    return replace(effect, alike=tuple(key for key in effect.alike if key not in found))
 
 
 def beside_its_line(state: TrialState, stored: AcceptedEffect) -> AcceptedEffect:

@@ -132,7 +132,7 @@ def _flows(present: Standing, effect: str, where: str) -> list[Trial]:
         searched = ", ".join(candidate.shape_names)
         raise RefusedError(
             f"{effect} at {candidate.where} would have {candidate.parameter} {value:.3g} "
-            f"{candidate.unit}, which is physically impossible"
+            f"{fit_.declared.unit_here(candidate.unit)}, which is physically impossible"
             + (f", wherever the search for {searched} begins" if searched else ""),
             "something else is missing: `rtid diagnose` names it"
             + (", or more values to begin from" if searched else ""),

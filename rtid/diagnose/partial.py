@@ -178,11 +178,12 @@ class _Bench:
         acting = [c for c, v in volumes.items() if np.any(v != 0.0)]
         rest = [part.T[acting].ravel() for part in parts]
         name = f"{candidate.effect}:{candidate.where}"
+        unit = self.fit.declared.unit_here(candidate.unit)
         return AddedVariable(
             candidate.key,
             candidate.parameter,
-            candidate.unit,
-            *(_trend(name, candidate.unit, y, r) for y, r in zip(rest[:2], rest[2:], strict=True)),
+            unit,
+            *(_trend(name, unit, y, r) for y, r in zip(rest[:2], rest[2:], strict=True)),
         )
 
     def _given(self, key: Key) -> float:

@@ -137,7 +137,6 @@ class Diagnosis:
     rms_flow_m3s: float
     beta_pa: tuple[float, ...]
     lag_s: float
-    lag_sd_s: float
     something_remains: bool
     held_out_judged: bool
     not_found: tuple[Unseen, ...]
@@ -175,7 +174,6 @@ def diagnosis(result: Result) -> Diagnosis:
         rms_flow_m3s=result.after.flow_m3s,
         beta_pa=tuple(1.0 / float(c) if c else float("inf") for c in words.compliance),
         lag_s=words.weights.lag_s,
-        lag_sd_s=words.lag_sd_s,
         something_remains=last.rho >= most_rho(last) or result.verdict == UNKNOWN,
         held_out_judged=result.held_out_judged,
         not_found=unseen,
@@ -222,30 +220,24 @@ def _named(result: Result, best: Key, other: Key) -> str:
 def parameters(fit: Fit, key: Key) -> dict[str, Value]:
     """The parameters of a cause that is part of a fit, by name."""
     values: dict[str, Value] = {}
-    spread = np.sqrt(max(1.0, fit.rho))
+    spread, here = np.sqrt(max(1.0, fit.rho)), fit.declared.unit_here
     for k, (timing, psi) in enumerate(fit.revision.timings):
         if timing.is_at(*key):
             for name, unit, value, j in zip(
                 timing.parameters, timing.units, psi, fit.timing_columns(k), strict=True
             ):
-                values[name] = Value(value, fit.estimate.sd(j) * spread, _of_command(fit, unit))
+                values[name] = Value(value, fit.estimate.sd(j) * spread, here(unit))
     for effect in fit.revision.effects:
         if effect.key == key:
             column = fit.column(effect)
             value, sd = fit.held.value(column), fit.estimate.sd(column) * spread
             scale = physical(fit, effect, 1.0)
-            values[effect.parameter] = Value(scale * value, abs(scale) * sd, effect.unit)
+            values[effect.parameter] = Value(scale * value, abs(scale) * sd, here(effect.unit))
             free = fit.shape_columns(effect)
             for k, name in enumerate(effect.shape_names):
                 sd = fit.estimate.sd(free[k]) * spread / abs(value) if k in free else float("nan")
-                values[name] = Value(effect.shape[k], sd, effect.shape_units[k])
+                values[name] = Value(effect.shape[k], sd, here(effect.shape_units[k]))
     return values
-
-
-def _of_command(fit: Fit, unit: str) -> str:
-    """A unit; V, in which pages count a command, as that of the machine's own."""
-    model = fit.declared
-    return model.signals[model.column(model.edges[0].command)].unit if unit == "V" else unit
 
 
 def _not_found(result: Result) -> tuple[Unseen, ...]:
@@ -274,11 +266,12 @@ def _not_found(result: Result) -> tuple[Unseen, ...]:
 
 
 def _limit(result: Result, candidate: Candidate, score: Score) -> Unseen:
-    fit, unit = result.last, candidate.unit
+    fit = result.last
+    unit = fit.declared.unit_here(candidate.unit)
     limit = physical(fit, candidate, detection_limit(score, fit.rho))
     if candidate.parameter == "share":  # of a timing: times the value that its column was made for
         limit = _of_timing(candidate, limit)
-        unit = _of_command(fit, candidate.shape_units[0])
+        unit = fit.declared.unit_here(candidate.shape_units[0])
         pages = catalogue()[candidate.effect].parameters
         (page,) = [p for p in pages if p.name in candidate.shape_names]
         is_possible = page.low < limit if page.unit == RATE else limit < page.high
@@ -348,7 +341,8 @@ def _experiment(result: Result, unseen: tuple[Unseen, ...]) -> list[str]:
             known = best.get(candidate.key)
             if known is None or scale * after < known[1]:
                 best[candidate.key] = scale * before, scale * after
-    units = {c.key: c.unit for c, _ in result.scores}
+    here = result.last.declared.unit_here
+    units = {c.key: here(c.unit) for c, _ in result.scores}
     return [
         f"Supply varied by 20 % in the same motion: {effect} ({where}) would be seen from "
         f"{limit(after, units.get((effect, where), '1'))} on, instead of "

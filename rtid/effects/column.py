@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from rtid.effects.law import Placed, Shape, Volumes
+from rtid.effects.law import LENGTH, Placed, Shape, Volumes, fitted_names
 from rtid.effects.page import SPREAD, Effect, Parameter, effect
 from rtid.effects.record_view import RecordView
 from rtid.plain import FloatArray
@@ -147,7 +147,8 @@ def by_equation(view: RecordView, placed: Placed) -> Cause:
     axes = tuple(_axis(view, p) for p in shapes)
     candidate = of_page(page, placed.where, shape=tuple(p.name for p in shapes))
     wide = all(axis[-1] - axis[0] > p.least for axis, p in zip(axes, shapes, strict=True) if p.over)
-    return Cause(candidate, lambda s: placed.volumes(view, s), axes, len(axes), wide)
+    is_timed = not view.model.joined or LENGTH not in fitted_names(page)
+    return Cause(candidate, lambda s: placed.volumes(view, s), axes, len(axes), wide and is_timed)
 
 
 def _axis(view: RecordView, p: Parameter) -> Shape:

@@ -21,16 +21,19 @@ import numpy as np
 
 from rtid.effects.expression import Expression
 from rtid.effects.filtering import filtered
+from rtid.effects.motions import RATE, halves_of, motions, rates, velocity
 from rtid.effects.page import FUNCTION, Effect, EffectError
 from rtid.effects.record_view import RecordView, supply_of, tank_of
 from rtid.effects.tree import NAME, ZERO, Node, derivative, evaluate, number, substituted
 from rtid.effects.view import View as Seen
-from rtid.model import Chamber, Edge, Machine
+from rtid.model import PRESSURE, Chamber, Edge, Machine
 from rtid.plain import FloatArray
 
 MODULUS, LENGTH, BEGIN = "beta", "t_r", "t_m"  # what only a fit knows: oil, length of the record
 BOTH, ALL_EDGES, EACH_EDGE = "both", "all valves", "edge"
 PORT = "port"  # the pressure behind a port of what drives a rate
+MOVED, PRESSED = "v_y", "press"  # a velocity beside what is measured, a pressure that presses there
+MOTION = "motion"  # the place of what such a velocity gives
 MAP = "Q of "  # before an edge's name: its flow by the fitted map
 LAGGED = "lag("  # before what is stored behind a port
 BEHIND_MAPS = "behind_maps"
@@ -203,10 +206,8 @@ def _places(
                 yield edge.name, _through(model, line, (edge,))
         else:
             yield ALL_EDGES, _through(model, line, model.edges)
-    elif PORT in lines[0].names:
-        for c, chamber in enumerate(chambers):
-            for port, way in chamber.ports:
-                yield port, _behind_port(model, lines[0], c, port, way)
+    elif lines[0].names & {MOVED, PORT}:
+        yield from _of_rate(model, lines[0])
     else:
         for where, at in chambers_by_place(model).items():
             if ("both chambers" if where == BOTH else "chamber") in effect.places:
@@ -250,6 +251,24 @@ def _behind_port(model: Machine, line: LawLine, c: int, port: str, way: int) -> 
     yield c, line, by | {"way": number(float(way))} | _of_machine(model)
 
 
+def _of_rate(model: Machine, line: LawLine) -> Iterator[tuple[str, Meant]]:
+    """Behind each port of a rate, or beside one that is measured, over each motion.
+
+    Over each pressure as well where the line has one.
+    """
+    if PORT in line.names:
+        for c, chamber in enumerate(model.chambers):
+            for port, way in chamber.ports:
+                yield port, _behind_port(model, line, c, port, way)
+        return
+    halves = halves_of(model)
+    pressures = [s.name for s in model.signals if s.kind == PRESSURE and s.name not in halves]
+    for moved in motions(model):
+        for pressure in pressures if PRESSED in line.names else [""]:
+            by = {MOVED: _signal(RATE + moved), PRESSED: _signal(pressure)} | _of_machine(model)
+            yield f"{moved}-{pressure}".removesuffix("-"), iter([(0, line, by)])
+
+
 def _through(model: Machine, line: LawLine, edges: tuple[Edge, ...]) -> Meant:
     """Into every chamber that an edge feeds or drains."""
     for c, chamber in enumerate(model.chambers):
@@ -290,6 +309,7 @@ def _refuse_unknown(
 ) -> None:
     known = {s.name for s in model.signals} | {"t", "x", "v"} | {p.symbol for p in effect.shapes}
     known |= {f"{letter}_{c.name}" for c in model.chambers for letter in "VA"}
+    known |= rates(model)
     known |= {MAP + edge.name for edge in model.edges} | ({FUNCTION} if effect.function else set())
     unknown = sorted({name for _, line in placed for name in line.names} - known)
     if unknown:
@@ -332,29 +352,37 @@ class Values:
             inside = lagged(self.at_samples(line.inner), self.view.step_s, lag_s)
             return np.asarray(0.5 * (outer[1:] + outer[:-1]) * np.diff(inside))
         names, view = line.outer.names, self.view
-        if FUNCTION not in names and not any(n in view.held or n.startswith(MAP) for n in names):
+        if FUNCTION not in names and not any(_is_of_intervals(n, view) for n in names):
             return view.over_intervals(self.at_samples(line.outer))
         start, end = (_evaluated(line.outer, at) for at in (self._at_start, self._at_end))
         return np.asarray(np.broadcast_to(0.5 * (start + end), view.dt_s.shape) * view.dt_s)
 
     def _at_start(self, name: str) -> FloatArray:
-        if name.startswith(MAP):
-            return self._mapped(name)
+        if name.startswith((MAP, RATE)):
+            return self._over_interval(name)
         here = self._here(name)
         return here[:-1] if here.ndim else here
 
     def _at_end(self, name: str) -> FloatArray:
         view = self.view
-        if name.startswith(MAP):
-            return self._mapped(name)
+        if name.startswith((MAP, RATE)):
+            return self._over_interval(name)
         if self.effect.function is not None and name == FUNCTION:
             return flow_in_python(self.effect, view.seen.before_the_next_command, self.values)
         here = self._here(name)
         return here if not here.ndim else here[:-1] if name in view.held else here[1:]
 
-    def _mapped(self, name: str) -> FloatArray:
+    def _over_interval(self, name: str) -> FloatArray:
+        """A flow of the map, or the velocity of a motion (n - 1,), SI."""
+        if name.startswith(RATE):
+            return velocity(self.view, name)
         edges = [edge.name for edge in self.view.model.edges]
         return self.view.flow(edges.index(name.removeprefix(MAP)))
+
+
+def _is_of_intervals(name: str, view: RecordView) -> bool:
+    """True for what is one value an interval, and not linear between the samples."""
+    return name in view.held or name.startswith((MAP, RATE))
 
 
 def lagged(values: FloatArray, step_s: float, lag_s: float) -> FloatArray:
@@ -417,7 +445,7 @@ def needs_no_pressure(effect: Effect) -> bool:
 
 def is_of_rates(effect: Effect) -> bool:
     """True for an effect between a command and a rate: no machine with pressures has it."""
-    return effect.law in OF_RATES or PORT in effect.places
+    return effect.law in OF_RATES or bool({PORT, MOTION} & set(effect.places))
 
 
 def fitted_names(effect: Effect) -> frozenset[str]:

@@ -17,6 +17,7 @@ import numpy as np
 from rtid.effects.column import Candidate
 from rtid.effects.extra import VOLUME
 from rtid.effects.law import LawLine, Placed, Values
+from rtid.effects.motions import rates
 from rtid.effects.page import FUNCTION, EffectError
 from rtid.effects.record_view import RecordView
 from rtid.effects.terms import placed_of, without_factor
@@ -106,16 +107,24 @@ def live_flows(
         if line.late or not _is_known(model, line.names, placed):
             return ()
         sign, alike = (1 if factor > 0 else -1), (abs(factor), node)
-        made = LiveFlow(model, placed, node, (), size * abs(factor), shape, line.inner)
+        made = LiveFlow(_of_bus(model), placed, node, (), size * abs(factor), shape, line.inner)
         known = flows.get(alike, made)
         flows[alike] = replace(known, signs=(*known.signs, (model.chambers[c].name, sign)))
     return tuple(flows.values())
+
+
+def _of_bus(model: Machine) -> Machine:
+    """The machine as its samples come: the integral of a rate that is measured is made of them."""
+    if not model.measured:
+        return model
+    return replace(model, signals=tuple(s for s in model.signals if s.name != model.position))
 
 
 def _is_known(model: Machine, names: set[str], placed: Placed) -> bool:
     """False for flows of the map, and for a velocity that would have to be made of samples."""
     signals = {s.name for s in model.signals}
     known = signals | {f"{letter}_{c.name}" for c in model.chambers for letter in "VA"} | {"x", "t"}
+    known |= rates(model)
     known |= {"v"} if any(s.kind == VELOCITY for s in model.signals) else set()
     known |= {FUNCTION} if placed.effect.function is not None else set()
     return names <= known

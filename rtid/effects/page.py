@@ -40,7 +40,7 @@ KINDS = {
 }
 PLACES = (
     *("chamber", "both chambers", "edge", "all valves"),
-    *("command", "sensor", "supply", "state", "port"),
+    *("command", "sensor", "supply", "state", "port", "motion"),
 )
 PLUGINS = "rtid.effects"  # entry points of other packages: a package with pages, or an effect
 FUNCTION = "flow"  # in the equation of an effect in Python: what its function gives

@@ -13,7 +13,7 @@ import numpy as np
 
 from rtid.estimator.misfit import Misfit
 from rtid.kernels.layout import MAX_BORDERS
-from rtid.model import COMMAND_ONLY, DROP_ONLY, Edge, Grid, Machine
+from rtid.model import COMMAND_ONLY, DROP_ONLY, PROPORTIONAL, Edge, Grid, Machine
 from rtid.plain import BoolArray, FloatArray
 
 AT_ONCE = 2  # intervals halved per axis and edge in one round
@@ -50,7 +50,7 @@ def halved_at_a_jump(model: Machine, misfit: Misfit) -> Machine:
     """
     grids = []
     for edge, excess in zip(model.edges, _excesses_of_maps(model, misfit), strict=True):
-        at = _jump(excess) if edge.terms != DROP_ONLY else []
+        at = _jump(excess) if edge.terms != DROP_ONLY and edge.basis != PROPORTIONAL else []
         grids.append(Grid(_split(edge.grid.u_v, at), edge.grid.dp_pa))
     return _on(model, grids)
 
@@ -98,7 +98,12 @@ def _excesses_of_maps(model: Machine, misfit: Misfit) -> list[Excess]:
 
 
 def _halved(edge: Edge, excess: Excess, clearly: float) -> Edge:
-    """The edge with its worst intervals halved; as it is where none is clearly above the noise."""
+    """The edge with its worst intervals halved; as it is where none is clearly above the noise.
+
+    A proportional map has one gain in each block on purpose: two of them would jump in between.
+    """
+    if edge.basis == PROPORTIONAL:
+        return edge
     axes = [_worst(excess, axis, clearly) if edge.terms != whole else [] for axis, whole in WHOLE]
     u, dp = (_split(b, k) for b, k in zip((edge.grid.u_v, edge.grid.dp_pa), axes, strict=True))
     return replace(edge, grid=Grid(u, dp))

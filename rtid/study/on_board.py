@@ -58,6 +58,7 @@ def on_board(project: Project, tell: Callable[[str], None]) -> Project:
         (terms, more), name = _live(project, added), f"{title(added.effect)} at {added.where}"
         if terms:
             signals = tuple(flow.signal for flow in more)
+            model = _disturbed(model)
             model = replace(model, terms=(*model.terms, *terms), signals=(*model.signals, *signals))
             flows = (*flows, *more)
             how = ", its flow computed sample by sample" if more else ""
@@ -87,19 +88,25 @@ def _is_behind(added: AddedSection) -> bool:
 def _behind(
     project: Project, model: Machine, flows: tuple[LiveFlow | RunningSum, ...], added: AddedSection
 ) -> tuple[Machine, tuple[LiveFlow | RunningSum, ...]]:
-    """The machine and its running integral with a lag behind the maps.
-
-    What disturbs the plant is found in records: where it is not declared a usual one weighs rows.
-    """
+    """The machine and its running integral with a lag behind the maps."""
     from rtid.effects.laws.response import with_lag  # noqa: PLC0415
 
     (lag,) = added.parameters.values()
-    if model.chambers[0].disturbance == 0.0:
-        usual = USUAL_DISTURBANCE * max(edge.rated_q_m3s for edge in model.edges)
-        model = replace(model, chambers=(replace(model.chambers[0], disturbance=usual),))
+    model = _disturbed(model)
     step_s = min((m.period_s for m in project.assembly.messages if m.period_s), default=1e-3)
     late = (replace(f, behind_s=lag.value) if isinstance(f, RunningSum) else f for f in flows)
     return with_lag(model, lag.value, step_s), tuple(late)
+
+
+def _disturbed(model: Machine) -> Machine:
+    """The machine with what disturbs a rate, beside which sizes that are known weigh what they do.
+
+    It is found in records: where it is not declared a usual one weighs rows.
+    """
+    if model.has_pressures or model.chambers[0].disturbance > 0.0:
+        return model
+    usual = USUAL_DISTURBANCE * max(edge.rated_q_m3s for edge in model.edges)
+    return replace(model, chambers=(replace(model.chambers[0], disturbance=usual),))
 
 
 def learned_sizes(board: Project, solution: Solution) -> list[tuple[str, float, float, str]]:

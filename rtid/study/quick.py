@@ -34,7 +34,7 @@ from rtid.study.quick_machine import (
     fitted_machine,
 )
 from rtid.study.quick_project import DEAD_VOLUME, head_of, of_channels, of_missing, project_text
-from rtid.study.quick_rate import QuickRate, driven_pairs, quick_rate
+from rtid.study.quick_rate import QuickRate, driven_pairs, pressed_pairs, quick_rate
 from rtid.study.study import diagnose_trace
 from rtid.trace import Report, judge
 from rtid.trace.quick_data import BAD, Point, level_of, points
@@ -151,7 +151,7 @@ def quick(
     named = proposal.named(source.signals, roles)
     guessed = proposal.with_named(proposal.propose(source.signals), named)
     is_table = "time_column" in source.keys
-    if is_table and (not CHAMBERS & guessed.keys() or driven_pairs(path, source, named)):
+    if is_table and _is_rate(path, source, guessed, named):
         return quick_rate(path, source, named, progress, more, held_out)
     if more:
         remedy = (
@@ -160,6 +160,18 @@ def quick(
         raise RtidError(f"{path}: of a cylinder with valves quick takes one record", remedy, 2)
     looked = _of_cylinder(path, source, roles_of(path, source, named), given, progress)
     return replace(looked, options=_options(dbc, given, roles))
+
+
+def _is_rate(
+    path: Path,
+    source: Source,
+    guessed: Mapping[str, RoleCandidate],
+    named: Mapping[str, RoleCandidate],
+) -> bool:
+    """True for a table of no cylinder with valves: no chambers, or driven by a pump, or pulled."""
+    if not CHAMBERS & guessed.keys() or driven_pairs(path, source, named):
+        return True
+    return "u" not in guessed and bool(pressed_pairs(path, source, named))
 
 
 def _options(dbc: Path | None, given: Given, roles: Mapping[str, str]) -> str:

@@ -49,17 +49,21 @@ def drive_of(
     ways = dict(zip(roles, (1, -1), strict=False))
     if len(levels) == len(PORTS) and levels["p_a"] < levels["p_b"]:
         ways = {role: -way for role, way in ways.items()}
-    return Drive(roles, ways, max([0.0, *(_window(t_s, columns[c.name]) for c in roles.values())]))
+    windows = [window_of(t_s, columns[c.name]) for c in roles.values()]
+    return Drive(roles, ways, max([0.0, *windows]))
 
 
-def _window(t_s: FloatArray, pressure: FloatArray) -> float:
-    """The shortest window in which a pressure (n,) stands out of its noise, s; 0: every sample."""
-    known = np.isfinite(pressure) & np.isfinite(t_s)
-    t_s, pressure = t_s[known], pressure[known]
-    step_s, noise = float(np.median(np.diff(t_s))), estimate_noise(t_s, pressure).sd
+def window_of(t_s: FloatArray, values: FloatArray) -> float:
+    """The shortest window in which what values (n,) change by stands out of their noise, s.
+
+    0: every sample does.
+    """
+    known = np.isfinite(values) & np.isfinite(t_s)
+    t_s, values = t_s[known], values[known]
+    step_s, noise = float(np.median(np.diff(t_s))), estimate_noise(t_s, values).sd
     for window_s in (step_s, *(w for w in WINDOWS_S if w >= 2.0 * step_s)):
         n = round(window_s / step_s)
-        means = pressure[: len(pressure) // n * n].reshape(-1, n).mean(axis=1)
+        means = values[: len(values) // n * n].reshape(-1, n).mean(axis=1)
         if np.var(np.diff(means)) > CLEAR * 2.0 * noise**2 / n:
             return 0.0 if n == 1 else window_s
     return WINDOWS_S[-1]

@@ -5,7 +5,8 @@
 The pair is told by units, by the words that both names share and by how much of the rate the
 command explains; the neutral, the grid and the part that is held out come from the record.  An
 acceleration or a force is y itself; commands whose names differ in a number share one map.  A speed
-of rotation that gives nearly all of the rate is a pump that drives (`rtid.study.quick_drive`).
+of rotation that gives nearly all of the rate is a pump that drives (`rtid.study.quick_drive`), a
+force beside a pressure and no command is an area's (`rtid.study.quick_pressed`).
 """
 
 from __future__ import annotations
@@ -33,6 +34,16 @@ from rtid.plain import FloatArray, Progress, plain, silent
 from rtid.project import Project
 from rtid.project.guess import ROLES, RoleCandidate, is_wanted, propose, relative, with_unit
 from rtid.study.quick_drive import Drive, drive_of, drive_text
+from rtid.study.quick_pressed import (
+    FORCES,
+    GIVEN,
+    MOTIONS,
+    PRESSED,
+    Pressed,
+    pressed_of,
+    pressed_text,
+    share_of,
+)
 from rtid.study.spans import HELD_OUT_SHARE
 from rtid.study.study import RecordError, Study
 from rtid.trace.neutral import held_out_from, neutral_of, neutrals, slope_of
@@ -64,7 +75,7 @@ class RatePair:
 
     share: of the rate's variance that the command explains; delay is not looked for.  more: further
     commands with the same map.  is_measured: the state is what the map gives, not what it moves.
-    drive: of a pump that moves it without valves.
+    drive: of a pump that moves it without valves; pressed: of a force that a pressure gives.
     """
 
     command: RoleCandidate
@@ -74,6 +85,7 @@ class RatePair:
     more: tuple[RoleCandidate, ...] = ()
     is_measured: bool = False
     drive: Drive | None = None
+    pressed: Pressed | None = None
 
     @property
     def options(self) -> str:
@@ -90,11 +102,19 @@ class RatePair:
         """Who plays which role: u, or u1, u2 ..., and x."""
         names = ["u"] if not self.more else [f"u{k + 1}" for k in range(len(self.commands))]
         known = dict(zip(names, self.commands, strict=True)) | {"x": self.state}
-        return known | (self.drive.roles if self.drive else {})
+        beside = self.drive or self.pressed
+        return known | (beside.roles if beside else {})
+
+    @property
+    def is_proportional(self) -> bool:
+        """True where the map is a straight line through zero: nothing is bent to hide an effect."""
+        return bool(self.drive or self.pressed)
 
     @property
     def kind(self) -> str:
         """Of plant, in words."""
+        if self.pressed:
+            return "a force that a pressure gives"
         return "a cylinder without valves" if self.drive else "a plant without pressures"
 
     @property
@@ -103,6 +123,8 @@ class RatePair:
         given = "x" if self.is_measured else "d x / dt"
         if self.drive:
             return f"{given} = D u, moved by a pump, a D for each direction"
+        if self.pressed:
+            return f"{given} = A u, with an area A"
         if not self.more:
             return f"{given} = f(u)"
         return f"{given} = f(u1) + ... + f(u{len(self.commands)}), one map for all of them"
@@ -114,6 +136,8 @@ def pairs_of(path: Path, source: Source, given: Mapping[str, RoleCandidate]) -> 
     t_s = table.seconds(source.keys["time_column"], source.keys["time_unit"])
     first = propose(source.signals)
     made = [(2, True, pair.share, pair) for pair in driven_pairs(path, source, given)]
+    rank = 3 if "u" in given else -1  # a command comes before a pressure, unless that is named
+    made += [(rank, False, pair.share, pair) for pair in pressed_pairs(path, source, given)]
     for command in _candidates(source.signals, given.get("u"), COMMAND_DIMENSIONS, DRIVES, "u"):
         for state in _candidates(source.signals, given.get("x"), STATES, MOVES, "x"):
             if command.name == state.name:
@@ -157,6 +181,28 @@ def driven_pairs(path: Path, source: Source, given: Mapping[str, RoleCandidate])
                 drive = drive_of(table.columns, t_s, command, propose(source.signals))
                 pairs.append(replace(pair, neutral=0.0, drive=drive))
     return sorted(pairs, key=lambda pair: pair.share)[-1:]
+
+
+def pressed_pairs(path: Path, source: Source, given: Mapping[str, RoleCandidate]) -> list[RatePair]:
+    """The force that one area times a pressure gives, the surest; beside it what moves."""
+    table = read_table(path)
+    t_s, made = table.seconds(source.keys["time_column"], source.keys["time_unit"]), []
+    for command in _of_dimension(_candidates(source.signals, given.get("u"), PRESSED, set(), "u")):
+        for state in _candidates(source.signals, given.get("x"), FORCES, set(), "x"):
+            share = share_of(table.columns[command.name], table.columns[state.name])
+            if share > GIVEN and not is_wanted(command):
+                made.append(RatePair(command, state, share, 0.0, is_measured=True))
+    best = sorted(made, key=lambda pair: pair.share)[-1:]
+    motions = list(_candidates(source.signals, None, MOTIONS, MOVES, "x")) if best else []
+    return [replace(pair, pressed=pressed_of(table.columns, t_s, motions)) for pair in best]
+
+
+def _of_dimension(candidates: Iterator[RoleCandidate]) -> Iterator[RoleCandidate]:
+    """Those that are pressures: a user may have named anything for a role."""
+    for candidate in candidates:
+        unit = find_unit(candidate.unit)
+        if unit is not None and unit.dimension in PRESSED:
+            yield candidate
 
 
 def alike_commands(
@@ -228,8 +274,10 @@ def _pair(
     return RatePair(command, state, share, neutral_of(t_s, u, x))
 
 
-def rate_text(name: str, path: Path, source: Source, pair: RatePair) -> str:
-    """TOML of the project of a pair, complete."""
+def rate_text(
+    name: str, path: Path, source: Source, pair: RatePair, more: Sequence[Path] = ()
+) -> str:
+    """TOML of the project of a pair, complete; more: further records that it is for."""
     table = read_table(path)
     t_s = table.seconds(source.keys["time_column"], source.keys["time_unit"])
     us = np.stack([table.columns[c.name] for c in pair.commands], axis=1)
@@ -240,7 +288,7 @@ def rate_text(name: str, path: Path, source: Source, pair: RatePair) -> str:
     step_s = float(np.median(np.diff(t_s)))
     unit = find_unit(pair.command.unit)
     key = f"u_grid_{unit.key}" if unit else "u_grid_v"
-    key = "grid" if unit and unit.dimension in FLOWING + TURNING else key
+    key = "grid" if unit and unit.dimension not in COMMAND_DIMENSIONS else key
     rows_hz = min(50.0, 1.0 / step_s)
     state: dict[str, Any] = {"column": pair.state.name, "unit": pair.state.unit}
     if _is_angle(pair.state):
@@ -249,6 +297,8 @@ def rate_text(name: str, path: Path, source: Source, pair: RatePair) -> str:
     moved, size = x, np.abs(slope_of(t_s, x))
     if pair.is_measured:
         state["noise"], moved, size = 0.0, us.sum(axis=1), np.abs(x) / us.shape[1]
+    if pair.pressed and pair.pressed.motion:
+        moved = table.columns[pair.pressed.motion.name][whole]
     is_long = pair.is_measured and t_s[-1] > LONG_S
     held_out = HELD_OUT_OF_MEASURED if is_long else HELD_OUT_SHARE
     split = held_out_from(t_s, moved, held_out)
@@ -280,6 +330,8 @@ def rate_text(name: str, path: Path, source: Source, pair: RatePair) -> str:
             "validation_s": [split, float(t_s[-1]) + step_s],
         },
     }
+    if pair.pressed:
+        return pressed_text(raw, pair.pressed, u, step_s, more)
     if pair.is_measured:
         head = [f"# A plant without pressures, {pair.equation}, written by rtid"]
         return "\n".join([*head, "", tomlkit.dumps(raw)])
@@ -467,7 +519,7 @@ def quick_rate(
     if not pairs:
         raise no_plant(path, source.signals)
     pair, *others = pairs
-    text, records = rate_text(path.stem or "machine", path, source, pair), (path, *more)
+    text, records = rate_text(path.stem or "machine", path, source, pair, more), (path, *more)
     if more:
         text = _of_records(text, records, held_out)
     with tempfile.TemporaryDirectory() as folder:
@@ -476,14 +528,14 @@ def quick_rate(
         study = Study(file, records, progress)
         diagnosed = study.diagnosed
         found = diagnosed.diagnosis.found
-        for effect in found if pair.drive else found[:1]:  # the maps are those beside it
+        for effect in found if pair.is_proportional else found[:1]:  # the maps are those beside it
             with suppress(RtidError):
                 study.add(f"{effect.effect}:{effect.where}", force=True)
         errors, at_rest = study.record_errors, _at_rest(study.project, records)
         model, flowmap, text = study.machine, publish(study.fit.solution), file.read_text("utf-8")
     used = {role.name for role in pair.roles.values()}
     unused = tuple(s.name for s in source.signals if s.name not in used)
-    gains = dead_band if pair.drive is None else per_direction
+    gains = per_direction if pair.is_proportional else dead_band
     bands = {edge.name: gains(edge) for edge in flowmap.edges}
     units = model.chambers[0].unit, model.signals[model.column(model.edges[0].command)].unit
     ranges = {edge.name: known for edge in flowmap.edges if (known := known_range(edge))}

@@ -146,6 +146,7 @@ class Study:
     def machine(self) -> Machine:
         """The declared machine, with the sensors' noise, and what disturbs its rate if unknown."""
         model = model_for(self.project, self.read.samples)
+        model = replace(model, joined=len(self.records) > 1)
         if model.has_pressures:
             return model
         self.progress("what moves it beside the command", 0.1)

@@ -72,7 +72,10 @@ def rate_lines(quick: QuickRate, saved: Path | None = None) -> Iterator[str]:
     if quick.unused:
         yield f"Not used: {', '.join(quick.unused)}"
     yield ""
-    if pair.is_measured:
+    if pair.pressed:
+        for band in quick.bands.values():
+            yield f"The area is {band.gain_above:.4g} {quick.unit}/{quick.command_unit}."
+    elif pair.is_measured:
         yield from _range_lines(quick)
     elif pair.drive:
         scale = scale_of(quick.unit.removesuffix("/s"))

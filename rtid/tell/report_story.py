@@ -226,14 +226,15 @@ def _scored(fit: Fit, scores: tuple[Candidate, Score] | None) -> Ranked | None:
     candidate, score = scores
     value, std = (physical(fit, candidate, v) for v in (score.value, score.sd))
     timing = candidate.parameter == "share" and bool(candidate.shape)
-    per = (candidate.shape[0], candidate.shape_units[0]) if timing else None
+    here = fit.declared.unit_here
+    per = (candidate.shape[0], here(candidate.shape_units[0])) if timing else None
     return Ranked(
         candidate.key,
         None,
         float(np.sqrt(score.gain)),
         value,
         std,
-        candidate.unit,
+        here(candidate.unit),
         candidate.is_possible(score.value),
         per,
     )

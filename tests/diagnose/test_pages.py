@@ -18,7 +18,7 @@ from rtid.diagnose.fit import first_map, prepare
 from rtid.diagnose.report import HYDRAULIC
 from rtid.effects import Effect, EffectError, Parameter, catalogue
 from rtid.effects.column import Cause, fixed, of_page
-from rtid.effects.law import OF_RATES, lines_of, places_of
+from rtid.effects.law import is_of_rates, lines_of, places_of
 from rtid.effects.laws import NAMED, cause_of, causes, law_of
 from rtid.effects.laws.pump import PUMP
 from rtid.effects.laws.timing import COMMAND_LAWS, TIMINGS, TimingLaw
@@ -47,7 +47,7 @@ def test_every_page_has_a_law_or_says_why_not(page: Effect) -> None:
         assert not page.law or page.law in COMMAND_LAWS or callable(law_of(page))
     else:
         assert not page.no_law
-        assert page.law in OF_RATES or page.name in effects_of_plants()
+        assert is_of_rates(page) or page.name in effects_of_plants()
 
 
 def test_every_column_is_that_of_its_page() -> None:
@@ -55,11 +55,7 @@ def test_every_column_is_that_of_its_page() -> None:
     model, chunk, _ = record()
     weights = prepare(model, chunk)
     found = causes(RecordView.of(model, chunk, weights, first_map(model, chunk, weights)))
-    of_pressures = {
-        n: page
-        for n, page in catalogue().items()
-        if page.law not in OF_RATES and page.places != ("port",)  # of a pump without valves
-    }
+    of_pressures = {n: page for n, page in catalogue().items() if not is_of_rates(page)}
     by_law = {n for n, page in of_pressures.items() if lines_of(page) or page.law in NAMED}
     assert {c.candidate.effect for c in found} == by_law
     for cause in found:

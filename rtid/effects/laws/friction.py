@@ -13,6 +13,7 @@ import numpy as np
 
 from rtid.effects.column import Cause, of_page
 from rtid.effects.law import Shape, Volumes
+from rtid.effects.motions import halves_of
 from rtid.effects.page import Effect
 from rtid.effects.record_view import RecordView
 from rtid.kernels.jit import kernel
@@ -26,10 +27,9 @@ LEAST_M = 1e-9
 
 def dahl(view: RecordView, effect: Effect) -> Iterator[Cause]:
     """The friction over each measured velocity, beside a rate that is measured itself."""
-    names = {signal.name for signal in view.model.signals}
+    halves = halves_of(view.model)
     for signal in view.model.signals if view.model.measured else ():
-        is_half = signal.name[-1] in "+-" and signal.name[:-1] in names  # of a split command
-        if signal.kind == VELOCITY and not is_half:
+        if signal.kind == VELOCITY and signal.name not in halves:
             v = view.signal(signal.name)
 
             def column(shape: Shape, v: FloatArray = v) -> Volumes:
