@@ -5,7 +5,7 @@ PYTHON ?= python3
 PIP = .venv/bin/python -m pip --disable-pip-version-check
 READY = .venv/.ready
 
-.PHONY: demo check test bench speed benchmark-missing lint campaign faults fuzz soak mutants paper pictures screenshots lock clean
+.PHONY: demo check test wheel bench speed benchmark-missing lint campaign faults fuzz soak mutants paper pictures screenshots lock clean
 
 demo: $(READY)
 	.venv/bin/rtid demo
@@ -17,6 +17,10 @@ test: $(READY)
 # first; all unit tests: make check ALL=1.
 check: $(READY)
 	.venv/bin/python -m tools.check $(if $(ALL),--all)
+
+# The wheel with its kernels compiled for a family of processors, tried in another folder, into out/.
+wheel: $(READY)
+	.venv/bin/python -m tools.wheel out
 
 bench: $(READY)
 	@mkdir -p out
@@ -59,12 +63,12 @@ faults: $(READY)
 	  cat out/faults.md; exit $$status
 
 # Mutated projects, DBCs, EDS, logs, tables and plant files, 500 of each format, each through its
-# command (an hour): make fuzz SEED=2 FUZZ="--logs 500 --dbcs 0"; one case again: --case logs-17
+# command (an hour): make fuzz SEED=2 FU.PHONY: demo check test wheel bench speed="--logs 500 --dbcs 0"; one case again: --case logs-17
 SEED ?= 1
-FUZZ ?= --projects 500 --dbcs 500 --nodes 500 --logs 5000 --tables 3000 --plants 200 --bombs 8
+FU.PHONY: demo check test wheel bench speed ?= --projects 500 --dbcs 500 --nodes 500 --logs 5000 --tables 3000 --plants 200 --bombs 8
 fuzz: $(READY)
 	@rm -rf out/fuzz && mkdir -p out
-	.venv/bin/python -m tests.fuzz --seed $(SEED) --out out/fuzz $(FUZZ)
+	.venv/bin/python -m tests.fuzz --seed $(SEED) --out out/fuzz $(FU.PHONY: demo check test wheel bench speed)
 
 # The long ones (an hour): a full bus, 50 kills, hours in minutes, live diagnoses, an open page.
 soak: $(READY)

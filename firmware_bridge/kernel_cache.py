@@ -5,6 +5,8 @@ binary would survive a change of them.  So the cache lies in a folder named by t
 sources.  And numba wants to write where it reads: kernels that were compiled at installation into a
 folder that is closed by now are taken from a copy.
 
+Kernels that came with the sources are taken over, see `carried`.
+
 Who starts while another process compiles the same kernel, as the daemon's helpers do, waits for it.
 """
 
@@ -28,6 +30,7 @@ from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler_lock import global_compiler_lock
 from numba.extending import is_jitted
 
+from firmware_bridge.carried import adapt, take_over
 from firmware_bridge.kernel_parts import compiled_as
 
 WAIT_S = 120.0  # for another process that compiles the same: it may have been stopped
@@ -42,6 +45,7 @@ def cache_folder(name: str, beside: Path, sources: Iterable[Path]) -> Path | Non
     name = f"{name}-{_digest(sources)}"
     for folder in (place / name for place in _places(beside)):
         if _is_writable(folder):
+            take_over(folder, beside)
             return folder
         if next(folder.glob("**/*.nbi"), None) is not None:
             return _copied(folder)
@@ -74,13 +78,14 @@ def lock_of(folder: Path, function: Callable[..., Any]) -> Path:
 
 def _compile_once(kernel: Any, lock: Path) -> None:
     """Let a kernel be compiled by one process at a time: who comes second loads it."""
-    compiled = kernel.compile
+    compiled, module = kernel.compile, kernel.__module__.rpartition(".")[2]
 
     def compile_alone(signature: Any) -> Any:
         if isinstance(signature, tuple) and signature in kernel.overloads:
             return compiled(signature)
         # numba's lock first, in every thread; a kernel that a part calls is still one for Python
         with global_compiler_lock, alone(lock), compiled_as(JITCodeLibrary):
+            adapt(Path(kernel.stats.cache_path), f"{module}.{kernel.__qualname__}")
             return compiled(signature)
 
     kernel.compile = compile_alone

@@ -6,7 +6,6 @@ The empty virtual environment, with dependencies from the registry, is in `tests
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -14,9 +13,7 @@ from zipfile import ZipFile
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
-PACKAGES = ("rtid", "firmware_bridge")
-TEMPORARY = shutil.ignore_patterns("__pycache__", "*.egg-info", "*.nb?")
+from tools.wheel import PACKAGES, ROOT, build, pip
 
 IMPORT_ALL = """
 import importlib, pkgutil, sys
@@ -28,23 +25,6 @@ assert not {"tests", "tools", "benchmarks"} & set(sys.modules)
 """
 
 
-def build(folder: Path) -> Path:
-    """The wheel of the checkout, made from a copy, without a network."""
-    source = folder / "source"
-    for package in PACKAGES:
-        shutil.copytree(ROOT / package, source / package, ignore=TEMPORARY)
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, source)
-    pip("wheel", "--no-build-isolation", "--no-deps", "--no-index", "-w", folder, source)
-    (wheel,) = folder.glob("*.whl")
-    return wheel
-
-
-def pip(*arguments: object) -> None:
-    command = [sys.executable, "-m", "pip", "--disable-pip-version-check", "-q"]
-    subprocess.run([*command, *map(str, arguments)], check=True)
-
-
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return build(tmp_path_factory.mktemp("wheel"))
@@ -54,7 +34,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def installed(wheel: Path) -> Path:
     """A folder with the wheel and nothing else; the dependencies are those of the tests."""
     target = wheel.parent / "site"
-    pip("install", "--no-deps", "--no-index", "--no-compile", "--target", target, wheel)
+    pip(wheel.parent, "install", "--no-compile", "--target", target, wheel)
     return target
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.test_wheel import build
+from tools.wheel import build
 
 pytestmark = pytest.mark.campaign
 
