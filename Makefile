@@ -46,6 +46,7 @@ lint: $(READY)
 	.venv/bin/mypy
 
 campaign: $(READY)
+	@mkdir -p out
 	.venv/bin/python -m pytest -q -s -p no:benchmark -m campaign tests; \
 	  status=$$?; .venv/bin/python -m tests.campaign.report && exit $$status
 

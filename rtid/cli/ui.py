@@ -33,6 +33,9 @@ def ui(
         Path | None,
         typer.Option("--map", help="Data sheet or exported map to hold beside the learned one."),
     ] = None,
+    test_bus: Annotated[
+        bool, typer.Option("--test-bus", help="Apply over udp_multicast too: no authentication.")
+    ] = False,
     open_page: Annotated[
         bool, typer.Option("--open/--no-open", help="Open the page in the browser.")
     ] = True,
@@ -69,6 +72,7 @@ def ui(
             host=host,
             port=port,
             sheet=sheet,
+            test_bus=test_bus,
         )
 
 

@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 
 from rtid.daemon.chronicle import DAY_S, FILE
@@ -52,6 +53,18 @@ class SpanNote:
     until_s: float
     who: str
     text: str
+
+
+TrendPoint = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class TrendLine:
+    """A quantity over time: unix_s, value and standard deviation, SI, the oldest first."""
+
+    name: str
+    unit: str
+    points: tuple[TrendPoint, ...]
 
 
 @contextmanager
@@ -97,6 +110,12 @@ def _values(base: sqlite3.Connection, span: Span) -> dict[tuple[str, str], tuple
             f"WHERE unix_s >= ? AND unix_s < ? AND abs({column}) < {KNOWN} GROUP BY {key}", ends,
         )  # fmt: skip
         found |= {(name.format(k), unit): (v, sd) for k, v, sd in rows if None not in (v, sd)}
+    if _has(base, "quantity"):
+        rows = base.execute(
+            f"SELECT name, unit, {mean.format('value')} FROM quantity WHERE unix_s >= ? "
+            f"AND unix_s < ? AND abs(value) < {KNOWN} GROUP BY name, unit", ends,
+        )  # fmt: skip
+        found |= {(name, unit): (v, sd) for name, unit, v, sd in rows if None not in (v, sd)}
     for v, sd in base.execute(
         f"SELECT {mean.format('rho')} FROM map WHERE unix_s >= ? AND unix_s < ?", ends
     ):
@@ -110,24 +129,45 @@ def _values(base: sqlite3.Connection, span: Span) -> dict[tuple[str, str], tuple
     return found
 
 
-def trend(folder: Path, since_s: float) -> dict[str, list[tuple[float, float, float]]]:
-    """Bulk moduli by chamber since a time: (unix_s, Pa, its standard deviation), thinned."""
+def trend(folder: Path, since_s: float) -> list[TrendLine]:
+    """What was learned since a time, thinned to means: bulk moduli, then lag and sizes by name."""
     with _opened(folder) as base:
-        rows = base.execute(
-            "SELECT chamber, unix_s, beta_pa, beta_sd_pa FROM estimate WHERE unix_s >= ? "
-            "ORDER BY unix_s", (since_s,),
-        ).fetchall()  # fmt: skip
-    by_name: dict[str, list[tuple[float, float, float]]] = {}
-    for name, *values in rows:
-        if all(isinstance(v, float) and abs(v) < float(KNOWN) for v in values):
-            by_name.setdefault(name, []).append((values[0], values[1], values[2]))
-    return {name: every[:: -(-len(every) // MOST_POINTS)] for name, every in by_name.items()}
+        found = list(_thinned(base, "estimate", "chamber", "beta_pa", "beta_sd_pa", since_s))
+        trends = [TrendLine(f"bulk modulus {name}", "Pa", points) for (name,), points in found]
+        if _has(base, "quantity"):
+            found = list(_thinned(base, "quantity", "name, unit", "value", "sd", since_s))
+            trends += [TrendLine(name, unit, points) for (name, unit), points in found]
+    return trends
+
+
+def _thinned(
+    base: sqlite3.Connection, table: str, key: str, value: str, sd: str, since_s: float
+) -> Iterator[tuple[tuple[str, ...], tuple[TrendPoint, ...]]]:
+    """Means over the MOST_POINTS part of the time that there is something of, by key."""
+    known = f"FROM {table} WHERE unix_s >= ? AND abs({value}) < {KNOWN} AND abs({sd}) < {KNOWN}"
+    first, last = base.execute(f"SELECT min(unix_s), max(unix_s) {known}", (since_s,)).fetchone()
+    if first is None:
+        return
+    step_s = max((last - first) / (MOST_POINTS - 1), 1e-3)
+    rows = base.execute(
+        f"SELECT {key}, avg(unix_s), avg({value}), avg({sd}) {known} "
+        f"GROUP BY {key}, CAST((unix_s - ?) / ? AS INTEGER) ORDER BY {key}, avg(unix_s)",
+        (since_s, first, step_s),
+    ).fetchall()
+    for name, group in groupby(rows, lambda row: tuple(row[:-3])):
+        yield name, tuple((t, v, deviation) for *_, t, v, deviation in group)
+
+
+def _has(base: sqlite3.Connection, table: str) -> bool:
+    """A history that an older daemon has written has less."""
+    asked = "SELECT 1 FROM sqlite_master WHERE name = ?"
+    return base.execute(asked, (table,)).fetchone() is not None
 
 
 def notes(folder: Path, span: Span) -> list[SpanNote]:
     """What was written about spans that touch this one, oldest first."""
     with _opened(folder) as base:
-        if not base.execute("SELECT 1 FROM sqlite_master WHERE name = 'note'").fetchone():
+        if not _has(base, "note"):
             return []
         rows = base.execute(
             "SELECT from_s, until_s, who, text FROM note WHERE until_s >= ? AND from_s < ? "

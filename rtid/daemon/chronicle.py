@@ -8,7 +8,9 @@ from __future__ import annotations
 import json
 import sqlite3
 import time
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from rtid.daemon.acceptance import Acceptance
 from rtid.daemon.jobs import Publication
@@ -23,9 +25,13 @@ CREATE TABLE IF NOT EXISTS map (unix_s REAL, edge TEXT, valid INTEGER, visited I
 CREATE TABLE IF NOT EXISTS alarm (unix_s REAL, name TEXT, kind TEXT, text TEXT, over INTEGER);
 CREATE TABLE IF NOT EXISTS verdict (unix_s REAL, verdict TEXT, text TEXT, content TEXT);
 CREATE TABLE IF NOT EXISTS decision (unix_s REAL, what TEXT, who TEXT, reason TEXT);
+CREATE TABLE IF NOT EXISTS quantity
+  (unix_s REAL, name TEXT, unit TEXT, value REAL, sd REAL);
+CREATE INDEX IF NOT EXISTS quantity_time ON quantity (unix_s);
 CREATE INDEX IF NOT EXISTS estimate_time ON estimate (unix_s);
 CREATE INDEX IF NOT EXISTS map_time ON map (unix_s);
 """
+QUANTITY = "INSERT INTO quantity VALUES (?, ?, ?, ?, ?)"
 
 
 class Chronicle:
@@ -37,10 +43,13 @@ class Chronicle:
         self._database.execute("PRAGMA synchronous=NORMAL")
         self._database.executescript(TABLES)
         self._pruned_s = 0.0
+        self._on_board = frozenset[str]()  # names of the sizes that are learned all the time
 
     def note_publication(self, publication: Publication, chambers: list[str]) -> None:
-        """One row per chamber and per edge."""
+        """One row per chamber, per edge and per size of an added effect."""
         now_s = time.time()
+        self._on_board = frozenset(effect.name for effect in publication.effects)
+        sizes = [(now_s, e.name, e.unit, e.size, e.sd) for e in publication.effects]
         estimates = [
             (now_s, name, float(beta), float(sd))
             for name, beta, sd in zip(
@@ -54,10 +63,11 @@ class Chronicle:
         self._database.execute("BEGIN")
         self._database.executemany("INSERT INTO estimate VALUES (?, ?, ?, ?)", estimates)
         self._database.executemany("INSERT INTO map VALUES (?, ?, ?, ?, ?)", maps)
+        self._database.executemany(QUANTITY, sizes)
         self._database.execute("COMMIT")
         if now_s - self._pruned_s > DAY_S:
             self._pruned_s = now_s
-            for table in ("estimate", "map"):
+            for table in ("estimate", "map", "quantity"):
                 self._database.execute(f"DELETE FROM {table} WHERE unix_s < ?", (now_s - KEPT_S,))
 
     def note_alarm(self, alarm: Alarm) -> None:
@@ -68,9 +78,15 @@ class Chronicle:
         self._database.execute("INSERT INTO alarm VALUES (?, ?, ?, ?, ?)", row)
 
     def note_verdict(self, verdict: Verdict) -> None:
-        """One row per diagnosis."""
+        """One row per diagnosis, one per number that it has learned and nobody learns on board."""
         row = (verdict.at_unix_s, verdict.verdict, verdict.text, json.dumps(verdict.content))
         self._database.execute("INSERT INTO verdict VALUES (?, ?, ?, ?)", row)
+        rows = [
+            (verdict.at_unix_s, *number)
+            for number in learned(verdict.content)
+            if number[0] not in self._on_board
+        ]
+        self._database.executemany(QUANTITY, rows)
 
     def note_acceptance(self, acceptance: Acceptance) -> None:
         """One row: somebody has taken the changed machine for the new normal."""
@@ -85,3 +101,17 @@ class Chronicle:
     def close(self) -> None:
         """Write everything back."""
         self._database.close()
+
+
+def learned(content: Mapping[str, Any]) -> Iterator[tuple[str, str, float, float]]:
+    """Name, unit, value and standard deviation, SI, of what a diagnosis has learned.
+
+    content: JSON of rtid/diagnose/schema.md.
+    """
+    if content.get("lag_s") is not None and content.get("lag_sd_s"):
+        yield "spool lag", "s", content["lag_s"], content["lag_sd_s"]
+    for effect in (*content.get("added", ()), *content.get("found", ())):
+        key = f"{effect['effect']} {effect['where']}"
+        for k, (name, number) in enumerate(effect["parameters"].items()):
+            if number["value"] is not None and number["std"]:
+                yield f"{key} {name}" if k else key, number["unit"], number["value"], number["std"]

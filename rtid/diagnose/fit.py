@@ -110,6 +110,14 @@ class Fit:
         return np.asarray(self.held.cov[:n_c, :n_c] * spread)
 
     @property
+    def lag_sd_s(self) -> float:
+        """Of the spools' lag, by the misfit that is left; NaN where the record does not tell it."""
+        at, tolerance_s = self.first_given, self.declared.lag.tolerance_s
+        if self.revision.replaces_lag or tolerance_s == 0.0 or at not in self.estimate.used:
+            return float("nan")
+        return self.estimate.sd(at) * float(np.sqrt(max(1.0, self.rho)))
+
+    @property
     def first_given(self) -> int:
         """Number of columns before the given ones: y and theta_beta."""
         return 1 + len(self.model.chambers)

@@ -137,6 +137,7 @@ class Diagnosis:
     rms_flow_m3s: float
     beta_pa: tuple[float, ...]
     lag_s: float
+    lag_sd_s: float
     something_remains: bool
     held_out_judged: bool
     not_found: tuple[Unseen, ...]
@@ -174,6 +175,7 @@ def diagnosis(result: Result) -> Diagnosis:
         rms_flow_m3s=result.after.flow_m3s,
         beta_pa=tuple(1.0 / float(c) if c else float("inf") for c in words.compliance),
         lag_s=words.weights.lag_s,
+        lag_sd_s=words.lag_sd_s,
         something_remains=last.rho >= most_rho(last) or result.verdict == UNKNOWN,
         held_out_judged=result.held_out_judged,
         not_found=unseen,

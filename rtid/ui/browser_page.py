@@ -17,7 +17,7 @@ from jinja2 import Environment, Template
 from rtid.tell.html import button, changed, cover, parsed, static
 from rtid.ui.arrival import DOES, fragments
 from rtid.ui.headline import record_line, strip, work_line
-from rtid.ui.live_page import Live
+from rtid.ui.live_page import Live, Question
 from rtid.ui.shared import FAILED, ROLE, Session
 from rtid.ui.turns import Turns
 from rtid.ui.views import VIEWS, places_of, table
@@ -59,7 +59,7 @@ class Page:
         self._is_open = self._is_gone = self._is_made = False
         self._turns, self._due = turns, set[str]()  # what is waiting for its turn
         self._seen, self._beats, self._moves = "", 0, 0
-        self._asked = ""  # what the user has to confirm on the live page
+        self._is_accepting = False  # the user is asked whether that is meant
         is_live = session.trace is None and session.arrival is None
         self._view = "live" if is_live else "compare"
         self._channel = Channel(name="channel")
@@ -238,17 +238,36 @@ class Page:
         self._channel.show = f"add {self._moves}"
         self._heard("view")
 
-    def ask_first(self, what: str) -> None:
-        """Ask whether it is meant."""
-        self._asked = what
+    def ask_accept(self) -> None:
+        """Ask whether the changed machine shall be accepted."""
+        self._is_accepting = True
+        self.session.not_sent()
 
-    def go_ahead(self) -> None:
-        """Do what was asked for."""
-        what, self._asked = self._asked, ""
-        if what == "accept":
+    def ask_apply(self) -> None:
+        """Ask whether the maps shall be sent."""
+        self._is_accepting = False
+        self.session.foretell()
+
+    def go_ahead(self, about: str) -> None:
+        """Do what was asked about."""
+        if about == "accept" and self._is_accepting:
             self.session.say(self.live.accept())
-        elif what == "apply":
-            self.session.apply()
+        elif about == "apply":
+            self.session.send()
+        self._is_accepting = False
+
+    def leave_it(self) -> None:
+        """Do nothing of what was asked about."""
+        self._is_accepting = False
+        self.session.not_sent()
+
+    @property
+    def _question(self) -> Question | None:
+        """What waits for a yes."""
+        sending = self.session.sending
+        if sending is not None:
+            return Question("apply", sending.html(), sending.may_go)
+        return Question("accept", f"<p>{ACCEPT}</p>") if self._is_accepting else None
 
     def _beat(self) -> None:
         """Five times a second: the live page, where it is looked at.
@@ -258,7 +277,7 @@ class Page:
         """
         self.live.hear()
         if self._view == "live" and self._sent.get("seen", "") == self._seen:
-            now = self.live.fragments(ASKED.get(self._asked, self._asked))
+            now = self.live.fragments(self._question, self._follows)
             if any(self._sent.get(place) != html for place, html in now.items()):
                 self._beats += 1
                 self._put(now | {"seen": str(self._beats)})
@@ -270,17 +289,15 @@ SESSION_ACTIONS: dict[str, Callable[[Session, dict[str, str]], None]] = {
     "save": lambda s, a: s.save(),
     "export": lambda s, a: s.export(a.get("what", "")),
 }
-ASKED = {
-    "accept": "Take the machine as it is now for the new normal? What was learned before is kept "
-    "aside, and the maps begin anew with the samples since the change.",
-    "apply": "Send the learned maps to the controller, all or nothing? `rtid apply --undo` sends "
-    "back what was there.",
-}
+ACCEPT = (
+    "Take the machine as it is now for the new normal? What was learned before is kept aside, and "
+    "the maps begin anew with the samples since the change."
+)
 LIVE_ACTIONS: dict[str, Callable[[Page, dict[str, str]], None]] = {
-    "accept": lambda page, a: page.ask_first("accept"),
-    "apply": lambda page, a: page.ask_first("apply"),
-    "sure": lambda page, a: page.go_ahead(),
-    "not_sure": lambda page, a: page.ask_first(""),
+    "accept": lambda page, a: page.ask_accept(),
+    "apply": lambda page, a: page.ask_apply(),
+    "sure": lambda page, a: page.go_ahead(a.get("name", "")),
+    "not_sure": lambda page, a: page.leave_it(),
     "days": lambda page, a: page.live.compare(a.get("name", "")),
     "look": lambda page, a: page.session.look_at(a.get("name", "")),
 }

@@ -5,10 +5,8 @@ It holds the fits; what it returns is plain and small enough to be sent.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from subprocess import run
 
 from rtid.compare import Reference
 from rtid.diagnose.report import Diagnosis
@@ -33,9 +31,8 @@ from rtid.tell.report_story import Ranked, ranked
 from rtid.tell.story import Chart
 from rtid.trace.glance import Glance, glance
 from rtid.ui.release_form import Released, ReleaseWish, release
+from rtid.ui.sending import Sending, Way, foretell, send
 from rtid.ui.upload import free_name
-
-APPLY_S = 600.0  # that a transfer may take
 
 
 @dataclass(frozen=True)
@@ -231,12 +228,14 @@ class Desk:
         last = self._stack[-1]
         return release(last.study, last.look, wish)
 
-    def apply(self, project: Path) -> str:
-        """`rtid apply` in a process of its own: what it says last.  RtidError where it refuses."""
-        self._progress("sending the maps", 0.5)
-        words = [sys.executable, "-m", "rtid", "apply", str(project), "--yes"]
-        done = run(words, capture_output=True, text=True, timeout=APPLY_S, check=False)
-        said = (done.stdout if done.returncode == 0 else done.stderr).strip().splitlines()
-        if done.returncode:
-            raise RtidError(said[0] if said else "rtid apply failed", " ".join(said[1:]))
-        return said[-1] if said else "applied"
+    def foretell(self, way: Way) -> Sending:
+        """What sending the daemon's offer would change, as the records have it."""
+        self._progress("looking at what would change", 0.5)
+        return foretell(way)
+
+    def send(self, way: Way, seen: Sending) -> str | Sending:
+        """Send what was read, or ask anew where the controller tells something else."""
+        self._progress("asking the controller", 0.0)
+        return send(
+            way, seen, lambda done, of: self._progress("sending the maps", done / max(of, 1))
+        )

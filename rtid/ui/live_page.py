@@ -8,8 +8,10 @@ stale.
 from __future__ import annotations
 
 import getpass
+import threading
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from math import log10
 from pathlib import Path
 
@@ -40,36 +42,58 @@ MOST_ALARMS = 6
 COUNTED = ("samples", "rows", "block_changes")
 DOTS = {"ok": "ok", "open": "ok", "late": "warn", "reopening": "warn", "suspended": "warn"}
 Clock = Callable[[], float]
+Do = Callable[[], None]
+
+
+def beside(do: Do) -> None:
+    """In a thread of its own, which ends with it."""
+    threading.Thread(target=do, name="rtid-history", daemon=True).start()
+
+
+@dataclass(frozen=True)
+class Question:
+    """What the user has to confirm: of what, in HTML, and whether yes may be said."""
+
+    about: str
+    html: str
+    may_go: bool = True
 
 
 class Live:
-    """The status of a daemon that keeps its state in a folder; None: there is none."""
+    """The status of a daemon that keeps its state in a folder; None: there is none.
 
-    def __init__(self, folder: Path | None, clock: Clock = time.time) -> None:
-        self._folder, self._clock = folder, clock
+    aside: does what takes long, beside whoever asks.
+    """
+
+    def __init__(
+        self, folder: Path | None, clock: Clock = time.time, aside: Callable[[Do], None] = beside
+    ) -> None:
+        self._folder, self._clock, self._aside = folder, clock, aside
         self._status: Status | None = None
         self._trouble = ""
         self._stamp = -1
-        self._recent, self._history, self._history_s = Recent(), "", -HISTORY_S
+        self._recent, self._instruments = Recent(), ("", "")
+        self._history, self._history_s, self._is_reading = "", -HISTORY_S, False
         self.days = DAYS[1]
 
-    def fragments(self, asking: str = "") -> dict[str, str]:
-        """HTML by place, from the newest status; asking: what the user has to confirm."""
+    def fragments(self, asking: Question | None = None, follows: bool = False) -> dict[str, str]:
+        """HTML by place, from the newest status; follows: another browser decides."""
         self.hear()
         status = self._status
         if status is None:
-            return {"live_health": _nothing(self._trouble), "live_learning": ""}
+            empty = dict.fromkeys(("live_scope", "live_planes", "live_learning"), "")
+            return empty | {"live_health": _nothing(self._trouble)}
         age_s = max(0.0, self._clock() - status.now_unix_s)
-        health = _head(status, age_s) + _alarms(status, self._clock()) + _decisions(status, asking)
-        health += self._recent.scopes(status.signals) + self._trends() + _loop(status)
+        health = _head(status, age_s) + _alarms(status, self._clock())
+        health += _decisions(status, asking, follows) + self._trends() + _loop(status)
         health += _signals(status.signals) + _messages(status.messages)
-        planes = "".join(self._recent.plane(edge) for edge in status.estimate.edges)
-        learning = _learning(status) + f'<div class="udp">{planes}</div>'
-        learning += _coach(status.advice) + _verdict(status)
+        learning = _learning(status) + _coach(status.advice) + _verdict(status)
+        scope, planes = self._instruments
         css = "stale" if age_s > STALE_S else ""
+        shown = {"scope": scope, "planes": planes, "health": health, "learning": learning}
         return {
-            "live_health": f'<div class="{css}">{health}</div>',
-            "live_learning": f'<div class="{css}">{learning}</div>',
+            f"live_{place}": f'<div class="{css}">{html}</div>' if html else ""
+            for place, html in shown.items()
         }
 
     def accept(self) -> str:
@@ -89,25 +113,20 @@ class Live:
 
     def _trends(self) -> str:
         """From the daemon's history, looked at now and then."""
-        if self._folder is None or self._clock() - self._history_s < HISTORY_S:
-            return self._history
-        now_s = self._history_s = self._clock()
+        now_s, folder = self._clock(), self._folder
+        if folder and not self._is_reading and now_s - self._history_s >= HISTORY_S:
+            self._is_reading, self._history_s = True, now_s
+            self._aside(lambda: self._look_back(folder, self.days, now_s))
+        return self._history
+
+    def _look_back(self, folder: Path, days: str, now_s: float) -> None:
+        """A month of estimates takes a while."""
         try:
-            series = trend(self._folder, now_s - TREND_S)
-            before, now = two_spans(float(self.days), now_s)
-            rows, noted = side_by_side(self._folder, before, now), notes(self._folder, now)
+            self._history = _history(folder, days, now_s)
         except RtidError:
             self._history = ""  # none is written yet
-            return ""
-        told = calendar_table(float(self.days), rows)
-        cells = [[text(cell) for cell in row] for row in told.rows]
-        said = "".join(f"<p>{text(f'{note.who}: {note.text}')}</p>" for note in noted)
-        self._history = (
-            f"<h3>Trends</h3>{trends(series, 'Pa')}<h3>Calendar</h3><p>The last "
-            f"{choice('days', DAYS, self.days)} days beside as many before.</p>"
-            f"{table(told.heads, cells)}{said}"
-        )
-        return self._history
+        finally:
+            self._is_reading = False
 
     def hear(self) -> None:
         """Take the newest status, where there is another one."""
@@ -119,10 +138,30 @@ class Live:
             if stamp != self._stamp:
                 self._status, self._stamp = read(self._folder), stamp
                 self._recent.take(self._status.scope)
+                self._instruments = self._drawn(self._status)
         except StatusError as error:
             self._trouble = str(error)
         except OSError as error:
             self._trouble = f"{self._folder / 'status.json'}: {error.strerror}"
+
+    def _drawn(self, status: Status) -> tuple[str, str]:
+        """Scope and planes, once for every status: they are most of what is sent."""
+        planes = "".join(self._recent.plane(edge) for edge in status.estimate.edges)
+        return self._recent.scopes(status.signals), planes and f'<div class="udp">{planes}</div>'
+
+
+def _history(folder: Path, days: str, now_s: float) -> str:
+    """Trends and calendar.  Raises RtidError where there is no history."""
+    lines = trend(folder, now_s - TREND_S)
+    before, now = two_spans(float(days), now_s)
+    told = calendar_table(float(days), side_by_side(folder, before, now))
+    cells = [[text(cell) for cell in row] for row in told.rows]
+    said = "".join(f"<p>{text(f'{note.who}: {note.text}')}</p>" for note in notes(folder, now))
+    return (
+        f"<h3>Trends</h3>{trends(lines)}<h3>Calendar</h3><p>The last "
+        f"{choice('days', DAYS, days)} days beside as many before.</p>"
+        f"{table(told.heads, cells)}{said}"
+    )
 
 
 def _nothing(trouble: str) -> str:
@@ -158,7 +197,7 @@ def _head(status: Status, age_s: float) -> str:
         f"<h2>{text(status.name)}</h2><p>{stale}{_dot(bus.state)}bus {text(bus.interface)} "
         f"{text(bus.channel)} is {bus.state}, {bus.frames_per_s:.0f} frames/s, {bus.frames:,} in "
         f"all{text(f'; refused: {refused}' if refused else '')}. State: "
-        f'<span class="{kind}">{text(saved)} {text(store.reason)}</span>. '
+        f'<span class="{kind}">{text(f"{saved} {store.reason}".rstrip())}</span>. '
         f"{status.rss_anon_mb:.0f} MB.</p>"
     )
 
@@ -195,13 +234,16 @@ def _seconds(trace: str) -> str:
     return " " + button("look at its seconds", "look", kind="link", name=trace)
 
 
-def _decisions(status: Status, asking: str) -> str:
+def _decisions(status: Status, asking: Question | None, follows: bool) -> str:
     """What somebody may decide: to accept a changed machine, to send the maps; twice asked."""
     if asking:
-        sure = button("Yes, do it", "sure", kind="main") + " " + button("No", "not_sure")
-        return f'<div class="card"><p>{text(asking)}</p>{sure}</div>'
-    accept = button("Accept the changed machine", "accept", off=not status.has(CHANGED))
-    return f"<p>{accept} {button('Apply the maps', 'apply')}</p>"
+        words = "No" if asking.may_go else "Close"
+        no = button(words, "not_sure", off=follows, name=asking.about)
+        sure = button("Yes, do it", "sure", kind="main", off=follows, name=asking.about)
+        return f'<div class="card">{asking.html}{f"{sure} " if asking.may_go else ""}{no}</div>'
+    has_changed = status.has(CHANGED)
+    accept = button("Accept the changed machine", "accept", off=follows or not has_changed)
+    return f"<p>{accept} {button('Apply the maps', 'apply', off=follows)}</p>"
 
 
 def _loop(status: Status) -> str:

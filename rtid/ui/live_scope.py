@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import pairwise
+from statistics import median
 
+from rtid.daemon.calendar import TrendLine, TrendPoint
 from rtid.daemon.status import BlockPlane, EdgeHealth, Scope, SignalHealth
 from rtid.model import COMMAND, POSITION, PRESSURE
 from rtid.tell.html import text
 from rtid.units import MPA, Z95, scale_of
 
 KEPT_S = 60.0
+DECIMALS = {"Pa": 1, "s": 2}  # of a value as it is shown
+SLIDE_S = 1.0  # between two statuses: the newest second comes in from the right meanwhile
+VAGUE = 5.0  # of the usual deviation of a trend's points
+GAP = 5.0  # of the usual time between two points of a trend
 WIDE, HIGH, PAD = 600.0, 88.0, 8.0
 COLOURS = ("var(--bar)", "var(--before)", "var(--good)", "var(--lit)", "var(--open)")
 KINDS = {COMMAND: "command", PRESSURE: "pressures", POSITION: "position"}
@@ -33,7 +40,7 @@ class Recent:
             if t > newest:
                 values = {n: (scope.low[n][k], scope.high[n][k]) for n in scope.low}
                 self._bins.append((t, values))
-        while self._bins and self._bins[-1][0] - self._bins[0][0] > KEPT_S:
+        while self._bins and self._bins[-1][0] - self._bins[0][0] > KEPT_S + SLIDE_S:
             self._bins.popleft()
 
     def __len__(self) -> int:
@@ -55,7 +62,7 @@ class Recent:
         names = [s.name for s in signals]
         ends = [e for _, values in self._bins for n in names for e in values.get(n, ())]
         low, high = _reach(ends)
-        end = self._bins[-1][0]
+        end = self._bins[-1][0] - SLIDE_S
         drawn = ""
         for name, colour in zip(names, COLOURS, strict=False):
             points = [
@@ -67,9 +74,10 @@ class Recent:
             for n, c in zip(names, COLOURS, strict=False)
         )
         words = f"{scale.factor * low:.3g} to {scale.factor * high:.3g} {scale.name}"
+        slide = f'<g class="slide">{drawn}</g>'
         return (
             f'<p class="key">{title}: {keys}; {text(words)}, last {KEPT_S:.0f} s</p>'
-            f"{_svg(drawn, f'{title} over the last minute', HIGH)}"
+            f"{_svg(slide, f'{title} over the last minute', HIGH)}"
         )
 
     def plane(self, edge: EdgeHealth) -> str:
@@ -122,26 +130,53 @@ class Recent:
 FILLS = {"v": "var(--bar)", "l": "var(--open)"}
 
 
-def trends(series: Mapping[str, Sequence[tuple[float, float, float]]], unit: str) -> str:
-    """Values over hours with their 95 % bands: (unix_s, value, sd) by name."""
-    known = {name: every for name, every in series.items() if len(every) > 1}
-    if not known:
-        return ""
-    t0 = min(every[0][0] for every in known.values())
-    t1 = max(every[-1][0] for every in known.values())
-    low, high = _reach([e for every in known.values() for _, v, sd in every
-                        for e in (v - Z95 * sd, v + Z95 * sd)])  # fmt: skip
-    drawn = ""
-    for (_, every), colour in zip(known.items(), COLOURS, strict=False):
-        points = [(WIDE * (t - t0) / max(t1 - t0, 1.0), v - Z95 * sd, v + Z95 * sd)
-                  for t, v, sd in every]  # fmt: skip
-        drawn += _band(points, low, high, colour)
-    scale, hours = scale_of(unit), (t1 - t0) / 3600.0
-    keys = ", ".join(
-        f'<span style="color:{c}">■</span> {text(n)}' for n, c in zip(known, COLOURS, strict=False)
+def trends(lines: Iterable[TrendLine]) -> str:
+    """What was learned over hours with its 95 % bands, one plot for what is of one kind."""
+    known = [line for line in lines if len(line.points) > 1]
+    kinds: dict[tuple[str, str], list[TrendLine]] = {}
+    for line in known:
+        kinds.setdefault((line.unit, line.name.split()[0]), []).append(line)
+    ends = [t for line in known for t in (line.points[0][0], line.points[-1][0])]
+    return "".join(_trend_plot(kind, min(ends), max(ends)) for kind in kinds.values())
+
+
+def _trend_plot(lines: Sequence[TrendLine], t0: float, t1: float) -> str:
+    """Bands and means from t0 to t1, unix_s; a time without values is a gap."""
+    low, high = _reach([end for line in lines for end in _ends(line.points)])
+    drawn, keys, scale = "", [], scale_of(lines[0].unit)
+    for line, colour in zip(lines, COLOURS, strict=False):
+        for points in _pieces(line.points):
+            at = [(WIDE * (t - t0) / max(t1 - t0, 1.0), v, Z95 * sd) for t, v, sd in points]
+            drawn += _band([(x, v - d, v + d) for x, v, d in at], low, high, colour, 0.3)
+            drawn += _band([(x, v, v) for x, v, _ in at], low, high, colour)
+        _, value, sd = line.points[-1]
+        said = f"{line.name} {scale.known(value, sd, DECIMALS.get(line.unit, 4))} {scale.name}"
+        keys.append(f'<span style="color:{colour}">■</span> {text(said.rstrip())}')
+    words = f"{scale.factor * low:.4g} to {scale.factor * high:.4g}, {(t1 - t0) / 3600.0:.2g} h"
+    return (
+        f'<p class="key">{", ".join(keys)}; {text(words)}, bands: 95 %</p>'
+        f"{_svg(drawn, f'{lines[0].name} over hours', HIGH)}"
     )
-    words = f"{scale.factor * low:.4g} to {scale.factor * high:.4g} {scale.name}, {hours:.2g} h"
-    return f'<p class="key">{keys}; {text(words)}, bands: 95 %</p>{_svg(drawn, "trends", HIGH)}'
+
+
+def _ends(points: Sequence[TrendPoint]) -> Iterator[float]:
+    """Ends of the bands; what was hardly known, at a start, says nothing of the scale."""
+    most = VAGUE * median(sd for _, _, sd in points)
+    for _, value, sd in points:
+        if sd <= most:
+            yield value - Z95 * sd
+            yield value + Z95 * sd
+
+
+def _pieces(points: Sequence[TrendPoint]) -> Iterator[Sequence[TrendPoint]]:
+    """The points without the gaps: times that are far longer than usual."""
+    steps = [b[0] - a[0] for a, b in pairwise(points)]
+    most, first = GAP * median(steps), 0
+    for k, step in enumerate(steps, 1):
+        if step > most:
+            yield points[first:k]
+            first = k
+    yield points[first:]
 
 
 def _reach(values: Sequence[float]) -> Ends:
@@ -150,7 +185,13 @@ def _reach(values: Sequence[float]) -> Ends:
     return low - room, high + room
 
 
-def _band(points: Sequence[tuple[float, float, float]], low: float, high: float, ink: str) -> str:
+def _band(
+    points: Sequence[tuple[float, float, float]],
+    low: float,
+    high: float,
+    ink: str,
+    opacity: float = 0.8,
+) -> str:
     """The ground between two lines: x, lower and upper end."""
 
     def y(value: float) -> float:
@@ -158,7 +199,7 @@ def _band(points: Sequence[tuple[float, float, float]], low: float, high: float,
 
     above = [f"{x:.1f},{y(b) - 0.5:.1f}" for x, _, b in points]
     below = [f"{x:.1f},{y(a) + 0.5:.1f}" for x, a, _ in reversed(points)]
-    return f'<polygon points="{" ".join(above + below)}" fill="{ink}" fill-opacity=".8"/>'
+    return f'<polygon points="{" ".join(above + below)}" fill="{ink}" fill-opacity="{opacity}"/>'
 
 
 def _svg(content: str, label: str, high: float) -> str:

@@ -295,18 +295,19 @@ def start(
     host: str = "127.0.0.1",
     port: int = 0,
     sheet: Path | None = None,
+    test_bus: bool = False,
 ) -> Workbench:
     """Begin to serve on the current event loop; port 0: any that is free.
 
     project: None where there is none yet; state: folder in which a daemon keeps its state, for the
-    live page.  Raises RtidError where the
-    port is taken.
+    live page; test_bus: maps may be sent over a bus that anybody may write to.  Raises RtidError
+    where the port is taken.
     """
     if trace is not None or project is None:
         import_module("rtid.ui.desk_views")  # now, not while somebody waits for a picture
     loop = IOLoop.current()
     worker = Worker(loop.add_callback)
-    session = Session(project or Path.cwd(), trace, worker, sheet)
+    session = Session(project or Path.cwd(), trace, worker, sheet, folder=state, test_bus=test_bus)
     if project is None:
         folder = trace.resolve().parent if trace else Path.cwd()
         session = Session(folder, None, worker, arrival=Arrival(folder, trace and trace.resolve()))

@@ -17,6 +17,7 @@ from rtid.plain import Key
 from rtid.project.added import AddedSection
 from rtid.ui.arrival import Arrival, choose
 from rtid.ui.release_form import Released, ReleaseWish
+from rtid.ui.sending import Sending, Way
 from rtid.ui.worker import Worker
 
 if TYPE_CHECKING:
@@ -62,6 +63,9 @@ class Session:
     writer: int | None = None  # the browser that works on the record
     arrival: Arrival | None = None  # before there is a project
     released: Released | None = None  # that can be taken from the page
+    folder: Path | None = None  # in which a daemon keeps its state
+    test_bus: bool = False  # maps may be sent over a bus that anybody may write to
+    sending: Sending | None = None  # waits for a yes
     _is_adding: bool = False
 
     def open(self) -> None:
@@ -166,9 +170,35 @@ class Session:
 
         self.ask("release", wish, then=done)
 
-    def apply(self) -> None:
-        """Send the learned maps to the controller, as `rtid apply` does."""
-        self.ask("apply", self.project, then=self.say)
+    def foretell(self) -> None:
+        """Ask whether the daemon's offer shall be sent, with what would change."""
+        self.sending = None
+        self.ask("foretell", self._way, then=self._foretold)
+
+    def send(self) -> None:
+        """Send what was asked about, as `rtid apply` does."""
+        seen, self.sending = self.sending, None
+        if seen is not None and seen.may_go:
+            self.ask("send", self._way, seen, then=self._sent)
+
+    def not_sent(self) -> None:
+        """Leave the controller as it is."""
+        self.sending = None
+
+    @property
+    def _way(self) -> Way:
+        return Way(self.project, self.folder, self.test_bus)
+
+    def _foretold(self, foretold: Sending) -> None:
+        self.sending = foretold
+        self.tell("state")
+
+    def _sent(self, outcome: str | Sending) -> None:
+        if isinstance(outcome, str):
+            self.say(outcome)
+        else:
+            self._foretold(outcome)
+            self.say("nothing was sent: the controller tells something else than the records")
 
     def look_at(self, name: str) -> None:
         """Open the recorded seconds around an alarm."""

@@ -71,7 +71,7 @@ VIEWS = {
     "why": ViewRow("rtid.ui.why_view:WhyView", ("plot", "says", "scroll ranking", "scroll page")),
     "add": ViewRow("rtid.ui.add_view:AddView", ("scroll bars", "plot", "says")),
     "map": ViewRow("rtid.ui.map_view:MapView", ("tools", "tools release", "plot", "says")),
-    "live": ViewRow("", ("scroll health", "scroll learning")),
+    "live": ViewRow("", ("scroll scope", "scroll health", "scroll planes", "scroll learning")),
 }
 
 

@@ -40,6 +40,16 @@ END_S = 60.0
 UPDATES = "() => Number(document.querySelector('#seen').textContent)"
 # what a page shows that gets no answer any more, without the line of the console about it
 GONE = """() => { window.fetch = () => Promise.reject(); }"""
+SLID_S = 2.0
+PLACES = f"""() => new Promise((done) => {{
+  const seen = new Set(), end = performance.now() + {1e3 * SLID_S};
+  const look = (now) => {{
+    const curves = document.querySelector("#live_scope .slide");
+    seen.add(getComputedStyle(curves).transform + document.querySelector("#seen").textContent);
+    if (now < end) requestAnimationFrame(look); else done(seen.size);
+  }};
+  requestAnimationFrame(look);
+}})"""
 MEMORY = "() => performance.memory.usedJSHeapSize / 1e6"
 
 
@@ -108,10 +118,11 @@ def test_the_page_follows_a_daemon(opened: Opened) -> None:
     assert "Hz" in signals
     assert "blocks valid" in page.locator("#live_learning").inner_text()
     assert page.locator("#live_learning >> text=To learn more").count() == 1
-    assert page.locator("#live_health .scope polygon").count() >= 5  # command, pressures, position
-    points = page.locator("#live_health .scope polygon").first.get_attribute("points") or ""
+    assert page.locator("#live_scope .scope polygon").count() >= 5  # command, pressures, position
+    points = page.locator("#live_scope .scope polygon").first.get_attribute("points") or ""
     assert len(points.split()) >= 2 * 5 * SHORT_S  # ten values a second, less what is not told yet
-    assert page.locator("#live_learning .plane circle").count() > 10
+    assert page.locator("#live_planes .plane circle").count() > 10
+    assert page.evaluate(PLACES) >= 10 * SLID_S  # the curves slide between two statuses
 
 
 @pytest.mark.soak

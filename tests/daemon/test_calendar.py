@@ -6,6 +6,7 @@ import json
 import re
 import sqlite3
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
@@ -13,6 +14,7 @@ from pathlib import Path
 from urllib.error import HTTPError
 from urllib.request import urlopen
 
+import numpy as np
 import pytest
 
 from rtid.cli.main import run
@@ -27,7 +29,9 @@ from rtid.daemon.calendar import (
     write_note,
 )
 from rtid.daemon.chronicle import DAY_S, FILE, Chronicle
+from rtid.daemon.jobs import Publication
 from rtid.errors import RtidError
+from rtid.estimator.flowmap import FlowMap
 from tests.daemon.test_parts import full_status
 
 NOW_S = 1.8e9
@@ -64,7 +68,65 @@ def test_two_weeks_stand_side_by_side(history: Path) -> None:
     cells = {r[0]: r for r in calendar_table(5.0, rows).rows}
     assert cells["bulk modulus a MPa"][3:] == ("-100", "more than both scatter")
     assert cells["bulk modulus b MPa"][4] == ""
-    assert len(trend(history, NOW_S - 5 * DAY_S)["a"]) == 50
+    lines = {line.name: line for line in trend(history, NOW_S - 5 * DAY_S)}
+    assert len(lines["bulk modulus a"].points) == 50
+    assert lines["bulk modulus a"].points[-1] == pytest.approx((NOW_S - 1.0, 9.01e8, 1e6))
+
+
+def test_sizes_and_the_lag_are_kept_with_their_intervals(tmp_path: Path) -> None:
+    """Those learned on board from every publication, the others from every diagnosis."""
+    value = {"value": 2e-12, "std": 1e-13, "unit": "m3/s/Pa"}
+    leak = {"effect": "leak", "where": "a-b", "parameters": {"coefficient": value}}
+    timing = {"value": 2e-3, "std": 1e-4, "unit": "s"}
+    late = {"effect": "late", "where": "u", "parameters": {"delay": timing, "no": {"value": None}}}
+    content = {"lag_s": 5e-3, "lag_sd_s": 2e-4, "added": [leak], "found": [late]}
+    history, since_s = Chronicle(tmp_path), time.time() - 100.0
+    for k in range(4):
+        verdict = status.Verdict(since_s + 10 * k, "missing", "said", content=content)
+        history.note_verdict(verdict)
+        size = status.EffectStatus("leak a-b", 2e-12 + k * 1e-13, 1e-13, "m3/s/Pa")
+        history.note_publication(publication(size), [])
+    history.note_verdict(replace(verdict, content={"lag_s": 5e-3}))
+    history.close()
+    lines = {line.name: line for line in trend(tmp_path, 0.0)}
+    assert [len(lines[name].points) for name in ("spool lag", "late u")] == [4, 4]
+    assert lines["spool lag"].points[0] == pytest.approx((since_s, 5e-3, 2e-4))
+    assert (lines["late u"].unit, lines["leak a-b"].unit) == ("s", "m3/s/Pa")
+    assert len(learned_on_board(tmp_path)) == 5  # one of the first diagnosis, before any on board
+    rows = {row.name: row for row in side_by_side(tmp_path, *two_spans(1.0))}
+    assert rows["spool lag"].now == pytest.approx((5e-3, 0.0), abs=1e-9)
+
+
+def test_a_history_of_an_older_daemon_has_no_sizes(history: Path) -> None:
+    with closing(sqlite3.connect(history / FILE)) as base:
+        base.execute("DROP TABLE quantity")
+        base.commit()
+    assert [line.name for line in trend(history, 0.0)] == ["bulk modulus a", "bulk modulus b"]
+    assert side_by_side(history, *two_spans(5.0, NOW_S))
+
+
+def test_a_trend_is_thinned_to_means(tmp_path: Path) -> None:
+    Chronicle(tmp_path).close()
+    with closing(sqlite3.connect(tmp_path / FILE)) as base:
+        rows = [(NOW_S + k, "a", 1e9 + k % 2, 1e6) for k in range(10_000)]
+        base.executemany("INSERT INTO estimate VALUES (?, ?, ?, ?)", rows)
+        base.commit()
+    (line,) = trend(tmp_path, NOW_S)
+    assert 390 <= len(line.points) <= 400
+    assert all(v == pytest.approx(1e9 + 0.5, abs=0.1) for _, v, _ in line.points[:-1])
+    times = [t for t, _, _ in line.points]
+    assert times == sorted(times) and times[-1] - times[0] > 9_900
+
+
+def publication(*effects: status.EffectStatus) -> Publication:
+    """Of a machine without valves, as far as a history is told of it."""
+    none = np.empty(0)
+    return Publication(1, FlowMap(()), none, none, 1.0, 0.0, (), 0.1, effects)
+
+
+def learned_on_board(folder: Path) -> list[tuple[float, ...]]:
+    with closing(sqlite3.connect(folder / FILE)) as base:
+        return base.execute("SELECT value FROM quantity WHERE name = 'leak a-b'").fetchall()
 
 
 def test_a_note_stands_with_its_span_and_no_other(history: Path) -> None:

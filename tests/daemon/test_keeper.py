@@ -18,6 +18,7 @@ from rtid.apply.reach import is_running
 from rtid.cli import main
 from rtid.daemon import jobs
 from rtid.daemon.acceptance import FILE, Acceptance, ask
+from rtid.daemon.core import Core
 from rtid.daemon.daemon import _locked
 from rtid.daemon.health import Health
 from rtid.daemon.keeper import BEGINS_S, Keeper
@@ -109,6 +110,24 @@ def test_an_accepted_change_is_learned_anew(keeper: Keeper) -> None:
     keeper._listen()
     assert (before, core.learner.learns) == (False, True)  # once the new estimate is there
     assert core.swap is anew and not keeper.plant.changed
+
+
+def test_no_hand_over_takes_the_samples_from_who_reads_them() -> None:
+    """The keeper's thread reads them for an acceptance while the loop copies the estimator."""
+
+    class Watched(Estimator):
+        def __setattr__(self, name: str, value: object) -> None:
+            assert name != "history", "gone for a moment"
+            super().__setattr__(name, value)
+
+    learner, put = machine().learner(), list[Any]()
+    learner.push(machine().frames[:3000])
+    learner.estimator.__class__ = Watched
+    analyst: Any = SimpleNamespace(put=lambda job, first: put.append(job))
+    source: Any = SimpleNamespace()
+    core = Core(machine().project, learner, source, analyst)
+    core.hand_over(publish=True, store=True)
+    assert put[0].estimator.history is None and learner.estimator.history is not None
 
 
 def test_the_coach_is_asked_while_the_machine_learns(keeper: Keeper) -> None:

@@ -13,6 +13,7 @@ from rtid.diagnose.diagnosis import search
 from rtid.diagnose.report import Diagnosis, FoundEffect, diagnosis
 from rtid.effects import from_expression, names_of_model
 from rtid.model import Lag
+from rtid.sim.random_plants import draw
 from rtid.tell.diagnosed import sentences
 from tests.diagnose.records import record
 
@@ -58,6 +59,8 @@ def test_a_lag_that_is_declared_as_anything_is_learned(seed: int) -> None:
     found = diagnosis(search(replace(model, lag=Lag(0.0, 5e-3)), chunk, held_out))
     assert (found.verdict, found.found) == ("matches", ())
     assert found.lag_s == pytest.approx(model.lag.nominal_s, abs=0.25e-3)
+    assert 1e-6 < found.lag_sd_s < 2e-5
+    assert abs(found.lag_s - draw(seed).lag_s) < 4 * found.lag_sd_s
     assert found.rho_before < 1.1
 
 

@@ -101,3 +101,4 @@ def test_a_lag_that_would_leave_its_range_is_held() -> None:
     model = replace(model, lag=Lag(1e-3, 1e-4))
     done = fit(model, chunk, replace(weights(), lag_s=1e-3), Revision(), bank=False)
     assert 0.0 <= done.weights.lag_s <= 1e-3 + 3 * 1e-4 + 1e-12
+    assert np.isnan(replace(done, declared=replace(model, lag=Lag(1e-3, 0.0))).lag_sd_s)

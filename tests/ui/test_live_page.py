@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from rtid.daemon import calendar
+from rtid.daemon.chronicle import Chronicle
 from rtid.daemon.status import (
     Advice,
     Alarm,
@@ -17,12 +21,14 @@ from rtid.daemon.status import (
     EstimateStatus,
     LoopHealth,
     MessageHealth,
+    Scope,
     SignalHealth,
     Status,
     Store,
     Verdict,
     write,
 )
+from rtid.ui import live_page
 from rtid.ui.live_page import Live
 
 NOW = 1_800_000_000.0
@@ -61,8 +67,7 @@ def status() -> Status:
 
 
 def shown(folder: Path, at: float = NOW + 0.5) -> str:
-    parts = Live(folder, lambda: at).fragments()
-    return parts["live_health"] + parts["live_learning"]
+    return "".join(Live(folder, lambda: at).fragments().values())
 
 
 def test_everything_that_the_daemon_says_is_there(tmp_path: Path) -> None:
@@ -104,3 +109,43 @@ def test_a_histogram_of_nothing_is_no_picture(tmp_path: Path, edges: tuple[float
     empty = Distribution(0, edges_us=edges, counts=(0,) * max(0, len(edges) - 1))
     write(tmp_path, replace(status(), loop=LoopHealth(1000.0, work=empty)))
     assert "<svg" not in shown(tmp_path)
+
+
+def test_a_long_history_is_read_beside_whoever_looks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The loop that serves all pages does not wait for it, and it is read once at a time."""
+    write(tmp_path, status())
+    Chronicle(tmp_path).close()
+    may_go, begun = threading.Event(), list[str]()
+
+    def slowly(*_: object) -> list[calendar.TrendLine]:
+        begun.append(threading.current_thread().name)
+        assert may_go.wait(30.0)
+        return [calendar.TrendLine("spool lag", "s", ((0.0, 5e-3, 1e-4), (60.0, 5e-3, 1e-4)))]
+
+    monkeypatch.setattr(live_page, "trend", slowly)
+    at = [NOW]
+    live = Live(tmp_path, lambda: at[0])
+    for _ in range(5):
+        assert "spool lag" not in live.fragments()["live_health"]
+        at[0] += 60.0
+    assert begun == ["rtid-history"]
+    may_go.set()
+    end_s = time.monotonic() + 30.0
+    while "spool lag 5.00" not in live.fragments()["live_health"]:
+        assert time.monotonic() < end_s
+
+
+def test_what_moves_is_sent_once_for_every_status(tmp_path: Path) -> None:
+    """Ages change five times a second; the scope and the planes, most of the bytes, do not."""
+    bins = tuple(NOW - 60 + 0.1 * k for k in range(10))
+    scope = Scope(bins, {"p_a": (1e6,) * 10}, {"p_a": (2e6,) * 10})
+    write(tmp_path, replace(status(), scope=scope))
+    at = [NOW]
+    live = Live(tmp_path, lambda: at[0], lambda do: None)
+    first = live.fragments()
+    at[0] += 0.2
+    later = live.fragments()
+    assert "<polygon" in first["live_scope"] and later["live_scope"] == first["live_scope"]
+    assert later["live_health"] != first["live_health"] and "<polygon" not in first["live_health"]

@@ -31,7 +31,7 @@ class Ticking:
     def hear(self) -> None:
         """A status is read whatever is looked at: the last minute is there when somebody looks."""
 
-    def fragments(self, asking: str = "") -> dict[str, str]:
+    def fragments(self, asking: object = None, follows: bool = False) -> dict[str, str]:
         self.looks += 1
         return {"live_health": f"<p>{self.looks}</p>", "live_learning": ""}
 

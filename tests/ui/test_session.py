@@ -10,7 +10,9 @@ from typing import Any
 from rtid.diagnose.report import Diagnosis, FoundEffect, Value
 from rtid.errors import RtidError
 from rtid.project.added import AddedSection, ParameterSection
+from rtid.tell.story import Story
 from rtid.ui.headline import strip
+from rtid.ui.sending import Sending, Way
 from rtid.ui.shared import FAILED, LOADING, READY, ROLE, Session
 
 KEY = "internal_leakage_laminar", "a-b"
@@ -53,7 +55,7 @@ def told(*named: tuple[str, str], alike: tuple[str, ...] = ()) -> Any:
     )
     said = Diagnosis(
         "missing" if named else "matches", (), found, 100.0, 1.0, 2e-6, 2e-7, 1e-7, 1e-4, (1e9,),
-        0.0, False, True, (), (), (),
+        0.0, NAN, False, True, (), (), (),
     )  # fmt: skip
     return SimpleNamespace(diagnosis=said, ranking=())
 
@@ -68,6 +70,10 @@ def state(session: Session) -> str:
 
 def named(session: Session) -> object:
     return session.named
+
+
+def waiting(session: Session) -> Sending | None:
+    return session.sending
 
 
 def looks(session: Session) -> list[Any]:
@@ -223,3 +229,42 @@ def test_one_browser_works_and_the_others_follow() -> None:
     assert writer(session) == 1, "who followed works on"
     session.leave(1)
     assert writer(session) is None and not session.pages
+
+
+def test_maps_are_sent_after_a_yes_to_what_would_change() -> None:
+    worker = FakeWorker()
+    session = Session(Path("m.toml"), None, worker, folder=Path("state"))  # type: ignore[arg-type]
+    session.open()
+    session.send()
+    assert worker.jobs == []  # nothing was asked about
+    session.foretell()
+    assert worker.jobs[0][:2] == ("foretell", (Way(Path("m.toml"), Path("state")),))
+    asked = Sending(Story("first", ()))
+    worker.answer(asked)
+    assert waiting(session) is asked and worker.jobs == []
+    session.not_sent()
+    session.send()
+    assert waiting(session) is None and worker.jobs == []
+    session.foretell()
+    worker.answer(asked)
+    session.send()
+    session.send()  # pressed twice
+    assert [job[:2] for job in worker.jobs] == [
+        ("send", (Way(Path("m.toml"), Path("state")), asked))
+    ]
+    other = Sending(Story("what the controller says", ()))
+    worker.answer(other)
+    assert waiting(session) is other and session.note.startswith("nothing was sent")
+    session.send()
+    worker.answer("active: version 2")
+    assert waiting(session) is None and session.note == "active: version 2"
+
+
+def test_what_is_refused_is_not_sent_by_a_yes() -> None:
+    worker = FakeWorker()
+    session = Session(Path("m.toml"), None, worker)  # type: ignore[arg-type]
+    for asked in (Sending(Story("", ()), ("too much",)), Sending(Story("", ()), is_same=True)):
+        session.foretell()
+        worker.answer(asked)
+        session.send()
+        assert worker.jobs == []
