@@ -64,12 +64,12 @@ faults: $(READY)
 	  cat out/faults.md; exit $$status
 
 # Mutated projects, DBCs, EDS, logs, tables and plant files, 500 of each format, each through its
-# command (an hour): make fuzz SEED=2 FU.PHONY: demo check test wheel bench speed="--logs 500 --dbcs 0"; one case again: --case logs-17
+# command (an hour): make fuzz SEED=2 FUZZ="--logs 500 --dbcs 0"; one case again: --case logs-17
 SEED ?= 1
-FU.PHONY: demo check test wheel bench speed ?= --projects 500 --dbcs 500 --nodes 500 --logs 5000 --tables 3000 --plants 200 --bombs 8
+FUZZ ?= --projects 500 --dbcs 500 --nodes 500 --logs 5000 --tables 3000 --plants 200 --bombs 8
 fuzz: $(READY)
 	@rm -rf out/fuzz && mkdir -p out
-	.venv/bin/python -m tests.fuzz --seed $(SEED) --out out/fuzz $(FU.PHONY: demo check test wheel bench speed)
+	.venv/bin/python -m tests.fuzz --seed $(SEED) --out out/fuzz $(FUZZ)
 
 # The long ones (an hour): a full bus, 50 kills, hours in minutes, live diagnoses, an open page.
 soak: $(READY)
