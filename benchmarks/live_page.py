@@ -1,13 +1,15 @@
 """What the live page costs: the daemon's loop with and without it, and the memory of its tab.
 
-`python -m benchmarks.live_page [--slice 10] [--pairs 12] [--minutes 10] [--priority 60]`
+`python -m benchmarks.live_page [--slice 4] [--pairs 60] [--minutes 10] [--priority 60]`
 
 Daemon, machine (on the test bus) and page server are processes of their own, the page is open in
-Chromium.  Slices with the page closed and open alternate, because the host steals time at random;
-of each second the daemon tells the p99 of its work and of its lateness; the ratio of the medians of
-two neighbouring slices is taken, its interval by resampling pairs.  Then the page stays open: the
+Chromium.  Slices without and with it alternate, because the host steals time at random: for the
+slice without, page server and browser are stopped as they are (SIGSTOP), so that opening the page
+is no part of what is measured.  Of each second the daemon tells the p99 of its work and of its
+lateness; the ratio of the medians of two neighbouring slices is taken, its interval by resampling
+pairs.  Beside it stands the processor time of server and browser.  Then the page stays open: the
 script heap after a collection and the private memory of its process, sampled every ten seconds; the
-growth is the slope after the first fifth.
+growth is the slope after the first fifth.  Whatever hangs, it ends after twice the time it should.
 """
 
 from __future__ import annotations
@@ -15,17 +17,20 @@ from __future__ import annotations
 import argparse
 import os
 import re
+import signal
 import subprocess
 import sys
 import tempfile
 import time
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.page import browser_s, spent_s
 from rtid.daemon.status import StatusError, read
 from rtid.sim.random_plants import draw
 from rtid.sim.recording import write_run
@@ -36,8 +41,8 @@ if TYPE_CHECKING:
 
 FLAGS = ["--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"]
 CHANNEL = f"239.74.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"
-SEED, SETTLE_S, SAMPLE_S, WARM = 3, 2.0, 10.0, 0.2
-PATIENCE_S = 120.0
+SEED, SETTLE_S, SAMPLE_S, WARM = 3, 1.5, 10.0, 0.2
+PATIENCE_S, END_S = 120.0, 30.0
 UPDATES = "() => Number(document.querySelector('#seen').textContent)"
 FloatArray = NDArray[np.float64]
 
@@ -47,13 +52,22 @@ def begin(stack: ExitStack, *arguments: str, heard: bool = False) -> subprocess.
     command = [sys.executable, "-u", "-m", "rtid", *arguments]
     out = subprocess.PIPE if heard else subprocess.DEVNULL
     process = subprocess.Popen(command, stdout=out, stderr=subprocess.DEVNULL, text=True)
-    stack.callback(process.wait, 30)
-    stack.callback(process.terminate)
+    stack.callback(end, process)
     return process
 
 
-def machine(stack: ExitStack, folder: Path, seconds: float, priority: int) -> tuple[Path, str]:
-    """A daemon that learns, and the page's server: state folder and address."""
+def end(process: subprocess.Popen[str]) -> None:
+    """Ask it to end; a daemon that cannot on a loaded machine must not load the next run."""
+    process.terminate()
+    try:
+        process.wait(END_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def machine(stack: ExitStack, folder: Path, seconds: float, priority: int) -> tuple[Path, str, int]:
+    """A daemon that learns, and the page's server: state folder, address, its process."""
     run = simulate(draw(SEED), "rich", SEED, 2.0)
     project = write_run(folder / "m.parquet", run, SEED, "rich")[2]
     if priority:
@@ -65,14 +79,15 @@ def machine(stack: ExitStack, folder: Path, seconds: float, priority: int) -> tu
     begin(stack, "run", str(project), *bus, "--state", str(state))
     begin(stack, "simulate", "--plant", str(SEED), "--motion", "rich", "--duration", f"{seconds:g}",
           "--bus", "udp_multicast", "--channel", CHANNEL)  # fmt: skip
-    page = begin(stack, "ui", str(project), "--state", str(state), "--port", "0", heard=True)
+    page = begin(stack, "ui", str(project), "--state", str(state), "--port", "0",
+                 "--no-open", heard=True)  # fmt: skip
     assert page.stdout is not None
     url = next(m[0] for line in page.stdout if (m := re.search(r"http://\S+", line)))
     end = time.monotonic() + PATIENCE_S
     while time.monotonic() < end:
         try:
             if read(state).estimate.samples > 5000:
-                return state, url
+                return state, url, page.pid
         except StatusError:
             pass
         time.sleep(0.5)
@@ -81,8 +96,9 @@ def machine(stack: ExitStack, folder: Path, seconds: float, priority: int) -> tu
 
 def seconds_of(state: Path, seconds: float) -> FloatArray:
     """p99 of work and lateness (n, 2), us, of every second that the daemon tells of."""
-    times, last, end = [], 0, time.monotonic() + seconds
-    while time.monotonic() < end:
+    last, end = 0, time.monotonic() + seconds
+    times: list[tuple[float, float]] = []
+    while time.monotonic() < end or not times:  # a stalled daemon is waited for
         loop = read(state).loop
         if loop.ticks != last:
             last = loop.ticks
@@ -91,29 +107,46 @@ def seconds_of(state: Path, seconds: float) -> FloatArray:
     return np.array(times)
 
 
-def cost(state: Path, page: Page, url: str, slice_s: float, pairs: int) -> FloatArray:
-    """Medians of both p99 (pairs, closed or open, 2)."""
-    shares = np.empty((pairs, 2, 2))
+@contextmanager
+def asleep(server: int) -> Iterator[None]:
+    """Stop page server and browser until the block ends."""
+    pids = [server, *browser_s()]
+    for pid in pids:
+        os.kill(pid, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        for pid in pids:
+            os.kill(pid, signal.SIGCONT)
+
+
+def cost(state: Path, server: int, slice_s: float, pairs: int) -> FloatArray:
+    """Medians of both p99 (pairs, without or with the open page, 2)."""
+    shares, spent, awake_s = np.empty((pairs, 2, 2)), np.zeros(2), 0.0
     for k in range(pairs):
-        for is_open in (k % 2, 1 - k % 2):  # neither comes first always
-            page.goto(f"{url}#live" if is_open else "about:blank")
-            if is_open:
-                page.wait_for_selector("#live_learning progress")
-            time.sleep(SETTLE_S)
-            shares[k, is_open] = np.median(seconds_of(state, slice_s), axis=0)
-        print(f"pair {k + 1}: closed {shares[k, 0]}, open {shares[k, 1]} us, load "
-              f"{os.getloadavg()[0]:.1f}", flush=True)  # fmt: skip
+        for is_awake in (k % 2, 1 - k % 2):  # neither comes first always
+            with nullcontext() if is_awake else asleep(server):
+                time.sleep(SETTLE_S)
+                before, begun = (spent_s(server), sum(browser_s().values())), time.monotonic()
+                shares[k, is_awake] = np.median(seconds_of(state, slice_s), axis=0)
+            if is_awake:
+                awake_s += time.monotonic() - begun
+                spent += (spent_s(server) - before[0], sum(browser_s().values()) - before[1])
+        if k % 10 == 9:
+            print(f"{k + 1} pairs, load {os.getloadavg()[0]:.1f}", flush=True)
+    server_share, browser_share = 100 * spent / awake_s
+    print(f"processor: page server {server_share:.1f} %, browser {browser_share:.1f} % of a core")
     return shares
 
 
 def report_cost(shares: FloatArray) -> None:
-    """Ratios open / closed with their intervals."""
+    """Ratios with / without the page, and their intervals."""
     ratios = shares[:, 1] / shares[:, 0]
     rng = np.random.default_rng(0)
     again = np.median(ratios[rng.integers(0, len(ratios), (1000, len(ratios)))], axis=1)
     low, high = np.quantile(again, [0.025, 0.975], axis=0)
     for k, name in enumerate(("work", "lateness")):
-        print(f"loop p99, {name}: closed {np.median(shares[:, 0, k]):.0f} us, open "
+        print(f"loop p99, {name}: without {np.median(shares[:, 0, k]):.0f} us, with "
               f"{np.median(shares[:, 1, k]):.0f} us, ratio {np.median(ratios[:, k]):.3f} "
               f"({low[k]:.3f} .. {high[k]:.3f})")  # fmt: skip
 
@@ -169,26 +202,34 @@ def report_memory(rate: float, sizes: FloatArray) -> None:
           f"what stays {heap:+.2f} and {private:+.1f} MB in 30 minutes")  # fmt: skip
 
 
+def _too_late(number: int, frame: object) -> None:
+    raise SystemExit("it took twice as long as it should: see what hangs")
+
+
 def main() -> None:
     """Measure and report."""
     from playwright.sync_api import sync_playwright
 
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--slice", type=float, default=10.0)
-    parser.add_argument("--pairs", type=int, default=12)
+    parser.add_argument("--slice", type=float, default=4.0)
+    parser.add_argument("--pairs", type=int, default=60)
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--priority", type=int, default=60)
     wanted = parser.parse_args()
-    seconds = 2.5 * wanted.pairs * (wanted.slice + 10) + 60 * wanted.minutes + PATIENCE_S
+    needed_s = 2 * wanted.pairs * (wanted.slice + SETTLE_S) + 60 * wanted.minutes + PATIENCE_S
+    signal.signal(signal.SIGALRM, _too_late)
+    signal.alarm(round(2 * needed_s))
     with ExitStack() as stack, sync_playwright() as running:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        state, url = machine(stack, folder, seconds, wanted.priority)
+        state, url, server = machine(stack, folder, 2 * needed_s, wanted.priority)
         browser = running.chromium.launch(executable_path="/usr/bin/chromium", args=FLAGS)
         page = browser.new_page()
         page.set_default_timeout(1e3 * PATIENCE_S)
         print(f"loop: {read(state).loop.rate_hz:g} Hz, {read(state).loop.scheduling}")
         if wanted.pairs:
-            report_cost(cost(state, page, url, wanted.slice, wanted.pairs))
+            page.goto(f"{url}#live")
+            page.wait_for_selector("#live_learning progress")
+            report_cost(cost(state, server, wanted.slice, wanted.pairs))
         if wanted.minutes:
             report_memory(*memory(browser, page, url, wanted.minutes))
         browser.close()

@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from math import log10
+from math import floor, log10
 from pathlib import Path
 
 from rtid.daemon.acceptance import Acceptance, ask
@@ -83,13 +83,13 @@ class Live:
         if status is None:
             empty = dict.fromkeys(("live_scope", "live_planes", "live_learning"), "")
             return empty | {"live_health": _nothing(self._trouble)}
-        age_s = max(0.0, self._clock() - status.now_unix_s)
-        health = _head(status, age_s) + _alarms(status, self._clock())
+        age_s = max(0.0, floor(self._clock() - status.now_unix_s))  # sent anew once a second
+        health = _head(status, age_s) + _alarms(status, status.now_unix_s + age_s)
         health += _decisions(status, asking, follows) + self._trends() + _loop(status)
         health += _signals(status.signals) + _messages(status.messages)
         learning = _learning(status) + _coach(status.advice) + _verdict(status)
         scope, planes = self._instruments
-        css = "stale" if age_s > STALE_S else ""
+        css = "stale" if age_s >= STALE_S else ""
         shown = {"scope": scope, "planes": planes, "health": health, "learning": learning}
         return {
             f"live_{place}": f'<div class="{css}">{html}</div>' if html else ""
@@ -189,7 +189,7 @@ def _age(age_s: float | None) -> str:
 
 def _head(status: Status, age_s: float) -> str:
     bus, store = status.bus, status.store
-    stale = f'<b class="bad">stale: {age_s:.0f} s old.</b> ' if age_s > STALE_S else ""
+    stale = f'<b class="bad">stale: {age_s:.0f} s old.</b> ' if age_s >= STALE_S else ""
     refused = _counts(bus.refused)
     saved = f"{store.state}{f' {_age(store.age_s)} ago' if store.age_s is not None else ''}"
     kind = "bad" if store.state == "NOT SAVED" else ""

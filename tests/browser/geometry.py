@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
-SIZES = ((1440, 900), (1024, 768), (768, 1024), (390, 844))
+SIZES = ((1920, 1080), (1440, 900), (1024, 768), (768, 1024), (390, 844))
 SCHEMES = ("light", "dark")
 PATIENCE_S, PAUSE_S = 5.0, 0.1  # for what still moves: plots that are laid out anew
 DRAWN = """() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(

@@ -6,14 +6,16 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 
 from rtid.maps.flashed import read_flashed
 from rtid.project import load
+from rtid.sim.random_plants import draw
 from rtid.study.look import look
 from rtid.study.study import Study
 from rtid.ui.views import VIEWS
-from tests.browser.conftest import DURATION_S, Opened, open_page
+from tests.browser.conftest import DURATION_S, SEED, Opened, open_page
 from tests.browser.geometry import SIZES, assert_clear
 from tests.ui.plugins import install, snippet
 from tests.ui.served import served
@@ -250,6 +252,33 @@ def test_from_the_verdict_to_the_falling_bar_and_back(
     page.keyboard.press("4")
     page.wait_for_function(f"() => document.querySelectorAll('{BARS}').length === 2")
     assert errors(opened)[1] == pytest.approx(second, rel=0.02)
+
+
+def test_a_data_sheet_is_held_beside_the_learned_map(
+    browser: Browser, recorded: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """Two clicks behind `rtid ui TRACE -p PROJECT --map sheet.csv`: the map, and the difference."""
+    trace, project = recorded
+    plant, w_v = draw(SEED), np.arange(0.0, 10.05, 0.1)
+    gains = [1.1 * plant.flow(edge, w_v, 4e6) / 2e3 for edge in plant.edges]
+    heads = ["abs_u_V", *(f"K_{edge.upper()}" for edge in plant.edges)]
+    sheet = tmp_path / "sheet.csv"
+    np.savetxt(
+        sheet, np.column_stack([w_v, *gains]), "%.9g", ",", header=",".join(heads), comments=""
+    )
+    with served(project=project, trace=trace, sheet=sheet) as bench:
+        for opened in open_page(browser, bench):
+            opened.go()
+            page = opened.page
+            page.wait_for_selector("#compare canvas")
+            page.click("nav >> text=Map")
+            page.wait_for_function(TITLED, arg="dots: sheet")
+            page.select_option("#second_select", "difference")
+            page.wait_for_function(TITLED, arg="flow less sheet")
+
+
+TITLED = """(words) => [...Bokeh.documents[0].all_models]
+  .some((m) => m.type === "Title" && m.text.includes(words))"""
 
 
 def test_the_view_of_another_package_is_a_tab_of_the_page(

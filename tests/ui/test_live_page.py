@@ -138,14 +138,16 @@ def test_a_long_history_is_read_beside_whoever_looks(
 
 
 def test_what_moves_is_sent_once_for_every_status(tmp_path: Path) -> None:
-    """Ages change five times a second; the scope and the planes, most of the bytes, do not."""
+    """The page looks five times a second; ages are those of whole seconds."""
     bins = tuple(NOW - 60 + 0.1 * k for k in range(10))
     scope = Scope(bins, {"p_a": (1e6,) * 10}, {"p_a": (2e6,) * 10})
     write(tmp_path, replace(status(), scope=scope))
     at = [NOW]
     live = Live(tmp_path, lambda: at[0], lambda do: None)
     first = live.fragments()
-    at[0] += 0.2
+    at[0] += 0.8
+    assert live.fragments() == first
+    at[0] += 0.3
     later = live.fragments()
     assert "<polygon" in first["live_scope"] and later["live_scope"] == first["live_scope"]
     assert later["live_health"] != first["live_health"] and "<polygon" not in first["live_health"]
