@@ -49,6 +49,7 @@ class Rotors:
     noise: float
     colour_s: float
     knee: float = 1.0  # of the command, beyond which a rotor gives no more
+    drift: float = 0.0  # of the thrust, a share of it per second
 
     @classmethod
     def drawn(cls, rng: np.random.Generator, place: str, knee: float = 1.0) -> Rotors:
@@ -72,7 +73,7 @@ class Rotors:
             FULL * np.clip(0.6 + (steps + _wander(rng, n, 1.0, 0.08))[:, None] + own, 0, 1)
         )
         sent = _late(u, self.lag_s) if self.place == "before" else u
-        y = self.thrust(sent).sum(axis=1)
+        y = self.thrust(sent).sum(axis=1) * (1.0 + self.drift * np.arange(n) / HZ)
         y = _late(y[:, None], self.lag_s)[:, 0] if self.place == "behind" else y
         y = (y + _wander(rng, n, self.colour_s, self.noise)) / GRAVITY
         rows = np.column_stack([np.arange(n) * round(1e6 / HZ), u, y])
@@ -113,6 +114,21 @@ def test_a_lag_behind_the_map_is_found_whatever_the_noise(tmp_path: Path, seed: 
     print(plant, [(e.effect, e.cannot_be_told_from) for e in quick.diagnosis.found])
     assert lag_of(quick) == pytest.approx(plant.lag_s, rel=0.05)
     assert [c.name for c in quick.pair.commands] == [f"motor_{k}" for k in (1, 2, 3, 4)]
+
+
+@pytest.mark.parametrize("drift", [-0.004, 0.003])
+def test_a_battery_that_empties_is_a_drift_of_the_gain(tmp_path: Path, drift: float) -> None:
+    """Beside the lag, from the first half of a flight; none is named where there is none."""
+    rng = np.random.default_rng([22, round(1e4 * abs(drift))])
+    plant = replace(Rotors.drawn(rng, "behind", knee=0.75), drift=drift)
+    for g in (drift, 0.0):
+        table = replace(plant, drift=g).recorded(tmp_path / "flight.csv", rng, 60.0)
+        found = {f.effect: f for f in looked_at(table).diagnosis.found}
+        print(plant, g, found)
+        assert found.keys() == ({"map_lag", "map_gain_drift"} if g else {"map_lag"})
+        if g:
+            rate = found["map_gain_drift"].parameters["rate"]
+            assert rate.unit == "1/s" and abs(rate.value - drift) < 0.15 * abs(drift)
 
 
 def test_noise_does_not_make_the_lag_shorter(tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ MOTION = "motion"  # the place of what such a velocity gives
 MAP = "Q of "  # before an edge's name: its flow by the fitted map
 LAGGED = "lag("  # before what is stored behind a port
 BEHIND_MAPS = "behind_maps"
-OF_RATES = (BEHIND_MAPS, "dahl")  # laws by name of plants without pressures
+OF_RATES = (BEHIND_MAPS, "dahl", "gain_drift")  # laws by name of plants without pressures
 NO_SHAPE: Mapping[str, float] = MappingProxyType({})
 Nodes = Mapping[str, Node]
 Volumes = dict[int, FloatArray]  # chamber -> (n - 1,) m3
@@ -204,7 +204,7 @@ def _places(
         if EACH_EDGE in effect.places:
             for edge in model.edges:
                 yield edge.name, _through(model, line, (edge,))
-        else:
+        elif not model.measured:  # whose maps are no valves
             yield ALL_EDGES, _through(model, line, model.edges)
     elif lines[0].names & {MOVED, PORT}:
         yield from _of_rate(model, lines[0])
