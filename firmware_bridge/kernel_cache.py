@@ -86,7 +86,11 @@ def _compile_once(kernel: Any, lock: Path) -> None:
         # numba's lock first, in every thread; a kernel that a part calls is still one for Python
         with global_compiler_lock, alone(lock), compiled_as(JITCodeLibrary):
             adapt(Path(kernel.stats.cache_path), f"{module}.{kernel.__qualname__}")
-            return compiled(signature)
+            try:
+                return compiled(signature)
+            except OSError as error:  # it is compiled, but the disk is full: no daemon must end
+                warnings.warn(f"a compiled kernel cannot be kept: {error}", stacklevel=2)
+                return compiled(signature)
 
     kernel.compile = compile_alone
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import shutil
 import threading
 import time
@@ -114,3 +115,18 @@ def test_who_comes_second_compiles_nothing(tmp_path: Path) -> None:
     first, second = (kernel_cache.cached(tmp_path, added) for _ in range(2))
     assert first(1.0) == second(1.0) == 2.0
     assert (first.stats.cache_misses, second.stats.cache_misses) == ({first.signatures[0]: 1}, {})
+
+
+def test_a_kernel_that_a_full_disk_cannot_keep_runs_all_the_same(tmp_path: Path) -> None:
+    """Else the daemon's helper would end there, and again after each start."""
+    kernel = kernel_cache.cached(tmp_path, added)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
+    try:
+        with pytest.warns(UserWarning, match="cannot be kept"):
+            assert kernel(1.0) == 2.0
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not list(tmp_path.rglob("*.nbc"))
+    again = kernel_cache.cached(tmp_path, added)  # there is room again
+    assert again(1.0) == 2.0 and list(tmp_path.rglob("*.nbc"))
