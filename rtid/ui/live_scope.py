@@ -93,16 +93,18 @@ class Recent:
         def y(p: float) -> float:
             return 120.0 * (p1 - p) / (p1 - p0)
 
-        blocks, n = "", len(plane.dp_pa) - 1
+        drawn, n = dict.fromkeys(FILLS, ""), len(plane.dp_pa) - 1
         for k, code in enumerate(plane.codes):
             i, j = divmod(k, n)
             if code in FILLS:
-                at = x(plane.u_v[i]), y(plane.dp_pa[j + 1])
-                size = x(plane.u_v[i + 1]) - at[0], y(plane.dp_pa[j]) - at[1]
-                blocks += (
-                    f'<rect x="{at[0]:.1f}" y="{at[1]:.1f}" width="{size[0]:.1f}" '
-                    f'height="{size[1]:.1f}" fill="{FILLS[code]}" fill-opacity=".45"/>'
-                )
+                left, top = x(plane.u_v[i]), y(plane.dp_pa[j + 1])
+                right, below = x(plane.u_v[i + 1]), y(plane.dp_pa[j])
+                drawn[code] += f"M{left:.1f},{top:.1f}H{right:.1f}V{below:.1f}H{left:.1f}Z"
+        blocks = "".join(
+            f'<path d="{shape}" fill="{FILLS[code]}" fill-opacity=".45"/>'
+            for code, shape in drawn.items()
+            if shape
+        )
         dots = "".join(
             f'<circle cx="{x(u):.1f}" cy="{y(p):.1f}" r="1.6" fill="var(--ink)"/>'
             for u, p in self._points(plane)

@@ -61,7 +61,9 @@ def test_a_plane_shows_its_blocks_and_where_the_machine_is() -> None:
     recent, edge = Recent(), EdgeHealth("pa", plane=PLANE)
     recent.take(second(0.0))
     drawn = recent.plane(edge)
-    assert drawn.count('fill="var(--bar)"') == 1 and drawn.count('fill="var(--open)"') == 1
+    valid, learning = re.findall(r'<path d="([^"]+)" fill="var\(--(?:bar|open)\)"', drawn)
+    assert valid == "M0.0,90.0H90.0V120.0H0.0Z"
+    assert learning == "M0.0,0.0H90.0V90.0H0.0Z"
     assert drawn.count("<circle") == 10
     x, y = re.findall(r'cx="([\d.]+)" cy="([\d.]+)"', drawn)[0]
     assert float(x) == pytest.approx(180 * 1.5 / 2, rel=0.02)
