@@ -18,7 +18,7 @@ from rtid.diagnose.residual import effect_values
 from rtid.effects.extra import with_extra_flow
 from rtid.estimator.misfit import Misfit, can_be_explained, residual_of
 from rtid.estimator.missed import excusing, misses
-from rtid.estimator.record import run
+from rtid.estimator.record import summed
 from rtid.estimator.solution import sketch
 from rtid.model import Machine
 from rtid.plain import FloatArray
@@ -68,7 +68,7 @@ def left_over(present: Fit) -> Misfit:
         return present.rest
     model, chunk = _machine(present)
     weights = present.weights
-    return residual_of(model, chunk, weights, sketch(model, run(model, chunk, weights)))
+    return residual_of(model, chunk, weights, sketch(model, summed(model, chunk, weights)))
 
 
 def _machine(present: Fit) -> tuple[Machine, FloatArray]:

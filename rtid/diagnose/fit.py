@@ -27,7 +27,7 @@ from rtid.effects.page import Effect
 from rtid.effects.record_view import MapTerms, RecordView
 from rtid.estimator.factor import PRIOR_SD, SHARED_PRIOR
 from rtid.estimator.misfit import Misfit
-from rtid.estimator.record import refined, run
+from rtid.estimator.record import refined, summed
 from rtid.estimator.solution import sketch
 from rtid.estimator.state import Weights
 from rtid.kernels.layout import TERMS
@@ -145,7 +145,7 @@ class Fit:
 
 def prepare(model: Machine, chunk: FloatArray) -> Weights:
     """Weights of the rows from a first estimate; chunk (n, 2 + signals), SI."""
-    return refined(model, sketch(model, run(model, chunk)), model.lag.nominal_s)
+    return refined(model, sketch(model, summed(model, chunk)), model.lag.nominal_s)
 
 
 def fit(

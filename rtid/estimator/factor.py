@@ -23,40 +23,47 @@ SHARED_PRIOR = 1e-2  # information on beta_nominal / beta: worth knowing it to a
 
 @dataclass(frozen=True)
 class Factor:
-    """Cholesky factor of the scaled normal matrix: columns scaled to about unit information.
+    """Cholesky factor of gram + prior, scaled to about unit information.
 
-    The scales are powers of two, so that the scaled matrix is the sums to the last bit.
+    gram (n, n): the sums themselves, not a copy; prior (n,), on the diagonal; scale (n,): powers of
+    two, so that scaling changes no digit; upper (n, n), Fortran order: the factor in its upper
+    triangle, what was factorised in the other one.  A matrix of a rich map has 50 MB: there is one
+    beside the sums.
     """
 
-    matrix: FloatArray
+    gram: FloatArray
+    prior: FloatArray
     scale: FloatArray
-    lower: FloatArray
+    upper: FloatArray
 
     def theta(self, right: FloatArray) -> FloatArray:
-        """Solution (n,) for a right-hand side (n,), in units of the scales, refined by one step.
+        """Solution (n,) for a right-hand side (n,), refined by one step.
 
         The residual is in twice the precision: the solution is that of the sums as they are, to
         about the square of condition number x rounding.
         """
-        right = right * self.scale
-        theta = cho_solve((self.lower, True), right, check_finite=False)
-        rest = residual(self.matrix, theta, right)
-        theta += cho_solve((self.lower, True), rest, check_finite=False)
-        return np.asarray(theta * self.scale)
+        theta = self._solved(right)
+        rest = residual(self.gram, theta, right) - self.prior * theta
+        return np.asarray(theta + self._solved(rest))
+
+    def _solved(self, right: FloatArray) -> FloatArray:
+        scaled = cho_solve((self.upper, False), right * self.scale, check_finite=False)
+        return np.asarray(scaled * self.scale)
 
     def columns(self, m: int) -> FloatArray:
         """The first m columns (n, m) of the inverse."""
         return np.stack([self.theta(unit) for unit in np.eye(m, len(self.scale))], axis=1)
 
     def cov(self) -> FloatArray:
-        """Inverse of the normal matrix (n, n): covariance in units of the scales."""
-        inverse, _ = dpotri(self.lower, lower=1)
-        mirror(inverse.T, self.scale)  # Fortran order: the transpose holds the upper triangle
+        """Inverse of gram + prior (n, n)."""
+        inverse, _ = dpotri(self.upper, lower=0)
+        inverse = inverse.T  # in C order, below the diagonal
+        mirror(inverse, self.scale)
         return np.asarray(inverse)
 
 
 def factorize(normal: Normal, n_shared: int) -> Factor:
-    """Factor of information + prior."""
+    """Factor of information + prior.  Raises LinAlgError where the sum is not definite."""
     prior = np.full(len(normal.right), PRIOR_SD**-2)
     prior[:n_shared] = SHARED_PRIOR
     matrix = normal.gram.copy()
@@ -64,8 +71,8 @@ def factorize(normal: Normal, n_shared: int) -> Factor:
     scale = np.ldexp(1.0, -(np.frexp(np.maximum(np.diag(matrix), np.finfo(float).tiny))[1] // 2))
     matrix *= scale[:, None]
     matrix *= scale
-    lower = cho_factor(matrix, lower=True)[0]
-    return Factor(matrix, scale, lower)
+    upper = cho_factor(matrix.T, lower=False, overwrite_a=True)[0]  # in place: it is symmetric
+    return Factor(normal.gram, prior, scale, upper)
 
 
 def misfit(normal: Normal, theta: FloatArray) -> float:

@@ -73,7 +73,7 @@ def fit_record(
     if not estimate_lag:
         model = replace(model, lag=replace(model.lag, tolerance_s=0.0))
     tolerance = np.zeros(0) if offset_tolerance_s is None else offset_tolerance_s
-    first = sketch(model, run(model, chunk))
+    first = sketch(model, summed(model, chunk))
     weights = _excused(model, chunk, refined(model, first, model.lag.nominal_s))
     lag_sd_s, offsets, offsets_sd = 0.0, np.zeros(len(tolerance)), np.zeros(len(tolerance))
     if model.lag.tolerance_s > 0 or len(tolerance):
@@ -82,7 +82,7 @@ def fit_record(
         weights = replace(weights, lag_s=float(result.value[0]))
         chunk = assemble(offsets) if assemble else chunk
         if len(tolerance):  # the first weights came from shifted signals
-            weights = refined(model, sketch(model, run(model, chunk, weights)), weights.lag_s)
+            weights = refined(model, sketch(model, summed(model, chunk, weights)), weights.lag_s)
     weights = _excused(model, chunk, weights)
     state = run(model, chunk, weights)
     solution = solve(model, state, counters=state.counters)
@@ -127,6 +127,11 @@ def run(model: Machine, chunk: FloatArray, weights: Weights | None = None) -> St
     return state
 
 
+def summed(model: Machine, chunk: FloatArray, weights: Weights | None = None) -> Sums:
+    """The sums over one pass; the state that took them is gone, it is as large as they."""
+    return Sums.ended(run(model, chunk, weights))
+
+
 def refined(model: Machine, sketched: Sketch, lag_s: float) -> Weights:
     """Weights from a first estimate: the slopes dQ/ddp of its own map, whatever the valves' law.
 
@@ -159,7 +164,7 @@ def excess(model: Machine, chunk: FloatArray, weights: Weights, leverage: FloatA
 
     chunk (n, 2 + signals), SI; leverage (chambers,): shares, as in `correct`.
     """
-    sums = Sums.of(run(model, chunk, weights))
+    sums = summed(model, chunk, weights)
     normal = sums.normal()
     with one_thread():
         corrected = correct(normal, factorize(normal, sums.n_shared), leverage)

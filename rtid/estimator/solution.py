@@ -93,9 +93,8 @@ class Sketch:
     unknowns: FloatArray
 
 
-def sketch(model: Machine, learned: State | Sums) -> Sketch:
+def sketch(model: Machine, sums: Sums) -> Sketch:
     """The estimate that weighs the next pass: no covariance, every term taken as learned."""
-    sums = sums_of(learned)
     normal, n_c = sums.normal(), len(model.chambers)
     leverage = leverage_of(model, sums, np.ones(len(normal.right)))
     with one_thread():

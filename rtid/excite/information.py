@@ -17,8 +17,8 @@ from rtid.diagnose.fit import one_pass
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.trials import physical, scored
 from rtid.estimator.factor import PRIOR_SD, factorize, one_thread
-from rtid.estimator.record import run
-from rtid.estimator.sums import Normal, Sums
+from rtid.estimator.record import summed
+from rtid.estimator.sums import Normal
 from rtid.excite.machine import DrivenMachine
 from rtid.kernels.layout import TERMS
 from rtid.plain import FloatArray, IntArray, Key
@@ -40,7 +40,7 @@ class Information:
 
 def of_blocks(machine: DrivenMachine, chunk: FloatArray) -> Information:
     """What samples (n, 2 + signals), SI, tell of the blocks that they visit."""
-    sums = Sums.of(run(machine.model, chunk, machine.weights))
+    sums = summed(machine.model, chunk, machine.weights)
     normal, ns = sums.normal(), sums.n_shared
     stayed = np.flatnonzero(sums.blocks["rows"] >= LEAST_ROWS)
     m, prior = len(stayed), KNOWN_SD**-2

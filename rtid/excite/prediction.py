@@ -15,7 +15,7 @@ from rtid.diagnose.fit import fit, prepare
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.trials import detection_limit, physical, scored
 from rtid.estimator.blocks import VALID, Block
-from rtid.estimator.record import refined, run
+from rtid.estimator.record import refined, summed
 from rtid.estimator.solution import Solution, sketch, solve
 from rtid.excite.selection import MOMENTS
 from rtid.model import Machine
@@ -84,8 +84,8 @@ class Prediction:
 
 def assess(model: Machine, chunk: FloatArray, name: str = "", effects: bool = True) -> Prediction:
     """Judge samples (n, 2 + signals), SI, with noise; effects: also the detection limits."""
-    weights = refined(model, sketch(model, run(model, chunk)), model.lag.nominal_s)
-    solution = solve(model, run(model, chunk, weights))
+    weights = refined(model, sketch(model, summed(model, chunk)), model.lag.nominal_s)
+    solution = solve(model, summed(model, chunk, weights))
     return Prediction(
         name,
         float(chunk[-1, 0] - chunk[0, 0]),

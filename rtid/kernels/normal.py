@@ -54,10 +54,9 @@ def _place(tile: FloatArray, low: int, high: int, gram: FloatArray) -> None:
 
 @kernel
 def mirror(matrix: FloatArray, scale: FloatArray) -> None:
-    """matrix (n, n) <- scale_i scale_j upper_ij, both triangles scaled by scale (n,); in place."""
-    n = len(matrix)
-    for i in range(n):
-        for j in range(i, n):
+    """matrix (n, n) <- scale_i scale_j lower_ij, both triangles scaled by scale (n,); in place."""
+    for i in range(len(matrix)):
+        for j in range(i + 1):
             value = matrix[i, j] * scale[i] * scale[j]
             matrix[i, j] = value
             matrix[j, i] = value

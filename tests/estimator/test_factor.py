@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from fractions import Fraction
 
 import numpy as np
@@ -21,19 +22,23 @@ def nearly_alike(seed: int, n: int, spread: float) -> tuple[FloatArray, FloatArr
     return columns.T @ columns, columns.T @ rng.standard_normal(500)
 
 
+def scaled(factor: Factor) -> FloatArray:
+    """What was factorised (n, n)."""
+    return (factor.gram + np.diag(factor.prior)) * np.outer(factor.scale, factor.scale)
+
+
 def exact(factor: Factor, right: FloatArray) -> FloatArray:
     """The factor's equations solved in fractions: Gauss elimination of a definite matrix."""
-    rows = [
-        [Fraction(x) for x in (*row, b)]
-        for row, b in zip(factor.matrix, right * factor.scale, strict=True)
-    ]
+    rows = [[Fraction(x) for x in (*row, b)] for row, b in zip(factor.gram, right, strict=True)]
+    for i, prior in enumerate(factor.prior):
+        rows[i][i] += Fraction(prior)
     n = len(rows)
     for k in range(n):
         for i in range(n):
             if i != k:
                 share = rows[i][k] / rows[k][k]
                 rows[i] = [x - share * y for x, y in zip(rows[i], rows[k], strict=True)]
-    return np.array([float(rows[k][n] / rows[k][k]) for k in range(n)]) * factor.scale
+    return np.array([float(rows[k][n] / rows[k][k]) for k in range(n)])
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -41,17 +46,37 @@ def test_one_step_of_refinement_is_enough(seed: int) -> None:
     """Condition 1e9: a step with its residual in double precision leaves 1e-7."""
     gram, right = nearly_alike(seed, 8, 1e-4)
     factor = factorize(Normal(gram * 1e6, right * 1e6, 1.0, np.zeros(1), 500.0), 1)
-    assert 1e9 < np.linalg.cond(factor.matrix) < 1e10
+    assert 1e9 < np.linalg.cond(scaled(factor)) < 1e10
     np.testing.assert_allclose(factor.theta(right), exact(factor, right), rtol=1e-12)
 
 
 def test_scaling_changes_no_digit() -> None:
     gram, right = nearly_alike(0, 8, 1e-2)
     factor = factorize(Normal(gram, right, 1.0, np.zeros(1), 500.0), 1)
-    back = factor.matrix / np.outer(factor.scale, factor.scale)
-    off_diagonal = ~np.eye(8, dtype=bool)
-    assert np.array_equal(back[off_diagonal], gram[off_diagonal])
-    assert 0.5 <= np.diag(factor.matrix).min() < np.diag(factor.matrix).max() < 2.0
+    below = np.tri(8, k=-1, dtype=bool)
+    back = factor.upper / np.outer(factor.scale, factor.scale)
+    assert np.array_equal(back[below], gram[below])
+    assert 0.5 <= np.diag(scaled(factor)).min() < np.diag(scaled(factor)).max() < 2.0
+
+
+def test_the_inverse_is_that_of_the_sums_with_their_prior() -> None:
+    gram, right = nearly_alike(2, 8, 1e-1)
+    factor = factorize(Normal(gram, right, 1.0, np.zeros(1), 500.0), 1)
+    product = factor.cov() @ (gram + np.diag(factor.prior))
+    np.testing.assert_allclose(product, np.eye(8), atol=1e-6)
+    assert np.array_equal(factor.cov(), factor.cov().T)
+
+
+def test_one_matrix_stands_beside_the_sums() -> None:
+    """The factor is written over the copy, and the sums are not copied again."""
+    gram = np.eye(300) * 1e6
+    normal = Normal(gram, np.ones(300), 1.0, np.zeros(1), 500.0)
+    factorize(normal, 1)
+    tracemalloc.start()
+    factor = factorize(normal, 1)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert factor.gram is gram and peak < 1.3 * gram.nbytes
 
 
 @pytest.mark.parametrize("function", [residual, residual.py_func], ids=["compiled", "python"])
