@@ -44,7 +44,11 @@ STRANGERS = {
     "mr_damper.csv": {"u": ("v_cm_s", "cm/s"), "x": ("F_N", "N")},
     "quadrotor_thrust.parquet": {f"u{k}": (f"motor_{k}", "PWM") for k in (1, 2, 3, 4)}
     | {"x": ("acc_z_g", "g")},
-    **{f"seal_oring_{p}bar.csv": {"x": ("x_mm", "mm")} for p in (1, 3, 5)},
+    # the force is what is measured, the pressure gives it, the friction goes by the motion
+    **{
+        f"seal_oring_{p}bar.csv": {"x": ("F_N", "N"), "u": ("p_bar", "bar"), "s": ("x_mm", "mm")}
+        for p in (1, 3, 5)
+    },
 }
 
 
