@@ -37,7 +37,7 @@ class Factor:
     upper: FloatArray
 
     def theta(self, right: FloatArray) -> FloatArray:
-        """Solution (n,) for a right-hand side (n,), refined by one step.
+        """Solution (n,) for a right-hand side (n,), in the units of the sums, refined by one step.
 
         The residual is in twice the precision: the solution is that of the sums as they are, to
         about the square of condition number x rounding.
@@ -55,7 +55,7 @@ class Factor:
         return np.stack([self.theta(unit) for unit in np.eye(m, len(self.scale))], axis=1)
 
     def cov(self) -> FloatArray:
-        """Inverse of gram + prior (n, n)."""
+        """Inverse of gram + prior (n, n): covariance in the units of the sums."""
         inverse, _ = dpotri(self.upper, lower=0)
         inverse = inverse.T  # in C order, below the diagonal
         mirror(inverse, self.scale)

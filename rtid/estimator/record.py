@@ -128,7 +128,7 @@ def run(model: Machine, chunk: FloatArray, weights: Weights | None = None) -> St
 
 
 def summed(model: Machine, chunk: FloatArray, weights: Weights | None = None) -> Sums:
-    """The sums over one pass; the state that took them is gone, it is as large as they."""
+    """The sums over one pass, chunk (n, 2 + signals), SI; the state that took them is let go."""
     return Sums.ended(run(model, chunk, weights))
 
 
