@@ -6,7 +6,7 @@ by so much again that it predicts better; and where most of what was missed in t
 is gone.  Half the width leaves 1/64 of what six terms miss of a cubic, and 1/8 at a corner; a
 missing effect hardly heeds the grid, and stays for the search: a leak that left rho 25 was
 swallowed down to 7 by grids that only had to explain a part.  Of a valve that opens with a jump
-half the width leaves a half, but one interval of the command holds nearly all of it.
+half the width leaves a half; a border on the jump leaves next to nothing (`jumps`).
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ import numpy as np
 
 from rtid.diagnose.excuse import left_over
 from rtid.diagnose.fit import Fit, fit, one_pass, prepare, with_covariances
+from rtid.diagnose.jumps import cut_at_jumps
 from rtid.estimator.misfit import Misfit, can_be_explained
-from rtid.estimator.refine import CLEARLY, halved, halved_at_a_jump, in_halved
+from rtid.estimator.refine import CLEARLY, halved, in_halved
 from rtid.model import Grid, Machine
 from rtid.plain import BoolArray
 
@@ -29,7 +30,7 @@ WORTH = 2.0  # chi2 per unknown more, by which a finer grid predicts better
 BY_CHANCE = 4.0  # standard deviations of what unknowns more explain by chance
 BAND_SD = 3.0  # standard deviations of rho that a record's own length gives it
 LEFT = 0.35  # of the misfit in the halved intervals, at most: 1/8 at a corner, 1/64 of a cubic
-LEFT_OF_A_JUMP = 0.7  # of all that is missed, at most: 1/2 of a jump, nearly all of what is missing
+LEFT_OF_A_JUMP = 0.7  # of all that is missed, at most: nearly all of what is missing would be
 
 
 def fine_enough(present: Fit) -> tuple[Fit, Misfit | None]:
@@ -84,9 +85,11 @@ def _better(present: Fit, rest: Misfit, machine: Machine) -> tuple[Fit, Misfit] 
 
 
 def _about_a_jump(present: Fit, rest: Misfit) -> tuple[Fit, Misfit] | None:
-    """As `_better`, with the interval of a command halved that alone misses the flow."""
-    machine = halved_at_a_jump(present.declared, rest)
-    if machine.n_cells == present.declared.n_cells or _is_in_band(present):
+    """As `_better`, with a border where each map jumps."""
+    if _is_in_band(present):
+        return None
+    machine = cut_at_jumps(present, rest)
+    if machine.n_cells == present.declared.n_cells:
         return None
     trial = _on_grid(present, machine)
     gone = trial.rho - 1.0 < LEFT_OF_A_JUMP * (present.rho - 1.0)

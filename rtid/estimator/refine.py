@@ -21,7 +21,6 @@ CLEARLY = 4.0  # standard deviations above unit variance
 LEAST_ROWS = 200  # in an interval: fewer cannot tell a misfit from a few odd rows
 WHOLE = (0, DROP_ONLY), (1, COMMAND_ONLY)  # axes along which such maps do not change: never halved
 LEAST_SHARE = 0.2  # of an edge's excess that an interval must hold
-ALONE = 8.0  # times the excess per row of an edge's other commands, from which one holds a jump
 
 
 @dataclass(frozen=True)
@@ -42,17 +41,23 @@ def halved(model: Machine, misfit: Misfit, clearly: float = CLEARLY) -> Machine:
     return _on(model, [_halved(edge, excess, clearly).grid for edge, excess in pairs])
 
 
-def halved_at_a_jump(model: Machine, misfit: Misfit) -> Machine:
-    """The machine with the interval of each command halved that alone misses the flow.
+def missing_commands(model: Machine, misfit: Misfit) -> list[list[int]]:
+    """Per edge, the intervals of its command that miss the flow most; of its owner where shared."""
+    return [
+        _worst(excess, 0, CLEARLY) if edge.terms != DROP_ONLY and edge.basis != PROPORTIONAL else []
+        for edge, excess in zip(model.edges, _excesses_of_maps(model, misfit), strict=True)
+    ]
 
-    Of a map that jumps, six terms miss as much however short the interval; only the time that is
-    spent in it halves.  What is missing from the model is missed at many commands.
-    """
-    grids = []
-    for edge, excess in zip(model.edges, _excesses_of_maps(model, misfit), strict=True):
-        at = _jump(excess) if edge.terms != DROP_ONLY and edge.basis != PROPORTIONAL else []
-        grids.append(Grid(_split(edge.grid.u_v, at), edge.grid.dp_pa))
-    return _on(model, grids)
+
+def cut(model: Machine, at_v: list[list[float]]) -> Machine:
+    """The machine with more borders along the command, those of each edge in volts."""
+    return _on(
+        model,
+        [
+            Grid(np.unique(np.append(edge.grid.u_v, more)), edge.grid.dp_pa)
+            for edge, more in zip(model.edges, at_v, strict=True)
+        ],
+    )
 
 
 def in_halved(model: Machine, finer: Machine, misfit: Misfit) -> BoolArray:
@@ -116,15 +121,6 @@ def _worst(excess: Excess, axis: int, clearly: float) -> list[int]:
     share = beyond > LEAST_SHARE * max(float(beyond[beyond > 0].sum()), 1e-12)
     worst = np.argsort(-beyond)[: min(AT_ONCE, MAX_BORDERS - 2 - len(rows))]
     return [int(k) for k in worst if clear[k] and share[k]]
-
-
-def _jump(excess: Excess) -> list[int]:
-    """The interval of the command whose excess per row is many times that of all others."""
-    rows, beyond = excess.rows.sum(axis=1), np.maximum(excess.beyond.sum(axis=1), 0.0)
-    k = int(np.argmax(beyond))
-    others = (beyond.sum() - beyond[k]) / max(1.0, rows.sum() - rows[k])
-    is_alone = beyond[k] > ALONE * others * rows[k] and len(rows) < MAX_BORDERS - 2
-    return [k] if is_alone and _is_clear(rows, beyond, CLEARLY)[k] else []
 
 
 def _is_clear(rows: FloatArray, beyond: FloatArray, clearly: float) -> BoolArray:
