@@ -4,34 +4,54 @@ Where the rate of one measurement stands beside another's, noise at 1 kHz hides 
 motion of seconds.  All signals go through the same windows, so that none comes late.  Windows begin
 anew behind a gap; one that a gap or the end cuts short is dropped, and one without a sample is a
 gap.  The result does not depend on the pieces in which samples arrive.
+
+What moves a state x between two means, d x / dt = D n, is none of their kind.  With s from 0 to 1
+along a window of length T, and means over the windows k and k + 1,
+
+    x(k + 1) - x(k) = D T (mean_k(s n) + mean_k+1((1 - s) n)),
+
+exactly; half the sum of both means of n is over a wider window, and makes D too large by what n
+does within T.  Signals `ahead` carry this mean, for which the next window must have ended.  Where n
+turns in between it is neither direction's: there the line is broken, as by a gap.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.samples import GAP, Samples, join
 
+TURNED = 0.02  # of what turns both ways between two windows: less is one direction's
+Floats = NDArray[np.float64]
+
 
 class Averaged:
-    """Samples in, their means over windows of step_us microseconds out; 0 lets them through."""
+    """Samples in, their means over windows of step_us microseconds out; 0 lets them through.
 
-    def __init__(self, step_us: int) -> None:
-        self.step_us = step_us
+    ahead: names of signals whose value acts from the mean instant of a window to that of the next.
+    """
+
+    def __init__(self, step_us: int, ahead: tuple[str, ...] = ()) -> None:
+        self.step_us, self.ahead = step_us, ahead
         self._begun: Samples | None = None  # of the window that is not over
         self._origin_us, self._next = 0, -1  # where windows count from; the number that is due
+        self._last: Samples | None = None  # the window that waits for the next one
 
     def push(self, samples: Samples) -> Samples:
         """The means of the windows that these samples (n, signals) end, at their mean instants."""
         if not self.step_us or not len(samples):
             return samples
+        samples = _with_moments(samples, self.ahead)
         if self._begun is not None:
             samples = join([self._begun, samples])
         begin = np.union1d([0], np.flatnonzero(samples.flags & GAP)).tolist()
         ends = [*begin[1:], len(samples)]
         runs = [_rows(samples, *ends_of) for ends_of in zip(begin, ends, strict=True)]
-        return join([self._of_run(run, run is runs[-1]) for run in runs])
+        made = join([self._of_run(run, run is runs[-1]) for run in runs])
+        return self._looking_ahead(made) if self.ahead else made
 
     def _of_run(self, run: Samples, is_open: bool) -> Samples:
         """The windows of samples without a gap; the last one waits for more, or is dropped."""
@@ -42,23 +62,56 @@ class Averaged:
         self._begun = _rows(run, int(first[-1]), len(run)) if is_open else None
         sizes, numbers = np.diff(first), number[first[:-1]]
         before = np.concatenate([[self._next - 1], numbers[:-1]])
-        made = _means(run, first, sizes)
+        made = _means(run, first, sizes, 2 * len(self.ahead))
         made.flags[numbers != before + 1] |= GAP
         if len(numbers):
             self._next = int(numbers[-1]) + 1
         return made
 
+    def _looking_ahead(self, made: Samples) -> Samples:
+        """All windows but the newest, with the means ahead; made: with moments behind them."""
+        if self._last is not None:
+            made = join([self._last, made])
+        self._last = _rows(made, len(made) - 1, len(made)) if len(made) else None
+        n, m = len(made.names) - 3 * len(self.ahead), len(self.ahead)
+        at = [made.names.index(name) for name in self.ahead]
+        plain, late, late_size = made.values[:, at], *np.split(made.values[:, -2 * m :], 2, axis=1)
+        ahead = late[:-1] + (plain - late)[1:]
+        size = late_size[:-1] + (made.values[:, n : n + m] - late_size)[1:]
+        goes_on = (made.flags[1:] & GAP) == 0
+        values, flags = made.values[:-1, :n].copy(), made.flags.copy()
+        values[:, at] = np.where(goes_on[:, None], ahead, plain[:-1])
+        flags[1:][goes_on & (np.abs(ahead) < (1.0 - TURNED) * size).any(axis=1)] |= GAP
+        if self._last is not None:
+            self._last = replace(self._last, flags=flags[-1:])
+        return Samples(made.names[:n], made.t_us[:-1], values, flags[:-1])
 
-def _means(run: Samples, first: NDArray[np.intp], sizes: NDArray[np.intp]) -> Samples:
-    """Of all windows but the last; first: where each begins, sizes: how many samples it has."""
+
+def _with_moments(samples: Samples, ahead: tuple[str, ...]) -> Samples:
+    """The samples with |n|, and n and |n| to be weighed along their windows, of signals ahead."""
+    if not ahead:
+        return samples
+    n = samples.values[:, [samples.names.index(name) for name in ahead]]
+    names, values = (*samples.names, *3 * ahead), [samples.values, np.abs(n), n, np.abs(n)]
+    return Samples(names, samples.t_us, np.hstack(values), samples.flags)
+
+
+def _means(run: Samples, first: NDArray[np.intp], sizes: NDArray[np.intp], weighed: int) -> Samples:
+    """Of all windows but the last; first: where each begins, sizes: how many samples it has.
+
+    The last `weighed` columns count by how far along its window each sample stands.
+    """
     if not len(sizes):
         return _rows(run, 0, 0)
     at, until, begun_us = first[:-1], int(first[-1]), run.t_us[first[:-1]]
     since_us = run.t_us[:until] - np.repeat(begun_us, sizes)
     t_us = np.asarray(begun_us + np.add.reduceat(since_us, at) // sizes, np.int64)
-    values = np.add.reduceat(run.values[:until], at, axis=0) / sizes[:, None]
+    values: Floats = run.values[:until].copy()
+    along = (np.arange(until) - np.repeat(at, sizes) + 0.5) / np.repeat(sizes, sizes)
+    values[:, values.shape[1] - weighed :] *= along[:, None]
+    means = np.add.reduceat(values, at, axis=0) / sizes[:, None]
     flags = np.bitwise_or.reduceat(run.flags[:until], at) & ~np.uint8(GAP)
-    return Samples(run.names, t_us, values, flags)
+    return Samples(run.names, t_us, means, flags)
 
 
 def _rows(samples: Samples, start: int, stop: int) -> Samples:

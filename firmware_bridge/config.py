@@ -55,7 +55,11 @@ class MessageSource:
 
 @dataclass(frozen=True)
 class Assembly:
-    """Everything that the assembler needs; `row_signal` is the position: it makes the rows."""
+    """Everything that the assembler needs; `row_signal` is the position: it makes the rows.
+
+    average_s: of the windows whose means are the samples, 0 for none; ahead: signals of which a
+    sample then carries the mean from its own window to the next one.
+    """
 
     mode: str
     signals: tuple[SignalSource, ...]
@@ -63,3 +67,4 @@ class Assembly:
     row_signal: str
     max_gap_s: float = 0.05
     average_s: float = 0.0
+    ahead: tuple[str, ...] = ()

@@ -34,7 +34,10 @@ NONE = ""  # in place of a signal's name: a quantity that is always zero
 
 @dataclass(frozen=True)
 class Signal:
-    """One column of the samples: its role, sensor noise (1 sigma, SI unit) and resolution (SI)."""
+    """One column of the samples: its role, sensor noise (1 sigma, SI unit) and resolution (SI).
+
+    is_ahead: a measurement of which a sample carries the mean up to the next sample.
+    """
 
     name: str
     kind: str  # COMMAND, PRESSURE, POSITION or VELOCITY
@@ -43,6 +46,12 @@ class Signal:
     resolution: float = 0.0
     minimum: float = -np.inf  # a value outside [minimum, maximum] is refused: gate "range"
     maximum: float = np.inf
+    is_ahead: bool = False
+
+    @property
+    def is_held(self) -> bool:
+        """True where a value acts up to the next one, and is not linear in between."""
+        return self.kind in (COMMAND, MODE) or self.is_ahead
 
 
 @dataclass(frozen=True)

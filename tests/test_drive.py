@@ -5,7 +5,7 @@ dx/dt = D n - C dp/dt of the port under pressure - L (p - p_other)
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -140,6 +140,47 @@ def test_means_do_not_depend_on_the_pieces() -> None:
     assert whole.values[0] == pytest.approx(first.mean())
 
 
+def test_the_mean_ahead_moves_the_mean_state() -> None:
+    """Exact from one mean to the next, in any pieces; where n turns the line is broken."""
+    step_us, size = 2_000, 50
+    n = np.concatenate([np.linspace(0, 9, 300) ** 2, 20 * np.sin(np.arange(300) / 50)])
+    t_us = step_us * np.arange(len(n))
+    x = np.cumsum(n) * 1e-6 * step_us - 0.5e-6 * step_us * n  # in the middle of each sample
+    samples = Samples(("n", "x"), t_us, np.column_stack([n, x]), np.full(len(n), ROW, np.uint8))
+    averaged, ahead = Averaged(step_us * size, ("n",)), Averaged(step_us * size, ("n",))
+    whole = ahead.push(samples)
+    pieces = join([averaged.push(_part(samples, k, k + 31)) for k in range(0, len(n), 31)])
+    np.testing.assert_array_equal(whole.flags, pieces.flags)
+    np.testing.assert_allclose(whole.values, pieces.values, atol=1e-12)
+    moved = np.diff(whole.column("x"))
+    np.testing.assert_allclose(moved, 0.1 * whole.column("n")[:-1], rtol=1e-9, atol=1e-6)
+    by_means = n.reshape(-1, size).mean(axis=1)
+    assert np.abs(moved - 0.05 * (by_means[1:] + by_means[:-1])[: len(moved)]).max() > 1e-3
+    turn = int(np.flatnonzero(np.diff(np.sign(n[1:])) < 0)[-1]) // size
+    begun, *broken = np.flatnonzero(whole.flags & GAP)
+    assert begun == 0 and broken and set(broken) <= {turn, turn + 1}
+
+
+def _part(samples: Samples, start: int, stop: int) -> Samples:
+    cut = slice(start, stop)
+    return Samples(samples.names, samples.t_us[cut], samples.values[cut], samples.flags[cut])
+
+
+def test_what_one_port_leaks_does_not_hide_the_other(tmp_path: Path) -> None:
+    """With the first leak in the project the second is seen, and both displacements are right."""
+    rng = np.random.default_rng([61, 0])
+    plant = replace(Driven.drawn(rng, float(rng.uniform(1e-9, 3e-9))), compliance=0.0)
+    for _ in range(2):
+        plant.recorded(tmp_path / "pump.csv", rng, 2e6)
+    looked = quick(plant.recorded(tmp_path / "pump.csv", rng, 2e6))
+    assert isinstance(looked, QuickRate)
+    found = {f.where: f.parameters["coefficient"].value for f in looked.diagnosis.found}
+    assert found == {p: pytest.approx(plant.leakage, rel=0.05) for p in ("p_a", "p_b")}
+    band = looked.bands["f"]
+    assert 2 * np.pi * band.gain_above == pytest.approx(plant.out, rel=0.008)
+    assert 2 * np.pi * band.gain_below == pytest.approx(plant.back, rel=0.008)
+
+
 def test_what_is_held_is_not_averaged(tmp_path: Path) -> None:
     rng = np.random.default_rng(45)
     table = Driven.drawn(rng).recorded(tmp_path / "pump.csv", rng, 2e6)
@@ -153,6 +194,20 @@ def test_what_is_held_is_not_averaged(tmp_path: Path) -> None:
     (tmp_path / "wrong.toml").write_text(text.replace("p_a = 1", "p_c = 1"))
     with pytest.raises(ProjectError, match=r"rate\.ports"):
         load(tmp_path / "wrong.toml")
+
+
+@pytest.mark.skipif(not STRANGERS.is_dir(), reason="no measurements of others beside this tree")
+def test_a_stranger_s_pump_in_one_command(tmp_path: Path) -> None:
+    """Compliances behind both ports and no leakage; the stroke's free run under the third load."""
+    tables, file = sorted(STRANGERS.glob("eha_*.parquet")), tmp_path / "eha.toml"
+    said("quick", *tables, "--held-out", "eha_3*", "--save", file)
+    study = Study(file, tables[0])
+    added = {(part.effect, part.where) for part in study.project.sections.added}
+    assert {("drive_compliance", port) for port in ("p_a", "p_b")} <= added
+    assert not [effect for effect, _ in added if effect == "drive_leakage"]
+    runs = [error.run for error in study.record_errors if error.is_held_out]
+    print(1e3 * np.array(runs))
+    assert len(runs) == 2 and np.mean(runs) < 0.8e-3
 
 
 @pytest.mark.skipif(not STRANGERS.is_dir(), reason="no measurements of others beside this tree")

@@ -65,7 +65,8 @@ def _write_rate(
     table: Path, output: Path, given: Mapping[str, RoleCandidate], has_pressures: bool
 ) -> bool:
     """The file of a plant without pressures, or of a pump that drives; False where it is none."""
-    from rtid.study.quick_rate import driven_pairs, pairs_of, rate_text
+    from rtid.study.rate_pairs import driven_pairs, pairs_of
+    from rtid.study.rate_project import rate_text
     from rtid.trace.quick_source import open_source
 
     opened = open_source(table, None)

@@ -20,7 +20,7 @@ from rtid.diagnose.fit import Fit, one_pass
 from rtid.diagnose.residual import KNOWN
 from rtid.diagnose.trials import Trial
 from rtid.effects.record_view import RecordView
-from rtid.model import Grid, Machine
+from rtid.model import PROPORTIONAL, Grid, Machine
 from rtid.plain import FloatArray
 from rtid.units import Z95
 
@@ -106,7 +106,8 @@ def _again(now: Fit, machine: Machine, chunk: FloatArray) -> Fit:
     """The same revision on another grid or part, chunk (n, 2 + signals), SI; one pass is near."""
     weights = now.weights
     if machine is not now.declared:
-        slopes, missed = (_spread(now.declared, w) for w in (weights.slopes, weights.missed))
+        of_cells = weights.slopes, weights.missed
+        slopes, missed = (_spread(now.declared, machine, each) for each in of_cells)
         weights = replace(weights, slopes=slopes, missed=missed)
     return one_pass(machine, chunk, weights, now.revision, None, False, thorough=False)
 
@@ -131,11 +132,14 @@ def _agree(a: tuple[float, float], b: tuple[float, float]) -> bool:
 
 
 def finer(machine: Machine) -> Machine:
-    """The same machine with every block cut into four."""
+    """The same machine with every block cut into four.
+
+    Of proportional maps none: they have one gain in each block on purpose.
+    """
     edges = []
     for edge in machine.edges:
         u, dp = (_halved(border) for border in (edge.grid.u_v, edge.grid.dp_pa))
-        edges.append(replace(edge, grid=Grid(u, dp)))
+        edges.append(edge if edge.basis == PROPORTIONAL else replace(edge, grid=Grid(u, dp)))
     return replace(machine, edges=tuple(edges))
 
 
@@ -143,11 +147,13 @@ def _halved(border: FloatArray) -> FloatArray:
     return np.sort(np.concatenate([border, 0.5 * (border[1:] + border[:-1])]))
 
 
-def _spread(machine: Machine, of_cells: FloatArray) -> FloatArray:
-    """What every cell has (cells,), given to the four that it is cut into."""
+def _spread(machine: Machine, finer_one: Machine, of_cells: FloatArray) -> FloatArray:
+    """What every cell has (cells,), given to those that the finer machine cuts it into."""
     parts = []
     sizes = [edge.grid.shape[0] * edge.grid.shape[1] for edge in machine.maps]
-    for edge, mine in zip(machine.maps, np.split(of_cells, np.cumsum(sizes)[:-1]), strict=True):
+    of_maps = zip(machine.maps, finer_one.maps, strict=True)
+    for (edge, cut), mine in zip(of_maps, np.split(of_cells, np.cumsum(sizes)[:-1]), strict=True):
+        times = cut.grid.shape[0] // edge.grid.shape[0]
         here = mine.reshape(edge.grid.shape)
-        parts.append(here.repeat(2, axis=0).repeat(2, axis=1).ravel())
+        parts.append(here.repeat(times, axis=0).repeat(times, axis=1).ravel())
     return np.concatenate(parts)

@@ -347,15 +347,21 @@ class Values:
 
     def volume(self, line: LawLine) -> FloatArray:
         """Over each interval (n - 1,), m3: the command is held, all else linear between samples."""
-        if line.inner is not None:
-            outer, lag_s = self.at_samples(line.outer), self.values.get(line.late, 0.0)
-            inside = lagged(self.at_samples(line.inner), self.view.step_s, lag_s)
-            return np.asarray(0.5 * (outer[1:] + outer[:-1]) * np.diff(inside))
-        names, view = line.outer.names, self.view
-        if FUNCTION not in names and not any(_is_of_intervals(n, view) for n in names):
-            return view.over_intervals(self.at_samples(line.outer))
-        start, end = (_evaluated(line.outer, at) for at in (self._at_start, self._at_end))
-        return np.asarray(np.broadcast_to(0.5 * (start + end), view.dt_s.shape) * view.dt_s)
+        if line.inner is None:
+            return self._mean(line.outer) * self.view.dt_s
+        lag_s = self.values.get(line.late, 0.0)
+        inside = lagged(self.at_samples(line.inner), self.view.step_s, lag_s)
+        return self._mean(line.outer) * np.diff(inside)
+
+    def _mean(self, node: Node) -> FloatArray:
+        """A tree over each interval (n - 1,), SI: half of what it is at both of its ends."""
+        if FUNCTION not in node.names and not any(
+            _is_of_intervals(n, self.view) for n in node.names
+        ):
+            here = self.at_samples(node)
+            return np.asarray(0.5 * (here[1:] + here[:-1]))
+        start, end = (_evaluated(node, at) for at in (self._at_start, self._at_end))
+        return np.broadcast_to(0.5 * (start + end), self.view.dt_s.shape)
 
     def _at_start(self, name: str) -> FloatArray:
         if name.startswith((MAP, RATE)):

@@ -16,7 +16,7 @@ from rtid.effects.view import View as Seen
 from rtid.estimator.state import Weights, build
 from rtid.kernels.following import follow_map
 from rtid.kernels.layout import TERMS
-from rtid.model import COMMAND, MODE, PRESSURE, Edge, Machine
+from rtid.model import PRESSURE, Edge, Machine
 from rtid.plain import BoolArray, FloatArray, IntArray
 
 TURNS = 0.05  # share of changes that reverse the one before: 2/3 for noise, next to 0 for motion
@@ -154,7 +154,7 @@ class RecordView:
     @cached_property
     def held(self) -> frozenset[str]:
         """Signals that are held between their samples, and not linear."""
-        return frozenset(s.name for s in self.model.signals if s.kind in (COMMAND, MODE))
+        return frozenset(s.name for s in self.model.signals if s.is_held)
 
     @cached_property
     def placed(self) -> dict[Any, Any]:

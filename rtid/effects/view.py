@@ -76,7 +76,7 @@ class View:
         """The same record at t_s[1:], with the command that acted until then."""
         values = self.values[1:].copy()
         for k, signal in enumerate(self.model.signals):
-            if signal.kind in (COMMAND, MODE):
+            if signal.is_held:
                 values[:, k] = self.values[:-1, k]
         return View(self.model, self.t_s[1:], values)
 

@@ -17,7 +17,6 @@ from rtid.kernels.recent import move_pairs
 from rtid.model import (
     BASES,
     BOTH,
-    COMMAND,
     COMMAND_ONLY,
     DROP_ONLY,
     PROPORTIONAL,
@@ -249,7 +248,7 @@ def _configure(e: np.void, model: Machine) -> None:
 def _configure_edge(e: np.void, model: Machine, i: int, edge: Edge, first_cell: int) -> None:
     e["source"][i], e["sink"][i] = _column(model, edge.source), _column(model, edge.sink)
     e["command"][i], e["direction"][i] = model.column(edge.command), edge.direction
-    e["is_sampled"][i] = model.signals[model.column(edge.command)].kind != COMMAND
+    e["is_sampled"][i] = not model.signals[model.column(edge.command)].is_held
     e["modes"][i] = sum(1 << m for m in edge.modes) if edge.modes else -1
     e["map_basis"][i] = BASES.index(edge.basis)
     e["mask"][i] = fitted_terms(edge)

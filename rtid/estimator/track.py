@@ -13,7 +13,7 @@ import numpy as np
 
 from rtid.estimator.state import Weights, build
 from rtid.kernels.layout import RESTART_MEMORY
-from rtid.model import COMMAND, TAYLOR, Chamber, Edge, Machine
+from rtid.model import TAYLOR, Chamber, Edge, Machine
 from rtid.plain import BoolArray, FloatArray, IntArray
 
 ROW, GAP = 1, 2  # flags of a sample, as in firmware_bridge.samples
@@ -109,7 +109,7 @@ def _held(model: Machine, sample: FloatArray, after: FloatArray | None = None) -
     """
     mode = int(sample[model.column(model.mode)]) if model.mode else 0
     if after is not None:
-        is_held = np.array([signal.kind == COMMAND for signal in model.signals])
+        is_held = np.array([signal.is_held for signal in model.signals])
         sample = np.where(is_held, sample, 0.5 * (sample + after))
     return np.array(
         [

@@ -34,7 +34,7 @@ from rtid.kernels.map_point import foot_width
 from rtid.maps.c_header import float_map
 from rtid.maps.fmu_description import FmuVariable, described
 from rtid.maps.lookup import ERROR_PERCENT, drops, sample
-from rtid.model import COMMAND, MODE, Edge, Machine
+from rtid.model import MODE, Edge, Machine
 from rtid.plain import FloatArray
 
 SUFFIX, IDENTIFIER = ".fmu", "rtid_machine"
@@ -228,10 +228,9 @@ def _variables(model: Machine, dynamics: Dynamics | None, used: set[str]) -> Ite
             about = f"pressure of chamber {states[signal.name].name}; its start is the run's"
             yield FmuVariable(signal.name, at, "state", unit, about, 1e5)
             continue
-        is_held = signal.kind in (COMMAND, MODE)
-        kind = "command" if is_held else "input"
+        kind = "command" if signal.is_held else "input"
         yield FmuVariable(signal.name, at, kind, unit, f"{signal.kind}", _start(signal.minimum))
-        if dynamics and not is_held:
+        if dynamics and not signal.is_held:
             about = f"rate of {signal.name} over the step"
             yield FmuVariable(f"{signal.name}_rate", at + n, "command", f"{unit}/s", about, 0.0)
     at = 1 + 2 * n

@@ -43,7 +43,11 @@ NO_BORDERS = (-1.0, 1.0)  # of a second argument that a map has not
 
 def build_model(sections: Sections, catalog: Catalog | None) -> Machine:
     """The declared machine, SI."""
-    signals = tuple(_signal(n, s, catalog) for n, s in sections.signals.items())
+    ahead = _means_ahead(sections)
+    signals = tuple(
+        replace(_signal(name, signal, catalog), is_ahead=name in ahead)
+        for name, signal in sections.signals.items()
+    )
     rate = sections.rate
     measured = rate.measured if rate and rate.measured else NONE
     if measured:
@@ -103,7 +107,18 @@ def build_assembly(
         row_signal=model.measured or model.position,
         max_gap_s=_max_gap_s(sections, catalog),
         average_s=sections.source.average_s,
+        ahead=_means_ahead(sections),
     )
+
+
+def _means_ahead(sections: Sections) -> tuple[str, ...]:
+    """What moves a state whose samples are means: what counts is its own mean from one to the next.
+
+    Through two means the line is wrong by an eighth where it turns within a window.
+    """
+    if not (sections.rate and sections.rate.state and sections.source.average_s):
+        return ()
+    return tuple(dict.fromkeys(u for part in sections.maps.values() for u in part.all_commands))
 
 
 def digest(value: object) -> str:

@@ -34,7 +34,8 @@ from rtid.study.quick_machine import (
     fitted_machine,
 )
 from rtid.study.quick_project import DEAD_VOLUME, head_of, of_channels, of_missing, project_text
-from rtid.study.quick_rate import QuickRate, driven_pairs, pressed_pairs, quick_rate
+from rtid.study.quick_rate import QuickRate, quick_rate
+from rtid.study.rate_pairs import driven_pairs, pressed_pairs
 from rtid.study.study import diagnose_trace
 from rtid.trace import Report, judge
 from rtid.trace.quick_data import BAD, Point, level_of, points

@@ -78,12 +78,7 @@ def rate_lines(quick: QuickRate, saved: Path | None = None) -> Iterator[str]:
     elif pair.is_measured:
         yield from _range_lines(quick)
     elif pair.drive:
-        scale = scale_of(quick.unit.removesuffix("/s"))
-        for band in quick.bands.values():
-            below, above = (
-                math.tau * scale.factor * gain for gain in (band.gain_below, band.gain_above)
-            )
-            yield f"A turn of the pump moves x by {above:.4g} {scale.name}, back by {below:.4g}."
+        yield from _turn_lines(quick)
     else:
         yield f"The neutral of the command is {pair.neutral:.6g} {u.unit}: there x stands most."
         if len(quick.records) > 1:
@@ -103,6 +98,15 @@ def rate_lines(quick: QuickRate, saved: Path | None = None) -> Iterator[str]:
         return
     yield f"Next: {quick.next_command}"
     yield "  writes the project with what was found."
+
+
+def _turn_lines(quick: QuickRate) -> Iterator[str]:
+    """What a turn of a pump moves, beside all that was found."""
+    scale = scale_of(quick.unit.removesuffix("/s"))
+    turn = math.tau * scale.factor
+    for band in quick.bands.values():
+        above, below = (turn * gain for gain in (band.gain_above, band.gain_below))
+        yield f"A turn of the pump moves x by {above:.4g} {scale.name}, back by {below:.4g}."
 
 
 def _range_lines(quick: QuickRate) -> Iterator[str]:

@@ -74,7 +74,7 @@ class Learner:
         self.network = Network(catalog, assembly.messages)
         self.senders = Senders(self.assembler.declared)
         self.frozen = Frozen(_run_limits(model, assembly))
-        self.averaged = Averaged(round(1e6 * assembly.average_s))
+        self.averaged = Averaged(round(1e6 * assembly.average_s), assembly.ahead)
         self.estimator = Estimator(model)
         self.learns = True
         self.frames = 0

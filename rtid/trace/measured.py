@@ -15,7 +15,8 @@ from rtid.project import Project
 
 def with_sums(project: Project, samples: Samples) -> Samples:
     """Averaged as the project asks, with a column for each of its running sums."""
-    samples = Averaged(round(1e6 * project.assembly.average_s)).push(samples)
+    of = project.assembly
+    samples = Averaged(round(1e6 * of.average_s), of.ahead).push(samples)
     flows, model = project.flows, project.model
     if not flows:
         return samples

@@ -114,8 +114,8 @@ def test_cylinders_that_a_pump_drives(tmp_path: Path) -> None:
             hits[hidden] += hidden in named
             alarms += [name for name in named if name != hidden]
             band = looked.bands["f"]
-            pairs = (band.gain_above, plant.out), (band.gain_below, plant.back)
-            errors += [abs(2 * np.pi * gain / true - 1.0) for gain, true in pairs]
+            turn = 2 * np.pi * np.array([band.gain_above, band.gain_below])
+            errors += np.abs(turn / np.array([plant.out, plant.back]) - 1.0).tolist()
     show_flow_as("m3/s")
     said = ", ".join(f"{name} {n}" for name, n in Counter(alarms).most_common()) or "none"
     words = (
