@@ -207,6 +207,12 @@ class Upkeep:
     history_s: float = 0.0
     history_rows_per_s: float = 1000.0
 
+    @property
+    def fades(self) -> bool:
+        """Whether anything of what was learned is given up again."""
+        forgets = np.isfinite(self.forget_s) or np.isfinite(self.shared_forget_s)
+        return bool(self.every_s > 0 and (forgets or self.innovation_sd > 0))
+
 
 @dataclass(frozen=True)
 class Machine:

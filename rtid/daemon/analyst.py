@@ -12,7 +12,7 @@ import sqlite3
 import sys
 import threading
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -25,21 +25,23 @@ from rtid.compare import CandidateMap
 from rtid.compare.suspects import LikelyCause
 from rtid.daemon import jobs
 from rtid.daemon.chronicle import Chronicle
+from rtid.daemon.edge_health import edges_of
 from rtid.daemon.first import against_first
-from rtid.daemon.guard import PROOF, TRUST, Guard, candidate_of
+from rtid.daemon.guard import PROOF, TRUST, Guard, candidate_of, with_wear
 from rtid.daemon.map_check import Judge
 from rtid.daemon.offering import Offering
 from rtid.daemon.pipe import Pipe
 from rtid.daemon.recorder import Recorder
 from rtid.daemon.shadow import Shadow
-from rtid.daemon.status import BlockPlane, EdgeHealth, EffectStatus
+from rtid.daemon.status import EffectStatus
+from rtid.daemon.waiting import MOST_BYTES, Waiting
+from rtid.daemon.wearing import WearWatch
 from rtid.errors import RtidError
 from rtid.estimator.estimator import Estimator
-from rtid.estimator.flowmap import LEARNING, VALID, EdgeMap, FlowMap
+from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.solution import Solution
 from rtid.maps.files import provenance, write_map
 from rtid.maps.prior_map import find_prior, published
-from rtid.model import Edge
 from rtid.plain import FloatArray
 from rtid.project import Project, load
 from rtid.study.on_board import learned_sizes, on_board
@@ -52,36 +54,7 @@ KEPT = 3  # handovers that can be recalled
 CLEAN_S = 2.0  # a handover must be older than a suspicion by the piece in which that began
 JUDGED_S, JUDGED = 6.0, 2  # before a judgement; seconds that the guard has judged, a piece late
 FIRST_S = 60.0  # of samples that a first map, or a later one, is checked by
-QUEUED_BYTES = 16 << 20  # of jobs taken from the pipe while one is in work
 FLOOD_S = 10.0  # the same refusal of the disk is told at most this often
-
-
-class Waiting(Queue[jobs.Job | None]):
-    """Jobs behind the one in work, bounded by what they hold and not by how many they are.
-
-    A handover is saved as it comes from the pipe: batches that come while a solve takes its time
-    must not keep it in there.
-    """
-
-    def _init(self, maxsize: int) -> None:
-        super()._init(maxsize)
-        self._bytes = 0
-
-    def _qsize(self) -> int:
-        return self._bytes
-
-    def _put(self, item: jobs.Job | None) -> None:
-        super()._put(item)
-        self._bytes += _size(item)
-
-    def _get(self) -> jobs.Job | None:
-        item = super()._get()
-        self._bytes -= _size(item)
-        return item
-
-
-def _size(job: jobs.Job | None) -> int:
-    return 1 + (job.size_bytes if isinstance(job, jobs.Batch) else 0)
 
 
 class Analyst:
@@ -114,6 +87,7 @@ class Analyst:
         self._saved = 0  # number of the newest handover that was to be written
         self._first: deque[FloatArray] = deque()  # samples of a first map
         self._shadow: Shadow | None = None  # of a baseline that is lost
+        self._wearing = WearWatch()
 
     def begin(self) -> None:
         """Publish the baseline of before, which has to foretell the motion first."""
@@ -125,12 +99,14 @@ class Analyst:
             return
         level = result.notes.get("level_m3s")
         job = jobs.Handover(0, result.estimator, publish=True, store=False)
-        candidate = self._tell(job)
-        assert candidate is not None, "only a first map can be refused"
+        solved = self._tell(job)
+        assert solved is not None, "only a first map can be refused"
+        candidate = solved[1]
         self._baseline, self._trusted_s = result.estimator, _newest_s(result.estimator)
         known = None if level is None else np.array(level)
         share = float(result.notes.get("known_share", 0.0))
         self._guard = Guard(self._project.model, candidate, known, "proving", share)
+        self._guard.worn += result.notes.get("worn", 0.0)
         if proof := self._generations.shadow(self._project.model).notes.get("proof"):
             self._guard.resume(proof)
         self._resume_trust(result.estimator)
@@ -218,6 +194,7 @@ class Analyst:
         older = older if older or self._baseline is not None else [*self._handed][:1]
         estimator = older[-1].estimator if older else self._baseline
         self._next = None
+        self._wearing.forget()
         if estimator is not None:
             self._answer(jobs.Recalled(estimator))
             self._tell(jobs.Handover(job.number, estimator, publish=True, store=False))
@@ -291,6 +268,7 @@ class Analyst:
         if not (stands and guard.is_lost):
             return False
         self._guard, self._baseline = shadow.guard, shadow.job.estimator
+        self._wearing.forget()
         self._judged(shadow.guard)
         self._store_baseline()
         return True
@@ -359,6 +337,7 @@ class Analyst:
         estimator.advance(job.chunk)
         self._handed.clear()
         self._guard = self._baseline = self._next = self._shadow = None
+        self._wearing.forget()
         self._answer(jobs.Recalled(estimator, is_accepted=True))
         with self._disk:
             self._waiting_s = None
@@ -370,9 +349,10 @@ class Analyst:
         if not len(job.estimator.sums.blocks):
             return
         self._handed.append(job)
-        candidate = self._tell(job)
-        if candidate is None:
+        solved = self._tell(job)
+        if solved is None:
             return
+        solution, candidate = solved
         if self._guard is None:
             self._guard = Guard(self._project.model, candidate, None, "proven")
             self._first.clear()
@@ -380,11 +360,32 @@ class Analyst:
         elif self._guard.level is None and self._guard.state == "proven":
             self._baseline = job.estimator  # the first maps: each is known for more places
             self._guard.follow(candidate)
-        elif self._next is None:
-            self._next = job, candidate
-            self._behind.clear()
+        else:
+            if self._next is None:
+                self._next = job, candidate
+                self._behind.clear()
+            self._follow_wear(self._guard, job.estimator, solution)
 
-    def _tell(self, job: jobs.Handover) -> CandidateMap | None:
+    def _follow_wear(self, guard: Guard, estimator: Estimator, solution: Solution) -> None:
+        """Carry over what is known to a machine that does what the map says, but for slow wear."""
+        if solution.model.upkeep.fades or not guard.is_calm_behind(-math.inf, 1):
+            return
+        wear = self._wearing.push(estimator.sums, solution, guard.moved)
+        if wear is None:
+            return
+        known = [job.estimator for job in self._handed]
+        known += [e for e in (self._baseline, self._next and self._next[0].estimator) if e]
+        for each in {id(each): each for each in known}.values():
+            each.carry_over(wear)
+        guard.carry_over(wear)
+        if self._next is not None:
+            job, candidate = self._next
+            self._next = job, with_wear(solution.model, candidate, wear)
+        self._answer(jobs.Worn(wear))
+        edges, worn = solution.model.edges, guard.worn
+        self._guarded("history", lambda: self._history().note_wear(edges, worn))
+
+    def _tell(self, job: jobs.Handover) -> tuple[Solution, CandidateMap] | None:
         """Solve, judge from now on, and publish; None for a first map that cannot be."""
         start_s = time.monotonic()
         with np.errstate(divide="ignore"):  # compliance 0: the motion has not shown it yet
@@ -409,7 +410,7 @@ class Analyst:
         self._offering.published(result, solution)
         self._guarded("map", lambda: self._write_map(flow_map, solution))
         self._guarded("history", lambda: self._history().note_publication(result, self._chambers))
-        return candidate_of(solution, flow_map)
+        return solution, candidate_of(solution, flow_map)
 
     def _write_map(self, flow_map: FlowMap, solution: Solution) -> None:
         """Replace the map in the folder, for the page and for `rtid compare --map`."""
@@ -489,30 +490,8 @@ def _notes(guard: Guard | None) -> dict[str, Any]:
     if guard is None:
         return {}
     level = None if guard.level is None else guard.level.tolist()
-    return {"level_m3s": level, "known_share": guard.known_share, "unix_s": time.time()}
-
-
-def edges_of(estimator: Estimator, solution: Solution, flow_map: FlowMap) -> tuple[EdgeHealth, ...]:
-    """Blocks and cells of each edge by status."""
-    edge_health = []
-    for i, edge in enumerate(estimator.model.edges):
-        mine = [block for block in solution.blocks if block.edge == i]
-        cells = Counter(str(status) for status in flow_map.edges[i].status.ravel())
-        progress = sum(block.progress for block in mine) / max(1, len(mine))
-        blocks = Counter(block.status for block in mine)
-        plane = plane_of(edge, flow_map.edges[i])
-        edge_health.append(EdgeHealth(edge.name, dict(blocks), dict(cells), progress, plane))
-    return tuple(edge_health)
-
-
-def plane_of(edge: Edge, learned: EdgeMap) -> BlockPlane | None:
-    """What became of every block of a map; None of one over no pressure drop."""
-    if not (edge.source and edge.sink):
-        return None
-    letters = {VALID: "v", LEARNING: "l"}
-    codes = "".join(letters.get(str(word), ".") for word in learned.status.ravel())
-    ends = tuple(learned.grid.u_v.tolist()), tuple(learned.grid.dp_pa.tolist())
-    return BlockPlane(*ends, codes, edge.command, edge.source, edge.sink, int(edge.direction))
+    worn, share = guard.worn.tolist(), guard.known_share
+    return {"level_m3s": level, "known_share": share, "worn": worn, "unix_s": time.time()}
 
 
 def main() -> None:
@@ -524,7 +503,7 @@ def main() -> None:
         with one_at_a_time:
             pipe.send(reply)
 
-    begun, waiting = Queue[Analyst](), Waiting(QUEUED_BYTES)
+    begun, waiting = Queue[Analyst](), Waiting(MOST_BYTES)
     receiver = threading.Thread(target=lambda: _receive(pipe, begun.get(), waiting), daemon=True)
     receiver.start()  # before this thread, and all that it starts, is nice: to save does not wait
     os.nice(NICE)

@@ -8,13 +8,15 @@ from __future__ import annotations
 import json
 import sqlite3
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from rtid.daemon.acceptance import Acceptance
 from rtid.daemon.jobs import Publication
 from rtid.daemon.status import Alarm, Verdict
+from rtid.model import Edge
+from rtid.plain import FloatArray
 
 FILE = "history.sqlite"
 DAY_S = 86_400.0
@@ -86,6 +88,15 @@ class Chronicle:
             for number in learned(verdict.content)
             if number[0] not in self._on_board
         ]
+        self._database.executemany(QUANTITY, rows)
+
+    def note_wear(self, edges: Sequence[Edge], worn: FloatArray) -> None:
+        """One row per map: the change of its gain since it was first learned.
+
+        worn (edges,), relative, dimensionless.
+        """
+        pairs, now_s = zip(edges, worn.tolist(), strict=True), time.time()
+        rows = [(now_s, f"wear of {e.name}", "", g, 0.0) for e, g in pairs if not e.shares]
         self._database.executemany(QUANTITY, rows)
 
     def note_acceptance(self, acceptance: Acceptance) -> None:

@@ -1,7 +1,7 @@
 """The part of the daemon that runs in the loop: frames in, samples learned, copies handed over.
 
 Nothing here waits, writes a file, prints or solves.  What others want done here they leave behind
-(`swap`, `suspend`, `want_handover`), and it is done between two ticks.
+(`swap`, `worn`), and it is done between two ticks.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from rtid.daemon.lag import LagMeter
 from rtid.daemon.notify import Notifier
 from rtid.daemon.scope import ScopeKeeper
 from rtid.estimator.estimator import Estimator
+from rtid.estimator.wear import Wear
 from rtid.project import Project
 from rtid.trace.learner import Learner
 
@@ -47,6 +48,7 @@ class Core:
         self.last: deque[Frames] = deque()
         self.scope = ScopeKeeper([s.name for s in learner.estimator.model.signals])
         self.swap: Estimator | None = None
+        self.worn: Wear | None = None  # of the machine, what was learned is to be carried over
         self.is_proving = False  # the map held has still to foretell: what is learned is a shadow
         self.is_solving = self.is_saving = True  # the analyst, or it is not ready yet
         self.save_s = 0.0  # what the last snapshot took until it was on the disk
@@ -68,6 +70,9 @@ class Core:
             self._swap_in(self.swap)
             self.hand_over(publish=False, store=True)  # what was taken back is not to be restored
             done = SWAP
+        if self.worn is not None:
+            self.learner.estimator.carry_over(self.worn)
+            self.worn, done = None, UPKEEP
         frames = self.source.read(0.0)
         if len(frames) or frames.refused:
             done = self._take(frames, now_ns) or done
@@ -167,4 +172,4 @@ class Core:
     def _swap_in(self, estimator: Estimator) -> None:
         """Go on with another estimate, and with the samples that are kept for the diagnosis."""
         estimator.history = self.learner.estimator.history
-        self.learner.estimator, self.swap = estimator, None
+        self.learner.estimator, self.swap, self.worn = estimator, None, None

@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -41,6 +42,7 @@ from rtid.daemon.first import follows_command, wrong_signs
 from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.solution import Solution
 from rtid.estimator.state import nominal_weights
+from rtid.estimator.wear import Wear
 from rtid.model import Machine
 from rtid.plain import FloatArray
 
@@ -68,6 +70,14 @@ def candidate_of(solution: Solution, flow_map: FlowMap) -> CandidateMap:
     return CandidateMap("", theta, solution.compliance, status, weights, solution.terms_theta)
 
 
+def with_wear(model: Machine, candidate: CandidateMap, wear: Wear) -> CandidateMap:
+    """The map of a machine that has changed so."""
+    gains = [g for g, e in zip(wear.gain, model.edges, strict=True) if not e.shares]
+    cells = [e.grid.shape[0] * e.grid.shape[1] for e in model.maps]
+    theta = (1.0 + np.repeat(gains, cells)[:, None]) * candidate.theta
+    return replace(candidate, theta=theta, terms=candidate.terms + wear.terms)
+
+
 class Guard:
     """One baseline beside the samples.
 
@@ -85,12 +95,13 @@ class Guard:
     ) -> None:
         self._model, self._candidate = model, candidate
         self.level, self.state, self._usual_share = level, state, usual_share
+        self.worn = np.zeros(len(model.edges))  # change of gain that was carried over, relative
         self.since_s = 0.0  # sample time at which the contradiction began
         self.against: tuple[str, ...] = ()  # what speaks against the samples themselves
         self._alarm_s, self._due = 0.0, 0  # of the contradiction; `_moved` to look for causes again
         self._is_sure = False  # there is motion enough for that
         self.has_foretold = False  # and was not merely known too little
-        self._moved = 0  # seconds of motion since the beginning
+        self.moved = 0  # seconds of motion since the beginning
         self._moved_s = -math.inf  # the newest of them: a piece may end within it
         self._counts: deque[tuple[int, int]] = deque(maxlen=COUNTED)  # rows in motion, known ones
         self._rows: Residuals | None = None
@@ -119,6 +130,11 @@ class Guard:
             self.level = self._measured() if self._can_measure() else self.level
             self._rows = None
 
+    def carry_over(self, wear: Wear) -> None:
+        """The machine that the baseline was learned of has changed slowly: so has the baseline."""
+        self._candidate = with_wear(self._model, self._candidate, wear)
+        self.worn = (1.0 + self.worn) * (1.0 + wear.gain) - 1.0
+
     def push(self, chunk: FloatArray) -> bool:
         """Take samples (n, 2 + signals), SI; whether the state has changed."""
         if not len(chunk):
@@ -143,11 +159,11 @@ class Guard:
         rows = self._rows
         parts = {} if rows is None else {name: part.tolist() for name, part in vars(rows).items()}
         counts = [list(count) for count in self._counts]
-        return {"moved": self._moved, "counts": counts, "rows": parts}
+        return {"moved": self.moved, "counts": counts, "rows": parts}
 
     def resume(self, progress: Mapping[str, Any]) -> None:
         """Go on with the `progress` of a process that was ended; times are those of its samples."""
-        self._moved = int(progress["moved"])
+        self.moved = int(progress["moved"])
         self._counts.extend((int(moved), int(known)) for moved, known in progress["counts"])
         parts, c = progress["rows"], len(self._model.chambers)
         if parts and np.shape(parts["columns"])[1:] == (c, c + COMMON):  # of this program, and any
@@ -163,9 +179,9 @@ class Guard:
         A suspicion may begin before the fault: healthy samples hide what would mend the others, or
         mend something else with a few seconds of them.
         """
-        if self.state != "contradicted" or self._moved < self._due:
+        if self.state != "contradicted" or self.moved < self._due:
             return None
-        self._due = self._moved + AGAIN
+        self._due = self.moved + AGAIN
         return self._causes(self._alarm_s)
 
     def _causes(self, since_s: float) -> list[LikelyCause]:
@@ -176,7 +192,7 @@ class Guard:
     @property
     def has_seen_much(self) -> bool:
         """Whether there was motion enough to be proven or contradicted by."""
-        return self._moved >= ENOUGH
+        return self.moved >= ENOUGH
 
     @property
     def is_lost(self) -> bool:
@@ -214,7 +230,7 @@ class Guard:
     def _judge(self, piece: FloatArray) -> bool:
         every = moving(self._model, residuals(self._model, self._candidate, piece))
         second = np.unique(np.floor(every.t_s))
-        self._moved += int((second > self._moved_s).sum())
+        self.moved += int((second > self._moved_s).sum())
         self._moved_s = max([self._moved_s, *second])
         self._counts.append((len(every.t_s), int(every.known.sum())))
         recent = self.newest
@@ -244,7 +260,7 @@ class Guard:
                 rises = window.cusum[0] > 0.0
                 self.since_s = window.cusum[1] if rises else self._disobeys_since_s()
                 self.state = "contradicted"
-                self._alarm_s, self._due = float(self._recent[-1][-1, 0]), self._moved + AGAIN
+                self._alarm_s, self._due = float(self._recent[-1][-1, 0]), self.moved + AGAIN
                 self._rows = None  # a way back needs new motion
                 return True
             if self.state == "proven":

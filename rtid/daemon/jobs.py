@@ -11,6 +11,7 @@ from rtid.daemon.acceptance import Acceptance
 from rtid.daemon.status import Advice, Alarm, EdgeHealth, EffectStatus, Verdict
 from rtid.estimator.estimator import Estimator
 from rtid.estimator.flowmap import FlowMap
+from rtid.estimator.wear import Wear
 from rtid.model import Machine
 from rtid.plain import FloatArray
 
@@ -158,6 +159,13 @@ class Foretold:
 
 
 @dataclass(frozen=True)
+class Worn:
+    """The machine has changed slowly: what was learned is to be carried over."""
+
+    wear: Wear
+
+
+@dataclass(frozen=True)
 class Recalled:
     """Answer to Recall, the oldest one there is where the wanted one is not; or to Relearn."""
 
@@ -228,6 +236,7 @@ Answer = (
     | Publication
     | HandoverJudgement
     | Recalled
+    | Worn
     | Foretold
     | SavedSnapshot
     | NotSaved

@@ -116,11 +116,9 @@ class Keeper:
                 for name, folder in answer.kept.items():
                     self.alarms.keep(name, folder)
             elif isinstance(answer, jobs.Recalled):
-                self._core.swap = answer.estimator
-                if answer.is_accepted:
-                    self.plant.accept()
-                    self._core.is_proving = False
-                    self._plant_changed()
+                self._recalled(answer)
+            elif isinstance(answer, jobs.Worn):
+                self._core.worn = answer.wear
             elif isinstance(answer, jobs.Foretold):
                 self._foretold(answer)
             elif isinstance(answer, jobs.Coached):
@@ -132,6 +130,14 @@ class Keeper:
                 if acquitted and self.plant.changed:
                     self.plant.accept()
                     self._plant_changed()
+
+    def _recalled(self, answer: jobs.Recalled) -> None:
+        """Another estimate is gone on with."""
+        self._core.swap = answer.estimator
+        if answer.is_accepted:
+            self.plant.accept()
+            self._core.is_proving = False
+            self._plant_changed()
 
     def _foretold(self, answer: jobs.Foretold) -> None:
         """The baseline has to prove itself, has done so, or is contradicted."""

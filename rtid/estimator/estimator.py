@@ -20,6 +20,7 @@ from rtid.estimator.ring import History
 from rtid.estimator.solution import Solution, solve
 from rtid.estimator.state import State, Weights, build, tell_unmarked
 from rtid.estimator.sums import Sums
+from rtid.estimator.wear import Wear, carried_over
 from rtid.kernels.layout import TERMS
 from rtid.model import Machine
 from rtid.plain import BoolArray, FloatArray, IntArray
@@ -135,11 +136,17 @@ class Estimator:
         upkeep = self.model.upkeep
         share = -float(np.expm1(-upkeep.every_s / upkeep.forget_s))
         shared = -float(np.expm1(-upkeep.every_s / upkeep.shared_forget_s))
-        if not (share or shared or upkeep.innovation_sd):
+        if not upkeep.fades:
             return
         self.folds = [
             faded(halved_surprise(past), news, share, shared, changed) for past in self.folds
         ]
+
+    def carry_over(self, wear: Wear) -> None:
+        """Go on as if all had been learned of a machine that has changed so."""
+        fold, news = self.turns % self.model.upkeep.folds, Sums.drained(self.state)
+        self.folds[fold] = self.folds[fold] + news
+        self.folds = [carried_over(past, wear) for past in self.folds]
 
     def _changed(self, news: Sums) -> IntArray:
         """Cells whose new rows contradict the map held."""

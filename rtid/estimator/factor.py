@@ -50,6 +50,11 @@ class Factor:
         scaled = cho_solve((self.upper, False), right * self.scale, check_finite=False)
         return np.asarray(scaled * self.scale)
 
+    def solved(self, columns: FloatArray) -> FloatArray:
+        """Solutions (n, k) for right-hand sides (n, k), in the units of the sums, not refined."""
+        scale = self.scale[:, None]
+        return np.asarray(cho_solve((self.upper, False), columns * scale) * scale)
+
     def columns(self, m: int) -> FloatArray:
         """The first m columns (n, m) of the inverse."""
         return np.stack([self.theta(unit) for unit in np.eye(m, len(self.scale))], axis=1)

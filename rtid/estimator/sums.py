@@ -134,6 +134,32 @@ class Sums:
             innovation=other.innovation if other.rows else self.innovation,
         )
 
+    def __sub__(self, other: Sums) -> Sums:
+        """The rows that came since `other`, which these hold as well."""
+        blocks = other.blocks.copy()
+        for name in ADDING:
+            blocks[name] *= -1
+        return self + replace(
+            other, shared=-other.shared, blocks=blocks, tiles=-other.tiles, noise=-other.noise,
+            rows=-other.rows, innovation=self.innovation,
+        )  # fmt: skip
+
+    def times(self, x: FloatArray) -> FloatArray:
+        """The normal equations' matrix times x (n, k), in scaled units, without making it dense."""
+        ns, cross = self.n_shared, self.blocks["shared"][:, :, 1 : 1 + self.n_shared]
+        top, rest = x[:ns], x[ns:].reshape(len(self.blocks), TERMS, -1)
+        low, high = self.pairs.T
+        product = self.blocks["gram"] @ rest + cross @ top
+        np.add.at(product, low, self.tiles @ rest[high])
+        np.add.at(product, high, self.tiles.swapaxes(1, 2) @ rest[low])
+        first = self.shared[1:, 1:] @ top + np.einsum("bis,bik->sk", cross, rest)
+        return np.concatenate([first, product.reshape(-1, x.shape[1])])
+
+    @property
+    def right(self) -> FloatArray:
+        """Their right-hand side (n,), in scaled units."""
+        return np.concatenate([self.shared[1:, 0], self.blocks["shared"][:, :, 0].ravel()])
+
     def _places(self, cells: IntArray) -> IntArray:
         """Place of each cell among mine, those that I lack behind them in their order."""
         if not len(self.blocks):

@@ -12,6 +12,7 @@ import os
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ import pytest
 
 from rtid.estimator.estimator import Estimator
 from rtid.estimator.published import publish
+from rtid.model import Term
 from rtid.sim.bus import run_frames
 from rtid.sim.run import Run, SimulationError
 from rtid.sim.run_files import START_US
@@ -42,13 +44,18 @@ pytestmark = pytest.mark.campaign
 class Taught:
     """A machine and the state folder of a healthy run, ended in good order."""
 
-    def __init__(self, folder: Path, seed: int, publish_s: float = 10.0) -> None:
-        self.bench, self._folder = Bench.of(folder, seed).publishing(publish_s), folder
+    def __init__(self, folder: Path, bench: Bench) -> None:
+        self.bench, self._folder = bench, folder
         self.state = folder / "state"
         daemon = Simulated(self.bench, self.state, 0.0)
-        daemon.hear(self.bench.run(HEALTHY_S, seed))
+        daemon.hear(self.bench.run(HEALTHY_S, bench.seed))
         daemon.stop()
         self.solution, self.published = daemon.solution, daemon.published
+
+    @classmethod
+    def of(cls, folder: Path, seed: int, publish_s: float = 10.0) -> Taught:
+        """The machine of a number."""
+        return cls(folder, Bench.of(folder, seed).publishing(publish_s))
 
     def again(self, name: str) -> Simulated:
         """Another start on a copy of the state."""
@@ -166,7 +173,7 @@ def test_a_fault_is_never_learned(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     rows: list[Row] = []
     for k in range(MACHINES):
         monkeypatch.chdir(tmp_path)  # and back at the end
-        taught = Taught(made(tmp_path / str(k)), FIRST + k)
+        taught = Taught.of(made(tmp_path / str(k)), FIRST + k)
         begun = Begun(taught, made(tmp_path / f"begun-{k}"))
         cases = [*itertools.product(FAULTS, BEGUN)]
         for n in range(0, len(cases), AT_ONCE):
@@ -186,7 +193,7 @@ def test_what_a_kill_costs_at_any_second(tmp_path: Path) -> None:
     """What would be published after it, against what is published, whatever was saved last."""
     costs: list[float] = []
     for k in range(MACHINES):
-        taught = Taught(made(tmp_path / str(k)), FIRST + k)
+        taught = Taught.of(made(tmp_path / str(k)), FIRST + k)
         project, daemon = taught.bench.project, taught.again("run")
         generations, seen = Generations(daemon.folder, project.digest), (0, 0)
         run = taught.bench.run(KILLED_S, taught.bench.seed + 502)
@@ -243,7 +250,7 @@ def test_a_healthy_day_is_not_refused(tmp_path: Path) -> None:
     """Nor does the guard cost any of what is learned meanwhile."""
     rng, alarms, late, costs = np.random.default_rng(18), list[str](), list[float](), [0.0]
     seeds = range(FIRST + 100, FIRST + 100 + MACHINES)
-    benches = [Taught(made(tmp_path / str(seed)), seed, SELDOM_S) for seed in seeds]
+    benches = [Taught.of(made(tmp_path / str(seed)), seed, SELDOM_S) for seed in seeds]
     while len(late) < RESTARTS:
         taught = benches[len(late) % len(benches)]
         try:
@@ -278,37 +285,77 @@ def _gains(plant: SimulatedPlant, worn: float, edges: Sequence[int]) -> Simulate
     return replace(plant, valves=tuple(valves))
 
 
+LEAKY = 0.01  # of rated, of the new machine: found by a diagnosis, and added
 WEAR: dict[str, Callable[[Bench, float], SimulatedPlant]] = {
     "all valves": lambda bench, worn: _gains(bench.plant, worn, range(5)),
     "one valve": lambda bench, worn: _gains(bench.plant, worn, [0]),
-    "a leak": lambda bench, worn: leak(0.1 * worn)(bench.plant, bench.rate),
+    "a leak": lambda bench, worn: leak(LEAKY + 0.1 * worn)(bench.plant, bench.rate),
 }
+NUMBERS = (9300, 9301, 9302, 9311, 9312, 9310)  # of machines, of each of three laws
 
 
-@pytest.mark.parametrize("name", WEAR)
-def test_slow_wear_is_followed(name: str, tmp_path: Path) -> None:
+def _with_leak(bench: Bench) -> Bench:
+    """A machine that leaks, with the leak as a term beside the maps, as `rtid add` leaves it."""
+    ends = (("p_a", 1.0), ("p_b", -1.0)), (("a", -1), ("b", 1))
+    term = Term("internal_leakage_laminar", *ends, LEAKY * bench.rate, sd=0.1)
+    project, plant = bench.project, leak(LEAKY)(bench.plant, bench.rate)
+    project = replace(project, model=replace(project.model, terms=(term,)))
+    return replace(bench, project=project, plant=plant)
+
+
+class Wearing:
+    """Ten hours of a machine that wears: a minute of motion each ten minutes; restarts."""
+
+    def __init__(self, folder: Path, name: str, seed: int) -> None:
+        bench = Bench.of(folder, seed).publishing(SELDOM_S)
+        self.taught = Taught(folder, _with_leak(bench) if name == "a leak" else bench)
+        self._worn = partial(WEAR[name], bench)
+        self.learns_s, self.name = list[float](), f"{name}, machine {seed}"
+        daemon = self.taught.again("wears")
+        for k in range(60):
+            daemon.hear(self.taught.bench.run(60.0, 1000 + k, plant=self._worn((k + 1) / 60)))
+            daemon.begin_s += 440.0  # behind the 100 s that `hear` leaves
+            change = 100 * map_drift(self.taught.published, daemon.published)
+            print(f"{self.name}, {k + 1} of 60: {change:.1f} % from the new one", flush=True)
+            assert not np.isfinite(daemon.alarm_s), f"after {k + 1} of 60: {daemon.text}"
+            if k % 10 == 9:
+                self.learns_s.append(daemon.learning_s)
+                self.followed, self.solution = daemon.published, daemon.solution
+                begin_s = daemon.begin_s
+                daemon.stop()
+                daemon = daemon.killed()
+                daemon.begin_s = begin_s
+
+    def of_new_and_worn(self, folder: Path) -> tuple[float, float]:
+        """How far the map of a daemon that knows the worn machine alone is from both maps."""
+        worn = Simulated(self.taught.bench, folder, 0.0)
+        worn.hear(self.taught.bench.run(HEALTHY_S, 2000, plant=self._worn(1.0)))
+        new, followed = (
+            map_drift(worn.published, m) for m in (self.taught.published, self.followed)
+        )
+        return new, followed
+
+
+@pytest.mark.parametrize("seed", NUMBERS[: 2 * MACHINES])
+@pytest.mark.parametrize("name", ["all valves", "one valve"])
+def test_slow_wear_is_followed(name: str, seed: int, tmp_path: Path) -> None:
     """10 % in 10 h, a minute of motion each ten minutes; a restart each 100 minutes."""
-    taught = Taught(made(tmp_path / "machine"), FIRST + 300 + [*WEAR].index(name), SELDOM_S)
-    bench, daemon, learns_s = taught.bench, taught.again("wears"), list[float]()
-    for k in range(60):
-        run = bench.run(60.0, 1000 + k, plant=WEAR[name](bench, (k + 1) / 60))
-        daemon.hear(run)
-        daemon.begin_s += 440.0  # behind the 100 s that `hear` leaves
-        assert not np.isfinite(daemon.alarm_s), f"after {k + 1} of 60: {daemon.text}"
-        if k % 10 == 9:
-            learns_s.append(daemon.learning_s)
-            begin_s, change = daemon.begin_s, map_drift(taught.published, daemon.published)
-            print(f"{name}, {k + 1} of 60: {100 * change:.1f} % from the new one", flush=True)
-            followed = daemon.published
-            daemon.stop()
-            daemon = daemon.killed()
-            daemon.begin_s = begin_s
-    worn = Simulated(bench, made(tmp_path / "worn"), 0.0)
-    worn.hear(bench.run(HEALTHY_S, 2000, plant=WEAR[name](bench, 1.0)))
-    behind, changed = (map_drift(worn.published, m) for m in (followed, taught.published))
-    said = f"0 alarms; the map has gone with it: {100 * behind:.1f} % from that of the worn "
+    wearing = Wearing(made(tmp_path / "machine"), name, seed)
+    changed, behind = wearing.of_new_and_worn(made(tmp_path / "worn"))
+    said = f"0 alarms; the map has gone with it: {100 * behind:.2f} % from that of the worn "
     said += f"machine, the one of the new machine {100 * changed:.1f} %"
-    said += f"; learning {max(learns_s):.0f} s at most after each of 6 restarts"
-    limit = "followed, no alarm"
-    leave(f"guard: wear of 10 % in 10 h, {name}", said, limit, f"machine {bench.seed}, 1 h motion")
-    assert behind < 0.5 * changed and max(learns_s) <= 60.0
+    said += f"; learning {max(wearing.learns_s):.0f} s at most after each of 6 restarts"
+    leave(f"guard: wear of 10 % in 10 h, {wearing.name}", said, "followed, no alarm", "1 h motion")
+    assert behind < 0.25 * changed and max(wearing.learns_s) <= 60.0
+
+
+@pytest.mark.parametrize("seed", NUMBERS[: 2 * MACHINES])
+def test_a_leak_that_is_known_is_followed(seed: int, tmp_path: Path) -> None:
+    """From 1 to 11 % of the rated flow in 10 h, learned beside the maps, which stay."""
+    wearing = Wearing(made(tmp_path / "machine"), "a leak", seed)
+    _, moved = wearing.of_new_and_worn(made(tmp_path / "worn"))
+    share = float(LEAKY * wearing.solution.terms_theta[0])
+    said = f"0 alarms; its size {100 * share:.2f} % of rated (11), the map moved by "
+    said += f"{100 * moved:.2f} %; learning {max(wearing.learns_s):.0f} s at most after a restart"
+    leave(f"guard: a leak that grows, {wearing.name}", said, "followed, no alarm", "1 h motion")
+    assert abs(share - 0.11) < 0.0055 and moved < 0.01 and max(wearing.learns_s) <= 60.0
