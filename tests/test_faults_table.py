@@ -50,6 +50,23 @@ def test_a_test_that_failed_elsewhere_is_seen() -> None:
     assert "1 of 1 tests pass" in line and line.endswith("| ok |")
 
 
+def test_a_test_that_failed_before_it_had_a_figure_is_seen() -> None:
+    """In each row of its name, or in none; a figure that is not met says it already."""
+    file = "tests/faults/test_process.py"
+    failed: list[dict[str, object]] = [
+        {"test": f"{file}::test_row_9_and_10_stalled[2]", "passed": False},
+        {"test": f"{file}::test_a_run", "passed": False},
+        {"test": f"{file}::test_row_18_disk_full", "passed": True},
+        {"test": f"{file}::test_row_22_hang", "passed": False},
+        {"row": 22, "what": "x", "value": 9.0, "wanted": "<= 1", "unit": "s", "met": False,
+         "test": f"{file}::test_row_22_hang"},
+    ]  # fmt: skip
+    lines = [line for line in table(failed).splitlines() if "NOT MET" in line]
+    assert [line.split("|")[1].strip() for line in lines] == ["9", "10", "22", ""]
+    assert all("test_row_9_and_10_stalled[2] failed" in line for line in lines[:2])
+    assert "test_a_run failed" in lines[3] and all(line.count("|") == 7 for line in lines)
+
+
 def test_a_row_whose_tests_did_not_run_is_no_success(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

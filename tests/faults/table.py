@@ -1,12 +1,14 @@
 """All faults as one table: `python -m tests.faults.table FIGURES.jsonl [--all]`; `make faults`.
 
-Each row has its figures, or how many of its tests passed elsewhere, or says why it has none.  With
---all it ends with 1 where a row has missed a figure, or tests of its did not run.
+Each row has its figures, or how many of its tests passed elsewhere, or says why it has none; a test
+that failed before it had a figure is named.  With --all it ends with 1 where a row has missed a
+figure, a test has failed, or tests of a row did not run.
 """
 
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections import defaultdict
 from pathlib import Path
@@ -31,20 +33,42 @@ NAMES = {
 
 
 NOT_MET, NOT_RUN = "**NOT MET**", "**NOT RUN**"
+HERE = "tests/faults/"
+NO_ROW = 0  # of tests whose name says none
 
 
 def table(figures: list[dict[str, object]]) -> str:
     """Markdown: per row its figures, what passed elsewhere, or why there is nothing."""
-    passed = _passed(figures)
+    passed, silent = _passed(figures), _failed_silently(figures)
     lines = ["| # | fault | what | measured | wanted | |", "|---|---|---|---|---|---|"]
     for row, name in NAMES.items():
-        lines += [f"| {row} | {name} | {told} |" for told in _of(row, figures, passed)]
+        failed = silent.get(row, [])
+        lines += [f"| {row} | {name} | {told} |" for told in _of(row, figures, passed, failed)]
+    lines += [f"| | of no row | {failed} |" for failed in silent.get(NO_ROW, ())]
     return "\n".join(lines)
 
 
-def _of(row: int, figures: list[dict[str, object]], passed: dict[str, list[bool]]) -> list[str]:
+def _failed_silently(figures: list[dict[str, object]]) -> dict[int, list[str]]:
+    """Tests that failed without a figure that is not met, by the rows that their names say."""
+    judged = {entry["test"] for entry in figures if entry.get("met") is False}
+    failed = {str(entry["test"]) for entry in figures if entry.get("passed") is False} - judged
+    by_row = defaultdict[int, list[str]](list)
+    for test in sorted(test for test in failed if test.startswith(HERE)):
+        name = test.rpartition("::")[2]
+        rows = re.match(r"test_row((?:_and|_\d+)+)_", name)
+        for row in map(int, re.findall(r"\d+", rows[1]) if rows else [NO_ROW]):
+            by_row[row].append(f"{name} failed | | | {NOT_MET}")
+    return by_row
+
+
+def _of(
+    row: int,
+    figures: list[dict[str, object]],
+    passed: dict[str, list[bool]],
+    failed: list[str],
+) -> list[str]:
     """What is said of one row, each in the last four columns."""
-    lines = []
+    lines = list(failed)
     for entry in (entry for entry in figures if entry.get("row") == row):
         met = "ok" if entry["met"] else NOT_MET
         lines.append(
