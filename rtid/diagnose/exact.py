@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
@@ -15,11 +15,16 @@ from rtid.diagnose.trials import GAIN, Trial, TrialState, scored
 from rtid.effects.column import Candidate
 from rtid.effects.laws.pump import PUMP, demand
 from rtid.effects.laws.sensors import sensor_timings
-from rtid.effects.laws.timing import Psi, TimingLaw, timings_of
-from rtid.plain import Key
+from rtid.effects.laws.timing import DEAD_BAND, Psi, TimingLaw, timings_of
+from rtid.effects.record_view import RecordView
+from rtid.estimator.orifice import root
+from rtid.estimator.track import pressure_drop
+from rtid.plain import FloatArray, Key
 
 LARGE = 1.5  # rho above which timing effects are refitted whatever their score
 CLOSE = 0.9  # timings whose coarse gain is this share of the best are refitted finely
+# where a valve opens: shares of its largest flow gain, bins of the command, least sqrt(dp)
+RISES, BINS, LEAST_ROOT = (0.15, 0.4), 40, 300.0
 NO_HINTS: Mapping[Key, float] = MappingProxyType({})
 PROMISING = 0.3  # share of the best gain that a timing's bank must reach to be closed in on
 # pumps to begin with: droops as shares of that seen, quantiles of the demand, stiffness in Pa/m3
@@ -86,7 +91,44 @@ def timing_trials(
     if not open_ or not present.view.has_pressures:
         return []
     hints = {key_of(t): _strength(t, *scores[key_of(t)]) for t in open_ if key_of(t) in scores}
-    return exact_trials(state, present, open_, other, hints)
+    return exact_trials(state, present, [*_behind_openings(present, open_)], other, hints)
+
+
+def _behind_openings(present: Fit, timings: list[TimingLaw]) -> Iterator[TimingLaw]:
+    """The timings; one behind the opening curve begins at the dead band that the maps show."""
+    for timing in timings:
+        if DEAD_BAND not in timing.parameters:
+            yield timing
+        elif (dead_v := opens_at(present.view)) > 0.0:
+            yield replace(timing, bank=tuple((psi[0], dead_v) for psi in timing.bank))
+
+
+def opens_at(view: RecordView) -> float:
+    """The command at which the valves open by the fitted maps, V: their middle; 0 for none.
+
+    From there the flow gain Q / s(dp) rises straight through two shares of its largest.
+    """
+    at = []
+    for i, edge in enumerate(view.model.edges):
+        w, s = view.along[:, i, 0], root(pressure_drop(view.model, edge, view.chunk[:, 2:]))
+        s = 0.5 * (s[1:] + s[:-1])
+        here = view.inside & (w > 0.0) & (np.abs(s) > LEAST_ROOT)
+        if np.count_nonzero(here) > BINS**2:
+            at.append(_foot(w[here], view.flow(i)[here] / s[here]))
+    return max(0.0, float(np.median(at))) if at else 0.0
+
+
+def _foot(w: FloatArray, gain: FloatArray) -> float:
+    """Where the gain over w, both (n,), begins to rise."""
+    border = np.linspace(0.0, float(w.max()), BINS + 1)
+    place = np.clip(np.searchsorted(border, w, side="right") - 1, 0, BINS - 1)
+    full = [k for k in range(BINS) if np.count_nonzero(place == k) >= BINS]
+    middle = np.array([0.5 * (border[k] + border[k + 1]) for k in full])
+    usual = np.array([np.median(gain[place == k]) for k in full])
+    low, high = (
+        middle[int(np.argmax(usual >= part * usual.max()))] if len(usual) else 0.0 for part in RISES
+    )
+    return float(low - (high - low) * RISES[0] / (RISES[1] - RISES[0]))
 
 
 def _strength(timing: TimingLaw, candidate: Candidate, score: Score) -> float:

@@ -65,10 +65,11 @@ def _finest(present: Fit, rest: Misfit) -> Fit:
     return present
 
 
-def on_grids(model: Machine, grids: Iterable[Grid]) -> Machine:
-    """The machine with these grids of its edges."""
+def on_grids(model: Machine, grids: Iterable[Grid], hysteresis: float) -> Machine:
+    """The machine with these grids of its edges, and blocks that are left by so much (`Gates`)."""
     pairs = zip(model.edges, grids, strict=True)
-    return replace(model, edges=tuple(replace(e, grid=g) for e, g in pairs))
+    gates = replace(model.gates, hysteresis=hysteresis)
+    return replace(model, edges=tuple(replace(e, grid=g) for e, g in pairs), gates=gates)
 
 
 def _better(present: Fit, rest: Misfit, machine: Machine) -> tuple[Fit, Misfit] | None:

@@ -70,9 +70,10 @@ def recall(
 
 
 def _timing(part: AddedEffect, known: tuple[TimingLaw, ...]) -> tuple[TimingLaw, Psi] | None:
-    for timing in known:
-        if timing.is_at(*part.key) and timing.own_spools == part.own_spools:
-            return timing, tuple(_value(part, name) for name in timing.parameters)
+    fit = [t for t in known if t.is_at(*part.key) and t.own_spools == part.own_spools]
+    if fit:  # where several have its name, the one with its parameters
+        timing = min(fit, key=lambda t: set(t.parameters) != set(part.parameters))
+        return timing, tuple(_value(part, name) for name in timing.parameters)
     if part.where == COMMAND:
         raise _unfit(part, "is no effect on a command")
     return None

@@ -42,11 +42,12 @@ from rtid.study.known_effects import KnownEffect
 class Seed:
     """Grids, weights and revision of a fit, and the map (cells, terms) that gave its columns.
 
-    timings: (effect, place, whether the spools are apart, parameters).  Pages of effects are not
-    kept.
+    hysteresis: as of `Gates`; timings: (effect, place, whether the spools are apart, parameters).
+    Pages of effects are not kept.
     """
 
     grids: tuple[Grid, ...]
+    hysteresis: float
     weights: Weights
     effects: tuple[Candidate, ...]
     timings: tuple[tuple[str, str, bool, Psi], ...]
@@ -63,7 +64,12 @@ class Seed:
         effects = tuple(replace(effect, page=None) for effect in revision.effects)
         sizes = tuple((replace(effect, page=None), size) for effect, size in revision.sizes)
         grids = tuple(edge.grid for edge in fit.declared.edges)
-        return cls(grids, fit.weights, effects, timings, sizes, map_.cells, map_.terms)
+        hysteresis = fit.declared.gates.hysteresis
+        return cls(grids, hysteresis, fit.weights, effects, timings, sizes, map_.cells, map_.terms)
+
+    def machine(self, model: Machine) -> Machine:
+        """The declared machine with the blocks of the fit."""
+        return on_grids(model, self.grids, self.hysteresis)
 
     @property
     def is_bare(self) -> bool:
@@ -88,14 +94,16 @@ class Seed:
             return replace(effect, page=pages.get(effect.effect))
 
         laws = (*timings_of(model, chunk[:, 0]), PUMP, *sensor_timings(model))
-        kinds = {(t.effect, t.where, t.own_spools): t for t in laws}
-        timings = tuple((kinds[effect, at, apart], psi) for effect, at, apart, psi in self.timings)
+        kinds = {(t.effect, t.where, t.own_spools, len(t.parameters)): t for t in laws}
+        timings = tuple(
+            (kinds[effect, at, apart, len(psi)], psi) for effect, at, apart, psi in self.timings
+        )
         effects = tuple(map(with_page, self.effects))
         sizes = tuple((with_page(effect), size) for effect, size in self.sizes)
         revision = Revision(effects, timings, sizes)
         before = MapTerms(self.cells, self.terms, NO_COV)
         return one_pass(
-            on_grids(model, self.grids),
+            self.machine(model),
             chunk,
             self.weights,
             revision,

@@ -19,7 +19,6 @@ from rtid.diagnose.clean import as_measured, usable
 from rtid.diagnose.diagnosis import Result, search, searched
 from rtid.diagnose.disturbance import with_disturbance
 from rtid.diagnose.extend import Extension, extend
-from rtid.diagnose.finer import on_grids
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.partial import Exhibit, exhibits
 from rtid.diagnose.parts import AddedEffect
@@ -210,7 +209,7 @@ class Study:
         if kept is None:
             return None
         model = as_measured(self.machine, self.taught)
-        seed, fine, steady = kept.steady, on_grids(model, kept.steady.grids), None
+        seed, fine, steady = kept.steady, kept.steady.machine(model), None
         if not seed.is_bare:
             chunk = usable(model, self.taught)
             steady = seed.fit(model, chunk, self.project.effects, thorough=False).light()

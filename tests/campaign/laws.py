@@ -7,16 +7,18 @@ the simulator's own, equal steps that somebody has thought of, or the file of `r
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
+from typing import TypeVar
 
 import numpy as np
 
 from rtid.diagnose.diagnosis import searched
 from rtid.diagnose.excuse import steady
-from rtid.diagnose.report import diagnosis
+from rtid.diagnose.fit import Fit
+from rtid.diagnose.report import Diagnosis, diagnosis
 from rtid.diagnose.standing import fitted, stand
 from rtid.estimator.estimator import to_chunk
 from rtid.estimator.flowmap import EXTRAPOLATED, VALID, EdgeMap
@@ -27,23 +29,26 @@ from rtid.project.template import U_STEPS, nice
 from rtid.sim.declare import declared_model, default_grid
 from rtid.sim.demand import IDENTIFICATION, VALIDATION
 from rtid.sim.hidden import hide
-from rtid.sim.random_plants import draw
+from rtid.sim.random_plants import draw, draw_hidden
 from rtid.sim.run import Run, Sensors, SimulationError, simulate
 from rtid.sim.simulated_plant import EDGES, SimulatedPlant
 from rtid.study.known_effects import acting, learn_beside
+from tests.campaign import diagnoses
+from tests.campaign.diagnoses import judge, truth
 
 WORKERS = 2
 RECORD_S = 44.0  # of which 32 s teach
 NEAR = 0.25  # of the visited span: how far off the data a map still gives a number
 DEFAULT, EQUAL, INIT = "default", "equal", "init"
 GRIDS = (DEFAULT, EQUAL, INIT)
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Case:
     """One machine: its number, its valves' law and its motion; what is hidden in it, "" for none.
 
-    size: of what is hidden, SI.
+    size: of what is hidden, SI; 0: of middle strength, in a random place.
     """
 
     seed: int
@@ -55,6 +60,8 @@ class Case:
     @property
     def plant(self) -> SimulatedPlant:
         """The machine."""
+        if self.hidden and not self.size:
+            return draw_hidden(self.seed, self.hidden, law=self.law)
         plant = draw(self.seed, law=self.law)
         return hide(plant, self.hidden, self.size) if self.hidden else plant
 
@@ -109,16 +116,52 @@ class Outcome:
         return 3.0 * float(np.sqrt(2.0 / self.dof))
 
 
+@dataclass(frozen=True)
+class Answer:
+    """What was said of a machine with an effect of middle strength in it.
+
+    judgement: as of `diagnoses.judge`; is_hidden: named where the maps had taken it in; size_z:
+    error of its size in stated standard deviations, NaN where it is not one number.
+    """
+
+    case: Case
+    judgement: str
+    named: str
+    is_hidden: bool
+    size_z: float
+    size_half: float
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A record, the fit of its first part and what a search has found; the machine behind it."""
+
+    plant: SimulatedPlant
+    run: Run
+    present: Fit
+    taught: FloatArray
+    said: Diagnosis
+
+
 def outcomes(cases: Iterable[Case]) -> Iterator[Outcome]:
     """Outcomes of all machines that could be simulated, on WORKERS processes."""
+    return _all(outcome, cases)
+
+
+def answers(cases: Iterable[Case]) -> Iterator[Answer]:
+    """Answers to all machines that could be simulated, on WORKERS processes."""
+    return _all(answer, cases)
+
+
+def _all(of: Callable[[Case], T | None], cases: Iterable[Case]) -> Iterator[T]:
     with ProcessPoolExecutor(WORKERS, get_context("spawn")) as pool:
-        for found in pool.map(outcome, cases, chunksize=2):
+        for found in pool.map(of, cases, chunksize=2):
             if found is not None:
                 yield found
 
 
-def outcome(case: Case) -> Outcome | None:
-    """One case; None where the drawn machine leaves its stroke or cavitates."""
+def judged(case: Case) -> Judged | None:
+    """One case through the diagnosis; None where the machine leaves its stroke or cavitates."""
     plant = case.plant
     try:
         run = simulate(plant, case.motion, case.seed, RECORD_S, case.sensors)
@@ -126,19 +169,42 @@ def outcome(case: Case) -> Outcome | None:
         return None
     model = declared(case, run)
     chunk = to_chunk(model, run.samples, 0)
-    t_s, began = chunk[:, 0], time.process_time()
+    t_s = chunk[:, 0]
     taught = chunk[t_s < IDENTIFICATION * RECORD_S]
     present = fitted(model, taught)
     standing = stand(model, taught, chunk[t_s >= VALIDATION * RECORD_S], known=present)
-    said = diagnosis(searched(standing))
+    return Judged(plant, run, present, taught, diagnosis(searched(standing)))
+
+
+def answer(case: Case) -> Answer | None:
+    """The answer to one case; None where it could not be simulated."""
+    found = judged(case)
+    if found is None:
+        return None
+    said, z, half = found.said, float("nan"), float("nan")
+    judgement = judge(diagnoses.Case(case.seed, case.hidden), said)
+    first = said.found[0] if said.found else None
+    true = found.plant.hidden[0].strength
+    if first is not None and first.effect == truth(case.hidden) and len(first.parameters) == 1:
+        (size,) = first.parameters.values()
+        z, half = (abs(size.value) - abs(true)) / size.std, 1.96 * size.std / abs(true)
+    is_hidden = first is not None and first.hidden_in_map is not None
+    return Answer(case, judgement, first.effect if first else "", is_hidden, z, half)
+
+
+def outcome(case: Case) -> Outcome | None:
+    """One case; None where the drawn machine leaves its stroke or cavitates."""
+    began = time.process_time()
+    found = judged(case)
+    if found is None:
+        return None
+    plant, run, present, said = found.plant, found.run, found.present, found.said
     words = steady(present)
     acts = acting(words, words.chunk)
     solution = learn_beside(words, acts, acts.chunk).solution
-    flowmap, n = publish(solution), len(taught)
-    of = [
-        _points(e, m, plant, run, n)
-        for e, m in zip(solution.model.edges, flowmap.edges, strict=True)
-    ]
+    flowmap, n = publish(solution), len(found.taught)
+    pairs = zip(solution.model.edges, flowmap.edges, strict=True)
+    of = [_points(edge, learned, plant, run, n) for edge, learned in pairs]
     return Outcome(
         case,
         said.verdict,

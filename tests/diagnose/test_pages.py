@@ -77,7 +77,8 @@ def test_every_timing_is_that_of_its_page(timing: TimingLaw) -> None:
     parts = zip(timing.parameters, timing.units, timing.low, timing.high, strict=True)
     for name, unit, low, high in parts:
         assert (pages[name].unit, pages[name].low, pages[name].high) == (unit, low, high), name
-    assert set(timing.parameters) == set(pages)
+    alike = [t for t in (*TIMINGS, PUMP) if t.effect == timing.effect]
+    assert {name for t in alike for name in t.parameters} == set(pages)
 
 
 def test_no_code_asks_for_an_effect_by_its_name() -> None:

@@ -15,6 +15,7 @@ from rtid.sim.declare import declared_model, default_grid
 from rtid.sim.random_plants import draw, draw_hidden
 from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import SimulatedPlant
+from rtid.study.seed import Seed
 
 
 def machine(seed: int, coarse: bool) -> tuple[SimulatedPlant, Machine, FloatArray]:
@@ -65,6 +66,7 @@ def test_a_border_is_put_where_a_valve_opens_with_a_jump() -> None:
     off_v = [np.abs(a - w).min() for a, w in zip(added, jumps_v, strict=False) if len(a)]
     assert sum(off < 0.005 for off in off_v) >= 2, (added, jumps_v)
     assert fit.declared.gates.hysteresis == 0.0
+    assert Seed.of(fit).machine(model).gates == fit.declared.gates
     assert fit.rho < MATCH_RHO
 
 

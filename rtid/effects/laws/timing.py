@@ -25,6 +25,9 @@ from rtid.plain import FloatArray
 Psi = tuple[float, ...]
 COMMAND, SUPPLY = "command", "supply"  # what a timing transforms; else a sensor at its place
 RATE = "rad/s"  # unit of a parameter that does the more the smaller it is
+SHUT_V = 1e-3  # of an opening that fades: less passes nothing
+LAG_S = "time_constant"
+DEAD_BAND = "dead_band"  # behind which a lag may sit
 USUAL_STEP_S = 0.01  # up to which the banks are those of the pages
 
 
@@ -125,6 +128,19 @@ def lagged(u: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
     return np.asarray(u + (start - u) * tau / dt_s * (1.0 - fade))
 
 
+def lagged_opening(u: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
+    """A lag behind the opening curve, mean over each interval (n,): time constant, dead band.
+
+    What is beyond the dead band lags, and is added to it again: a valve that is told to shut still
+    closes while the command is inside.  u (n,), V: of one sign.
+    """
+    tau_s, dead_v = psi
+    size = np.abs(u)
+    opening = lagged(np.maximum(size - dead_v, 0.0), dt_s, (tau_s,))
+    out = np.where(opening > SHUT_V, dead_v + opening, np.minimum(size, dead_v))
+    return np.asarray(np.copysign(out, u.min() if -u.min() > u.max() else 1.0))
+
+
 def second_order(u: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
     """Spool of natural frequency psi[0] rad/s and damping psi[1], mean over each interval (n,)."""
     wn, zeta = psi
@@ -151,7 +167,9 @@ def of_law(
     law: str, apply: Callable[[FloatArray, float, Psi], FloatArray], names: tuple[str, ...] = (),
     **keys: Any,
 ) -> TimingLaw:  # fmt: skip
-    """The timing of the page that names this law, with its parameters; names: in another order.
+    """The timing of the page that names this law, with its parameters.
+
+    names: in another order, or some of them.
 
     apply: (n,) to (n,), both in V, or of a demand in m3/s to Pa.
     """
@@ -173,7 +191,10 @@ def of_law(
 
 COMMAND_LAWS: dict[str, tuple[TimingLaw, ...]] = {
     "delay": (of_law("delay", delayed),),
-    "lag": tuple(of_law("lag", lagged, own_spools=its_own) for its_own in (False, True)),
+    "lag": (
+        *(of_law("lag", lagged, (LAG_S,), own_spools=its_own) for its_own in (False, True)),
+        of_law("lag", lagged_opening, (LAG_S, DEAD_BAND), own_spools=True, is_linear=False),
+    ),
     "second_order": tuple(
         of_law("second_order", second_order, replaces_lag=True, own_spools=its_own)
         for its_own in (False, True)
