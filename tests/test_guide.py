@@ -37,6 +37,8 @@ LEFT = {
         "9 s; tests/excite/test_machine.py designs after a record, and for an effect",
     "rtid compare run.blf -p run.toml --map sheet.csv --pictures pictures":
         "draws 19 pictures for 9 s; tests/test_compare_command.py does",
+    "rtid report run.blf -p run.toml -o run.html":
+        "draws for 6 s; tests/test_report.py and tests/browser/test_report_page.py do",
     "rtid quick jib.csv --save jib.toml": "tests/test_rate.py records a jib",
     "rtid quick jib.csv --role u=u_jib_pct --role x=x_jib_mm": "the same",
 }  # fmt: skip

@@ -221,7 +221,9 @@ def measured(
 
 PLANTS = {"motor": motor, "spring": spring, "room": room, "tanks": tanks, "volume": volume}
 CAMPAIGN = pytest.mark.campaign
-LONG = ("coulomb_friction",)  # found in the electric drive of `rtid.sim.other_plants` every time
+# Each five seconds or more, and found every time elsewhere: the first in the electric drive of
+# `rtid.sim.other_plants`, the next two as a pair below, the last in the measured tanks.
+LONG = ("coulomb_friction", "dead_zone", "pure_delay", "overflow")
 SIZE = {"overflow": "rim"}  # the parameter to look at, where it is not the first
 HIDDEN = [
     ("motor", "coulomb_friction", "w"),

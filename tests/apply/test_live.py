@@ -52,7 +52,7 @@ class Listener:
         self._bus.shutdown()
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 def test_offer_apply_and_undo_beside_a_running_daemon(tmp_path: Path) -> None:
     with contextlib.ExitStack() as stack:
         at = stack.enter_context(process.daemon(tmp_path, settings=f"publish_s = 3\n{PUBLISH}"))

@@ -108,49 +108,6 @@ def watched(opened: Opened, for_s: float) -> tuple[int, float]:
     return page.evaluate(UPDATES) - first, page.evaluate(MEMORY) - before
 
 
-@pytest.mark.slow
-def test_the_page_follows_a_daemon(opened: Opened) -> None:
-    updates, _ = watched(opened, SHORT_S)
-    assert updates >= SHORT_S / 2  # the daemon tells once a second
-    page = opened.page
-    signals = page.locator("#live_health").inner_text()
-    assert all(name in signals for name in ("p_a", "p_b", "p_supply", "u"))
-    assert "Hz" in signals
-    assert "blocks valid" in page.locator("#live_learning").inner_text()
-    assert page.locator("#live_learning >> text=To learn more").count() == 1
-    assert page.locator("#live_scope .scope polygon").count() >= 5  # command, pressures, position
-    points = page.locator("#live_scope .scope polygon").first.get_attribute("points") or ""
-    assert len(points.split()) >= 2 * 5 * SHORT_S  # ten values a second, less what is not told yet
-    assert page.locator("#live_planes .plane circle").count() > 10
-    assert page.evaluate(PLACES) >= 10 * SLID_S  # the curves slide between two statuses
-
-
-@pytest.mark.soak
-def test_half_an_hour_of_updates_leaves_the_tab_as_it_was(browser: Browser, opened: Opened) -> None:
-    rate, found = memory(browser, opened.page, opened.bench.url, SOAK_MINUTES)
-    heap_mb, private_mb = growth(found)
-    assert rate > 0.8  # the page looks five times a second, the daemon tells once
-    assert heap_mb <= MOST_MB
-    assert private_mb <= MOST_MB
-
-
-@pytest.mark.slow
-def test_stale_is_shown_as_stale(
-    browser: Browser, project: Path, machine: Path, tmp_path: Path
-) -> None:
-    """A status that is not renewed: the page greys and says how old it is."""
-    status = machine / "status.json"
-    end = time.monotonic() + START_S
-    while not status.exists() and time.monotonic() < end:
-        time.sleep(0.2)
-    (tmp_path / "status.json").write_bytes(status.read_bytes())
-    with served(project=project, state=tmp_path) as bench:
-        for opened in open_page(browser, bench):
-            opened.go("live")
-            opened.page.wait_for_selector("#live_health .stale >> text=stale:")
-            assert_clear(opened.page, "#live_health")
-
-
 def test_words_from_outside_are_shown_as_they_are(
     browser: Browser, project: Path, tmp_path: Path
 ) -> None:
@@ -236,3 +193,49 @@ def test_the_page_of_a_machine_without_a_daemon_says_what_to_do(
             opened.page.evaluate(GONE)
             opened.page.wait_for_selector("#lost >> text=The server has gone")
             assert_clear(opened.page, "#lost", "#cover h2")
+
+
+# The daemon and its machine run on to the end of this module: what needs them comes last.
+
+
+@pytest.mark.slow
+def test_the_page_follows_a_daemon(opened: Opened) -> None:
+    updates, _ = watched(opened, SHORT_S)
+    assert updates >= SHORT_S / 2  # the daemon tells once a second
+    page = opened.page
+    signals = page.locator("#live_health").inner_text()
+    assert all(name in signals for name in ("p_a", "p_b", "p_supply", "u"))
+    assert "Hz" in signals
+    assert "blocks valid" in page.locator("#live_learning").inner_text()
+    assert page.locator("#live_learning >> text=To learn more").count() == 1
+    assert page.locator("#live_scope .scope polygon").count() >= 5  # command, pressures, position
+    points = page.locator("#live_scope .scope polygon").first.get_attribute("points") or ""
+    assert len(points.split()) >= 2 * 5 * SHORT_S  # ten values a second, less what is not told yet
+    assert page.locator("#live_planes .plane circle").count() > 10
+    assert page.evaluate(PLACES) >= 10 * SLID_S  # the curves slide between two statuses
+
+
+@pytest.mark.soak
+def test_half_an_hour_of_updates_leaves_the_tab_as_it_was(browser: Browser, opened: Opened) -> None:
+    rate, found = memory(browser, opened.page, opened.bench.url, SOAK_MINUTES)
+    heap_mb, private_mb = growth(found)
+    assert rate > 0.8  # the page looks five times a second, the daemon tells once
+    assert heap_mb <= MOST_MB
+    assert private_mb <= MOST_MB
+
+
+@pytest.mark.slow
+def test_stale_is_shown_as_stale(
+    browser: Browser, project: Path, machine: Path, tmp_path: Path
+) -> None:
+    """A status that is not renewed: the page greys and says how old it is."""
+    status = machine / "status.json"
+    end = time.monotonic() + START_S
+    while not status.exists() and time.monotonic() < end:
+        time.sleep(0.2)
+    (tmp_path / "status.json").write_bytes(status.read_bytes())
+    with served(project=project, state=tmp_path) as bench:
+        for opened in open_page(browser, bench):
+            opened.go("live")
+            opened.page.wait_for_selector("#live_health .stale >> text=stale:")
+            assert_clear(opened.page, "#live_health")
