@@ -19,7 +19,7 @@ from can.interfaces.udp_multicast import UdpMulticastBus
 from can.interfaces.virtual import VirtualBus
 from hypothesis import settings
 
-from tests.left import Here, left_since
+from tests.left import Here, left_since, of_this_run
 
 # Two test workers fill two cores already, and OpenBLAS' idle threads spin: a diagnosis of the tanks
 # took 94 s of processor time instead of 28.  Read at the first import of numba and of numpy.
@@ -35,6 +35,11 @@ LONG_S = 8 * 3600.0  # the limit of what is meant to take hours
 AGAIN_S = 5.0  # after its limit a test is ended as often as it begins anew, as hypothesis does
 ROOT = Path(__file__).parents[1]
 SHARED = ROOT.parent / "shared"
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Before there is anything that the workers share."""
+    of_this_run(config)
 
 
 @pytest.hookimpl(trylast=True)  # of those that are chosen

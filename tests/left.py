@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import gc
 import os
+import shutil
 import tempfile
 import threading
 import time
@@ -14,6 +15,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+
+import pytest
 
 OWN = Path("/proc/self")
 LASTING = (
@@ -31,6 +34,7 @@ FOLDERS = (
 KEPT = ("anon_inode:", "/dev/", "/proc/", "/sys/")  # of libraries, and of the system
 TEMPORARY = tempfile.gettempdir()
 LIBRARIES = "/site-packages/"  # fonts that matplotlib keeps open
+OF_RUN = "RTID_TESTS_FOLDER"  # environment: the folder of this run
 PATIENCE_S = 3.0  # for what is just about to end
 
 
@@ -42,6 +46,13 @@ def _for_all() -> tempfile.TemporaryDirectory[str]:
 def shared_folder(name: str) -> Path:
     """A folder for what all tests of a run share; it goes when the run ends."""
     return Path(tempfile.mkdtemp(prefix=name, dir=_for_all().name))
+
+
+def of_this_run(config: pytest.Config) -> None:
+    """Make the folder that both workers share, in their environment; it goes when the run ends."""
+    if not hasattr(config, "workerinput"):
+        os.environ[OF_RUN] = folder = tempfile.mkdtemp(prefix="rtid-tests-", dir=TEMPORARY)
+        config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
 
 
 def children(pid: int) -> Iterator[int]:

@@ -1,85 +1,127 @@
-"""What the tests of a module share: the same trace with the same project is learned once.
+"""What the tests of a run share: the same record is learned, diagnosed and published once.
 
 A replay, a diagnosis and a map are functions of what they are given, bit for bit, and what follows
-only reads them; so each command of a module need not begin anew.
+only reads them; so each command of a test need not begin anew.  What was made lies in a folder of
+the run, and both workers take it from there.
 """
 
 from __future__ import annotations
 
 import functools
 import hashlib
+import inspect
 import io
+import os
 import pickle
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
-from types import FunctionType, MethodType
+from types import CodeType, FunctionType, MethodType
 from typing import Any
 
 import pytest
 
+from firmware_bridge.kernel_cache import alone
 from rtid.diagnose.diagnosis import search, searched
 from rtid.diagnose.report import diagnosis
 from rtid.diagnose.standing import fitted
 from rtid.estimator.published import publish
+from rtid.excite.exciting import excite
+from rtid.sim.run import simulate
+from tests.left import OF_RUN
 
-SHARED: tuple[Callable[..., Any], ...] = (fitted, search, searched, diagnosis, publish)
+SHARED: tuple[Callable[..., Any], ...] = (
+    *(simulate, search, searched, diagnosis, publish, excite),
+)
+LARGE: tuple[Callable[..., Any], ...] = (fitted,)  # tens of MB each: kept by a module alone
+ROOT = str(Path(__file__).parents[1])
+UNFIT = (pickle.PicklingError, AttributeError, TypeError, ValueError, OSError)
 
 
 @pytest.fixture(scope="module", autouse=True)
-def shared_replays() -> Iterator[None]:
-    """Have every command take what was made before."""
-    remembered = [_once(function) for function in SHARED]
-    for function, instead in zip(SHARED, remembered, strict=True):
-        _replace(function, instead)
+def shared_replays(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Have every command, and every test of a module that imports this, take what was made."""
+    folder, tests = Path(os.environ[OF_RUN]), vars(request.module)
+    remembered = {function: _once(function, tests, folder) for function in SHARED}
+    remembered |= {function: _once(function, tests) for function in LARGE}
+    _replace(remembered)
     yield
-    for function, instead in zip(SHARED, remembered, strict=True):
-        _replace(instead, function)
+    _replace({instead: function for function, instead in remembered.items()})
 
 
-def _once(function: Callable[..., Any]) -> Callable[..., Any]:
+def _apart(tests: dict[str, Any]) -> str:
+    """The test that runs, where it changes the program and must not share; else ""."""
+    name = os.environ.get("PYTEST_CURRENT_TEST", "").rpartition(" ")[0]
+    test = tests.get(name.rpartition("::")[2].partition("[")[0])
+    return name if test and "monkeypatch" in inspect.signature(test).parameters else ""
+
+
+def _once(
+    function: Callable[..., Any], tests: dict[str, Any], folder: Path | None = None
+) -> Callable[..., Any]:
     """It, with a memory of what it made; what cannot be told apart is made each time."""
-    made: dict[bytes, Any] = {}
+    own: dict[str, Any] = {}
 
     @functools.wraps(function)
     def remembered(*arguments: Any, **named: Any) -> Any:
         try:
-            key = _digest(
-                *arguments, *(value for _, value in sorted(named.items())), *sorted(named)
-            )
-        except (pickle.PicklingError, AttributeError, TypeError, OSError):  # no such file
+            key = _digest(_apart(tests), arguments, sorted(named.items()))
+        except UNFIT:
             return function(*arguments, **named)
-        if key not in made:
-            made[key] = function(*arguments, **named)
-        return made[key]
+        if folder is not None:
+            path = folder / f"{function.__qualname__}-{key}"
+            return _kept(path, lambda: function(*arguments, **named))
+        if key not in own:
+            own[key] = function(*arguments, **named)
+        return own[key]
 
     return remembered
 
 
-def _digest(*given: Any) -> bytes:
+def _kept(path: Path, make: Callable[[], Any]) -> Any:
+    """A copy of what lies in the file; where there is none yet, one process makes it."""
+    with alone(path.with_name(f"{path.name}.lock")):
+        if path.exists():
+            return pickle.loads(path.read_bytes())
+        made = make()
+        with suppress(*UNFIT):
+            path.write_bytes(pickle.dumps(made, pickle.HIGHEST_PROTOCOL))
+    return made
+
+
+def _digest(apart: str, arguments: tuple[Any, ...], named: list[tuple[str, Any]]) -> str:
     """Of what is given, files with their time; whom to tell of the progress does not count."""
     told = [
-        (value, value.stat().st_mtime_ns) if isinstance(value, Path) else value
-        for value in given
+        (name, (value, value.stat().st_mtime_ns) if isinstance(value, Path) else value)
+        for name, value in [*enumerate(arguments), *named]
         if not callable(value)
     ]
     text = io.BytesIO()
-    _Named(text).dump(told)
-    return hashlib.sha256(text.getbuffer()).digest()
+    _Named(text).dump((apart, told))
+    return hashlib.sha256(text.getbuffer()).hexdigest()[:32]
 
 
 class _Named(pickle.Pickler):
-    """Functions by their names alone: whom to tell of the progress may be a method of anything."""
+    """Functions by what they do: a law may be a function within another, which no pickle takes."""
 
     def reducer_override(self, item: Any) -> Any:
-        if isinstance(item, FunctionType | MethodType):
-            return str, (item.__qualname__,)
+        if isinstance(item, MethodType):
+            return str, (item.__func__.__qualname__,), item.__self__
+        if isinstance(item, FunctionType):
+            cells = [cell.cell_contents for cell in item.__closure__ or ()]
+            return str, (item.__qualname__,), (item.__module__, item.__code__, cells)
+        if isinstance(item, CodeType):
+            return str, (item.co_name,), (item.co_code, item.co_names, item.co_consts)
         return NotImplemented
 
 
-def _replace(item: Callable[..., Any], other: Callable[..., Any]) -> None:
-    """In every module that has imported it."""
-    for name, module in list(sys.modules.items()):
-        if name.split(".")[0] == "rtid":
-            for known in [key for key, value in vars(module).items() if value is item]:
-                setattr(module, known, other)
+def _replace(others: dict[Callable[..., Any], Callable[..., Any]]) -> None:
+    """In every module of this repository that has imported it."""
+    by_identity = {id(function): other for function, other in others.items()}
+    for module in list(sys.modules.values()):
+        file = str(getattr(module, "__file__", None))
+        if file.startswith(ROOT) and "site-packages" not in file:
+            for name, value in list(vars(module).items()):
+                if id(value) in by_identity:
+                    setattr(module, name, by_identity[id(value)])

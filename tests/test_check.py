@@ -25,6 +25,7 @@ from rtid.trace.check import against_signs
 from rtid.trace.plausible import Motion, Spring
 from rtid.trace.series import Series, describe, longest_frozen
 from rtid.trace.signals import read_recording
+from tests.replays import shared_replays  # noqa: F401
 
 ROOT = Path(__file__).parents[1]
 Edit = Callable[[dict[str, Any]], None]

@@ -14,6 +14,7 @@ from rtid.cli.exits import Exit
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import SimulatedPlant
+from tests.replays import shared_replays  # noqa: F401
 from tests.test_names import rtid
 
 RECORDS = {"rich": ("rich", 12.0), "sweep": ("sweep", 12.0), "short": ("rich", 3.0)}

@@ -20,6 +20,7 @@ from rtid.plain import FloatArray
 from rtid.sim.declare import declared_model
 from rtid.sim.run import Run, simulate
 from rtid.sim.simulated_plant import SimulatedPlant
+from tests.replays import shared_replays  # noqa: F401
 
 GRID = Grid(
     np.concatenate([np.arange(1.0, 4.0, 0.25), np.arange(4.0, 10.1, 0.5)]),

@@ -44,6 +44,7 @@ from rtid.sim.random_plants import draw
 from rtid.sim.run import simulate as run_plant
 from rtid.sim.simulated_plant import SimulatedPlant
 from rtid.units import Z95
+from tests.replays import shared_replays  # noqa: F401
 from tests.test_other_plants import plant as other_plant
 
 SEEN_S = 25.0

@@ -19,6 +19,7 @@ from rtid.study.quick_rate import QuickRate, quick_rate
 from rtid.study.study import Study
 from rtid.trace.quick_source import open_source
 from rtid.units import show_flow_as
+from tests.replays import shared_replays  # noqa: F401
 from tests.test_rate import said
 
 STRANGERS = Path(__file__).parents[2] / "shared/data/strangers"

@@ -35,6 +35,7 @@ from rtid.study.study import diagnose_live, diagnose_trace
 from rtid.trace.reading import read_trace
 from rtid.trace.snapshot import load as load_snapshot
 from rtid.trace.snapshot import save
+from tests.replays import shared_replays  # noqa: F401
 
 ROOT = Path(__file__).parents[1]
 PAGES = ("README.md", "docs/api.md", "docs/guide.md", "docs/extending.md")

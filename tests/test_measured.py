@@ -25,6 +25,7 @@ from rtid.study.study import Study
 from rtid.trace.quick_source import open_source
 from rtid.trace.reading import read_trace
 from rtid.units import show_flow_as
+from tests.replays import shared_replays  # noqa: F401
 from tests.test_rate import said
 
 STRANGERS = Path(__file__).parents[2] / "shared/data/strangers"

@@ -19,6 +19,7 @@ from rtid.maps.files import read_map
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import SimulatedPlant
+from tests.replays import shared_replays  # noqa: F401
 
 EXAMPLE = Path(rtid.project.__file__).parent / "examples" / "cylinder.toml"
 TEXT = EXAMPLE.read_text("utf-8").replace('"p_A"', '"p_a"').replace('"p_B"', '"p_b"')

@@ -23,6 +23,7 @@ from rtid.study.quick_rate import QuickRate
 from rtid.study.study import Study
 from rtid.trace.reading import read_trace
 from rtid.units import show_flow_as
+from tests.replays import shared_replays  # noqa: F401
 from tests.test_rate import said
 
 STRANGERS = Path(__file__).parents[2] / "shared/data/strangers"

@@ -22,6 +22,7 @@ from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import EDGES, SimulatedPlant, flow_points
 from rtid.study.replay import Replay, replay
+from tests.replays import shared_replays  # noqa: F401
 
 PLANT = SimulatedPlant()
 

@@ -13,6 +13,7 @@ import pytest
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import SimulatedPlant
+from tests.replays import shared_replays  # noqa: F401
 
 
 @pytest.fixture(scope="module")

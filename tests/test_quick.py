@@ -37,6 +37,7 @@ from rtid.study.quick_machine import (
 from rtid.study.quick_project import project_text
 from rtid.study.study import Study
 from rtid.trace.quick_source import open_source, roles_of
+from tests.replays import shared_replays  # noqa: F401
 
 LEAK, TRUTH = "internal_leakage_laminar", 2e-12
 TWICE = ("--bore", 100, "--rod", 70)  # of what is assumed

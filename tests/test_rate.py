@@ -23,6 +23,7 @@ from rtid.project import ProjectError, load
 from rtid.study.study import Study
 from rtid.trace.neutral import neutral_of
 from rtid.units import flow_name, show_flow_as
+from tests.replays import shared_replays  # noqa: F401
 
 STRANGERS = Path(__file__).parents[2] / "shared/data/strangers"
 

@@ -21,6 +21,7 @@ from rtid.study.compared import compare_trace
 from rtid.study.study import Study
 from rtid.tell.recorded import groups_of, write_recorded
 from rtid.trace.snapshot import save as save_snapshot
+from tests.replays import shared_replays  # noqa: F401
 
 ORIGIN = {"project": "here"}
 

@@ -13,6 +13,7 @@ from rtid.errors import RtidError
 from rtid.project import ProjectError, load
 from rtid.study.study import Study
 from rtid.units import show_flow_as
+from tests.replays import shared_replays  # noqa: F401
 from tests.test_rate import Crane, said
 
 

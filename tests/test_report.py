@@ -27,6 +27,7 @@ from rtid.tell.diagnosed import sentences
 from rtid.tell.report import page
 from rtid.tell.report_file import Reported, report
 from rtid.tell.report_story import ReportStory
+from tests.replays import shared_replays  # noqa: F401
 
 SEED, DURATION_S = 3, 40.0
 MOST_BYTES = 3_000_000

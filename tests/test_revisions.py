@@ -29,6 +29,7 @@ from rtid.study.revisions import add, drop, undo
 from rtid.study.spans import parts
 from rtid.study.study import diagnose_trace
 from rtid.trace.reading import Trace, read_trace
+from tests.replays import shared_replays  # noqa: F401
 
 LEAK, WRONG = "internal_leakage_laminar", "position_sensor_delay"
 DRIFT = "valve_gain_drift"  # of either sign: what is next to nothing is never impossible

@@ -17,6 +17,7 @@ from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import SimulatedPlant
 from tests.diagnose.records import record
+from tests.replays import shared_replays  # noqa: F401
 
 
 def rtid(*words: object) -> int:

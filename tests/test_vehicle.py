@@ -22,6 +22,7 @@ from rtid.model import Grid
 from rtid.plain import FloatArray
 from rtid.study.study import Study
 from rtid.units import show_flow_as
+from tests.replays import shared_replays  # noqa: F401
 from tests.test_rate import said
 
 HZ, INNER, MINUTES, GRAVITY = 30.0, 4, 10, 9.80665

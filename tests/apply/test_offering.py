@@ -30,6 +30,7 @@ from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import SimulatedPlant
 from rtid.trace.learner import Learner, catalog_of
+from tests.replays import shared_replays  # noqa: F401
 
 SECONDS, ROUGH_S, GOOD_S = 56.0, 8.0, 30.0
 

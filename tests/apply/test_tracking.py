@@ -28,6 +28,7 @@ from rtid.project import load
 from rtid.project.errors import ProjectError
 from rtid.project.schema import ControllerSection
 from rtid.study.study import Study
+from tests.replays import shared_replays  # noqa: F401
 from tests.tracking_machines import (
     KP_1PS,
     Tried,

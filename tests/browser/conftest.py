@@ -19,6 +19,7 @@ from rtid.sim.run import simulate
 from rtid.ui.server import Workbench
 from tests.browser.geometry import assert_clear
 from tests.left import PATIENCE_S
+from tests.replays import shared_replays  # noqa: F401
 from tests.ui.served import served
 
 if TYPE_CHECKING:

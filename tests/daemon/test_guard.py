@@ -34,6 +34,7 @@ from rtid.sim.simulated_plant import SimulatedPlant
 from rtid.trace.snapshot import WATCH_FILE, Generations
 from tests.campaign.guarding import FAULTS, Bench, Simulated, oil
 from tests.faults.harness import fault_free, machine
+from tests.replays import shared_replays  # noqa: F401
 
 
 @pytest.fixture(scope="module")

@@ -29,6 +29,7 @@ from rtid.sim.simulated_plant import SimulatedPlant
 from rtid.trace.snapshot import save
 from tests.eighty import eighty  # noqa: F401
 from tests.excite.machines import machine, motion, motion_of, write_project
+from tests.replays import shared_replays  # noqa: F401
 
 NUMBER = 7
 EXCITE = "external_leakage_laminar"

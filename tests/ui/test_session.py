@@ -14,6 +14,7 @@ from rtid.tell.story import Story
 from rtid.ui.headline import strip
 from rtid.ui.sending import Sending, Way
 from rtid.ui.shared import FAILED, LOADING, READY, ROLE, Session
+from tests.replays import shared_replays  # noqa: F401
 
 KEY = "internal_leakage_laminar", "a-b"
 NAN = float("nan")

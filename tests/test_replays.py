@@ -1,0 +1,67 @@
+"""What the tests share is what they would have made: the same, made once, and never mixed up."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.left import OF_RUN
+from tests.replays import _digest, _once
+
+
+def adding(number: float) -> Callable[[float], float]:
+    """A law with a number of its own."""
+    return lambda x: x + number
+
+
+def digest(*given: object) -> str:
+    return _digest("", given, [])
+
+
+def test_laws_are_told_apart_by_what_they_do() -> None:
+    assert digest([adding(1.0)]) == digest([adding(1.0)])
+    assert digest([adding(1.0)]) != digest([adding(2.0)])
+    assert digest([adding(1.0)]) != digest([digest])
+    assert digest(1.0, adding) == digest(1.0, digest), "whom to tell does not count"
+
+
+def test_a_file_is_another_one_once_it_was_written_anew(tmp_path: Path) -> None:
+    path = tmp_path / "trace"
+    path.touch()
+    before = digest(path)
+    os.utime(path, (1, 1))
+    assert digest(path) != before
+
+
+def test_it_is_made_once_and_each_gets_a_copy(tmp_path: Path) -> None:
+    made = list[float]()
+
+    def law(number: float) -> list[float]:
+        made.append(number)
+        return [number]
+
+    first, other = (_once(law, {}, tmp_path) for _ in range(2))  # as two workers have it
+    first(1.0).append(2.0)
+    assert other(1.0) == [1.0] and made == [1.0]
+    assert other(2.0) == [2.0] and made == [1.0, 2.0]
+
+
+def test_who_changes_the_program_does_not_share(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = list[float]()
+    apart, with_all = (_once(made.append, tests, tmp_path) for tests in (globals(), {}))
+    with_all(1.0)
+    apart(1.0)
+    apart(1.0)
+    assert made == [1.0, 1.0], "once for all, once for this test"
+    monkeypatch.setenv("PYTEST_CURRENT_TEST", "")
+    apart(1.0)
+    assert made == [1.0, 1.0]
+
+
+def test_the_folder_is_that_of_the_run() -> None:
+    assert Path(os.environ[OF_RUN]).is_dir()
