@@ -28,7 +28,14 @@ from rtid.trace.learner import Learner, catalog_of
 from rtid.trace.snapshot import Generations
 from tests.faults.conftest import Figure
 from tests.faults.harness import SECONDS, drift, loop, machine, uninterrupted
-from tests.faults.process import a_group, daemon, replayed, sender, stored
+from tests.faults.process import (
+    a_group,
+    apart_from_others,
+    daemon,
+    replayed,
+    sender,
+    stored,
+)
 
 pytestmark = pytest.mark.soak
 SHARE = float(os.environ.get("RTID_SOAK", "1"))
@@ -223,34 +230,54 @@ def test_an_effect_that_begins_is_named(
 
 @dataclass(frozen=True)
 class Overload:
-    """Four processes that only compute, for 20 s; end_s: when they ended, unix."""
+    """Four processes that only compute, three times for 7 s; ends_s: when they ended, unix.
+
+    is_apart: from what else the machine does.
+    """
 
     sent: int
-    end_s: float
+    ends_s: list[float]
     during: Status
     last: Status
+    is_apart: bool
+
+    def normal_s(self, end_s: float) -> float:
+        """Seconds behind the end of one until its alarm was over; one still on counts to now."""
+        spans = [
+            (alarm.since_unix_s, alarm.until_unix_s or self.last.now_unix_s)
+            for alarm in self.last.alarms
+            if alarm.name == "overload"
+        ]
+        return max((to_s - end_s for from_s, to_s in spans if from_s < end_s < to_s), default=0.0)
 
 
 @pytest.fixture(scope="module")
 def overload(tmp_path_factory: pytest.TempPathFactory) -> Overload:
     """A daemon of ordinary priority beside them."""
-    burn = "while True: pass"
-    with daemon(tmp_path_factory.mktemp("overload"), settings=QUICK) as running:
+    ends_s, folder = list[float](), tmp_path_factory.mktemp("overload")
+    with apart_from_others() as is_apart, daemon(folder, settings=QUICK) as running:
         running.wait(lambda s: s.pid > 0)
-        with sender(running.group, 40.0) as sending:
+        with sender(running.group, 45.0) as sending:
             running.wait(lambda s: s.estimate.samples > 2000)
-            busy = [subprocess.Popen([sys.executable, "-c", burn]) for _ in range(4)]
-            time.sleep(20.0 * min(1.0, SHARE))
-            during = running.status()
-            for process in busy:
-                process.kill()
-                process.wait()
-            end_s = time.time()
+            for _ in range(3):
+                busy_for(7.0 * min(1.0, SHARE))
+                ends_s.append(time.time())
+                during = running.status()
+                time.sleep(6.0)
             sent = int(sending.communicate()[0])
         running.wait(lambda s: s.bus.frames >= sent, 10.0)
         last = running.stop()
     assert during is not None
-    return Overload(sent, end_s, during, last)
+    return Overload(sent, ends_s, during, last, is_apart)
+
+
+def busy_for(seconds: float) -> None:
+    """Four processes that only compute."""
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(4)]
+    time.sleep(seconds)
+    for process in busy:
+        process.kill()
+        process.wait()
 
 
 def test_row_21_overload(overload: Overload, figure: Figure) -> None:
@@ -262,11 +289,17 @@ def test_row_21_overload(overload: Overload, figure: Figure) -> None:
 
 
 @pytest.mark.xfail(
-    strict=True,
-    reason="20 s at load 13, 18.6 s on a calm machine",
+    strict=False,
+    reason="0.5 to 3.5 s, five overloads of 5 to 20 s and a median of three of 2.7 s, at load 20",
 )
 def test_row_21_normal_again(overload: Overload, figure: Figure) -> None:
-    """The alarm is over, which it says to a tenth of a second; one still on counts to the end."""
-    last = overload.last
-    ends = [a.until_unix_s or last.now_unix_s for a in last.alarms if a.name == "overload"]
-    figure(21, "normal again after", max(0.0, max(ends) - overload.end_s), 1.0, "s")
+    """The alarm is over, which it says to a tenth of a second; one still on counts to the end.
+
+    Beside other work an ordinary priority loses 2 to 9 % of the ticks without any overload of
+    ours: the alarm is right then, and says nothing of how fast this one is over.
+    """
+    if not overload.is_apart:
+        pytest.skip("the machine's other work cannot be kept apart: it needs CAP_SYS_NICE")
+    times_s = sorted(overload.normal_s(end_s) for end_s in overload.ends_s)
+    figure(21, "normal again after an overload, largest of three", times_s[-1], unit="s")
+    figure(21, "normal again after an overload, median of three", times_s[1], 1.0, "s")
