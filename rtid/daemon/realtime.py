@@ -20,7 +20,7 @@ SWITCH_S = 0.5e-3  # another Python thread hands over the interpreter after so l
 MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4  # on fault: what is reserved costs nothing
 PR_SET_TIMERSLACK = 29
 M_ARENA_MAX, M_MMAP_THRESHOLD = -8, -3
-LARGE_BYTES = 1 << 18  # from here on memory goes back to the system when it is given up
+LARGE_BYTES = 1 << 16  # from here on memory goes back to the system when it is given up
 
 _libc = ctypes.CDLL(None, use_errno=True)
 
@@ -54,6 +54,7 @@ def share_arenas() -> None:
     """Let all threads allocate from two pools, not each from its own; before they are started.
 
     Large arrays stay out of the pools: between small ones that live on they would leave holes.
+    A batch for the helper has 70 kB or more, and waits while that is busy.
     """
     _libc.mallopt(M_ARENA_MAX, 2)
     _libc.mallopt(M_MMAP_THRESHOLD, LARGE_BYTES)

@@ -171,18 +171,22 @@ def test_row_28_hours_at_ten_times_the_pace(hours: Hours, figure: Figure) -> Non
     figure(28, "states that differ from one-shot replay", 0 if mine == theirs else 1, 0)
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="16.8 MB/h over the first 0.3 h, at load 14; 12 MB/h over 4 h, before some mending",
-)
 def test_row_28_memory(hours: Hours, figure: Figure) -> None:
-    """Over the whole run since the ring of samples is full."""
-    last, warm = hours.seen[-1], hours.warm
-    past_h = (last[0] - warm[0]) / 3600
-    figure(28, "private memory at the end", last[1], unit="MB")
-    figure(28, f"hours of the machine, from {warm[0]:.0f} s on", past_h, unit="h")
+    """The least of the last tenth against that of the first, since the ring of samples is full.
+
+    At ten times the pace the helper is behind at times: what waits for it, 16 MB at most, comes
+    and goes.
+    """
+    seen = [entry for entry in hours.seen if entry[0] >= hours.warm[0]]
+    tenth = max(1, len(seen) // 10)
+    (first_s, first_mb, _), (last_s, last_mb, _) = (
+        min(part, key=lambda entry: entry[1]) for part in (seen[:tenth], seen[-tenth:])
+    )
+    past_h = (last_s - first_s) / 3600
+    figure(28, "private memory at the end", last_mb, unit="MB")
+    figure(28, f"hours of the machine, from {first_s:.0f} s on", past_h, unit="h")
     figure(28, "memory growth per hour of the machine, from there to the end",
-           (last[1] - warm[1]) / past_h, 5.0, "MB/h")  # fmt: skip
+           (last_mb - first_mb) / past_h, 5.0, "MB/h")  # fmt: skip
 
 
 @pytest.mark.parametrize(("number", "effect", "name"), [
