@@ -36,10 +36,10 @@ def in_turn(study: Study, is_straight: bool) -> Diagnosis:
     return said
 
 
-def _added(study: Study, found: tuple[FoundEffect, ...]) -> tuple[FoundEffect, ...]:
+def _added(study: Study, effects: tuple[FoundEffect, ...]) -> tuple[FoundEffect, ...]:
     """Those that the project has now."""
     new = []
-    for effect in found:
+    for effect in effects:
         with suppress(RtidError):
             study.add(f"{effect.effect}:{effect.where}", force=True)
             new.append(effect)
