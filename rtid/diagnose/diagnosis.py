@@ -13,6 +13,7 @@ from rtid.diagnose.contest import contest, trials_of
 from rtid.diagnose.exact import carried_on
 from rtid.diagnose.excuse import few_excused
 from rtid.diagnose.fit import Fit, fit, with_covariances
+from rtid.diagnose.joined import joints
 from rtid.diagnose.parts import AddedEffect
 from rtid.diagnose.regression import Score
 from rtid.diagnose.residual import Residual, residual
@@ -30,7 +31,17 @@ from rtid.diagnose.trials import (
     physical,
     scored,
 )
-from rtid.diagnose.verdict import MATERIAL, NAMED, UNKNOWN, can_judge, most_rho, verdict
+from rtid.diagnose.verdict import (
+    MATCHES,
+    MATERIAL,
+    MISSING,
+    NAMED,
+    UNKNOWN,
+    can_judge,
+    most_rho,
+    verdict,
+)
+from rtid.diagnose.zeros import Zero, zeros
 from rtid.effects.column import Candidate
 from rtid.effects.page import Effect, catalogue, correcting
 from rtid.model import Machine
@@ -66,6 +77,7 @@ class Result:
     verdict: str
     given: tuple[AddedEffect, ...] = ()
     held_out_judged: bool = True  # False: too little of it is known, and the record itself judged
+    zeros: tuple[Zero, ...] = ()  # of the pressure sensors, where valves have joined them at rest
 
 
 def search(
@@ -89,6 +101,7 @@ def searched(standing: Standing, progress: Progress = silent) -> Result:
     """Diagnose a record, from the model as it stands on."""
     first, before, parts = standing.fit, standing.held_out, standing.state.given
     state = standing.state.anew(progress)
+    record = state.chunk, state.held_out
     judged = can_judge(before)
     if not judged:
         state.held_out = state.chunk
@@ -102,10 +115,14 @@ def searched(standing: Standing, progress: Progress = silent) -> Result:
     said = verdict(state, first, present, last, judged)
     if said == UNKNOWN:  # what explains a part of it only is not named, and not counted
         present, last, state.found = first, before, []
-    result, negligible = tuple(state.found), state.negligible
+    result, negligible, scores = tuple(state.found), state.negligible, scored(present)
+    joined = tuple(joint for part in record for joint in joints(present, part, scores))
+    apart = zeros(present, joined)
+    if said == MATCHES and any(zero.matters for zero in apart):
+        said = MISSING
     return Result(
-        first, present.light(), result, negligible, scored(present), before, last, said, parts,
-        held_out_judged=judged,
+        first, present.light(), result, negligible, scores, before, last, said, parts,
+        held_out_judged=judged, zeros=apart,
     )  # fmt: skip
 
 

@@ -6,8 +6,8 @@ judged by the same limits.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from rtid.diagnose.contest import alike_ones
 from rtid.diagnose.diagnosis import LEAST_SHARE, taken_in
 from rtid.diagnose.exact import carried_on, exact_trials, is_inside, key_of, with_pump
 from rtid.diagnose.excuse import few_excused
+from rtid.diagnose.report import Value
 from rtid.diagnose.standing import Standing, with_bank
 from rtid.diagnose.trials import (
     GAIN,
@@ -50,7 +51,8 @@ class RefusedError(RtidError):
 class Extension:
     """An effect that was tried: chi2 fell by `gain`; against: why it should not be added.
 
-    better: in plain words, a cause that would explain clearly more, else empty.
+    better: in plain words, a cause that would explain clearly more, else empty; sizes: parameters
+    of what is no part of the fit.
     """
 
     key: Key
@@ -59,6 +61,7 @@ class Extension:
     after: Standing
     against: tuple[str, ...]
     better: str
+    sizes: Mapping[str, Value] = field(default_factory=dict)
 
 
 def extend(present: Standing, effect: str, where: str = "") -> Extension:

@@ -17,14 +17,16 @@ from rtid.diagnose.diagnosis import Result
 from rtid.diagnose.excuse import steady
 from rtid.diagnose.experiment import limits, would_separate
 from rtid.diagnose.fit import Fit
-from rtid.diagnose.regression import Score
+from rtid.diagnose.regression import LIMIT_SD, Score
 from rtid.diagnose.remains import described
 from rtid.diagnose.trials import AcceptedEffect, detection_limit, physical
 from rtid.diagnose.verdict import MATERIAL, UNKNOWN, doubts_about, most_rho
+from rtid.diagnose.zeros import Zero
 from rtid.effects import catalogue
 from rtid.effects.column import Candidate
 from rtid.effects.law import is_of_rates
 from rtid.effects.laws.timing import COMMAND, RATE
+from rtid.effects.page import ZERO, correcting
 from rtid.estimator.validity import Doubt
 from rtid.plain import Key, plain
 from rtid.units import limit
@@ -146,6 +148,7 @@ class Diagnosis:
     doubts: tuple[Doubt, ...] = ()
     cut: tuple[Cut, ...] = ()
     disturbance: float = 0.0
+    zeros: tuple[Zero, ...] = ()
 
     @property
     def is_slight(self) -> bool:
@@ -161,6 +164,8 @@ class Diagnosis:
 def diagnosis(result: Result) -> Diagnosis:
     """The plain values of a search."""
     last, effects = result.last, tuple(_effect(result, f) for f in result.found)
+    if result.verdict != UNKNOWN:  # what explains a part of it only is not named
+        effects += tuple(_shown_too_much(result, z) for z in result.zeros if z.matters)
     words = steady(last)
     unseen = _not_found(result)
     return Diagnosis(
@@ -186,6 +191,7 @@ def diagnosis(result: Result) -> Diagnosis:
         doubts=doubts_about(last),
         cut=cuts(last.declared, last.chunk),
         disturbance=max(chamber.disturbance for chamber in last.declared.chambers),
+        zeros=result.zeros,
     )
 
 
@@ -202,6 +208,23 @@ def _effect(result: Result, accepted: AcceptedEffect) -> FoundEffect:
         heldout_residual_before_m3s=before,
         heldout_residual_after_m3s=after,
         hidden_in_map=_hidden(result.last, accepted.key[0], accepted.hidden),
+    )
+
+
+def _shown_too_much(result: Result, zero: Zero) -> FoundEffect:
+    """A sensor whose zero is off: the maps have taken it in, whatever the residual."""
+    (page,) = correcting(ZERO)
+    left = result.after.rms_m3s
+    return FoundEffect(
+        effect=page.name,
+        where=zero.signal,
+        cannot_be_told_from=(),
+        parameters={page.size.name: Value(zero.apart_pa, zero.std_pa, page.size.unit)},
+        p_value=float(chdtrc(1, (zero.apart_pa / zero.std_pa) ** 2)),
+        heldout_gain_pct=0.0,
+        heldout_residual_before_m3s=left,
+        heldout_residual_after_m3s=left,
+        hidden_in_map=HiddenInMap(None, dict(zero.maps), {}, ()),
     )
 
 
@@ -255,6 +278,7 @@ def _not_found(result: Result) -> tuple[Unseen, ...]:
         for key, (candidate, score) in best.items()
         if key not in listed
     ]
+    seen += [_told_by_joints(zero) for zero in result.zeros if not zero.matters]
     named = {u.effect for u in seen} | {key[0] for key in listed}
     has_pressures = result.last.declared.has_pressures
     absent = [
@@ -291,6 +315,12 @@ def _limit(result: Result, candidate: Candidate, score: Score) -> Unseen:
         reason = f"the maps follow {100 * (1 - score.visible**2):.2f} % of it in this record"
     largest = float(limit) if is_possible else None
     return Unseen(candidate.effect, candidate.where, largest, unit, bool(visible), reason)
+
+
+def _told_by_joints(zero: Zero) -> Unseen:
+    """The smallest error of a sensor's zero that its joints would have shown."""
+    (page,) = correcting(ZERO)
+    return Unseen(page.name, zero.signal, LIMIT_SD * zero.std_pa, page.size.unit, True, "")
 
 
 def _of_timing(candidate: Candidate, share: float) -> float:

@@ -218,6 +218,14 @@ def correcting(size: str) -> tuple[Effect, ...]:
     return tuple(sorted(pages, key=lambda page: page.size.name not in size))
 
 
+ZERO = "zero of a pressure sensor"  # what is taken out of the samples, and no part of a fit
+
+
+def is_zero(name: str) -> bool:
+    """True for the effect that is an error of a sensor's zero."""
+    return any(page.name == name for page in correcting(ZERO))
+
+
 def effect(name: str) -> Effect:
     """The effect of that name; EffectError names the nearest."""
     if name not in catalogue():

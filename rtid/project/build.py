@@ -46,7 +46,7 @@ def build_model(sections: Sections, catalog: Catalog | None) -> Machine:
     ahead = _means_ahead(sections)
     signals = tuple(
         replace(_signal(name, signal, catalog), is_ahead=name in ahead)
-        for name, signal in sections.signals.items()
+        for name, signal in _right(sections, catalog).items()
     )
     rate = sections.rate
     measured = rate.measured if rate and rate.measured else NONE
@@ -102,7 +102,7 @@ def build_assembly(
     messages = tuple(_message(name, sections, catalog) for name in used)
     return Assembly(
         mode=CYCLE if table else _mode(sections, catalog),
-        signals=tuple(_source(n, s, catalog, table) for n, s in sections.signals.items()),
+        signals=tuple(_source(n, s, catalog, table) for n, s in _right(sections, catalog).items()),
         messages=messages,
         row_signal=model.measured or model.position,
         max_gap_s=_max_gap_s(sections, catalog),
@@ -175,6 +175,16 @@ def _dbc(signal: SignalSection, catalog: Catalog | None) -> tuple[float, tuple[f
     if low is None or high is None or not low < high:
         return step, everything
     return step, (float(low) - step / 2, float(high) + step / 2)
+
+
+def _right(sections: Sections, catalog: Catalog | None) -> dict[str, SignalSection]:
+    """The signals with the zeros that `rtid add` has found in their offsets."""
+    right = dict(sections.signals)
+    for name, bias_pa in sections.zeros_pa.items():
+        if name in right:
+            offset = (right[name].offset or 0.0) - bias_pa / unit_of(right[name], catalog).factor
+            right[name] = right[name].model_copy(update={"offset": offset})
+    return right
 
 
 def _signal(name: str, signal: SignalSection, catalog: Catalog | None) -> Signal:

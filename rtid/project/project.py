@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from firmware_bridge.catalog import Place
 from firmware_bridge.config import Assembly
 from rtid.effects import Effect
+from rtid.effects.page import is_zero
 from rtid.model import Machine
 from rtid.project.added import AddedSection
 from rtid.project.schema import (
@@ -74,6 +75,17 @@ class Sections:
     publish: PublishSection = field(default_factory=PublishSection)
     effects: dict[str, EffectSection] = field(default_factory=dict)
     added: tuple[AddedSection, ...] = ()
+
+    @property
+    def parts(self) -> tuple[AddedSection, ...]:
+        """What of [[added]] is part of the fit: all but the zeros of sensors."""
+        return tuple(a for a in self.added if not is_zero(a.effect))
+
+    @property
+    def zeros_pa(self) -> dict[str, float]:
+        """What is taken out of the samples of each pressure sensor."""
+        zeros = (a for a in self.added if is_zero(a.effect))
+        return {a.where: next(iter(a.parameters.values())).value for a in zeros}
 
     @property
     def stroke_m(self) -> float:

@@ -34,7 +34,7 @@ from rtid.effects.record_view import RecordView
 from rtid.effects.terms import terms_of
 from rtid.errors import RtidError
 from rtid.estimator.estimator import to_chunk
-from rtid.estimator.factor import PRIOR_SD, SHARED_PRIOR, one_thread
+from rtid.estimator.factor import PRIOR_SD, SHARED_PRIOR, misfit, one_thread
 from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.limits import refuse_unfit
 from rtid.estimator.misfit import count_misfit
@@ -201,7 +201,7 @@ def replayed(
     whole = to_chunk(machine, trace.samples, int(trace.samples.t_us[0]))
     acts, record = learn_acting(fit, usable(fit.declared, whole), taught_s(project))
     record = _judged(present, record)
-    added = known_effects(present, acts, [section.key for section in project.sections.added])
+    added = known_effects(present, acts, [section.key for section in project.sections.parts])
     record = replace(record, offsets_s=ages.offsets_s, offsets_sd_s=ages.sd_s)
     made = held_against(project, fit.declared, fit, machine, trace, record, added)
     return made, fit
@@ -275,18 +275,16 @@ def told(sums: Sums, theta: FloatArray, cov: FloatArray) -> Sums:
     """
     normal, ns = sums.normal(), sums.n_shared
     gram, right = normal.gram, normal.right
-    maps = gram[ns:, ns:].copy()
-    maps[np.diag_indices(len(maps))] += PRIOR_SD**-2
-    both = np.column_stack([gram[ns:, :ns], right[ns:]])
-    with one_thread():  # in place: the matrix is large, and symmetric
-        upper = linalg.cho_factor(maps.T, overwrite_a=True, check_finite=False)
-        follow = linalg.cho_solve(upper, both, check_finite=False)
+    maps = gram[ns:, ns:] + PRIOR_SD**-2 * np.eye(len(right) - ns)
+    with one_thread():
+        both = np.column_stack([gram[ns:, :ns], right[ns:]])
+        follow = linalg.solve(maps, both, assume_a="pos")
     information = np.linalg.inv(cov)
-    known = information - SHARED_PRIOR * np.eye(ns) + gram[:ns, ns:] @ follow[:, :ns]
-    drawn = information @ theta + gram[:ns, ns:] @ follow[:, ns]
+    whole = np.concatenate([theta, follow[:, ns] - follow[:, :ns] @ theta])
     shared = np.zeros_like(sums.shared)
-    shared[1:, 1:], shared[1:, 0], shared[0, 1:] = known, drawn, drawn
-    # both misfits have in common what they say of the maps
-    shared[0, 0] = normal.square - 2 * (right[:ns] - drawn) @ theta
-    shared[0, 0] += theta @ (gram[:ns, :ns] - known) @ theta
-    return replace(sums, shared=shared, noise=np.zeros_like(sums.noise))
+    shared[1:, 1:] = information - SHARED_PRIOR * np.eye(ns) + gram[:ns, ns:] @ follow[:, :ns]
+    shared[1:, 0] = information @ theta + gram[:ns, ns:] @ follow[:, ns]
+    shared[0, 1:] = shared[1:, 0]
+    replaced = replace(sums, shared=shared, noise=np.zeros_like(sums.noise))
+    shared[0, 0] = misfit(normal, whole) - misfit(replaced.normal(), whole)
+    return replaced

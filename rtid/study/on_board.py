@@ -50,7 +50,7 @@ def on_board(project: Project, tell: Callable[[str], None]) -> Project:
     an effect is not gone on with.  Raises NoRoomOnBoardError.
     """
     model, flows = project.model, project.flows
-    for added in project.sections.added:
+    for added in project.sections.parts:
         if model.measured and _is_behind(added):
             model, flows = _behind(project, model, flows, added)
             tell(f"{title(added.effect)} at {added.where} is part of the equation")
@@ -112,7 +112,7 @@ def _disturbed(model: Machine) -> Machine:
 def learned_sizes(board: Project, solution: Solution) -> list[tuple[str, float, float, str]]:
     """Of each term of an added effect: its name, learned size and standard deviation, SI, unit."""
     terms, sds, sizes = board.model.terms, np.sqrt(np.diag(solution.terms_cov)), []
-    for added in board.sections.added:
+    for added in board.sections.parts:
         effect, key = _effect(board, added), f"{added.effect} {added.where}"
         size = added.parameters.get(effect.size.name) if effect is not None else None
         for term, theta, sd in zip(terms, solution.terms_theta, sds, strict=True):
@@ -133,7 +133,7 @@ def load_for(path: Path, project: Project) -> tuple[Estimator, tuple[AddedSectio
     except SnapshotError:
         if board is project:
             raise
-        live = tuple(a for a in project.sections.added if _is_behind(a) or _live(project, a)[0])
+        live = tuple(a for a in project.sections.parts if _is_behind(a) or _live(project, a)[0])
         return load(path, board.model, board.digest), live
 
 

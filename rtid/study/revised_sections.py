@@ -12,6 +12,7 @@ from rtid.diagnose.extend import Extension
 from rtid.diagnose.report import Value, parameters
 from rtid.diagnose.residual import Residual
 from rtid.diagnose.standing import Standing
+from rtid.effects.page import is_zero
 from rtid.project.added import AddedSection, ChangeSection, ErrorsSection, ParameterSection
 
 
@@ -33,16 +34,19 @@ def extended(
         date=now(),
         trace=trace,
         reason=reason,
-        parameters=_parameters(after, extension.key),
+        parameters={name: _parameter(value) for name, value in extension.sizes.items()}
+        or _parameters(after, extension.key),
         errors=errors_between(extension.before, after),
     )
     return (*refreshed(sections, after), new)
 
 
 def refreshed(sections: Sequence[AddedSection], present: Standing) -> tuple[AddedSection, ...]:
-    """The sections with their parameters as fitted to a record."""
-    """The sections with their parameters as fitted now."""
-    return tuple(s.model_copy(update={"parameters": _parameters(present, s.key)}) for s in sections)
+    """The sections with their parameters as fitted now; a zero stays as it was found."""
+    return tuple(
+        s if is_zero(s.effect) else s.model_copy(update={"parameters": _parameters(present, s.key)})
+        for s in sections
+    )
 
 
 def _parameters(present: Standing, key: tuple[str, str]) -> dict[str, ParameterSection]:

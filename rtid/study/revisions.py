@@ -17,6 +17,7 @@ from rtid.diagnose.standing import stand
 from rtid.diagnose.verdict import AMBIGUOUS, MATCHES, MISSING
 from rtid.effects import catalogue
 from rtid.effects import effect as page_of
+from rtid.effects.page import is_zero
 from rtid.errors import RtidError, door
 from rtid.plain import Progress, silent
 from rtid.project import Project, load
@@ -25,6 +26,7 @@ from rtid.project.history import ADD, DROP, UNDO, Change, digest, read, standing
 from rtid.study.revised_sections import errors_between, extended, now, plain, refreshed, turned
 from rtid.study.spans import added_parts
 from rtid.study.study import Study
+from rtid.study.zeroed import shifted
 from rtid.trace.records import TracePaths
 from rtid.units import nearest
 
@@ -100,12 +102,22 @@ def with_effect(study: Study, effect: str, where: str, reason: str) -> Study:
     """
     extension = study.tried(effect, where)
     sections = extended(study.project.sections.added, extension, study.path.name, reason)
+    if is_zero(effect):
+        return shifted(study, extension.key[1], -_size(sections[-1]), sections)
     return study.having(extension.after, sections, is_final=False)
+
+
+def _size(section: AddedSection) -> float:
+    """Of an effect with one parameter, SI."""
+    return next(iter(section.parameters.values())).value
 
 
 def without(study: Study, gone: AddedSection) -> tuple[Study, ErrorsSection]:
     """The study without one of its effects, in memory, and what that costs."""
     kept = tuple(a for a in study.project.sections.added if a is not gone)
+    if is_zero(gone.effect):
+        other = shifted(study, gone.where, _size(gone), kept)
+        return other, errors_between(study.standing, other.standing)
     rest = tuple(part for part in added_parts(study.project) if part.key != gone.key)
     before = study.standing
     study.progress("fitting without it", 0.5)

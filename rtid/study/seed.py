@@ -20,6 +20,7 @@ from rtid.diagnose.report import (
     Value,
 )
 from rtid.diagnose.revision import Revision
+from rtid.diagnose.zeros import Zero
 from rtid.effects.column import Candidate
 from rtid.effects.laws.pump import PUMP
 from rtid.effects.laws.sensors import sensor_timings
@@ -165,6 +166,7 @@ CLASSES: dict[str, tuple[type, ...]] = {
         Value,
         Doubt,
         Cut,
+        Zero,
     ),
     EVIDENCE: (Exhibit, AddedVariable, Rise, Dependence),
     REMAINDER: (Remainder, Dependence),

@@ -21,11 +21,11 @@ def added_parts(project: Project) -> tuple[AddedEffect, ...]:
     NotTrustedError where one of them may be in Python that is not run.
     """
     known = {*catalogue(), *(effect.name for effect in project.effects)}
-    if any(a.effect not in known for a in project.sections.added):
+    if any(a.effect not in known for a in project.sections.parts):
         _ = project.all_effects
     return tuple(
         AddedEffect(a.effect, a.where, {n: p.value for n, p in a.parameters.items()}, a.own_spools)
-        for a in project.sections.added
+        for a in project.sections.parts
     )
 
 

@@ -28,6 +28,7 @@ from rtid.diagnose.residual import Residual, residual
 from rtid.diagnose.standing import Standing, fitted, stand
 from rtid.diagnose.verdict import UNKNOWN
 from rtid.effects import Effect
+from rtid.effects.page import is_zero
 from rtid.errors import door
 from rtid.estimator.estimator import Estimator, to_chunk
 from rtid.estimator.flowmap import FlowMap
@@ -39,6 +40,7 @@ from rtid.plain import BoolArray, FloatArray, Progress, silent
 from rtid.project import Project, load
 from rtid.project.added import AddedSection
 from rtid.project.history import Change, read
+from rtid.study import zeroed
 from rtid.study.compared import TraceComparison
 from rtid.study.compared import study as examined
 from rtid.study.kept import Kept
@@ -339,9 +341,12 @@ class Study:
         """The model with one effect more, fitted once.  Raises RefusedError."""
         made: dict[tuple[str, str], Extension] = vars(self).setdefault("_tried", {})
         if (effect, where) not in made:
-            present: Standing = vars(self).get("_onward") or self.standing
             self.progress("fitting with the effect", 0.5)
-            made[effect, where] = extend(present, effect, where)
+            if is_zero(effect):
+                made[effect, where] = zeroed.tried(self, effect, where)
+            else:
+                present: Standing = vars(self).get("_onward") or self.standing
+                made[effect, where] = extend(present, effect, where)
         return made[effect, where]
 
     def having(

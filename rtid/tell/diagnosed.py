@@ -11,7 +11,7 @@ from rtid.diagnose.verdict import INSUFFICIENT, MATCHES, MATERIAL, UNKNOWN
 from rtid.effects.page import title
 from rtid.tell.story import Chart, Story, Table
 from rtid.tell.words import VERDICTS, quantity
-from rtid.units import CONVENTION, limit
+from rtid.units import CONVENTION, Z95, limit
 
 SLIGHTLY_CUT = 1e-3  # of a record: less is not worth a sentence
 MOST_BENDS = 2  # maps that a sentence names
@@ -39,6 +39,7 @@ def sentences(diagnosis: Diagnosis) -> list[str]:
         )
     lines += [_not_judged(cut) for cut in diagnosis.cut if cut.share > SLIGHTLY_CUT]
     lines += [_one(diagnosis, effect) for effect in diagnosis.found]
+    lines += _zeros(diagnosis)
     if rest := remains(diagnosis):
         lines.append(rest)
     if diagnosis.negligible:
@@ -65,6 +66,27 @@ def _not_judged(cut: Cut) -> str:
         f"{_share(cut.share)} of the record was not judged: {cut.signal} stood at {limit}, the end "
         f"of its range, the longest from {begin:.2f} to {end:.2f} s: {why}."
     )
+
+
+def _zeros(diagnosis: Diagnosis) -> list[str]:
+    """What the pressure sensors show where a valve joins them at rest, but for what is named."""
+    off = [z for z in diagnosis.zeros if z.is_off and not z.matters]
+    alike = [z for z in diagnosis.zeros if not z.is_off]
+    lines = [
+        f"{z.signal} shows {quantity(Value(abs(z.apart_pa), z.std_pa, 'Pa'))} "
+        f"{'more' if z.apart_pa > 0 else 'less'} than {z.against} where an open valve joins them "
+        f"at rest ({z.seconds:.1f} s): "
+        + ("it bends no map by 1 %." if z.is_confirmed else "one of them is off, or is not joined.")
+        for z in off
+    ]
+    if alike:
+        most = max(abs(z.apart_pa) + Z95 * z.std_pa for z in alike)
+        names = _and(list(dict.fromkeys([*(z.signal for z in alike), alike[0].against])))
+        lines.append(
+            f"The zeros of {names} agree within {limit(most, 'Pa')}, where open valves join them "
+            "at rest."
+        )
+    return lines
 
 
 def remains(diagnosis: Diagnosis) -> str:

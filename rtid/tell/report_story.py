@@ -191,7 +191,7 @@ def ranked(result: Result, diagnosis: Diagnosis) -> tuple[Ranked, ...]:
     """The clearest candidates of the first model, and what became of them."""
     before = {key: np.sqrt(score.gain) for key, (_, score) in _best(result.first).items()}
     last = _best(result.last)
-    inside = {(e.effect, e.where) for e in diagnosis.found}
+    inside = {accepted.key for accepted in result.found}  # a sensor's zero is no column of the fit
     limits = {(u.effect, u.where): u for u in diagnosis.not_found if u.visible}
     ranked = []
     for key in {**before, **last, **dict.fromkeys(inside)}:

@@ -1,0 +1,170 @@
+"""Zeros of pressure sensors: told where an open valve joins them at rest, and only there."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from rtid.diagnose.diagnosis import Result, search
+from rtid.diagnose.joined import joints
+from rtid.diagnose.report import diagnosis
+from rtid.diagnose.trials import scored
+from rtid.diagnose.zeros import Zero, zeros
+from rtid.kernels.engine import GAP_FLAG
+from rtid.model import Machine
+from rtid.plain import FloatArray
+from rtid.sim.random_plants import draw
+from rtid.tell.diagnosed import sentences
+from rtid.units import Z95
+from tests.diagnose.records import record
+from tests.diagnose.stops import against_the_stops
+
+BOTH_STOPS = ((9.0, 3.0), (-9.0, 3.0))
+LEAK = "internal_leakage_laminar"
+
+
+def with_stops(
+    chunk: FloatArray,
+    seed: int,
+    commands: tuple[tuple[float, float], ...] = BOTH_STOPS,
+    leak: float = 0.0,
+) -> FloatArray:
+    """A record, chunk (n, 2 + signals), and behind it the machine against its stops."""
+    values = against_the_stops(draw(seed), commands, seed, leak)
+    more = np.column_stack(
+        [chunk[-1, 0] + 5.0 + 1e-3 * np.arange(len(values)), np.ones(len(values)), values]
+    )
+    more[0, 1] = int(more[0, 1]) | GAP_FLAG
+    return np.vstack([chunk, more])
+
+
+def shifted(model: Machine, chunk: FloatArray, by: dict[str, float]) -> FloatArray:
+    """The record, chunk (n, 2 + signals), as sensors with these zeros, Pa, show it."""
+    chunk = chunk.copy()
+    for name, bias in by.items():
+        chunk[:, 2 + model.column(name)] += bias
+    return chunk
+
+
+@cache
+def learned(effect: str = "", strength: float = 0.0, seed: int = 3) -> Result:
+    return search(*record(effect, strength, seed))
+
+
+def told(result: Result, chunk: FloatArray) -> dict[str, Zero]:
+    """What a record, chunk (n, 2 + signals), tells beside the maps of a fit."""
+    found = joints(result.last, chunk, scored(result.last))
+    return {zero.signal: zero for zero in zeros(result.last, found)}
+
+
+@pytest.mark.parametrize(("seed", "signal", "bias"), [(3, "p_b", 0.1e6), (4, "p_a", -0.25e6)])
+def test_a_zero_that_is_off_is_named_with_its_size(seed: int, signal: str, bias: float) -> None:
+    model, chunk, held_out = record(seed=seed)
+    first, last = (
+        shifted(model, part, {signal: bias}) for part in (chunk, with_stops(held_out, seed))
+    )
+    said = diagnosis(search(model, first, last))
+    assert said.verdict == "missing"
+    (effect,) = said.found
+    assert (effect.effect, effect.where) == ("pressure_sensor_bias", signal)
+    size = effect.parameters["bias"]
+    assert abs(size.value - bias) < 3 * size.std < 5e3
+    assert effect.hidden_in_map is not None
+    assert max(effect.hidden_in_map.maps.values()) > 0.01
+    assert any("Pressure sensor bias" in line for line in sentences(said))
+
+
+def test_what_a_zero_bends_is_what_it_moves_the_true_map_by() -> None:
+    model, chunk, _ = record(seed=3)
+    off = told(learned(), shifted(model, with_stops(chunk, 3), {"p_b": 50e3}))["p_b"]
+    plant, view = draw(3), learned().last.view
+    for edge, direction, sign in (("pb", -1, -1.0), ("bt", 1, 1.0)):
+        i = [e.name for e in model.edges].index(edge)
+        at = view.inside & (view.flow(i) != 0.0)
+        u, p = view.signal("u")[:-1][at], view.signal("p_b")[:-1][at]
+        dp = (
+            view.signal("p_supply")[:-1][at] - p
+            if edge == "pb"
+            else p - view.signal("p_tank")[:-1][at]
+        )
+        true, moved = (plant.flow(edge, direction * u, dp + by) for by in (0.0, sign * 50e3))
+        bend = np.sqrt(np.mean((moved - true) ** 2)) / np.abs(true).max()
+        assert off.maps[edge] == pytest.approx(bend, rel=0.25)
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_sensors_that_agree_are_said_to(seed: int) -> None:
+    model, chunk, held_out = record(seed=seed)
+    said = diagnosis(search(model, chunk, with_stops(held_out, seed)))
+    assert (said.verdict, said.found) == ("matches", ())
+    assert [zero.signal for zero in said.zeros] == ["p_supply", "p_a", "p_b"] or len(
+        said.zeros
+    ) == 3
+    assert any("agree within" in line for line in sentences(said))
+    limits = {u.where: u for u in said.not_found if u.effect == "pressure_sensor_bias"}
+    assert limits.keys() == {"p_a", "p_b", "p_supply"}
+    assert all(u.visible and 0.0 < (u.detection_limit or 0.0) < 20e3 for u in limits.values())
+
+
+def test_a_zero_that_bends_no_map_is_told_and_not_named() -> None:
+    model, chunk, held_out = record(seed=3)
+    first, last = (
+        shifted(model, part, {"p_a": -20e3}) for part in (chunk, with_stops(held_out, 3))
+    )
+    said = diagnosis(search(model, first, last))
+    assert (said.verdict, said.found) == ("matches", ())
+    assert any(
+        "p_a shows 0.0200" in line and "less than p_tank" in line for line in sentences(said)
+    )
+
+
+def test_a_record_that_never_rests_with_an_open_valve_tells_nothing() -> None:
+    said = diagnosis(learned())
+    assert said.zeros == ()
+    unseen = next(u for u in said.not_found if u.effect == "pressure_sensor_bias")
+    assert not unseen.visible
+
+
+@pytest.mark.parametrize("strength", [6e-13, 2e-12])
+def test_a_leak_that_a_valve_feeds_at_rest_is_in_the_interval(strength: float) -> None:
+    """Its drop over the open valve passes for a zero otherwise: up to 0.1 MPa here."""
+    result = learned(LEAK, strength, 3)
+    _, chunk, _ = record(seed=3)
+    for zero in told(result, with_stops(chunk, 3, leak=strength)).values():
+        assert abs(zero.apart_pa) < Z95 * zero.std_pa
+        assert not zero.matters
+
+
+def test_one_stop_alone_does_not_say_which_sensor_is_off() -> None:
+    model, chunk, _ = record(seed=3)
+    off = told(learned(), shifted(model, with_stops(chunk, 3, ((9.0, 3.0),)), {"p_a": 0.2e6}))
+    assert off["p_a"].against == "p_supply"
+    assert off["p_a"].is_off
+    assert not off["p_a"].matters
+
+
+def test_what_only_one_way_shows_is_no_zero() -> None:
+    """A check valve before a chamber holds it above the supply, with the valve open."""
+    model, chunk, _ = record(seed=3)
+    held = with_stops(chunk, 3)
+    behind = held[:, 2 + model.column("u")] > 8.0
+    held[behind, 2 + model.column("p_a")] += 0.3e6
+    assert not any(zero.matters for zero in told(learned(), held).values())
+
+
+def test_a_piston_that_creeps_is_not_at_rest() -> None:
+    model, chunk, _ = record(seed=3)
+    moving = with_stops(chunk, 3)
+    stop = moving[:, 0] > chunk[-1, 0]
+    moving[stop, 2 + model.column("x")] += 1e-3 * (moving[stop, 0] - moving[stop, 0][0])
+    assert told(learned(), moving) == {}
+
+
+def test_a_gap_ends_a_rest() -> None:
+    _, chunk, _ = record(seed=3)
+    torn = with_stops(chunk, 3)
+    stop = np.flatnonzero(torn[:, 0] > chunk[-1, 0])
+    torn[stop[::200], 1] = GAP_FLAG + 1
+    assert told(learned(), torn) == {}
