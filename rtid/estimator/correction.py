@@ -33,16 +33,24 @@ class Corrected:
     cost: float
 
 
-def correct(normal: Normal, factor: Factor, leverage: FloatArray) -> Corrected:
+def plain(normal: Normal, factor: Factor) -> tuple[FloatArray, FloatArray]:
+    """The estimate (n,) without correction, and its covariance with the compliances (n, chambers).
+
+    Both in the scaled units of the sums.
+    """
+    return factor.theta(normal.right), factor.columns(len(normal.noise))
+
+
+def correct(
+    normal: Normal, theta: FloatArray, columns: FloatArray, leverage: FloatArray
+) -> Corrected:
     """Take the noise out of the compliances' information, and let the flow terms follow.
 
-    leverage (chambers,): share of the noise that the flow terms absorb (see `leverage_of`).  Where
-    the motion holds no more information than the noise pretends, little is left, and the
-    variance says so.
+    theta (n,) and columns (n, chambers): as from `plain`; leverage (chambers,): share of the noise
+    that the flow terms absorb (see `leverage_of`).  Where the motion holds no more information
+    than the noise pretends, little is left, and the variance says so.
     """
     n_c = len(normal.noise)
-    theta = factor.theta(normal.right)
-    columns = factor.columns(n_c)
     information = np.linalg.inv(columns[:n_c])
     noise = np.diag(normal.noise * (1 - leverage))
     least = SHARED_PRIOR + 3 * np.sqrt(2 / max(1, normal.rows)) * normal.noise

@@ -59,9 +59,12 @@ class Factor:
         """The first m columns (n, m) of the inverse."""
         return np.stack([self.theta(unit) for unit in np.eye(m, len(self.scale))], axis=1)
 
-    def cov(self) -> FloatArray:
-        """Inverse of gram + prior (n, n): covariance in the units of the sums."""
-        inverse, _ = dpotri(self.upper, lower=0)
+    def cov(self, is_last: bool = False) -> FloatArray:
+        """Inverse of gram + prior (n, n): covariance in the units of the sums.
+
+        is_last: nobody asks the factor any more, and it is written over.
+        """
+        inverse, _ = dpotri(self.upper, lower=0, overwrite_c=is_last)
         inverse = inverse.T  # in C order, below the diagonal
         mirror(inverse, self.scale)
         return np.asarray(inverse)

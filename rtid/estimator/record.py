@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rtid.errors import ArgumentError, door
-from rtid.estimator.correction import correct
+from rtid.estimator.correction import correct, plain
 from rtid.estimator.factor import factorize, one_thread
 from rtid.estimator.misfit import can_be_explained, count_misfit
 from rtid.estimator.missed import weighed
@@ -167,5 +167,6 @@ def excess(model: Machine, chunk: FloatArray, weights: Weights, leverage: FloatA
     sums = summed(model, chunk, weights)
     normal = sums.normal()
     with one_thread():
-        corrected = correct(normal, factorize(normal, sums.n_shared), leverage)
+        first = plain(normal, factorize(normal, sums.n_shared))
+        corrected = correct(normal, *first, leverage)
     return corrected.cost - normal.rows * len(model.chambers)

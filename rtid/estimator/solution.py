@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from rtid.estimator.blocks import Block, mean_flows, read_blocks, rms_slopes
-from rtid.estimator.correction import correct, leverage_of
+from rtid.estimator.correction import correct, leverage_of, plain
 from rtid.estimator.factor import PRIOR_SD, factorize, misfit, one_thread
 from rtid.estimator.state import State
 from rtid.estimator.sums import Sums, sums_of
@@ -15,6 +15,8 @@ from rtid.estimator.windowed import overlaps, to_taylor
 from rtid.kernels.layout import TERMS
 from rtid.model import Machine
 from rtid.plain import FloatArray, IntArray
+
+ROWS_AT_ONCE = 256  # of a covariance that is changed in place
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,7 @@ def sketch(model: Machine, sums: Sums) -> Sketch:
     leverage = leverage_of(model, sums, np.ones(len(normal.right)))
     with one_thread():
         factor = factorize(normal, sums.n_shared)
-        unknowns = theta = correct(normal, factor, leverage).theta
+        unknowns = theta = correct(normal, *plain(normal, factor), leverage).theta
         if overlaps(model):
             theta = to_taylor(model, sums, factor.cov(), PRIOR_SD)[0] @ theta
     flow = mean_flows(model, sums, theta)
@@ -122,12 +124,12 @@ def solve(
     normal, n_c, ns = sums.normal(), len(model.chambers), sums.n_shared
     with one_thread():
         factor = factorize(normal, ns)
-        cov = factor.cov()
+        first = plain(normal, factor)
+        cov = factor.cov(is_last=True)
         effective = np.einsum("ij,ij->i", cov, normal.gram)
         leverage = leverage_of(model, sums, effective)
-        corrected = correct(normal, factor, leverage)
-        del factor  # two matrices as large as cov
-        cov += corrected.basis @ corrected.cov_change @ corrected.basis.T
+        corrected = correct(normal, *first, leverage)
+        _add(cov, corrected.basis @ corrected.cov_change, corrected.basis)
     influence, m = cov[:n_c].copy(), len(sums.blocks)
     tiles = cov[ns:, ns:].reshape(m, TERMS, m, TERMS)[np.arange(m), :, np.arange(m)]
     theta, basis = corrected.theta, corrected.basis
@@ -154,6 +156,12 @@ def solve(
         terms_cov=cov[n_c:ns, n_c:ns] * np.outer(scales, scales),
         counters=counters or {},
     )
+
+
+def _add(cov: FloatArray, moved: FloatArray, basis: FloatArray) -> None:
+    """Add moved @ basis.T, both (n, chambers), to cov (n, n) in place, which is large."""
+    for k in range(0, len(cov), ROWS_AT_ONCE):
+        cov[k : k + ROWS_AT_ONCE] += moved[k : k + ROWS_AT_ONCE] @ basis.T
 
 
 def widen(solution: Solution, more: FloatArray) -> Solution:

@@ -34,7 +34,7 @@ from rtid.effects.record_view import RecordView
 from rtid.effects.terms import terms_of
 from rtid.errors import RtidError
 from rtid.estimator.estimator import to_chunk
-from rtid.estimator.factor import PRIOR_SD, SHARED_PRIOR, misfit, one_thread
+from rtid.estimator.factor import PRIOR_SD, SHARED_PRIOR, one_thread
 from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.limits import refuse_unfit
 from rtid.estimator.misfit import count_misfit
@@ -275,16 +275,18 @@ def told(sums: Sums, theta: FloatArray, cov: FloatArray) -> Sums:
     """
     normal, ns = sums.normal(), sums.n_shared
     gram, right = normal.gram, normal.right
-    maps = gram[ns:, ns:] + PRIOR_SD**-2 * np.eye(len(right) - ns)
-    with one_thread():
-        both = np.column_stack([gram[ns:, :ns], right[ns:]])
-        follow = linalg.solve(maps, both, assume_a="pos")
+    maps = gram[ns:, ns:].copy()
+    maps[np.diag_indices(len(maps))] += PRIOR_SD**-2
+    both = np.column_stack([gram[ns:, :ns], right[ns:]])
+    with one_thread():  # in place: the matrix is large, and symmetric
+        upper = linalg.cho_factor(maps.T, overwrite_a=True, check_finite=False)
+        follow = linalg.cho_solve(upper, both, check_finite=False)
     information = np.linalg.inv(cov)
-    whole = np.concatenate([theta, follow[:, ns] - follow[:, :ns] @ theta])
+    known = information - SHARED_PRIOR * np.eye(ns) + gram[:ns, ns:] @ follow[:, :ns]
+    drawn = information @ theta + gram[:ns, ns:] @ follow[:, ns]
     shared = np.zeros_like(sums.shared)
-    shared[1:, 1:] = information - SHARED_PRIOR * np.eye(ns) + gram[:ns, ns:] @ follow[:, :ns]
-    shared[1:, 0] = information @ theta + gram[:ns, ns:] @ follow[:, ns]
-    shared[0, 1:] = shared[1:, 0]
-    replaced = replace(sums, shared=shared, noise=np.zeros_like(sums.noise))
-    shared[0, 0] = misfit(normal, whole) - misfit(replaced.normal(), whole)
-    return replaced
+    shared[1:, 1:], shared[1:, 0], shared[0, 1:] = known, drawn, drawn
+    # both misfits have in common what they say of the maps
+    shared[0, 0] = normal.square - 2 * (right[:ns] - drawn) @ theta
+    shared[0, 0] += theta @ (gram[:ns, :ns] - known) @ theta
+    return replace(sums, shared=shared, noise=np.zeros_like(sums.noise))

@@ -79,6 +79,15 @@ def test_one_matrix_stands_beside_the_sums() -> None:
     assert factor.gram is gram and peak < 1.3 * gram.nbytes
 
 
+def test_the_last_inverse_is_written_over_the_factor() -> None:
+    gram, right = nearly_alike(2, 8, 1e-1)
+    normal = Normal(gram, right, 1.0, np.zeros(1), 500.0)
+    factor, other = factorize(normal, 1), factorize(normal, 1)
+    inverse = factor.cov(is_last=True)
+    assert np.shares_memory(inverse, factor.upper)
+    assert np.array_equal(inverse, other.cov()) and not np.shares_memory(other.cov(), other.upper)
+
+
 @pytest.mark.parametrize("function", [residual, residual.py_func], ids=["compiled", "python"])
 def test_residual_is_rounded_once(function: object) -> None:
     """Terms of size 1e3 whose sum is 1e-6, and less."""
