@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rtid.diagnose.fit import Fit, one_pass
-from rtid.diagnose.residual import KNOWN
+from rtid.diagnose.residual import is_known
 from rtid.diagnose.trials import Trial
 from rtid.effects.record_view import RecordView
 from rtid.model import PROPORTIONAL, Grid, Machine
@@ -67,8 +67,7 @@ def _bends(present: Fit, now: Fit) -> Iterator[tuple[str, float]]:
     """Edge by edge, over the intervals in which it is open and both maps are known."""
     record = now.model, now.sent, now.weights
     with_it, without = (RecordView.of(*record, fit.map) for fit in (now, present))
-    known = with_it.inside & without.inside
-    known &= (with_it.flow_sd() < KNOWN) & (without.flow_sd() < KNOWN)
+    known = is_known(with_it) & is_known(without)
     for i, edge in enumerate(now.model.edges):
         flow, other = with_it.flow(i), without.flow(i)
         open_ = known & ((flow != 0.0) | (other != 0.0))

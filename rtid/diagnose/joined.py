@@ -226,7 +226,8 @@ def _spans(
     source, sink = (machine.signals[machine.column(name)] for name in (edge.source, edge.sink))
     shown = chunk[:, 2 + machine.column(edge.source)] - chunk[:, 2 + machine.column(edge.sink)]
     apart = windows.halves(shown).mean(axis=1)
-    resistance = _resistance(fit, edge, windows.halves(_opening(machine, chunk, edge)).mean(axis=1))
+    opening = windows.halves(_opening(machine, chunk, edge)).mean(axis=1)
+    resistance = np.where(at, _resistance(fit, edge, opening), 0.0)
     drop = -0.5 * edge.sign(chamber) * resistance * known
     doubt = resistance * (_net_flow(fit, chunk, windows, chamber) + unseen) / UNIFORM
     noise = np.hypot(source.noise, sink.noise)

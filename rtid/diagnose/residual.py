@@ -19,7 +19,7 @@ from rtid.effects.laws.response import behind_s, left_behind
 from rtid.effects.record_view import RecordView
 from rtid.estimator.state import variance
 from rtid.kernels.explain import filter_rows
-from rtid.plain import FloatArray
+from rtid.plain import BoolArray, FloatArray
 
 KNOWN = 4.0  # times what a valid block may be uncertain by: where the map is known worse, nothing
 # is judged
@@ -118,6 +118,12 @@ def measured(view: RecordView) -> FloatArray:
     return np.stack([c.sign * c.area_m2 * speed for c in view.model.chambers], axis=1)
 
 
+def is_known(view: RecordView) -> BoolArray:
+    """True (n - 1,) where the open edges are on their grids and the map is known well."""
+    worst = KNOWN * view.model.gates.max_sd_share
+    return view.inside & (view.flow_sd() <= worst)
+
+
 def through_filter(
     view: RecordView, rates: list[FloatArray]
 ) -> tuple[FloatArray, list[FloatArray]]:
@@ -127,8 +133,8 @@ def through_filter(
     left out.
     """
     rates_of_all = np.concatenate(rates, axis=1)
-    worst, by = KNOWN * view.model.gates.max_sd_share, view.model.filter
-    rates_of_all[~view.inside | (view.flow_sd() > worst)] = np.nan
+    by = view.model.filter
+    rates_of_all[~is_known(view)] = np.nan
     period = 1.0 / by.rows_per_s
     out = np.empty((int((view.t_s[-1] - view.t_s[0]) / period) + 2, 1 + rates_of_all.shape[1]))
     n = filter_rows(view.t_s, rates_of_all, by.wn_rad_s, by.zeta, period, out)

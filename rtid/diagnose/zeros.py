@@ -22,7 +22,7 @@ from rtid.diagnose.consequence import BEND
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.joined import UNIFORM, Joint
 from rtid.diagnose.regression import LIMIT_SD
-from rtid.diagnose.residual import KNOWN
+from rtid.diagnose.residual import is_known
 from rtid.effects.record_view import RecordView, supply_of, tank_of
 from rtid.model import Machine
 
@@ -109,9 +109,7 @@ def _bent(fit: Fit, zero: Zero) -> Zero:
     shifted, column = fit.sent.copy(), 2 + fit.model.column(zero.signal)
     shifted[:, column] -= zero.apart_pa
     view = RecordView.of(fit.model, shifted, fit.weights, fit.map)
-    known, most = fit.view.inside & view.inside, KNOWN * fit.model.gates.max_sd_share
-    known &= (fit.view.flow_sd() < most) & (view.flow_sd() < most)
-    bends = dict[str, float]()
+    known, bends = is_known(fit.view) & is_known(view), dict[str, float]()
     for i, edge in enumerate(fit.model.edges):
         flow, other = fit.view.flow(i), view.flow(i)
         open_ = known & (flow != 0.0) & (other != 0.0)

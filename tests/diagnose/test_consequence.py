@@ -18,10 +18,12 @@ from rtid.diagnose.diagnosis import (
 )
 from rtid.diagnose.experiment import FLOW, would_separate
 from rtid.diagnose.report import Diagnosis, diagnosis
-from rtid.diagnose.residual import Residual
+from rtid.diagnose.residual import Residual, is_known
 from rtid.diagnose.trials import Trial, TrialState
 from rtid.diagnose.verdict import MATERIAL
+from rtid.effects.record_view import RecordView
 from rtid.plain import silent
+from rtid.sim.random_plants import draw
 from rtid.tell.diagnosed import sentences
 from tests.diagnose.records import record
 
@@ -51,6 +53,24 @@ def test_a_leak_that_only_the_maps_show_is_named_with_its_size(told: Diagnosis) 
     value = next(iter(own.parameters.values()))
     if own.effect == LEAK[0]:
         assert abs(value.value - LEAK[1]) < max(3 * value.std, 0.1 * LEAK[1])
+
+
+def test_what_it_bends_is_what_the_map_without_it_is_off_by(result: Result) -> None:
+    """Over the places where the map is known: where it is not, it is off by anything."""
+    (accepted,) = result.found
+    assert accepted.hidden is not None
+    first, plant = result.first, draw(LEAK[2])
+    view = RecordView.of(first.model, first.sent, first.weights, first.map)
+    told_off, truly_off = dict(accepted.hidden.maps), dict[str, float]()
+    for i, edge in enumerate(first.model.edges):
+        at = is_known(view) & (view.flow(i) != 0.0)
+        dp = view.signal(edge.source) - view.signal(edge.sink)
+        w = edge.direction * view.signal(edge.command)[:-1][at]
+        true = plant.flow(edge.name, w, 0.5 * (dp[1:] + dp[:-1])[at])
+        off = view.flow(i)[at] - true
+        truly_off[edge.name] = float(np.sqrt(np.mean(off**2)) / np.abs(true).max())
+    assert {e for e, off in truly_off.items() if off > 0.005} == {"pa", "at"}
+    assert all(told_off[e] == pytest.approx(truly_off[e], rel=0.25) for e in ("pa", "at"))
 
 
 def test_it_is_said_with_what_it_bends(told: Diagnosis) -> None:
