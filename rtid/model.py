@@ -71,6 +71,9 @@ class Grid:
 class Chamber:
     """One pressure equation: `pressure` names its signal, V(x) = v0_m3 + sign * area_m2 * x.
 
+    Of a motor that goes round for ever x is its angle in rad, area_m2 its displacement in m3/rad,
+    and with is_constant V = v0_m3: what comes in on one side goes out on the other.
+
     Without a pressure (NONE) it is xdot = ..., times area_m2.  disturbance: intensity of unmodelled
     flow, m3/s per sqrt(Hz), a white noise that the rows are weighed for.  unit: of the equation.
     behind_s: a lag behind the maps, whose noise stands behind it too; see
@@ -87,6 +90,16 @@ class Chamber:
     unit: str = FLOW
     behind_s: float = 0.0
     ports: tuple[tuple[str, int], ...] = ()
+    is_constant: bool = False
+
+    @property
+    def growth_m2(self) -> float:
+        """dV/dx, signed, m2."""
+        return 0.0 if self.is_constant else self.sign * self.area_m2
+
+    def volume(self, x_m: FloatArray) -> FloatArray:
+        """V (...) in m3 at positions x (...) in m."""
+        return self.v0_m3 + self.growth_m2 * x_m
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,8 @@ PRACTICAL = {
     "m3/s/sqrt(Pa)": ("L/min/sqrt(MPa)", 6e7),
     "m3/s": ("L/min", LPM),
     "m3/Pa": ("cm3/MPa", 1e12),
+    "m3/Pa/m": ("cm3/MPa/m", 1e12),
+    "m/Pa/m": ("mm/MPa/m", 1e9),
     "Pa s/m3": ("MPa/(L/min)", MPA / LPM),
     "Pa/m3": ("MPa/L", 1e-3 * MPA),
     "Pa s2/m3": ("MPa s2/L", 1e-3 * MPA),

@@ -8,13 +8,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import savgol_filter
 
 from rtid.errors import RtidError
+from rtid.estimator.estimator import to_chunk
+from rtid.plain import FloatArray
 from rtid.project import ProjectError, load
+from rtid.study.state_run import run_error
 from rtid.study.study import Study
 from rtid.units import show_flow_as
 from tests.replays import shared_replays  # noqa: F401
 from tests.test_rate import Crane, said
+
+STRANGERS = Path(__file__).parents[2] / "shared/data/strangers"
+SESSIONS = "manual_1016_1735", "manual_1016_1720", "manual_mitch_1101_2319", "manual_ol_1006_1648"
 
 
 @pytest.fixture(autouse=True)
@@ -144,3 +151,48 @@ def test_a_cylinder_with_valves_is_looked_at_alone(
     table = tmp_path / "cylinder.csv"
     table.write_text("t_s,u_V,x_mm,pA_bar,pB_bar\n0,1,2,3,4\n1,2,3,4,5\n")
     assert "takes one record" in said("quick", table, days[1][0], code=2)
+
+
+def rate_errors(study: Study) -> list[float]:
+    """Of each record, the model's rate beside the measured one's Savitzky-Golay, 20 Hz, rms, m/s.
+
+    9 points, 2nd order, of what was measured alone; the model's state runs free.
+    """
+    chunk, column = to_chunk(study.machine, study.trace.samples, 0), study.machine.position
+    errors = []
+    for span in study.records:
+        part = chunk[(chunk[:, 0] >= span.start_s) & (chunk[:, 0] <= span.end_s)]
+        x = part[:, 2 + study.machine.column(column)]
+        off = run_error(study.fitted, study.map, part)
+        gaps = np.flatnonzero(np.diff(part[:, 0]) > 0.5) + 1
+        pieces = zip(*(np.split(v, gaps) for v in (part[:, 0], x, x - off)), strict=True)
+        rest = [_rate_off(t, seen, model) for t, seen, model in pieces if len(t) > 40]
+        errors.append(float(np.sqrt(np.mean(np.concatenate(rest) ** 2))))
+    return errors
+
+
+def _rate_off(t_s: FloatArray, seen: FloatArray, model: FloatArray) -> FloatArray:
+    at = np.arange(t_s[0], t_s[-1], 0.05)
+    smooth = savgol_filter(np.interp(at, t_s, seen), 9, 2, deriv=1, delta=0.05)
+    return np.asarray(smooth - np.gradient(np.interp(at, t_s, model), 0.05))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not STRANGERS.is_dir(), reason="no measurements of others beside this tree")
+@pytest.mark.parametrize(
+    ("what", "own", "others", "late_ms"), [("boom", 1.55, 1.55, 125), ("stick", 2.4, 3.3, 100)]
+)
+def test_an_excavator_s_other_days(
+    what: str, own: float, others: float, late_ms: float, tmp_path: Path
+) -> None:
+    """One session teaches, three judge, each with its own neutral; rates in mm/s."""
+    tables = [STRANGERS / f"excavator_{name}.csv" for name in SESSIONS]
+    held_out = [word for t in tables[1:] for word in ("--held-out", t.name)]
+    roles = "--role", f"u=u_{what}_pct", "--role", f"x=x_{what}_cm"
+    file = tmp_path / "jib.toml"
+    words = said("quick", *tables, *roles, *held_out, "--save", file)
+    late = float(words.partition(" ms on average")[0].rpartition(" ")[2])
+    assert "delay and lag together are" in words and late == pytest.approx(late_ms, abs=2)
+    errors = [1e3 * error for error in rate_errors(Study(file, tables))]
+    print(what, errors)
+    assert errors[0] < own and max(errors[1:]) < others

@@ -192,6 +192,8 @@ def _refuse_unfit(model: Machine, section: ControllerSection) -> None:
     where = "[controller]"
     if any(not chamber.pressure for chamber in model.chambers):
         raise NoTrackingError(f"{where}: a machine without pressures cannot be run", "drop it")
+    if any(chamber.is_constant for chamber in model.chambers):
+        raise NoTrackingError(f"{where}: a motor that goes round is not foretold", "drop it")
     if section.law == "robust" and len(model.chambers) < 2:
         raise NoTrackingError(f"{where}: law = 'robust' needs both chambers", "use 'feedforward'")
     roles = dict(zip(ROLES, _by_role(model), strict=True))

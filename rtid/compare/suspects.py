@@ -274,7 +274,7 @@ def _air(model: Machine, chambers: list[Chamber]) -> Suspect:
         flow = np.zeros((len(chunk) - 1, len(model.chambers)))
         dt = np.maximum(np.diff(chunk[:, 0]), 1e-9)
         for chamber in chambers:
-            volume = chamber.v0_m3 + chamber.sign * chamber.area_m2 * 0.5 * (x[1:] + x[:-1])
+            volume = chamber.volume(0.5 * (x[1:] + x[:-1]))
             rate = np.diff(-ATMOSPHERE_PA / chunk[:, _at(model, chamber)]) / dt
             flow[:, model.chambers.index(chamber)] = -size * volume * rate
         return chunk, flow

@@ -33,6 +33,7 @@ from rtid.units import limit
 
 SCHEMA = 1
 LONG_STEP = 0.2  # share of the delay: a shorter step changes little
+TOGETHER = "delay and lag together are"
 WORTH = 2.0  # times better that an experiment must be to be proposed
 NOBODY_LOOKED = "Not examined: the diagnosis has no column for it here."
 VISIBLE = 2e-3  # share of a column that must be left beside the maps
@@ -333,7 +334,7 @@ def advice(result: Result, unseen: tuple[Unseen, ...]) -> tuple[str, ...]:
     """What an unknown residual follows; which motion would tell more of what is open."""
     pages = catalogue()
     lines = list(described(result.last)) if result.verdict == UNKNOWN else []
-    lines += _of_held_commands(result.last)
+    lines += _of_held_commands(result)
     for f in result.found:
         for key in f.alike:
             page = pages.get(f.key[0])
@@ -347,16 +348,22 @@ def advice(result: Result, unseen: tuple[Unseen, ...]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(lines + _experiment(result, unseen)))
 
 
-def _of_held_commands(fit: Fit) -> list[str]:
-    """How much longer a delay is where a command may have changed long before its row."""
+def _of_held_commands(result: Result) -> list[str]:
+    """How much longer a delay is where a command may have changed long before its row.
+
+    A lag is to first order a delay as long as it: where they are not told apart, it is their sum.
+    """
+    fit = result.last
     step_s = float(np.median(np.diff(fit.chunk[:, 0])))
     timings = [(t, psi) for t, psi in fit.revision.timings if t.where == COMMAND]
-    delays = [psi[0] for timing, psi in timings if timing.parameters == ("delay",)]
+    delays = [(t.effect, psi[0]) for t, psi in timings if t.parameters == ("delay",)]
+    tied = {f.key[0] for f in result.found if any(where == COMMAND for _, where in f.alike)}
     return [
         f"A row comes each {1e3 * step_s:.0f} ms, and the command may have changed up to that long "
-        f"before it: from the command itself the delay is {1e3 * delay:.0f} to "
-        f"{1e3 * (delay + step_s):.0f} ms."
-        for delay in delays
+        f"before it: from the command itself {TOGETHER if name in tied else 'the delay is'} "
+        f"{1e3 * delay:.0f} to {1e3 * (delay + step_s):.0f} ms, "
+        f"{1e3 * (delay + 0.5 * step_s):.0f} ms on average."
+        for name, delay in delays
         if step_s > LONG_STEP * delay
     ]
 

@@ -143,8 +143,7 @@ class RecordView:
 
     def volume(self, c: int) -> FloatArray:
         """Volume of chamber c (n,), m3."""
-        chamber = self.model.chambers[c]
-        return chamber.v0_m3 + chamber.sign * chamber.area_m2 * self.x_m
+        return self.model.chambers[c].volume(self.x_m)
 
     @cached_property
     def seen(self) -> Seen:

@@ -115,7 +115,7 @@ class View:
     @cached_property
     def volume_m3(self) -> dict[str, FloatArray]:
         """V(x) (n,) by the chamber's name."""
-        return {c.name: c.v0_m3 + c.sign * c.area_m2 * self.x for c in self.model.chambers}
+        return {c.name: c.volume(self.x) for c in self.model.chambers}
 
     @property
     def area_m2(self) -> dict[str, float]:

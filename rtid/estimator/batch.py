@@ -153,7 +153,7 @@ def term_rates(
     for chamber in model.chambers:
         if chamber.name == term.volume:
             x = values[:, model.column(model.position)]
-            volume = chamber.v0_m3 + chamber.sign * chamber.area_m2 * x
+            volume = chamber.volume(x)
     rate = -term.scale * (f[end] - f[end - 1]) / dt
     return np.stack([volume[end - 1] * rate, volume[end] * rate], axis=1)
 

@@ -230,6 +230,7 @@ def _configure(e: np.void, model: Machine) -> None:
         e["p_column"][c] = _column(model, chamber.pressure)
         e["p_var_pa2"][c] = variance(model, chamber.pressure) * model.pressure_share
         e["area_m2"][c], e["v0_m3"][c] = chamber.sign * chamber.area_m2, chamber.v0_m3
+        e["growth_m2"][c] = chamber.growth_m2
     for i, (edge, first) in enumerate(zip(model.edges, model.first_cells, strict=True)):
         _configure_edge(e, model, i, edge, first)
     for i, owner in enumerate(model.owners):

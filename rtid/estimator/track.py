@@ -135,7 +135,7 @@ def stored_per_pressure(model: Machine, values: FloatArray, compliance: FloatArr
     values (..., signals), SI; compliance (chambers,), 1/Pa.
     """
     x = values[..., model.column(model.position)]
-    volume = {c.name: c.v0_m3 + c.sign * c.area_m2 * x for c in model.chambers}
+    volume = {c.name: c.volume(x) for c in model.chambers}
     soft = {c.name: volume[c.name] * compliance[i] for i, c in enumerate(model.chambers)}
     for term in (term for term in model.terms if term.rate):
         z = term.constant + sum(w * values[..., model.column(name)] for name, w in term.weights)

@@ -57,6 +57,8 @@ class DrivenMachine:
         chambers = [chamber.pressure for chamber in model.chambers]
         if not all(chambers):
             raise MachineError("a chamber has no pressure", "excite needs hydraulic chambers")
+        if any(chamber.is_constant for chamber in model.chambers):
+            raise MachineError("a motor that goes round for ever has no stroke", "excite needs one")
         commands = {edge.command for edge in model.edges}
         if len(commands) != 1:
             names = ", ".join(sorted(commands))

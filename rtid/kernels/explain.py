@@ -80,7 +80,7 @@ def _one(
     x0, x1 = e.values[e.x_column], sample[2 + e.x_column]
     for c in range(e.n_chambers):
         rate = (sample[2 + e.p_column[c]] - e.values[e.p_column[c]]) / dt
-        v = e.v0_m3[c] + 0.5 * e.area_m2[c] * (x0 + x1)
+        v = e.v0_m3[c] + 0.5 * e.growth_m2[c] * (x0 + x1)
         flow[MEASURED + 2 * c] = e.area_m2[c] * (x1 - x0) / dt
         flow[MODELLED + 2 * c] = -v * rate * compliance[c]
         for k in range(e.n_terms):

@@ -282,10 +282,10 @@ def sides(
             q *= rise((w - e.safe_v[i]) / foot[i] - 1.0) if foot[i] > 0.0 else 1.0
             f0, f1 = f0 + e.sign[i, 0] * q, f1 + e.sign[i, 1] * q
             beyond = beyond or off
-    m00, m01 = (e.v0_m3[0] + e.area_m2[0] * x) * theta_beta[0], 0.0
+    m00, m01 = (e.v0_m3[0] + e.growth_m2[0] * x) * theta_beta[0], 0.0
     m10, m11 = 0.0, 1.0
     if e.n_chambers == 2:
-        m11 = (e.v0_m3[1] + e.area_m2[1] * x) * theta_beta[1]
+        m11 = (e.v0_m3[1] + e.growth_m2[1] * x) * theta_beta[1]
     for k in range(e.n_terms):
         flow, d0, d1 = _term(e, k, now, x, dt)
         f0, f1 = f0 + e.term_sign[k, 0] * flow, f1 + e.term_sign[k, 1] * flow
@@ -301,7 +301,7 @@ def _term(e: Any, k: int, now: FloatArray, x: float, dt: float) -> tuple[float, 
     if volume == FLOW:
         return theta * shaped(e, k, now, 0), 0.0, 0.0
     if volume != RATE:
-        theta *= e.v0_m3[volume] + e.area_m2[volume] * x
+        theta *= e.v0_m3[volume] + e.growth_m2[volume] * x
     z, rate, shape = e.term_constant[k], 0.0, e.term_shape[k]
     by_p0, by_p1 = 0.0, 0.0
     for j in range(e.n_signals):

@@ -39,7 +39,7 @@ def shared_increments(e: Any, sample: FloatArray, dt: float) -> None:
     for c in range(e.n_chambers):
         dx = e.area_m2[c] * (x1 - x0)
         dp = -e.compliance[c] * (sample[2 + e.p_column[c]] - e.values[e.p_column[c]])
-        v0, v1 = e.v0_m3[c] + e.area_m2[c] * x0, e.v0_m3[c] + e.area_m2[c] * x1
+        v0, v1 = e.v0_m3[c] + e.growth_m2[c] * x0, e.v0_m3[c] + e.growth_m2[c] * x1
         if e.form != INTEGRAL:
             e.inc[c, 0], e.end[c, 0] = dx / dt, dx / dt
             e.inc[c, 1 + c], e.end[c, 1 + c] = dp * v0 / dt, dp * v1 / dt
@@ -82,8 +82,8 @@ def term_rates(e: Any, k: int, sample: FloatArray, dt: float) -> tuple[float, fl
     rate = -scale * (end - start) / dt
     if volume == RATE:
         return rate, rate
-    v0 = e.v0_m3[volume] + e.area_m2[volume] * e.values[e.x_column]
-    v1 = e.v0_m3[volume] + e.area_m2[volume] * sample[2 + e.x_column]
+    v0 = e.v0_m3[volume] + e.growth_m2[volume] * e.values[e.x_column]
+    v1 = e.v0_m3[volume] + e.growth_m2[volume] * sample[2 + e.x_column]
     return rate * v0, rate * v1
 
 
@@ -110,7 +110,7 @@ def soften(e: Any) -> None:
             if volume != FLOW and weight != 0.0:
                 v = 1.0
                 if volume != RATE:
-                    v = e.v0_m3[volume] + e.area_m2[volume] * e.values[e.x_column]
+                    v = e.v0_m3[volume] + e.growth_m2[volume] * e.values[e.x_column]
                 e.softness[c] += e.term_sign[k, c] * e.term_scale[k] * weight * v * steepness(e, k)
 
 

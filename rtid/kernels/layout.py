@@ -69,6 +69,7 @@ ENGINE = np.dtype(
         ("x_column", _I),
         ("p_column", _I, (MAX_CHAMBERS,)),
         ("area_m2", _F, (MAX_CHAMBERS,)),  # signed: s_c A_c
+        ("growth_m2", _F, (MAX_CHAMBERS,)),  # dV/dx: the same, 0 where the volume stays as it is
         ("v0_m3", _F, (MAX_CHAMBERS,)),
         ("x_var_m2", _F),
         ("p_var_pa2", _F, (MAX_CHAMBERS,)),

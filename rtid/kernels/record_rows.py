@@ -126,7 +126,7 @@ def _add_measured(
     x0, x1 = e.values[e.x_column], sample[2 + e.x_column]
     for c in range(e.n_chambers):
         dx = e.area_m2[c] * (x1 - x0)
-        v = e.v0_m3[c] + 0.5 * e.area_m2[c] * (x0 + x1)
+        v = e.v0_m3[c] + 0.5 * e.growth_m2[c] * (x0 + x1)
         dp = -e.compliance[c] * v * (sample[2 + e.p_column[c]] - e.values[e.p_column[c]])
         now[c, 0] += a * dx
         later[c, 0] += (1.0 - a) * dx

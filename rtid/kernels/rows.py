@@ -39,7 +39,7 @@ def position_noise(e: Any, a: int, b: int) -> float:
     """Covariance R of the rows' white noise, m6: one x for both chambers, one p for each."""
     r = e.area_m2[a] * e.area_m2[b] * e.x_var_m2
     if a == b:
-        v = e.v0_m3[a] + e.area_m2[a] * e.values[e.x_column]
+        v = e.v0_m3[a] + e.growth_m2[a] * e.values[e.x_column]
         r += (v * e.compliance[a] + e.softness[a]) ** 2 * e.p_var_pa2[a]
     return r
 
@@ -73,7 +73,7 @@ def fade(e: Any, d: Any) -> None:
 @inlined
 def _column_variance(e: Any, c: int) -> float:
     """Variance of the noise n in column -V dP of chamber c, m6."""
-    w = (e.v0_m3[c] + e.area_m2[c] * e.values[e.x_column]) * e.compliance[c]
+    w = (e.v0_m3[c] + e.growth_m2[c] * e.values[e.x_column]) * e.compliance[c]
     return float(w * w * e.p_var_pa2[c])
 
 

@@ -172,6 +172,7 @@ def _model(
             *_ints("P_COLUMN", e["p_column"][:chambers]),
             *_doubles("AREA_M2", e["area_m2"][:chambers]),
             *_doubles("V0_M3", e["v0_m3"][:chambers]),
+            *_doubles("GROWTH_M2", e["growth_m2"][:chambers]),
             *_doubles("P_LOW", e["minimum"][e["p_column"][:chambers]]),
             *_doubles("P_HIGH", e["maximum"][e["p_column"][:chambers]]),
             *_doubles("SIGN", e["sign"][:edges, :chambers]),

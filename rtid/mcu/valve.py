@@ -59,6 +59,8 @@ def _faults(model: Machine) -> Iterator[str]:
     upkeep = model.upkeep
     if model.measured:
         yield f"rate.measured is {model.measured!r}, it knows a state, not its rate"
+    if any(chamber.is_constant for chamber in model.chambers):
+        yield "a motor that goes round for ever: it knows volumes that change with the position"
     if model.form != "integral":
         yield f"estimator.form is {model.form!r}, it knows 'integral'"
     if math.isfinite(upkeep.forget_s) or math.isfinite(upkeep.shared_forget_s):

@@ -200,12 +200,18 @@ def _signal(name: str, signal: SignalSection, catalog: Catalog | None) -> Signal
     return Signal(
         name=name,
         kind=kind,
-        unit=_SI_UNIT.get(kind) or _SI_OTHER.get(unit.dimension) or _command_unit(unit),
+        unit=_si_unit(kind, unit, signal) or _command_unit(unit),
         noise=slope * (signal.noise or 0.0),
         resolution=slope * resolution,
         minimum=low,
         maximum=high,
     )
+
+
+def _si_unit(kind: str, unit: Unit, signal: SignalSection) -> str | None:
+    """Of a motor's position it is an angle's."""
+    known = None if unit.dimension == "angle" and not signal.table else _SI_UNIT.get(kind)
+    return known or _SI_OTHER.get(unit.dimension)
 
 
 def _command_unit(unit: Unit) -> str:
@@ -388,9 +394,12 @@ def _map(name: str, part: MapSection, sections: Sections) -> Iterator[Edge]:
 def _chamber(name: str, sections: Sections) -> Chamber:
     """V(x) = v0 + sign A x; the dead volume is what is left at the end where V is smallest."""
     chamber = sections.chambers[name]
-    area_m2 = chamber.net_area_m2()
-    swept_m3 = area_m2 * sections.stroke_m if chamber.sign < 0 else 0.0
-    return Chamber(name, chamber.pressure, area_m2, chamber.sign, chamber.dead_volume_m3 + swept_m3)
+    area_m2, goes_round = chamber.net_area_m2(), chamber.displacement_m3 is not None
+    is_full = chamber.sign < 0 and not goes_round
+    swept_m3 = area_m2 * sections.stroke_m if is_full else 0.0
+    v0_m3 = chamber.dead_volume_m3 + swept_m3
+    of = Chamber(name, chamber.pressure, area_m2, chamber.sign, v0_m3)
+    return replace(of, is_constant=goes_round)
 
 
 def _edge(name: str, edge: EdgeSection, sections: Sections, signals: tuple[Signal, ...]) -> Edge:

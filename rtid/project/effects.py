@@ -55,7 +55,7 @@ def build(
     chambers = [str(name) for name in named if name]
     names = names_of(kinds, chambers)
     geometry = parts.get("geometry")
-    constants = {"stroke": geometry.stroke_m} if geometry else {}
+    constants = {"stroke": geometry.stroke_m} if geometry and geometry.stroke_m else {}
     user_effects: dict[str, Effect] = {}
     problems: list[Problem] = []
     for name, section in parts.get("effects", {}).items():

@@ -96,7 +96,7 @@ def _read_sections(raw: Raw) -> tuple[dict[str, Any], list[Problem]]:
     problems += [
         Problem(name, "missing", f"add a section [{name}]")
         for name in (*REQUIRED, *(OF_RATE if "rate" in raw else OF_PRESSURES))
-        if name not in raw
+        if name not in raw and not (name == "geometry" and references.goes_round(raw))
     ]
     if "rate" in raw:
         problems += [

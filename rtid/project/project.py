@@ -90,7 +90,7 @@ class Sections:
     @property
     def stroke_m(self) -> float:
         """The stroke; inf for a plant that has none."""
-        return self.geometry.stroke_m if self.geometry else math.inf
+        return (self.geometry and self.geometry.stroke_m) or math.inf
 
 
 @dataclass(frozen=True)

@@ -94,6 +94,7 @@ def check(raw: Raw, catalog: Catalog | None, folder: Path) -> Iterator[Problem]:
     yield from _named_signals(raw, kinds)
     yield from _controller(raw, kinds)
     yield from _rate(raw, kinds) if "rate" in raw else _position(raw, kinds)
+    yield from _stroke(raw)
     for name, chamber in tables(raw, "chambers").items():
         yield from _chamber(f"chambers.{name}", chamber)
     for name, edge in tables(raw, "edges").items():
@@ -137,7 +138,12 @@ def _signal(
     elif kind in KIND_DIMENSIONS and unit.dimension not in KIND_DIMENSIONS[kind]:
         fit = [u.name for d in KIND_DIMENSIONS[kind] for u in units_of(d)]
         yield Problem(f"{path}.unit", f"{name!r} is no unit of {kind}", f"use {' or '.join(fit)}")
-    elif unit.dimension == "angle" and "table" not in signal and kind != OTHER:
+    elif (
+        unit.dimension == "angle"
+        and "table" not in signal
+        and kind != OTHER
+        and not goes_round(raw)
+    ):
         remedy = "add table = {angle = [...], position_mm = [...]}"
         yield Problem(f"{path}.table", "missing: an angle is not yet a position", remedy)
     declared = find_unit(dbc_unit or "")
@@ -205,6 +211,26 @@ def _position(raw: Raw, kinds: dict[str, str | None]) -> Iterator[Problem]:
         yield Problem("geometry.position", f"several positions: {', '.join(positions)}", remedy)
 
 
+def goes_round(raw: Raw) -> bool:
+    """True for a motor: all of its chambers have a displacement, and its position is an angle."""
+    chambers = tables(raw, "chambers").values()
+    return bool(chambers) and all(key_of(c, "displacement") in c for c in chambers)
+
+
+def _stroke(raw: Raw) -> Iterator[Problem]:
+    """A cylinder has a stroke, a motor has none; a machine is one of both."""
+    geometry, chambers = table(raw, "geometry"), tables(raw, "chambers")
+    written = key_of(geometry, "stroke")
+    has_stroke = written in geometry
+    if "geometry" in raw and not has_stroke and not goes_round(raw):
+        yield Problem("geometry.stroke_mm", "missing", "add stroke_mm = 500")
+    for name, chamber in chambers.items():
+        written = key_of(chamber, "displacement")
+        if written in chamber and (has_stroke or not goes_round(raw)):
+            remedy = "a motor that goes round for ever has one in each chamber, and no stroke"
+            yield Problem(f"chambers.{name}.{written}", "has no place here", remedy)
+
+
 def _rate(raw: Raw, kinds: dict[str, str | None]) -> Iterator[Problem]:
     """The state of [rate], and what its maps are over."""
     rate = table(raw, "rate")
@@ -262,11 +288,13 @@ def _map_commands(
 
 
 def _chamber(path: str, chamber: Raw) -> Iterator[Problem]:
-    area, piston = (key_of(chamber, stem) for stem in ("area", "piston_diameter"))
-    if (area in chamber) == (piston in chamber):
-        both = "given twice" if area in chamber else "missing"
-        remedy = "give either area_cm2 or piston_diameter_mm (and rod_diameter_mm)"
-        yield Problem(f"{path}.{area}", both, remedy)
+    stems = "area", "piston_diameter", "displacement"
+    given = [key for key in (key_of(chamber, stem) for stem in stems) if key in chamber]
+    if len(given) != 1:
+        remedy = "give either area_cm2 or piston_diameter_mm (and rod_diameter_mm); of a motor "
+        remedy += "that goes round for ever displacement_cm3, per turn"
+        said = "given twice" if given else "missing"
+        yield Problem(f"{path}.{given[0] if given else 'area'}", said, remedy)
 
 
 def _edge(

@@ -186,24 +186,36 @@ class SignalSection(Section):
 
 
 class GeometrySection(Section):
-    """[geometry]: stroke, and which signal is the position (the only one, unless named)."""
+    """[geometry]: stroke, and which signal is the position (the only one, unless named).
 
-    stroke_m: Annotated[float, LENGTH] = Field(gt=0, description="stroke_mm = 500")
+    A motor that goes round for ever has no stroke: its chambers have a displacement.
+    """
+
+    stroke_m: Annotated[float | None, LENGTH] = Field(default=None, gt=0)
     position: str | None = None
 
 
 class ChamberSection(Section):
-    """[chambers.NAME]: area and dead volume, the volume left where the chamber is smallest."""
+    """[chambers.NAME]: area and dead volume, the volume left where the chamber is smallest.
+
+    displacement: of a motor that goes round for ever, per turn; the dead volume is all of its side.
+    """
 
     pressure: str = Field(description='pressure = "p_a", a pressure of [signals]')
     sign: Sign = Field(description="sign = 1 if the volume grows with x, -1 if it shrinks")
     area_m2: Annotated[float | None, AREA] = Field(default=None, gt=0)
     piston_diameter_m: Annotated[float | None, LENGTH] = Field(default=None, gt=0)
     rod_diameter_m: Annotated[float, LENGTH] = Field(default=0.0, ge=0)
+    displacement_m3: Annotated[float | None, VOLUME] = Field(default=None, gt=0)
     dead_volume_m3: Annotated[float, VOLUME] = Field(gt=0, description="dead_volume_l = 0.6")
 
     def net_area_m2(self) -> float:
-        """The area, given or from the diameters; not positive if the diameters are wrong."""
+        """The area, given or from the diameters; not positive if the diameters are wrong.
+
+        Of a motor its displacement, m3/rad.
+        """
+        if self.displacement_m3 is not None:
+            return self.displacement_m3 / (2.0 * math.pi)
         if self.area_m2 is not None:
             return self.area_m2
         piston_m = self.piston_diameter_m or 0.0

@@ -22,11 +22,12 @@ NAMED = (MISSING, AMBIGUOUS, INSUFFICIENT)
 def in_turn(study: Study, is_straight: bool) -> Diagnosis:
     """Diagnose, add what is named, and look again; the project of the study has it then.
 
-    is_straight: of maps that cannot bend; beside others the first effect alone is added, whose
-    shape the maps may have taken for the rest.
+    is_straight: of maps that cannot bend.  Beside those of a state's rate the first effect alone is
+    added, whose shape the maps may have taken for the rest; beside others nobody looks again.
     """
     said = study.diagnosis()
-    new = _added(study, said.found if is_straight else said.found[:1])
+    takes_all = is_straight or bool(study.project.model.measured)
+    new = _added(study, said.found if takes_all else said.found[:1])
     for _ in range(ROUNDS - 1):
         if not (new and is_straight):
             break

@@ -6,6 +6,7 @@ What nobody has said is assumed, and every assumption is kept with what would ch
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -16,9 +17,10 @@ from rtid.project.guess import RoleCandidate
 from rtid.project.template import EDGES, nice
 from rtid.study.spans import HELD_OUT_SHARE
 from rtid.trace.neutral import last_part_from
-from rtid.trace.quick_source import unit_of
+from rtid.trace.quick_source import is_motor, unit_of
 
 BORE_M, ROD_SHARE, DEAD_SHARE = 0.05, 0.7, 0.2  # a usual cylinder
+TURN_M3, DEAD_TURNS = 50e-6, 10.0  # a usual motor's displacement; its sides and lines, in turns
 SUPPLY_PA = 7e6
 U_STEPS, DP_STEPS = 24, 12  # with 16 along u a healthy machine left 1.2 times its noise
 RATED_DP_PA = 5e5  # as data sheets have it
@@ -58,6 +60,7 @@ class MachineSizes:
     """Sizes and grids, SI; reversed: roles to be turned round.
 
     spans_s: the part of the record that teaches, and the one that judges; empty: not looked at yet.
+    goes_round: a motor, whose x is an angle.
     """
 
     bore_m: float
@@ -74,6 +77,12 @@ class MachineSizes:
     spans_s: tuple[tuple[float, float], ...] = ()
     reversed: frozenset[str] = frozenset()
     assumptions: tuple[Assumption, ...] = field(default=())
+    goes_round: bool = False
+
+    @property
+    def displacement_m3(self) -> float:
+        """What a turn of a motor takes, whose bore is of the area of that over 2 pi."""
+        return math.tau * math.pi / 4 * self.bore_m**2
 
 
 def lag_of(machine: MachineSizes) -> tuple[float, float]:
@@ -85,6 +94,40 @@ def lag_of(machine: MachineSizes) -> tuple[float, float]:
 
 def first_machine(roles: dict[str, RoleCandidate], given: Given) -> MachineSizes:
     """The machine from the ranges of its signals alone, as far as it takes to read the samples."""
+    return _first_motor(roles, given) if is_motor(roles) else _first_cylinder(roles, given)
+
+
+def _first_motor(roles: dict[str, RoleCandidate], given: Given) -> MachineSizes:
+    volumes = given.dead_volumes_m3
+    as_cylinder = replace(given, bore_m=math.sqrt(2.0 * TURN_M3) / math.pi, rod_m=0.0, stroke_m=1.0,
+                          dead_volumes_m3=volumes or 2 * (DEAD_TURNS * TURN_M3,))  # fmt: skip
+    first = _first_cylinder(roles, as_cylinder)
+    assumptions = (*_of_displacement(), *_of_dead_volumes(volumes is None))
+    return replace(
+        first,
+        x_zero_m=0.0,
+        dead_is_fitted=volumes is None,
+        goes_round=True,
+        assumptions=tuple(assumptions),
+    )
+
+
+def _of_displacement() -> Iterator[Assumption]:
+    yield Assumption(
+        f"a turn of the motor takes {1e6 * TURN_M3:.0f} cm3 (displacement_cm3 in the file)",
+        "every flow, leak and map is scaled by the true one over this one; the verdict stays",
+    )
+
+
+def _of_dead_volumes(are_fitted: bool) -> Iterator[Assumption]:
+    if are_fitted:
+        yield Assumption(
+            "the dead volumes are whatever explains the record best (--dead-volume)",
+            "extra dead volume and hoses cannot be told from it, and are not judged",
+        )
+
+
+def _first_cylinder(roles: dict[str, RoleCandidate], given: Given) -> MachineSizes:
     bore = given.bore_m or BORE_M
     rod = given.rod_m if given.rod_m is not None else ROD_SHARE * bore
     x, u = roles["x"], roles["u"]
@@ -142,12 +185,7 @@ def _of_geometry(
             f"the piston is fully retracted at x = {1e3 * zero:.0f} mm, the lowest seen",
             volumes.replace("volume of b is", "volumes are"),
         ))  # fmt: skip
-    if fitted:
-        assumptions.append(Assumption(
-            "the dead volumes are whatever explains the record best (--dead-volume)",
-            "extra dead volume and hoses cannot be told from it, and are not judged",
-        ))  # fmt: skip
-    return assumptions
+    return [*assumptions, *_of_dead_volumes(fitted)]
 
 
 def fitted_machine(machine: MachineSizes, samples: Samples) -> MachineSizes:

@@ -37,14 +37,7 @@ def project_text(
         if any(c.message == message for c in roles.values())
     }
     raw["signals"] = _signals(source, roles, machine)
-    raw["geometry"] = {"stroke_mm": _neat(1e3 * machine.stroke_m)}
-    bore = {"piston_diameter_mm": _neat(1e3 * machine.bore_m)}
-    room_a, room_b = ({"dead_volume_l": _neat(1e3 * v)} for v in machine.dead_volumes_m3)
-    rod = {"rod_diameter_mm": _neat(1e3 * machine.rod_m)}
-    raw["chambers"] = {
-        "a": {"pressure": "p_a", "sign": 1, **bore, **room_a},
-        "b": {"pressure": "p_b", "sign": -1, **bore, **rod, **room_b},
-    }
+    raw |= _sizes(machine)
     raw["edge_defaults"] = {
         "command": "u",
         f"u_grid_{key}": [_neat(border) for border in machine.u_grid],
@@ -70,6 +63,23 @@ def project_text(
         teaches, judges = machine.spans_s
         raw["record"] = {"identification_s": list(teaches), "validation_s": list(judges)}
     return tomlkit.dumps({name: part for name, part in raw.items() if part})
+
+
+def _sizes(machine: MachineSizes) -> dict[str, Any]:
+    """[geometry] and [chambers] of a cylinder, or of a motor that has no stroke."""
+    bore = {"piston_diameter_mm": _neat(1e3 * machine.bore_m)}
+    rod = {"rod_diameter_mm": _neat(1e3 * machine.rod_m)}
+    geometry = {"stroke_mm": _neat(1e3 * machine.stroke_m)}
+    if machine.goes_round:
+        bore, rod, geometry = {"displacement_cm3": _neat(1e6 * machine.displacement_m3)}, {}, {}
+    room_a, room_b = ({"dead_volume_l": _neat(1e3 * v)} for v in machine.dead_volumes_m3)
+    return {
+        "geometry": geometry,
+        "chambers": {
+            "a": {"pressure": "p_a", "sign": 1, **bore, **room_a},
+            "b": {"pressure": "p_b", "sign": -1, **bore, **rod, **room_b},
+        },
+    }
 
 
 def _neat(value: float) -> float:

@@ -103,7 +103,7 @@ def _u_to_v(model: Machine, windows: Windows) -> float:
 def _spring(model: Machine, chamber: Chamber, windows: Windows) -> Spring:
     """Regress the swept volume on V dP and P, each about its mean at equal command."""
     x, p = model.column(model.position), model.column(chamber.pressure)
-    volume = chamber.v0_m3 + chamber.sign * chamber.area_m2 * windows.start[:, x]
+    volume = chamber.volume(windows.start[:, x])
     swept = chamber.sign * chamber.area_m2 * windows.change[:, x]
     columns = (-volume * windows.change[:, p], windows.mean[:, p], swept)
     stored, level, y = (_about_bin_mean(c, _command_bin(model, windows)) for c in columns)

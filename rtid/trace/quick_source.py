@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -127,12 +128,18 @@ def roles_of(
             "in a project file: rtid init",
         )
     unit = find_unit(roles["x"].unit)
-    if unit is not None and unit.dimension == "angle":
+    if unit is not None and unit.dimension == "angle" and not is_motor(roles):
         raise RtidError(
             f"{path}: {roles['x'].name} is an angle, and only you know what position it means",
             "write a project file with its table: rtid init",
         )
     return _alike(roles)
+
+
+def is_motor(roles: Mapping[str, RoleCandidate]) -> bool:
+    """True where the position is an angle that goes beyond one turn."""
+    x, unit = roles["x"], unit_of(roles["x"])
+    return unit.dimension == "angle" and unit.factor * (x.high - x.low) > math.tau
 
 
 def _alike(roles: dict[str, RoleCandidate]) -> dict[str, RoleCandidate]:

@@ -4,7 +4,7 @@
     spool         four edges ground on one spool, that of the sensor's zero off by up to 0.25 V
     vane          a motor of limited angle: equal displacements, chambers that swap their volume
 
-A motor that goes round for ever has chambers of constant volume, which no project file can say.
+A motor that goes round for ever is among `tests.campaign.modelica`.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -90,6 +90,31 @@ class Points:
     half: FloatArray
 
 
+class Hiding(Protocol):
+    """A machine by its number, its valves' law, its motion, and what is hidden in it."""
+
+    @property
+    def seed(self) -> int: ...
+
+    @property
+    def law(self) -> str: ...
+
+    @property
+    def motion(self) -> str: ...
+
+    @property
+    def hidden(self) -> str: ...
+
+
+class TruePlant(Protocol):
+    """What is known of a machine that is judged: its bulk modulus, and its maps in m3/s."""
+
+    @property
+    def beta_pa(self) -> float: ...
+
+    def flow(self, edge: str, w_v: FloatArray, dp_pa: FloatArray, /) -> FloatArray: ...
+
+
 @dataclass(frozen=True)
 class Outcome:
     """What was said of a machine, beside the truth.
@@ -98,7 +123,7 @@ class Outcome:
     all that was found and what it cannot be told from; limits: (effect, where) -> detection limit.
     """
 
-    case: Case
+    case: Hiding
     verdict: str
     names: tuple[str, ...]
     rho: float
@@ -136,7 +161,7 @@ class Answer:
 class Judged:
     """A record, the fit of its first part and what a search has found; the machine behind it."""
 
-    plant: SimulatedPlant
+    plant: TruePlant
     run: Run
     present: Fit
     taught: FloatArray
@@ -167,7 +192,11 @@ def judged(case: Case) -> Judged | None:
         run = simulate(plant, case.motion, case.seed, RECORD_S, case.sensors)
     except SimulationError:
         return None
-    model = declared(case, run)
+    return of_run(plant, run, declared(case, run))
+
+
+def of_run(plant: TruePlant, run: Run, model: Machine) -> Judged:
+    """A run of a plant through the diagnosis, declared as this model."""
     chunk = to_chunk(model, run.samples, 0)
     t_s = chunk[:, 0]
     taught = chunk[t_s < IDENTIFICATION * RECORD_S]
@@ -184,7 +213,7 @@ def answer(case: Case) -> Answer | None:
     said, z, half = found.said, float("nan"), float("nan")
     judgement = judge(diagnoses.Case(case.seed, case.hidden), said)
     first = said.found[0] if said.found else None
-    true = found.plant.hidden[0].strength
+    true = case.plant.hidden[0].strength
     if first is not None and first.effect == truth(case.hidden) and len(first.parameters) == 1:
         (size,) = first.parameters.values()
         z, half = (abs(size.value) - abs(true)) / size.std, 1.96 * size.std / abs(true)
@@ -196,13 +225,17 @@ def outcome(case: Case) -> Outcome | None:
     """One case; None where the drawn machine leaves its stroke or cavitates."""
     began = time.process_time()
     found = judged(case)
-    if found is None:
-        return None
-    plant, run, present, said = found.plant, found.run, found.present, found.said
+    return None if found is None else outcome_of(case, found, began)
+
+
+def outcome_of(case: Hiding, judgement: Judged, began: float) -> Outcome:
+    """What was said beside the truth; began: the processor time at the start, s."""
+    plant, run, present = judgement.plant, judgement.run, judgement.present
+    said = judgement.said
     words = steady(present)
     acts = acting(words, words.chunk)
     solution = learn_beside(words, acts, acts.chunk).solution
-    flowmap, n = publish(solution), len(found.taught)
+    flowmap, n = publish(solution), len(judgement.taught)
     pairs = zip(solution.model.edges, flowmap.edges, strict=True)
     of = [_points(edge, learned, plant, run, n) for edge, learned in pairs]
     return Outcome(
@@ -238,7 +271,7 @@ def declared(case: Case, run: Run) -> Machine:
 
 
 def _points(
-    edge: Edge, learned: EdgeMap, plant: SimulatedPlant, run: Run, n: int
+    edge: Edge, learned: EdgeMap, plant: TruePlant, run: Run, n: int
 ) -> tuple[Points, Points]:
     """The map of an edge at four points per cell: valid ones, and extrapolated ones near the data.
 

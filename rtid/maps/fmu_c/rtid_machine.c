@@ -130,7 +130,7 @@ static double term_of(const Machine *m, int k, const double *now, double x, doub
         if (TERM_SHAPE[k] == SHAPE_HINGE) return theta * (z > 0.0 ? z : 0.0);
         return theta * (TERM_SHAPE[k] == SHAPE_INVERSE ? -1.0 / z : z);
     }
-    if (TERM_VOLUME[k] >= 0) theta *= V0_M3[TERM_VOLUME[k]] + AREA_M2[TERM_VOLUME[k]] * x;
+    if (TERM_VOLUME[k] >= 0) theta *= V0_M3[TERM_VOLUME[k]] + GROWTH_M2[TERM_VOLUME[k]] * x;
     if (TERM_SHAPE[k] == SHAPE_ROOT) slope = 0.5 / sqrt(fabs(z) > 1.0 ? fabs(z) : 1.0);
     else if (TERM_SHAPE[k] == SHAPE_HINGE) slope = z > 0.0;
     else if (TERM_SHAPE[k] == SHAPE_INVERSE) slope = 1.0 / (z * z);
@@ -154,7 +154,7 @@ static int rates(const Machine *m, double s, double dt, const double *p, double 
     }
     for (int c = 0; c < N_CHAMBERS; c++) {
         f[c] -= AREA_M2[c] * speed_of(m);
-        g[c][c] = (V0_M3[c] + AREA_M2[c] * x) / m->real[AT_BETA + c];
+        g[c][c] = (V0_M3[c] + GROWTH_M2[c] * x) / m->real[AT_BETA + c];
     }
     for (int k = 0; k < N_TERMS; k++) {
         double by[2], flow = term_of(m, k, now, x, by);
