@@ -12,7 +12,7 @@ import numpy as np
 
 from rtid.effects.laws.pump import demand
 from rtid.effects.laws.response import behind_s
-from rtid.effects.laws.sensors import sensor_of
+from rtid.effects.laws.sensors import sensors_of
 from rtid.effects.laws.timing import COMMAND, SUPPLY, Psi, TimingLaw
 from rtid.effects.record_view import RecordView
 from rtid.model import Machine
@@ -69,8 +69,9 @@ def _put_right(model: Machine, chunk: FloatArray, timings: Timings) -> FloatArra
         chunk[:, 2 + model.column(model.position)] += lag_s * behind
     for timing, psi in timings:
         if timing.of_sensor and not model.measured:
-            column = 2 + model.column(sensor_of(model, timing))
-            chunk[:, column] = timing.apply(chunk[:, column].copy(), dt_s, psi)
+            for name in sensors_of(model, timing):
+                column = 2 + model.column(name)
+                chunk[:, column] = timing.apply(chunk[:, column].copy(), dt_s, psi)
     for timing, psi in timings:
         if timing.where == SUPPLY:
             view = RecordView.without_map(model, chunk)

@@ -18,6 +18,7 @@ from rtid.diagnose.parts import AddedEffect
 from rtid.diagnose.regression import Score
 from rtid.diagnose.residual import Residual, residual
 from rtid.diagnose.revision import Revision
+from rtid.diagnose.spread import with_spreads
 from rtid.diagnose.standing import Standing, stand, with_bank
 from rtid.diagnose.trials import (
     GAIN,
@@ -115,6 +116,7 @@ def searched(standing: Standing, progress: Progress = silent) -> Result:
     said = verdict(state, first, present, last, judged)
     if said == UNKNOWN:  # what explains a part of it only is not named, and not counted
         present, last, state.found = first, before, []
+    present = with_spreads(present)
     result, negligible, scores = tuple(state.found), state.negligible, scored(present)
     joined = tuple(joint for part in record for joint in joints(present, part, scores))
     apart = zeros(present, joined)

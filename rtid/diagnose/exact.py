@@ -91,7 +91,7 @@ def timing_trials(
     if not open_ or not present.view.has_pressures:
         return []
     hints = {key_of(t): _strength(t, *scores[key_of(t)]) for t in open_ if key_of(t) in scores}
-    return exact_trials(state, present, [*_behind_openings(present, open_)], other, hints)
+    return exact_trials(state, present, open_, other, hints)
 
 
 def _behind_openings(present: Fit, timings: list[TimingLaw]) -> Iterator[TimingLaw]:
@@ -124,10 +124,10 @@ def _foot(w: FloatArray, gain: FloatArray) -> float:
     place = np.clip(np.searchsorted(border, w, side="right") - 1, 0, BINS - 1)
     full = [k for k in range(BINS) if np.count_nonzero(place == k) >= BINS]
     middle = np.array([0.5 * (border[k] + border[k + 1]) for k in full])
-    usual = np.array([np.median(gain[place == k]) for k in full])
-    low, high = (
-        middle[int(np.argmax(usual >= part * usual.max()))] if len(usual) else 0.0 for part in RISES
-    )
+    usual = np.maximum.accumulate([np.median(gain[place == k]) for k in full])
+    if len(full) < 2 or usual[-1] <= 0.0:
+        return 0.0
+    low, high = np.interp(np.array(RISES) * usual[-1], usual, middle)
     return float(low - (high - low) * RISES[0] / (RISES[1] - RISES[0]))
 
 
@@ -155,6 +155,7 @@ def exact_trials(
     strengths by name to try as well, where they are below those of the bank.  anywhere: those too
     that end at nothing or at a bound, and so are no causes.
     """
+    timings = [*_behind_openings(present, timings)]
     gains = _from_afar(state.coarse.beside(present), timings, other, hints, anywhere)
     most = max([other, *(gain for gain, _, _ in gains)])
     trials: dict[Key, Trial] = {}

@@ -16,6 +16,7 @@ from rtid.diagnose.diagnosis import LEAST_SHARE, taken_in
 from rtid.diagnose.exact import carried_on, exact_trials, is_inside, key_of, with_pump
 from rtid.diagnose.excuse import few_excused
 from rtid.diagnose.report import Value
+from rtid.diagnose.spread import with_spreads
 from rtid.diagnose.standing import Standing, with_bank
 from rtid.diagnose.trials import (
     GAIN,
@@ -80,7 +81,7 @@ def extend(present: Standing, effect: str, where: str = "") -> Extension:
         choices = " or ".join(f"{effect}:{place}" for _, place in (best.key, *alike))
         raise RefusedError(f"{effect} explains as much at several places", f"name one: {choices}")
     now = carried_on(state, present.fit, best)
-    after = Standing(state, with_bank(few_excused(now), state.suspects))
+    after = Standing(state, with_spreads(with_bank(few_excused(now), state.suspects)))
     against = tuple(_against(present, after, best))
     tried = Extension(best.key, best.gain, present, after, against, _better(present, best))
     if best.is_timing and effect != PUMP.effect and best.fit and not is_inside(best.fit):

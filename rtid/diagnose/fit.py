@@ -53,6 +53,7 @@ class Fit:
     shapes: (effect, nonlinear parameter) of each column of shapes.  rows: of the record, for
     another fit with the same commands and weights; large.  suspects: scored beside the catalogue.
     rest: what the maps leave of the record where nothing was added, if somebody has asked before.
+    spreads: (column, how far its size is from one number), where somebody has asked (`spread`).
     """
 
     declared: Machine
@@ -70,6 +71,7 @@ class Fit:
     rows: Rows | None = None
     suspects: tuple[Effect, ...] = ()
     rest: Misfit | None = None
+    spreads: tuple[tuple[int, float], ...] = ()
 
     @cached_property
     def model(self) -> Machine:
@@ -116,6 +118,11 @@ class Fit:
         if self.revision.replaces_lag or tolerance_s == 0.0 or at not in self.estimate.used:
             return float("nan")
         return self.estimate.sd(at) * float(np.sqrt(max(1.0, self.rho)))
+
+    def sd_of(self, column: int) -> float:
+        """Of a size, by the misfit that is left and by how far it is from one number."""
+        sd = self.estimate.sd(column) * float(np.sqrt(max(1.0, self.rho)))
+        return float(np.hypot(sd, dict(self.spreads).get(column, 0.0)))
 
     @property
     def first_given(self) -> int:

@@ -252,11 +252,11 @@ def parameters(fit: Fit, key: Key) -> dict[str, Value]:
             for name, unit, value, j in zip(
                 timing.parameters, timing.units, psi, fit.timing_columns(k), strict=True
             ):
-                values[name] = Value(value, fit.estimate.sd(j) * spread, here(unit))
+                values[name] = Value(value, fit.sd_of(j), here(unit))
     for effect in fit.revision.effects:
         if effect.key == key:
             column = fit.column(effect)
-            value, sd = fit.held.value(column), fit.estimate.sd(column) * spread
+            value, sd = fit.held.value(column), fit.sd_of(column)
             scale = physical(fit, effect, 1.0)
             values[effect.parameter] = Value(scale * value, abs(scale) * sd, here(effect.unit))
             free = fit.shape_columns(effect)

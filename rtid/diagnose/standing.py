@@ -11,6 +11,7 @@ from rtid.diagnose.finer import fine_enough
 from rtid.diagnose.fit import Fit, fit, one_pass, prepare
 from rtid.diagnose.parts import AddedEffect, recall
 from rtid.diagnose.residual import Residual, residual
+from rtid.diagnose.spread import with_spreads
 from rtid.diagnose.trials import TrialState
 from rtid.effects.page import Effect
 from rtid.model import Machine
@@ -55,7 +56,7 @@ def fitted(
     if first is fine:
         first = replace(first, rest=rest)
     record = first.declared, chunk, first.weights, first.revision
-    return one_pass(*record, first, bank=False)
+    return with_spreads(one_pass(*record, first, bank=False))
 
 
 def stand(
@@ -84,4 +85,5 @@ def stand(
 def with_bank(present: Fit, suspects: tuple[Effect, ...] = ()) -> Fit:
     """A fit where it is, with every candidate beside it."""
     record = present.declared, present.chunk, present.weights, present.revision
-    return one_pass(*record, present, bank=True, suspects=suspects)
+    banked = one_pass(*record, present, bank=True, suspects=suspects)
+    return with_spreads(banked) if present.spreads else banked

@@ -9,6 +9,7 @@ from rtid.diagnose.diagnosis import search
 from rtid.diagnose.parts import AddedEffect, recall
 from rtid.diagnose.report import Diagnosis, diagnosis
 from rtid.diagnose.standing import fitted
+from rtid.effects.law import BOTH
 from rtid.effects.laws.sensors import ahead, quickened, sensor_timings
 from rtid.study.seed import Seed
 from tests.diagnose.records import record
@@ -39,6 +40,8 @@ def test_a_late_sensor_is_named_and_sized(effect: str, strength: float) -> None:
     """It was "spool lag", or nothing: its derivative alone is no measure of it."""
     said: Diagnosis = diagnosis(search(*record(effect, strength)))
     assert {own.effect for own in said.found} == {effect}
+    if effect == "pressure_sensor_lag":  # one filter on both
+        assert [own.where for own in said.found] == [BOTH]
     assert said.rho_before > 5.0 > 3.0 * said.rho_after
     for own in said.found:
         (value,) = own.parameters.values()
@@ -50,7 +53,7 @@ def test_a_sensor_of_the_project_is_put_right_and_kept() -> None:
     model, chunk, _ = record()
     part = AddedEffect("position_sensor_delay", model.position, {"delay": 2e-3})
     laws = {timing.where: timing for timing in sensor_timings(model)}
-    assert set(laws) == {model.position, *(chamber.name for chamber in model.chambers)}
+    assert set(laws) == {model.position, *(chamber.name for chamber in model.chambers), BOTH}
     made = fitted(model, chunk[:15_000], (part,))
     ((timing, psi),) = made.revision.timings
     assert timing == laws[model.position] and 0.0 < psi[0] < 2e-3  # a sensor that is not late

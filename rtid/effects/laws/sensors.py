@@ -14,7 +14,7 @@ import numpy as np
 
 from rtid.effects.column import Cause, fixed, of_page
 from rtid.effects.filtering import fitted
-from rtid.effects.law import Volumes
+from rtid.effects.law import Volumes, chambers_by_place
 from rtid.effects.laws.common import slope_to, stored
 from rtid.effects.laws.response import MAP_LAG, later, map_lag_of
 from rtid.effects.laws.timing import Psi, TimingLaw, of_law
@@ -27,9 +27,9 @@ QUICK_S = 5e-3  # half width of the window for the rate of a slow sensor's press
 
 
 def late_pressure(view: RecordView, effect: Effect) -> Iterator[Cause]:
-    """A slow pressure sensor on each chamber."""
-    for c, chamber in enumerate(view.model.chambers):
-        yield fixed(of_page(effect, chamber.name), _slow_pressure, view, c)
+    """A slow pressure sensor on each chamber, or the same on both: one amplifier, one filter."""
+    for place, at in chambers_by_place(view.model).items():
+        yield fixed(of_page(effect, place), _slow_pressures, view, at)
 
 
 def late_position(view: RecordView, effect: Effect) -> Iterator[Cause]:
@@ -37,11 +37,15 @@ def late_position(view: RecordView, effect: Effect) -> Iterator[Cause]:
     yield fixed(of_page(effect, view.model.position), _late_position, view)
 
 
-def _slow_pressure(view: RecordView, c: int) -> Volumes:
+def _slow_pressures(view: RecordView, at: tuple[int, ...]) -> Volumes:
+    return {c: _slow_pressure(view, c) for c in at}
+
+
+def _slow_pressure(view: RecordView, c: int) -> FloatArray:
     """The true pressure is ahead by tau dP/dt, in the map and in what is stored."""
     rate = view.smooth(view.pressure(c), 1)
     through = 0.5 * (rate[1:] + rate[:-1]) * slope_to(view, c) * view.dt_s
-    return {c: through + view.compliance[c] * stored(view, c, rate)}
+    return np.asarray(through + view.compliance[c] * stored(view, c, rate))
 
 
 def _late_position(view: RecordView) -> Volumes:
@@ -81,21 +85,21 @@ def sensor_timings(model: Machine) -> tuple[TimingLaw, ...]:
         return (behind,)
     if not (model.position and model.has_pressures):
         return ()
-    slow = (replace(LATE_PRESSURE, where=chamber.name) for chamber in model.chambers)
+    slow = (replace(LATE_PRESSURE, where=place) for place in chambers_by_place(model))
     return replace(LATE_POSITION, where=model.position), *slow
 
 
-def sensor_of(model: Machine, timing: TimingLaw) -> str:
-    """The signal that a timing of a sensor puts right."""
-    pressures = {chamber.name: chamber.pressure for chamber in model.chambers}
-    return pressures.get(timing.where, timing.where)
+def sensors_of(model: Machine, timing: TimingLaw) -> tuple[str, ...]:
+    """The signals that a timing of a sensor puts right."""
+    chambers = chambers_by_place(model).get(timing.where)
+    if chambers is None:
+        return (timing.where,)
+    return tuple(model.chambers[c].pressure for c in chambers)
 
 
 def late(view: RecordView, timing: TimingLaw, psi: Psi) -> Volumes:
     """Volumes per interval and chamber of a unit more of what a sensor is late by."""
     if timing.effect == MAP_LAG.effect:
         return later(view, psi[0])
-    chambers = [chamber.name for chamber in view.model.chambers]
-    if timing.where in chambers:
-        return _slow_pressure(view, chambers.index(timing.where))
-    return _late_position(view)
+    chambers = chambers_by_place(view.model).get(timing.where)
+    return _slow_pressures(view, chambers) if chambers else _late_position(view)

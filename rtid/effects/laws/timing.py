@@ -25,7 +25,7 @@ from rtid.plain import FloatArray
 Psi = tuple[float, ...]
 COMMAND, SUPPLY = "command", "supply"  # what a timing transforms; else a sensor at its place
 RATE = "rad/s"  # unit of a parameter that does the more the smaller it is
-SHUT_V = 1e-3  # of an opening that fades: less passes nothing
+SHUT_V = 0.02  # of an opening that fades: as little passes nothing
 LAG_S = "time_constant"
 DEAD_BAND = "dead_band"  # behind which a lag may sit
 USUAL_STEP_S = 0.01  # up to which the banks are those of the pages
@@ -137,7 +137,8 @@ def lagged_opening(u: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
     tau_s, dead_v = psi
     size = np.abs(u)
     opening = lagged(np.maximum(size - dead_v, 0.0), dt_s, (tau_s,))
-    out = np.where(opening > SHUT_V, dead_v + opening, np.minimum(size, dead_v))
+    inside = np.maximum(dead_v - size, 0.0) * np.exp(-opening / SHUT_V)
+    out = dead_v - inside + opening
     return np.asarray(np.copysign(out, u.min() if -u.min() > u.max() else 1.0))
 
 

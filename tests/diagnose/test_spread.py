@@ -1,0 +1,41 @@
+"""The size of an effect whose law is not nature's is no one number, and its interval says so."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rtid.diagnose.diagnosis import search
+from rtid.diagnose.report import diagnosis
+from rtid.diagnose.spread import spread
+from rtid.sim.hidden import hide
+from rtid.sim.random_plants import draw
+from rtid.sim.run import simulate
+from rtid.sim.sensing import P_A, P_B
+from rtid.units import Z95
+from tests.diagnose.records import DURATION_S, record
+
+LEAK = "internal_leakage_laminar"
+
+
+def test_the_spread_is_what_sizes_differ_by_beyond_their_noise() -> None:
+    rng, t = np.random.default_rng(1), 0.5
+    mix = np.tril(rng.uniform(0.2, 1.0, (4, 4))) * 0.2
+    drawn = rng.standard_normal((2000, 4)) @ mix.T + t * rng.standard_normal((2000, 4))
+    squares = [spread(3.0 + sizes, mix @ mix.T) ** 2 for sizes in drawn]
+    assert np.sqrt(np.mean(squares)) == pytest.approx(t, rel=0.1)
+    alike = [spread(3.0 + mix @ rng.standard_normal(4), mix @ mix.T) for _ in range(500)]
+    assert np.median(alike) < 0.1 * t
+
+
+@pytest.mark.slow
+def test_the_interval_of_a_leak_knows_that_its_gap_widens() -> None:
+    """The size that its own flow has over the record; the noise alone gave an interval of 0.1 %."""
+    model, chunk, held_out = record(LEAK, 2e-12)
+    (found,) = diagnosis(search(model, chunk, held_out)).found
+    (size,) = found.parameters.values()
+    truth = simulate(hide(draw(3), LEAK, 2e-12), "rich", 3, DURATION_S).truth
+    drop, flow = truth.signals[:, P_A] - truth.signals[:, P_B], -truth.extra_m3s[:, 0]
+    true = float(flow @ drop / (drop @ drop))
+    print(f"{size.value:.4g} +- {Z95 * size.std:.2g}, true {true:.4g}")
+    assert abs(size.value - true) < Z95 * size.std < 0.1 * true
