@@ -4,7 +4,7 @@ The baseline is a map that was published or accepted, with the level of what it 
 healthy machine.  After a start it has to foretell PROOF_S seconds of motion within that level;
 then it is held against the motion all the time (`rtid.compare.foretelling`).  What it does not know
 proves nothing: there the samples must move as declared (`rtid.daemon.first`), and the machine must
-not keep out of all that it knows.
+not keep out of all that it knows.  Slow wear is carried over to it (`rtid.daemon.wearing`).
 
 What goes on being published after a kill need not be proven: it must not hold a fault that matters.
 A second with a mean square s above 2 log(4) / 1.5 = 1.85 lets the sum of the test rise, so TRUST

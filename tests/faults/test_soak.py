@@ -119,10 +119,10 @@ def test_row_17_killed_at_random(tmp_path: Path, figure: Figure) -> None:
     figure(17, f"of {kills} restarts that began anew", began_anew, 0)
     torn = [*running.folder.rglob("*.refused.npz")]
     figure(17, f"torn files after {kills} kills", len(torn), 0)
+    figure(17, "age of the newest snapshot at a kill, median", sorted(ages_s)[kills // 2], unit="s")
     learned = stored(running.folder, machine().project).estimator
     figure(17, f"drift after {kills} kills against no kill",
            drift(uninterrupted(learned), learned.solution()), 0.01)  # fmt: skip
-    figure(17, "age of the newest snapshot at a kill, median", sorted(ages_s)[kills // 2], unit="s")
     figure(17, f"age of the newest snapshot at {kills} kills, largest", max(ages_s), 3.0, "s")
 
 
