@@ -280,3 +280,4 @@ def test_the_thrust_of_a_stranger_s_quadrotor() -> None:
     assert time.process_time() - began < 15  # compiling included
     assert len(quick.pair.commands) == 4 and quick.pair.state.name == "acc_z_g"
     assert 0.055 < lag_of(quick) < 0.075
+    assert all(f'effect = "{name}"' in quick.text for name in ("map_lag", "map_gain_drift"))
