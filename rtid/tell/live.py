@@ -19,7 +19,7 @@ from bokeh.palettes import Cividis256, RdBu11, YlOrBr9, interp_palette
 from bokeh.plotting import figure
 
 from rtid.plain import FloatArray
-from rtid.tell.charts.lines import Lines
+from rtid.tell.charts.lines import Column
 from rtid.tell.charts.theme import INK_TAG, NARROW_PX, NARROWEST_PX, NOTE_TAG, beside, plot, styled
 from rtid.tell.charts.time_plots import TimePlots
 from rtid.tell.colours import GREY, INK
@@ -227,15 +227,15 @@ def _over_time(chart: Chart) -> UIElement:
     spans = {s.name: (s.low, s.high) for s in chart.panels[0][0].shades}
     time, columns = TimePlots(spans), []
     for panels in zip(*chart.panels, strict=True):
-        lines, made, last = Lines(), [], len(panels) - 1
-        values: dict[str, FloatArray] = {}
+        lines, made, last = time.lines("report"), [], len(panels) - 1
+        values: dict[str, Column] = {}
         for r, panel in enumerate(panels):
             made.append(time.plot("report", panel.y_label, panel.title, r == last))
             for k, line in enumerate(panel.lines):
                 name = f"{r} {k}"
                 colour = INK_TAG if line.colour == INK else line.colour
                 lines.add(made[-1], name, colour, line.width)
-                values[name] = line.y
+                values[name] = line.y.__getitem__
         lines.show([(panels[0].lines[0].x, values)])
         columns.append(made)
     for others in columns[1:]:

@@ -10,14 +10,17 @@ import numpy as np
 
 from firmware_bridge import catalog as catalogs
 from firmware_bridge.frames import Frames
+from firmware_bridge.samples import Samples
 from firmware_bridge.sources import open_file
 from firmware_bridge.sources.table import Table
+from rtid.model import Machine
 from rtid.plain import FloatArray
 from rtid.project import guess as proposal
 from rtid.trace.described import by_message
 from rtid.trace.quick_source import open_source
 
 PIECES = 90  # of a curve
+FINE = 600  # of a curve as wide as the page
 MOST = 80  # signals that are shown: those that may play a role first
 
 
@@ -60,9 +63,17 @@ def glance(path: Path, dbc: Path | None = None) -> Glance:
     return Glance(tuple(curves), roles, max(0, len(names) - MOST))
 
 
-def extremes(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+def glimpse(model: Machine, samples: Samples) -> tuple[Curve, ...]:
+    """The signals of a machine in a record, SI."""
+    return tuple(
+        Curve(signal.name, signal.unit, *extremes(samples.column(signal.name), FINE))
+        for signal in model.signals
+    )
+
+
+def extremes(values: FloatArray, most: int = PIECES) -> tuple[FloatArray, FloatArray]:
     """Least and largest finite value (pieces,) of each piece of values (n,), any unit, n > 0."""
-    pieces = min(PIECES, len(values))
+    pieces = min(most, len(values))
     at = np.linspace(0, len(values), pieces, endpoint=False).astype(int)
     return np.fmin.reduceat(values, at), np.fmax.reduceat(values, at)
 

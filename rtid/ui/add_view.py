@@ -17,8 +17,8 @@ from rtid.project.added import AddedSection
 from rtid.study.look import Look
 from rtid.tell.charts.blocks import LARGEST, ML_PER_MIN, Quantity, quantities, round_up
 from rtid.tell.charts.flows import NAMES, flows_of, pressures_of
-from rtid.tell.charts.lines import Lines
 from rtid.tell.charts.theme import INK_TAG
+from rtid.tell.charts.time_plots import TimePlots
 from rtid.tell.colours import BLUE, ORANGE
 from rtid.tell.html import button, error_bars, table, text
 from rtid.tell.words import quantity
@@ -35,7 +35,7 @@ class AddView(PageView):
         super().__init__(bench)
         look, plots = bench.look, bench.time
         self.has_runs = any(part.runs for part in look.parts.values())
-        self._before, self._after = _Revised(), _Revised()
+        self._before, self._after = _Revised(plots), _Revised(plots)
         rows: list[UIElement] = []
         last = len(look.model.chambers) - 1
         for c, chamber in enumerate(look.model.chambers):
@@ -68,15 +68,14 @@ class AddView(PageView):
 class _Revised:
     """The lines of one revision."""
 
-    def __init__(self) -> None:
-        self.pressures, self.flows = Lines(), Lines()
+    def __init__(self, time: TimePlots) -> None:
+        self.pressures, self.flows = (time.lines("add") for _ in range(2))
 
     def show(self, look: Look | None) -> None:
         """Those of a look; None: nothing."""
         parts = list(look.parts.values()) if look else []
         self.pressures.show(pressures_of(part.runs[FREE_RUN]) for part in parts if part.runs)
-        rows = [part.equation for part in parts]
-        self.flows.show(flows_of(e.t_s, e.measured_m3s, e.residual_m3s) for e in rows)
+        self.flows.show(flows_of(part.equation) for part in parts)
 
 
 def errors_of(session: Session) -> tuple[list[tuple[str, float, bool]], float]:

@@ -12,15 +12,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from rtid.errors import RtidError
 from rtid.tell.html import button, text
+from rtid.ui.curves import spark, spoken
 from rtid.ui.upload import DATABASES, is_welcome
-from rtid.units import MPA, find_unit
 
 if TYPE_CHECKING:
-    from rtid.plain import FloatArray
     from rtid.study.quick_machine import Given
     from rtid.trace.glance import Curve, Glance
     from rtid.ui.desk import Judged
@@ -214,34 +211,14 @@ def _signals(arrival: Arrival) -> str:
 
 
 def _curve(curve: Curve, role: str) -> str:
-    low, high, unit = _spoken(curve)
+    low, high, unit = spoken(curve)
     words = f"{low:.3g} to {high:.3g} {unit or '(no unit)'}"
     return (
         f'<button class="curve" data-do="curve" data-name="{text(curve.name)}" '
         f'aria-pressed="{str(bool(role)).lower()}"><span><b>{text(curve.name)}</b>'
-        f"{f' = {role}' if role else ''}</span>{_spark(curve.low, curve.high)}"
+        f"{f' = {role}' if role else ''}</span>{spark(curve.low, curve.high)}"
         f"<span>{text(words)}</span></button>"
     )
-
-
-def _spoken(curve: Curve) -> tuple[float, float, str]:
-    """Range and unit of a signal as the rest of the page says them."""
-    low, high = float(np.nanmin(curve.low)), float(np.nanmax(curve.high))
-    unit = find_unit(curve.unit)
-    if unit is None or unit.dimension != "pressure":
-        return low, high, curve.unit
-    return unit.si(low) * MPA, unit.si(high) * MPA, "MPa"
-
-
-def _spark(low: FloatArray, high: FloatArray) -> str:
-    """A band from the least to the largest value of each piece."""
-    known = np.isfinite(low) & np.isfinite(high)
-    low, high, n = low[known], high[known], max(int(known.sum()) - 1, 1)
-    top, span = float(high.max()), max(float(high.max() - low.min()), 1e-300)
-    above = [f"{160 * k / n:.1f},{2 + 34 * (top - y) / span:.1f}" for k, y in enumerate(high)]
-    below = [f"{160 * k / n:.1f},{3 + 34 * (top - y) / span:.1f}" for k, y in enumerate(low)]
-    path = " ".join([*above, *reversed(below)])
-    return f'<svg viewBox="0 0 160 40" aria-hidden="true"><polygon points="{path}"/></svg>'
 
 
 def _sizes() -> str:

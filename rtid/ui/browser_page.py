@@ -16,6 +16,7 @@ from jinja2 import Environment, Template
 
 from rtid.tell.html import button, changed, cover, parsed, static
 from rtid.ui.arrival import DOES, fragments
+from rtid.ui.curves import record
 from rtid.ui.headline import record_line, strip, work_line
 from rtid.ui.live_page import Live, Question
 from rtid.ui.shared import FAILED, ROLE, Session
@@ -137,6 +138,7 @@ class Page:
         if self._desk is not None and what != ROLE:
             self._desk.refresh(what)
             self._desk.show(self._view)
+            self._is_made = self._is_made and what not in ("looks", "told")
         self._say()
 
     def _say(self) -> None:
@@ -191,7 +193,7 @@ class Page:
             command = f"rtid ui {session.project} TRACE"
             return cover("No record is open", [f"Open one with: {command}"])
         words = f"{session.trace.name}: {session.doing} ..."
-        return cover("Learning from the record", [words], session.share)
+        return cover("Learning from the record", [words], session.share) + record(session.curves)
 
     def _put(self, parts: dict[str, str]) -> None:
         """Send what has changed."""
@@ -286,6 +288,8 @@ class Page:
 SESSION_ACTIONS: dict[str, Callable[[Session, dict[str, str]], None]] = {
     "drop": lambda s, a: s.drop(a.get("effect", ""), a.get("where", "")),
     "undo": lambda s, a: s.undo(),
+    "stop": lambda s, a: s.stop(),
+    "diagnose": lambda s, a: s.diagnose(),
     "save": lambda s, a: s.save(),
     "export": lambda s, a: s.export(a.get("what", "")),
 }

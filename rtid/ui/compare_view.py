@@ -11,7 +11,6 @@ from bokeh.plotting import figure
 
 from rtid.compare import FREE_RUN, HORIZONS_S, Comparison
 from rtid.tell.charts.flows import NAMES, flow_plots, flows_of, pressures_of
-from rtid.tell.charts.lines import Lines
 from rtid.tell.charts.theme import INK_TAG, beside
 from rtid.tell.colours import BLUE, ORANGE
 from rtid.tell.html import button, choice
@@ -28,7 +27,7 @@ class CompareView(PageView):
         super().__init__(bench)
         look, self.run = bench.look, FREE_RUN
         self._time = bench.time
-        self._pressures, self._flows = Lines(), Lines()
+        self._pressures, self._flows = (self._time.lines("compare") for _ in range(2))
         self._titles: list[Title] = []
         self.has_runs = any(part.runs for part in look.parts.values())
         columns = [self._column(c, chamber.name) for c, chamber in enumerate(look.model.chambers)]
@@ -65,10 +64,7 @@ class CompareView(PageView):
         parts = list(self.look.parts.values())
         if self.has_runs:
             self._pressures.show(pressures_of(part.runs[self.run]) for part in parts if part.runs)
-        self._flows.show(
-            flows_of(p.equation.t_s, p.equation.measured_m3s, p.equation.residual_m3s)
-            for p in parts
-        )
+        self._flows.show(flows_of(part.equation) for part in parts)
         for c, title in enumerate(self._titles):
             title.text = self._title(c)
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from rtid.compare import Reference
 from rtid.diagnose.report import Diagnosis
 from rtid.errors import RtidError
+from rtid.estimator.flowmap import FlowMap
 from rtid.maps.files import formats
 from rtid.plain import Progress
 from rtid.project import load
@@ -26,10 +27,9 @@ from rtid.study.study import Study
 from rtid.tell.charts.evidence import charts_of
 from rtid.tell.diagnosed import heading
 from rtid.tell.quick import lines, rate_lines
-from rtid.tell.report_file import report
 from rtid.tell.report_story import Ranked, ranked
 from rtid.tell.story import Chart
-from rtid.trace.glance import Glance, glance
+from rtid.trace.glance import Curve, Glance, glance, glimpse
 from rtid.ui.release_form import Released, ReleaseWish, release
 from rtid.ui.sending import Sending, Way, foretell, send
 from rtid.ui.upload import free_name
@@ -88,10 +88,13 @@ class Saved:
 
 @dataclass
 class _Revision:
-    """A study with the effects of its revision, what it shows, and what led to it."""
+    """A study with the effects of its revision, its map, and what led to it.
+
+    What it shows is the page's: the worker would hold the record once more.
+    """
 
     study: Study
-    look: Look
+    flowmap: FlowMap
     kind: str = ""
     section: AddedSection | None = None
     is_saved: bool = False
@@ -109,6 +112,7 @@ class Desk:
     def __init__(self, progress: Progress) -> None:
         self._progress = progress
         self._stack: list[_Revision] = []
+        self._opening: Study | None = None
 
     def glance(self, file: Path, dbc: Path | None) -> Glance:
         """What is in a file that has no project."""
@@ -126,15 +130,20 @@ class Desk:
         kind, words = ("bad", "No verdict") if not looked.diagnosis else heading(looked.diagnosis)
         return Judged(kind, words, tuple(told)[:-2], project, project_text)
 
+    def read(self, project: Path, trace: Path) -> tuple[Curve, ...]:
+        """Read a record, which is then opened: its signals, before anything is learned."""
+        self._opening = study = Study(project, trace, self._progress)
+        return glimpse(study.machine, study.read.samples)
+
     def open(self, project: Path, trace: Path, sheet: Path | None) -> Opened:
         """Read and learn; the model has the effects that the project file has.
 
         sheet: data sheet or exported map to hold beside the learned one.
         """
-        study = Study(project, trace, self._progress)
+        study, self._opening = self._opening or Study(project, trace, self._progress), None
         learned, read = study.replay, study.trace
         self._progress("simulating the pressures", 0.8)
-        first = _Revision(study, look(learned), is_saved=True)
+        seen, first = look(learned), _Revision(study, learned.map, is_saved=True)
         self._stack = [first]
         return Opened(
             study.project.name,
@@ -142,7 +151,7 @@ class Desk:
             read.duration_s,
             len(read.samples),
             {name: n for name, n in read.counters.items() if n},
-            first.look,
+            seen,
             first.sections,
             find_reference(study.project, sheet),
         )
@@ -170,13 +179,12 @@ class Desk:
         self._progress("learning the maps again", 0.6)
         seen = last.ready.get((effect, where)) or look(study.replay)
         section = study.project.sections.added[-1]
-        self._stack.append(_Revision(study, seen, ADD, section))
+        self._stack.append(_Revision(study, seen.flowmap, ADD, section))
         return Addition(section, study.project.sections.added, seen, against)
 
-    def back(self) -> None:
-        """Forget the newest revision."""
-        if len(self._stack) > 1:
-            self._stack.pop()
+    def back(self, kept: int) -> None:
+        """Forget all revisions but the first ones."""
+        del self._stack[max(kept, 1) :]
 
     def drop(self, effect: str, where: str) -> Addition:
         """The newest revision without one of its effects."""
@@ -186,7 +194,7 @@ class Desk:
             raise RtidError(f"{effect} at {where} is not part of the model")
         study, errors = without(last.study, gone)
         seen, section = look(study.replay), gone.model_copy(update={"errors": errors})
-        self._stack.append(_Revision(study, seen, DROP, section))
+        self._stack.append(_Revision(study, seen.flowmap, DROP, section))
         return Addition(section, study.project.sections.added, seen, "")
 
     def save(self) -> Saved:
@@ -216,6 +224,8 @@ class Desk:
         if what != "report":
             raise RtidError(f"{what!r} is no format", "report; maps are released")
         study = self._stack[-1].study
+        from rtid.tell.report_file import report  # noqa: PLC0415 - nothing else here needs Bokeh
+
         path = study.path.with_suffix(".report.html")
         report(load(study.project.path), study.path, path, self._progress)
         return f"wrote {path}: the story of the project file as it is saved"
@@ -226,7 +236,7 @@ class Desk:
             raise RtidError(f"{wish.suffix!r} is no format", f"one of {', '.join(formats())}")
         self._progress("laying out the tables", 0.5)
         last = self._stack[-1]
-        return release(last.study, last.look, wish)
+        return release(last.study, last.flowmap, wish)
 
     def foretell(self, way: Way) -> Sending:
         """What sending the daemon's offer would change, as the records have it."""

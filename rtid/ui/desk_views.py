@@ -44,15 +44,21 @@ class DeskViews:
         self._roots, self._put = roots, put
         self._bench = Bench(session, self._mark_block, self._mark_span)
         self._views: dict[str, PageView] = {}
+        self._stale: set[str] = set()  # views that show what was before
+        self._looked_at = ""
 
     def show(self, view: str) -> None:
         """Look at a view."""
+        self._looked_at = view
         self._make(view)
         self._bench.time.look_at(view)
         self._tell()
 
     def _make(self, name: str) -> None:
-        """Make a view that nobody has looked at before."""
+        """Make a view that nobody has looked at before, or have it show what is now."""
+        if name in self._stale:
+            self._stale.remove(name)
+            self._views[name].refresh()
         if name in self._views or name not in self._rows:
             return
         self._views[name] = view = made(self._rows[name], self._bench)
@@ -62,18 +68,18 @@ class DeskViews:
 
     def prepare(self) -> bool:
         """Make one more view before it is looked at; False where all are made."""
-        missing = [name for name in self._rows if name not in self._views]
+        missing = [name for name in self._rows if name not in self._views or name in self._stale]
         if missing:
             self._make(missing[0])
         return len(missing) > 1
 
     def refresh(self, what: str) -> None:
-        """Show what has changed in the session."""
+        """Show what has changed in the session, in the view that is looked at first."""
         if what == "looks":
             self._forget()
-        for view in self._views.values():
-            if what in ("looks", "told"):
-                view.refresh()
+        if what in ("looks", "told"):
+            self._stale = set(self._views)
+            self._make(self._looked_at)
         self._tell()
 
     def take(self, what: str, asked: dict[str, str]) -> None:
@@ -81,12 +87,21 @@ class DeskViews:
         its_own: dict[str, Action] = {
             "forget": lambda _: self._forget(),
             "drag": lambda asked: self._bench.time.set_drag(asked.get("mode", "")),
+            "zoom": self._zoom,
         }
         every = [its_own, *(view.actions for view in self._views.values())]
         action = next((actions[what] for actions in every if what in actions), None)
         if action is not None:
             action(asked)
         self._tell()
+
+    def _zoom(self, asked: dict[str, str]) -> None:
+        """A page has come to a window of time that it has too few values of."""
+        try:
+            low, high = float(asked["low"]), float(asked["high"])
+        except (KeyError, ValueError):
+            return
+        self._bench.time.zoom(asked.get("view", ""), low, high)
 
     def _tell(self) -> None:
         """The words of all views."""

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from math import isfinite
+from typing import TYPE_CHECKING
 
 from rtid.project.history import ADD
 from rtid.tell.html import button, text
-from rtid.ui.shared import FAILED, Session, ShownRevision
+from rtid.ui.shared import FAILED, STOPPED, Session, ShownRevision
+
+if TYPE_CHECKING:
+    from rtid.diagnose.report import Diagnosis
 
 WELCOME = (
     "A file, what its signals are, sizes of the cylinder: then whether the data is good enough, "
@@ -37,9 +41,10 @@ def work_line(session: Session) -> str:
             f'<span title="{words}"><span class="bad">{text(message)}</span> {text(remedy)}</span>'
         )
     if session.doing:
+        stop = button("Stop", "stop", kind="link") if session.can_stop else ""
         return (
             f'{text(session.doing)} ...<progress max="1" value="{session.share:.2f}" '
-            f'aria-label="progress"></progress>'
+            f'aria-label="progress"></progress>{stop}'
         )
     return _in_full(session.note) if session.note else ""
 
@@ -50,21 +55,40 @@ def strip(session: Session) -> str:
     if session.arrival is not None:
         return f"<h1>What is in it?</h1><p>{WELCOME}</p>"
     if session.state == FAILED or session.trace is None:
-        return ""
+        return _not_opened(session)
     if last is not None and last.section is not None and (last.told is None or last.note):
         return _changed(session, last)
-    if last is not None and last.told is None and session.trouble[0] and not session.doing:
+    if last is None or last.told is None:
+        return _undecided(session)
+    return _decided(session, last, last.told.diagnosis)
+
+
+def _not_opened(session: Session) -> str:
+    """Why is told where the pictures would be; what was stopped may be asked for again."""
+    if session.trouble != STOPPED:
+        return ""
+    again = button("Open the record", "diagnose", kind="main")
+    return f"<h1>Stopped</h1><p>Nothing has been learned.</p>{again}"
+
+
+def _undecided(session: Session) -> str:
+    """Before there is a diagnosis, or where none came."""
+    if session.last is not None and session.is_stopped:
+        again = button("Look for what is missing", "diagnose", kind="main")
+        return f"<h1>Not diagnosed</h1><p>It was stopped. The maps are learned.</p>{again}"
+    if session.last is not None and session.trouble[0] and not session.doing:
         message, remedy = session.trouble
         words = f"{message}. {remedy}" if remedy else message
         return f'<h1 class="bad">Not diagnosed</h1><p>{text(words)}</p>'
-    if last is None or last.told is None:
-        heading = "Looking for what is missing" if last else "Opening the record"
-        return f"<h1>{heading}</h1><p>{_waiting(session)}</p>"
+    heading = "Looking for what is missing" if session.last else "Opening the record"
+    return f"<h1>{heading}</h1><p>{_waiting(session)}</p>"
+
+
+def _decided(session: Session, last: ShownRevision, diagnosis: Diagnosis) -> str:
     from rtid.effects.page import title  # noqa: PLC0415 - the live page needs none
     from rtid.tell.diagnosed import heading as heading_of  # noqa: PLC0415
     from rtid.tell.diagnosed import said  # noqa: PLC0415
 
-    diagnosis = last.told.diagnosis
     kind, heading = heading_of(diagnosis)
     words = said(diagnosis)
     offer = ""
@@ -98,8 +122,12 @@ def _changed(session: Session, last: ShownRevision) -> str:
         return (
             f'<h1 class="open">{heading}, against the evidence</h1><p>{text(last.note)}</p>{undo}'
         )
-    words += "Looking whether anything else is missing ..."
-    return f'<h1 class="good">{heading}</h1><p>{text(words)}</p>{button("Undo", "undo")}'
+    offer = button("Undo", "undo")
+    if session.is_stopped:
+        offer = button("Look for what is missing", "diagnose", kind="main") + offer
+    else:
+        words += "Looking whether anything else is missing ..."
+    return f'<h1 class="good">{heading}</h1><p>{text(words)}</p>{offer}'
 
 
 def _waiting(session: Session) -> str:

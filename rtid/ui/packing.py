@@ -25,10 +25,12 @@ class Packing(Protocol):  # type: ignore[misc]
     def __init__(self, turns: Turns) -> None:
         super().__init__()
         self._turns = turns
+        self.has_given = False  # the whole document, on which every change rests
 
     def create(self, msgtype: Any, *args: Any, **metadata: Any) -> Any:
         """A message, or what is to be awaited for one: its caller, the session, does so."""
         if msgtype == "PULL-DOC-REPLY":
+            self.has_given = True
             return self.packed(msgtype, *args, **metadata)
         return super().create(msgtype, *args, **metadata)
 
@@ -45,8 +47,14 @@ class Packing(Protocol):  # type: ignore[misc]
 
 
 class Packed(ServerConnection):  # type: ignore[misc]
-    """A connection whose changes of the document are packed when it is their turn."""
+    """A connection whose changes of the document are packed when it is their turn.
+
+    What changes before the page has fetched its document is part of that: pictures that are made
+    while the browser is still loading would otherwise be sent twice.
+    """
 
     async def send_patch_document(self, event: DocumentPatchedEvent) -> None:
         """Pack and send it; the document is locked until that is done."""
+        if not self.protocol.has_given:
+            return
         await self._socket.send_message(await self.protocol.packed("PATCH-DOC", [event]))

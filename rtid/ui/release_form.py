@@ -17,9 +17,9 @@ from rtid.errors import RtidError
 from rtid.tell.html import button, select, table, text
 
 if TYPE_CHECKING:
+    from rtid.estimator.flowmap import FlowMap
     from rtid.maps.flashed import FlashedMap
     from rtid.maps.release import Room
-    from rtid.study.look import Look
     from rtid.study.study import Study
 
 PLACE = "/release"
@@ -53,7 +53,7 @@ class Released:
     changed: tuple[tuple[str, ...], ...]
 
 
-def release(study: Study, look: Look, wish: ReleaseWish) -> Released:
+def release(study: Study, flowmap: FlowMap, wish: ReleaseWish) -> Released:
     """Write the maps of a revision beside its record.  Raises RtidError where they do not fit."""
     from rtid.estimator.validity import doubts_of  # noqa: PLC0415 - the live page needs none
     from rtid.maps.files import provenance  # noqa: PLC0415
@@ -62,7 +62,7 @@ def release(study: Study, look: Look, wish: ReleaseWish) -> Released:
     from rtid.study.known_effects import as_json  # noqa: PLC0415
     from rtid.tell.released import changed_rows, rows, sheet  # noqa: PLC0415
 
-    project, trace, fit, flowmap = study.project, study.path, study.fit, look.flowmap
+    project, trace, fit = study.project, study.path, study.fit
     path = trace.with_suffix(f".map{wish.suffix}")
     invalid = [d for d in doubts_of(fit.solution, fit.lag_s, fit.lag_sd_s) if d.is_invalid]
     refuse_unfounded(trace.name, wish.suffix, invalid, flowmap)

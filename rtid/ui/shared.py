@@ -18,14 +18,17 @@ from rtid.project.added import AddedSection
 from rtid.ui.arrival import Arrival, choose
 from rtid.ui.release_form import Released, ReleaseWish
 from rtid.ui.sending import Sending, Way
-from rtid.ui.worker import Worker
+from rtid.ui.worker import Worker, ignore
 
 if TYPE_CHECKING:
     from rtid.study.look import Look
+    from rtid.trace.glance import Curve
     from rtid.ui.desk import Addition, Opened, RankedDiagnosis, Saved
 
 Listener = Callable[[str], None]
 LOADING, READY, FAILED = "loading", "ready", "failed"
+STOPPABLE = ("read", "open", "diagnose", "prepare", "add", "drop", "glance", "judge")
+STOPPED = "Stopped", "nothing has been learned from this record"
 ROLE = "role"  # what pages hear when another browser comes, goes or takes over
 
 
@@ -55,6 +58,7 @@ class Session:
     share: float = 0.0
     trouble: tuple[str, str] = ("", "")
     note: str = ""
+    curves: tuple[Curve, ...] = ()  # of the record, before anything is learned from it
     opened: Opened | None = None
     revisions: list[ShownRevision] = field(default_factory=list)
     listeners: list[Listener] = field(default_factory=list)
@@ -66,6 +70,7 @@ class Session:
     folder: Path | None = None  # in which a daemon keeps its state
     test_bus: bool = False  # maps may be sent over a bus that anybody may write to
     sending: Sending | None = None  # waits for a yes
+    is_stopped: bool = False  # what was being done, by the user
     _is_adding: bool = False
 
     def open(self) -> None:
@@ -78,9 +83,8 @@ class Session:
         if self.trace is None:
             self.state, self.doing = READY, ""
             return
-        self.ask(
-            "open", self.project, self.trace, self.sheet, then=self._opened, failed=self._not_opened
-        )
+        self.state, self.trouble = LOADING, ("", "")
+        self.ask("read", self.project, self.trace, then=self._read, failed=self._not_opened)
 
     def begin(self, project: Path, text: str, trace: Path) -> None:
         """Write the project of a file that had none, and open both."""
@@ -148,9 +152,45 @@ class Session:
         self.ask("drop", effect, where, then=self._added("drop"))
 
     def undo(self) -> None:
-        """Take the last change of this session back."""
-        if len(self.revisions) > 1 and not self.revisions[-1].is_saved:
-            self.ask("back", then=self._taken_back)
+        """Take the last change of this session back; the page shows so before the worker knows."""
+        if self._is_adding:
+            self.stop()
+        elif len(self.revisions) > 1 and not self.revisions[-1].is_saved:
+            self._forget()
+            self.revisions.pop()
+            self._step_back()
+            self.tell("looks")
+            self._diagnose()
+
+    def stop(self) -> None:
+        """Wait no longer for what is being done; what there was before stays."""
+        self._forget()
+        self.is_stopped = True
+        if not self.revisions:
+            self.state, self.trouble = FAILED, STOPPED
+        else:
+            self._step_back()
+        self.tell("state")
+
+    @property
+    def can_stop(self) -> bool:
+        """Whether what is being done may be left alone in the middle."""
+        return self.worker.is_doing(*STOPPABLE)
+
+    def _forget(self) -> None:
+        self.worker.forget(*STOPPABLE)
+        self.doing, self.share, self._is_adding = "", 0.0, False
+
+    def _step_back(self) -> None:
+        """Let the worker forget what the page no longer has, when it comes to it."""
+        self.worker.ask("back", len(self.revisions), then=ignore, failed=ignore)
+
+    def diagnose(self) -> None:
+        """Look for what is missing, where that was stopped; or open the record that was not."""
+        if self.revisions:
+            self._diagnose()
+        elif self.state == FAILED:
+            self.open()
 
     def save(self) -> None:
         """Write the changes of this session to the project file."""
@@ -229,7 +269,7 @@ class Session:
             self.doing, self.share, self.trouble = "", 0.0, ("", "")
             then(result)
 
-        self.note, self.trouble = "", ("", "")
+        self.note, self.trouble, self.is_stopped = "", ("", ""), False
         self.doing, self.share = self.doing or "working", 0.0
         self.worker.ask(
             method, *arguments, then=done, failed=failed or self._failed, progress=self._progress
@@ -248,8 +288,12 @@ class Session:
         self.state = FAILED
         self._failed(error)
 
+    def _read(self, curves: tuple[Curve, ...]) -> None:
+        self.curves, known = curves, (self.project, self.trace, self.sheet)
+        self.ask("open", *known, then=self._opened, failed=self._not_opened)
+
     def _opened(self, opened: Opened) -> None:
-        self.state, self.opened = READY, opened
+        self.state, self.opened, self.curves = READY, opened, ()
         self.revisions = [ShownRevision(opened.look, opened.added, is_saved=True)]
         self.tell("looks")
         self._diagnose()
@@ -289,10 +333,6 @@ class Session:
             self._diagnose()
 
         return added
-
-    def _taken_back(self, _: None) -> None:
-        self.revisions.pop()
-        self.tell("looks")
 
     def _saved(self, saved: Saved) -> None:
         for revision in self.revisions:

@@ -24,7 +24,6 @@ from rtid.tell.charts.blocks import (
 )
 from rtid.tell.charts.dependence import over_signal
 from rtid.tell.charts.flows import NAMES, flows_of
-from rtid.tell.charts.lines import Lines
 from rtid.tell.colours import CHAMBERS
 from rtid.tell.html import button, choice, select, text
 from rtid.tell.live import PanelPlot
@@ -53,7 +52,7 @@ class WhereView(PageView):
         self.planes = BlockPlots(look.model, every, bench.mark_block)
         self.signal = max(self._depends, key=_explains).signal if self._depends else ""
         self._over = PanelPlot(self._panel)
-        self._lines = Lines()
+        self._lines = self._time.lines("where")
         self.side = self._side()
         self.words = ""
         self.roots = {"maps": self.planes.root, "time": self.side}
@@ -97,8 +96,7 @@ class WhereView(PageView):
 
     def show(self) -> None:
         """Draw what is chosen."""
-        parts = [p.equation for p in self.look.parts.values()]
-        self._lines.show(flows_of(e.t_s, e.measured_m3s, e.residual_m3s) for e in parts)
+        self._lines.show(flows_of(part.equation) for part in self.look.parts.values())
         self.planes.show(self.blocks, self._quantities[self.quantity])
         self._show_signal()
 

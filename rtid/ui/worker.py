@@ -5,15 +5,19 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
+from multiprocessing.synchronize import Event
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from rtid.errors import RtidError
 from rtid.plain import Progress
+from rtid.ui.parcel import packed
 
 Then = Callable[[Any], None]
 OUR_PACKAGES = ("rtid", "firmware_bridge")  # their errors are meant for the user
@@ -27,6 +31,10 @@ class WorkerError(RtidError):
     exit_code = 1
 
 
+class StoppedError(Exception):
+    """Nobody waits for a job any more."""
+
+
 @dataclass(frozen=True)
 class Job:
     """A method of the desk, its arguments, and who waits for progress, result or refusal."""
@@ -38,23 +46,36 @@ class Job:
     progress: Progress
 
 
-def serve(pipe: Connection) -> None:
-    """Work until the pipe is closed.  Runs in the worker's process."""
+def serve(pipe: Connection, folder: Path, stop: Event) -> None:
+    """Work until the pipe is closed.  Runs in the worker's process.
+
+    folder: for what is large in an answer; stop: is set when nobody waits for the job any more.
+    """
     os.nice(POLITE)  # the page comes first
     from rtid.ui.desk import Desk  # noqa: PLC0415 - only the worker imports the estimator's weight
 
-    desk = Desk(lambda text, share: pipe.send(("progress", (text, share))))
+    def progress(text: str, share: float) -> None:
+        if stop.is_set():
+            raise StoppedError("stopped")
+        pipe.send(("progress", (text, share)))
+
+    desk = Desk(progress)
     while True:
         try:
             method, arguments = pipe.recv()
         except (EOFError, OSError, KeyboardInterrupt):
             return
+        stop.clear()
         try:
-            pipe.send(("done", getattr(desk, method)(*arguments)))
+            pipe.send(("done", packed(getattr(desk, method)(*arguments), folder)))
         except KeyboardInterrupt:
             return
         except Exception as error:
             pipe.send(("refused", in_words(method, error)))
+
+
+def ignore(*_: object) -> None:
+    """What came of a job that nobody waits for."""
 
 
 def in_words(method: str, error: Exception) -> tuple[str, str]:
@@ -75,6 +96,8 @@ class Worker:
         self._pipe: Connection | None = None
         self._process: BaseProcess | None = None
         self._listener: threading.Thread | None = None
+        self._folder: TemporaryDirectory[str] | None = None
+        self._stop: Event | None = None
 
     @property
     def is_busy(self) -> bool:
@@ -94,6 +117,19 @@ class Worker:
         if len(self._jobs) == 1:
             self._begin()
 
+    def is_doing(self, *methods: str) -> bool:
+        """Whether the job that is being done is one of these."""
+        return bool(self._jobs) and self._jobs[0].method in methods
+
+    def forget(self, *methods: str) -> None:
+        """Wait no longer for jobs of these kinds; one that is being done ends when it can."""
+        now, later = self._jobs[:1], self._jobs[1:]
+        if now and now[0].method in methods:
+            now = [replace(now[0], then=ignore, failed=ignore, progress=ignore)]
+            if self._stop is not None:
+                self._stop.set()
+        self._jobs = now + [job for job in later if job.method not in methods]
+
     def stop(self) -> None:
         """End the process, whatever it does, and wait until nothing of it is left."""
         if self._process is None or self._pipe is None or self._listener is None:
@@ -102,12 +138,17 @@ class Worker:
         self._process.join(5.0)
         self._listener.join(5.0)
         self._pipe.close()
+        if self._folder is not None:
+            self._folder.cleanup()
 
     def _start(self) -> Connection:
         """The process, started with the first job: a page that only looks on needs none."""
         context = get_context("spawn")
         ours, theirs = context.Pipe()
-        self._process = context.Process(target=serve, args=(theirs,), daemon=True)
+        self._folder = TemporaryDirectory(prefix="rtid-", ignore_cleanup_errors=True)
+        self._stop = context.Event()
+        given = theirs, Path(self._folder.name), self._stop
+        self._process = context.Process(target=serve, args=given, daemon=True)
         self._process.start()
         theirs.close()
         self._listener = threading.Thread(target=self._listen, args=(ours,), daemon=True)
@@ -130,6 +171,8 @@ class Worker:
             except (EOFError, OSError):
                 self._on_loop(partial(self._take, "refused", ENDED))
                 return
+            if kind == "done":
+                content = content.value()
             self._on_loop(partial(self._take, kind, content))
 
     def _take(self, kind: str, content: Any) -> None:

@@ -54,7 +54,7 @@ def test_a_file_is_looked_at_judged_and_kept(tmp_path: Path) -> None:
     assert "<odd>" not in html and "2 more are not shown" in html
     asked(session, arrival, {"do": "keep"})
     assert (tmp_path / "day.toml").read_text() == "text\n"
-    assert session.arrival is None and worker.jobs[0][0] == "open"
+    assert session.arrival is None and worker.jobs[0][0] == "read"
     assert worker.jobs[0][1][:2] == (tmp_path / "day.toml", tmp_path / "day.csv")
 
 

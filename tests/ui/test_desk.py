@@ -70,7 +70,7 @@ def test_the_whole_way_of_an_effect(worn: tuple[Path, Path]) -> None:
     assert pair.before is not None
     assert pair.after is not None
     assert pair.after < 0.2 * pair.before
-    desk.back()
+    desk.back(1)
     with pytest.raises(RtidError, match="spool_lag_of_the_moon"):
         desk.add("spool_lag_of_the_moon", "", "")
     again = desk.add(*LEAK, "once more")
@@ -78,7 +78,7 @@ def test_the_whole_way_of_an_effect(worn: tuple[Path, Path]) -> None:
     dropped = desk.drop(*LEAK)
     assert left(dropped.look) == pytest.approx(left(first), rel=1e-9)
     assert dropped.sections == ()
-    desk.back()
+    desk.back(2)
     assert project.read_bytes() == untouched
     (line,) = re.findall(r"`(rtid undo[^`]*)` takes", desk.save().note)
     assert shlex.split(line) == [

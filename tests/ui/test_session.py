@@ -7,10 +7,13 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
+
 from rtid.diagnose.report import Diagnosis, FoundEffect, Value
 from rtid.errors import RtidError
 from rtid.project.added import AddedSection, ParameterSection
 from rtid.tell.story import Story
+from rtid.trace.glance import Curve
 from rtid.ui.headline import strip
 from rtid.ui.sending import Sending, Way
 from rtid.ui.shared import FAILED, LOADING, READY, ROLE, Session
@@ -32,6 +35,12 @@ class FakeWorker:
 
     def ask(self, method: str, *arguments: Any, **answers: Any) -> None:
         self.jobs.append((method, arguments, answers))
+
+    def is_doing(self, *methods: str) -> bool:
+        return bool(self.jobs) and self.jobs[0][0] in methods
+
+    def forget(self, *methods: str) -> None:
+        self.jobs = [job for job in self.jobs if job[0] not in methods]
 
     def answer(self, result: Any = None) -> str:
         method, _, answers = self.jobs.pop(0)
@@ -69,6 +78,10 @@ def state(session: Session) -> str:
     return session.state
 
 
+def can_stop(session: Session) -> bool:
+    return session.can_stop
+
+
 def named(session: Session) -> object:
     return session.named
 
@@ -86,6 +99,9 @@ def begun() -> tuple[Session, FakeWorker, list[str]]:
     session = Session(Path("m.toml"), Path("run.blf"), worker)  # type: ignore[arg-type]
     session.listeners.append(heard.append)
     session.open()
+    curves = (Curve("p_a", "Pa", np.zeros(2), np.ones(2)),)
+    assert state(session) == LOADING and worker.answer(curves) == "read"
+    assert session.curves == curves  # before anything is learned
     return session, worker, heard
 
 
@@ -121,11 +137,69 @@ def test_add_and_undo_leave_the_file_alone() -> None:
     assert looks(session) == ["first look", "second look"]
     assert worker.answer(told()) == "diagnose"
     session.undo()
+    assert looks(session) == ["first look"]  # before the worker knows of it
     assert worker.answer() == "back"
-    assert looks(session) == ["first look"]
     assert session.named == KEY
     session.undo()
     assert not worker.is_busy  # there is nothing more to take back
+
+
+def second() -> Any:
+    return SimpleNamespace(look="second look", sections=(section(),), section=section(), note="")
+
+
+def test_what_is_undone_is_gone_while_the_worker_still_looks_at_it() -> None:
+    session, worker, heard = begun()
+    for result in (opened(), told(KEY), None):
+        worker.answer(result)
+    session.add(*KEY)
+    worker.answer(second())
+    assert worker.is_doing("diagnose")
+    heard.clear()
+    session.undo()
+    assert looks(session) == ["first look"] and heard == ["looks"]
+    assert [(method, arguments) for method, arguments, _ in worker.jobs] == [("back", (1,))]
+    assert named(session) == KEY and session.doing == ""
+
+
+def test_an_addition_that_is_being_made_is_stopped_by_undo() -> None:
+    session, worker, _ = begun()
+    for result in (opened(), told(KEY), None):
+        worker.answer(result)
+    session.add(*KEY)
+    session.undo()
+    assert [method for method, *_ in worker.jobs] == ["back"]  # should it have been made meanwhile
+    assert looks(session) == ["first look"] and named(session) == KEY
+
+
+def test_a_diagnosis_that_is_stopped_may_be_asked_for_again() -> None:
+    session, worker, _ = begun()
+    worker.answer(opened())
+    assert can_stop(session)
+    session.stop()
+    assert worker.answer() == "back" and not can_stop(session)
+    assert "It was stopped" in strip(session) and 'data-do="diagnose"' in strip(session)
+    session.diagnose()
+    assert worker.answer(told(KEY)) == "diagnose"
+    assert named(session) == KEY
+
+
+def test_a_record_that_is_not_opened_after_all_may_be_opened_again() -> None:
+    session, worker, _ = begun()
+    session.stop()
+    assert state(session) == FAILED and not worker.is_busy
+    assert 'data-do="diagnose"' in strip(session)
+    session.diagnose()
+    assert state(session) == LOADING and worker.answer(()) == "read"
+
+
+def test_what_is_written_cannot_be_stopped() -> None:
+    session, worker, _ = begun()
+    for result in (opened(), told(KEY), None):
+        worker.answer(result)
+    session.save()
+    session.stop()
+    assert worker.answer(SimpleNamespace(note="wrote m.toml")) == "save"
 
 
 def test_what_was_saved_is_not_taken_back_here() -> None:

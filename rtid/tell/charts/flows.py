@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from bokeh.plotting import figure
 
-from rtid.compare import Simulation
+from rtid.compare import Comparison, Simulation
 from rtid.plain import FloatArray
-from rtid.tell.charts.lines import Columns, Lines
+from rtid.tell.charts.lines import Column, Lines, Part
 from rtid.tell.charts.theme import INK_TAG
 from rtid.tell.charts.time_plots import TimePlots
 from rtid.tell.colours import BLUE, ORANGE
@@ -27,18 +29,34 @@ def flow_plots(
     return made
 
 
-def flows_of(
-    t_s: FloatArray, measured: FloatArray, residual: FloatArray
-) -> tuple[FloatArray, Columns]:
-    """Times (n,) and, per chamber, measured, modelled and what is left, from (n, chambers) m3/s."""
-    columns = {"measured": measured, "model": measured - residual, "left": residual}
-    return t_s, {f"{k} {c}": v[:, c] * lpm() for k, v in columns.items() for c in range(v.shape[1])}
+def flows_of(part: Comparison) -> Part:
+    """Measured and modelled flow of every chamber, and what is left."""
+
+    def columns(c: int) -> dict[str, Column]:
+        return {
+            f"measured {c}": lambda at: part.measured_m3s[at, c] * lpm(),
+            f"model {c}": lambda at: part.modelled_m3s[at, c] * lpm(),
+            f"left {c}": lambda at: (part.measured_m3s[at, c] - part.modelled_m3s[at, c]) * lpm(),
+        }
+
+    return part.t_s, _of_all(columns, part.measured_m3s.shape[1])
 
 
-def pressures_of(run: Simulation) -> tuple[FloatArray, Columns]:
-    """Times (n,), s, and the same (n,) of simulated pressures in MPa; what is left in kPa."""
-    model = np.where(run.predicted[:, None], run.simulated_pa, np.nan)
-    columns = {
-        "measured": run.measured_pa * MPA, "model": model * MPA, "left": run.error_pa * KPA
-    }  # fmt: skip
-    return run.t_s, {f"{k} {c}": v[:, c] for k, v in columns.items() for c in range(v.shape[1])}
+def pressures_of(run: Simulation) -> Part:
+    """Measured and simulated pressure of every chamber in MPa; what is left in kPa."""
+
+    def columns(c: int) -> dict[str, Column]:
+        def model(at: slice) -> FloatArray:
+            return np.where(run.predicted[at], run.simulated_pa[at, c], np.nan)
+
+        return {
+            f"measured {c}": lambda at: run.measured_pa[at, c] * MPA,
+            f"model {c}": lambda at: model(at) * MPA,
+            f"left {c}": lambda at: (run.measured_pa[at, c] - model(at)) * KPA,
+        }
+
+    return run.t_s, _of_all(columns, run.measured_pa.shape[1])
+
+
+def _of_all(columns: Callable[[int], dict[str, Column]], chambers: int) -> dict[str, Column]:
+    return {name: column for c in range(chambers) for name, column in columns(c).items()}

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from bokeh.layouts import row
-from bokeh.models import DataRange1d, Row, Title, UIElement
+from bokeh.models import DataRange1d, GlyphRenderer, Row, Title, UIElement
 from bokeh.plotting import figure
 
 NARROW_PX, NARROWEST_PX = 900, 560  # widths of the page below which less stands side by side
@@ -38,7 +38,7 @@ def plot(
         min_border_bottom=2,
         **({"tools": ""} | more),
     )
-    made.xgrid.visible = False
+    made.center.remove(made.xgrid[0])
     made.ygrid.grid_line_alpha = 0.35
     for axis in (*made.xaxis, *made.yaxis):
         axis.axis_label_text_font_style = "normal"
@@ -50,6 +50,12 @@ def plot(
         axis.axis_line_width = 0.7
     made.title = styled(Title(text=title))
     return made
+
+
+def lean(drawn: GlyphRenderer) -> GlyphRenderer:
+    """What is drawn in one way alone: nobody selects or mutes it, and a page has many."""
+    drawn.nonselection_glyph = drawn.muted_glyph = None
+    return drawn
 
 
 def styled(title: Title) -> Title:

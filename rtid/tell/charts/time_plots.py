@@ -7,7 +7,6 @@ from typing import Any
 
 from bokeh.events import SelectionGeometry
 from bokeh.models import (
-    BoxAnnotation,
     BoxSelectTool,
     BoxZoomTool,
     ColumnDataSource,
@@ -17,10 +16,12 @@ from bokeh.models import (
 from bokeh.plotting import figure
 
 from rtid.study.look import Look
-from rtid.tell.charts.theme import LIT, plot
-from rtid.tell.colours import HELD_OUT, SEEN
+from rtid.tell.charts.lines import Lines
+from rtid.tell.charts.theme import LIT, lean, plot
 
-DARK = {SEEN: "#182a36", HELD_OUT: "#33290f"}
+# what the fit has seen, and what it has not: the same on a light and a dark ground
+SEEN, HELD_OUT = ("#0072b2", 0.10), ("#e69f00", 0.14)
+MARKED, EDGE = (LIT, 0.35), 0.8  # what the user has pointed at, and the ends of it
 MARGIN = 0.01  # of the record, at either end
 Spans = list[tuple[float, float]]
 
@@ -47,12 +48,14 @@ class TimePlots:
         self._spans: Spans = []
         self._view = ""
         self._plots: list[figure] = []
-        self._on_span = on_span
+        self._lines: dict[str, list[Lines]] = {}
+        self._on_span, self._handles = on_span, BoxZoomTool().overlay.handles
         self.drag = "zoom"
 
     def plot(self, view: str, label: str, title: str = "", is_last: bool = True) -> figure:
         """One more plot on the common time; is_last: the one of a column that tells the time."""
         zoom, select = BoxZoomTool(dimensions="width"), BoxSelectTool(dimensions="width")
+        zoom.overlay.handles = select.overlay.handles = self._handles
         select.overlay.fill_color, select.overlay.fill_alpha = LIT, 0.2
         wheel = WheelZoomTool(dimensions="width")
         tools = [zoom, select, wheel, "xpan"] if self._on_span else [zoom]
@@ -60,11 +63,10 @@ class TimePlots:
         made.toolbar.active_drag = zoom
         if self._on_span:
             made.toolbar.active_scroll = wheel
-        made.vstrip(
-            x0="x0", x1="x1", source=self._lit_of(view), fill_color=LIT, fill_alpha=0.35,
-            line_color=LIT, line_alpha=0.8, line_width=0.8,
-        )  # fmt: skip
-        self._shade(made)
+        lean(made.vstrip(
+            x0="x0", x1="x1", source=self._strips_of(view), fill_color="colour", fill_alpha="alpha",
+            line_color="colour", line_alpha="edge", line_width=0.8, level="image",
+        ))  # fmt: skip
         if is_last:
             made.xaxis.axis_label = "time in s"
         else:
@@ -74,23 +76,39 @@ class TimePlots:
         self._plots.append(made)
         return made
 
+    def lines(self, view: str) -> Lines:
+        """Lines of a view, which are sent more finely where somebody zooms to them."""
+        made = Lines(is_whole=self._on_span is None)
+        self._lines.setdefault(view, []).append(made)
+        return made
+
+    def zoom(self, view: str, low: float, high: float) -> None:
+        """A view has come to a window of the record, s, that it has too few values of."""
+        for lines in self._lines.get(view, []):
+            lines.zoom(low, high)
+
     def _range(self, view: str) -> Range1d:
         if view not in self._ranges:
             name = f"time_{view}"
             self._ranges[view] = Range1d(*self._whole, bounds=self._whole, name=name, tags=["time"])
         return self._ranges[view]
 
-    def _shade(self, made: figure) -> None:
-        """What the fit has seen, and what it has not."""
-        for name, (low, high) in self._parts.items():
-            colour = SEEN if name == "identification" else HELD_OUT
-            box = BoxAnnotation(left=low, right=high, fill_color=colour, fill_alpha=1.0)
-            box.line_color, box.level = None, "image"
-            box.tags = [{"light": colour, "dark": DARK[colour]}]
-            made.add_layout(box)
+    def _strips(self, marked: Spans) -> dict[str, list[Any]]:
+        """The parts of the record, and what is marked in them."""
+        looks = [SEEN if name == "identification" else HELD_OUT for name in self._parts]
+        spans, looks = [*self._parts.values(), *marked], looks + [MARKED] * len(marked)
+        return {
+            "x0": [low for low, _ in spans],
+            "x1": [high for _, high in spans],
+            "colour": [colour for colour, _ in looks],
+            "alpha": [alpha for _, alpha in looks],
+            "edge": [EDGE if look is MARKED else 0.0 for look in looks],
+        }
 
-    def _lit_of(self, view: str) -> ColumnDataSource:
-        return self._lit.setdefault(view, ColumnDataSource({"x0": [], "x1": []}))
+    def _strips_of(self, view: str) -> ColumnDataSource:
+        if view not in self._lit:
+            self._lit[view] = ColumnDataSource(self._strips([]))
+        return self._lit[view]
 
     def light(self, spans: Spans) -> None:
         """Mark time spans."""
@@ -100,10 +118,9 @@ class TimePlots:
     def look_at(self, view: str) -> None:
         """Another view: what is marked is marked there too, not before it is seen."""
         self._view = view
-        marked = {"x0": [a for a, _ in self._spans], "x1": [b for _, b in self._spans]}
-        lit = self._lit.get(view)
-        if lit is not None and dict(lit.data) != marked:
-            lit.data = marked
+        strips, lit = self._strips(self._spans), self._lit.get(view)
+        if lit is not None and dict(lit.data) != strips:
+            lit.data = strips
 
     def set_drag(self, mode: str) -> None:
         """Dragging zooms or selects a span."""

@@ -143,6 +143,7 @@
     document.body.dataset.ready = "yes";
   }
   document.documentElement.classList.toggle("dark", theme === "dark");
+  plots.askForMore((view, low, high) => ask("zoom", { view, low, high }));
   plots.spareStyles();
   plots.keepFitting();
   document.addEventListener("DOMContentLoaded", attach);

@@ -12,7 +12,9 @@ const plots = (() => {
     } catch { /* another Bokeh: slower, the same picture */ }
   }
 
-  // -- lines: a source with the tags [whole, name] draws the column `name` of the source `whole`
+  // -- lines: a source with the tags [whole, name, detail] draws the column `name` of the source
+  // `detail`, a window of the record, where that spans what is seen, else of the source `whole`.
+  // Where its name says that it is thinned, more of what is seen is asked for.
   function first(t, at, past) {  // index of the first time that is not before (past: is after) `at`
     let low = 0, high = t.length;
     while (low < high) {
@@ -45,12 +47,37 @@ const plots = (() => {
     return [Float64Array.from(chosen, (i) => t[i]), Float64Array.from(chosen, (i) => y[i])];
   }
 
+  const binsSeen = () => Math.max(400, Math.round(window.innerWidth / 2));
+
+  function spans(detail, whole, range) {
+    const t = detail.data.t, all = whole.data.t, last = all.length - 1;
+    return t.length > 1 && t[0] <= Math.max(range.start, all[0]) &&
+      t[t.length - 1] >= Math.min(range.end, all[last]);
+  }
+
   function thin(drawn, range) {
-    const [whole, name] = drawn.tags, { t, [name]: y } = whole.data;
-    const bins = Math.max(400, Math.round(window.innerWidth / 2));
+    const [whole, name, detail] = drawn.tags, from = spans(detail, whole, range) ? detail : whole;
+    const { t, [name]: y } = from.data, bins = binsSeen();
     const [seenT, seenY] = y ? between(t, y, range.start, range.end, bins) : [[], []];
     drawn.setv({ data: { t: seenT, y: seenY } }, { sync: false });
+    const seen = y ? first(t, range.end, true) - first(t, range.start, false) : 0;
+    if (from.name === "thinned" && seen < 2 * bins) wantMore(range);
   }
+
+  const MARGIN = 0.5, CALM_MS = 40;  // of what is seen, at either side; of no further zoom
+  let more = null, waiting = 0, wanted = "";  // who is asked, when, and for what the last time
+
+  function wantMore({ name, start, end }) {
+    const view = name.replace("time_", ""), margin = MARGIN * (end - start);
+    clearTimeout(waiting);
+    waiting = setTimeout(() => {
+      const what = `${view} ${start} ${end}`;
+      if (more && what !== wanted) more(view, start - margin, end + margin);
+      wanted = what;
+    }, CALM_MS);
+  }
+
+  const askForMore = (whom) => { more = whom; };
 
   // -- room: a title takes as many lines as it needs, figures in blocks stand where they fit
   const pen = document.createElement("canvas").getContext("2d");
@@ -146,7 +173,8 @@ const plots = (() => {
       for (const { data_source: drawn } of plot.renderers) {
         if (!drawn || !drawn.tags[1] || known.get(range).has(drawn)) continue;
         known.get(range).add(drawn);
-        drawn.tags[0].properties.data.change.connect(() => thin(drawn, range));
+        for (const source of [drawn.tags[0], drawn.tags[2]])
+          source.properties.data.change.connect(() => thin(drawn, range));
         thin(drawn, range);
       }
     }
@@ -188,8 +216,6 @@ const plots = (() => {
       set({ label_text_color: quiet, background_fill_color: CARD[theme] });
     else if (model.type === "ColorBar") set({ major_label_text_color: quiet,
       title_text_color: quiet, background_fill_alpha: 0 });
-    else if (model.type === "BoxAnnotation" && model.tags[0])
-      set({ fill_color: model.tags[0][theme] });
     if (glyph) set({ line_color: ink, text_color: ink, fill_color: ink });
   }
 
@@ -211,5 +237,5 @@ const plots = (() => {
     for (const model of all()) { paintOne(model, theme); twin(model, theme); }
   }
 
-  return { between, follow, keepFitting, look, move, paint, spareStyles };
+  return { askForMore, between, follow, keepFitting, look, move, paint, spareStyles };
 })();
