@@ -4,7 +4,13 @@ from rtid.compare.candidate import CandidateMap, learned
 from rtid.compare.comparison import Comparison, Intervals, compare, refitted
 from rtid.compare.correlation import Correlation, correlations
 from rtid.compare.cusum import Cusum, cusums, recursive_residuals
-from rtid.compare.dependence import Dependence, against_signals, by_direction, over_time
+from rtid.compare.dependence import (
+    Dependence,
+    across_piston,
+    against_signals,
+    by_direction,
+    over_time,
+)
 from rtid.compare.examination import Examination, examine
 from rtid.compare.motion import smooth_position
 from rtid.compare.places import NoSuchBlockError, Visit, blocks_in_span, spans_of_block
@@ -42,6 +48,7 @@ __all__ = [
     "ReferenceMap",
     "Simulation",
     "Visit",
+    "across_piston",
     "against_signals",
     "block_rows",
     "blocks_in_span",

@@ -65,6 +65,16 @@ def against_signals(model: Machine, part: Comparison, bins: int = BINS) -> list[
     return dependences
 
 
+def across_piston(model: Machine, part: Comparison) -> list[Dependence]:
+    """Dependence on the pressure difference of two chambers: what creeps past a seal follows it."""
+    names = [signal.name for signal in model.signals]
+    pressures = [c.pressure for c in model.chambers if c.pressure in names]
+    if len(pressures) != 2 or not len(part.signals):
+        return []
+    first, second = (part.signals[:, names.index(name)] for name in pressures)
+    return [binned(" - ".join(pressures), "Pa", first - second, part.residual_m3s)]
+
+
 def over_time(part: Comparison, bins: int = TIME_BINS) -> Dependence:
     """Dependence on time."""
     t_s = part.t_s if len(part.t_s) else np.zeros(1)

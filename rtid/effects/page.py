@@ -300,6 +300,7 @@ def readable(line: str) -> str:
     """An equation as it is printed: d/dt, powers and products as on paper."""
     line = re.sub(r"\bddt\(", "d/dt(", line).replace(" * ", " · ")
     line = re.sub(r"\*\*(\w+)", r"^\1", line).replace("**", "^")
+    line = re.sub(r"ssqrt\(([^()]*)\)", r"±√|\1|", line)
     return re.sub(r"d/dt\((\w+)\)", r"d\1/dt", line)
 
 

@@ -13,6 +13,7 @@ from rtid.compare import (
     Comparison,
     Dependence,
     Simulation,
+    across_piston,
     against_signals,
     block_rows,
     compare,
@@ -70,7 +71,7 @@ def look(result: Replay) -> Look:
                 for name in HORIZONS_S
             }
         depends = [d for d in against_signals(result.model, equation) if d.signal in signals]
-        depends.append(over_time(equation))
+        depends += [*across_piston(result.model, equation), over_time(equation)]
         parts[title] = SpanLook(equation, runs, depends, block_rows(solution, equation, flowmap))
     beta, sd = solution.beta_pa, solution.beta_sd_pa
     return Look(result.model, parts, flowmap, beta, sd, result.fit.lag_s)

@@ -29,7 +29,7 @@ def spoken(curve: Curve) -> tuple[float, float, str]:
 
 
 def spark(low: FloatArray, high: FloatArray, wide: float = 160.0) -> str:
-    """A band from the least to the largest value of each piece."""
+    """A band from the least to the largest value (pieces,) of each piece, any unit."""
     known = np.isfinite(low) & np.isfinite(high)
     low, high, n = low[known], high[known], max(int(known.sum()) - 1, 1)
     top, span = float(high.max()), max(float(high.max() - low.min()), 1e-300)

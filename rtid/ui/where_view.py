@@ -50,7 +50,7 @@ class WhereView(PageView):
         top = round_up(float(np.quantile(values, LARGEST))) if values else 1.0
         self._quantities = quantities(top)
         self.planes = BlockPlots(look.model, every, bench.mark_block)
-        self.signal = max(self._depends, key=_explains).signal if self._depends else ""
+        self.signal = _explains_most(look)
         self._over = PanelPlot(self._panel)
         self._lines = self._time.lines("where")
         self.side = self._side()
@@ -192,6 +192,9 @@ class WhereView(PageView):
         )
 
 
-def _explains(depends: Dependence) -> float:
-    """The share of the residual's variance that a signal explains, in the chamber that has most."""
-    return float(depends.explained.max(initial=0.0))
+def _explains_most(look: Look) -> str:
+    """The signal that explains most of the residual's variance, in all chambers and parts."""
+    shares: dict[str, float] = {}
+    for depends in (d for part in look.parts.values() for d in part.depends):
+        shares[depends.signal] = shares.get(depends.signal, 0.0) + float(depends.explained.sum())
+    return max(shares, key=shares.__getitem__, default="")

@@ -85,3 +85,11 @@ def test_missing_values_break_the_line_and_do_not_hide_their_neighbours(blank: P
 def test_a_window_beside_the_record_shows_nothing_of_it(blank: Page) -> None:
     t, _ = drawn(blank, [], 200.0, 300.0)
     assert len(t) <= 1
+
+
+def test_two_breaks_in_a_bin_are_both_kept(blank: Page) -> None:
+    """Of a run that begins anew right behind a gap the gap itself was joined."""
+    t, y = drawn(blank, [(40_000, 40_001, None), (40_001, 40_003, 9.0), (40_003, 40_004, None)])
+    first = int(np.flatnonzero(y == 9.0)[0])
+    assert np.isnan(y[first - 1]) and t[first - 1] == 40.0
+    assert np.isnan(y[first + 1 :][t[first + 1 :] <= 40.003]).any()

@@ -82,7 +82,7 @@ def _cut(part: Part, low: float, high: float, names: Iterable[str]) -> Piece:
 
 
 def unbroken(t: FloatArray, columns: Mapping[str, FloatArray]) -> list[Piece]:
-    """Times (n,) and columns (n,) between the gaps of the times."""
+    """Times (n,), s, and columns (n,) in the unit of their plot, between the gaps of the times."""
     at = [0, *_gaps(t).tolist(), len(t)] if len(t) else [0]
     return [(t[a:b], {name: y[a:b] for name, y in columns.items()}) for a, b in pairwise(at)]
 
@@ -90,7 +90,7 @@ def unbroken(t: FloatArray, columns: Mapping[str, FloatArray]) -> list[Piece]:
 def thinned(t: FloatArray, columns: Mapping[str, FloatArray], bins: int) -> Piece:
     """Least, largest and last value of every bin, NaN in place of the last where one is missing.
 
-    t and columns (n,); few of them are left as they are.
+    t (n,), s, and columns (n,) in the unit of their plot; few of them are left as they are.
     """
     n = len(t)
     if n <= ROWS * bins:

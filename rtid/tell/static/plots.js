@@ -29,19 +29,28 @@ const plots = (() => {
     const from = Math.max(0, first(t, low, false) - 1);
     const to = Math.min(t.length, first(t, high, true) + 1), n = to - from;
     if (n <= 2 * bins) return [t.slice(from, to), y.slice(from, to)];
-    const chosen = [];
-    const take = (i) => { if (i >= 0 && i !== chosen[chosen.length - 1]) chosen.push(i); };
+    const chosen = [], newest = () => chosen[chosen.length - 1];
+    const take = (i) => { if (i >= 0 && i !== newest()) chosen.push(i); };
+    let least = -1, most = -1;
+    const takeBoth = () => {
+      take(Math.min(least, most));
+      take(Math.max(least, most));
+      least = most = -1;
+    };
     take(from);
     for (let bin = 0; bin < bins; bin++) {
       const end = from + Math.floor((bin + 1) * n / bins);
-      let least = -1, most = -1, broken = -1;
       for (let i = from + Math.floor(bin * n / bins); i < end; i++) {
         const value = y[i];
-        if (value !== value) { broken = i; continue; }
+        if (value !== value) {  // broken here: what lies before is not joined to what lies behind
+          takeBoth();
+          if (y[newest()] === y[newest()]) take(i);
+          continue;
+        }
         if (least < 0 || value < y[least]) least = i;
         if (most < 0 || value > y[most]) most = i;
       }
-      [least, most, broken].sort((a, b) => a - b).forEach(take);
+      takeBoth();
     }
     take(to - 1);
     return [Float64Array.from(chosen, (i) => t[i]), Float64Array.from(chosen, (i) => y[i])];
