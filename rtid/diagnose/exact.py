@@ -155,15 +155,16 @@ def exact_trials(
     strengths by name to try as well, where they are below those of the bank.  anywhere: those too
     that end at nothing or at a bound, and so are no causes.
     """
-    timings = [*_behind_openings(present, timings)]
-    gains = _from_afar(state.coarse.beside(present), timings, other, hints, anywhere)
+    timings, coarse = [*_behind_openings(present, timings)], state.coarse.beside(present)
+    gains = _from_afar(coarse, timings, other, hints, anywhere)
     most = max([other, *(gain for gain, _, _ in gains)])
     trials: dict[Key, Trial] = {}
     for gain, timing, psi in gains:
         if gain < CLOSE * most:
             continue
         revision = replace(present.revision, timings=(*present.revision.timings, (timing, psi)))
-        now = tried(state.model, state.chunk, present.weights, revision)
+        weights = coarse.weights(((timing, psi),), present.weights)
+        now = tried(state.model, state.chunk, weights, revision)
         if not (anywhere or is_inside(now)):
             continue
         exact, key = present.held.sse - now.estimate.sse, key_of(timing)

@@ -91,6 +91,22 @@ class Beside:
 
     def cost(self, more: Timings) -> float:
         """Residual sum of squares with more timings; inf where they lose rows."""
+        return self._solved(more)[0]
+
+    def weights(self, more: Timings, like: Weights) -> Weights:
+        """Those like others, with the compliances that more timings give on the coarse map.
+
+        A delay that is missing bends the modulus by more than rows may be weighed apart.
+        """
+        theta, n_c = self._solved(more)[1], len(self.search.model.chambers)
+        if not self.search.model.has_pressures or len(theta) < n_c:
+            return like
+        low, high = sorted(1.0 / bound for bound in self.search.model.beta_bounds_pa)
+        compliance = theta[:n_c] * self.search.weights.compliance
+        return replace(like, compliance=np.clip(compliance, low, high))
+
+    def _solved(self, more: Timings) -> tuple[float, FloatArray]:
+        """The cost with more timings, and the coefficients of compliances and effects."""
         search, timings = self.search, (*self.timings, *more)
         weights = search.weights
         if any(t.replaces_lag for t, _ in timings):
@@ -100,13 +116,13 @@ class Beside:
         rows = rows_of(search.split, sent, weights, ROW_S, soft, search.thinning.m)
         self.most_rows = max(self.most_rows, rows.n)
         if rows.n < KEPT * self.most_rows:
-            return float("inf")
+            return float("inf"), np.zeros(0)
         columns = Columns(rows.condensed)
         for volumes in self.volumes:
             columns.add(volumes)
         s = project(rows, columns.released()).schur
         theta = np.linalg.lstsq(s[1:, 1:], s[1:, 0], rcond=1e-12)[0]
-        return float(s[0, 0] - s[0, 1:] @ theta)
+        return float(s[0, 0] - s[0, 1:] @ theta), np.asarray(theta)
 
     def gain(self, timing: TimingLaw, psi: Psi) -> float:
         """What a timing lowers the cost by."""

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.signal import savgol_filter
 
-from rtid.diagnose.fit import one_pass, prepare
+from rtid.diagnose.fit import one_pass, prepare, tried
+from rtid.diagnose.moving import SIZED
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.search import Search
 from rtid.diagnose.thinned import Thinning
@@ -62,6 +63,10 @@ def test_a_late_command_is_closed_in_on() -> None:
     psi, gain = beside.closed_in(delay, beside.bank(delay))
     assert psi[0] == pytest.approx(12e-3, rel=0.03)
     assert gain > 1.2 * max(beside.bank(play).values())
+    alone = tried(model, chunk, fit.weights, Revision((), ((delay, psi),)))
+    weights = beside.weights(((delay, psi),), fit.weights)
+    assert weights.compliance == pytest.approx(alone.compliance, rel=SIZED)  # no second pass
+    assert not np.allclose(fit.weights.compliance, alone.compliance, rtol=SIZED, atol=0.0)
 
 
 def test_a_bank_ends_where_it_falls() -> None:
