@@ -9,11 +9,14 @@ computer does is not in them.  Medians and ratios go to pytest-benchmark's `extr
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
 from time import process_time
+from types import MappingProxyType
 from typing import Any
+
+NOTHING_ASKED: Mapping[str, str] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -49,12 +52,22 @@ def ratio(times: dict[str, list[float]], name: str, base: str) -> float:
 
 
 def side_by_side(  # `benchmark` is pytest-benchmark's fixture, which has no types
-    benchmark: Any, title: str, unit: str, jobs: Sequence[Job], base: str, rounds: int = 15
+    benchmark: Any,
+    title: str,
+    unit: str,
+    jobs: Sequence[Job],
+    base: str,
+    rounds: int = 15,
+    asked: Mapping[str, str] = NOTHING_ASKED,
 ) -> dict[str, list[float]]:
-    """Time the jobs interleaved, report their medians and ratios to `base`, return all times."""
+    """Time the jobs interleaved, report their medians and ratios to `base`, return all times.
+
+    asked: what some of them should reach, by name, in words.
+    """
     times: dict[str, list[float]] = benchmark.pedantic(interleave, args=(jobs, rounds), rounds=1)
     rows = [
         {"name": name, "seconds": median(seconds), "ratio": ratio(times, name, base)}
+        | ({"asked": asked[name]} if name in asked else {})
         for name, seconds in times.items()
     ]
     report(benchmark, title, unit, rows)
@@ -62,10 +75,11 @@ def side_by_side(  # `benchmark` is pytest-benchmark's fixture, which has no typ
 
 
 def report(benchmark: Any, title: str, unit: str, rows: Sequence[dict[str, Any]]) -> None:
-    """Hand rows of {name, seconds or text, ratio or absent} to the table, and print them."""
+    """Hand rows of {name, seconds or text, ratio and asked or absent} to the table, print them."""
     benchmark.extra_info.update(title=title, unit=unit, rows=list(rows))
     print(f"\n{title}")
     for row in rows:
         value = row.get("text") or f"{row['seconds'] * 1e6:12.3f} us per {unit}"
         times = f"{row['ratio']:10.2f} x" if "ratio" in row else ""
-        print(f"  {row['name']:48s} {value} {times}")
+        asked = f"   asked: {row['asked']}" if "asked" in row else ""
+        print(f"  {row['name']:48s} {value} {times}{asked}")

@@ -21,15 +21,15 @@ def human_time(seconds: float) -> str:
 
 
 def _lines(runs: list[dict[str, Any]]) -> Iterator[str]:
-    yield "| | time | ratio |"
-    yield "|---|---|---|"
+    yield "| | time | ratio | asked |"
+    yield "|---|---|---|---|"
     for run in runs:
         info = run["extra_info"]
-        yield f"| **{info['title']}** | per {info['unit']} | |"
+        yield f"| **{info['title']}** | per {info['unit']} | | |"
         for row in info["rows"]:
             time = row.get("text") or human_time(row["seconds"])
             times = f"{row['ratio']:.3g} x" if "ratio" in row else ""
-            yield f"| {row['name']} | {time} | {times} |"
+            yield f"| {row['name']} | {time} | {times} | {row.get('asked', '')} |"
 
 
 def markdown(measured: dict[str, Any]) -> str:
@@ -38,7 +38,9 @@ def markdown(measured: dict[str, Any]) -> str:
     cpu = machine["cpu"].get("brand_raw", machine["machine"])
     head = (
         f"Measured by `make bench` on {cpu}, Python {machine['python_version']}; every group was "
-        "timed interleaved in one run, ratios are medians over its rounds.\n"
+        "timed interleaved in one run, times are of the processor, ratios are medians over the "
+        "rounds. Asked: at most so much time, memory or multiple of the first row; of other "
+        "libraries and of real time at least so many times.\n"
     )
     return "\n".join([head, *_lines([r for r in measured["benchmarks"] if r["extra_info"]])])
 

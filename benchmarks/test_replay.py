@@ -22,6 +22,7 @@ from rtid.estimator.solution import solve
 from rtid.sim.run_files import write_log
 
 PER_CYCLE = 3  # frames
+ALL, ASKED = "log to samples to estimate to all maps", "1500 x real time"
 CYCLES = 6000
 
 
@@ -41,13 +42,14 @@ def test_replay(benchmark: Any, tmp_path: Path, suffix: str) -> None:
         Job("read the log", lambda: open_log(log)),
         Job("frames to samples", lambda: assembler().push(read)),
         Job("estimate", lambda: empty(machine).advance(data)),
-        Job("log to samples to estimate to all maps", whole),
+        Job(ALL, whole),
     ]
     times = benchmark.pedantic(interleave, args=(jobs, 7), rounds=1)
     rows = []
     for name, seconds in times.items():
         typical = float(np.median(seconds))
-        rows.append({"name": name, "text": f"{SECONDS / typical:.0f} x real time"})
+        asked = {"asked": ASKED} if name == ALL else {}
+        rows.append({"name": name, "text": f"{SECONDS / typical:.0f} x real time"} | asked)
     size = f"{len(read)} frames, 10 x 8 blocks per edge"
     title = f"Replay of {SECONDS:.0f} s at 1 kHz ({size}) from {suffix}, warm"
     report(benchmark, title, "trace", rows)
