@@ -156,6 +156,8 @@ def _extended(state: TrialState, first: Fit, before: Residual) -> tuple[Fit, Res
         added = _add_best(state, present, last)
         if added is None:
             break
+        if present.rows is not None and present.rows is not added[0].rows:
+            present.rows.forget()  # who asked holds on to the first fit
         present, last = added
     return _look_back(state, present, last)
 

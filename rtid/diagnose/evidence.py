@@ -107,6 +107,10 @@ class Rows:
         """Cholesky factor of the maps' products and their prior."""
         return EvidenceFactor.of(self.maps())
 
+    def forget(self) -> None:
+        """Let the factor go, which is large: who asks for it again makes it anew."""
+        vars(self).pop("factor", None)
+
 
 @dataclass(frozen=True)
 class EvidenceFactor:

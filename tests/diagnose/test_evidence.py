@@ -105,6 +105,15 @@ def test_covariances_are_blocks_of_the_inverse() -> None:
         assert np.abs((cov - inverse[at, at]) / size).max() < 1e-5
 
 
+def test_a_factor_that_was_let_go_is_made_anew() -> None:
+    model, chunk, _ = record()
+    rows = rows_of(model, chunk[:2000], nominal_weights(model))
+    upper = rows.factor.upper.copy()
+    rows.forget()
+    assert "factor" not in vars(rows)
+    assert np.array_equal(rows.factor.upper, upper)
+
+
 def test_a_given_column_is_its_own_sum() -> None:
     """-V dP given from outside has the products of the built-in column."""
     model, chunk, _ = record()
