@@ -18,6 +18,7 @@ import numpy as np
 
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.regression import Score
+from rtid.diagnose.residual import transformed_like
 from rtid.diagnose.trials import detection_limit
 from rtid.effects.column import Candidate
 from rtid.effects.laws import cause_of
@@ -30,6 +31,8 @@ HALF_S = 0.25  # of a window: two halves tell whether anything moves
 LEAST_SAMPLES = 4  # of a half
 STILL = 2e-3  # of the rated flow: a chamber whose oil moves by more does not rest
 OPEN = 0.2  # of its largest gain, from which a valve counts as open
+SURE = 0.05  # of a block's mean flow, that its standard deviation may be
+MOST_PA = 1e6  # two sensors that show more apart are not joined, whatever the command says
 SEEN = 0.1  # of a leak's column that must be left beside the maps for its limit to count
 UNIFORM = 3.0**0.5  # half width over standard deviation, of what may lie anywhere between
 FLOW = "flow"  # the kind of an effect that takes or gives oil
@@ -116,11 +119,10 @@ def _resting(
 ) -> BoolArray:
     """True (w,) where this edge alone is open to a chamber that neither moves nor stores."""
     machine = fit.declared
-    gains = _gains(fit, edge) if chamber.pressure else np.zeros(0)
-    if not np.nanmax(gains, initial=0.0) > 0.0:
+    opens_v = _opens_at(fit, edge) if chamber.pressure else np.inf
+    if not np.isfinite(opens_v):
         return np.zeros(len(windows.t_s), bool)
-    wide = np.flatnonzero(gains >= OPEN * np.nanmax(gains))
-    is_open = _opening(machine, chunk, edge) >= edge.grid.u_v[wide[0]]
+    is_open = _opening(machine, chunk, edge) >= opens_v
     for other in machine.edges:
         if other is not edge and other.sign(chamber):
             is_open &= _opening(machine, chunk, other) <= max(0.0, other.safe_band_v)
@@ -147,13 +149,19 @@ def _net_flow(fit: Fit, chunk: FloatArray, windows: _Windows, chamber: Chamber) 
 
 
 def _known(fit: Fit, edge: Edge) -> tuple[FloatArray, FloatArray]:
-    """Mean flow, m3/s, of the known blocks of an edge and their drop, Pa: (nu, nd), else NaN."""
+    """Mean flow, m3/s, of the blocks of an edge that are known well, and drop, Pa: (nu, nd).
+
+    NaN elsewhere.
+    """
     machine = fit.model
     shape, size = edge.grid.shape, edge.grid.shape[0] * edge.grid.shape[1]
     first = machine.first_cells[[e.name for e in machine.edges].index(edge.name)]
     mine = (fit.map.cells >= first) & (fit.map.cells < first + size)
     flow = np.full(size, np.nan)
-    flow[fit.map.cells[mine] - first] = fit.map.terms[mine, 0] * edge.rated_q_m3s
+    mean = fit.map.terms[mine, 0]
+    if len(fit.map.cov):
+        mean = np.where(fit.map.cov[mine, 0, 0] < (SURE * mean) ** 2, mean, np.nan)
+    flow[fit.map.cells[mine] - first] = mean * edge.rated_q_m3s
     middle = 0.5 * (edge.grid.dp_pa[1:] + edge.grid.dp_pa[:-1])
     return flow.reshape(shape), np.broadcast_to(middle, shape)
 
@@ -164,6 +172,17 @@ def _gains(fit: Fit, edge: Edge) -> FloatArray:
     forward = flow * dp > 0.0
     gains = np.where(forward, np.abs(flow) / np.sqrt(np.maximum(np.abs(dp), 1.0)), np.nan)
     return np.array([np.nanmedian(row) if np.isfinite(row).any() else np.nan for row in gains])
+
+
+def _opens_at(fit: Fit, edge: Edge) -> float:
+    """The command, V, from which on the known map passes a fair part of its most; inf if none."""
+    gains = _gains(fit, edge)
+    known = np.flatnonzero(np.isfinite(gains))
+    if not len(known):
+        return np.inf
+    shut = known[gains[known] < OPEN * gains[known].max()]
+    wide = known[known > shut.max(initial=-1)]
+    return float(edge.grid.u_v[wide[0]])
 
 
 def _resistance(fit: Fit, edge: Edge, w: FloatArray) -> FloatArray:
@@ -187,7 +206,7 @@ def _leaks(
     """Into each chamber (chambers, w), m3/s: what is known to leak, and what may leak unseen."""
     machine = fit.model
     known, unseen = (np.zeros((len(machine.chambers), len(windows.t_s))) for _ in range(2))
-    view = RecordView.without_map(fit.declared, chunk, fit.compliance)
+    view = RecordView.of(machine, transformed_like(fit, chunk), fit.weights, fit.map)
     for effect in fit.revision.effects:
         if effect.law.kind == FLOW:
             value = fit.held.value(fit.column(effect))
@@ -232,7 +251,7 @@ def _spans(
     doubt = resistance * (_net_flow(fit, chunk, windows, chamber) + unseen) / UNIFORM
     noise = np.hypot(source.noise, sink.noise)
     for span in np.split(np.arange(len(at)), 1 + np.flatnonzero(np.diff(at.astype(int)))):
-        if at[span[0]]:
+        if at[span[0]] and np.abs(apart[span]).max() < MOST_PA:
             samples = float(windows.count[span].sum())
             random = np.sqrt(noise**2 / samples + np.var(apart[span]) / len(span))
             yield Joint(

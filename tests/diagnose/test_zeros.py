@@ -168,3 +168,21 @@ def test_a_gap_ends_a_rest() -> None:
     stop = np.flatnonzero(torn[:, 0] > chunk[-1, 0])
     torn[stop[::200], 1] = GAP_FLAG + 1
     assert told(learned(), torn) == {}
+
+
+def test_a_valve_that_is_shut_joins_nothing() -> None:
+    """What its map makes of blocks that it hardly knows, below the dead band, opens no valve."""
+    _, chunk, _ = record(seed=3)
+    still = with_stops(chunk, 3, ((1.2, 3.0), (-1.2, 3.0)))
+    assert told(learned(), still) == {}
+
+
+def test_a_finding_that_needs_the_flow_of_the_map_is_among_the_leaks() -> None:
+    """A lag of the spools beside a rest: the leaks' columns ask for the fitted map."""
+    _, chunk, _ = record(seed=3)
+    result = search(*record("input_delay", 15e-3, 3))
+    assert {zero.signal for zero in told(result, with_stops(chunk, 3)).values()} == {
+        "p_a",
+        "p_b",
+        "p_supply",
+    }
