@@ -188,16 +188,20 @@ def _from_afar(
     hints: Mapping[Key, float],
     anywhere: bool,
 ) -> list[tuple[float, TimingLaw, Psi]]:
-    """Gain and parameters of every timing that is promising from afar, or of all; one a name."""
+    """Gain and parameters of every timing that is promising from afar, or of all; one a name.
+
+    A lag may be before or behind the opening curve: from so far that cannot be told.
+    """
     banks = {timing: coarse.bank(timing, hints.get(key_of(timing), 0.0)) for timing in timings}
     bar = PROMISING * max([other, *(max(bank.values()) for bank in banks.values())])
-    best: dict[Key, tuple[float, TimingLaw, Psi]] = {}
+    best: dict[tuple[Key, bool], tuple[float, TimingLaw, Psi]] = {}
     for timing, bank in banks.items():
         if not anywhere and (max(bank.values()) < bar or max(bank.values()) <= 0.0):
             continue
         psi, gain = coarse.closed_in(timing, bank)
-        if key_of(timing) not in best or gain > best[key_of(timing)][0]:
-            best[key_of(timing)] = gain, timing, psi
+        form = key_of(timing), DEAD_BAND in timing.parameters
+        if form not in best or gain > best[form][0]:
+            best[form] = gain, timing, psi
     return list(best.values())
 
 
