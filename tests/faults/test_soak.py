@@ -293,7 +293,7 @@ def test_row_21_overload(overload: Overload, figure: Figure) -> None:
 
 
 @pytest.mark.xfail(
-    strict=False,
+    strict=True,
     reason="0.5 to 3.5 s, five overloads of 5 to 20 s and a median of three of 2.7 s, at load 20",
 )
 def test_row_21_normal_again(overload: Overload, figure: Figure) -> None:
