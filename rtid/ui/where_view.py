@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 from bokeh.layouts import column, row
-from bokeh.models import UIElement
+from bokeh.models import Row, UIElement
 from bokeh.plotting import figure
 
 from rtid.compare import BlockRow, Dependence
@@ -28,8 +28,10 @@ from rtid.tell.colours import CHAMBERS
 from rtid.tell.html import button, choice, select, text
 from rtid.tell.live import PanelPlot
 from rtid.tell.story import Panel
+from rtid.tell.words import named
 from rtid.ui.add_view import name_of
 from rtid.ui.desk_views import Bench
+from rtid.ui.shared import ShownRevision
 from rtid.ui.views import PageView
 from rtid.units import MPA, flow_name
 
@@ -41,7 +43,7 @@ class WhereView(PageView):
 
     def __init__(self, bench: Bench) -> None:
         super().__init__(bench)
-        self._shown = look = bench.look
+        self._shown, look = bench.session.revisions[-1], bench.look
         self.part = "validation" if "validation" in look.parts else next(iter(look.parts))
         self.quantity = "residual"
         self._time = bench.time
@@ -50,8 +52,9 @@ class WhereView(PageView):
         top = round_up(float(np.quantile(values, LARGEST))) if values else 1.0
         self._quantities = quantities(top)
         self.planes = BlockPlots(look.model, every, bench.mark_block)
-        self.signal = _explains_most(look)
-        self._over = PanelPlot(self._panel)
+        self._asked = ""  # the signal that the user wants to see
+        self._over = Row(sizing_mode="stretch_both")
+        self._drawn: tuple[Look, str, str] | None = None
         self._lines = self._time.lines("where")
         self.side = self._side()
         self.words = ""
@@ -64,19 +67,28 @@ class WhereView(PageView):
     @property
     def look(self) -> Look:
         """The revision that is shown."""
-        return self._shown
+        return self._shown.look
 
     def refresh(self) -> None:
         """The newest revision, and the names of all."""
         revisions = self.bench.session.revisions
         names = [f"{k} {name_of(r, k)}" for k, r in enumerate(revisions)]
         self.revisions = names if len(names) > 1 else []
-        self.revision, self._shown = names[-1], revisions[-1].look
+        self.revision, self._shown = names[-1], revisions[-1]
         self.show()
 
     @property
-    def _depends(self) -> list[Dependence]:
-        return self.look.parts[self.part].depends
+    def _pictures(self) -> dict[str, Panel]:
+        """The residual over what a named effect is proportional to, then over every signal."""
+        names = [chamber.name for chamber in self.look.model.chambers]
+        depends = sorted(self.look.parts[self.part].depends, key=_explained, reverse=True)
+        return _evidence(self._shown) | {d.signal: over_signal(names, d) for d in depends}
+
+    @property
+    def signal(self) -> str:
+        """What the residual is shown over: as chosen, else what explains most."""
+        pictures = self._pictures
+        return self._asked if self._asked in pictures else next(iter(pictures), "")
 
     @property
     def blocks(self) -> list[BlockRow]:
@@ -91,14 +103,17 @@ class WhereView(PageView):
             strip = self._time.plot("where", flow_name(), title, is_last)
             self._lines.add(strip, f"left {c}", CHAMBERS[c], 0.8)
             strips.append(strip)
-        parts = [row(s, sizing_mode="stretch_both") for s in (*strips, self._over.root)]
+        parts = [row(s, sizing_mode="stretch_both") for s in (*strips, self._over)]
         return column(*parts, sizing_mode="stretch_both")
 
     def show(self) -> None:
         """Draw what is chosen."""
         self._lines.show(flows_of(part.equation) for part in self.look.parts.values())
         self.planes.show(self.blocks, self._quantities[self.quantity])
-        self._show_signal()
+        if (wanted := (self.look, self.part, self.signal)) != self._drawn:
+            panel = self._pictures.get(self.signal)
+            self._over.children = [PanelPlot(panel).root] if panel else []
+            self._drawn = wanted
 
     def choose(self, what: str, asked: dict[str, str]) -> None:
         """Another quantity, part, signal or revision."""
@@ -107,11 +122,11 @@ class WhereView(PageView):
             self.quantity = name
         elif what == "part" and name in self.look.parts:
             self.part = name
-        elif what == "signal" and name in [d.signal for d in self._depends]:
-            self.signal = name
+        elif what == "signal":
+            self._asked = name
         elif what == "revision" and name in self.revisions:
             self.revision = name
-            self._shown = self.bench.session.revisions[self.revisions.index(name)].look
+            self._shown = self.bench.session.revisions[self.revisions.index(name)]
         self.show()
 
     def mark(self, keys: Sequence[Key], words: str) -> None:
@@ -128,27 +143,15 @@ class WhereView(PageView):
         """The block with the largest share of the residual."""
         return max(self.blocks, key=lambda b: b.residual_share, default=None)
 
-    def _show_signal(self) -> None:
-        if self._depends:
-            self._over.show(self._panel)
-
-    @property
-    def _panel(self) -> Panel:
-        """The residual over the chosen signal; empty where this part has none."""
-        names = [chamber.name for chamber in self.look.model.chambers]
-        result = next((d for d in self._depends if d.signal == self.signal), None)
-        return over_signal(names, result) if result else Panel("")
-
     def fragments(self) -> Mapping[str, str]:
         """Tools above, and what the picture says."""
         parts = {name: NAMES.get(name, name) for name in self.look.parts}
-        signals = [d.signal for d in self._depends]
         tools = select("revision", self.revisions, self.revision, "model") if self.revisions else ""
         tools += (
             select("quantity", list(self._quantities), self.quantity, "blocks show")
             + self._scale()
             + select("part", parts, self.part, "of")
-            + select("signal", signals, self.signal, "residual over")
+            + select("signal", list(self._pictures), self.signal, "residual over")
             + "<span><label>drag </label>"
             + choice("drag", ["zoom", "span"], self._time.drag, "mode")
             + "</span>"
@@ -192,9 +195,18 @@ class WhereView(PageView):
         )
 
 
-def _explains_most(look: Look) -> str:
-    """The signal that explains most of the residual's variance, in all chambers and parts."""
-    shares: dict[str, float] = {}
-    for depends in (d for part in look.parts.values() for d in part.depends):
-        shares[depends.signal] = shares.get(depends.signal, 0.0) + float(depends.explained.sum())
-    return max(shares, key=shares.__getitem__, default="")
+def _explained(depends: Dependence) -> float:
+    """Share of the residual's variance, in all chambers."""
+    return float(depends.explained.sum())
+
+
+def _evidence(shown: ShownRevision) -> dict[str, Panel]:
+    """What the verdict rests on, by the name of the effect; nothing where none is named.
+
+    The maps have learned a part of what is missing, so that the plain residual may follow nothing.
+    """
+    ranked = shown.told
+    if ranked is None:
+        return {}
+    pairs = zip(ranked.diagnosis.found, ranked.evidence, strict=False)
+    return {named((effect.effect, effect.where)): chart.panels[0][0] for effect, chart in pairs}

@@ -216,6 +216,16 @@ def test_from_the_verdict_to_the_falling_bar_and_back(
     page.wait_for_selector(NAMED)
     assert "Internal leakage" in page.locator("#verdict").inner_text()
     assert_clear(page, NAMED, sizes=SIZES[-1:])
+    page.keyboard.press("2")  # its first picture is the one that explains most
+    page.wait_for_selector("#where.shown canvas")
+    page.wait_for_function(
+        "() => document.querySelector('#signal_select').value === 'Internal leakage, laminar (a-b)'"
+    )
+    shown = "m => m.type === 'Title' && m.text.startsWith('before: ')"
+    page.wait_for_function(f"() => [...Bokeh.documents[0].all_models].some({shown})")
+    page.select_option("#signal_select", "p_a - p_b")
+    over = "m => m.type === 'Title' && m.text.startsWith('residual over p_a - p_b')"
+    page.wait_for_function(f"() => [...Bokeh.documents[0].all_models].some({over})")
     page.keyboard.press("3")
     page.wait_for_selector("#why_ranking .card h2.found")
     assert "q_a = -C_il" in page.locator("#why_page pre").inner_text()
