@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 CHANNEL = f"239.74.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"  # one for each test worker
 SEED = 3
 SOAK_MINUTES, SHORT_S = 30.0, 8.0
+SPEAKS_S = 400.0, 2400.0  # the machine, of which each 100 s take 0.6 s to make; while it is soaked
 MOST_MB = 20.0  # that a tab grows by in half an hour
 START_S = 90.0  # of a cold daemon on a loaded machine
 END_S = 60.0
@@ -71,13 +72,15 @@ def end(process: subprocess.Popen[bytes]) -> None:
 
 
 @pytest.fixture(scope="module")
-def machine(project: Path) -> Iterator[Path]:
+def machine(project: Path, request: pytest.FixtureRequest) -> Iterator[Path]:
     """A daemon and its machine on the test bus, in processes of their own; the state folder."""
     state = project.parent / "state"
     bus = ["--bus", f"udp_multicast:{CHANNEL}", "--test-bus", "--state", str(state)]
     run = [sys.executable, "-m", "rtid", "run", str(project), *bus]
     speak = [sys.executable, "-m", "rtid", "simulate", "--plant", str(SEED), "--motion", "rich"]
-    speak += ["--duration", "2400", "--bus", "udp_multicast", "--channel", CHANNEL]
+    is_soaked = any(item.get_closest_marker("soak") for item in request.session.items)
+    speak += ["--duration", str(SPEAKS_S[is_soaked]), "--bus", "udp_multicast"]
+    speak += ["--channel", CHANNEL]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     with ExitStack() as stack:
         for command in (run, speak):
