@@ -20,8 +20,8 @@ from firmware_bridge.frames import EXTENDED, empty
 from rtid.cli.main import run
 from rtid.estimator.noise import estimate_noise
 from rtid.project import load
-from rtid.trace import Finding, Report, bus, judge, timing
-from rtid.trace.check import against_signs
+from rtid.trace.arrivals import bus, timing
+from rtid.trace.check import Finding, Report, against_signs, judge
 from rtid.trace.plausible import Motion, Spring
 from rtid.trace.series import Series, describe, longest_frozen
 from rtid.trace.signals import read_recording

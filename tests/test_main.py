@@ -53,6 +53,14 @@ def test_a_command_that_reads_frames_does_not_load_what_reads_mf4(tmp_path: Path
     assert done.stdout.endswith("loaded: ['can']\n")
 
 
+def test_the_page_of_a_daemon_loads_neither_numba_nor_a_bus() -> None:
+    """It stands on a gateway beside the loop; where a record is opened the worker learns it."""
+    code = "import rtid.ui.server, sys; print({'can', 'numba', 'scipy'} & set(sys.modules) or '')"
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == ""
+
+
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert ends(["--version"]) == Exit.OK
     assert capsys.readouterr().out == f"rtid {rtid.__version__}\n"

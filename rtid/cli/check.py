@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from firmware_bridge.mended import Mended
     from rtid.project import Project
     from rtid.tell.story import Table
-    from rtid.trace import IdTiming, Report, Stamps, Timing
+    from rtid.trace.arrivals import IdTiming, Stamps, Timing
+    from rtid.trace.check import Report
     from rtid.trace.described import Described
 
 SCHEMA = 1
@@ -83,7 +84,7 @@ def _judged(project: Project, path: Path, progress: Progress) -> Report:
     """The report of a trace, and what replay learns from it where nothing stands against that."""
     from rtid.estimator.flowmap import VALID
     from rtid.study.study import Study
-    from rtid.trace import judge, with_learned
+    from rtid.trace.check import judge, with_learned
     from rtid.trace.reading import NoSamplesError
     from rtid.trace.signals import read_recording
 
@@ -112,7 +113,7 @@ def _check_bus(log: Path, dbc: Path | None, as_json: bool) -> None:
     from firmware_bridge import catalog
     from firmware_bridge.mended import mend
     from firmware_bridge.sources import open_log
-    from rtid.trace import bus, stamps
+    from rtid.trace.arrivals import bus, stamps
     from rtid.trace.described import described, match, on_channels
 
     raw = open_log(log, mended=False)

@@ -10,13 +10,15 @@ import sqlite3
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rtid.daemon.acceptance import Acceptance
-from rtid.daemon.jobs import Publication
 from rtid.daemon.status import Alarm, Verdict
-from rtid.model import Edge
-from rtid.plain import FloatArray
+
+if TYPE_CHECKING:
+    from rtid.daemon.jobs import Publication
+    from rtid.model import Edge
+    from rtid.plain import FloatArray
 
 FILE = "history.sqlite"
 DAY_S = 86_400.0

@@ -24,7 +24,7 @@ from rtid.project import Project, load
 from rtid.study.spans import added_parts
 from rtid.study.study import diagnose_live
 from rtid.tell.diagnosed import sentences
-from rtid.trace import judge
+from rtid.trace.check import judge
 from rtid.trace.signals import read_recording
 
 NICE = 5

@@ -37,7 +37,7 @@ from rtid.study.quick_project import DEAD_VOLUME, head_of, of_channels, of_missi
 from rtid.study.quick_rate import QuickRate, quick_rate
 from rtid.study.rate_pairs import driven_pairs, pressed_pairs
 from rtid.study.study import diagnose_trace
-from rtid.trace import Report, judge
+from rtid.trace.check import Report, judge
 from rtid.trace.quick_data import BAD, Point, level_of, points
 from rtid.trace.quick_source import Source, open_source, roles_of
 from rtid.trace.reading import NoSamplesError

@@ -14,7 +14,7 @@ import numpy as np
 from firmware_bridge.samples import ROW
 from rtid.model import Machine
 from rtid.plain import FloatArray
-from rtid.trace import Report
+from rtid.trace.check import Report
 from rtid.trace.quick_source import NEEDED
 from rtid.trace.series import SignalReport
 from rtid.trace.signals import Recording
