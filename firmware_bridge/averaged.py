@@ -12,7 +12,10 @@ along a window of length T, and means over the windows k and k + 1,
 
 exactly; half the sum of both means of n is over a wider window, and makes D too large by what n
 does within T.  Signals `ahead` carry this mean, for which the next window must have ended.  Where n
-turns in between it is neither direction's: there the line is broken, as by a gap.
+turns in between it is neither direction's: there the line is broken, as by a gap.  What a pressure
+lets flow moves x in the same way, while its own change from mean to mean is what is stored: its
+mean ahead is one more signal, of another name.  A pump that stands drives nothing: only where
+something turns the pressure counts, which is part of a window where a stroke begins or ends.
 """
 
 from __future__ import annotations
@@ -31,10 +34,11 @@ Floats = NDArray[np.float64]
 class Averaged:
     """Samples in, their means over windows of step_us microseconds out; 0 lets them through.
 
-    ahead: names of signals whose value acts from the mean instant of a window to that of the next.
+    ahead: signals whose value acts from the mean instant of a window to that of the next, each with
+    the name of the signal that carries that mean: its own, or one behind all others.
     """
 
-    def __init__(self, step_us: int, ahead: tuple[str, ...] = ()) -> None:
+    def __init__(self, step_us: int, ahead: tuple[tuple[str, str], ...] = ()) -> None:
         self.step_us, self.ahead = step_us, ahead
         self._begun: Samples | None = None  # of the window that is not over
         self._origin_us, self._next = 0, -1  # where windows count from; the number that is due
@@ -42,16 +46,18 @@ class Averaged:
 
     def push(self, samples: Samples) -> Samples:
         """The means of the windows that these samples (n, signals) end, at their mean instants."""
-        if not self.step_us or not len(samples):
+        if not self.step_us:
             return samples
         samples = _with_moments(samples, self.ahead)
+        if not len(samples):
+            return self._looking_ahead(samples)
         if self._begun is not None:
             samples = join([self._begun, samples])
         begin = np.union1d([0], np.flatnonzero(samples.flags & GAP)).tolist()
         ends = [*begin[1:], len(samples)]
         runs = [_rows(samples, *ends_of) for ends_of in zip(begin, ends, strict=True)]
         made = join([self._of_run(run, run is runs[-1]) for run in runs])
-        return self._looking_ahead(made) if self.ahead else made
+        return self._looking_ahead(made)
 
     def _of_run(self, run: Samples, is_open: bool) -> Samples:
         """The windows of samples without a gap; the last one waits for more, or is dropped."""
@@ -70,30 +76,42 @@ class Averaged:
 
     def _looking_ahead(self, made: Samples) -> Samples:
         """All windows but the newest, with the means ahead; made: with moments behind them."""
+        if not self.ahead:
+            return made
         if self._last is not None:
             made = join([self._last, made])
         self._last = _rows(made, len(made) - 1, len(made)) if len(made) else None
-        n, m = len(made.names) - 3 * len(self.ahead), len(self.ahead)
-        at = [made.names.index(name) for name in self.ahead]
-        plain, late, late_size = made.values[:, at], *np.split(made.values[:, -2 * m :], 2, axis=1)
+        n = len(made.names) - 4 * len(self.ahead)
+        is_own = np.array([signal == name for signal, name in self.ahead])
+        plain, size, late, late_size = np.split(made.values[:, n:], 4, axis=1)
         ahead = late[:-1] + (plain - late)[1:]
-        size = late_size[:-1] + (made.values[:, n : n + m] - late_size)[1:]
+        size = late_size[:-1] + (size - late_size)[1:]
         goes_on = (made.flags[1:] & GAP) == 0
         values, flags = made.values[:-1, :n].copy(), made.flags.copy()
-        values[:, at] = np.where(goes_on[:, None], ahead, plain[:-1])
-        flags[1:][goes_on & (np.abs(ahead) < (1.0 - TURNED) * size).any(axis=1)] |= GAP
+        moved = np.where(goes_on[:, None], ahead, plain[:-1])
+        own = [made.names.index(signal) for signal, name in self.ahead if signal == name]
+        values[:, own] = moved[:, is_own]
+        turned = (np.abs(ahead) < (1.0 - TURNED) * size)[:, is_own].any(axis=1)
+        flags[1:][goes_on & turned] |= GAP
         if self._last is not None:
             self._last = replace(self._last, flags=flags[-1:])
-        return Samples(made.names[:n], made.t_us[:-1], values, flags[:-1])
+        more = [name for signal, name in self.ahead if signal != name]
+        values = np.hstack([values, moved[:, ~is_own]])
+        return Samples((*made.names[:n], *more), made.t_us[:-1], values, flags[:-1])
 
 
-def _with_moments(samples: Samples, ahead: tuple[str, ...]) -> Samples:
-    """The samples with |n|, and n and |n| to be weighed along their windows, of signals ahead."""
+def _with_moments(samples: Samples, ahead: tuple[tuple[str, str], ...]) -> Samples:
+    """The samples with what signals move and its size, twice: once to be weighed in a window."""
     if not ahead:
         return samples
-    n = samples.values[:, [samples.names.index(name) for name in ahead]]
-    names, values = (*samples.names, *3 * ahead), [samples.values, np.abs(n), n, np.abs(n)]
-    return Samples(names, samples.t_us, np.hstack(values), samples.flags)
+    at = [samples.names.index(signal) for signal, _ in ahead]
+    is_own = np.array([signal == name for signal, name in ahead])
+    moving = samples.values[:, at].copy()
+    turns = (moving[:, is_own] != 0.0).any(axis=1)
+    moving[:, ~is_own] *= turns[:, None]
+    values = np.hstack([samples.values, *2 * [moving, np.abs(moving)]])
+    names = (*samples.names, *4 * [signal for signal, _ in ahead])
+    return Samples(names, samples.t_us, values, samples.flags)
 
 
 def _means(run: Samples, first: NDArray[np.intp], sizes: NDArray[np.intp], weighed: int) -> Samples:

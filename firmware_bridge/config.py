@@ -58,7 +58,8 @@ class Assembly:
     """Everything that the assembler needs; `row_signal` is the position: it makes the rows.
 
     average_s: of the windows whose means are the samples, 0 for none; ahead: signals of which a
-    sample then carries the mean from its own window to the next one.
+    sample then carries the mean from its own window to the next one, each with the name that this
+    mean has: its own, or that of one more signal.
     """
 
     mode: str
@@ -67,4 +68,4 @@ class Assembly:
     row_signal: str
     max_gap_s: float = 0.05
     average_s: float = 0.0
-    ahead: tuple[str, ...] = ()
+    ahead: tuple[tuple[str, str], ...] = ()

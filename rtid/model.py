@@ -29,6 +29,7 @@ TAYLOR, LAPPED, BLENDED, PROPORTIONAL = BASES = "taylor", "lapped", "blended", "
 BOTH, COMMAND_ONLY, DROP_ONLY = "both", "command", "drop"
 MOST_MODE = 62  # a set of modes is kept as bits of one integer
 FLOW, VOLUME = "m3/s", "m3"  # units of a machine with pressures
+AHEAD = "mean ahead of "  # before a signal's name: its mean up to the next mean
 NONE = ""  # in place of a signal's name: a quantity that is always zero
 
 
@@ -310,6 +311,11 @@ class Machine:
         """The same machine with the noise of some signals (1 sigma, SI), by name, replaced."""
         signals = tuple(replace(s, noise=noise.get(s.name, s.noise)) for s in self.signals)
         return replace(self, signals=signals)
+
+    def ahead(self, name: str) -> str:
+        """The signal that carries the mean of `name` up to the next sample: itself without one."""
+        is_there = any(signal.name == AHEAD + name for signal in self.signals)
+        return AHEAD + name if is_there else name
 
     def column(self, name: str) -> int:
         """Column of the signal `name` in `Samples.values`; KeyError if the model has none."""

@@ -148,7 +148,7 @@ def test_the_mean_ahead_moves_the_mean_state() -> None:
     t_us = step_us * np.arange(len(n))
     x = np.cumsum(n) * 1e-6 * step_us - 0.5e-6 * step_us * n  # in the middle of each sample
     samples = Samples(("n", "x"), t_us, np.column_stack([n, x]), np.full(len(n), ROW, np.uint8))
-    averaged, ahead = Averaged(step_us * size, ("n",)), Averaged(step_us * size, ("n",))
+    averaged, ahead = (Averaged(step_us * size, (("n", "n"),)) for _ in range(2))
     whole = ahead.push(samples)
     pieces = join([averaged.push(_part(samples, k, k + 31)) for k in range(0, len(n), 31)])
     np.testing.assert_array_equal(whole.flags, pieces.flags)
@@ -162,21 +162,47 @@ def test_the_mean_ahead_moves_the_mean_state() -> None:
     assert begun == 0 and broken and set(broken) <= {turn, turn + 1}
 
 
+def test_a_pressure_s_mean_ahead_counts_while_something_turns() -> None:
+    """What leaks moves the mean state by it, exactly, where a stroke begins within a window too."""
+    step_us, size, rng = 2_000, 50, np.random.default_rng(46)
+    n = np.concatenate([np.zeros(130), np.full(240, 5.0), np.zeros(230)])
+    t_us, p = step_us * np.arange(len(n)), np.cumsum(rng.standard_normal(len(n)))
+    flow = (n > 0) * p
+    x = np.cumsum(flow) * 1e-6 * step_us - 0.5e-6 * step_us * flow
+    values, ahead = np.column_stack([n, p, x]), (("n", "n"), ("p", "p ahead"))
+    samples = Samples(("n", "p", "x"), t_us, values, np.full(len(n), ROW, np.uint8))
+    whole, averaged = Averaged(step_us * size, ahead).push(samples), Averaged(step_us * size, ahead)
+    pieces = join([averaged.push(_part(samples, k, k + 31)) for k in range(0, len(n), 31)])
+    np.testing.assert_allclose(whole.values, pieces.values, atol=1e-12)
+    assert len(averaged.push(_part(samples, 0, 0))) == 0 and pieces.names[-1] == "p ahead"
+    moved = np.diff(whole.column("x"))
+    np.testing.assert_allclose(moved, 0.1 * whole.column("p ahead")[:-1], atol=1e-9)
+    means = p.reshape(-1, size).mean(axis=1)[: len(whole)]
+    np.testing.assert_allclose(whole.column("p"), means, atol=1e-12)
+
+
 def _part(samples: Samples, start: int, stop: int) -> Samples:
     cut = slice(start, stop)
     return Samples(samples.names, samples.t_us[cut], samples.values[cut], samples.flags[cut])
 
 
-def test_what_one_port_leaks_does_not_hide_the_other(tmp_path: Path) -> None:
-    """With the first leak in the project the second is seen, and both displacements are right."""
-    rng = np.random.default_rng([61, 0])
+@pytest.mark.parametrize("k", [0, 9, 13])
+def test_what_one_port_leaks_does_not_hide_the_other(tmp_path: Path, k: int) -> None:
+    """With the first leak in the project the second is seen, both displacements are right.
+
+    And nothing else is named: in two of these a compliance over the stroke was, of what half the
+    sum of two means of a pressure misses of its own mean from the one to the other.
+    """
+    rng = np.random.default_rng([61, k])
     plant = replace(Driven.drawn(rng, float(rng.uniform(1e-9, 3e-9))), compliance=0.0)
     for _ in range(2):
         plant.recorded(tmp_path / "pump.csv", rng, 2e6)
     looked = quick(plant.recorded(tmp_path / "pump.csv", rng, 2e6))
     assert isinstance(looked, QuickRate)
-    found = {f.where: f.parameters["coefficient"].value for f in looked.diagnosis.found}
-    assert found == {p: pytest.approx(plant.leakage, rel=0.05) for p in ("p_a", "p_b")}
+    found = {f.where: f.parameters["coefficient"].value for f in looked.diagnosis.found
+             if f.effect == "drive_leakage"}  # fmt: skip
+    assert found == {p: pytest.approx(plant.leakage, rel=0.02) for p in ("p_a", "p_b")}
+    assert len(looked.diagnosis.found) == 2
     band = looked.bands["f"]
     assert 2 * np.pi * band.gain_above == pytest.approx(plant.out, rel=0.008)
     assert 2 * np.pi * band.gain_below == pytest.approx(plant.back, rel=0.008)

@@ -245,9 +245,14 @@ def _alone(model: Machine, line: LawLine, at: tuple[int, ...]) -> Meant:
 
 
 def _behind_port(model: Machine, line: LawLine, c: int, port: str, way: int) -> Meant:
-    """Into the rate, while its command puts this port under pressure."""
-    others = [name for name, _ in model.chambers[c].ports if name != port]
-    by = {PORT: _signal(port), "other": _signal(others[0] if others else "")}
+    """Into the rate, while its command puts this port under pressure.
+
+    What flows moves the state by the pressures' means ahead, what is stored by their change.
+    """
+    seen = [port, *(name for name, _ in model.chambers[c].ports if name != port)]
+    if line.inner is None:
+        seen = [model.ahead(name) for name in seen]
+    by = {PORT: _signal(seen[0]), "other": _signal(seen[1] if len(seen) > 1 else "")}
     yield c, line, by | {"way": number(float(way))} | _of_machine(model)
 
 

@@ -13,6 +13,7 @@ from firmware_bridge.catalog import Catalog
 from firmware_bridge.config import CYCLE, MULTIRATE, Assembly, MessageSource, SignalSource
 from rtid.effects.summed import RunningSum, sum_signal
 from rtid.model import (
+    AHEAD,
     BOTH,
     COMMAND_ONLY,
     MOST_MODE,
@@ -43,10 +44,9 @@ NO_BORDERS = (-1.0, 1.0)  # of a second argument that a map has not
 
 def build_model(sections: Sections, catalog: Catalog | None) -> Machine:
     """The declared machine, SI."""
-    ahead = _means_ahead(sections)
-    signals = tuple(
-        replace(_signal(name, signal, catalog), is_ahead=name in ahead)
-        for name, signal in _right(sections, catalog).items()
+    right = _right(sections, catalog).items()
+    signals = _with_means_ahead(
+        tuple(_signal(name, signal, catalog) for name, signal in right), _means_ahead(sections)
     )
     rate = sections.rate
     measured = rate.measured if rate and rate.measured else NONE
@@ -111,14 +111,26 @@ def build_assembly(
     )
 
 
-def _means_ahead(sections: Sections) -> tuple[str, ...]:
+def _means_ahead(sections: Sections) -> tuple[tuple[str, str], ...]:
     """What moves a state whose samples are means: what counts is its own mean from one to the next.
 
-    Through two means the line is wrong by an eighth where it turns within a window.
+    Through two means the line is wrong by an eighth where it turns within a window.  A pressure
+    lets oil pass in the same way, and stores by what it changes from mean to mean: it is both.
     """
     if not (sections.rate and sections.rate.state and sections.source.average_s):
         return ()
-    return tuple(dict.fromkeys(u for part in sections.maps.values() for u in part.all_commands))
+    commands = dict.fromkeys(u for part in sections.maps.values() for u in part.all_commands)
+    ports = ((port, AHEAD + port) for port in sections.rate.ports)
+    return (*((command, command) for command in commands), *ports)
+
+
+def _with_means_ahead(
+    signals: tuple[Signal, ...], ahead: tuple[tuple[str, str], ...]
+) -> tuple[Signal, ...]:
+    """The signals, those that are means ahead marked, and one more for each that is both."""
+    by_name = {signal.name: signal for signal in signals}
+    marked = {name: replace(by_name[of], name=name, is_ahead=True) for of, name in ahead}
+    return tuple((by_name | marked).values())
 
 
 def digest(value: object) -> str:
