@@ -31,6 +31,7 @@ from rtid.daemon.guard import PROOF, TRUST, Guard, candidate_of, with_wear
 from rtid.daemon.map_check import Judge
 from rtid.daemon.offering import Offering
 from rtid.daemon.pipe import Pipe
+from rtid.daemon.realtime import SWITCH_S
 from rtid.daemon.recorder import Recorder
 from rtid.daemon.shadow import Shadow
 from rtid.daemon.status import EffectStatus
@@ -496,6 +497,7 @@ def _notes(guard: Guard | None) -> dict[str, Any]:
 
 def main() -> None:
     """Serve the daemon at the other end of the pipe until it says None or is gone."""
+    sys.setswitchinterval(SWITCH_S)  # a save must not wait for what solves
     fd, project, folder = sys.argv[1:]
     pipe, one_at_a_time = Pipe(int(fd)), threading.Lock()
 
@@ -506,12 +508,12 @@ def main() -> None:
     begun, waiting = Queue[Analyst](), Waiting(MOST_BYTES)
     receiver = threading.Thread(target=lambda: _receive(pipe, begun.get(), waiting), daemon=True)
     receiver.start()  # before this thread, and all that it starts, is nice: to save does not wait
-    os.nice(NICE)
     loaded = on_board(load(project), lambda _: None)
     Estimator(loaded.model).solution()  # compiles
     analyst = Analyst(loaded, Path(folder), answer)
     try:
         analyst.begin()
+        os.nice(NICE)  # not before: until it is ready nothing of what is learned is saved
         answer(jobs.Ready())
         begun.put(analyst)
         while (job := waiting.get()) is not None:

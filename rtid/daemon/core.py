@@ -51,7 +51,7 @@ class Core:
         self.worn: Wear | None = None  # of the machine, what was learned is to be carried over
         self.is_proving = False  # the map held has still to foretell: what is learned is a shadow
         self.is_solving = self.is_saving = True  # the analyst, or it is not ready yet
-        self.save_s = 0.0  # what the last snapshot took until it was on the disk
+        self.save_s = 0.0  # what a snapshot may take until it is on the disk
         self._kept = 0
         self._collector = Collector(2 + len(learner.estimator.model.signals), daemon.record_mb > 0)
         self._publish_ns, self._store_ns = (

@@ -148,8 +148,6 @@ class Daemon:
         self._loop = loop = Loop(rate_hz, _until(core.tick, end_ns, self.stop))
         keeper.teller.loop = loop
         keeper.start()
-        if self._project.sections.daemon.priority:
-            realtime.favour_threads()
         logger.info("running %s on %s %s at %g Hz", self._project.name, self._bus.interface,
                     self._bus.channel, rate_hz)  # fmt: skip
         try:

@@ -11,8 +11,10 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
+from statistics import median
 
-from rtid.daemon import jobs, wording
+from rtid.daemon import jobs, realtime, wording
 from rtid.daemon import status as st
 from rtid.daemon.acceptance import Acceptance, taken
 from rtid.daemon.alarms import Alarms
@@ -27,7 +29,8 @@ from rtid.daemon.suspension import remember, suspended
 from rtid.daemon.teller import Facts, Saving, Teller
 
 LOOK_S = 0.1
-OVERLOAD, LOADS = 0.05, 6  # share of ticks lost within so many looks that is worth an alarm
+OVERLOAD, LOADS = 0.05, 5  # share of ticks lost in most of so many looks that is worth an alarm
+SAVES = 0.8  # what one save took counts for the next ones: on a busy computer some take long
 CHECK_S = 30.0  # of samples after which the project file is held against them
 BEGINS_S = 5.0  # so long after the start nobody misses a message
 FALLEN_S = 60.0  # so long a helper that ended is an alarm
@@ -59,7 +62,7 @@ class Keeper:
         self._first_s: float | None = None  # time of the first sample of this run
         self._is_checked = self._is_ready = False
         self._told_s = 0.0
-        self._loads: deque[tuple[int, int, Counter[str]]] = deque(maxlen=LOADS)
+        self._loads: deque[tuple[int, int, Counter[str]]] = deque(maxlen=LOADS + 1)
         self._deaf = ""  # why no request can be taken
         self._fallen = 0
         self._fallen_s = -math.inf
@@ -87,6 +90,8 @@ class Keeper:
             if time.monotonic() >= next_s:
                 next_s = time.monotonic() + 1.0
                 self._survived(self._tell)
+                if self._facts.project.sections.daemon.priority:
+                    realtime.favour_threads()  # also those that have begun since
 
     def _survived(self, step: Callable[[], None]) -> None:
         """Take a step; one that fails must not keep the others from being taken."""
@@ -110,7 +115,8 @@ class Keeper:
             elif isinstance(answer, jobs.SavedSnapshot | jobs.NotSaved | jobs.SavedAgain):
                 self._saving.hear(answer)
                 if isinstance(answer, jobs.SavedSnapshot):
-                    self._core.save_s = time.monotonic() - answer.made_s
+                    took_s = time.monotonic() - answer.made_s
+                    self._core.save_s = max(took_s, SAVES * self._core.save_s)
             elif isinstance(answer, jobs.RecorderState):
                 self._recording = answer.path
                 for name, folder in answer.kept.items():
@@ -227,14 +233,16 @@ class Keeper:
             self._analyst.put(jobs.Recall(self.plant.trusted, -math.inf))
 
     def _look_at_load(self) -> None:
-        """Ticks that were lost within the last few looks."""
+        """Ticks that were lost within the last few looks; one stall is no overload."""
         if self.teller.loop is None:
             return
         total = self.teller.loop.total
         lost = total.overruns + total.skipped
         self._loads.append((total.ticks + total.skipped, lost, Counter(total.causes)))
         (due_0, lost_0, causes_0), (due, lost, causes) = self._loads[0], self._loads[-1]
-        much = lost - lost_0 > OVERLOAD * (due - due_0)
+        looks = pairwise(self._loads)
+        shares = [(l1 - l0) / max(1, d1 - d0) for (d0, l0, _), (d1, l1, _) in looks]
+        much = len(shares) == LOADS and median(shares) > OVERLOAD
         text = wording.overload(lost - lost_0, due - due_0, causes - causes_0)
         self.alarms.put("overload", "loop", text if much else "")
 

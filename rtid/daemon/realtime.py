@@ -1,7 +1,8 @@
 """What the system can do for a steady loop; each step returns whether it was granted.
 
-Only the calling thread is promoted (children and new threads start as ordinary ones), and a loop
-that hangs is stopped by the system after RUN_AWAY_S of computing without a pause.
+The calling thread is promoted, and those beside it a little: what holds the interpreter must not be
+put aside by the machine's other work.  Children and new threads start as ordinary ones, and what
+hangs is stopped by the system after RUN_AWAY_S of computing without a pause.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import sys
 import threading
 
 RUN_AWAY_S = 2
-FAVOUR = -10
+BESIDE = 1  # priority of the other threads: before all that is not real-time
 SWITCH_S = 0.5e-3  # another Python thread hands over the interpreter after so long
 MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4  # on fault: what is reserved costs nothing
 PR_SET_TIMERSLACK = 29
@@ -40,14 +41,17 @@ RLIMIT_RTTIME: int = getattr(resource, "RLIMIT_RTTIME", 15)
 
 
 def favour_threads() -> None:
-    """Nice all other threads by -10, where that is granted.
+    """SCHED_RR, below the loop's priority, for all threads that are ordinary ones still.
 
-    One of them that was put aside while it held the interpreter would hold up the loop.
+    They share the loop's interpreter and its locks: one of them that was put aside while it held
+    either would hold up the loop, whatever priority that has.
     """
     for thread in threading.enumerate():
-        if thread.native_id not in (None, threading.get_native_id()):
-            with contextlib.suppress(OSError):
-                os.setpriority(os.PRIO_PROCESS, thread.native_id or 0, FAVOUR)
+        with contextlib.suppress(OSError):
+            number = thread.native_id or 0
+            if number and os.sched_getscheduler(number) == os.SCHED_OTHER:
+                policy = os.SCHED_RR | os.SCHED_RESET_ON_FORK
+                os.sched_setscheduler(number, policy, os.sched_param(BESIDE))
 
 
 def share_arenas() -> None:

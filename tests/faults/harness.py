@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from firmware_bridge.catalog import Catalog
 from firmware_bridge.frames import Frames
-from rtid.estimator.estimator import Estimator
 from rtid.estimator.flowmap import VALID, EdgeMap, FlowMap
 from rtid.estimator.published import publish
 from rtid.estimator.solution import Solution
@@ -72,16 +71,6 @@ def loop(k: int) -> Frames:
     """The k-th time that the minute is sent."""
     again = machine().frames[:]
     return replace(again, t_us=again.t_us + round(k * (SECONDS + PAUSE_S) * 1e6))
-
-
-def uninterrupted(learned: Estimator) -> Solution:
-    """What was sent up to the newest sample of a daemon's estimate, learned without any break."""
-    newest_us = (learned.origin_us or 0) + round(1e6 * float(learned.state.engine[0]["t_s"]))
-    whole, k = machine().learner(), 0
-    while (again := loop(k)).t_us[0] <= newest_us:
-        whole.push(again[again.t_us <= newest_us])
-        k += 1
-    return whole.estimator.solution()
 
 
 def drift(clean: Solution, faulty: Solution) -> float:

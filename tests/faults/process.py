@@ -15,7 +15,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
 
+from firmware_bridge.frames import Frames
 from rtid.daemon.status import Status, StatusError, from_json, read
+from rtid.estimator.estimator import Estimator
 from rtid.project import Project
 from rtid.trace.learner import Learner
 from rtid.trace.snapshot import Generations
@@ -198,12 +200,30 @@ def sender(
     loops: int = 1,
     flood_hz: float = 0.0,
     trace: Path | None = None,
+    is_prompt: bool = False,
 ) -> Iterator[subprocess.Popen[str]]:
-    """Somebody who sends the machine's frames; ended at the end."""
+    """Somebody who sends the machine's frames; ended at the end.
+
+    is_prompt: as a bus does, which the computer's other work does not keep waiting.
+    """
     command = [
         sys.executable, "-m", "tests.faults.sender", str(trace or machine().trace), group,
         str(seconds), str(speed), str(loops), str(flood_hz),
     ]  # fmt: skip
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT)
+    if is_prompt:
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(process.pid, os.SCHED_RR, os.sched_param(1))
+    try:
+        yield process
+    finally:
+        ended(process)
+
+
+@contextlib.contextmanager
+def idle(rate_hz: float, priority: int) -> Iterator[subprocess.Popen[str]]:
+    """A loop of that rate and priority which does nothing; SIGTERM makes it tell what it missed."""
+    command = [sys.executable, "-m", "tests.faults.idle", str(rate_hz), str(priority)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT)
     try:
         yield process
@@ -229,6 +249,19 @@ def stored(folder: Path, project: Project) -> Learner:
 
 def recorded(folder: Path) -> int:
     """Frames in the recording of a state folder."""
+    return sum(len(frames) for frames in _recording(folder))
+
+
+def heard(folder: Path) -> Estimator:
+    """What is learned, without any break, of all that the daemons of a folder have heard."""
+    learner = machine().learner()
+    for frames in _recording(folder):
+        for part in frames.chunks(3000):
+            learner.push(part)
+    return learner.estimator
+
+
+def _recording(folder: Path) -> Iterator[Frames]:
     from firmware_bridge.sources import open_log
 
-    return sum(len(open_log(path)) for path in sorted((folder / "recording").glob("*.blf")))
+    return map(open_log, sorted((folder / "recording").glob("*.blf")))

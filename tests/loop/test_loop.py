@@ -95,6 +95,31 @@ def test_quantiles_are_right_to_a_bin(share: float) -> None:
     assert truth * 0.99 <= histogram.quantile_us(share) <= 1.11 * truth
 
 
+def test_threads_beside_a_promoted_loop_come_before_ordinary_work() -> None:
+    """Else one that holds the interpreter is put aside by it; children stay ordinary."""
+    script = """
+import os, subprocess, sys, threading
+from rtid.daemon.realtime import favour_threads, promote
+if not promote(5):
+    sys.exit("no")
+end = threading.Event()
+thread = threading.Thread(target=end.wait)
+thread.start()
+favour_threads()
+policy, children = os.sched_getscheduler(thread.native_id), os.SCHED_RESET_ON_FORK
+assert policy == os.SCHED_RR | children, policy
+assert os.sched_getscheduler(0) == os.SCHED_FIFO | children, "the loop keeps its own"
+child = [sys.executable, "-c", "import os; print(os.sched_getscheduler(0))"]
+assert int(subprocess.check_output(child)) == os.SCHED_OTHER
+end.set()
+"""
+    command = [sys.executable, "-c", script]
+    found = subprocess.run(command, capture_output=True, text=True, check=False)
+    if found.stderr.strip() == "no":
+        pytest.skip("this machine grants no real-time priority")
+    assert found.returncode == 0, found.stderr
+
+
 def test_only_the_calling_thread_is_promoted() -> None:
     """In a process of its own: the promotion would stay with the tests."""
     script = """
