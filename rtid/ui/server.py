@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import logging
 import re
 import secrets
 import signal
@@ -305,6 +306,7 @@ def start(
     """
     if trace is not None or project is None:
         import_module("rtid.ui.desk_views")  # now, not while somebody waits for a picture
+    logging.getLogger("bokeh.server.views.ws").setLevel(logging.ERROR)  # a tab may be closed
     loop = IOLoop.current()
     worker = Worker(loop.add_callback)
     session = Session(project or Path.cwd(), trace, worker, sheet, folder=state, test_bus=test_bus)

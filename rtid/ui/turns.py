@@ -23,7 +23,7 @@ class Turns:
     def __init__(self, later: Callable[[float, Do], object]) -> None:
         self._later = later
         self._waiting: deque[Do] = deque()
-        self._is_going = False
+        self._is_going = self._is_over = False
         self.is_working = False  # something is done beside the loop: the next step waits
         self._studio = ThreadPoolExecutor(1, "rtid-studio")
         self._studio.submit(int)  # its thread begins now
@@ -36,7 +36,9 @@ class Turns:
             self._later(0.0, self._next)
 
     async def apart(self, do: Do) -> None:
-        """Do this in a thread of its own; the loop goes on meanwhile."""
+        """Do this in a thread of its own; the loop goes on meanwhile.  After `stop` nothing is."""
+        if self._is_over:
+            return
         self.is_working = True
         try:
             await asyncio.get_running_loop().run_in_executor(self._studio, do)
@@ -45,10 +47,13 @@ class Turns:
 
     async def packed(self, pack: Callable[[], T]) -> T:
         """The same for a message: behind what is drawn, and no step waits for it."""
+        if self._is_over:
+            return pack()
         return await asyncio.get_running_loop().run_in_executor(self._studio, pack)
 
     def stop(self) -> None:
         """End the thread."""
+        self._is_over = True
         self._studio.shutdown(cancel_futures=True)
 
     def _next(self) -> None:

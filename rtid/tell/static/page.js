@@ -145,6 +145,7 @@
   document.documentElement.classList.toggle("dark", theme === "dark");
   plots.askForMore((view, low, high) => ask("zoom", { view, low, high }));
   plots.spareStyles();
+  plots.clearWhole();
   plots.keepFitting();
   document.addEventListener("DOMContentLoaded", attach);
 

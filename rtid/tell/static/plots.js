@@ -12,6 +12,17 @@ const plots = (() => {
     } catch { /* another Bokeh: slower, the same picture */ }
   }
 
+  // Bokeh clears a canvas from the middle of its first pixels on: a title that once was higher than
+  // its place would be seen along the edge for ever.
+  function clearWhole() {
+    try {
+      Bokeh.require("core/util/canvas").CanvasLayer.prototype.clear = function () {
+        const { x, y, width, height } = this.bbox;
+        this.ctx.clearRect(x - 1, y - 1, width + 2, height + 2);
+      };
+    } catch { /* another Bokeh */ }
+  }
+
   // -- lines: a source with the tags [whole, name, detail] draws the column `name` of the source
   // `detail`, a window of the record, where that spans what is seen, else of the source `whole`.
   // Where its name says that it is thinned, more of what is seen is asked for.
@@ -246,5 +257,5 @@ const plots = (() => {
     for (const model of all()) { paintOne(model, theme); twin(model, theme); }
   }
 
-  return { askForMore, between, follow, keepFitting, look, move, paint, spareStyles };
+  return { askForMore, between, clearWhole, follow, keepFitting, look, move, paint, spareStyles };
 })();

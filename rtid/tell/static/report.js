@@ -1,6 +1,7 @@
 "use strict";
 // The report's own part: everything is drawn once, and follows the system's theme.
 plots.spareStyles();
+plots.clearWhole();
 plots.keepFitting();
 (() => {
   const dark = matchMedia("(prefers-color-scheme: dark)");
