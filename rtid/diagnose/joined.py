@@ -119,7 +119,7 @@ def _resting(
 ) -> BoolArray:
     """True (w,) where this edge alone is open to a chamber that neither moves nor stores."""
     machine = fit.declared
-    opens_v = _opens_at(fit, edge) if chamber.pressure else np.inf
+    opens_v = opening(_gains(fit, edge), edge.grid.u_v) if chamber.pressure else np.inf
     if not np.isfinite(opens_v):
         return np.zeros(len(windows.t_s), bool)
     is_open = _opening(machine, chunk, edge) >= opens_v
@@ -174,15 +174,16 @@ def _gains(fit: Fit, edge: Edge) -> FloatArray:
     return np.array([np.nanmedian(row) if np.isfinite(row).any() else np.nan for row in gains])
 
 
-def _opens_at(fit: Fit, edge: Edge) -> float:
-    """The command, V, from which on the known map passes a fair part of its most; inf if none."""
-    gains = _gains(fit, edge)
+def opening(gains: FloatArray, u_v: FloatArray) -> float:
+    """The command, V, from which on a map passes a fair part of its most; inf where it never does.
+
+    gains (nu,): Q / sqrt(dp), NaN where nothing is known, at the commands u_v (nu + 1,).  Whose
+    furthest known command passes little is not known to be open anywhere.
+    """
     known = np.flatnonzero(np.isfinite(gains))
-    if not len(known):
-        return np.inf
-    shut = known[gains[known] < OPEN * gains[known].max()]
+    shut = known[gains[known] <= OPEN * gains[known].max(initial=0.0)]
     wide = known[known > shut.max(initial=-1)]
-    return float(edge.grid.u_v[wide[0]])
+    return float(u_v[wide[0]]) if len(wide) else np.inf
 
 
 def _resistance(fit: Fit, edge: Edge, w: FloatArray) -> FloatArray:

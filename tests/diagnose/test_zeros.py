@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rtid.diagnose.diagnosis import Result, search
-from rtid.diagnose.joined import joints
+from rtid.diagnose.joined import joints, opening
 from rtid.diagnose.report import diagnosis
 from rtid.diagnose.trials import scored
 from rtid.diagnose.zeros import Zero, zeros
@@ -168,6 +168,22 @@ def test_a_gap_ends_a_rest() -> None:
     stop = np.flatnonzero(torn[:, 0] > chunk[-1, 0])
     torn[stop[::200], 1] = GAP_FLAG + 1
     assert told(learned(), torn) == {}
+
+
+@pytest.mark.parametrize(
+    ("gains", "opens_v"),
+    [
+        ([0.0, 1.0, 5.0, 6.0], 2.0),
+        ([np.nan, 0.1, 5.0, np.nan], 2.0),
+        ([5.0, 6.0, np.nan, 0.1], np.inf),  # a rig's run: little was known of the last block
+        ([np.nan] * 4, np.inf),
+        ([0.0] * 4, np.inf),
+    ],
+)
+def test_a_valve_opens_where_all_that_is_known_further_on_is_open(
+    gains: list[float], opens_v: float
+) -> None:
+    assert opening(np.array(gains), np.arange(5.0)) == opens_v
 
 
 def test_a_valve_that_is_shut_joins_nothing() -> None:
