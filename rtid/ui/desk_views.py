@@ -89,7 +89,8 @@ class DeskViews:
             "drag": lambda asked: self._bench.time.set_drag(asked.get("mode", "")),
             "zoom": self._zoom,
         }
-        every = [its_own, *(view.actions for view in self._views.values())]
+        looked_at = [view for name, view in self._views.items() if name == self._looked_at]
+        every = [its_own, *(view.actions for view in (*looked_at, *self._views.values()))]
         action = next((actions[what] for actions in every if what in actions), None)
         if action is not None:
             action(asked)

@@ -7,11 +7,14 @@ page has to know it.
 
 from __future__ import annotations
 
+import re
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from importlib.metadata import entry_points
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 if TYPE_CHECKING:
     from bokeh.models import UIElement
@@ -20,7 +23,8 @@ if TYPE_CHECKING:
     from rtid.tell.charts.blocks import Key
     from rtid.ui.desk_views import Bench
 
-PLUGINS = "rtid.views"
+PLUGINS = "rtid.views"  # entry points of other packages: name of the tab = a PageView
+SAYS = "says"
 Action = Callable[[dict[str, str]], None]
 
 
@@ -76,39 +80,57 @@ VIEWS = {
 
 
 def table() -> dict[str, ViewRow]:
-    """All rows by name, those of other packages last."""
-    more = {
-        plugin.name: ViewRow(f"{plugin.module}:{plugin.attr}", _places(plugin.load))
-        for plugin in entry_points(group=PLUGINS)
-        if plugin.name.isidentifier() and plugin.name not in VIEWS
-    }
-    return VIEWS | more
+    """All rows by name, those of other packages last, each under a name that is free."""
+    rows = dict(VIEWS)
+    for plugin in entry_points(group=PLUGINS):
+        name = re.sub(r"\W", "_", plugin.name)
+        while name in rows or not name.isidentifier():
+            name = f"own_{name}"
+        rows[name] = ViewRow(f"{plugin.module}:{plugin.attr}", _places(plugin.load))
+    return rows
 
 
 def _places(load: Callable[[], type[PageView]]) -> tuple[str, ...]:
-    """Of a view of another package; one that cannot be loaded has room for the reason."""
+    """Of a view of another package, and always one for the reason why it fails."""
     try:
-        return load().places
+        places = tuple(load().places)
     except Exception:  # whatever another package does, the page opens
-        return ("says",)
+        return (SAYS,)
+    return places if SAYS in places else (*places, SAYS)
 
 
 def made(row: ViewRow, bench: Bench) -> PageView:
     """The view of a row; one of another package that fails says so in its own place."""
+    module, _, name = row.where.partition(":")
+    if row in VIEWS.values():
+        own: PageView = getattr(import_module(module), name)(bench)
+        return own
     try:
-        module, _, name = row.where.partition(":")
         view: PageView = getattr(import_module(module), name)(bench)
+        lost = _without_place(view.roots, row, "plot")
     except Exception as error:
-        if row in VIEWS.values():
-            raise
-        return Failed(bench, f"{row.where} failed: {type(error).__name__}: {error}")
-    return view
+        traceback.print_exception(error)
+        return Failed(bench, _failed(row, error))
+    return Failed(bench, lost) if lost else Outside(view, row)
+
+
+def _failed(row: ViewRow, error: Exception) -> str:
+    return f"{row.where} failed: {type(error).__name__}: {error}"
+
+
+def _without_place(parts: Mapping[str, object], row: ViewRow, kind: str = "") -> str:
+    """Why some parts of a row's view are not seen; "" where all are.  kind: of their places."""
+    pairs = [place.partition(" ") for place in row.places]
+    places = [word or k for k, _, word in pairs if k == kind or (not kind and k != "plot")]
+    lost = sorted(set(parts) - set(places))
+    known = ", ".join(places) or "none"
+    return f"{row.where}: no place for {', '.join(lost)}; `places` has {known}" if lost else ""
 
 
 class Failed(PageView):
     """What stands in the place of a view that cannot be made."""
 
-    places = ("says",)
+    places = (SAYS,)
 
     def __init__(self, bench: Bench, reason: str) -> None:
         super().__init__(bench)
@@ -116,9 +138,56 @@ class Failed(PageView):
 
     def fragments(self) -> Mapping[str, str]:
         """The reason."""
-        from rtid.tell.html import text  # noqa: PLC0415 - rarely needed
+        return {SAYS: _text(self._reason)}
 
-        return {"says": text(self._reason)}
+
+class Outside(PageView):
+    """A view of another package: what fails in it is said in its own place, and stops no other."""
+
+    def __init__(self, view: PageView, row: ViewRow) -> None:
+        super().__init__(view.bench)
+        self._view, self._row = view, row
+        self._reason, self._told = "", ""  # what failed last, and what the terminal knows of
+        self.roots = view.roots
+        self.actions = {what: partial(self._try, do) for what, do in view.actions.items()}
+
+    def refresh(self) -> None:
+        """Of the view."""
+        self._try(self._view.refresh)
+
+    def fragments(self) -> Mapping[str, str]:
+        """Those of the view; in place of its sentence, what failed since it did something last."""
+        try:
+            parts = dict(self._view.fragments())
+            reason = self._reason or _without_place(parts, self._row)
+        except Exception as error:
+            parts, reason = {}, self._heard(error)
+        return parts | {SAYS: _text(reason)} if reason else parts
+
+    def mark(self, keys: Sequence[Key], words: str) -> None:
+        """Of the view."""
+        self._try(self._view.mark, keys, words)
+
+    def _try(self, do: Callable[..., None], *given: Any) -> None:
+        try:
+            do(*given)
+            self._reason = ""
+        except Exception as error:
+            self._reason = self._heard(error)
+
+    def _heard(self, error: Exception) -> str:
+        """What failed, in one line; where it did, once on the terminal."""
+        reason = _failed(self._row, error)
+        if reason != self._told:
+            traceback.print_exception(error)
+        self._told = reason
+        return reason
+
+
+def _text(words: str) -> str:
+    from rtid.tell.html import text  # noqa: PLC0415 - rarely needed
+
+    return text(words)
 
 
 @dataclass(frozen=True)

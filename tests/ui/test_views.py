@@ -12,6 +12,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
+from rtid.ui.desk_views import DeskViews
 from rtid.ui.views import VIEWS, Failed, ViewRow, made, places_of, table
 from tests.ui.plugins import install, snippet
 from tests.ui.served import project_file, served
@@ -84,9 +85,67 @@ def test_one_that_fails_says_so_in_its_own_place_and_the_page_opens(
     entries = "[rtid.views]\nbroken = broken_view:View\ncompare = broken_view:View\n"
     install(tmp_path, "broken_view", code, entries, monkeypatch)
     rows = table()
-    assert list(rows) == [*VIEWS, "broken"]  # nobody takes the place of a view of the page
+    assert list(rows) == [*VIEWS, "broken", "own_compare"]  # nobody takes the place of the page's
     assert rows["compare"] is VIEWS["compare"]
     view = made(rows["broken"], bench())
     assert isinstance(view, Failed)
     assert "&lt;no licence&gt;" in view.fragments()["says"]
     assert [place.name for place in places_of("broken", rows["broken"])] == ["broken_says"]
+
+
+TROUBLE = """
+from rtid.ui.views import PageView
+
+class View(PageView):
+    places = ("tools", "plot")
+    is_well = True
+
+    def __init__(self, bench):
+        super().__init__(bench)
+        self.actions = {"finer": lambda asked: self.fail()}
+        self.roots = bench.roots
+
+    def fail(self):
+        if not self.is_well:
+            raise ValueError("no <x>")
+
+    refresh = fail
+
+    def fragments(self):
+        self.fail()
+        return {"tools": "a button"}
+"""
+
+
+def test_one_that_fails_later_says_so_and_is_well_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whatever it is asked: to refresh, for its words, to act; where it failed is printed once."""
+    install(tmp_path, "ill_view", TROUBLE, "[rtid.views]\nworn-bore = ill_view:View\n", monkeypatch)
+    row = table()["worn_bore"]  # a name that the page can have
+    assert row.places == ("tools", "plot", "says")
+    view = made(row, SimpleNamespace(roots={}))  # type: ignore[arg-type]
+    assert view.fragments() == {"tools": "a button"}
+    view._view.is_well = False  # type: ignore[attr-defined]
+    for ask in (view.refresh, lambda: view.actions["finer"]({}), view.fragments):
+        ask()
+        assert view.fragments() == {"says": "ill_view:View failed: ValueError: no &lt;x&gt;"}
+    assert capsys.readouterr().err.count("ValueError: no <x>") == 1
+    view._view.is_well = True  # type: ignore[attr-defined]
+    view.refresh()
+    assert view.fragments() == {"tools": "a button"}
+    lost = made(row, SimpleNamespace(roots={"curve": None}))  # type: ignore[arg-type]
+    assert lost.fragments() == {"says": "ill_view:View: no place for curve; `places` has plot"}
+
+
+def test_a_word_that_two_views_act_on_is_that_of_the_view_looked_at() -> None:
+    asked: list[str] = []
+    desk = DeskViews.__new__(DeskViews)
+    views: Any = {
+        name: SimpleNamespace(actions={"finer": lambda _, n=name: asked.append(n)}, fragments=dict)
+        for name in "ab"
+    }
+    desk._views = views
+    desk._put, desk._looked_at = lambda parts: None, "b"
+    desk.take("finer", {})
+    assert asked == ["b"]
