@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import textwrap
+from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -26,20 +28,41 @@ SCHEMA = 1
 
 def effects(
     name: Annotated[str, typer.Argument(help="An effect; all are listed without it.")] = "",
+    project: Annotated[
+        Path | None, typer.Option("--project", "-p", help="Project file: its own effects too.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print as JSON, SI units.")] = False,
     units: UnitsOption = System.DISPLAY,
 ) -> None:
     """List the physical effects that `rtid diagnose` knows, or explain one."""
     from rtid.effects import catalogue, effect
 
+    known = {**catalogue(), **_own(project)}
     if name:
-        page = effect(name)
+        page = known.get(name) or effect(name)
         print(json.dumps({"schema": SCHEMA} | _plain(page))) if as_json else _print_page(page)
         return
     if as_json:
-        print(json.dumps({"schema": SCHEMA, "effects": [_plain(e) for e in catalogue().values()]}))
+        print(json.dumps({"schema": SCHEMA, "effects": [_plain(e) for e in known.values()]}))
         return
-    _print_list()
+    _print_list(known)
+
+
+def _own(project: Path | None) -> dict[str, Effect]:
+    """What a project file brings, by name."""
+    if project is None:
+        return {}
+    from rtid.project import load
+
+    return {effect.name: effect for effect in load(project).all_effects}
+
+
+def _places(effect: Effect) -> str:
+    """Where it acts; an effect of a user's at one place, by its chambers."""
+    from rtid.effects.law import place_of
+
+    chambers = [name for name, _ in effect.into]
+    return place_of(effect.into, chambers) if chambers else ", ".join(effect.places)
 
 
 def _plain(page: Effect) -> dict[str, Any]:
@@ -55,13 +78,12 @@ def _console() -> Console:
     return console
 
 
-def _print_list() -> None:
-    from rtid.effects import catalogue
+def _print_list(known: Mapping[str, Effect]) -> None:
     from rtid.effects.page import KINDS
 
     console = _console()
     for kind, meaning in KINDS.items():
-        group = [e for e in catalogue().values() if e.kind == kind]
+        group = [e for e in known.values() if e.kind == kind]
         _heading(console, f"\n{kind}", f": {meaning}")
         console.print(_group(group))
     console.print(
@@ -72,7 +94,7 @@ def _print_list() -> None:
 def _group(group: list[Effect]) -> Table:
     from rtid.tell.story import Table
 
-    rows = [("  " + effect.name, effect.title, ", ".join(effect.places)) for effect in group]
+    rows = [("  " + effect.name, effect.title, _places(effect)) for effect in group]
     return Table("", ("", "~", "~"), rows)
 
 
@@ -81,9 +103,10 @@ def _print_page(page: Effect) -> None:
 
     console = _console()
     _heading(console, page.title, f"  ({page.name})")
-    _paragraph(console, page.summary)
-    _heading(console, "\nKind", f"     {page.kind}; acts on: {', '.join(page.places)}")
-    _heading(console, "Signals", f"  {', '.join(page.signals)}")
+    _paragraph(console, page.summary if page.summary != page.title else "")
+    _heading(console, "\nKind", f"     {page.kind}; acts on: {_places(page)}")
+    if page.signals:
+        _heading(console, "Signals", f"  {', '.join(page.signals)}")
     _heading(console, "\nEquation")
     for line in page.equation:
         console.print(f"    {readable(line)}", soft_wrap=True)
@@ -101,8 +124,9 @@ def _print_page(page: Effect) -> None:
         ("Visible when", page.visible_when),
         ("Reference", page.reference),
     ):
-        _heading(console, f"\n{title}")
-        _paragraph(console, text)
+        if text:  # a formula of a project says no more than itself
+            _heading(console, f"\n{title}")
+            _paragraph(console, text)
 
 
 def _heading(console: Console, words: str, rest: str = "") -> None:
@@ -112,6 +136,8 @@ def _heading(console: Console, words: str, rest: str = "") -> None:
 
 
 def _paragraph(console: Console, text: str, indent: int = INDENT) -> None:
+    if not text:
+        return
     width = console.width - indent - INDENT
     lines = textwrap.wrap(text, width, break_long_words=False, break_on_hyphens=False)
     console.print(textwrap.indent("\n".join(lines), " " * indent))

@@ -232,7 +232,7 @@ def effect(name: str) -> Effect:
         near = [known for known in catalogue() if name in known] if name else []
         near += get_close_matches(name, list(catalogue()), n=4, cutoff=0.5)
         hint = f"did you mean {' or '.join(dict.fromkeys(near))}?" if near else ""
-        remedy = f"{hint} `rtid effects` lists all but those of a project file".strip()
+        remedy = f"{hint} `rtid effects` lists all, with -p those of a project file too".strip()
         raise EffectError(f"there is no effect {name!r}", remedy)
     return catalogue()[name]
 
