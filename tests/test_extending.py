@@ -318,3 +318,114 @@ def test_an_export_of_ones_own_is_taken(
     finally:
         WRITERS.pop(".lines", None)
     assert set(json.loads((tmp_path / "map.lines").read_text())) == {"pa", "at", "pb", "bt"}
+
+
+PACKAGE = {
+    "slow_gap.toml": """
+title = "Gap that opens slowly"
+kind = "flow"
+places = ["both chambers"]
+summary = "The seal creeps: it leaks after the pressure."
+equation = ["q_a = -C_s * lag(p_a - p_b, tau)", "q_b = C_s * lag(p_a - p_b, tau)"]
+law = "my_laws.gap:slow_gap"
+signals = ["p_a", "p_b"]
+signature = "The residual follows the pressure of some moments ago."
+confounders = ["internal_leakage_laminar"]
+separates = "A hold behind a fast change of load."
+visible_when = "The load changes while the seal settles."
+reference = "none"
+
+[[parameters]]
+name = "coefficient"
+symbol = "C_s"
+unit = "m3/s/Pa"
+low = 1e-14
+high = 1e-9
+sign = 1
+meaning = "leakage coefficient once the seal has settled"
+
+[[parameters]]
+name = "settling"
+symbol = "tau"
+unit = "s"
+low = 0.02
+high = 5.0
+sign = 1
+start = [0.1, 0.3, 1.0]
+meaning = "time constant of the seal"
+""",
+    "__init__.py": "",
+}
+
+
+@pytest.fixture
+def my_laws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A package with one page whose law is the recipe's."""
+    package = tmp_path / "my_laws"
+    package.mkdir()
+    for name, text in PACKAGE.items():
+        (package / name).write_text(text)
+    (package / "gap.py").write_text(snippet("python", "def slow_gap"))
+    install(tmp_path, "my_laws", "rtid.effects", "gap = my_laws\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for name in ("my_laws", "my_laws.gap"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    catalogue.cache_clear()
+    yield package
+    catalogue.cache_clear()
+
+
+def test_an_effect_with_a_law_of_ones_own_goes_the_whole_way(
+    leaking: Path, tmp_path: Path, my_laws: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its equation is words for a reader: no command takes it for a law that it cannot read."""
+    file = project(leaking, tmp_path, "")
+    assert rtid("diagnose", leaking, "-p", file, "--json") == Exit.OK
+    said = json.loads(capsys.readouterr().out)
+    seen = {u["effect"] for u in said["not_found"]}
+    assert "slow_gap" in seen | {n for f in said["found"] for n in f["cannot_be_told_from"]}
+    assert rtid("add", "slow_gap", leaking, "-p", file, "--force") == Exit.OK
+    assert load(file).sections.added[0].parameters.keys() == {"coefficient", "settling"}
+    told: list[str] = []
+    on_board(load(file), told.append)
+    assert "is not in the model on board, because it needs a record" in told[0]
+    assert rtid("compare", leaking, "-p", file) in (Exit.OK, Exit.NEGATIVE)
+
+
+def test_what_a_plug_in_changes_is_seen_though_a_fit_was_kept(
+    leaking: Path, tmp_path: Path, my_laws: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = project(leaking, tmp_path, "")
+    words = "diagnose", leaking, "-p", file, "--json"
+    assert rtid(*words) == Exit.OK
+    page = my_laws / "slow_gap.toml"
+    page.write_text(page.read_text().replace("gap:slow_gap", "gap:nobody"))
+    catalogue.cache_clear()
+    capsys.readouterr()
+    assert rtid(*words) == Exit.USAGE
+    assert "no law 'my_laws.gap:nobody'" in capsys.readouterr().err
+
+
+def test_an_equation_that_cannot_be_read_is_named_with_its_effect(
+    my_effects: None, leaking: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "my_effects" / "worn_end.toml"
+    page.write_text(page.read_text().replace("pos(x", "posi(x"))
+    file = project(leaking, tmp_path, "")
+    assert rtid("add", "worn_end", leaking, "-p", file) == Exit.USAGE
+    told = capsys.readouterr().err
+    assert "the equation of worn_end: 'posi' is no known function" in told and "law = " in told
+
+
+def test_the_effects_of_a_project_are_listed_and_explained_with_it(
+    leaking: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = project(leaking, tmp_path, GAP)
+    assert rtid("effects", "-p", file) == Exit.OK
+    assert re.search(r"^  gap +gap +a-b", capsys.readouterr().out, re.M)
+    assert rtid("effects", "gap", "-p", file) == Exit.OK
+    shown = capsys.readouterr().out
+    assert "acts on: a-b" in shown and "q_b = coefficient" in shown
+    assert "In the residual" not in shown
+    assert rtid("effects", "gap") == Exit.USAGE
+    assert "-p" in capsys.readouterr().err

@@ -23,6 +23,7 @@ from rtid.effects.expression import Expression
 from rtid.effects.filtering import filtered
 from rtid.effects.motions import RATE, halves_of, motions, rates, velocity
 from rtid.effects.page import FUNCTION, Effect, EffectError
+from rtid.effects.parsing import ExpressionError
 from rtid.effects.record_view import RecordView, supply_of, tank_of
 from rtid.effects.tree import NAME, ZERO, Node, derivative, evaluate, number, substituted
 from rtid.effects.view import View as Seen
@@ -111,8 +112,18 @@ def lines_of(effect: Effect) -> tuple[LawLine, ...]:
     """The lines of an effect's equation that say what flows into chambers, for a coefficient of 1.
 
     Empty where the equation says something else.  One line a side: a second one of the same left
-    side describes more than a flow of the present (a poppet with a state).
+    side describes more than a flow of the present (a poppet with a state).  Beside a law by name
+    the equation may be words for a reader; else EffectError for one that cannot be read.
     """
+    try:
+        return tuple(_lines(effect).values())
+    except ExpressionError as error:
+        if effect.law:
+            return ()
+        raise EffectError(f"the equation of {effect.name}: {error}", _WRITE) from error
+
+
+def _lines(effect: Effect) -> dict[str, LawLine]:
     known: dict[str, Node] = {
         p.symbol: number(p.start[0]) for p in effect.parameters[1:] if p.is_held
     }
@@ -127,7 +138,13 @@ def lines_of(effect: Effect) -> tuple[LawLine, ...]:
                 result[left] = line
         elif not is_flow and left.isidentifier() and "ddt(" not in right and _is_plain(right):
             known[left] = substituted(Expression.parse(right).root, known)
-    return tuple(result.values())
+    return result
+
+
+_WRITE = (
+    "write it in p_a, p_b, p_c, p_tank, p_supply, x, v, t, u, V_c, dp, sigma and Q, or name a law: "
+    "law = ..."
+)
 
 
 def _is_plain(text: str) -> bool:
@@ -320,8 +337,7 @@ def _refuse_unknown(
     if unknown:
         raise EffectError(
             f"the equation of {effect.name} uses {', '.join(unknown)}, which no record has",
-            "write it in p_a, p_b, p_c, p_tank, p_supply, x, v, t, u, V_c, dp, sigma and Q, or "
-            "name a law: law = ...",
+            _WRITE,
         )
 
 

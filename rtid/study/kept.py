@@ -17,10 +17,14 @@ from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, fields
 from functools import cache
+from importlib.metadata import entry_points
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import rtid
+from firmware_bridge.sources import formats
+from rtid.effects import page
 from rtid.errors import RtidError
 from rtid.project import Project
 from rtid.study.packed import packed, unpacked
@@ -138,7 +142,7 @@ def _of_project(project: Project) -> str:
     sections = project.sections
     words = {f.name: getattr(sections, f.name) for f in fields(sections) if f.name not in ASIDE}
     layouts = [(_of_file(place.file), place.node) for place in project.databases]
-    text = f"{project.digest} {sorted(words.items())!r} {layouts} {_of_program()}"
+    text = f"{project.digest} {sorted(words.items())!r} {layouts} {_of_program()} {_of_plugins()}"
     return _hash(text.encode()).hexdigest()
 
 
@@ -146,13 +150,27 @@ def _of_project(project: Project) -> str:
 def _of_program() -> str:
     """Of the program's files, by size and date."""
     root = Path(rtid.__file__).parent
-    words = []
-    for folder in (root, root.with_name("firmware_bridge")):
-        for path in sorted(folder.rglob("*")):
-            if path.suffix in (".py", ".toml"):
-                stat = path.stat()
-                words.append(f"{path.relative_to(folder)} {stat.st_size} {stat.st_mtime_ns}")
+    words = [line for f in (root, root.with_name("firmware_bridge")) for line in _dates_in(f)]
     return _hash("\n".join(words).encode()).hexdigest()
+
+
+def _of_plugins() -> list[str]:
+    """Of the packages that bring effects or log formats, which nobody loads for it."""
+    brought = [p for group in (page.PLUGINS, formats.PLUGINS) for p in entry_points(group=group)]
+    words = [f"{plugin.name} = {plugin.value}" for plugin in brought]
+    for name in sorted({plugin.module.partition(".")[0] for plugin in brought}):
+        spec = find_spec(name)
+        folders = spec.submodule_search_locations if spec else None
+        for place in folders or ([spec.origin] if spec and spec.origin else ()):
+            words += _dates_in(Path(place))
+    return words
+
+
+def _dates_in(place: Path) -> list[str]:
+    """The code and pages of a folder, or one file, by size and date."""
+    paths = sorted(place.rglob("*")) if place.is_dir() else [place]
+    known = [(path, path.stat()) for path in paths if path.suffix in (".py", ".toml")]
+    return [f"{path.relative_to(place)} {s.st_size} {s.st_mtime_ns}" for path, s in known]
 
 
 def _hash(content: bytes = b"") -> Any:

@@ -151,6 +151,19 @@ def test_what_is_done_apart_leaves_the_loop_free_and_holds_the_next_step_back() 
     assert (looked, waited) == ([False], [True])
 
 
+def test_a_page_that_is_open_while_the_server_stops_draws_nothing() -> None:
+    """It said "cannot schedule new futures after shutdown", with a traceback, at each Ctrl-C."""
+    drawn = list[int]()
+
+    async def main() -> None:
+        turns = Turns(asyncio.get_running_loop().call_later)
+        turns.stop()
+        await turns.apart(lambda: drawn.append(1))
+
+    done(main())
+    assert not drawn
+
+
 def test_a_follower_changes_nothing_until_it_takes_over() -> None:
     shown, _ = page()
     session = shown.session
