@@ -107,6 +107,24 @@ def test_a_save_that_took_long_counts_for_the_next_ones(keeper: Keeper) -> None:
     assert 0.64 <= keeper._core.save_s < 0.9
 
 
+@pytest.mark.parametrize("alarm", ["implausible", "signal_range"])
+def test_a_sensor_that_cannot_be_believed_teaches_nothing(keeper: Keeper, alarm: str) -> None:
+    """Learning is held from the alarm to its end; what is implausible has already been learned."""
+    if alarm == "implausible":
+        vars(keeper._diagnosing)["implausible"] = ("p_a and p_b are swapped",)
+    else:
+        keeper.alarms.set(alarm, "sensor", "x went from -1 to 9 m")
+    for _ in range(2):
+        keeper._look()
+        assert not keeper._core.learner.learns
+    recalls = [job.before_s for job in vars(keeper)["put"] if isinstance(job, jobs.Recall)]
+    assert recalls == ([-np.inf] if alarm == "implausible" else [])
+    vars(keeper._diagnosing)["implausible"] = ()
+    keeper.alarms._on.pop(alarm)
+    keeper._look()
+    assert keeper._core.learner.learns
+
+
 def test_an_accepted_change_is_learned_anew(keeper: Keeper) -> None:
     core = keeper._core
     keeper._accept(REQUEST)
