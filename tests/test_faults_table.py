@@ -67,6 +67,22 @@ def test_a_test_that_failed_before_it_had_a_figure_is_seen() -> None:
     assert "test_a_run failed" in lines[3] and all(line.count("|") == 7 for line in lines)
 
 
+def test_what_make_soak_has_left_stands_in_the_same_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whether it has run here or not."""
+    figure = {"row": 21, "what": "normal again", "value": 0.4, "wanted": "<= 1", "unit": "s",
+              "met": True, "test": "b"}  # fmt: skip
+    names = [str(tmp_path / name) for name in ("faults.jsonl", "soak.jsonl")]
+    monkeypatch.setattr("sys.argv", ["table", *names])
+    main()
+    assert "| in `make soak` |" in capsys.readouterr().out
+    Path(names[1]).write_text(json.dumps(figure))
+    main()
+    line = next(t for t in capsys.readouterr().out.splitlines() if t.startswith("| 21 "))
+    assert "normal again (`make soak`, 20" in line and line.endswith("| 0.4 s | <= 1 | ok |")
+
+
 def test_a_row_whose_tests_did_not_run_is_no_success(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

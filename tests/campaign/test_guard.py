@@ -18,6 +18,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rtid.daemon import jobs
+from rtid.daemon.diagnoser import diagnose
 from rtid.estimator.estimator import Estimator
 from rtid.estimator.published import publish
 from rtid.model import Term
@@ -361,3 +363,30 @@ def test_a_leak_that_is_known_is_followed(seed: int, tmp_path: Path) -> None:
     what = "guard: a leak learned beside the maps that grows from 1 to 11 % of rated in 10 h"
     leave(f"{what}, machine {seed}", said, "followed, no alarm", OVER)
     assert abs(share - 0.11) < 0.25 * 0.1 and moved < 0.25 * 0.1 and max(wearing.learns_s) <= 60.0
+
+
+GROWN = (0.005, 0.01, 0.02)  # of rated
+
+
+@pytest.mark.parametrize("seed", NUMBERS[:MACHINES])
+def test_a_leak_that_no_term_holds_is_named_while_it_grows(seed: int, tmp_path: Path) -> None:
+    """By the diagnosis of the last two minutes that the daemon makes each `diagnose_s`.
+
+    The guard does not stand against it: the maps take up what they can of so slow a change.
+    """
+    bench, texts = Bench.of(tmp_path, seed), list[str]()
+    for share in GROWN:
+        run = bench.run(120.0, 77, plant=leak(share)(bench.plant, bench.rate))
+        learner = Learner(bench.project.model, bench.catalog, bench.project.assembly)
+        for piece in run_frames(run, start_us=START_US).chunks(PIECE):
+            learner.push(piece)
+        history = learner.estimator.history
+        assert history is not None
+        verdict = diagnose(jobs.Diagnose(bench.project.model, history.chunk()), bench.project)
+        assert verdict.verdict is not None, verdict.reason
+        texts.append(verdict.verdict.text)
+        print(f"machine {seed}, {100 * share:g} %: {texts[-1]}", flush=True)
+        assert any("leak" in effect for effect in verdict.verdict.effects), texts[-1]
+    what = "guard: a leak that no term holds, while it grows"
+    said = "named at 0.5, 1 and 2 % of rated by the diagnosis of two minutes in between"
+    leave(f"{what}, machine {seed}", said, "said, never quarantined", "each `diagnose_s`")

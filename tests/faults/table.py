@@ -1,4 +1,4 @@
-"""All faults as one table: `python -m tests.faults.table FIGURES.jsonl [--all]`; `make faults`.
+"""All faults as one table: `python -m tests.faults.table FIGURES.jsonl... [--all]`; `make faults`.
 
 Each row has its figures, or how many of its tests passed elsewhere, or says why it has none; a test
 that failed before it had a figure is named.  With --all it ends with 1 where a row has missed a
@@ -11,6 +11,7 @@ import json
 import re
 import sys
 from collections import defaultdict
+from datetime import UTC, datetime
 from pathlib import Path
 
 from tests.faults.elsewhere import ELSEWHERE, IN_SOAK, NOT_TESTED
@@ -34,6 +35,7 @@ NAMES = {
 
 NOT_MET, NOT_RUN = "**NOT MET**", "**NOT RUN**"
 HERE = "tests/faults/"
+SOAK = "soak"  # file of the figures of `make soak`
 NO_ROW = 0  # of tests whose name says none
 
 
@@ -98,11 +100,22 @@ def _passed(figures: list[dict[str, object]]) -> dict[str, list[bool]]:
     return by_file
 
 
+def noted(path: Path) -> list[dict[str, object]]:
+    """Figures of a run, with its day beside those of another command; none where it never ran."""
+    if not path.exists():
+        return []
+    figures = [json.loads(line) for line in path.read_text("utf-8").splitlines()]
+    day = datetime.fromtimestamp(path.stat().st_mtime, UTC).date().isoformat()
+    for entry in figures:
+        if path.stem == SOAK and "what" in entry:
+            entry["what"] = f"{entry['what']} (`make soak`, {day})"
+    return figures
+
+
 def main() -> None:
     """Print the table; with --all, end with 1 where it is not as it must be."""
-    path = Path(sys.argv[1])
-    text = path.read_text("utf-8") if path.exists() else ""
-    told = table([json.loads(line) for line in text.splitlines()])
+    paths = [Path(word) for word in sys.argv[1:] if not word.startswith("--")]
+    told = table([entry for path in paths for entry in noted(path)])
     print(told)
     if "--all" in sys.argv and (NOT_MET in told or NOT_RUN in told):
         sys.exit(1)
