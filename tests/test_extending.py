@@ -18,7 +18,7 @@ from firmware_bridge.frames import Frames
 from firmware_bridge.sources import formats, open_log
 from rtid.cli import main
 from rtid.cli.exits import Exit
-from rtid.effects import catalogue
+from rtid.effects import catalogue, page
 from rtid.effects.live import LiveFlow
 from rtid.maps.files import WRITERS
 from rtid.project import load
@@ -26,6 +26,7 @@ from rtid.sim.hidden import hide_wish
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import SimulatedPlant
+from rtid.study import kept
 from rtid.study.on_board import on_board
 
 PAGE = Path(__file__).parents[1] / "docs" / "extending.md"
@@ -395,11 +396,12 @@ def test_an_effect_with_a_law_of_ones_own_goes_the_whole_way(
 def test_what_a_plug_in_changes_is_seen_though_a_fit_was_kept(
     leaking: Path, tmp_path: Path, my_laws: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    assert kept.PLUGINS == (page.PLUGINS, formats.PLUGINS)
     file = project(leaking, tmp_path, "")
     words = "diagnose", leaking, "-p", file, "--json"
     assert rtid(*words) == Exit.OK
-    page = my_laws / "slow_gap.toml"
-    page.write_text(page.read_text().replace("gap:slow_gap", "gap:nobody"))
+    changed = my_laws / "slow_gap.toml"
+    changed.write_text(changed.read_text().replace("gap:slow_gap", "gap:nobody"))
     catalogue.cache_clear()
     capsys.readouterr()
     assert rtid(*words) == Exit.USAGE

@@ -23,8 +23,6 @@ from pathlib import Path
 from typing import Any
 
 import rtid
-from firmware_bridge.sources import formats
-from rtid.effects import page
 from rtid.errors import RtidError
 from rtid.project import Project
 from rtid.study.packed import packed, unpacked
@@ -34,6 +32,7 @@ FOLDER, SUFFIX = ".rtid", ".kept"
 MOST_BYTES = 64_000_000
 PLACE = "RTID_CACHE"  # environment: a folder for all that is kept, or OFF
 OFF = "off"
+PLUGINS = ("rtid.effects", "rtid.formats")  # entry points that a fit depends on; not imported here
 ASIDE = ("prior", "publish", "daemon", "excite")  # sections that no fit depends on
 _IS_ON = ContextVar("is_on", default=False)
 
@@ -156,7 +155,7 @@ def _of_program() -> str:
 
 def _of_plugins() -> list[str]:
     """Of the packages that bring effects or log formats, which nobody loads for it."""
-    brought = [p for group in (page.PLUGINS, formats.PLUGINS) for p in entry_points(group=group)]
+    brought = [p for group in PLUGINS for p in entry_points(group=group)]
     words = [f"{plugin.name} = {plugin.value}" for plugin in brought]
     for name in sorted({plugin.module.partition(".")[0] for plugin in brought}):
         spec = find_spec(name)
