@@ -24,6 +24,7 @@ from firmware_bridge.names import split_unit
 
 LPM, MPA, KPA = 6e4, 1e-6, 1e-3  # of all that is shown: L/min per m3/s, MPa and kPa per Pa
 Z95 = 1.96  # standard deviations in half of a 95 % interval
+UNIFORM = 3.0**0.5  # half width over standard deviation, of what may lie anywhere between
 CONVENTION = "± is the 95 % interval."
 # by SI unit: what the workshop says, and factor
 PRACTICAL = {

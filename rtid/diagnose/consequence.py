@@ -118,8 +118,11 @@ def _size(fit: Fit, trial: Trial) -> tuple[float, float]:
         k = len(fit.revision.timings) - 1
         column = fit.timing_columns(k)[0]
         value = fit.revision.timings[k][1][0] + fit.estimate.value(column)
+    elif (effect := fit.revision.effects[-1]).is_whole and (free := fit.shape_columns(effect)):
+        column = free.get(0, min(free.values()))
+        value = effect.shape[0] + (fit.estimate.value(column) if 0 in free else 0.0)
     else:
-        column = fit.column(fit.revision.effects[-1])
+        column = fit.column(effect)
         value = fit.held.value(column)
     return value, spread * fit.estimate.sd(column)
 

@@ -44,6 +44,7 @@ from rtid.diagnose.verdict import (
 )
 from rtid.diagnose.zeros import Zero, zeros
 from rtid.effects.column import Candidate
+from rtid.effects.laws.lines import LINE
 from rtid.effects.page import Effect, catalogue, correcting
 from rtid.model import Machine
 from rtid.plain import FloatArray, Key, Progress, silent
@@ -52,7 +53,7 @@ LATER_GAIN = 25.0  # chi2 of every effect behind the first
 # chi2 of what the maps have taken in: ten standard deviations of its size.  On a clean sweep the
 # inertance of a line that was not there reached 56, stable, and moved a modulus by 3 %
 HIDDEN_GAIN = 100.0
-LINE, OF_LINES = "line", "dead volume"  # the law of a line; the declared size that its oil adds to
+OF_LINES = "dead volume"  # the declared size that the oil of a line adds to
 MOST = 6  # effects that are added at most
 WORSE = 1.02  # held-out residual, as a share, that an immaterial effect may not raise
 CLEAR = 1.5  # times the variance of the sensors' noise, from which unseen data show a misfit ...

@@ -36,6 +36,7 @@ from rtid.plain import FloatArray
 
 PASSES = 10  # of Gauss-Newton
 HALVINGS = 2  # of one step, before it is given up
+WHOLLY = 1e8  # information of a coefficient that is 1, the effect being what its shape says
 RIDGE = 1e-9  # of the square of a timing's or a shape's column: more than rounding leaves
 WEIGHED = 0.05  # share by which the compliances may differ that weigh the rows alike
 NO_COV = np.zeros((0, TERMS, TERMS))  # of maps whose covariance nobody asked for
@@ -227,6 +228,8 @@ def one_pass(
     regression.prior[weak] = RIDGE * regression.own[weak] + (regression.own[weak] == 0.0)
     at = [first + columns.candidates.index(e) for e in revision.effects]
     regression.prior[at] += regression.own[at] == 0.0  # what never acts here is held at nothing
+    whole = [column for column, e in zip(at, revision.effects, strict=True) if e.is_whole]
+    regression.prior[whole], regression.mean[whole] = WHOLLY, 1.0
     estimate = regression.fit((*range(1, first), *at))
     fixed = regression.fit((*range(1, 1 + len(model.chambers)), *at))
     flowmap = MapTerms(rows.cells, projected.terms(list(fixed.used), fixed.theta), NO_COV)

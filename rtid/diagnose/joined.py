@@ -26,6 +26,7 @@ from rtid.effects.record_view import RecordView
 from rtid.kernels.engine import GAP_FLAG
 from rtid.model import Chamber, Edge, Machine
 from rtid.plain import BoolArray, FloatArray, IntArray
+from rtid.units import UNIFORM
 
 HALF_S = 0.25  # of a window: two halves tell whether anything moves
 LEAST_SAMPLES = 4  # of a half
@@ -34,7 +35,6 @@ OPEN = 0.2  # of its largest gain, from which a valve counts as open
 SURE = 0.05  # of a block's mean flow, that its standard deviation may be
 MOST_PA = 1e6  # two sensors that show more apart are not joined, whatever the command says
 SEEN = 0.1  # of a leak's column that must be left beside the maps for its limit to count
-UNIFORM = 3.0**0.5  # half width over standard deviation, of what may lie anywhere between
 FLOW = "flow"  # the kind of an effect that takes or gives oil
 
 

@@ -57,7 +57,7 @@ def moved(fit: Fit) -> Step | None:
     )
     is_near = fit.regression.rho(fit.estimate) < FAR  # once all that may move has moved
     weights = replace(fit.weights, lag_s=way.lag_s(LAG_REACH if is_near else 1.0))
-    if is_near:
+    if is_near or any(effect.is_whole for effect in old.effects):  # whose column knows the modulus
         weights = replace(weights, compliance=_compliance(fit))
     is_same = (timings, effects) == (old.timings, old.effects) and _weigh_alike(sizes, old.sizes)
     is_same &= weights.lag_s == fit.weights.lag_s

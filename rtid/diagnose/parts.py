@@ -82,7 +82,8 @@ def _timing(part: AddedEffect, known: tuple[TimingLaw, ...]) -> tuple[TimingLaw,
 def _candidate(part: AddedEffect, offered: list[Cause]) -> Candidate:
     for cause in offered:
         candidate = cause.candidate
-        if candidate.key == part.key and candidate.parameter in part.parameters:
+        first = candidate.shape_names[0] if candidate.is_whole else candidate.parameter
+        if candidate.key == part.key and first in part.parameters:
             names = zip(candidate.shape_names, cause.axes, strict=True)
             return cause.at(tuple(_value(part, name, axis[0]) for name, axis in names))
     raise _unfit(part, "cannot act in this record")

@@ -25,6 +25,7 @@ from rtid.diagnose.zeros import Zero
 from rtid.effects import catalogue
 from rtid.effects.column import Candidate
 from rtid.effects.law import is_of_rates
+from rtid.effects.laws.lines import LINE, inertance
 from rtid.effects.laws.timing import COMMAND, RATE
 from rtid.effects.page import ZERO, correcting
 from rtid.estimator.validity import Doubt
@@ -246,7 +247,7 @@ def _named(result: Result, best: Key, other: Key) -> str:
 def parameters(fit: Fit, key: Key) -> dict[str, Value]:
     """The parameters of a cause that is part of a fit, by name."""
     values: dict[str, Value] = {}
-    spread, here = np.sqrt(max(1.0, fit.rho)), fit.declared.unit_here
+    here = fit.declared.unit_here
     for k, (timing, psi) in enumerate(fit.revision.timings):
         if timing.is_at(*key):
             for name, unit, value, j in zip(
@@ -258,12 +259,23 @@ def parameters(fit: Fit, key: Key) -> dict[str, Value]:
             column = fit.column(effect)
             value, sd = fit.held.value(column), fit.sd_of(column)
             scale = physical(fit, effect, 1.0)
-            values[effect.parameter] = Value(scale * value, abs(scale) * sd, here(effect.unit))
+            if not effect.is_whole:
+                values[effect.parameter] = Value(scale * value, abs(scale) * sd, here(effect.unit))
             free = fit.shape_columns(effect)
             for k, name in enumerate(effect.shape_names):
-                sd = fit.estimate.sd(free[k]) * spread / abs(value) if k in free else float("nan")
+                sd = fit.sd_of(free[k]) / abs(value) if k in free else float("nan")
                 values[name] = Value(effect.shape[k], sd, here(effect.shape_units[k]))
+            if effect.law.law == LINE:
+                values |= _inertance(fit, effect, values)
     return values
+
+
+def _inertance(fit: Fit, line: Candidate, values: dict[str, Value]) -> dict[str, Value]:
+    """The inertance of a line by its shape: 1 / (w^2 V_l / beta)."""
+    radps, volume, _ = (values[name] for name in line.shape_names)
+    size, page = inertance(fit.view, line), line.law.size
+    share = float(np.hypot(2.0 * radps.std / radps.value, volume.std / volume.value))
+    return {page.name: Value(size, size * share, page.unit)}
 
 
 def _not_found(result: Result) -> tuple[Unseen, ...]:
@@ -296,7 +308,13 @@ def _limit(result: Result, candidate: Candidate, score: Score) -> Unseen:
     fit = result.last
     unit = fit.declared.unit_here(candidate.unit)
     limit = physical(fit, candidate, detection_limit(score, fit.rho))
-    if candidate.parameter == "share":  # of a timing: times the value that its column was made for
+    if candidate.is_whole:
+        limit, unit = limit * inertance(fit.view, candidate), candidate.law.size.unit
+        is_possible = limit < candidate.law.size.high
+        visible = score.visible > VISIBLE and is_possible
+    elif (
+        candidate.parameter == "share"
+    ):  # of a timing: times the value that its column was made for
         limit = _of_timing(candidate, limit)
         unit = fit.declared.unit_here(candidate.shape_units[0])
         pages = catalogue()[candidate.effect].parameters

@@ -90,7 +90,7 @@ def residual(fit: Fit, chunk: FloatArray, leave_out: Candidate | None = None) ->
     leave_out: an effect whose flow is not counted.
     """
     sent = transformed_like(fit, chunk)
-    view = RecordView.of(fit.model, sent, fit.weights, fit.map)
+    view = RecordView.of(fit.model, sent, fit.weights, fit.map, fit.view)
     flows = measured(view)
     left, noise = flows - modelled(fit, view, leave_out), _noise(fit, view)
     rates = [seen_rates(view, flows), behind_lag(fit, view, left), behind_lag(fit, view, noise)]

@@ -26,6 +26,7 @@ from rtid.effects.column import Columns
 from rtid.effects.law import Volumes
 from rtid.effects.laws import total_softness
 from rtid.plain import FloatArray
+from rtid.units import UNIFORM
 
 PARTS = 4
 
@@ -34,7 +35,8 @@ def with_spreads(fitted: Fit) -> Fit:
     """A fit that knows how far its sizes are from one number; as it is without its rows."""
     if fitted.rows is None or not (fitted.revision.effects or fitted.revision.timings):
         return fitted
-    better = replace(fitted, spreads=tuple(_spreads(fitted, fitted.rows)))
+    spreads = (*_spreads(fitted, fitted.rows), *_of_wholes(fitted))
+    better = replace(fitted, spreads=spreads)
     vars(better).update(model=fitted.model, sent=fitted.sent, view=fitted.view)
     return better
 
@@ -65,6 +67,21 @@ def _spreads(fitted: Fit, rows: Rows) -> Iterator[tuple[int, float]]:
         right = s[at, 0] + held * np.append(mean[others - 1], np.zeros(PARTS))
         sizes, cov = _solved(s[np.ix_(at, at)] + np.diag(held), right)
         yield column, spread(sizes[-PARTS:], max(1.0, fitted.rho) * cov[-PARTS:, -PARTS:])
+
+
+def _of_wholes(fitted: Fit) -> Iterator[tuple[int, float]]:
+    """Column and spread of each number of an effect that its shape alone describes.
+
+    What is left may be as much of the effect's own form, or none of it: anything between.
+    """
+    rest = max(0.0, fitted.held.sse - fitted.regression.dof)
+    for effect in fitted.revision.effects:
+        if effect.is_whole:
+            column = fitted.column(effect)
+            without = fitted.regression.fit(tuple(k for k in fitted.held.used if k != column))
+            share = np.sqrt(rest / max(without.sse - fitted.held.sse, rest, 1e-300)) / UNIFORM
+            for k, at in fitted.shape_columns(effect).items():
+                yield at, float(share * abs(effect.shape[k] * fitted.held.value(column)))
 
 
 def _given(fitted: Fit) -> dict[int, Volumes]:

@@ -54,7 +54,7 @@ class Trial:
         """Parameters that the cause brings."""
         if self.is_timing:
             return len(self.revision.timings[-1][1])
-        return 1 + len(self.effect.shape)
+        return len(self.effect.shape) + (not self.effect.is_whole)
 
     @property
     def effect(self) -> Candidate:
@@ -134,8 +134,7 @@ def best_by_key(
 def is_at_a_bound(now: Fit) -> bool:
     """True where a form of the last effect has ended at an end of its page's range; 0 is none."""
     effect = now.revision.effects[-1]
-    pages = {p.name: p for p in effect.law.parameters}
-    known = [(pages.get(name), v) for name, v in zip(effect.shape_names, effect.shape, strict=True)]
+    known = [(effect.page_of(k), value) for k, value in enumerate(effect.shape)]
     return any(p and (v > 0.99 * p.high or 0.0 < v < 1.01 * p.low) for p, v in known)
 
 

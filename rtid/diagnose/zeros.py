@@ -20,11 +20,12 @@ from scipy.special import chdtrc
 
 from rtid.diagnose.consequence import BEND
 from rtid.diagnose.fit import Fit
-from rtid.diagnose.joined import UNIFORM, Joint
+from rtid.diagnose.joined import Joint
 from rtid.diagnose.regression import LIMIT_SD
 from rtid.diagnose.residual import is_known
 from rtid.effects.record_view import RecordView, supply_of, tank_of
 from rtid.model import Machine
+from rtid.units import UNIFORM
 
 CONTRADICTS = 1e-3  # probability of what the joints leave, below which they contradict each other
 

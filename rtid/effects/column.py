@@ -21,6 +21,7 @@ from rtid.plain import FloatArray
 
 STEPS = (-1.0, -0.5, 0.5, 1.0)  # about a shape, in steps of its axes
 SLOPE_STEP = 0.05  # the same, for derivatives
+WHOLE = "whole"  # the coefficient of a cause that its shape alone describes: it is 1
 
 
 @dataclass(frozen=True)
@@ -49,9 +50,19 @@ class Candidate:
         return self.page or effect(self.effect)
 
     @property
+    def is_whole(self) -> bool:
+        """True where the shape says all of it: its first number is the size."""
+        return self.parameter == WHOLE
+
+    @property
     def key(self) -> tuple[str, str]:
         """Candidates that differ in shape alone are one cause."""
         return self.effect, self.where
+
+    def page_of(self, k: int) -> Parameter | None:
+        """What its page says of nonlinear parameter k, whose name may say more than the page's."""
+        name = self.shape_names[k]
+        return next((p for p in self.law.parameters if f"{name}_".startswith(f"{p.name}_")), None)
 
     def is_possible(self, value: float) -> bool:
         """True for a physically possible sign and size."""
@@ -109,8 +120,8 @@ class Cause:
 
     def bounds(self, k: int) -> tuple[float, float]:
         """Between which nonlinear parameter k may be: as its page says, not far beyond its axis."""
-        axis, spacing, name = self.axes[k], self.spacing(k), self.candidate.shape_names[k]
-        page = next((p for p in self.candidate.law.parameters if p.name == name), None)
+        axis, spacing = self.axes[k], self.spacing(k)
+        page = self.candidate.page_of(k)
         low, high = (page.low, page.high) if page else (min(axis[0], 0.0), np.inf)
         return max(axis[0] - spacing, low), min(axis[-1] + spacing, high)
 

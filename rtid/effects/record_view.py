@@ -62,7 +62,8 @@ class MapTerms:
 class RecordView:
     """chunk (n, 2 + signals); compliance (chambers,) 1/Pa; along as from `follow_map`, 0 for NaN.
 
-    inside (n - 1,): every open edge is on its grid, and the record has no gap.
+    inside (n - 1,): every open edge is on its grid, and the record has no gap.  taught: the record
+    that the map is of, where this is another one.
     """
 
     model: Machine
@@ -70,10 +71,16 @@ class RecordView:
     compliance: FloatArray
     along: FloatArray
     inside: BoolArray
+    taught: RecordView | None = None
 
     @classmethod
     def of(
-        cls, model: Machine, chunk: FloatArray, weights: Weights, flowmap: MapTerms
+        cls,
+        model: Machine,
+        chunk: FloatArray,
+        weights: Weights,
+        flowmap: MapTerms,
+        taught: RecordView | None = None,
     ) -> RecordView:
         """The record beside a fitted map; chunk (n, 2 + signals), SI."""
         rated = np.repeat(
@@ -91,7 +98,7 @@ class RecordView:
         follow_map(state.engine, state.cells, theta, cov, chunk, along, cell)
         inside = np.isfinite(along[:, 0, 0])
         along[~inside] = 0.0
-        return cls(model, chunk, weights.compliance, along, inside)
+        return cls(model, chunk, weights.compliance, along, inside, taught)
 
     @classmethod
     def without_map(

@@ -30,7 +30,6 @@ from rtid.sim.simulated_plant import SimulatedPlant
 from tests.diagnose.records import record
 
 LAG = "time_constant"  # of a sag: resistance / stiffness, the two that its page has
-ENDS = "_sensor_at_"  # of a line, whose column depends on the end at which the sensor sits
 HOMES = {"rtid/sim/hideable.py", "rtid/sim/other_plants.py"}  # what is hidden in simulations
 
 
@@ -60,15 +59,17 @@ def test_every_column_is_that_of_its_page() -> None:
     assert {c.candidate.effect for c in found} == by_law
     for cause in found:
         column, pages = cause.candidate, parameters(cause.candidate.effect)
-        size = pages[column.parameter.partition(ENDS)[0]]
-        if column.parameter == size.name and column.parameter != "stiffness":
-            assert size == catalogue()[column.effect].size
-        assert (column.unit, column.largest, column.sign) == (size.unit, size.high, size.sign)
+        if not column.is_whole:
+            size = pages[column.parameter]
+            if column.parameter == size.name and column.parameter != "stiffness":
+                assert size == catalogue()[column.effect].size
+            assert (column.unit, column.largest, column.sign) == (size.unit, size.high, size.sign)
         for k, (name, unit) in enumerate(zip(column.shape_names, column.shape_units, strict=True)):
             if name != LAG:
-                low, high = cause.bounds(k)
-                assert unit == pages[name].unit and pages[name].low <= low
-                assert high <= pages[name].high, column
+                (low, high), page = cause.bounds(k), column.page_of(k)
+                assert page is not None and (page.name == name or column.is_whole)
+                assert unit == page.unit and page.low <= low
+                assert high <= page.high, column
 
 
 @pytest.mark.parametrize("timing", [*TIMINGS, PUMP], ids=lambda t: t.effect)

@@ -1,32 +1,179 @@
-"""The line between valve and chamber."""
+"""The line between valve and chamber as a whole: its oil's inertia, volume and resistance.
+
+One pi section: half of the line's volume V_l at the valve, half beside the chamber, C = V_l / beta,
+
+    C dp_v/dt = Q(u, p_v) - q,    I dq/dt = p_v - p_c - R q,    A v = q - (V + V_l) / beta dp_c/dt
+
+The sensor is at either end.  With d = p_v - p_c and Q_0, k = - dQ/dp of the fitted maps at the
+pressure that is measured, a sensor at the cylinder leaves to the chamber beside Q_0
+
+    q - Q_0 - C dp_c/dt,            C dd/dt = Q_0 - k d - q - C dp_c/dt,
+
+and one at the valve, by whose pressure the maps are right,
+
+    (V + V_l) / beta dd/dt - 2 C dp_v/dt,       d = I dq/dt + R q,  q = Q_0 - C dp_v/dt,
+
+by parabolas: an equation for p_c would want A v, and of the measured motion it explained itself.
+Its natural frequency 1 / sqrt(I C) is what a record tells first: it stands in the place of I.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 
-from rtid.effects.column import Cause, fixed, of_page
-from rtid.effects.law import Volumes
-from rtid.effects.laws.common import slope_to
+from rtid.effects.column import WHOLE, Candidate, Cause
+from rtid.effects.filtering import fitted
+from rtid.effects.law import Shape, Volumes, chambers_by_place
+from rtid.effects.laws.gauged import gauged
 from rtid.effects.page import Effect
 from rtid.effects.record_view import RecordView
+from rtid.kernels.jit import kernel
+from rtid.plain import FloatArray
+
+LINE = "line"  # the law's name
+FREQUENCY = "natural_frequency"
+AT_VALVE, AT_CYLINDER = (f"{FREQUENCY}_sensor_at_{end}" for end in ("valve", "cylinder"))
+# to begin with: natural frequencies of 12 to 2 m of hose, volumes, and the loss of laminar flow
+RADPS, VOLUMES_M3, RESISTANCES = (130.0, 200.0, 300.0, 450.0, 700.0), (2e-4, 6e-4), (2e8, 2e9)
+LARGEST = 3.0  # times the bank's own size that a column of it may have
+QUICK_S = 2e-3  # half width of the parabolas
+STEPS = 4  # of the section's equations in an interval of the record
 
 
 def lines(view: RecordView, effect: Effect) -> Iterator[Cause]:
-    """Inertance of a line between valve and chamber, seen by a sensor at either end of it."""
-    for c, chamber in enumerate(view.model.chambers):
-        for end in ("valve", "cylinder"):
-            called = f"inertance_sensor_at_{end}"
-            yield fixed(
-                of_page(effect, chamber.name, called=called),
-                _line, view, c, end,
+    """A line before one chamber or alike before both, seen by sensors at either end of it."""
+    known = {p.name: p for p in effect.parameters}
+    for place, at in chambers_by_place(view.model).items():
+        for name, column in ((AT_VALVE, _at_valve), (AT_CYLINDER, _at_cylinder)):
+            candidate = Candidate(
+                effect.name, place, WHOLE, "1", LARGEST, 1,
+                shape_names=(name, "volume", "resistance"),
+                shape_units=tuple(known[n].unit for n in (FREQUENCY, "volume", "resistance")),
+                page=effect,
             )  # fmt: skip
+            axes = RADPS, VOLUMES_M3, RESISTANCES
+            yield Cause(candidate, partial(_of_chambers, column, view, at), axes)
 
 
-def _line(view: RecordView, c: int, end: str) -> Volumes:
-    rate = view.smooth(view.chamber_flow(c), 1)
-    if end == "cylinder":
-        return {c: rate * slope_to(view, c) * view.dt_s}
-    bend = np.diff(rate, prepend=rate[:1])
-    return {c: view.compliance[c] * view.volume(c)[:-1] * bend}
+def _of_chambers(
+    column: Callable[[RecordView, int, Shape], FloatArray],
+    view: RecordView,
+    at: tuple[int, ...],
+    shape: Shape,
+) -> Volumes:
+    return {c: column(view, c, shape) for c in at}
+
+
+def inertance(view: RecordView, candidate: Candidate) -> float:
+    """I of a line of this shape, Pa s2/m3."""
+    at = list(chambers_by_place(view.model)[candidate.where])
+    soft = candidate.shape[1] * float(np.mean(view.compliance[at]))
+    return 1.0 / (soft * candidate.shape[0] ** 2)
+
+
+def line_softness(view: RecordView, candidate: Candidate) -> Volumes:
+    """What the oil of a line takes up per Pa of the measured pressure (n,), m3/Pa."""
+    at, volume = chambers_by_place(view.model)[candidate.where], candidate.shape[1]
+    return {c: np.full(view.n, 2.0 * volume * float(view.compliance[c])) for c in at}
+
+
+def line_echo(view: RecordView, candidate: Candidate, noise: Volumes) -> Volumes:
+    """What a line makes of its pressure's noise alone, chamber -> (n,) Pa."""
+    of_noise = _late if AT_CYLINDER in candidate.shape_names else _kept_back
+    at, nothing = chambers_by_place(view.model)[candidate.where], np.zeros(view.n - 1)
+    return {c: of_noise(view, c, candidate.shape, noise[c], nothing) for c in at}
+
+
+def _at_cylinder(view: RecordView, c: int, shape: Shape) -> FloatArray:
+    """What the line takes from the flow of the valves by the time it reaches the chamber."""
+    return _late(view, c, shape, view.pressure(c), gauged(view, c)[0])
+
+
+def _late(
+    view: RecordView, c: int, shape: Shape, pressure: FloatArray, flow: FloatArray
+) -> FloatArray:
+    """Volumes (n - 1,), m3, of q - Q_0 - C dp_c/dt for p_c (n,) and Q_0 (n - 1,)."""
+    soft, resistance = shape[1] * float(view.compliance[c]), shape[2]
+    through = np.empty(view.n - 1)
+    drive, (_, opens) = flow - soft * np.diff(pressure) / view.dt_s, gauged(view, c)
+    _section(drive, opens, view.dt_s, 1.0 / (soft * shape[0] ** 2), soft, resistance, through)
+    return np.asarray((through - flow) * view.dt_s - soft * np.diff(pressure))
+
+
+def _at_valve(view: RecordView, c: int, shape: Shape) -> FloatArray:
+    """What the chamber stores otherwise than the pressure at the valve says."""
+    return _kept_back(view, c, shape, view.pressure(c), gauged(view, c)[0])
+
+
+def _kept_back(
+    view: RecordView, c: int, shape: Shape, pressure: FloatArray, flow: FloatArray
+) -> FloatArray:
+    """Volumes (n - 1,), m3, of (V + V_l) / beta dd/dt - 2 C dp_v/dt for p_v (n,), Q_0 (n - 1,)."""
+    radps, volume, resistance = shape
+    soft, half = volume * float(view.compliance[c]), max(2, round(QUICK_S / view.step_s))
+    at_samples = np.concatenate([flow[:1], _mean(flow), flow[-1:]])
+
+    def along(derivative: int) -> FloatArray:
+        """A derivative of q (n,)."""
+        drawn = fitted(pressure, half, derivative + 1, view.step_s)
+        return fitted(at_samples, half, derivative, view.step_s) - soft * drawn
+
+    drop = along(1) / (soft * radps**2) + resistance * along(0)
+    return np.asarray(_room(view, c, shape) * np.diff(drop) - 2.0 * soft * np.diff(pressure))
+
+
+def _room(view: RecordView, c: int, shape: Shape) -> FloatArray:
+    """(V + V_l) / beta (n - 1,), m3/Pa."""
+    return (_mean(view.volume(c)) + shape[1]) * float(view.compliance[c])
+
+
+def _mean(values: FloatArray) -> FloatArray:
+    return np.asarray(0.5 * (values[1:] + values[:-1]))
+
+
+@kernel
+def _section(
+    drive: FloatArray,
+    opens: FloatArray,
+    dt_s: FloatArray,
+    inertance: float,
+    soft: float,
+    resistance: float,
+    through: FloatArray,
+) -> None:
+    """Fill through (n - 1,), m3/s: the mean of q over each interval.
+
+    C dd/dt = drive - opens d - q,  I dq/dt = d - R q:  drive m3/s, opens m3/s/Pa, both (n - 1,).
+    """
+    q, d = drive[0], resistance * drive[0]
+    for k in range(len(drive)):
+        h = dt_s[k] / STEPS
+        total = 0.0
+        for _ in range(STEPS):
+            before = q
+            q, d = _trapezoid(q, d, drive[k], opens[k], h, inertance, soft, resistance)
+            total += 0.5 * (q + before)
+        through[k] = total / STEPS
+
+
+@kernel
+def _trapezoid(
+    q: float,
+    d: float,
+    drive: float,
+    opens: float,
+    h: float,
+    inertance: float,
+    soft: float,
+    resistance: float,
+) -> tuple[float, float]:
+    """q and d after h seconds: C dd/dt = drive - opens d - q,  I dq/dt = d - R q."""
+    a, b = 0.5 * h / inertance, 0.5 * h / soft
+    left, right = 1.0 + a * resistance, 1.0 + b * opens
+    from_q = (1.0 - a * resistance) * q + a * d
+    from_d = (1.0 - b * opens) * d - b * q + 2.0 * b * drive
+    det = left * right + a * b
+    return (right * from_q + a * from_d) / det, (left * from_d - b * from_q) / det

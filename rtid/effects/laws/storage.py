@@ -10,6 +10,7 @@ import numpy as np
 from rtid.effects.column import Candidate, Cause, Columns
 from rtid.effects.law import Placed, Shape, Volumes, lagged, placed_on
 from rtid.effects.laws.common import stored
+from rtid.effects.laws.lines import LINE, line_echo, line_softness
 from rtid.effects.record_view import RecordView
 from rtid.estimator.state import variance
 from rtid.plain import FloatArray
@@ -45,6 +46,8 @@ def add_echoes(
 
 def _echo(view: RecordView, candidate: Candidate, noise: Volumes) -> Volumes:
     """What a storage effect makes of the pressures' noise alone, chamber -> (n,) Pa; {} else."""
+    if candidate.law.law == LINE:
+        return line_echo(view, candidate, noise)
     placed = _placed(view, candidate)
     if placed is None:
         return {}
@@ -54,6 +57,8 @@ def _echo(view: RecordView, candidate: Candidate, noise: Volumes) -> Volumes:
 
 def softness(view: RecordView, candidate: Candidate) -> Volumes:
     """What one unit of a storage effect takes up per Pa, by chamber (n,), m3/Pa; {} for others."""
+    if candidate.law.law == LINE:
+        return line_softness(view, candidate)
     placed = _placed(view, candidate)
     return placed.softness(view, candidate.shape) if placed is not None else {}
 
