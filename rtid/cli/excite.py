@@ -43,7 +43,8 @@ def excite(
     The limits stand in the section `excite` of the project file: stroke_mm, speed_mps, command_v,
     pressure_mpa, usual_supply_mpa, mass_kg, kp_per_s and volts_per_mps are needed; duration_s,
     command_rate_per_s, offset_v, supply_mpa, supply_pa_per_s, tank_mpa, may_shut, see, load_n,
-    load_slope_n_per_m, friction_n, friction_ns_per_m, deadband_v and blend_mps have defaults.
+    load_slope_n_per_m, friction_n, friction_ns_per_m, deadband_v and blend_mps have defaults;
+    stops_mm: stops that the piston may be held against, for `--see pressure_sensor_bias`.
 
     The motion is a row of segments from rest to rest, chosen for what they tell per second on the
     nominal machine (the data sheet's or the learned maps).  Predicted are the standard error of

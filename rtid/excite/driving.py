@@ -28,7 +28,7 @@ X_REF, V_REF, OFFSET, SUPPLY, SHUT = range(5)  # columns of a reference
 
 
 class Piston(NamedTuple):
-    """The load on the piston: load_n at x_mid_m, against a growing x; friction."""
+    """The load on the piston: load_n at x_mid_m, against a growing x; friction; its stops."""
 
     mass_kg: float
     load_n: float
@@ -37,6 +37,8 @@ class Piston(NamedTuple):
     viscous_nspm: float
     coulomb_n: float
     width_mps: float = 4e-3
+    least_m: float = -math.inf
+    most_m: float = math.inf
 
 
 class Control(NamedTuple):
@@ -126,4 +128,8 @@ def drive(
         v = (v + STEP_S * force / piston.mass_kg) / (
             1.0 + STEP_S * piston.viscous_nspm / piston.mass_kg
         )
+        if (v > 0.0 and x + STEP_S * v > piston.most_m) or (
+            v < 0.0 and x + STEP_S * v < piston.least_m
+        ):
+            v = 0.0
     return len(reference)

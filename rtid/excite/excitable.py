@@ -143,6 +143,7 @@ def limits_of(section: ExciteSection) -> Limits:
         offset_v=section.offset_v,
         command_rate_vps=section.command_rate_per_s,
         may_shut=section.may_shut,
+        stops_m=section.stops_m,
     )
 
 

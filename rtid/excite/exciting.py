@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from rtid.effects.page import is_zero
 from rtid.errors import RtidError, door
 from rtid.excite.design import Design, design
 from rtid.excite.driving import OFFSET, SHUT, STEP_S, SUPPLY, V_REF, X_REF
@@ -18,6 +19,7 @@ from rtid.excite.machine import DrivenMachine
 from rtid.excite.motion_limits import Limits
 from rtid.excite.prediction import Prediction, assess, median_ratio
 from rtid.excite.selection import D_OPTIMAL
+from rtid.excite.stops import against_stops, with_rests
 from rtid.excite.sweep import swept_sine
 from rtid.plain import FloatArray, Progress, plain, silent
 from rtid.project import Project
@@ -75,7 +77,12 @@ def excite(
     if not pool:
         raise NothingMissingError(f"by {begun.taught_by}, no segment tells much more")
     progress("choosing", 0.6)
-    designed = design(machine, limits, begun.known, pool)
+    wanted = (*see, *(project.sections.excite.see if project.sections.excite else ()))
+    rests = against_stops(limits, machine) if any(is_zero(name) for name in wanted) else None
+    before_s = rests.duration_s if rests is not None else 0.0
+    designed = design(machine, limits.without(before_s), begun.known, pool)
+    if rests is not None:
+        designed = with_rests(designed, rests, limits)
     progress("predicting", 0.75)
     predictions = [designed.predicted(), _swept(machine, limits)]
     if compare:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +23,8 @@ class Limits:
     """Ranges are (low, high), SI; a supply whose ends agree is constant, offset_v = 0: no dither.
 
     command_rate_vps: of the offset that is added to the controller's command; pressure_pa: of the
-    chambers; supply_rate_paps: of the supply's setpoint.
+    chambers; supply_rate_paps: of the supply's setpoint; stops_m: mechanical stops that the piston
+    may be held against, None for none.
     """
 
     duration_s: float
@@ -36,6 +37,7 @@ class Limits:
     offset_v: float = 0.0
     command_rate_vps: float = 50.0
     may_shut: bool = True
+    stops_m: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         """Refuse limits that leave no motion."""
@@ -49,10 +51,16 @@ class Limits:
             "supply_rate": self.supply_rate_paps <= 0,
             "command_rate": self.command_rate_vps <= 0,
             "offset": self.offset_v < 0,
+            "stops": self.stops_m is not None
+            and not self.stops_m[0] <= self.stroke_m[0] < self.stroke_m[1] <= self.stops_m[1],
         }
         bad = [name for name, is_wrong in wrong.items() if is_wrong]
         if bad:
             raise LimitError(f"limits leave no motion: {', '.join(bad)}", "adapt [excite]")
+
+    def without(self, seconds: float) -> Limits:
+        """The same for so much less time."""
+        return replace(self, duration_s=self.duration_s - seconds)
 
     @property
     def supply_varies(self) -> bool:

@@ -385,15 +385,17 @@ class RecordSection(Section):
 class ExciteSection(Section):
     """[excite]: what a designed motion may do, the load and the position controller.
 
-    supply: range of its setpoint, None where it cannot be changed; offset: steps that may be added
-    to the controller's command, 0 for none; load: force against growing x in mid-stroke; see:
-    effects that are to become visible.
+    stops: the mechanical ones, if the piston may be held against them; supply: range of its
+    setpoint, None where it cannot be changed; offset: steps that may be added to the controller's
+    command, 0 for none; load: force against growing x in mid-stroke; see: effects that are to
+    become visible.
     The controller's u = deadband tanh(demand / blend) + volts_per_mps demand,
     demand = v_ref + kp (x_ref - x), with steps in the command's unit.
     """
 
     duration_s: Annotated[float, TIME] = Field(default=80.0, gt=0)
     stroke_m: Annotated[Interval, LENGTH] = Field(description="stroke_mm = [75, 425]")
+    stops_m: Annotated[Interval | None, LENGTH] = None
     speed_mps: Annotated[float, VELOCITY] = Field(gt=0, description="speed_mps = 0.3")
     command_v: Annotated[float, COMMAND] = Field(gt=0, description="command_v = 9")
     command_rate_per_s: float = Field(default=50.0, gt=0)

@@ -9,6 +9,8 @@ import numpy as np
 
 from rtid.excite.exciting import Excited
 from rtid.excite.prediction import median_ratio
+from rtid.excite.stops import NAME as STOPS
+from rtid.excite.stops import REST_AT_STOP_S
 from rtid.tell.story import Story, Table
 from rtid.units import CONVENTION, Z95, limit, scale_of
 
@@ -33,6 +35,12 @@ def _sentences(excited: Excited) -> Iterator[str]:
         f"valid blocks instead of {sweep.valid}, and the median standard error of the map, over "
         f"the blocks of both, is {ratio:.2f} of the sweep's."
     )
+    if any(c.segment.name == STOPS for c in design.segments):
+        yield (
+            f"It ends with {REST_AT_STOP_S:.0f} s against each stop, slowly approached, with the "
+            "valves open: each chamber is then joined to the supply and to the tank, and `rtid "
+            "diagnose` tells the zeros of the pressure sensors from it."
+        )
     if excited.worth < excited.tried:
         yield (
             f"By what is learned already, {excited.worth} of {excited.tried} possible segments are "

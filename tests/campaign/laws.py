@@ -6,6 +6,7 @@ the simulator's own, equal steps that somebody has thought of, or the file of `r
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -20,11 +21,12 @@ from rtid.diagnose.excuse import steady
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.report import Diagnosis, diagnosis
 from rtid.diagnose.standing import fitted, stand
+from rtid.effects.laws import causes
 from rtid.estimator.estimator import to_chunk
 from rtid.estimator.flowmap import EXTRAPOLATED, VALID, EdgeMap
 from rtid.estimator.published import publish
 from rtid.model import Edge, Grid, Lag, Machine
-from rtid.plain import FloatArray
+from rtid.plain import FloatArray, Key
 from rtid.project.template import U_STEPS, nice
 from rtid.sim.declare import declared_model, default_grid
 from rtid.sim.demand import IDENTIFICATION, VALIDATION
@@ -36,8 +38,9 @@ from rtid.study.known_effects import acting, learn_beside
 from tests.campaign import diagnoses
 from tests.campaign.diagnoses import judge, truth
 
-WORKERS = 2
+WORKERS = int(os.environ.get("RTID_WORKERS", "2"))
 RECORD_S = 44.0  # of which 32 s teach
+WARM = 1.5  # records: time constant with which the gains drift
 NEAR = 0.25  # of the visited span: how far off the data a map still gives a number
 DEFAULT, EQUAL, INIT = "default", "equal", "init"
 GRIDS = (DEFAULT, EQUAL, INIT)
@@ -120,7 +123,8 @@ class Outcome:
     """What was said of a machine, beside the truth.
 
     beta_z, beta_half (chambers,): error in standard deviations, half-width as a share; names: of
-    all that was found and what it cannot be told from; limits: (effect, where) -> detection limit.
+    all that was found and what it cannot be told from; limits: (effect, where) -> detection limit;
+    left: of the held-out part, in units of the sensors' noise.
     """
 
     case: Hiding
@@ -134,6 +138,7 @@ class Outcome:
     near: Points
     limits: dict[tuple[str, str], float]
     seconds: float
+    left: float
 
     @property
     def band(self) -> float:
@@ -146,15 +151,21 @@ class Answer:
     """What was said of a machine with an effect of middle strength in it.
 
     judgement: as of `diagnoses.judge`; is_hidden: named where the maps had taken it in; size_z:
-    error of its size in stated standard deviations, NaN where it is not one number.
+    error of its size in stated standard deviations, NaN where it is not one number; beta_z, half
+    (chambers,) as of an outcome; left: of the held-out part, in units of the sensors' noise.
     """
 
     case: Case
     judgement: str
+    verdict: str
     named: str
     is_hidden: bool
     size_z: float
     size_half: float
+    beta_z: FloatArray
+    beta_half: FloatArray
+    left: float
+    seconds: float
 
 
 @dataclass(frozen=True)
@@ -166,6 +177,14 @@ class Judged:
     present: Fit
     taught: FloatArray
     said: Diagnosis
+    last: Fit
+
+    @property
+    def beta_sd_pa(self) -> FloatArray:
+        """Of the moduli that are told, (chambers,)."""
+        words = steady(self.last)
+        beta = 1.0 / words.compliance
+        return np.asarray(np.sqrt(np.diag(words.compliance_cov)) * beta**2)
 
 
 def outcomes(cases: Iterable[Case]) -> Iterator[Outcome]:
@@ -202,23 +221,54 @@ def of_run(plant: TruePlant, run: Run, model: Machine) -> Judged:
     taught = chunk[t_s < IDENTIFICATION * RECORD_S]
     present = fitted(model, taught)
     standing = stand(model, taught, chunk[t_s >= VALIDATION * RECORD_S], known=present)
-    return Judged(plant, run, present, taught, diagnosis(searched(standing)))
+    result = searched(standing)
+    return Judged(plant, run, present, taught, diagnosis(result), result.last)
 
 
 def answer(case: Case) -> Answer | None:
     """The answer to one case; None where it could not be simulated."""
+    began = time.process_time()
     found = judged(case)
     if found is None:
         return None
     said, z, half = found.said, float("nan"), float("nan")
     judgement = judge(diagnoses.Case(case.seed, case.hidden), said)
     first = said.found[0] if said.found else None
-    true = case.plant.hidden[0].strength
     if first is not None and first.effect == truth(case.hidden) and len(first.parameters) == 1:
+        true = _over_the_record(found, (first.effect, first.where))
+        true = true if np.isfinite(true) else case.plant.hidden[0].strength * _taught(case)
         (size,) = first.parameters.values()
         z, half = (abs(size.value) - abs(true)) / size.std, 1.96 * size.std / abs(true)
     is_hidden = first is not None and first.hidden_in_map is not None
-    return Answer(case, judgement, first.effect if first else "", is_hidden, z, half)
+    beta, true = np.array(said.beta_pa), case.plant.constants.beta_pa
+    sd = found.beta_sd_pa
+    left = said.heldout_residual_after_m3s / said.noise_floor_m3s
+    return Answer(
+        case, judgement, said.verdict, first.effect if first else "", is_hidden, z, half,
+        (beta - true) / sd, 1.96 * sd / true, left, time.process_time() - began,
+    )  # fmt: skip
+
+
+def _taught(case: Case) -> float:
+    """The share of an effect that the taught part holds: gains warm up over the whole record."""
+    if not case.hidden.startswith("valve_gain_drift"):
+        return 1.0
+    return float(np.expm1(-IDENTIFICATION / WARM) / np.expm1(-1.0 / WARM))
+
+
+def _over_the_record(found: Judged, key: Key) -> float:
+    """The coefficient that a plain column has of the true flow past the valves; NaN for another.
+
+    A gap widens with pressure: what it lets through at 3 MPa is not its size in a record at 1 MPa.
+    """
+    view, n = found.present.view, found.present.view.n
+    plain = [c for c in causes(view) if c.candidate.key == key and not c.axes]
+    past = found.run.truth.extra_m3s[:n]
+    if not plain or not past.any():
+        return float("nan")
+    column = plain[0].column(())
+    true = {c: 0.5 * (past[1:, c] + past[:-1, c]) * view.dt_s for c in column}
+    return float(sum(column[c] @ true[c] for c in column) / sum(v @ v for v in column.values()))
 
 
 def outcome(case: Case) -> Outcome | None:
@@ -250,6 +300,7 @@ def outcome_of(case: Hiding, judgement: Judged, began: float) -> Outcome:
         _joined([near for _, near in of]),
         {(u.effect, u.where): u.detection_limit or np.inf for u in said.not_found},
         time.process_time() - began,
+        said.heldout_residual_after_m3s / said.noise_floor_m3s,
     )
 
 

@@ -22,8 +22,9 @@ from rtid.units import show_flow_as
 from tests.campaign.diagnoses import wilson
 from tests.campaign.kinds import HIDDEN, KINDS, SPOOL, KindCase
 from tests.campaign.laws import Outcome, outcome
+from tests.campaign.laws_at_size import ALARMS, Z95
 from tests.campaign.report import leave
-from tests.campaign.test_laws import ALARMS, Z95, covered
+from tests.campaign.test_laws import covered
 from tests.test_drive import Driven
 
 MACHINES = int(os.environ.get("RTID_KINDS", "20"))

@@ -3,6 +3,7 @@
 RTID_LAWS: machines per law (42 of each by default; about five seconds each).  Of four, one makes
 the paper's sweep.  Effects at twice the limit that the clean machine's record states are hidden
 beside, and must be named; and one of middle strength in each machine, in turn, on either motion.
+At a reduced size, and case by case: `python -m tests.campaign.laws_at_size`.
 """
 
 from __future__ import annotations
@@ -15,19 +16,13 @@ import numpy as np
 import pytest
 
 from rtid.plain import FloatArray
-from rtid.sim.hideable import KNOWN
 from rtid.sim.valve_laws import LAWS
 from tests.campaign.diagnoses import IN_SET, RIGHT, WRONG, wilson
 from tests.campaign.laws import Case, Outcome, answers, outcome, outcomes
+from tests.campaign.laws_at_size import ALARMS, EFFECTS, FIRST, Z95
 from tests.campaign.report import leave
 
 MACHINES = int(os.environ.get("RTID_LAWS", "42"))
-FIRST = 5000
-# what a free map takes in whatever the motion is no effect that could be named
-SWALLOWED = ("deadband_shift", "pressure_sensor_bias", "load_compensated_valve", "velocity_scale")
-EFFECTS = tuple(name for name in KNOWN if name not in SWALLOWED)
-ALARMS = ("missing", "ambiguous", "unknown")
-Z95 = 1.96
 AT_LIMIT = (
     ("external_leakage_laminar", "a"),
     ("internal_leakage_laminar", "a-b"),
