@@ -19,15 +19,10 @@ from rtid.plain import FloatArray
 from rtid.sim.valve_laws import LAWS
 from tests.campaign.diagnoses import IN_SET, RIGHT, WRONG, wilson
 from tests.campaign.laws import Case, Outcome, answers, outcome, outcomes
-from tests.campaign.laws_at_size import ALARMS, EFFECTS, FIRST, Z95
+from tests.campaign.laws_at_size import ALARMS, AT_LIMIT, EFFECTS, FIRST, Z95
 from tests.campaign.report import leave
 
 MACHINES = int(os.environ.get("RTID_LAWS", "42"))
-AT_LIMIT = (
-    ("external_leakage_laminar", "a"),
-    ("internal_leakage_laminar", "a-b"),
-    ("input_delay", "command"),
-)
 
 
 def test_a_clean_valve_of_another_law_raises_no_alarm() -> None:
