@@ -14,7 +14,7 @@ import json
 import platform
 import shutil
 import subprocess
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -132,9 +132,7 @@ def _model(
     """rtid_model.h, and the variables as a model description lists them."""
     engine = build(model.with_taylor_maps, nominal_weights(model)).engine
     e = engine.view(np.recarray)[0]
-    n, edges, chambers = int(e["n_signals"]), len(model.edges), len(model.chambers)
-    chambers = chambers if dynamics else 0
-    terms = len(model.terms) if dynamics else 0
+    chambers = len(model.chambers) if dynamics else 0
     variables = list(_variables(model, dynamics, _used(model, dynamics)))
     lines = [
         "/* A machine learned by rtid: do not edit. */",
@@ -142,17 +140,30 @@ def _model(
         "#define RTID_MODEL_H",
         '#include "rtid_map.h"',
         '#define TOKEN "@TOKEN@"',
-        f"enum {{ N_SIGNALS = {n}, X_COLUMN = {e['x_column']} }};",
+        f"enum {{ N_SIGNALS = {int(e['n_signals'])}, X_COLUMN = {e['x_column']} }};",
         f"enum {{ MODE_COLUMN = {e['mode_column']} }};",
         f"#define N_CHAMBERS {chambers}",
-        f"#define N_TERMS {terms}",
-        f"#define N_EDGES {edges}",
+        f"#define N_TERMS {len(model.terms) if dynamics else 0}",
+        f"#define N_EDGES {len(model.edges)}",
         f"#define OVERLAP {OVERLAP!r}",
         f"enum {{ SHAPE_FLOW = {FLOW}, SHAPE_ROOT = {ROOT}, SHAPE_HINGE = {HINGE}, "
         f"SHAPE_INVERSE = {INVERSE} }};",
+        *_of_edges(model, e, flowmap),
+        *(_of_chambers(model, e, dynamics) if dynamics else ()),
+        *_doubles("START", _starts(variables, 1 + 2 * int(e["n_signals"]) + chambers + 1)),
     ]
-    borders = [(edge.grid.u_v, edge.grid.dp_pa) for edge in model.edges]
-    lines += [
+    for edge in model.edges:
+        name = f"sd_{edge.name}".replace("-", "_")
+        lines += float_map(name, deviations(edge, flowmap, error_percent))
+    tables = ", ".join(f"&sd_{edge.name}".replace("-", "_") for edge in model.edges)
+    lines += [f"static const rtid_map *const TABLES[] = {{{tables}}};", "#endif"]
+    return "\n".join(lines) + "\n", variables
+
+
+def _of_edges(model: Machine, e: np.record, flowmap: FlowMap) -> list[str]:
+    """The grids and the map of every edge, and between which signals it lies."""
+    edges, borders = len(model.edges), [(edge.grid.u_v, edge.grid.dp_pa) for edge in model.edges]
+    return [
         *_ints("N_U", e["n_u"][:edges]), *_ints("N_DP", e["n_dp"][:edges]),
         *_ints("FIRST_CELL", e["first_cell"][:edges]),
         *_ints("FIRST_U", np.cumsum([0, *(len(u) for u, _ in borders)])),
@@ -167,34 +178,37 @@ def _model(
         *_ints("SOURCE", e["source"][:edges]), *_ints("SINK", e["sink"][:edges]),
         f"static const long long MODES[] = {{{', '.join(f'{m}LL' for m in e['modes'][:edges])}}};",
     ]  # fmt: skip
-    if chambers:
-        lines += [
-            *_ints("P_COLUMN", e["p_column"][:chambers]),
-            *_doubles("AREA_M2", e["area_m2"][:chambers]),
-            *_doubles("V0_M3", e["v0_m3"][:chambers]),
-            *_doubles("GROWTH_M2", e["growth_m2"][:chambers]),
-            *_doubles("P_LOW", e["minimum"][e["p_column"][:chambers]]),
-            *_doubles("P_HIGH", e["maximum"][e["p_column"][:chambers]]),
-            *_doubles("SIGN", e["sign"][:edges, :chambers]),
-            *_ints("TERM_SHAPE", e["term_shape"][: max(terms, 1)]),
-            *_ints("TERM_VOLUME", e["term_volume"][: max(terms, 1)]),
-            *_doubles("TERM_THETA", np.append(dynamics.terms if dynamics else [], 0.0)),
-            *_doubles("TERM_SCALE", e["term_scale"][: max(terms, 1)]),
-            *_doubles("TERM_CONSTANT", e["term_constant"][: max(terms, 1)]),
-            *_doubles("TERM_WEIGHT", e["term_weight"][: max(terms, 1), :n]),
-            *_doubles("TERM_SIGN", e["term_sign"][: max(terms, 1), :chambers]),
-        ]
-    start = np.zeros(1 + 2 * n + chambers + 1)
+
+
+def _of_chambers(model: Machine, e: np.record, dynamics: Dynamics) -> list[str]:
+    """What the pressures come from: the chambers, and the terms beside the maps (C has no 0)."""
+    n, edges, chambers = int(e["n_signals"]), len(model.edges), len(model.chambers)
+    terms = max(len(model.terms), 1)
+    return [
+        *_ints("P_COLUMN", e["p_column"][:chambers]),
+        *_doubles("AREA_M2", e["area_m2"][:chambers]),
+        *_doubles("V0_M3", e["v0_m3"][:chambers]),
+        *_doubles("GROWTH_M2", e["growth_m2"][:chambers]),
+        *_doubles("P_LOW", e["minimum"][e["p_column"][:chambers]]),
+        *_doubles("P_HIGH", e["maximum"][e["p_column"][:chambers]]),
+        *_doubles("SIGN", e["sign"][:edges, :chambers]),
+        *_ints("TERM_SHAPE", e["term_shape"][:terms]),
+        *_ints("TERM_VOLUME", e["term_volume"][:terms]),
+        *_doubles("TERM_THETA", np.append(dynamics.terms, 0.0)),
+        *_doubles("TERM_SCALE", e["term_scale"][:terms]),
+        *_doubles("TERM_CONSTANT", e["term_constant"][:terms]),
+        *_doubles("TERM_WEIGHT", e["term_weight"][:terms, :n]),
+        *_doubles("TERM_SIGN", e["term_sign"][:terms, :chambers]),
+    ]
+
+
+def _starts(variables: Sequence[FmuVariable], n: int) -> FloatArray:
+    """The values (n,) with which the variables begin, by their references, in their SI units."""
+    start = np.zeros(n)
     for variable in variables:
-        if variable.reference < len(start) and variable.start is not None:
+        if variable.reference < n and variable.start is not None:
             start[variable.reference] = variable.start
-    lines += _doubles("START", start)
-    for edge in model.edges:
-        name = f"sd_{edge.name}".replace("-", "_")
-        lines += float_map(name, deviations(edge, flowmap, error_percent))
-    tables = ", ".join(f"&sd_{edge.name}".replace("-", "_") for edge in model.edges)
-    lines += [f"static const rtid_map *const TABLES[] = {{{tables}}};", "#endif"]
-    return "\n".join(lines) + "\n", variables
+    return start
 
 
 def deviations(edge: Edge, flowmap: FlowMap, error_percent: float = ERROR_PERCENT) -> Table:

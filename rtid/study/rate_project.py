@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,30 +44,19 @@ def rate_text(
     key = f"u_grid_{unit.key}" if unit else "u_grid_v"
     key = "grid" if unit and unit.dimension not in COMMAND_DIMENSIONS else key
     rows_hz = min(50.0, 1.0 / step_s)
-    state: dict[str, Any] = {"column": pair.state.name, "unit": pair.state.unit}
-    if _is_angle(pair.state):
-        state["kind"] = "other"
-    state |= {"noise": "estimate", "resolution": source.steps[pair.state.name]}
     moved, size = x, np.abs(slope_of(t_s, x))
     if pair.is_measured:
-        state["noise"], moved, size = 0.0, us.sum(axis=1), np.abs(x) / us.shape[1]
+        moved, size = us.sum(axis=1), np.abs(x) / us.shape[1]
     if pair.pressed and pair.pressed.motion:
         moved = table.columns[pair.pressed.motion.name][whole]
     is_long = pair.is_measured and t_s[-1] > LONG_S
     held_out = HELD_OUT_OF_MEASURED if is_long else HELD_OUT_SHARE
     split = held_out_from(t_s, moved, held_out)
     commands = {name: c for name, c in pair.roles.items() if name != "x"}
-    offset: dict[str, Any] = {} if pair.is_measured else {"offset": "estimate"}
     raw: dict[str, dict[str, Any]] = {
         "project": {"name": name},
         "source": dict(source.keys),
-        "signals": {
-            **{
-                name: {"column": command.name, "unit": command.unit} | offset
-                for name, command in commands.items()
-            },
-            "x": state,
-        },
+        "signals": _signals(pair, commands, source.steps[pair.state.name]),
         "rate": {"measured" if pair.is_measured else "state": "x"},
         "maps": {
             "f": {
@@ -96,6 +85,22 @@ def rate_text(
         f"# ({pair.neutral:.6g} {pair.command.unit} here), which is found anew in every table.",
     ]
     return "\n".join([*head, "", tomlkit.dumps(raw)])
+
+
+def _signals(
+    pair: RatePair, commands: Mapping[str, RoleCandidate], step: float
+) -> dict[str, dict[str, Any]]:
+    """The columns of the commands and of what they drive; step: the smallest change of that."""
+    offset: dict[str, Any] = {} if pair.is_measured else {"offset": "estimate"}
+    signals = {
+        name: {"column": command.name, "unit": command.unit} | offset
+        for name, command in commands.items()
+    }
+    state: dict[str, Any] = {"column": pair.state.name, "unit": pair.state.unit}
+    if _is_angle(pair.state):
+        state["kind"] = "other"
+    noise = 0.0 if pair.is_measured else "estimate"
+    return signals | {"x": state | {"noise": noise, "resolution": step}}
 
 
 def _neutral(pair: RatePair) -> float:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from pathlib import Path
+from socket import socket
 from typing import TYPE_CHECKING, Any
 
 from bokeh.application import Application
@@ -307,27 +308,59 @@ def start(
     if trace is not None or project is None:
         import_module("rtid.ui.desk_views")  # now, not while somebody waits for a picture
     logging.getLogger("bokeh.server.views.ws").setLevel(logging.ERROR)  # a tab may be closed
-    loop = IOLoop.current()
-    worker = Worker(loop.add_callback)
-    session = Session(project or Path.cwd(), trace, worker, sheet, folder=state, test_bus=test_bus)
-    if project is None:
-        folder = trace.resolve().parent if trace else Path.cwd()
-        session = Session(folder, None, worker, arrival=Arrival(folder, trace and trace.resolve()))
-    try:
-        sockets = bind_sockets(port, host)
-    except OSError as error:
-        worker.stop()
-        remedy = "another `rtid ui` may be running; --port 0 takes any free port"
-        raise RtidError(f"{host}:{port}: {error.strerror}", remedy) from None
+    loop, sockets = IOLoop.current(), _bound(host, port)
+    session = _session(project, trace, Worker(loop.add_callback), sheet, state, test_bus)
     turns = Turns(loop.call_later)
     door = Door(host, port=sockets[0].getsockname()[1])
-    app = Numbered(
-        door,
-        FunctionHandler(partial(build, session=session, live=Live(state), turns=turns)),
+    guarded = _guarded(door, session, Live(state), turns)
+    http = HTTPServer(
+        guarded,
+        max_header_size=2**14,
+        max_body_size=2**16,
+        idle_connection_timeout=60,
+        body_timeout=BODY_S,
     )
-    guarded = Guarded(
+    http.add_sockets(sockets)
+    server = BaseServer(loop, guarded, http)
+    server.start()
+    session.open()
+    # Bokeh collects all garbage twice for each page that goes, 0.14 s of the loop each time; what
+    # is here already is not looked at again.
+    gc.collect()
+    gc.freeze()
+    url = f"http://{_in_url(host)}:{door.port}/?{TOKEN}={door.token}"
+    return Workbench(server, guarded, session, url, turns)
+
+
+def _bound(host: str, port: int) -> list[socket]:
+    try:
+        return bind_sockets(port, host)
+    except OSError as error:
+        remedy = "another `rtid ui` may be running; --port 0 takes any free port"
+        raise RtidError(f"{host}:{port}: {error.strerror}", remedy) from None
+
+
+def _session(
+    project: Path | None,
+    trace: Path | None,
+    worker: Worker,
+    sheet: Path | None,
+    state: Path | None,
+    test_bus: bool,
+) -> Session:
+    """Of a project and its trace; without a project, of a file that is made one of."""
+    if project is not None:
+        return Session(project, trace, worker, sheet, folder=state, test_bus=test_bus)
+    folder = trace.resolve().parent if trace else Path.cwd()
+    return Session(folder, None, worker, arrival=Arrival(folder, trace and trace.resolve()))
+
+
+def _guarded(door: Door, session: Session, live: Live, turns: Turns) -> Guarded:
+    """The pages of a session, and what else is served, behind the door."""
+    make = partial(build, session=session, live=live, turns=turns)
+    return Guarded(
         door,
-        app,
+        Numbered(door, FunctionHandler(make)),
         turns,
         extra_patterns=[
             ("/alive", Alive),
@@ -346,23 +379,6 @@ def start(
         include_headers=[],
         include_cookies=[],
     )
-    http = HTTPServer(
-        guarded,
-        max_header_size=2**14,
-        max_body_size=2**16,
-        idle_connection_timeout=60,
-        body_timeout=BODY_S,
-    )
-    http.add_sockets(sockets)
-    server = BaseServer(loop, guarded, http)
-    server.start()
-    session.open()
-    # Bokeh collects all garbage twice for each page that goes, 0.14 s of the loop each time; what
-    # is here already is not looked at again.
-    gc.collect()
-    gc.freeze()
-    url = f"http://{_in_url(host)}:{door.port}/?{TOKEN}={door.token}"
-    return Workbench(server, guarded, session, url, turns)
 
 
 def _uploads(session: Session) -> list[tuple[str, type, dict[str, object]]]:
