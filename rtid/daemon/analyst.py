@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import os
-import sqlite3
 import sys
 import threading
 import time
@@ -17,14 +16,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from queue import Queue
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import numpy as np
 
 from rtid.compare import CandidateMap
 from rtid.compare.suspects import LikelyCause
 from rtid.daemon import jobs
-from rtid.daemon.chronicle import Chronicle
+from rtid.daemon.books import Books
 from rtid.daemon.edge_health import edges_of
 from rtid.daemon.first import against_first
 from rtid.daemon.guard import PROOF, TRUST, Guard, candidate_of, with_wear
@@ -32,7 +31,6 @@ from rtid.daemon.map_check import Judge
 from rtid.daemon.offering import Offering
 from rtid.daemon.pipe import Pipe
 from rtid.daemon.realtime import SWITCH_S
-from rtid.daemon.recorder import Recorder
 from rtid.daemon.shadow import Shadow
 from rtid.daemon.status import EffectStatus
 from rtid.daemon.waiting import MOST_BYTES, Waiting
@@ -48,14 +46,12 @@ from rtid.project import Project, load
 from rtid.study.on_board import learned_sizes, on_board
 from rtid.trace.snapshot import Generations
 
-T = TypeVar("T")
 NICE = 5
 MAP_FILE = "map.npz"
 KEPT = 3  # handovers that can be recalled
 CLEAN_S = 2.0  # a handover must be older than a suspicion by the piece in which that began
 JUDGED_S, JUDGED = 6.0, 2  # before a judgement; seconds that the guard has judged, a piece late
 FIRST_S = 60.0  # of samples that a first map, or a later one, is checked by
-FLOOD_S = 10.0  # the same refusal of the disk is told at most this often
 
 
 class Analyst:
@@ -67,15 +63,9 @@ class Analyst:
         self._answer, self._project, self._prior = answer, project, find_prior(project)
         self._chambers = [chamber.name for chamber in project.model.chambers]
         self._generations, self._disk = Generations(folder, project.digest), threading.Lock()
-        limit_bytes = project.sections.daemon.record_mb << 20
         self._folder = folder
-        self._recorder: Recorder | None = None
-        self._limit_bytes = limit_bytes
-        self._chronicle: Chronicle | None = None
+        self._books = Books(folder, project.sections.daemon.record_mb << 20, answer)
         self._judge: Judge | None = None
-        self._segment = ""
-        self._told: dict[str, float] = {}
-        self._well: set[str] = set()  # what the disk has taken since it has last refused it
         self._handed: deque[jobs.Handover] = deque(maxlen=KEPT)
         self._offering = Offering(project, folder)
         self._guard: Guard | None = None
@@ -94,8 +84,8 @@ class Analyst:
         """Publish the baseline of before, which has to foretell the motion first."""
         result = self._generations.baseline(self._project.model)
         for reason in result.refused:
-            self._refused("baseline", reason)
-        self._guarded("points", lambda: self._generations.keep("start"))
+            self._books.refused("baseline", reason)
+        self._books.put("points", lambda: self._generations.keep("start"))
         if result.estimator is None:
             return
         level = result.notes.get("level_m3s")
@@ -124,7 +114,7 @@ class Analyst:
         try:
             self._do(job)
         except RtidError as error:
-            self._refused("analysis", str(error))
+            self._books.refused("analysis", str(error))
 
     def _do(self, job: jobs.Job) -> None:
         if isinstance(job, jobs.Batch):
@@ -132,27 +122,27 @@ class Analyst:
         elif isinstance(job, jobs.Handover) and job.publish:
             try:
                 self._publish(job)
-                self._took("analysis")
+                self._books.took("analysis")
             finally:
                 self._answer(jobs.Ready(to_save=False))
         elif isinstance(job, jobs.Handover) and job.is_proving and self._guard is not None:
             self._cast(job, self._guard)
         elif isinstance(job, jobs.Note):
-            self._note(job)
+            self._books.note(job)
         elif isinstance(job, jobs.Recall):
             self._recall(job)
         elif isinstance(job, jobs.Relearn):
             self._relearn(job)
         elif isinstance(job, jobs.VerdictAnswer) and job.verdict is not None:
             verdict = job.verdict
-            self._guarded("history", lambda: self._history().note_verdict(verdict))
+            self._books.write(lambda history: history.note_verdict(verdict))
 
     def save(self, job: jobs.Handover) -> None:
         """Write the snapshot, in any thread."""
         path = None
         with self._disk:
             if job.number >= self._saved:  # else one that had to be on the disk has overtaken it
-                path, self._saved = self._guarded("snapshot", lambda: self._save(job)), job.number
+                path, self._saved = self._books.put("snapshot", lambda: self._save(job)), job.number
         if path is not None:
             self._answer(jobs.SavedSnapshot(job.number, str(path), job.made_s))
         self._answer(jobs.Ready(to_solve=False))
@@ -182,10 +172,7 @@ class Analyst:
         if trusted and _newest_s(trusted[-1]) > self._trusted_s:
             self._baseline = trusted[-1]
             self._store_baseline()
-        if self._recorder is not None:
-            self._recorder.close()
-        if self._chronicle is not None:
-            self._chronicle.close()
+        self._books.close()
 
     def _recall(self, job: jobs.Recall) -> None:
         """Give back what was learned before, and publish it again."""
@@ -257,9 +244,9 @@ class Analyst:
         with self._disk:
             if self._waiting_s != newest_s:  # another one was saved meanwhile
                 return
-            self._guarded("baseline", self._generations.trust)
+            self._books.put("baseline", self._generations.trust)
             self._trusted_s, self._waiting_s = newest_s, None
-        self._guarded("points", lambda: self._generations.keep("publish"))
+        self._books.put("points", lambda: self._generations.keep("publish"))
 
     def _lead(self, guard: Guard, shadow: Shadow, chunk: FloatArray) -> bool:
         """Whether what was learned in the shadow takes the place of a baseline that is lost."""
@@ -288,9 +275,9 @@ class Analyst:
             self._next = None
             with self._disk:
                 self._waiting_s = None
-                self._guarded("snapshot", self._generations.distrust)
-                self._guarded("snapshot", self._generations.drop_shadow)
-            self._guarded("points", lambda: self._generations.keep("alarm"))
+                self._books.put("snapshot", self._generations.distrust)
+                self._books.put("snapshot", self._generations.drop_shadow)
+            self._books.put("points", lambda: self._generations.keep("alarm"))
             self._answer(_foretold("contradicted", guard, guard.causes()))
             self._is_named = False  # but by few seconds, of which some may be healthy
         else:
@@ -302,8 +289,8 @@ class Analyst:
         if baseline is None:
             return
         self._trusted_s = _newest_s(baseline)
-        self._guarded("baseline", lambda: self._generations.save_baseline(baseline, notes))
-        self._guarded("points", lambda: self._generations.keep("publish"))
+        self._books.put("baseline", lambda: self._generations.save_baseline(baseline, notes))
+        self._books.put("points", lambda: self._generations.keep("publish"))
 
     def _is_fit(self, job: jobs.Handover, solution: Solution) -> bool:
         """Whether a first map may be published; from then on it is the baseline."""
@@ -323,13 +310,9 @@ class Analyst:
                 self._answer(replace(judgement, is_guarded=self._is_judged(judgement.t_s)))
         if len(batch.chunk):
             self._watch(batch.chunk)
-        self._guarded("offer", lambda: self._offering.push(batch.chunk))
-        frames = batch.frames
-        if frames is not None and self._limit_bytes:
-            self._guarded("recording", lambda: self._record().write(frames))
-            if self._recorder is not None and self._recorder.path != self._segment:
-                self._segment = self._recorder.path
-                self._answer(jobs.RecorderState(self._segment))
+        self._books.put("offer", lambda: self._offering.push(batch.chunk))
+        if batch.frames is not None:
+            self._books.record(batch.frames)
 
     def _relearn(self, job: jobs.Relearn) -> None:
         """Begin anew with the machine as it is; what was learned before is kept aside."""
@@ -342,9 +325,9 @@ class Analyst:
         self._answer(jobs.Recalled(estimator, is_accepted=True))
         with self._disk:
             self._waiting_s = None
-            self._guarded("snapshot", lambda: self._generations.set_aside("accept"))
-            self._guarded("snapshot", lambda: self._generations.save(estimator))
-        self._guarded("history", lambda: self._history().note_acceptance(job.acceptance))
+            self._books.put("snapshot", lambda: self._generations.set_aside("accept"))
+            self._books.put("snapshot", lambda: self._generations.save(estimator))
+        self._books.write(lambda history: history.note_acceptance(job.acceptance))
 
     def _publish(self, job: jobs.Handover) -> None:
         if not len(job.estimator.sums.blocks):
@@ -384,7 +367,7 @@ class Analyst:
             self._next = job, with_wear(solution.model, candidate, wear)
         self._answer(jobs.Worn(wear))
         edges, worn = solution.model.edges, guard.worn
-        self._guarded("history", lambda: self._history().note_wear(edges, worn))
+        self._books.write(lambda history: history.note_wear(edges, worn))
 
     def _tell(self, job: jobs.Handover) -> tuple[Solution, CandidateMap] | None:
         """Solve, judge from now on, and publish; None for a first map that cannot be."""
@@ -409,8 +392,8 @@ class Analyst:
         )
         self._answer(result)
         self._offering.published(result, solution)
-        self._guarded("map", lambda: self._write_map(flow_map, solution))
-        self._guarded("history", lambda: self._history().note_publication(result, self._chambers))
+        self._books.put("map", lambda: self._write_map(flow_map, solution))
+        self._books.write(lambda history: history.note_publication(result, self._chambers))
         return solution, candidate_of(solution, flow_map)
 
     def _write_map(self, flow_map: FlowMap, solution: Solution) -> None:
@@ -419,49 +402,6 @@ class Analyst:
         temporary = self._folder / f"part-{MAP_FILE}"
         write_map(temporary, flow_map, origin)
         os.replace(temporary, self._folder / MAP_FILE)
-
-    def _note(self, note: jobs.Note) -> None:
-        self._guarded("history", lambda: self._history().note_alarm(note.alarm))
-        if note.keep and self._limit_bytes:
-            alarm = note.alarm
-            keep = self._guarded(
-                "recording", lambda: self._record().keep(alarm.name, alarm.since_unix_s)
-            )
-            kept = {alarm.name: keep} if keep else {}
-            self._answer(jobs.RecorderState(self._recorder.path if self._recorder else "", kept))
-
-    def _record(self) -> Recorder:
-        if self._recorder is None:
-            self._recorder = Recorder(self._folder, self._limit_bytes)
-        return self._recorder
-
-    def _history(self) -> Chronicle:
-        if self._chronicle is None:
-            self._chronicle = Chronicle(self._folder)
-        return self._chronicle
-
-    def _guarded(self, what: str, action: Callable[[], T]) -> T | None:
-        """Do something with the disk; a refusal is told, and tried again with the next job."""
-        try:
-            result = action()
-        except (OSError, sqlite3.Error) as error:
-            self._refused(what, str(error))
-            return None
-        self._took(what)
-        return result
-
-    def _refused(self, what: str, reason: str) -> None:
-        now_s = time.monotonic()
-        if what in self._well or now_s >= self._told.get(what, 0.0):
-            self._told[what] = now_s + FLOOD_S
-            self._answer(jobs.NotSaved(what, reason))
-        self._well.discard(what)
-
-    def _took(self, what: str) -> None:
-        """Told once: also by a process that knows nothing of what the one before was refused."""
-        if what not in self._well:
-            self._well.add(what)
-            self._answer(jobs.SavedAgain(what))
 
 
 def _foretold(

@@ -268,7 +268,8 @@ class Simulated:
         """In a process that was forked: go on with a copy of the state, the working folder's."""
         shutil.copytree(".", folder)
         os.chdir(folder)
-        self.analyst._chronicle = self.analyst._recorder = None  # their files are the parent's
+        books = self.analyst._books
+        books._chronicle = books._recorder = None  # their files are the parent's
 
     def hear(self, run: Run, from_s: float = 0.0, to_s: float = math.inf) -> None:
         """The frames of a run, or of a part of it, from begin_s of the machine's time on.
