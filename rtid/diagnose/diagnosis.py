@@ -16,7 +16,7 @@ from rtid.diagnose.fit import Fit, fit, with_covariances
 from rtid.diagnose.joined import joints
 from rtid.diagnose.parts import AddedEffect
 from rtid.diagnose.regression import Score
-from rtid.diagnose.residual import Residual, residual
+from rtid.diagnose.residual import Residual
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.spread import with_spreads
 from rtid.diagnose.standing import Standing, stand, with_bank
@@ -94,7 +94,8 @@ def search(
 
     parts: effects that the model has already; suspects: effects of the user's that are scored
     beside those of the catalogue.  Raises PartError where the record has none of them.
-    Where the map is known over next to nothing of the held-out part, the record itself judges.
+    Where the map is known over next to nothing of the held-out part, the record itself judges; and
+    where it is known over next to nothing of that, all of it: what is named then is, nothing else.
     """
     return searched(stand(model, chunk, held_out, parts, progress, suspects=suspects), progress)
 
@@ -107,7 +108,10 @@ def searched(standing: Standing, progress: Progress = silent) -> Result:
     judged = can_judge(before)
     if not judged:
         state.held_out = state.chunk
-        before = residual(first, state.held_out)
+        before = state.left(first)
+        if not can_judge(before):
+            state.judges_itself = True
+            before = state.left(first)
     bare = _bare(state, first)
     state.excess = bare.held.sse - bare.regression.dof
     present, first, last = first, first.light(), before
@@ -190,8 +194,8 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
         now = with_covariances(carried_on(state, present, trial), like=present)
         if now.rho >= most_rho(now) and not trial.is_timing and is_at_a_bound(now):
             continue
-        after = residual(now, state.held_out)
-        own = own_share(now, trial, state.held_out, after)
+        after = state.left(now)
+        own = own_share(state, now, trial, after)
         share = min(material_share(last, after), BENT * own)
         is_shown = share >= MATERIAL
         does = None
@@ -252,7 +256,7 @@ def is_form_of_another(state: TrialState, key: Key) -> bool:
 def _with_bank(state: TrialState, now: Fit) -> tuple[Fit, Residual]:
     """A fit with every candidate beside it, and what it leaves of the held-out part."""
     kept = with_bank(few_excused(now), state.suspects)
-    return kept, residual(kept, state.held_out)
+    return kept, state.left(kept)
 
 
 def _is_noticed(present: Fit, trial: Trial) -> bool:
@@ -282,7 +286,7 @@ def _look_back(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Re
         present = fit(
             state.model, state.chunk, present.weights, revision, present, suspects=state.suspects
         )
-        last = residual(present, state.held_out)
+        last = state.left(present)
         state.found = [f for f in state.found if f.key != effect.key]
         state.negligible.pop(effect.key, None)
     return present, last

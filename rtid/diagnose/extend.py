@@ -169,7 +169,7 @@ def _against(before: Standing, after: Standing, trial: Trial) -> Iterator[str]:
     if not np.isfinite(new.rms_m3s + old.rms_m3s):
         yield UNJUDGED
         return
-    share = own_share(after.fit, trial, after.state.held_out, new)
+    share = own_share(after.state, after.fit, trial, new)
     is_slight = min(share, material_share(old, new)) < MATERIAL
     if is_slight and taken_in(before.fit, after.fit, trial, share, old, new):
         pass  # the maps hide it

@@ -2,7 +2,7 @@
 
 Everything passes the machine's filter H_f (10 Hz, damping 0.8, 50 rows per second unless another is
 declared).  Intervals whose blocks the fit does not know are left out, and the filter settles anew
-behind them.
+behind them; of the record that has taught the blocks none need be, since its fit is of all of them.
 """
 
 from __future__ import annotations
@@ -84,17 +84,20 @@ def effect_values(fit: Fit) -> list[tuple[Candidate, float]]:
     return [(e, fit.held.value(fit.column(e))) for e in fit.revision.effects]
 
 
-def residual(fit: Fit, chunk: FloatArray, leave_out: Candidate | None = None) -> Residual:
+def residual(
+    fit: Fit, chunk: FloatArray, leave_out: Candidate | None = None, everywhere: bool = False
+) -> Residual:
     """Hold a fitted revision against a record, chunk (n, 2 + signals), SI, as recorded.
 
-    leave_out: an effect whose flow is not counted.
+    leave_out: an effect whose flow is not counted.  everywhere: on the grid, however well the map
+    is known there: of the record that has taught it.
     """
     sent = transformed_like(fit, chunk)
     view = RecordView.of(fit.model, sent, fit.weights, fit.map, fit.view)
     flows = measured(view)
     left, noise = flows - modelled(fit, view, leave_out), _noise(fit, view)
     rates = [seen_rates(view, flows), behind_lag(fit, view, left), behind_lag(fit, view, noise)]
-    t_s, (moved, left, noise) = through_filter(view, rates)
+    t_s, (moved, left, noise) = through_filter(view, rates, everywhere)
     return Residual(t_s, moved, left, noise, fit.model.filter.rows_per_s)
 
 
@@ -125,16 +128,16 @@ def is_known(view: RecordView) -> BoolArray:
 
 
 def through_filter(
-    view: RecordView, rates: list[FloatArray]
+    view: RecordView, rates: list[FloatArray], everywhere: bool = False
 ) -> tuple[FloatArray, list[FloatArray]]:
     """Instants (rows,) and rows (rows, chambers) of rates (n - 1, chambers) behind H_f.
 
     Instants in s, rates in m3/s.  view: the record beside the map, whose unknown places are
-    left out.
+    left out, or with `everywhere` those off its grid alone.
     """
     rates_of_all = np.concatenate(rates, axis=1)
     by = view.model.filter
-    rates_of_all[~is_known(view)] = np.nan
+    rates_of_all[~(view.inside if everywhere else is_known(view))] = np.nan
     period = 1.0 / by.rows_per_s
     out = np.empty((int((view.t_s[-1] - view.t_s[0]) / period) + 2, 1 + rates_of_all.shape[1]))
     n = filter_rows(view.t_s, rates_of_all, by.wn_rad_s, by.zeta, period, out)

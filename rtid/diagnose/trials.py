@@ -81,7 +81,11 @@ class AcceptedEffect:
 
 @dataclass
 class TrialState:
-    """State of a diagnosis."""
+    """State of a diagnosis.
+
+    judges_itself: the map is known over too little of either part, and all of the record that has
+    taught it judges: what is named there is, what is not is no match.
+    """
 
     model: Machine
     chunk: FloatArray
@@ -92,11 +96,18 @@ class TrialState:
     excess: float = 0.0  # chi2 without any effect beyond what the noise gives
     given: tuple[AddedEffect, ...] = ()  # effects that the model has already
     suspects: tuple[Effect, ...] = ()  # effects of the user's, scored beside the catalogue
+    judges_itself: bool = False
     _coarse: Search | None = None
 
     def anew(self, progress: Progress) -> TrialState:
         """The state of a search that has not begun."""
-        return replace(self, progress=progress, found=[], negligible={}, excess=0.0)
+        return replace(
+            self, progress=progress, found=[], negligible={}, excess=0.0, judges_itself=False
+        )
+
+    def left(self, fit_: Fit, leave_out: Candidate | None = None) -> Residual:
+        """What a fit leaves of the part that judges; leave_out: an effect that is not counted."""
+        return residual(fit_, self.held_out, leave_out, self.judges_itself)
 
     @property
     def coarse(self) -> Search:
@@ -196,15 +207,15 @@ def material_share(before: Residual, after: Residual) -> float:
     return float(np.sqrt(max(0.0, gone)) / max(before.flow_m3s, 1e-12))
 
 
-def own_share(now: Fit, trial: Trial, held_out: FloatArray, whole: Residual) -> float:
-    """Size of an effect's own flow on the held-out part, as a share of the rms flow.
+def own_share(state: TrialState, now: Fit, trial: Trial, whole: Residual) -> float:
+    """Size of an effect's own flow on the part that judges, as a share of the rms flow.
 
-    held_out (n, 2 + signals), SI; whole: what the fit leaves of it.  inf for a timing.
+    whole: what the fit leaves of it.  inf for a timing.
     """
     if trial.is_timing:
         return float("inf")
     effect = now.revision.effects[-1]
-    without = residual(now, held_out, leave_out=effect)
+    without = state.left(now, leave_out=effect)
     change = whole.left - without.left
     return float(np.sqrt(np.mean(change**2)) / max(whole.flow_m3s, 1e-12)) if change.size else 0.0
 

@@ -65,6 +65,8 @@ def verdict(
     if not (has_moved and is_whole and can_judge(after)):
         return INSUFFICIENT
     if not state.found:
+        if state.judges_itself:
+            return INSUFFICIENT
         # what was seen and is too small in a record that judges itself may matter on other motion,
         # and what is left there of its flow is less than its maps may have taken in
         is_open = bool(state.negligible) or is_slight(after)
@@ -75,5 +77,5 @@ def verdict(
     explained = 1.0 - rest / state.excess if state.excess > 0 else 1.0
     # a rate without pressures is disturbed by whatever moves the machine: unseen data have judged
     if last.declared.has_pressures and last.rho >= most_rho(last) and explained < NAMED:
-        return UNKNOWN
+        return INSUFFICIENT if state.judges_itself else UNKNOWN
     return AMBIGUOUS if any(f.alike for f in state.found[:1]) else MISSING

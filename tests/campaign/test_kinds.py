@@ -20,7 +20,7 @@ from rtid.study.quick import quick
 from rtid.study.quick_rate import QuickRate
 from rtid.units import show_flow_as
 from tests.campaign.diagnoses import wilson
-from tests.campaign.kinds import HIDDEN, KINDS, SPOOL, KindCase
+from tests.campaign.kinds import COMPENSATED, HIDDEN, KINDS, SPOOL, KindCase
 from tests.campaign.laws import Outcome, outcome
 from tests.campaign.laws_at_size import ALARMS, Z95
 from tests.campaign.report import leave
@@ -39,6 +39,13 @@ def test_a_spool_with_its_zero_off_raises_no_alarm() -> None:
     assert np.abs(found.beta_z).max() < 4.0 and np.abs(found.valid.error).mean() < 0.003
 
 
+@pytest.mark.slow
+def test_what_a_record_shows_that_is_too_short_for_its_grid() -> None:
+    """No block is known well enough to judge by, and a leak was not even looked for."""
+    found = outcome(KindCase(7011, COMPENSATED, hidden="internal_leakage_laminar"))
+    assert found is not None and found.names[0] == "internal_leakage_laminar"
+
+
 def machines(kind: str, hidden: bool) -> Iterator[Outcome]:
     """So many of a kind; those that leave their stroke or cavitate are drawn anew."""
     left = MACHINES
@@ -47,6 +54,7 @@ def machines(kind: str, hidden: bool) -> Iterator[Outcome]:
         found = outcome(KindCase(seed, kind, hidden=name)) if left else None
         if found is not None:
             left -= 1
+            print(found.case, found.verdict, *found.names)
             yield found
 
 
