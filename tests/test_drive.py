@@ -14,6 +14,7 @@ import pytest
 
 from firmware_bridge.averaged import Averaged
 from firmware_bridge.samples import GAP, ROW, Samples, join
+from rtid.cli.exits import Exit
 from rtid.estimator.estimator import to_chunk
 from rtid.project import ProjectError, load
 from rtid.study.on_board import on_board
@@ -221,6 +222,15 @@ def test_what_is_held_is_not_averaged(tmp_path: Path) -> None:
     (tmp_path / "wrong.toml").write_text(text.replace("p_a = 1", "p_c = 1"))
     with pytest.raises(ProjectError, match=r"rate\.ports"):
         load(tmp_path / "wrong.toml")
+
+
+@pytest.mark.skipif(not STRANGERS.is_dir(), reason="no measurements of others beside this tree")
+def test_too_short_a_record_says_what_it_lacks() -> None:
+    """Rows that teach beside those that a verdict takes, and the command with another record."""
+    table = STRANGERS / "eha_1_1.parquet"
+    words = said("quick", table, code=Exit.NEGATIVE)
+    assert "insufficient_data" in words and "50 rows of it teach, and a verdict takes 100" in words
+    assert f"rtid quick {table} MORE.parquet --role u=n_rpm" in words
 
 
 @pytest.mark.skipif(not STRANGERS.is_dir(), reason="no measurements of others beside this tree")

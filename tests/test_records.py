@@ -14,6 +14,8 @@ from rtid.errors import RtidError
 from rtid.estimator.estimator import to_chunk
 from rtid.plain import FloatArray
 from rtid.project import ProjectError, load
+from rtid.study.quick import quick
+from rtid.study.quick_rate import QuickRate
 from rtid.study.state_run import run_error
 from rtid.study.study import Study
 from rtid.units import show_flow_as
@@ -175,6 +177,18 @@ def _rate_off(t_s: FloatArray, seen: FloatArray, model: FloatArray) -> FloatArra
     at = np.arange(t_s[0], t_s[-1], 0.05)
     smooth = savgol_filter(np.interp(at, t_s, seen), 9, 2, deriv=1, delta=0.05)
     return np.asarray(smooth - np.gradient(np.interp(at, t_s, model), 0.05))
+
+
+@pytest.mark.skipif(not STRANGERS.is_dir(), reason="no measurements of others beside this tree")
+def test_a_delay_is_looked_for_that_a_bent_map_hides() -> None:
+    """Its first order told nothing there: gains of 9 and 12 mm/s per %, and `matches`."""
+    looked = quick(STRANGERS / f"excavator_{SESSIONS[2]}.csv")
+    assert isinstance(looked, QuickRate)
+    (delay,) = looked.diagnosis.found
+    assert "input_delay" in (delay.effect, *delay.cannot_be_told_from) and delay.where == "command"
+    band = looked.bands["f"]
+    assert -1.3 < band.low < -0.8 and 1.0 < band.high < 1.5
+    assert min(band.gain_below, band.gain_above) > 15e-3
 
 
 @pytest.mark.slow

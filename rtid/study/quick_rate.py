@@ -14,7 +14,7 @@ from firmware_bridge.sources import read_table
 from firmware_bridge.sources.table import to_samples
 from rtid.compare.dead_band import DeadBand, dead_band, per_direction
 from rtid.diagnose.report import Diagnosis
-from rtid.diagnose.verdict import INSUFFICIENT
+from rtid.diagnose.verdict import INSUFFICIENT, least_evidence
 from rtid.errors import RtidError
 from rtid.estimator.flowmap import VALID, EdgeMap
 from rtid.estimator.published import publish
@@ -53,8 +53,9 @@ class QuickRate:
 
     text: the project file; bands: dead band (low, high) about the neutral and gains (below, above)
     by map, in SI, NaN where the map does not tell; ranges: lowest and highest command that a map is
-    known at, and what it gives there, SI.  Of several records: their files, the neutral of the
-    command in each, where one is looked for, and what the model leaves of each.
+    known at, and what it gives there, SI; rows: those that teach, and how many a verdict takes.
+    Of several records: their files, the neutral of the command in each, where one is looked for,
+    and what the model leaves of each.
     """
 
     path: Path
@@ -67,6 +68,7 @@ class QuickRate:
     unused: tuple[str, ...]
     unit: str
     command_unit: str
+    rows: tuple[int, int]
     records: tuple[Path, ...] = ()
     neutrals: tuple[float, ...] = ()
     errors: tuple[RecordError, ...] = ()
@@ -75,6 +77,12 @@ class QuickRate:
     def is_enough(self) -> bool:
         """Whether there is a verdict that the data can bear."""
         return self.diagnosis.verdict != INSUFFICIENT
+
+    @property
+    def with_more(self) -> str:
+        """What to do where one record is not enough; MORE stands for another of the machine."""
+        more = f"MORE{self.path.suffix}"
+        return f"rtid quick {self.path} {more} {self.pair.options} --save machine.toml"
 
     @property
     def next_command(self) -> str:
@@ -101,6 +109,7 @@ class QuickRate:
                 "roles": {name: asdict(role) for name, role in self.pair.roles.items()},
                 "neutral": self.pair.neutral,
                 "neutrals": self.neutrals,
+                "rows": self.rows,
                 "others": pairs,
                 "unused": list(self.unused),
                 "maps": {name: asdict(band) for name, band in self.bands.items()},
@@ -150,6 +159,7 @@ def quick_rate(
         study = Study(file, records, progress)
         said = in_turn(study, pair.is_proportional)
         errors, at_rest = study.record_errors, _at_rest(study.project, records)
+        rows = study.fitted.regression.rows, least_evidence(study.machine)
         model, flowmap, text = study.machine, publish(study.fit.solution), file.read_text("utf-8")
     used = {role.name for role in pair.roles.values()}
     unused = tuple(s.name for s in source.signals if s.name not in used)
@@ -159,7 +169,7 @@ def quick_rate(
     ranges = {edge.name: known for edge in flowmap.edges if (known := known_range(edge))}
     several = records if more else ()
     seen = said, bands, ranges, unused
-    return QuickRate(path, pair, tuple(others), text, *seen, *units, several, at_rest, errors)
+    return QuickRate(path, pair, tuple(others), text, *seen, *units, rows, several, at_rest, errors)
 
 
 def _at_rest(project: Project, records: Sequence[Path]) -> tuple[float, ...]:

@@ -91,6 +91,8 @@ def rate_lines(quick: QuickRate, saved: Path | None = None) -> Iterator[str]:
     for sentence in sentences(quick.diagnosis):
         yield f"  {sentence}"
     yield from record_lines(quick.errors)
+    if not quick.is_enough:
+        yield from _more_lines(quick)
     yield ""
     if saved is not None:
         yield f"wrote {saved}"
@@ -98,6 +100,15 @@ def rate_lines(quick: QuickRate, saved: Path | None = None) -> Iterator[str]:
         return
     yield f"Next: {quick.next_command}"
     yield "  writes the project with what was found."
+
+
+def _more_lines(quick: QuickRate) -> Iterator[str]:
+    """What a verdict takes that the record has not, and the command that goes on."""
+    has, needs = quick.rows
+    if has < needs:
+        yield f"  {has} rows of it teach, and a verdict takes {needs} at least."
+    yield "  Record more motion; several records of one machine make one fit:"
+    yield f"  {quick.with_more}"
 
 
 def _turn_lines(quick: QuickRate) -> Iterator[str]:
