@@ -78,12 +78,16 @@ def timing_trials(
 ) -> list[Trial]:
     """Exact refits with one timing more, of those that may matter; scores: of the first order.
 
-    Without pressures a disturbance as large as what is left hides how much that is, and maps that a
-    delay has bent hide its first order: every timing is refitted there.
+    Without pressures a disturbance as large as what is left hides how much that is: then a timing
+    may matter whose first order is clear, though it may point the wrong way.  Maps of a state that
+    a delay has bent hide the first order as well: there the first timing is looked for by refits.
     """
     timings = (*timings_of(state.model, state.chunk[:, 0]), *sensor_timings(state.model))
     open_ = [t for t in timings if not present.revision.has(key_of(t))]
-    if state.model.has_pressures and present.rho < LARGE:
+    if not state.model.has_pressures and (state.model.measured or present.revision.timings):
+        stirred = {c.key for c, score in scored(present) if score.gain > GAIN}
+        open_ = [t for t in open_ if key_of(t) in stirred]
+    elif state.model.has_pressures and present.rho < LARGE:
         open_ = [t for t in open_ if key_of(t) in scores and scores[key_of(t)][1].gain > GAIN]
     if not open_ or not present.view.has_pressures:
         return []
