@@ -82,7 +82,9 @@ def test_every_alarm_and_exit_code_stands_in_operations() -> None:
     assert all(f"{code.value} " in told for code in Exit)
 
 
-@pytest.mark.parametrize("page", ["theory.md", "architecture.md", "guide.md"])
+@pytest.mark.parametrize(
+    "page", ["theory.md", "architecture.md", "guide.md", "extending.md", "how-it-works.md"]
+)
 def test_files_that_a_page_names_exist(page: str) -> None:
     for name in re.findall(r"`((?:rtid|firmware_bridge|tests|docs)/[\w/.]+)`", text_of(page)):
         assert (ROOT / name).exists(), name
