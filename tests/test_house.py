@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
+NAMES_EFFECTS = {"hideable.py"}  # of the simulated machines; all others ask a page what it says
 MODULES = sorted((ROOT / "rtid").rglob("*.py"))
 SAY_NOTHING = {"found", "one", "told", "own", "left", "held"}  # the type has a name
 # A command, what is said of it and its chart are named after the same subject; so are registries.
@@ -53,3 +54,16 @@ def test_parameters_have_the_name_of_what_they_are(package: str) -> None:
         if name in SAY_NOTHING
     ]
     assert not said, "\n".join(said)
+
+
+def test_an_effect_is_named_by_its_page_and_by_what_simulates_it() -> None:
+    """No code asks for a catalogue effect by its name; a name of one word may mean other things."""
+    names = {page.stem for page in (ROOT / "rtid/effects/pages").glob("*_*.toml")}
+    said = [
+        f"{path.relative_to(ROOT)}:{node.lineno}: {node.value}"
+        for path in MODULES
+        if path.name not in NAMES_EFFECTS
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Constant) and node.value in names
+    ]
+    assert len(names) > 20 and not said, "\n".join(said)
