@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 from rtid.diagnose.clean import as_measured, usable
-from rtid.diagnose.coarser import carried
 from rtid.diagnose.excuse import few_excused
 from rtid.diagnose.finer import fine_enough
 from rtid.diagnose.fit import Fit, fit, one_pass, prepare
@@ -52,7 +51,7 @@ def fitted(
     model, chunk = as_measured(model, chunk), usable(model, chunk)
     weights = prepare(model, chunk)
     revision = recall(model, chunk, weights, parts, suspects)
-    fine, rest = fine_enough(carried(fit(model, chunk, weights, revision, bank=False)))
+    fine, rest = fine_enough(fit(model, chunk, weights, revision, bank=False))
     first = few_excused(fine, rest)
     if first is fine:
         first = replace(first, rest=rest)
