@@ -60,13 +60,16 @@ class Daemon:
         """Seconds since the start, 50 times per second, for as long as the daemon may take.
 
         It fails when the daemon has ended, has used limit_s of processor time (so that the load of
-        the machine does not count), or hangs.
+        the machine does not count), or hangs: has used none for HANGS_S.
         """
         start_s, used_s = time.monotonic(), self.cpu_s()
-        while self.cpu_s() - used_s < limit_s and time.monotonic() - start_s < HANGS_S:
+        newest_s, moved_s = used_s, start_s
+        while newest_s - used_s < limit_s and time.monotonic() - moved_s < HANGS_S:
             yield time.monotonic() - start_s
             assert self.process.poll() is None, self.process.communicate()[1]
             time.sleep(0.02)
+            if (now_s := self.cpu_s()) != newest_s:
+                newest_s, moved_s = now_s, time.monotonic()
         raise AssertionError(f"not within {limit_s} s of processor time: {_short(self.status())}")
 
     def stop(self, limit_s: float = LIMIT_S) -> Status:

@@ -181,7 +181,8 @@ def hours(tmp_path_factory: pytest.TempPathFactory) -> Hours:
 
 def test_row_28_hours_at_ten_times_the_pace(hours: Hours, figure: Figure) -> None:
     """No handle more, and the state of one pass over the same frames."""
-    handles = hours.seen[-1][2] - hours.warm[2]
+    tenth = max(1, len(hours.seen) // 10)  # a diagnosis in between has two while it lasts
+    handles = min(entry[2] for entry in hours.seen[-tenth:]) - hours.warm[2]
     figure(28, "handles since the ring of samples is full", handles, 0)
     learner = machine().learner()
     for k in range(hours.loops):
