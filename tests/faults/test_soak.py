@@ -97,17 +97,23 @@ def test_row_14_a_full_bus_for_60_s(full_bus: FullBus, figure: Figure) -> None:
 
 
 @pytest.mark.xfail(
-    reason="0.02 to 0.15 % in nine runs at load 8 to 12; 0.14 to 0.29 % with the machine's own"
+    strict=True,
+    reason="0.14 to 0.29 % of all ticks in nine runs at load 8 to 12, an empty loop 0.10 to 0.13",
 )
 def test_row_14_overruns(full_bus: FullBus, figure: Figure) -> None:
-    """Beyond those of a loop that does nothing: a virtual machine is kept from its processor."""
     loop = full_bus.last.loop
     for cause, n in loop.causes.items():
         figure(14, f"overruns, cause {cause}, share of ticks", n / loop.ticks)
-    share = loop.overruns / loop.ticks
-    figure(14, "overruns, share of all ticks", share)
+    figure(14, "overruns, share of all ticks", loop.overruns / loop.ticks, 0.001)
+
+
+@pytest.mark.xfail(reason="0.02 to 0.15 % in nine runs at load 8 to 12")
+def test_row_14_overruns_of_our_own(full_bus: FullBus, figure: Figure) -> None:
+    """Beyond those of a loop that does nothing: a virtual machine is kept from its processor."""
+    loop = full_bus.last.loop
+    beyond = max(0.0, loop.overruns / loop.ticks - full_bus.withheld)
     figure(14, "overruns of an empty loop beside it", full_bus.withheld)
-    figure(14, "overruns beyond those of the empty loop", max(0.0, share - full_bus.withheld), 1e-3)
+    figure(14, "overruns beyond those of the empty loop", beyond, 0.001)
 
 
 def test_row_17_killed_at_random(tmp_path: Path, figure: Figure) -> None:
@@ -181,8 +187,7 @@ def hours(tmp_path_factory: pytest.TempPathFactory) -> Hours:
 
 def test_row_28_hours_at_ten_times_the_pace(hours: Hours, figure: Figure) -> None:
     """No handle more, and the state of one pass over the same frames."""
-    tenth = max(1, len(hours.seen) // 10)  # a diagnosis in between has two while it lasts
-    handles = min(entry[2] for entry in hours.seen[-tenth:]) - hours.warm[2]
+    handles = hours.seen[-1][2] - hours.warm[2]
     figure(28, "handles since the ring of samples is full", handles, 0)
     learner = machine().learner()
     for k in range(hours.loops):
