@@ -51,7 +51,7 @@
   const LONGEST = 16;
   for (const cell of new Set(things.filter((t) => t.kind === "text").map((t) => t.el.closest("td")).filter(Boolean))) {
     if (cell.querySelector("*")) continue;
-    const most = cell.textContent.trim().split(/[\s-]+/).reduce((all, w) => all + Math.ceil(w.length / LONGEST), 0);
+    const most = cell.textContent.trim().split(/[\s-]+/).reduce((all, w) => all + Math.max(1, Math.ceil(w.length / LONGEST)), 0);
     const range = document.createRange(); range.selectNodeContents(cell);
     const tops = new Set([...range.getClientRects()].map((r) => Math.round(r.top)));
     if (tops.size > most) say(`is broken into letters, ${tops.size} lines: ${name(cell)}`);
