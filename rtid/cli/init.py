@@ -29,7 +29,8 @@ def init(
     """Write a commented project file and say what is still missing.
 
     Roles are proposed by unit and name; what only you know is marked TODO.  A table without
-    pressures gives the complete file of a plant whose rate follows a command.
+    pressures gives the complete file of a plant whose rate follows a command, or of one by its
+    equations where it empties or cools down by itself.
     """
     if output.exists() and not force:
         raise RtidError(f"{output} exists", "give another -o, or --force", Exit.USAGE)
@@ -65,11 +66,19 @@ def _write_rate(
     table: Path, output: Path, given: Mapping[str, RoleCandidate], has_pressures: bool
 ) -> bool:
     """The file of a plant without pressures, or of a pump that drives; False where it is none."""
+    from rtid.study.quick_plant import equations_of
     from rtid.study.rate_pairs import driven_pairs, pairs_of
     from rtid.study.rate_project import rate_text
     from rtid.trace.quick_source import open_source
 
     opened = open_source(table, None)
+    if not has_pressures and (found := equations_of(table, opened, given)):
+        output.write_text(found.text, "utf-8")
+        print(f"wrote {output}: {found.structure.words}, by its equations")
+        for name, signal in found.pair.roles.items():
+            print(f"  {name:9} {signal.full_name} [{signal.unit or '?'}]")
+        print(f"It is complete. Next: rtid refit {output} {table} --diagnose")
+        return True
     pairs = (driven_pairs if has_pressures else pairs_of)(table, opened, given)
     if not pairs:
         return False

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from rtid.study.quick import Quick
     from rtid.study.quick_machine import Given
+    from rtid.study.quick_plant import QuickPlant
     from rtid.study.quick_rate import QuickRate
 
 
@@ -85,7 +86,8 @@ def quick(
     Guesses the roles of the signals by name, unit and range, takes the grids from the data, and
     states what it assumes of the machine; --save writes the project of it, with which every other
     command gives the same answer.  A table without pressures is one of a plant whose rate follows a
-    command: its neutral, dead band, gains and delay are found.  Exit code 3: the file cannot be
+    command: its neutral, dead band, gains and delay are found; one that empties or cools down by
+    itself is refitted by its equations, as `rtid refit` does.  Exit code 3: the file cannot be
     read, or is of no kind of plant; 4: it is read, and too little for a verdict.
     """
     from rtid.study.quick import quick as look
@@ -135,10 +137,14 @@ class _Answer(NamedTuple):
     is_truncated: bool
 
 
-def _answer(looked: Quick | QuickRate, file: Path, save: Path | None) -> _Answer:
+def _answer(looked: Quick | QuickRate | QuickPlant, file: Path, save: Path | None) -> _Answer:
+    from rtid.study.quick_plant import QuickPlant
     from rtid.study.quick_rate import QuickRate
     from rtid.tell.quick import lines, rate_lines
+    from rtid.tell.quick_equations import plant_json, plant_lines
 
+    if isinstance(looked, QuickPlant):
+        return _Answer(looked.text, plant_lines(looked, save), plant_json(looked, save), False)
     if isinstance(looked, QuickRate):
         return _Answer(
             looked.text_for(save or file), rate_lines(looked, save), looked.as_json(), False

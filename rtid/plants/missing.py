@@ -115,11 +115,13 @@ def diagnose(
     progress: Progress = silent,
     add: tuple[Key, ...] = (),
     unseen: Callable[[PlantModel], FloatArray] | None = None,
+    *,
+    with_limits: bool = True,
 ) -> PlantDiagnosis:
     """Find the effects that are missing in a plant, beside those that are added already.
 
     unseen: a model's error (outputs,), in their units, on data that are kept from the fit, if there
-    are any.
+    are any.  with_limits: what was not found is looked at as well.
     Raises PlantError if the plant cannot be fitted.
     """
     search = _Search(progress)
@@ -132,7 +134,7 @@ def diagnose(
         progress("checking on unseen data", 0.85)
         last, missings, refuted = _confirmed(search, last, missings, unseen)
     progress("looking at what was not found", 0.9)
-    rivals = tuple(_candidates(search, last, 0.9, 1.0))
+    rivals = tuple(_candidates(search, last, 0.9, 1.0) if with_limits else ())
     noise = sensor_noise(plant, record)
     verdict = _verdict(first, last, missings, noise)
     path, negligible = tuple(search.path), tuple(search.negligible)

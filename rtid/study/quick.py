@@ -33,6 +33,7 @@ from rtid.study.quick_machine import (
     first_machine,
     fitted_machine,
 )
+from rtid.study.quick_plant import QuickPlant, quick_plant
 from rtid.study.quick_project import DEAD_VOLUME, head_of, of_channels, of_missing, project_text
 from rtid.study.quick_rate import QuickRate, quick_rate
 from rtid.study.rate_pairs import driven_pairs, pressed_pairs
@@ -139,10 +140,11 @@ def quick(
     roles: Mapping[str, str] = NOBODY,
     more: Sequence[Path] = (),
     held_out: Sequence[str] = (),
-) -> Quick | QuickRate:
+) -> Quick | QuickRate | QuickPlant:
     """Judge a table or a CAN log; roles: names of signals by role, where guesses would fail.
 
-    A table without pressures is one of a plant that is a rate.  more: further records of such a
+    A table without pressures is one of a plant that is a rate, or one of its equations where it
+    empties or cools down by itself.  more: further records of such a
     plant, of which those named held_out judge, or the last.  Raises RtidError where the file cannot
     be read, or is of no kind of plant.
     """
@@ -153,7 +155,8 @@ def quick(
     guessed = proposal.with_named(proposal.propose(source.signals), named)
     is_table = "time_column" in source.keys
     if is_table and _is_rate(path, source, guessed, named):
-        return quick_rate(path, source, named, progress, more, held_out)
+        by_equations = None if more else quick_plant(path, source, named, progress)
+        return by_equations or quick_rate(path, source, named, progress, more, held_out)
     if more:
         remedy = (
             f"rtid quick {path} --save machine.toml, its [record] taken out, and `rtid diagnose`"

@@ -94,9 +94,13 @@ def run(
     add: tuple[Key, ...] = (),
     *,
     with_diagnosis: bool = False,
+    with_limits: bool = True,
     progress: Progress = silent,
 ) -> Refitted:
-    """Fit the plant, add effects, and diagnose what it misses beyond them.  Raises PlantError."""
+    """Fit the plant, add effects, and diagnose what it misses beyond them.  Raises PlantError.
+
+    with_limits: the smallest size of what was not found is looked for as well.
+    """
     progress("fitting", 0.0)
     first = last = refit(file.plant, records.identification)
     if add:
@@ -105,7 +109,9 @@ def run(
     diagnosis = None
     if with_diagnosis:
         unseen = records.unseen if records.validation is not None else None
-        diagnosis = diagnose(file.plant, records.identification, progress, add, unseen)
+        diagnosis = diagnose(
+            file.plant, records.identification, progress, add, unseen, with_limits=with_limits
+        )
         last = diagnosis.last
     return Refitted(file, records, first, last, diagnosis)
 

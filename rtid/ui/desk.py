@@ -21,6 +21,7 @@ from rtid.study.compared import find_reference
 from rtid.study.look import Look, look
 from rtid.study.quick import quick
 from rtid.study.quick_machine import Given
+from rtid.study.quick_plant import QuickPlant
 from rtid.study.quick_rate import QuickRate
 from rtid.study.revisions import change_of, undo_command, with_effect, without
 from rtid.study.study import Study
@@ -123,6 +124,9 @@ class Desk:
         """The verdict of a file without a project, and the project that would be saved."""
         looked = quick(file, dbc, given, self._progress, roles)
         project = free_name(file.with_suffix(".toml"))
+        if isinstance(looked, QuickPlant):
+            remedy = f"{looked.next_command}, and `rtid refit`: it has no maps for this page"
+            raise RtidError(f"{file}: a plant by its equations, {looked.structure.words}", remedy)
         if isinstance(looked, QuickRate):
             told, project_text = rate_lines(looked, project), looked.text
         else:

@@ -1,0 +1,86 @@
+"""Tables of plants that empty or cool down by themselves: `rtid quick` takes their equations.
+
+The tables are solved by scipy, not by the free run that is fitted to them.  The measured tanks are
+those of nonlinearbenchmark.org (Schoukens and Noel, 2017).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from rtid.cli.init import init
+from rtid.plain import FloatArray
+from rtid.project.plant_file import load_plant
+from rtid.study.quick import quick
+from rtid.study.quick_plant import QuickPlant, equations_of, moves_itself
+from rtid.study.structures import BODIES, VESSELS
+from rtid.trace.quick_source import open_source
+
+
+def commands(rng: np.random.Generator, n: int, held: int, low: float, high: float) -> FloatArray:
+    """Steps (n,) of random height, each held so many samples."""
+    return np.repeat(rng.uniform(low, high, n // held + 1), held)[:n]
+
+
+def solved(rates: object, start: list[float], u: FloatArray, step_s: float) -> FloatArray:
+    """States (n, states) at even steps under held commands (n,)."""
+    x = [np.array(start)]
+    for k in range(len(u) - 1):
+        run = solve_ivp(rates, (0.0, step_s), x[-1], args=(u[k],), rtol=1e-8, atol=1e-10)  # type: ignore[call-overload]
+        x.append(run.y[:, -1])
+    return np.array(x)
+
+
+def heater(file: Path) -> Path:
+    """A table of a body that cools down to 21 degC in some 200 s, a row each 2 s."""
+    rng = np.random.default_rng(3)
+    u = commands(rng, 900, 60, 0.0, 100.0)
+    warm = solved(lambda _, x, u: 0.004 * u - (x - 21.0) / 200.0, [21.0], u, 2.0)[:, 0]
+    rows = np.column_stack([2.0 * np.arange(len(u)), u, warm + 0.05 * rng.standard_normal(len(u))])
+    np.savetxt(file, rows, "%.3f", ",", header="t_s,heater_pct,temp_degC", comments="")
+    return file
+
+
+def test_a_heater_is_a_body_that_loses_heat(tmp_path: Path) -> None:
+    table = heater(tmp_path / "oven.csv")
+    looked = quick(table)
+    assert isinstance(looked, QuickPlant)
+    assert looked.structure is BODIES[0]
+    loss, sd = looked.refitted.first.fit.value("a")
+    assert loss == pytest.approx(1.0 / 200.0, rel=0.02) and sd < 0.02 * loss
+    assert not looked.diagnosis.found
+
+
+def test_init_writes_its_plant_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table, file = heater(tmp_path / "oven.csv"), tmp_path / "oven.toml"
+    init(str(table), file)
+    assert f"rtid refit {file}" in capsys.readouterr().out
+    plant = load_plant(file)
+    assert [s.quantity for s in plant.plant.states] == ["temperature"]
+
+
+def test_what_stands_where_it_is_left_is_a_rate() -> None:
+    rng = np.random.default_rng(4)
+    u, t_s = commands(rng, 1500, 20, -5.0, 5.0), np.linspace(0.0, 74.95, 1500)
+    late = np.concatenate([np.zeros(4), u[:-4]])
+    x: FloatArray = np.cumsum(0.4 * late) + 0.1 * rng.standard_normal(len(u))
+    assert moves_itself(t_s, u, x) < 0.02
+
+
+@pytest.mark.slow
+def test_measured_tanks_go_the_way_of_equations(shared: Path) -> None:
+    """0.669 -> 0.263 V on the record of the table that judges."""
+    table = shared / "data" / "real" / "cascaded_tanks.csv"
+    looked = quick(table)
+    assert isinstance(looked, QuickPlant) and looked.structure is VESSELS[1]
+    assert looked.judges == ("u_val_V", "y_val_V") and looked.pair.state.unit == "V"
+    refitted = looked.refitted
+    assert refitted.errors(refitted.first)["validation"][0] == pytest.approx(0.669, abs=0.002)
+    assert refitted.errors(refitted.last)["validation"][0] == pytest.approx(0.263, abs=0.003)
+    assert looked.diagnosis.found[0].key == ("overflow", "x1")
+    found = equations_of(table, open_source(table, None), {})
+    assert found is not None and found.record.same_start
