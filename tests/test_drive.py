@@ -21,7 +21,7 @@ from rtid.study.on_board import on_board
 from rtid.study.quick import quick
 from rtid.study.quick_rate import QuickRate
 from rtid.study.study import Study
-from rtid.trace.reading import read_trace
+from rtid.trace.reading import NoSamplesError, read_trace
 from rtid.units import show_flow_as
 from tests.replays import shared_replays  # noqa: F401
 from tests.test_rate import said
@@ -95,6 +95,17 @@ def test_a_pump_s_way_and_compliance_are_found(tmp_path: Path, seed: int) -> Non
     band = looked.bands["f"]
     assert 2 * np.pi * band.gain_above == pytest.approx(plant.out, rel=0.01)
     assert 2 * np.pi * band.gain_below == pytest.approx(plant.back, rel=0.01)
+
+
+def test_a_record_too_short_for_a_pump_says_what_goes_on(tmp_path: Path) -> None:
+    """It ended with a key of a project file that there is not."""
+    rng = np.random.default_rng(45)
+    table = Driven.drawn(rng).recorded(tmp_path / "pump.csv", rng, 2e6)
+    lines = table.read_text().splitlines()
+    table.write_text("\n".join(lines[: len(lines) // 8]) + "\n")
+    with pytest.raises(NoSamplesError) as refused:
+        quick(table)
+    assert "rtid quick" in str(refused.value.remedy) and "MORE.csv" in str(refused.value.remedy)
 
 
 def test_a_pump_s_leakage_is_named_where_there_is_one(tmp_path: Path) -> None:

@@ -27,6 +27,7 @@ from rtid.study.rate_project import of_records, rate_text
 from rtid.study.study import RecordError, Study
 from rtid.trace.neutral import neutrals
 from rtid.trace.quick_source import Source
+from rtid.trace.reading import NoSamplesError
 from rtid.trace.table import declared
 
 SCHEMA = 1
@@ -81,8 +82,7 @@ class QuickRate:
     @property
     def with_more(self) -> str:
         """What to do where one record is not enough; MORE stands for another of the machine."""
-        more = f"MORE{self.path.suffix}"
-        return f"rtid quick {self.path} {more} {self.pair.options} --save machine.toml"
+        return _with_more(self.path, self.pair)
 
     @property
     def next_command(self) -> str:
@@ -121,6 +121,17 @@ class QuickRate:
         return words
 
 
+def _with_more(path: Path, pair: RatePair) -> str:
+    return f"rtid quick {path} MORE{path.suffix} {pair.options} --save machine.toml"
+
+
+def _longer(path: Path, pair: RatePair) -> str:
+    """What goes on from a record too short to tell its sensors' noise."""
+    return (
+        f"record a minute or more of motion; several records make one fit: {_with_more(path, pair)}"
+    )
+
+
 def known_range(edge: EdgeMap) -> tuple[float, float, float, float] | None:
     """Lowest and highest command between which a map is known, and what it gives; None: nowhere."""
     at = np.flatnonzero((edge.status == VALID).any(axis=1))
@@ -157,7 +168,12 @@ def quick_rate(
         file = Path(folder) / "machine.toml"
         file.write_text(text, "utf-8")
         study = Study(file, records, progress)
-        said = in_turn(study, pair.is_proportional)
+        try:
+            said = in_turn(study, pair.is_proportional)
+        except NoSamplesError as error:
+            raise NoSamplesError(
+                f"{path}: too short for a verdict, {error}", _longer(path, pair)
+            ) from error
         errors, at_rest = study.record_errors, _at_rest(study.project, records)
         rows = study.fitted.regression.rows, least_evidence(study.machine)
         model, flowmap, text = study.machine, publish(study.fit.solution), file.read_text("utf-8")
