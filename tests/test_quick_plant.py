@@ -6,6 +6,7 @@ those of nonlinearbenchmark.org (Schoukens and Noel, 2017).
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,11 @@ from scipy.integrate import solve_ivp
 
 from rtid.cli.init import init
 from rtid.plain import FloatArray
+from rtid.project.guess import RoleCandidate
 from rtid.project.plant_file import load_plant
 from rtid.study.quick import quick
 from rtid.study.quick_plant import QuickPlant, equations_of, moves_itself
+from rtid.study.rate_pairs import RatePair
 from rtid.study.structures import BODIES, VESSELS
 from rtid.trace.quick_source import open_source
 
@@ -53,6 +56,12 @@ def test_a_heater_is_a_body_that_loses_heat(tmp_path: Path) -> None:
     loss, sd = looked.refitted.first.fit.value("a")
     assert loss == pytest.approx(1.0 / 200.0, rel=0.02) and sd < 0.02 * loss
     assert not looked.diagnosis.found
+
+
+def test_a_column_of_two_words_is_one_word_on_the_command_line() -> None:
+    command = RoleCandidate("Sollwert Ventil", "", "V", 0.0, 10.0)
+    pair = RatePair(command, RoleCandidate("Hub", "", "mm", 0.0, 500.0), 0.9, 5.0)
+    assert shlex.split(pair.options) == ["--role", "u=Sollwert Ventil", "--role", "x=Hub"]
 
 
 def test_init_writes_its_plant_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,6 +12,7 @@ share one map.  A speed of rotation that gives nearly all of the rate is a pump 
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -67,7 +68,8 @@ class RatePair:
     @property
     def options(self) -> str:
         """What names this pair on the command line."""
-        return f"--role u={self.command.name} --role x={self.state.name}"
+        words = (f"u={self.command.name}", f"x={self.state.name}")
+        return " ".join(f"--role {shlex.quote(word)}" for word in words)
 
     @property
     def commands(self) -> tuple[RoleCandidate, ...]:
