@@ -82,5 +82,4 @@ def contest(
 
 def _finished(state: TrialState, present: Fit, trial: Trial) -> Trial:
     now = carried_on(state, present, trial)
-    gain = present.held.sse - now.held.sse
-    return replace(trial, gain=gain, revision=now.revision, fit=now.light())
+    return replace(trial, gain=now.wins_over(present), revision=now.revision, fit=now.light())

@@ -6,14 +6,16 @@ significant, possible and material; when nothing more is, the verdict follows fr
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
-from rtid.diagnose.consequence import Consequence, consequence, is_stable
+from rtid.diagnose.consequence import BENT, HIDDEN_GAIN, Consequence, consequence, is_stable
 from rtid.diagnose.contest import contest, trials_of
 from rtid.diagnose.exact import carried_on
 from rtid.diagnose.excuse import few_excused
 from rtid.diagnose.fit import Fit, fit, with_covariances
 from rtid.diagnose.joined import joints
+from rtid.diagnose.nameable import Reach, reaches
 from rtid.diagnose.parts import AddedEffect
 from rtid.diagnose.regression import Score
 from rtid.diagnose.residual import Residual
@@ -39,6 +41,7 @@ from rtid.diagnose.verdict import (
     NAMED,
     UNKNOWN,
     can_judge,
+    doubts_about,
     most_rho,
     verdict,
 )
@@ -50,15 +53,11 @@ from rtid.model import Machine
 from rtid.plain import FloatArray, Key, Progress, silent
 
 LATER_GAIN = 25.0  # chi2 of every effect behind the first
-# chi2 of what the maps have taken in: ten standard deviations of its size.  On a clean sweep the
-# inertance of a line that was not there reached 56, stable, and moved a modulus by 3 %
-HIDDEN_GAIN = 100.0
 OF_LINES = "dead volume"  # the declared size that the oil of a line adds to
 MOST = 6  # effects that are added at most
 WORSE = 1.02  # held-out residual, as a share, that an immaterial effect may not raise
 CLEAR = 1.5  # times the variance of the sensors' noise, from which unseen data show a misfit ...
 LEFT = 0.4  # ... of which what explains it may leave so much
-BENT = 3.0  # times its own flow that an effect may gain: it also bends the maps when it is missing
 MOST_NEGLIGIBLE = 4  # that are looked at
 NOTICED = 0.01  # of the degrees of freedom: chi2 from which an immaterial effect stays in the model
 SHARE = 0.4  # of the misfit left that a cause must explain, once most of the first is explained,
@@ -80,6 +79,7 @@ class Result:
     given: tuple[AddedEffect, ...] = ()
     held_out_judged: bool = True  # False: too little of it is known, and the record itself judged
     zeros: tuple[Zero, ...] = ()  # of the pressure sensors, where valves have joined them at rest
+    reach: Mapping[Candidate, Reach] = field(default_factory=dict)  # of what was not found
 
 
 def search(
@@ -127,9 +127,10 @@ def searched(standing: Standing, progress: Progress = silent) -> Result:
     apart = zeros(present, joined)
     if said == MATCHES and any(zero.matters for zero in apart):
         said = MISSING
+    reach = reaches(present, scores, last.flow_m3s)
     return Result(
         first, present.light(), result, negligible, scores, before, last, said, parts,
-        held_out_judged=judged, zeros=apart,
+        held_out_judged=judged, zeros=apart, reach=reach,
     )  # fmt: skip
 
 
@@ -194,6 +195,8 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
         now = with_covariances(carried_on(state, present, trial), like=present)
         if now.rho >= most_rho(now) and not trial.is_timing and is_at_a_bound(now):
             continue
+        if not trial.is_timing and is_spread_alone(present, now, least):
+            continue
         after = state.left(now)
         own = own_share(state, now, trial, after)
         share = min(material_share(last, after), BENT * own)
@@ -207,7 +210,8 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
             state.found.append(AcceptedEffect(*what, last, after, does))
             return kept, after
         state.negligible[trial.key] = share
-        if _is_noticed(present, trial) and after.rms_m3s <= WORSE * last.rms_m3s:
+        is_good = after.rms_m3s <= WORSE * last.rms_m3s and _is_as_credible(present, now)
+        if is_good and _is_noticed(present, trial):
             state.negligible |= dict.fromkeys(alike, share)
             return _with_bank(state, now)
         del now  # its rows are large
@@ -231,6 +235,11 @@ def taken_in(
     if is_needed and is_seen_again(now, last, after):
         return does
     return does if (does.is_material or is_needed) and is_stable(now, trial) else None
+
+
+def is_spread_alone(present: Fit, now: Fit, least: float) -> bool:
+    """True where an effect only lets the rows be noisier, and makes the record no likelier."""
+    return min(present.held.sse - now.held.sse, now.wins_over(present)) < least
 
 
 def is_seen_again(now: Fit, last: Residual, after: Residual) -> bool:
@@ -263,6 +272,11 @@ def _is_noticed(present: Fit, trial: Trial) -> bool:
     """True for an immaterial cause that explains a fair part of the misfit all the same."""
     dof = present.regression.dof
     return trial.gain > max(NOTICED * dof, LEAST_SHARE * (present.held.sse - dof))
+
+
+def _is_as_credible(present: Fit, now: Fit) -> bool:
+    """False where what is not material makes moduli contradict each other that had agreed."""
+    return bool(doubts_about(present)) or not doubts_about(now)
 
 
 def _explains(state: TrialState, present: Fit, trial: Trial) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rtid.diagnose.evidence import Projected
+from rtid.diagnose.evidence import Projected, Rows
 from rtid.diagnose.regression import Regression
 from rtid.diagnose.revision import Revision
 from rtid.effects.column import Columns
@@ -44,7 +44,7 @@ def regression_of(
     revision: Revision,
     projected: Projected,
     columns: Columns,
-    rows: int,
+    rows: Rows,
     dof: float,
 ) -> Regression:
     """What the projection has left, the echoes' products as its noise, and the declared priors."""
@@ -58,4 +58,6 @@ def regression_of(
         tolerance = model.lag.tolerance_s
         prior[1 + n_c] = tolerance**-2 if tolerance > 0 else HELD
         mean[1 + n_c] = model.lag.nominal_s - weights.lag_s
-    return Regression(projected.schur, noise, prior, mean, projected.own, dof, rows)
+    return Regression(
+        projected.schur, noise, prior, mean, projected.own, dof, rows.n, rows.log_noise
+    )

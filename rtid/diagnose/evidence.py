@@ -61,6 +61,12 @@ class Rows:
         """Number of scalar rows."""
         return self.own.shape[0] * self.own.shape[1]
 
+    @property
+    def log_noise(self) -> float:
+        """Logarithm of the determinant of the noise that the rows are weighed for, 2 ln m3 each."""
+        factors = self.whiten[:, : 2 * self.own.shape[1] : 2]  # 1 / L00, and 1 / L11 of two
+        return -2.0 * float(np.log(factors).sum())
+
     def condensed(self, series: FloatArray) -> FloatArray:
         """What a series (n - 1,) of volumes per interval, m3, adds to each row (rows,), m3."""
         out = np.empty(len(self.own))
@@ -82,7 +88,7 @@ class Rows:
         given: condensed columns, chamber -> (rows,).
         """
         given = list(given)
-        columns = self._columns(given)
+        columns = self.columns(given)
         products.whitened(columns, self.fresh, self.whiten, self.keep)
         flat = columns.reshape(self.n, columns.shape[2])
         with one_thread():
@@ -92,8 +98,8 @@ class Rows:
         products.cross(columns, self.sign, self.start, self.block, self.terms, cross)
         return gram, cross
 
-    def _columns(self, given: list[Volumes]) -> FloatArray:
-        """What all of them add to the rows (rows, chambers, h)."""
+    def columns(self, given: list[Volumes]) -> FloatArray:
+        """What y, theta_beta and condensed columns add to the rows (rows, chambers, h), m3."""
         rows, n_c, first = self.own.shape
         columns = np.zeros((rows, n_c, first + len(given)))
         columns[:, :, :first] = self.own

@@ -99,6 +99,17 @@ class Fit:
         """Degrees of freedom that are left to the rows."""
         return max(1.0, self.regression.dof - len(self.held.used))
 
+    def wins_over(self, other: Fit) -> float:
+        """How far -2 log likelihood falls from another fit of the same record to this one.
+
+        Rows that are weighed for more noise leave a smaller chi2 whatever explains them: on clean
+        sweeps a hose took 730 off chi2, and its pressure's noise had spread the rows by 815.
+        """
+        gain = other.held.sse - self.held.sse
+        if self.regression.rows == other.regression.rows:
+            gain += other.regression.log_noise - self.regression.log_noise
+        return gain
+
     @property
     def compliance(self) -> FloatArray:
         """1 / beta (chambers,), 1/Pa."""
@@ -223,7 +234,7 @@ def one_pass(
     add_echoes(view, columns, n_timing, slopes)
     projected = project(rows, columns.released())
     dof = float(rows.n - TERMS * len(rows.cells))
-    regression = regression_of(model, weights, revision, projected, columns, rows.n, dof)
+    regression = regression_of(model, weights, revision, projected, columns, rows, dof)
     weak = slice(first - len(shapes) - sum(len(psi) for _, psi in revision.timings), first)
     regression.prior[weak] = RIDGE * regression.own[weak] + (regression.own[weak] == 0.0)
     at = [first + columns.candidates.index(e) for e in revision.effects]

@@ -58,7 +58,7 @@ class Regression:
 
     s, noise (columns, columns); prior, mean (columns,): information and value of the priors;
     own (columns,): squares of the columns before the maps were taken out; rows: of all segments;
-    dof: what the maps leave of them.
+    dof: what the maps leave of them; log_noise: logarithm of the determinant of their noise.
     """
 
     s: FloatArray
@@ -68,6 +68,7 @@ class Regression:
     own: FloatArray
     dof: float
     rows: int
+    log_noise: float = 0.0
 
     def fit(self, used: tuple[int, ...]) -> Estimate:
         """Least squares on some columns, errors in variables taken out."""

@@ -17,6 +17,7 @@ from rtid.diagnose.diagnosis import Result
 from rtid.diagnose.excuse import steady
 from rtid.diagnose.experiment import limits, would_separate
 from rtid.diagnose.fit import Fit
+from rtid.diagnose.nameable import clearest
 from rtid.diagnose.regression import LIMIT_SD, Score
 from rtid.diagnose.remains import described
 from rtid.diagnose.trials import AcceptedEffect, detection_limit, physical
@@ -102,6 +103,8 @@ class FittedEffect:
 class Unseen:
     """An effect that was not found: the smallest size that the record would have shown.
 
+    detection_limit: of four standard deviations; named_from: the size from which on it would have
+    been named, which must also matter; None where no possible one would.
     examined: False where this machine and record have no column for it: nobody looked.
     """
 
@@ -112,6 +115,7 @@ class Unseen:
     visible: bool
     reason: str
     examined: bool = True
+    named_from: float | None = None
 
 
 @dataclass(frozen=True)
@@ -280,11 +284,7 @@ def _inertance(fit: Fit, line: Candidate, values: dict[str, Value]) -> dict[str,
 
 def _not_found(result: Result) -> tuple[Unseen, ...]:
     """Every effect of the catalogue that concerns this machine and was not added."""
-    best: dict[Key, tuple[Candidate, Score]] = {}
-    for candidate, score in result.scores:
-        known = best.get(candidate.key)
-        if known is None or score.sd < known[1].sd:
-            best[candidate.key] = candidate, score
+    best = clearest(result.scores)
     listed = {f.key for f in result.found} | {p.key for p in result.given}
     seen = [
         _limit(result, candidate, score)
@@ -305,25 +305,12 @@ def _not_found(result: Result) -> tuple[Unseen, ...]:
 
 
 def _limit(result: Result, candidate: Candidate, score: Score) -> Unseen:
-    fit = result.last
-    unit = fit.declared.unit_here(candidate.unit)
-    limit = physical(fit, candidate, detection_limit(score, fit.rho))
-    if candidate.is_whole:
-        limit, unit = limit * inertance(fit.view, candidate), candidate.law.size.unit
-        is_possible = limit < candidate.law.size.high
-        visible = score.visible > VISIBLE and is_possible
-    elif (
-        candidate.parameter == "share"
-    ):  # of a timing: times the value that its column was made for
-        limit = _of_timing(candidate, limit)
-        unit = fit.declared.unit_here(candidate.shape_units[0])
-        pages = catalogue()[candidate.effect].parameters
-        (page,) = [p for p in pages if p.name in candidate.shape_names]
-        is_possible = page.low < limit if page.unit == RATE else limit < page.high
-        visible = score.visible > VISIBLE and is_possible
-    else:
-        is_possible = limit < candidate.largest
-        visible = score.visible > VISIBLE and is_possible
+    limit, unit, is_possible = _sized(
+        result.last, candidate, detection_limit(score, result.last.rho)
+    )
+    visible = score.visible > VISIBLE and is_possible
+    known = result.reach.get(candidate)
+    named_from, _, may_be = _sized(result.last, candidate, known.named_from if known else np.inf)
     if candidate.key in result.negligible:
         reason = "present, negligible: it changes next to nothing on the held-out part"
     elif visible:
@@ -333,7 +320,28 @@ def _limit(result: Result, candidate: Candidate, score: Score) -> Unseen:
     else:
         reason = f"the maps follow {100 * (1 - score.visible**2):.2f} % of it in this record"
     largest = float(limit) if is_possible else None
-    return Unseen(candidate.effect, candidate.where, largest, unit, bool(visible), reason)
+    named = float(named_from) if may_be and known else None
+    return Unseen(
+        candidate.effect, candidate.where, largest, unit, bool(visible), reason, named_from=named
+    )
+
+
+def _sized(fit: Fit, candidate: Candidate, coefficient: float) -> tuple[float, str, bool]:
+    """A coefficient as the size that people know, its unit, and whether it is possible.
+
+    That of a timing is times the value that its column was made for.
+    """
+    size, unit = physical(fit, candidate, coefficient), candidate.unit
+    if candidate.is_whole:
+        size, unit = size * inertance(fit.view, candidate), candidate.law.size.unit
+        return size, unit, size < candidate.law.size.high
+    if candidate.parameter == "share":
+        size, (unit,) = _of_timing(candidate, size), candidate.shape_units
+        pages = catalogue()[candidate.effect].parameters
+        (page,) = [p for p in pages if p.name in candidate.shape_names]
+        is_possible = page.low < size if page.unit == RATE else size < page.high
+        return size, fit.declared.unit_here(unit), is_possible
+    return size, fit.declared.unit_here(unit), size < candidate.largest
 
 
 def _told_by_joints(zero: Zero) -> Unseen:

@@ -232,12 +232,15 @@ def _unseen_table(diagnosis: Diagnosis) -> Table:
     listed: list[Unseen] = sorted(diagnosis.not_found, key=lambda u: not u.visible)
     rows = [
         (u.effect, u.where,
-         limit(u.detection_limit or 0.0, u.unit) if u.visible else "cannot be seen", u.reason)
+         limit(u.detection_limit or 0.0, u.unit) if u.visible else "cannot be seen",
+         limit(u.named_from, u.unit) if u.visible and u.named_from else "", u.reason)
         for u in listed
         if u.examined
     ]  # fmt: skip
-    title = "not found, and the smallest size that this record would have shown"
-    heads = ("effect", "where", "detection limit", "remark~")
+    title = (
+        "not found: the size from which on it is significant here, and from which on it is named"
+    )
+    heads = ("effect", "where", "seen from", "named from", "remark~")
     return Table(title, heads, rows[: 3 * SHOWN], keys=2)
 
 

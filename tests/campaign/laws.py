@@ -123,7 +123,8 @@ class Outcome:
     """What was said of a machine, beside the truth.
 
     beta_z, beta_half (chambers,): error in standard deviations, half-width as a share; names: of
-    all that was found and what it cannot be told from; limits: (effect, where) -> detection limit;
+    all that was found and what it cannot be told from; limits: (effect, where) -> size from
+    which on it would be named;
     left: of the held-out part, in units of the sensors' noise.
     """
 
@@ -298,7 +299,7 @@ def outcome_of(case: Hiding, judgement: Judged, began: float) -> Outcome:
         1.96 * solution.beta_sd_pa / plant.beta_pa,
         _joined([valid for valid, _ in of]),
         _joined([near for _, near in of]),
-        {(u.effect, u.where): u.detection_limit or np.inf for u in said.not_found},
+        {(u.effect, u.where): u.named_from or np.inf for u in said.not_found},
         time.process_time() - began,
         said.heldout_residual_after_m3s / said.noise_floor_m3s,
     )

@@ -1,0 +1,199 @@
+"""From which size on an effect would have been named: what a reader takes a limit for.
+
+Leaving out an effect of size c leaves c r of the flows and moves maps and moduli by c b, where
+
+    z = X b + r,    z its column for a size of 1,  X those of maps, compliances and other effects,
+
+so all that a name needs (`diagnosis`) is linear in c: to be significant, and that c r is material,
+or that c z is, or what c b moves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rtid.diagnose.bank import add_shapes, add_timing, offer
+from rtid.diagnose.commands import commands
+from rtid.diagnose.consequence import BEND, BENT, HIDDEN_GAIN, OWN, SOFTER
+from rtid.diagnose.evidence import Rows, project
+from rtid.diagnose.regression import LIMIT_SD, Score
+from rtid.diagnose.residual import KNOWN
+from rtid.diagnose.verdict import MATERIAL
+from rtid.effects.column import Candidate, Columns
+from rtid.effects.laws.timing import COMMAND
+from rtid.kernels.explain import filter_rows
+from rtid.plain import BoolArray, FloatArray, Key
+from rtid.units import Z95
+
+if TYPE_CHECKING:
+    from rtid.diagnose.fit import Fit
+
+NOTHING = 1e-300
+
+
+@dataclass(frozen=True)
+class Reach:
+    """What leaving out one unit of a column does; sd: of its size.
+
+    left: of the rms flow, what nothing else follows; own: its own flow, inf for a timing; bend: of
+    a map's largest flow, the most of all; softer: of a modulus, where its interval is the narrower.
+    """
+
+    sd: float
+    left: float
+    own: float
+    bend: float
+    softer: float
+
+    @property
+    def named_from(self) -> float:
+        """The size from which on it is named: the residual shows it, or the maps hide it."""
+        shown = MATERIAL / max(min(self.left, BENT * self.own), NOTHING)
+        own = self.own if np.isfinite(self.own) else 0.0
+        matters = max(own / OWN, self.bend / BEND, self.softer / SOFTER, NOTHING)
+        hidden = max(float(np.sqrt(HIDDEN_GAIN)) * self.sd, 1.0 / matters)
+        return max(LIMIT_SD * self.sd, min(shown, hidden))
+
+
+def clearest(scores: list[tuple[Candidate, Score]]) -> dict[Key, tuple[Candidate, Score]]:
+    """The column of each cause whose size the record tells best."""
+    best: dict[Key, tuple[Candidate, Score]] = {}
+    for candidate, score in scores:
+        known = best.get(candidate.key)
+        if known is None or score.sd < known[1].sd:
+            best[candidate.key] = candidate, score
+    return best
+
+
+def reaches(
+    fit: Fit, scores: list[tuple[Candidate, Score]], flow_m3s: float
+) -> dict[Candidate, Reach]:
+    """What each cause beside a fit does, by its clearest column; flow_m3s: rms of the flows.
+
+    fit: with its rows and its bank; without them nothing is said.
+    """
+    if fit.rows is None or not fit.map.cells.size or not flow_m3s > 0.0:
+        return {}
+    wide = float(np.sqrt(max(1.0, fit.rho)))
+    wanted = [
+        (candidate, score.sd * wide)
+        for candidate, score in clearest(scores).values()
+        if np.isfinite(score.sd)
+    ]
+    return dict(_reaches(fit, fit.rows, wanted, flow_m3s))
+
+
+def _reaches(
+    fit: Fit, rows: Rows, wanted: list[tuple[Candidate, float]], flow_m3s: float
+) -> Iterator[tuple[Candidate, Reach]]:
+    on_rows, narrow = _OnRows.of(fit, rows), _narrowness(fit)
+    columns, n_c = _columns(fit, rows), len(fit.model.chambers)
+    first, used = fit.first_given, list(fit.estimate.used)
+    given = [columns[k - first] for k in used if k >= first]
+    given += [columns[fit.column(candidate) - first] for candidate, _ in wanted]
+    projected = project(rows, given)
+    beside = [*range(1, first), *range(first, first + len(used) - n_c)]
+    gram = projected.schur[np.ix_(beside, beside)] + np.diag(fit.regression.prior[used] + NOTHING)
+    whole = rows.columns(given)
+    for k, (candidate, sd) in enumerate(wanted, first + len(used) - n_c):
+        b = np.asarray(np.linalg.solve(gram, projected.schur[beside, k]), np.float64)
+        flows = on_rows.flows(projected.terms(beside, b, k))
+        z = whole[:, :, k]
+        left = z - whole[:, :, beside] @ b - on_rows.into_chambers(flows)
+        softer = float(np.max(np.abs(b[:n_c]) * narrow, initial=0.0))
+        own = np.inf if candidate.where == COMMAND else on_rows.rms(z) / flow_m3s
+        reach = Reach(sd, on_rows.rms(left) / flow_m3s, own, on_rows.bend(flows), softer)
+        yield candidate, reach
+
+
+def _columns(fit: Fit, rows: Rows) -> list[dict[int, FloatArray]]:
+    """All columns behind the compliances, in the order of a fit with its bank, on the rows."""
+    columns, sent = Columns(rows.condensed), commands(fit.declared, fit.chunk)
+    add_timing(fit.view, columns, sent, fit.weights, fit.revision)
+    list(add_shapes(fit.view, columns, fit.revision))
+    offer(fit.view, columns, fit.revision, True, (), fit.suspects)
+    return columns.released()
+
+
+def _narrowness(fit: Fit) -> FloatArray:
+    """Relative move of each modulus per unit (chambers,), less where its interval is the wider."""
+    share = fit.weights.compliance / np.maximum(np.abs(fit.compliance), NOTHING)
+    half = Z95 * np.sqrt(np.maximum(np.diag(fit.compliance_cov), 0.0))
+    wide = half / np.maximum(np.abs(fit.compliance), NOTHING) / SOFTER
+    return np.asarray(share / np.maximum(1.0, wide))
+
+
+@dataclass(frozen=True)
+class _OnRows:
+    """The rows of a fit as flows.
+
+    t_s (rows + 1,): their borders; row, edge (entries,): of what blocks add; largest (edges,):
+    flows by the fit's map, m3/s; known (rows,): where the map is known well.
+    """
+
+    fit: Fit
+    rows: Rows
+    t_s: FloatArray
+    row: np.ndarray
+    edge: np.ndarray
+    known: BoolArray
+
+    @classmethod
+    def of(cls, fit: Fit, rows: Rows) -> _OnRows:
+        """As flows; the time of a row is that of its intervals."""
+        edges = fit.model.maps
+        sizes = [e.grid.shape[0] * e.grid.shape[1] for e in edges]
+        edge = np.repeat(np.arange(len(edges)), sizes)[rows.cells[rows.block]]
+        row = np.repeat(np.arange(len(rows.start) - 1), np.diff(rows.start))
+        lasts = np.maximum(rows.condensed(fit.view.dt_s), fit.view.step_s)
+        t_s = np.concatenate([[0.0], np.cumsum(lasts)])
+        known = np.ones(len(lasts), bool)
+        if len(fit.map.cov):
+            inner = np.einsum("ej,ejk->ek", rows.terms, fit.map.cov[rows.block])
+            sd = np.sqrt(np.maximum(np.einsum("ek,ek->e", inner, rows.terms), 0.0)) / lasts[row]
+            rated = np.array([e.rated_q_m3s for e in edges])[edge]
+            known[row[sd > KNOWN * fit.model.gates.max_sd_share * rated]] = False
+        return cls(fit, rows, t_s, row, edge, known)
+
+    def flows(self, terms: FloatArray) -> FloatArray:
+        """Volumes (entries,), m3, that maps with terms (V, 6) let into what their edges feed."""
+        return np.asarray(np.einsum("ej,ej->e", self.rows.terms, terms[self.rows.block]))
+
+    def into_chambers(self, volumes: FloatArray) -> FloatArray:
+        """Those of (entries,) into the chambers (rows, chambers), m3."""
+        sign, n = self.rows.sign[self.rows.block], len(self.known)
+        n_c = len(self.fit.model.chambers)
+        return np.stack(
+            [np.bincount(self.row, sign[:, c] * volumes, n) for c in range(n_c)], axis=1
+        )
+
+    def rms(self, volumes: FloatArray) -> float:
+        """Root mean square of volumes (rows, chambers), m3, as flows behind H_f, m3/s."""
+        rates = volumes / np.diff(self.t_s)[:, None]
+        rates[~self.known] = np.nan
+        by = self.fit.model.filter
+        period = 1.0 / by.rows_per_s
+        out = np.empty((int(self.t_s[-1] / period) + 2, 1 + rates.shape[1]))
+        n = filter_rows(self.t_s, rates, by.wn_rad_s, by.zeta, period, out)
+        return float(np.sqrt(np.mean(out[:n, 1:] ** 2))) if n else 0.0
+
+    def bend(self, volumes: FloatArray) -> float:
+        """Root mean square of each edge's volumes (entries,), of its largest flow: the most."""
+        most = 0.0
+        usual = self._of_edges(self.flows(self.fit.map.terms))
+        for flow, own in zip(self._of_edges(volumes), usual, strict=True):
+            open_ = self.known & (own != 0.0)
+            if open_.any():
+                largest = max(float(np.abs(own[open_]).max()), NOTHING)
+                most = max(most, float(np.sqrt(np.mean(flow[open_] ** 2))) / largest)
+        return most
+
+    def _of_edges(self, volumes: FloatArray) -> FloatArray:
+        """Flows (edges, rows), m3/s, of volumes (entries,)."""
+        n, edges = len(self.known), len(self.fit.model.maps)
+        total = np.bincount(self.edge * n + self.row, volumes, n * edges).reshape(edges, n)
+        return np.asarray(total / np.diff(self.t_s))
