@@ -43,6 +43,7 @@ pytestmark = pytest.mark.soak
 SHARE = float(os.environ.get("RTID_SOAK", "1"))
 KILLS = int(os.environ.get("RTID_SOAK_KILLS", "50"))
 QUICK = "publish_s = 5\nstore_s = 2\n"
+ALL_OF_IT = "record_mb = 2000\n"  # what is heard through 300 kills stays in the recording
 FULL_BUS_HZ = 8000.0
 WARM_S = 120.0  # the ring of samples is full, all blocks of the minute have been visited
 
@@ -126,7 +127,7 @@ def test_row_17_killed_at_random(tmp_path: Path, figure: Figure) -> None:
     restored, ages_s = list[str](), list[float]()
     with sender(group, SECONDS, loops=100 * max(1, kills // 50)):
         for k in range(kills + 1):
-            with daemon(tmp_path, settings=QUICK, group=group) as running:
+            with daemon(tmp_path, settings=QUICK + ALL_OF_IT, group=group) as running:
                 running.wait(running.is_its_own)
                 running.wait(lambda s: s.store.age_s is not None)
                 time.sleep(chance.uniform(0.0, 4.0))
@@ -137,6 +138,7 @@ def test_row_17_killed_at_random(tmp_path: Path, figure: Figure) -> None:
                     running.process.kill()
                     ages_s.append(status.store.age_s + time.time() - status.now_unix_s)
                     running.process.wait()
+                    print(f"kill {k + 1}: snapshot {ages_s[-1]:.1f} s old", flush=True)
                 else:
                     running.stop()
     began_anew = sum(text.startswith("fresh") for text in restored[1:])
