@@ -23,6 +23,7 @@ from rtid.diagnose.revision import Revision
 from rtid.effects.column import Candidate, Cause, Columns
 from rtid.effects.law import Shape, Volumes
 from rtid.effects.laws import add_echoes, cause_of
+from rtid.effects.laws.response import behind_s
 from rtid.effects.page import Effect
 from rtid.effects.record_view import MapTerms, RecordView
 from rtid.estimator.factor import PRIOR_SD, SHARED_PRIOR
@@ -103,10 +104,13 @@ class Fit:
         """How far -2 log likelihood falls from another fit of the same record to this one.
 
         Rows that are weighed for more noise leave a smaller chi2 whatever explains them: on clean
-        sweeps a hose took 730 off chi2, and its pressure's noise had spread the rows by 815.
+        sweeps a hose took 730 off chi2, and its pressure's noise had spread the rows by 815.  A lag
+        behind the maps transforms what is measured, A y with A = 1 + tau d/dt: ln det of the noise
+        rises by 2 ln det A, and so does the density of y, so that chi2 alone is left.
         """
         gain = other.held.sse - self.held.sse
-        if self.regression.rows == other.regression.rows:
+        lags = {behind_s(fit.revision.timings) for fit in (self, other)}
+        if self.regression.rows == other.regression.rows and len(lags) == 1:
             gain += other.regression.log_noise - self.regression.log_noise
         return gain
 
