@@ -18,10 +18,9 @@ from rtid.plain import FloatArray
 from rtid.project.guess import RoleCandidate
 from rtid.project.plant_file import load_plant
 from rtid.study.quick import quick
-from rtid.study.quick_plant import QuickPlant, equations_of, moves_itself
+from rtid.study.quick_plant import QuickPlant, moves_itself
 from rtid.study.rate_pairs import RatePair
 from rtid.study.structures import BODIES, VESSELS
-from rtid.trace.quick_source import open_source
 
 
 def commands(rng: np.random.Generator, n: int, held: int, low: float, high: float) -> FloatArray:
@@ -52,7 +51,7 @@ def test_a_heater_is_a_body_that_loses_heat(tmp_path: Path) -> None:
     table = heater(tmp_path / "oven.csv")
     looked = quick(table)
     assert isinstance(looked, QuickPlant)
-    assert looked.structure is BODIES[0]
+    assert looked.found.structure is BODIES[0]
     loss, sd = looked.refitted.first.fit.value("a")
     assert loss == pytest.approx(1.0 / 200.0, rel=0.02) and sd < 0.02 * loss
     assert not looked.diagnosis.found
@@ -85,11 +84,11 @@ def test_measured_tanks_go_the_way_of_equations(shared: Path) -> None:
     """0.669 -> 0.263 V on the record of the table that judges."""
     table = shared / "data" / "real" / "cascaded_tanks.csv"
     looked = quick(table)
-    assert isinstance(looked, QuickPlant) and looked.structure is VESSELS[1]
-    assert looked.judges == ("u_val_V", "y_val_V") and looked.pair.state.unit == "V"
+    assert isinstance(looked, QuickPlant) and looked.found.structure is VESSELS[1]
+    found = looked.found
+    assert found.record.others == ("u_val_V", "y_val_V") and found.record.same_start
+    assert found.pair.state.unit == "V"
     refitted = looked.refitted
     assert refitted.errors(refitted.first)["validation"][0] == pytest.approx(0.669, abs=0.002)
     assert refitted.errors(refitted.last)["validation"][0] == pytest.approx(0.263, abs=0.003)
     assert looked.diagnosis.found[0].key == ("overflow", "x1")
-    found = equations_of(table, open_source(table, None), {})
-    assert found is not None and found.record.same_start

@@ -191,8 +191,8 @@ def test_ten_minutes_of_driving_are_a_map(tmp_path: Path, seed: int) -> None:
     print(len(w), "cells,", known.mean(), "known; rms and 95 %, of four points too:", of_range)
     assert known.mean() > 0.6
     assert np.quantile(errors[known], 0.95) < 0.03
-    # cells that are refused are no estimate: of seed 2 twelve, 4.6 % off beside 2.9 by four points
     assert np.square(errors[known]).mean() < np.square(plain[known]).mean()
+    assert of_range[0] < of_range[1]  # fails on seed 2: one block, refused, is 2.2 sd off
     said("export", table, tmp_path / "accel_map.csv", "-p", project)
     _read_as_autoware_does(tmp_path, study.map)
 

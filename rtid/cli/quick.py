@@ -144,7 +144,9 @@ def _answer(looked: Quick | QuickRate | QuickPlant, file: Path, save: Path | Non
     from rtid.tell.quick_equations import plant_json, plant_lines
 
     if isinstance(looked, QuickPlant):
-        return _Answer(looked.text, plant_lines(looked, save), plant_json(looked, save), False)
+        return _Answer(
+            looked.found.text, plant_lines(looked, save), plant_json(looked, save), False
+        )
     if isinstance(looked, QuickRate):
         return _Answer(
             looked.text_for(save or file), rate_lines(looked, save), looked.as_json(), False

@@ -56,19 +56,23 @@ WORD = re.compile(r"[A-Za-z]+")
 
 
 @dataclass(frozen=True)
-class QuickPlant:
-    """What a table tells of a plant by its equations: the structure, its refit, the plant file.
+class Found:
+    """The pair of a table, the structure that was chosen, what the table tells, the plant file."""
 
-    judges: columns (u, y) of a second record in the table, which judges, if there is one.
-    """
-
-    path: Path
     pair: RatePair
     structure: Structure
-    refitted: Refitted
+    record: Told
     text: str
+
+
+@dataclass(frozen=True)
+class QuickPlant:
+    """What a table tells of a plant by its equations, and their refit."""
+
+    path: Path
+    found: Found
+    refitted: Refitted
     unused: tuple[str, ...]
-    judges: tuple[str, str] | None
 
     @property
     def diagnosis(self) -> PlantDiagnosis:
@@ -84,7 +88,7 @@ class QuickPlant:
     @property
     def next_command(self) -> str:
         """What writes the plant file."""
-        return f"rtid quick {self.path} {self.pair.options} --save plant.toml"
+        return f"rtid quick {self.path} {self.found.pair.options} --save plant.toml"
 
     def after(self, saved: Path) -> str:
         """What to do with the plant file."""
@@ -108,20 +112,9 @@ def quick_plant(
         plant = load_plant(file)
         records = load_records(plant, path)
         refitted = run(plant, records, with_diagnosis=True, with_limits=False, progress=progress)
-    others = found.record.others
-    used = {found.pair.command.name, found.pair.state.name, *(others or ())}
+    used = {*found.record.columns, *(found.record.others or ())}
     unused = tuple(s.name for s in source.signals if s.name not in used)
-    return QuickPlant(path, found.pair, found.structure, refitted, found.text, unused, others)
-
-
-@dataclass(frozen=True)
-class Found:
-    """The pair of a table, the structure that was chosen, what the table tells, the plant file."""
-
-    pair: RatePair
-    structure: Structure
-    record: Told
-    text: str
+    return QuickPlant(path, found, refitted, unused)
 
 
 def equations_of(

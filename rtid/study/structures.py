@@ -10,6 +10,7 @@ Only the last state is measured.  What stands in front of it is in the unit of w
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +21,7 @@ from rtid.plain import FloatArray
 
 LEVEL, TEMPERATURE, ANY = "level", "temperature", "any"
 SLOWEST, FASTEST = 1.0, 0.25  # of 1 / record and of 1 / step: what a record can tell of a rate
+SMOOTHED = 8  # samples over which a command acts, at least
 ABOVE = 5.0  # times the highest measured: how full what nobody measures can be
 
 
@@ -38,6 +40,11 @@ class Structure:
     def measured(self) -> str:
         """The state that is measured."""
         return list(self.rates)[-1]
+
+    @property
+    def symbols(self) -> set[str]:
+        """All names in the equations: parameters, states, the command, functions."""
+        return set(re.findall(r"\w+", " ".join(self.rates.values())))
 
 
 STANDS = Structure("what is moved, and stands where it is left", {"x": "k*u + c"})
@@ -135,21 +142,17 @@ def _parameters(structure: Structure, record: Told) -> dict[str, dict[str, Any]]
         "b": (usual * outflow, slowest * outflow, fastest * outflow, f"{root or '1'}/s"),
         "c": (0.0, -size * fastest, size * fastest, f"{y_unit}/s"),
     }
-    said = " ".join(structure.rates.values())
     return {
         name: {"start": _three(start), "low": _three(low), "high": _three(high), "unit": unit}
         for name, (start, low, high, unit) in drawn.items()
-        if f"{name}*" in said or said.endswith(f"+ {name}")
+        if name in structure.symbols
     }
 
 
 def _direction(record: Told) -> float:
     """1 where what is measured grows with the command, -1 where it falls."""
-    late = np.convolve(record.u - record.u.mean(), np.ones(_LATE) / _LATE)[: len(record.u)]
+    late = np.convolve(record.u - record.u.mean(), np.ones(SMOOTHED) / SMOOTHED)[: len(record.u)]
     return 1.0 if float(np.dot(late, record.y - record.y.mean())) >= 0.0 else -1.0
-
-
-_LATE = 8  # samples over which a command acts, at least
 
 
 def _three(value: float) -> float:

@@ -15,15 +15,16 @@ SCHEMA = 1
 
 def plant_lines(quick: QuickPlant, saved: Path | None = None) -> Iterator[str]:
     """What it was taken as, its equations, how far their free run is off, what they miss."""
-    yield f"{quick.path.name}, without a project file: {quick.structure.words}."
-    for role, candidate in quick.pair.roles.items():
+    found = quick.found
+    yield f"{quick.path.name}, without a project file: {found.structure.words}."
+    for role, candidate in found.pair.roles.items():
         yield f"  {role:9} {candidate.full_name} [{candidate.unit or '?'}]"
-    if quick.judges:
-        yield f"A second record is in the table, and judges: {' and '.join(quick.judges)}."
+    if judges := found.record.others:
+        yield f"A second record is in the table, and judges: {' and '.join(judges)}."
     if quick.unused:
         yield f"Not used: {', '.join(quick.unused)}"
     yield "What the command moves does not stand where it is left: no map of a rate serves it."
-    for state, rate in quick.structure.rates.items():
+    for state, rate in found.structure.rates.items():
         yield f"  d {state} / dt = {rate}"
     yield ""
     yield from sentences(quick.refitted)
@@ -42,9 +43,9 @@ def plant_json(quick: QuickPlant, saved: Path | None = None) -> dict[str, Any]:
         "schema": SCHEMA,
         "file": str(quick.path),
         "plant": "equations",
-        "kind": quick.structure.words,
-        "roles": {role: asdict(candidate) for role, candidate in quick.pair.roles.items()},
-        "judges": quick.judges,
+        "kind": quick.found.structure.words,
+        "roles": {role: asdict(candidate) for role, candidate in quick.found.pair.roles.items()},
+        "judges": quick.found.record.others,
         "unused": list(quick.unused),
         "refit": as_json(quick.refitted),
         "next": quick.after(saved) if saved else quick.next_command,

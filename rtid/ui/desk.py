@@ -126,7 +126,9 @@ class Desk:
         project = free_name(file.with_suffix(".toml"))
         if isinstance(looked, QuickPlant):
             remedy = f"{looked.next_command}, and `rtid refit`: it has no maps for this page"
-            raise RtidError(f"{file}: a plant by its equations, {looked.structure.words}", remedy)
+            raise RtidError(
+                f"{file}: a plant by its equations, {looked.found.structure.words}", remedy
+            )
         if isinstance(looked, QuickRate):
             told, project_text = rate_lines(looked, project), looked.text
         else:
