@@ -16,6 +16,7 @@ from rtid.units import CONVENTION, Z95, limit
 SLIGHTLY_CUT = 1e-3  # of a record: less is not worth a sentence
 MOST_BENDS = 2  # maps that a sentence names
 SHOWN = 14  # rows of the table of what was not found
+LIMITS = ("seen from", "named from")  # sizes of what was not found: significant; and it matters
 
 
 def story(diagnosis: Diagnosis, evidence: Sequence[Chart] = ()) -> Story:
@@ -231,17 +232,22 @@ def _found_table(diagnosis: Diagnosis) -> Table:
 def _unseen_table(diagnosis: Diagnosis) -> Table:
     listed: list[Unseen] = sorted(diagnosis.not_found, key=lambda u: not u.visible)
     rows = [
-        (u.effect, u.where,
-         limit(u.detection_limit or 0.0, u.unit) if u.visible else "cannot be seen",
-         limit(u.named_from, u.unit) if u.visible and u.named_from else "", u.reason)
+        (u.effect, u.where, *(limits(u) if u.visible else ("cannot be seen", "")), u.reason)
         for u in listed
         if u.examined
-    ]  # fmt: skip
+    ]
     title = (
         "not found: the size from which on it is significant here, and from which on it is named"
     )
-    heads = ("effect", "where", "seen from", "named from", "remark~")
+    heads = ("effect", "where", *LIMITS, "remark~")
     return Table(title, heads, rows[: 3 * SHOWN], keys=2)
+
+
+def limits(unseen: Unseen) -> tuple[str, str]:
+    """The sizes below `LIMITS`; nothing where no possible one is."""
+    sizes = (unseen.detection_limit, unseen.named_from)
+    seen, named = ("" if size is None else limit(size, unseen.unit) for size in sizes)
+    return seen, named
 
 
 def judged(diagnosis: Diagnosis) -> str:

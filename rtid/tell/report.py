@@ -18,7 +18,7 @@ from rtid.tell import stills as still_pictures
 from rtid.tell.charts.dependence import before_and_after
 from rtid.tell.charts.maps import maps, slices
 from rtid.tell.charts.over_time import flows
-from rtid.tell.diagnosed import heading, sentences
+from rtid.tell.diagnosed import LIMITS, heading, limits, sentences
 from rtid.tell.history import history_table
 from rtid.tell.html import rendered
 from rtid.tell.report_page import embedded, key_figures, page_of
@@ -239,16 +239,15 @@ def _not_found(unseen: tuple[Unseen, ...], ranking: tuple[Ranked, ...]) -> tuple
     seen = [u for u in unseen if u.visible and u.detection_limit is not None]
     hidden = [u for u in unseen if u not in seen]
     rows = [
-        (title(u.effect), u.where, limit(u.detection_limit or 0.0, u.unit),
-         u.reason or _why_not(clear.get((u.effect, u.where))))
+        (title(u.effect), u.where, *limits(u), u.reason or _why_not(clear.get((u.effect, u.where))))
         for u in seen
-    ]  # fmt: skip
+    ]
     blind = [(title(u.effect), u.where, u.reason) for u in hidden]
     says = (
-        f"An effect of the smallest size below would have stood out by {LIMIT_SD:g} standard "
-        "deviations of this record."
+        f"Seen from: the size that stands out by {LIMIT_SD:g} standard deviations of this record. "
+        "Named from: the size that also matters."
     )
-    head = ("effect", "where", "would have shown", "remark")
+    head = ("effect", "where", *LIMITS, "remark")
     parts: list[StoryPart] = [says, Table("", head, rows)]
     if hidden:
         parts.append(Table("What this record cannot show", ("effect", "where", "why"), blind))

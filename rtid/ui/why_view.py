@@ -14,7 +14,7 @@ from rtid.effects import effect as page_of
 from rtid.effects.page import Effect as Page
 from rtid.effects.page import EffectError, readable, title
 from rtid.tell.charts.theme import NARROWEST_PX, beside
-from rtid.tell.diagnosed import heading, hidden, judged, percent, said
+from rtid.tell.diagnosed import LIMITS, heading, hidden, judged, limits, percent, said
 from rtid.tell.html import button, clearness, table, text
 from rtid.tell.live import PanelPlot
 from rtid.tell.report_story import Ranked
@@ -202,10 +202,10 @@ def _unseen(diagnosis: Diagnosis) -> list[str]:
     listed = () if diagnosis.verdict == "insufficient_data" else diagnosis.not_found
     seen = [u for u in listed if u.visible and u.detection_limit is not None]
     blind = [u for u in diagnosis.not_found if not u.visible]
-    head = ("effect", "where", "smallest size that would have shown", "remark")
+    head = ("effect", "where", *LIMITS, "remark")
     parts = []
     if seen:
-        rows = [(*_place(u), text(_limit(u)), text(u.reason)) for u in seen]
+        rows = [(*_place(u), *map(text, limits(u)), text(u.reason)) for u in seen]
         parts.append("<h3>Looked for and not found</h3>" + table(head, rows))
     if blind:
         hidden = [(*_place(u), text(u.reason)) for u in blind]
@@ -224,10 +224,6 @@ def _with_titles(advice: str) -> str:
 
 def _place(unseen: Unseen) -> tuple[str, str]:
     return _link(unseen.effect, title(unseen.effect)), text(unseen.where)
-
-
-def _limit(unseen: Unseen) -> str:
-    return limit(unseen.detection_limit or 0.0, unseen.unit)
 
 
 def effect_page(name: str) -> str:
