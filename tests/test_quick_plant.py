@@ -14,13 +14,15 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from rtid.cli.init import init
-from rtid.plain import FloatArray
+from rtid.plain import FloatArray, silent
 from rtid.project.guess import RoleCandidate
 from rtid.project.plant_file import load_plant
 from rtid.study.quick import quick
+from rtid.study.quick_machine import Given
 from rtid.study.quick_plant import QuickPlant, moves_itself
 from rtid.study.rate_pairs import RatePair
 from rtid.study.structures import BODIES, VESSELS
+from rtid.ui import desk
 
 
 def commands(rng: np.random.Generator, n: int, held: int, low: float, high: float) -> FloatArray:
@@ -47,7 +49,9 @@ def heater(file: Path) -> Path:
     return file
 
 
-def test_a_heater_is_a_body_that_loses_heat(tmp_path: Path) -> None:
+def test_a_heater_is_a_body_that_loses_heat(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     table = heater(tmp_path / "oven.csv")
     looked = quick(table)
     assert isinstance(looked, QuickPlant)
@@ -55,6 +59,10 @@ def test_a_heater_is_a_body_that_loses_heat(tmp_path: Path) -> None:
     loss, sd = looked.refitted.first.fit.value("a")
     assert loss == pytest.approx(1.0 / 200.0, rel=0.02) and sd < 0.02 * loss
     assert not looked.diagnosis.found
+    monkeypatch.setattr(desk, "quick", lambda *_: looked)  # the page's door says the same
+    judged = desk.Desk(silent).judge(table, None, Given(), {})
+    assert judged.heading == "The model matches" and judged.project is None
+    assert any(line.startswith("  d x / dt = ") for line in judged.lines)
 
 
 def test_a_column_of_two_words_is_one_word_on_the_command_line() -> None:

@@ -153,8 +153,8 @@ def asked(session: Session, arrival: Arrival, asked: dict[str, str]) -> None:
             arrival.measure(asked.get("size", ""), name)
         elif what == "judge":
             judge(session, arrival)
-        elif what == "keep" and arrival.judged and arrival.file:
-            session.begin(arrival.judged.project, arrival.judged.text, arrival.file)
+        elif what == "keep" and (judged := arrival.judged) and judged.project and arrival.file:
+            session.begin(judged.project, judged.text, arrival.file)
     except RtidError as error:
         session.trouble = str(error), error.remedy
     session.tell("state")
@@ -264,6 +264,7 @@ def _told(session: Session, arrival: Arrival) -> str:
     if arrival.judged is None:
         return f"{again}<p>Roles and sizes have changed, or a role is missing.</p>"
     judged = arrival.judged
-    keep = button(f"Save {judged.project.name} and open", "keep", kind="main")
-    lines = text("\n".join(judged.lines))
+    lines, keep = text("\n".join(judged.lines)), ""
+    if judged.project:
+        keep = button(f"Save {judged.project.name} and open", "keep", kind="main")
     return f'<h3 class="{judged.kind}">{text(judged.heading)}</h3>{keep} {again}<pre>{lines}</pre>'

@@ -28,8 +28,10 @@ from rtid.study.study import Study
 from rtid.tell.charts.evidence import charts_of
 from rtid.tell.diagnosed import heading
 from rtid.tell.quick import lines, rate_lines
+from rtid.tell.quick_equations import plant_lines
 from rtid.tell.report_story import Ranked, ranked
 from rtid.tell.story import Chart
+from rtid.tell.words import VERDICTS
 from rtid.trace.glance import Curve, Glance, glance, glimpse
 from rtid.ui.release_form import Released, ReleaseWish, release
 from rtid.ui.sending import Sending, Way, foretell, send
@@ -71,12 +73,15 @@ class Addition:
 
 @dataclass(frozen=True)
 class Judged:
-    """The verdict of a file alone: kind for the colour, all lines, and the project as a text."""
+    """The verdict of a file alone: kind for the colour, all lines, and the project as a text.
+
+    project: where it would be saved; None for equations, which have no maps for the page.
+    """
 
     kind: str
     heading: str
     lines: tuple[str, ...]
-    project: Path
+    project: Path | None
     text: str
 
 
@@ -125,10 +130,8 @@ class Desk:
         looked = quick(file, dbc, given, self._progress, roles)
         project = free_name(file.with_suffix(".toml"))
         if isinstance(looked, QuickPlant):
-            remedy = f"{looked.next_command}, and `rtid refit`: it has no maps for this page"
-            raise RtidError(
-                f"{file}: a plant by its equations, {looked.found.structure.words}", remedy
-            )
+            kind, words = VERDICTS[looked.diagnosis.verdict]
+            return Judged(kind, words, tuple(plant_lines(looked)), None, looked.found.text)
         if isinstance(looked, QuickRate):
             told, project_text = rate_lines(looked, project), looked.text
         else:

@@ -58,6 +58,17 @@ def test_a_file_is_looked_at_judged_and_kept(tmp_path: Path) -> None:
     assert worker.jobs[0][1][:2] == (tmp_path / "day.toml", tmp_path / "day.csv")
 
 
+def test_what_has_no_maps_is_told_and_not_opened(tmp_path: Path) -> None:
+    session, arrival, worker = begun(tmp_path)
+    asked(session, arrival, {"do": "file", "name": "day.csv"})
+    worker.answer(SEEN)
+    worker.answer(Judged("good", "The model matches", ("Next: rtid quick",), None, "text\n"))
+    html = "".join(fragments(session, arrival).values())
+    assert "Next: rtid quick" in html and "and open" not in html
+    asked(session, arrival, {"do": "keep"})
+    assert session.arrival is arrival and not list(tmp_path.glob("*.toml"))
+
+
 def test_a_project_that_came_in_the_meantime_is_not_overwritten(tmp_path: Path) -> None:
     session, arrival, _ = begun(tmp_path)
     (tmp_path / "day.toml").write_text("mine")
