@@ -74,6 +74,12 @@ class Arrival:
             self.file = path
         self.seen, self.judged, self.roles = None, None, {}
 
+    @property
+    def can_be_judged(self) -> bool:
+        """Command and position are known; without pressures what is moved is found with them."""
+        roles = self.roles.keys()
+        return "u" in roles and ("x" in roles or not {"p_a", "p_b"} & roles)
+
     def give(self, name: str) -> None:
         """Let a signal play the role that is next, and no other."""
         self.roles = {r: n for r, n in self.roles.items() if n != name} | {self.role: name}
@@ -119,7 +125,7 @@ def choose(session: Session, arrival: Arrival, path: Path) -> None:
         arrival.seen, arrival.roles = result, dict(result.roles)
         arrival.role = next((r for r in ROLES if r not in arrival.roles), "u")
         session.tell("state")
-        if {"u", "x"} <= arrival.roles.keys():
+        if arrival.can_be_judged:
             judge(session, arrival)
 
     session.ask("glance", arrival.file, arrival.dbc, then=seen)

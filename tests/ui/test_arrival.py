@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -56,6 +57,19 @@ def test_a_file_is_looked_at_judged_and_kept(tmp_path: Path) -> None:
     assert (tmp_path / "day.toml").read_text() == "text\n"
     assert session.arrival is None and worker.jobs[0][0] == "read"
     assert worker.jobs[0][1][:2] == (tmp_path / "day.toml", tmp_path / "day.csv")
+
+
+@pytest.mark.parametrize(
+    ("roles", "is_judged"),
+    [({"u": "cmd", "v": "y"}, True), ({"u": "cmd", "p_a": "P1"}, False), ({"v": "y"}, False)],
+)
+def test_without_pressures_a_command_is_enough(
+    tmp_path: Path, roles: dict[str, str], is_judged: bool
+) -> None:
+    session, arrival, worker = begun(tmp_path)
+    asked(session, arrival, {"do": "file", "name": "day.csv"})
+    worker.answer(replace(SEEN, roles=roles))
+    assert [job[0] for job in worker.jobs] == ["judge"] * is_judged
 
 
 def test_what_has_no_maps_is_told_and_not_opened(tmp_path: Path) -> None:
