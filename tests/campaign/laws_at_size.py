@@ -2,8 +2,8 @@
 
 python -m tests.campaign.laws_at_size rich|sweep|clean|limit FIRST LAST    (machines per law)
 
-limit: effects at twice the limit that the records of the clean machines state, of those that are
-kept.
+limit: effects at twice the size from which on the records of the clean machines, of those that are
+kept, say that they are named.
 
 What is kept in out/campaign/laws makes the lines of the table, however few they are.
 """
@@ -125,7 +125,7 @@ def of_hidden(motion: str, found: list[Answer], clean_left: float) -> str:
 
 def of_clean(found: list[Outcome]) -> str:
     """The words of all clean machines."""
-    alarms = sum(o.verdict in ALARMS for o in found)
+    alarms = [f"{o.case.seed} {o.case.law}" for o in found if o.verdict in ALARMS]
     said = Counter(o.verdict for o in found).most_common()
     rho = {law: [o.rho for o in found if o.case.law == law] for law in LAWS}
     worst = max((x for x in rho if rho[x]), key=lambda law: abs(np.median(rho[law]) - 1.0))
@@ -141,7 +141,7 @@ def of_clean(found: list[Outcome]) -> str:
     )
     in_band = sum(abs(o.rho - 1.0) < o.band for o in found)
     parts = [
-        f"alarms {_share(alarms, len(found))}",
+        f"alarms {_share(len(alarms), len(found))} {', '.join(alarms)}".rstrip(),
         ", ".join(f"{verdict} {n}" for verdict, n in said),
         f"rho median {np.median([o.rho for o in found]):.3f}, farthest off 1 {worst} "
         f"{np.median(rho[worst]):.3f}, within 3 sqrt(2/dof) {_share(in_band, len(found))}",
@@ -157,19 +157,24 @@ def main(kind: str, first: str, last: str) -> None:
     """Judge, and leave the lines of all that is kept."""
     judge_all(kind, int(first), int(last))
     clean = kept(CLEAN)
-    if clean:
-        leave(
-            "clean valves of ten laws, at a reduced size", of_clean(clean),
-            "at most 1 % of 420; rho 1.00 +- 0.02; 93 to 97 %",
-            f"{len(clean)} machines, rich and sweep, 44 s",
-        )  # fmt: skip
+    for motion, record in MOTIONS.items():
+        if found := [o for o in clean if o.case.motion == record]:
+            seeds = sorted({o.case.seed for o in found})
+            leave(
+                f"clean valves of ten laws, {motion}, at a reduced size", of_clean(found),
+                "at most 1 % of 420; rho 1.00 +- 0.02; 93 to 97 %",
+                f"{len(found)} machines, 44 s, seeds {', '.join(map(str, seeds))}",
+            )  # fmt: skip
     if weak := kept(LIMIT):
         named = sum(o.judgement in (RIGHT, IN_SET) for o in weak)
         said = Counter(f"{o.case.hidden} {o.judgement}" for o in weak)
         each = ", ".join(f"{words} {n}" for words, n in said.items())
+        wrong = [
+            f"{o.case.hidden} as {o.named}, {o.case.law}" for o in weak if o.judgement == WRONG
+        ]
         leave(
-            "effects at twice the stated limit, ten laws, at a reduced size",
-            f"{_share(named, len(weak))}; {each}",
+            "effects at twice the size that is said to be named, ten laws, at a reduced size",
+            f"{_share(named, len(weak))}; {each}; wrong: {', '.join(wrong) or 'none'}",
             "90 %", f"{len(weak)} machines, rich motion, 44 s",
         )  # fmt: skip
     ratio = float(np.median([o.left for o in clean])) if clean else 1.0
