@@ -226,8 +226,12 @@ def taken_in(
     own_flow: of the rms flow; last, after: residuals without and with it.  One that
     explains most of a misfit beyond the noise's is no matter of taste: where it does so in data
     that have not taught it, no halves are asked, in which a pump's numbers would only trade off.
+    One that takes moduli out of what they can be is nothing that the maps have hidden: on a clean
+    sweep a line took both from 1030 MPa to 1660 and 1860, stable, and 3 % off the residual.
     """
     if trial.gain < HIDDEN_GAIN or after.rms_m3s > WORSE * last.rms_m3s:
+        return None
+    if not _is_as_credible(present, now):
         return None
     does = consequence(present, now, own_flow)
     misfit = present.held.sse - present.regression.dof
@@ -275,7 +279,7 @@ def _is_noticed(present: Fit, trial: Trial) -> bool:
 
 
 def _is_as_credible(present: Fit, now: Fit) -> bool:
-    """False where what is not material makes moduli contradict each other that had agreed."""
+    """False where what the residual hardly shows makes moduli impossible, or contradict."""
     return bool(doubts_about(present)) or not doubts_about(now)
 
 
