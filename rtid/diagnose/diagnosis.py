@@ -35,6 +35,7 @@ from rtid.diagnose.trials import (
     scored,
 )
 from rtid.diagnose.verdict import (
+    INSUFFICIENT,
     MATCHES,
     MATERIAL,
     MISSING,
@@ -127,7 +128,7 @@ def searched(standing: Standing, progress: Progress = silent) -> Result:
     apart = zeros(present, joined)
     if said == MATCHES and any(zero.matters for zero in apart):
         said = MISSING
-    reach = reaches(present, scores, last.flow_m3s)
+    reach = {} if said == INSUFFICIENT else reaches(present, scores, last.flow_m3s)
     return Result(
         first, present.light(), result, negligible, scores, before, last, said, parts,
         held_out_judged=judged, zeros=apart, reach=reach,

@@ -5,7 +5,8 @@ Leaving out an effect of size c leaves c r of the flows and moves maps and modul
     z = X b + r,    z its column for a size of 1,  X those of maps, compliances and other effects,
 
 so all that a name needs (`diagnosis`) is linear in c: to be significant, and that c r is material,
-or that c z is, or what c b moves.
+or that c z is, or what c b moves.  r is that of the motion that taught the maps: where unseen
+motion shows more, a smaller effect is named as well (one of a tenth was).
 """
 
 from __future__ import annotations
