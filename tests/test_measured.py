@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from firmware_bridge.samples import Samples
+from rtid.compare import sample_errors
 from rtid.effects.filtering import filtered
 from rtid.effects.flow_sums import FlowSums
 from rtid.effects.laws.response import behind_s
@@ -65,8 +66,18 @@ class Rotors:
         w = np.minimum(u / FULL, self.knee)
         return np.asarray(0.3 * self.linear + self.linear * w + self.square * w * w)
 
-    def recorded(self, path: Path, rng: np.random.Generator, seconds: float = 30.0) -> Path:
-        """A flight: steps of all rotors, and what keeps it upright."""
+    def recorded(
+        self,
+        path: Path,
+        rng: np.random.Generator,
+        seconds: float = 30.0,
+        until_s: float = np.inf,
+        rest_s: float = 0.0,
+    ) -> Path:
+        """A flight: steps of all rotors, and what keeps it upright.
+
+        The gain drifts until until_s; before it all rests on a floor for rest_s.
+        """
         n = round(HZ * seconds)
         steps = np.repeat(rng.uniform(-0.15, 0.15, n), round(0.7 * HZ))[:n]
         own = np.stack([_wander(rng, n, 0.15, 0.06) for _ in range(4)], axis=1)
@@ -74,8 +85,12 @@ class Rotors:
             FULL * np.clip(0.6 + (steps + _wander(rng, n, 1.0, 0.08))[:, None] + own, 0, 1)
         )
         sent = _late(u, self.lag_s) if self.place == "before" else u
-        y = self.thrust(sent).sum(axis=1) * (1.0 + self.drift * np.arange(n) / HZ)
+        drifted_s = np.minimum(np.arange(n) / HZ, until_s)
+        y = self.thrust(sent).sum(axis=1) * (1.0 + self.drift * drifted_s)
         y = _late(y[:, None], self.lag_s)[:, 0] if self.place == "behind" else y
+        rest = round(HZ * rest_s)
+        u, y = np.pad(u, ((rest, 0), (0, 0))), np.pad(y, (rest, 0), constant_values=GRAVITY)
+        n += rest
         y = (y + _wander(rng, n, self.colour_s, self.noise)) / GRAVITY
         rows = np.column_stack([np.arange(n) * round(1e6 / HZ), u, y])
         head = "t_us,motor_1,motor_2,motor_3,motor_4,acc_z_g"
@@ -130,6 +145,30 @@ def test_a_battery_that_empties_is_a_drift_of_the_gain(tmp_path: Path, drift: fl
         if g:
             rate = found["map_gain_drift"].parameters["rate"]
             assert rate.unit == "1/s" and abs(rate.value - drift) < 0.15 * abs(drift)
+
+
+def test_what_is_left_of_the_samples_is_that_of_a_flight_behind_its_last_gain(
+    tmp_path: Path,
+) -> None:
+    """A gain that falls in the first half alone, and rests on a floor: t went on, and so did it."""
+    rng = np.random.default_rng(41)
+    plant = replace(Rotors.drawn(rng, "", knee=0.75), drift=-0.004, noise=0.1, colour_s=0.0)
+    table = plant.recorded(tmp_path / "flight.csv", rng, 60.0, until_s=30.0, rest_s=8.0)
+    said("init", table, "-o", tmp_path / "flight.toml")
+    project = tmp_path / "flight.toml"
+    begun = project.read_text().partition("[[added]]")[0].partition("[record]")[0]
+    spans = "identification_s = [0, 38]\nvalidation_s = [38, 68]\n"
+    project.write_text(f"{begun}[record]\n{spans}")
+    study = Study(project, table).add("map_gain_drift", force=True)
+    comparison = Study(project, table).comparison()
+    assert study.changes and "while" in said("replay", table, "-p", project)
+    model, parts = comparison.replay.model, comparison.held[0].parts
+    flying, resting = sample_errors(model, parts["identification"])
+    assert (flying.given, resting.given) == (True, False)
+    assert flying.duration_s == pytest.approx(30.0, abs=0.1)
+    (flying,) = sample_errors(model, parts["validation"])
+    print(flying)
+    assert flying.sd < 1.1 * plant.noise and abs(flying.mean) < 0.3 * 0.004 * 15 * GRAVITY
 
 
 def test_noise_does_not_make_the_lag_shorter(tmp_path: Path) -> None:
@@ -272,7 +311,7 @@ def test_what_is_wrong_with_a_project_is_said_with_its_place(
 
 
 @pytest.mark.skipif(not STRANGERS.is_dir(), reason="no measurements of others beside this tree")
-def test_the_thrust_of_a_stranger_s_quadrotor() -> None:
+def test_the_thrust_of_a_stranger_s_quadrotor(tmp_path: Path) -> None:
     """One map of four motors, and their lag behind it, in one command."""
     table = STRANGERS / "quadrotor_thrust.parquet"
     began = time.process_time()
@@ -281,3 +320,9 @@ def test_the_thrust_of_a_stranger_s_quadrotor() -> None:
     assert len(quick.pair.commands) == 4 and quick.pair.state.name == "acc_z_g"
     assert 0.055 < lag_of(quick) < 0.075
     assert all(f'effect = "{name}"' in quick.text for name in ("map_lag", "map_gain_drift"))
+    project = tmp_path / "flight.toml"
+    project.write_text(quick.text)
+    comparison = Study(project, table).comparison()
+    (flying, _) = sample_errors(comparison.replay.model, comparison.held[0].parts["validation"])
+    print(flying)
+    assert flying.given and flying.sd < 0.43 and flying.rms < 0.52  # m/s2, as were asked for

@@ -15,6 +15,7 @@ from rtid.compare.examination import Examination, examine
 from rtid.compare.motion import smooth_position
 from rtid.compare.places import NoSuchBlockError, Visit, blocks_in_span, spans_of_block
 from rtid.compare.reference import LearnedReference, Reference, ReferenceMap
+from rtid.compare.sampled import SampleErrors, sample_errors
 from rtid.compare.simulation import FREE_RUN, HORIZONS_S, NoFreeRunError, Simulation, simulate
 from rtid.compare.tables import (
     PAPER_DP_PA,
@@ -46,6 +47,7 @@ __all__ = [
     "NoSuchBlockError",
     "Reference",
     "ReferenceMap",
+    "SampleErrors",
     "Simulation",
     "Visit",
     "across_piston",
@@ -62,6 +64,7 @@ __all__ = [
     "over_time",
     "recursive_residuals",
     "refitted",
+    "sample_errors",
     "simulate",
     "smooth_position",
     "spans_of_block",

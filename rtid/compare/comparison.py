@@ -8,7 +8,7 @@ effects go to the modelled side.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,8 @@ class Intervals:
     first; begun anew after every interval whose flow does not stand on data.  NaN: no row, or such
     an interval.  own (n - 1, c): the same of the fit's own terms instead of the published map's,
     in the data of the fit.  values (n - 1, m): the model's signals at the interval's start.
+    left (n - 1,): of a rate that is measured itself, its sample at the interval's start less what
+    is modelled, behind its lag; empty of others.
     """
 
     t_s: FloatArray
@@ -45,6 +47,7 @@ class Intervals:
     innovation: FloatArray
     own: FloatArray
     values: FloatArray
+    left: FloatArray = field(default_factory=lambda: np.empty(0))
 
 
 @dataclass(frozen=True)
@@ -155,6 +158,7 @@ def compare(
             innovation,
             innovations,
             chunk[:-1, 2 : 2 + len(model.signals)],
+            _left_of_samples(model, sums, chunk),
         ),
     )
 
@@ -221,6 +225,15 @@ def _as_measured(model: Machine, sums: _Held, means: FloatArray) -> FloatArray:
     step_s = float(np.median(np.diff(sums.t_s)))
     left = left_behind(left, step_s, model.chambers[0].behind_s)
     return np.hstack([np.where(np.isnan(left), np.nan, y), y - left])
+
+
+def _left_of_samples(model: Machine, sums: _Held, chunk: FloatArray) -> FloatArray:
+    """What is left of each sample (n - 1,) of a rate that is measured itself; empty of others."""
+    if not model.measured:
+        return np.empty(0)
+    values = chunk[:, 2 : 2 + len(model.signals)]
+    modelled = _as_measured(model, sums, 0.5 * (values[1:] + values[:-1]))[:, 1]
+    return np.asarray(values[:-1, model.column(model.measured)] - modelled)
 
 
 def _mean_squares(innovation: FloatArray) -> FloatArray:

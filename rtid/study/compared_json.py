@@ -17,7 +17,9 @@ from rtid.compare import (
     Deviation,
     Examination,
     Simulation,
+    sample_errors,
 )
+from rtid.model import Machine
 from rtid.plain import plain
 
 if TYPE_CHECKING:
@@ -36,7 +38,7 @@ def as_json(comparison: TraceComparison) -> dict[str, Any]:
         "project": str(comparison.replay.project.path),
         "chambers": [chamber.name for chamber in comparison.replay.model.chambers],
         "rho_of_fit": solution.rho,
-        "maps": [_held(tested) for tested in comparison.held],
+        "maps": [_held(comparison.replay.model, tested) for tested in comparison.held],
         "blocks": [plain(vars(row)) for row in comparison.blocks],
         "blocks_by_part": {
             title: [plain(vars(row)) for row in rows]
@@ -49,10 +51,11 @@ def as_json(comparison: TraceComparison) -> dict[str, Any]:
     }
 
 
-def _held(tested: Held) -> dict[str, Any]:
+def _held(model: Machine, tested: Held) -> dict[str, Any]:
     parts = {}
     for title, part in tested.parts.items():
-        parts[title] = _equation(part)
+        errors = [plain(vars(e)) | {"rms": e.rms} for e in sample_errors(model, part)]
+        parts[title] = _equation(part) | ({"samples": errors} if errors else {})
         if title in tested.examinations:
             parts[title] |= _examination(tested.examinations[title])
     return {"name": tested.name, "beta_pa": plain(tested.beta_pa), "parts": parts}

@@ -60,8 +60,8 @@ class TooManyEffectsError(RtidError):
 class KnownEffect:
     """An effect of the model as fitted to a record; parameters: SI.
 
-    follows: its flow is that of the simulated pressures where pressures are simulated; else it is
-    taken from the measured ones.
+    follows: its flow is that of the simulated pressures where pressures are simulated; False where
+    it is taken from the measured ones.
     """
 
     effect: str
@@ -96,10 +96,11 @@ def acting(fit: Fit, chunk: FloatArray, published: FlowMap | None = None) -> Act
         return Acting(fit.declared, chunk, (), ())
     sent = transformed_like(fit, chunk)
     model = with_positive_pressures(fit.model, sent)
-    view = RecordView.of(model, sent, fit.weights, fit.map)
+    view = RecordView.of(model, sent, fit.weights, fit.map, fit.view)
     if published is not None:
         of_terms = model.with_taylor_maps
-        view = RecordView.of(of_terms, sent, fit.weights, everywhere(of_terms, published))
+        known = everywhere(of_terms, published)
+        view = RecordView.of(of_terms, sent, fit.weights, known, fit.view)
     if not fit.revision.timings:  # nothing was done to the commands
         model, sent = fit.declared, chunk
         model = with_positive_pressures(model, chunk)
@@ -252,7 +253,8 @@ def known_effects(
     fit: Fit, acts: Acting, keys: Iterable[tuple[str, str]]
 ) -> tuple[KnownEffect, ...]:
     """The effects of a fit by their names and places, effects and timings alike."""
-    apart = {effect.key for effect in acts.measured}
+    simulates = fit.declared.has_pressures  # no pressure is simulated of other plants
+    apart = {effect.key for effect in acts.measured} if simulates else set()
     return tuple(KnownEffect(*key, parameters(fit, key), key not in apart) for key in keys)
 
 

@@ -29,6 +29,7 @@ def story(studies: Sequence[TraceComparison]) -> Story:
     """Everything of one study, or of two side by side."""
     shown = [
         tables.equation(studies),
+        tables.samples(studies),
         tables.pressure(studies),
         tables.checks(studies),
         tables.directions(studies),

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from rtid.compare import BlockRow, Comparison, Deviation, Examination
+from rtid.compare import BlockRow, Comparison, Deviation, Examination, sample_errors
 from rtid.compare.dependence import DIRECTIONS
 from rtid.compare.tables import CAUSES, cause_of
 from rtid.study.compared import Held, TraceComparison, share_on_own_data
@@ -48,6 +48,22 @@ def equation(studies: Sequence[TraceComparison]) -> Table:
         cells = [(*row[:3], *row[4:]) for row in rows]
         return Table("Equation residual, rms", (*heads[:3], *heads[4:]), cells, keys=3)
     return Table("Equation residual, rms", heads, rows, keys=3)
+
+
+def samples(studies: Sequence[TraceComparison]) -> Table:
+    """What is left of a rate that is measured itself, sample by sample; empty of other plants."""
+    scale, rows = scale_of("m3/s"), []
+    for comparison in studies:
+        model = comparison.replay.model
+        for tested in comparison.held:
+            for title, part in tested.parts.items():
+                for error in sample_errors(model, part):
+                    sizes = (scale.number(v, 3) for v in (error.mean, error.sd, error.rms))
+                    state = "a command is given" if error.given else "at rest"
+                    rows.append((tested.name, title, state, f"{error.duration_s:.1f}", *sizes))
+    title = f"What is left of the samples, without a filter, {scale.name}"
+    heads = ("map", "part", "while", "time s|", "mean|", "standard deviation|", "rms|")
+    return Table(title, heads, rows, keys=3)
 
 
 def pressure(studies: Sequence[TraceComparison]) -> Table:

@@ -20,6 +20,7 @@ from rtid.plain import plain
 from rtid.study.compared import TraceComparison
 from rtid.study.compared import as_json as compared_json
 from rtid.study.kept_record import Replay
+from rtid.tell import compared_tables as tables
 from rtid.tell.charts.maps import maps, slices
 from rtid.tell.charts.over_time import residual
 from rtid.tell.story import FAINT, Story, Table
@@ -129,6 +130,7 @@ class LearnedStory:
                 *self._grids(),
                 *doubts,
                 self._residual(),
+                tables.samples([self.compared]),
                 self._blocks(),
                 *maps,
             ),
