@@ -210,6 +210,8 @@ class Upkeep:
     `innovation_rows` in a row the gate opens; 0: no gate.  folds: interleaved parts of the record,
     changed at every upkeep, whose sums are kept apart for cross-validation.  history_s: raw samples
     of so many seconds are kept, at `history_rows_per_s`, for refits and the diagnosis; 0: none.
+    gain_walk: standard deviation of what the gain of all maps changes by in a second, a share of
+    it; see `rtid.estimator.walking`.
     """
 
     every_s: float = 0.0
@@ -220,12 +222,14 @@ class Upkeep:
     folds: int = 1
     history_s: float = 0.0
     history_rows_per_s: float = 1000.0
+    gain_walk: float = 0.0
 
     @property
     def fades(self) -> bool:
         """Whether anything of what was learned is given up again."""
         forgets = np.isfinite(self.forget_s) or np.isfinite(self.shared_forget_s)
-        return bool(self.every_s > 0 and (forgets or self.innovation_sd > 0))
+        gives_up = forgets or self.innovation_sd > 0 or self.gain_walk > 0
+        return bool(self.every_s > 0 and gives_up)
 
 
 @dataclass(frozen=True)

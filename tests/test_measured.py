@@ -259,6 +259,34 @@ def test_it_runs_on_board_in_the_recursive_core(flown: tuple[Rotors, Path, Path]
     assert np.sqrt(np.mean(error**2)) < 0.04 * plant.thrust(w).max()
 
 
+def test_a_gain_that_drifts_is_followed_on_board(tmp_path: Path) -> None:
+    """The map of a battery that empties is that of now, more than 100 times as fast as it flies."""
+    rng = np.random.default_rng(43)
+    plant = replace(Rotors.drawn(rng, "", knee=0.75), drift=-0.004, noise=0.1, colour_s=0.0)
+    table = plant.recorded(tmp_path / "flight.csv", rng, 60.0)
+    project = tmp_path / "flight.toml"
+    said("init", table, "-o", project)
+    said("add", "map_gain_drift", table, "-p", project, "--force")
+    told: list[str] = []
+    board = on_board(load(project), told.append)
+    assert "is followed" in told[0]
+    samples = read_trace(board, table).samples
+    w, errors = FULL * np.linspace(0.5, 0.7, 9), list[float]()
+    for walk in (board.model.upkeep.gain_walk, 0.0):
+        upkeep = replace(board.model.upkeep, gain_walk=walk)
+        estimator = Estimator(replace(board.model, upkeep=upkeep))
+        estimator.update(first_of(samples, 100))
+        estimator.reset()
+        began = time.process_time()
+        estimator.update(samples)
+        assert 60.0 / (time.process_time() - began) > 100
+        now = plant.thrust(w) * (1.0 + plant.drift * 60.0)
+        off = publish(estimator.solution())["f"].flow(w, np.zeros(9)) - now
+        errors.append(float(np.sqrt(np.mean(off**2)) / now.max()))
+    print(errors)
+    assert errors[0] < 0.02 and errors[1] > 2.0 * errors[0]
+
+
 def first_of(samples: Samples, n: int) -> Samples:
     """The first samples, to have the kernels compiled."""
     return Samples(samples.names, samples.t_us[:n], samples.values[:n], samples.flags[:n])

@@ -104,7 +104,7 @@ def read_blocks(
         shape, rated = model.edges[edge].grid.shape, model.edges[edge].rated_q_m3s
         i, j = divmod(int(record["cell"]) - first[edge], shape[1])
         used = at + np.flatnonzero(fitted_terms(model.edges[edge]))
-        condition = _condition(gram[used[:, None], used])
+        condition = condition_of(gram[used[:, None], used])
         variance = float(means[place] @ cov[columns, columns] @ means[place])
         sd_share = rated / largest[edge] * max(0.0, variance) ** 0.5
         status, reason = _status(model.gates, record, condition, sd_share, now_s)
@@ -125,8 +125,8 @@ def read_blocks(
         )
 
 
-def _condition(gram: FloatArray) -> float:
-    """Condition number of Phi'Phi in local coordinates; inf where a term was never excited."""
+def condition_of(gram: FloatArray) -> float:
+    """Condition number of Phi'Phi (n, n), scaled units; inf where a term was never excited."""
     values = np.linalg.eigvalsh(gram)
     return float(values[-1] / values[0]) if values[0] > 0 else np.inf
 

@@ -20,6 +20,7 @@ from rtid.estimator.ring import History
 from rtid.estimator.solution import Solution, solve
 from rtid.estimator.state import State, Weights, build, tell_unmarked
 from rtid.estimator.sums import Sums
+from rtid.estimator.walking import gain_of, walked
 from rtid.estimator.wear import Wear, carried_over
 from rtid.kernels.layout import TERMS
 from rtid.model import Machine
@@ -127,6 +128,7 @@ class Estimator:
         with one_thread():
             changed = self._changed(news)
             self._fade(news, changed)
+            self._walk(news)
         self.folds[fold] = self.folds[fold] + without_surprise(news, changed)
         if upkeep.innovation_sd > 0:
             self.hold(self.solution())
@@ -141,6 +143,15 @@ class Estimator:
         self.folds = [
             faded(halved_surprise(past), news, share, shared, changed) for past in self.folds
         ]
+
+    def _walk(self, news: Sums) -> None:
+        """Let the past know less of the gain of all maps, which has gone on since."""
+        upkeep = self.model.upkeep
+        if upkeep.gain_walk <= 0.0:
+            return
+        total = sum(self.folds, news)
+        gain, variance = gain_of(self.model, total), upkeep.gain_walk**2 * upkeep.every_s
+        self.folds = [walked(past, news, gain, variance) for past in self.folds]
 
     def carry_over(self, wear: Wear) -> None:
         """Go on as if all had been learned of a machine that has changed so."""

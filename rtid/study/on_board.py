@@ -10,6 +10,7 @@ board the maps take up what they can of them.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rtid.effects import Effect, catalogue
-from rtid.effects.law import BEHIND_MAPS
+from rtid.effects.law import BEHIND_MAPS, GAIN_DRIFT
 from rtid.effects.page import title
 from rtid.effects.summed import RunningSum
 from rtid.errors import RtidError
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
 
 LEAST_SD, USUAL_SD = 0.01, 0.1  # relative: an oil warms, a seal wears
 USUAL_DISTURBANCE = 0.01  # of the rated rate, per sqrt(Hz)
+USUAL_RECORD_S = 60.0  # over which a drift was seen, where nothing is declared of its record
+WALK_S = 1.0  # after so long a gain that walks has another step
 
 
 class NoRoomOnBoardError(RtidError):
@@ -54,6 +57,13 @@ def on_board(project: Project, tell: Callable[[str], None]) -> Project:
         if model.measured and _is_behind(added):
             model, flows = _behind(project, model, flows, added)
             tell(f"{title(added.effect)} at {added.where} is part of the equation")
+            continue
+        if model.measured and _walks(added):
+            model = _walking(project, model, added)
+            tell(
+                f"{title(added.effect)} at {added.where} is followed: the maps' gain may change by "
+                f"{100 * model.upkeep.gain_walk:.2g} % in a second"
+            )
             continue
         (terms, more), name = _live(project, added), f"{title(added.effect)} at {added.where}"
         if terms:
@@ -74,15 +84,36 @@ def on_board(project: Project, tell: Callable[[str], None]) -> Project:
         refuse_unfit(model)
     except ValueError as error:
         raise NoRoomOnBoardError(f"{project.path}: {error}", "drop an effect: rtid drop") from None
-    beside = tuple(flow.key for flow in flows)
+    beside = *(flow.key for flow in flows), *filter(None, [model.upkeep.gain_walk])
     key, alone = digest((project.digest, model.terms, *beside)), digest(model)
     return replace(project, model=model, digest=key, machine_digest=alone, flows=flows)
 
 
 def _is_behind(added: AddedSection) -> bool:
     """Whether it is a lag behind the maps of a plant whose rate is measured."""
+    return _has_law(added, BEHIND_MAPS)
+
+
+def _walks(added: AddedSection) -> bool:
+    """Whether it is a drift of the gain of maps that give what is measured."""
+    return _has_law(added, GAIN_DRIFT)
+
+
+def _has_law(added: AddedSection, law: str) -> bool:
     page = catalogue().get(added.effect)
-    return page is not None and page.law == BEHIND_MAPS
+    return page is not None and page.law == law
+
+
+def _walking(project: Project, model: Machine, added: AddedSection) -> Machine:
+    """The machine whose gain walks as far over a record as it was seen to drift: q T = (g T)^2.
+
+    How a gain goes on nobody knows: a battery's had lost 10 % in half a minute, 3 % in the next.
+    """
+    (rate,) = added.parameters.values()
+    begin_s, end_s = project.sections.record.identification_s or (0.0, USUAL_RECORD_S)
+    walk = abs(rate.value) * math.sqrt(end_s - begin_s)
+    model, every_s = _disturbed(model), model.upkeep.every_s or WALK_S
+    return replace(model, upkeep=replace(model.upkeep, every_s=every_s, gain_walk=walk))
 
 
 def _behind(
@@ -133,7 +164,8 @@ def load_for(path: Path, project: Project) -> tuple[Estimator, tuple[AddedSectio
     except SnapshotError:
         if board is project:
             raise
-        live = tuple(a for a in project.sections.parts if _is_behind(a) or _live(project, a)[0])
+        parts = project.sections.parts
+        live = tuple(a for a in parts if _is_behind(a) or _walks(a) or _live(project, a)[0])
         return load(path, board.model, board.digest), live
 
 

@@ -11,7 +11,7 @@ from functools import partial
 from importlib import import_module
 
 from rtid.effects.column import Candidate, Cause, by_equation
-from rtid.effects.law import BEHIND_MAPS, needs_no_pressure, placed_on
+from rtid.effects.law import BEHIND_MAPS, GAIN_DRIFT, needs_no_pressure, placed_on
 from rtid.effects.laws.drift import gain_drift
 from rtid.effects.laws.friction import dahl
 from rtid.effects.laws.lines import lines
@@ -37,7 +37,7 @@ NAMED: dict[str, Law] = {
     "late_position": late_position,
     BEHIND_MAPS: map_lag,
     "dahl": dahl,
-    "gain_drift": gain_drift,
+    GAIN_DRIFT: gain_drift,
 }
 
 
