@@ -30,7 +30,7 @@ from rtid.daemon.guard import PROOF, TRUST, Guard, candidate_of, with_wear
 from rtid.daemon.map_check import Judge
 from rtid.daemon.offering import Offering
 from rtid.daemon.pipe import Pipe
-from rtid.daemon.realtime import SWITCH_S
+from rtid.daemon.realtime import SWITCH_S, hasten
 from rtid.daemon.shadow import Shadow
 from rtid.daemon.status import EffectStatus
 from rtid.daemon.waiting import MOST_BYTES, Waiting
@@ -446,14 +446,23 @@ def main() -> None:
             pipe.send(reply)
 
     begun, waiting = Queue[Analyst](), Waiting(MOST_BYTES)
-    receiver = threading.Thread(target=lambda: _receive(pipe, begun.get(), waiting), daemon=True)
+    nice = os.getpriority(os.PRIO_PROCESS, 0) + NICE
+
+    def give_way() -> None:
+        os.setpriority(os.PRIO_PROCESS, os.getpid(), nice)  # the main thread alone
+
+    def receive() -> None:
+        hasten(threading.get_native_id())
+        _receive(pipe, begun.get(), waiting, give_way)
+
+    receiver = threading.Thread(target=receive, daemon=True)
     receiver.start()  # before this thread, and all that it starts, is nice: to save does not wait
     loaded = on_board(load(project), lambda _: None)
     Estimator(loaded.model).solution()  # compiles
     analyst = Analyst(loaded, Path(folder), answer)
     try:
         analyst.begin()
-        os.nice(NICE)  # not before: until it is ready nothing of what is learned is saved
+        give_way()  # not before: until it is ready nothing of what is learned is saved
         answer(jobs.Ready())
         begun.put(analyst)
         while (job := waiting.get()) is not None:
@@ -463,12 +472,18 @@ def main() -> None:
     analyst.close()
 
 
-def _receive(pipe: Pipe, analyst: Analyst, waiting: Waiting) -> None:
-    """Queue the jobs, and save what is to be saved of them at once."""
+def _receive(pipe: Pipe, analyst: Analyst, waiting: Waiting, saved: Callable[[], None]) -> None:
+    """Queue the jobs, and save what is to be saved of them at once.
+
+    What solves holds the interpreter for tenths of a second of its processor time, within scipy: a
+    save would wait for all to which it gives way. So the daemon hastens it with what is to be
+    saved, and it gives way again when that is `saved`.
+    """
     try:
         while (job := pipe.receive()) is not None:
             if isinstance(job, jobs.Handover) and job.store:
                 analyst.save(job)
+                saved()
             waiting.put(job)
     except (EOFError, OSError):
         pass  # the daemon is gone

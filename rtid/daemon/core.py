@@ -26,6 +26,7 @@ from rtid.trace.learner import Learner
 
 BATCH_NS = 200_000_000
 KEPT_FRAMES = 2000  # of the last frames, to be dumped on failure
+EARLY_S = 0.5  # a disk may take so much more for a save than it took for those before
 BACKLOG_TICKS = 20  # so many ticks' frames at once are a backlog
 HANDOVER, SWAP, UPKEEP, BACKLOG = "handover", "swap", "upkeep", "backlog"
 
@@ -164,7 +165,7 @@ class Core:
             self._due_publish_ns = now_ns + self._publish_ns
         if store:
             # what is on the disk is not to be older than that: the next one takes its time as well
-            early_ns = min(round(1e9 * self.save_s), self._store_ns // 2)
+            early_ns = min(round(1e9 * max(self.save_s, EARLY_S)), self._store_ns // 2)
             self._due_store_ns = now_ns + self._store_ns - early_ns
         self.hand_over(publish, store)
         return HANDOVER

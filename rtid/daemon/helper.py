@@ -17,7 +17,8 @@ from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
-from rtid.daemon.jobs import Answer, Batch, Job
+from rtid.daemon import realtime
+from rtid.daemon.jobs import Answer, Batch, Handover, Job
 from rtid.daemon.pipe import Pipe, pair
 
 QUEUED = 500  # jobs that may wait: a slow disk or a long solve
@@ -143,15 +144,22 @@ class Helper:
         os.close(theirs)
         pipe = Pipe(ours)
         listener = threading.Thread(target=self._listen, args=(pipe,), daemon=True)
-        listener.start()
         try:
-            while (job := self._next()) is not None:
-                pipe.send(job)
-            pipe.send(None)
+            with realtime.hastened():
+                listener.start()
+                self._feed(pipe, self.process)
             self.process.wait()
         finally:
             listener.join(PATIENCE_S)  # what it has said last
             pipe.close()
+
+    def _feed(self, pipe: Pipe, process: subprocess.Popen[bytes]) -> None:
+        """Send what there is to do; what is to be saved must not wait behind other work."""
+        while (job := self._next()) is not None:
+            if isinstance(job, Handover) and job.store:
+                realtime.hasten(process.pid)  # its main thread, which holds the interpreter
+            pipe.send(job)
+        pipe.send(None)
 
     def _next(self) -> Job | None:
         """The next job; None when it is time to end."""

@@ -62,6 +62,7 @@ class Keeper:
         self._first_s: float | None = None  # time of the first sample of this run
         self._is_checked = self._is_ready = False
         self._told_s = 0.0
+        self._is_news = False  # what is told at once
         self._loads: deque[tuple[int, int, Counter[str]]] = deque(maxlen=LOADS + 1)
         self._deaf = ""  # why no request can be taken
         self._fallen = 0
@@ -117,6 +118,7 @@ class Keeper:
                 if isinstance(answer, jobs.SavedSnapshot):
                     took_s = time.monotonic() - answer.made_s
                     self._core.save_s = max(took_s, SAVES * self._core.save_s)
+                    self._is_news = True  # how old the state on the disk is
             elif isinstance(answer, jobs.RecorderState):
                 self._recording = answer.path
                 for name, folder in answer.kept.items():
@@ -219,8 +221,8 @@ class Keeper:
         if learner.learns and not self._diagnosing.is_running:
             self._coaching.look(learner.estimator)
         self._look_at_load()
-        if self.alarms.on != tuple(a for a in self.status.alarms if a.until_unix_s is None):
-            self._tell_alarms()
+        if self._is_news or self.alarms.on != self._alarms_told():
+            self._tell_news()
 
     def _look_at_quarantine(self, implausible: bool) -> None:
         """Nothing is learned while a sensor cannot be believed."""
@@ -302,9 +304,12 @@ class Keeper:
                    "on" if begins else "over", alarm.name, alarm.kind, alarm.text)  # fmt: skip
         self._analyst.put(jobs.Note(alarm, keep=begins and alarm.kind != "loop"))
 
-    def _tell_alarms(self) -> None:
-        """What has just begun or ended is told at once."""
-        now_s, store = time.time(), self._store()
+    def _alarms_told(self) -> tuple[st.Alarm, ...]:
+        return tuple(alarm for alarm in self.status.alarms if alarm.until_unix_s is None)
+
+    def _tell_news(self) -> None:
+        """An alarm that has just begun or ended, or a snapshot, is told at once."""
+        now_s, store, self._is_news = time.time(), self._store(), False
         self.status = replace(self.status, now_unix_s=now_s, alarms=self.alarms.all, store=store)
         self._write_status()
 

@@ -14,10 +14,12 @@ import os
 import resource
 import sys
 import threading
+from collections.abc import Iterator
 
 RUN_AWAY_S = 2
 BESIDE = 1  # priority of the other threads: before all that is not real-time
 SWITCH_S = 0.5e-3  # another Python thread hands over the interpreter after so long
+HASTY = -10  # nice, as the service file grants it: before all ordinary work of the machine
 MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4  # on fault: what is reserved costs nothing
 PR_SET_TIMERSLACK = 29
 M_ARENA_MAX, M_MMAP_THRESHOLD = -8, -3
@@ -52,6 +54,26 @@ def favour_threads() -> None:
             if number and os.sched_getscheduler(number) == os.SCHED_OTHER:
                 policy = os.SCHED_RR | os.SCHED_RESET_ON_FORK
                 os.sched_setscheduler(number, policy, os.sched_param(BESIDE))
+
+
+def hasten(thread: int) -> bool:
+    """Let an ordinary thread, of any process of this user, come before other ordinary work."""
+    with contextlib.suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, thread, HASTY)
+        return True
+    return False
+
+
+@contextlib.contextmanager
+def hastened() -> Iterator[None]:
+    """The calling thread meanwhile, and the threads and processes that it starts."""
+    thread = threading.get_native_id()
+    before = os.getpriority(os.PRIO_PROCESS, thread)
+    hasten(thread)
+    try:
+        yield
+    finally:
+        os.setpriority(os.PRIO_PROCESS, thread, before)
 
 
 def share_arenas() -> None:

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
-from scipy.linalg.lapack import dpotri
+from scipy.linalg import cho_solve
 from threadpoolctl import ThreadpoolController
 
+from rtid.estimator import lapack
 from rtid.estimator.sums import Normal
 from rtid.kernels.normal import mirror, residual
 from rtid.plain import FloatArray
@@ -64,8 +64,8 @@ class Factor:
 
         is_last: nobody asks the factor any more, and it is written over.
         """
-        inverse, _ = dpotri(self.upper, lower=0, overwrite_c=is_last)
-        inverse = inverse.T  # in C order, below the diagonal
+        upper = self.upper if is_last else self.upper.copy(order="F")
+        inverse = lapack.inverted(upper).T  # in C order, below the diagonal
         mirror(inverse, self.scale)
         return np.asarray(inverse)
 
@@ -79,7 +79,7 @@ def factorize(normal: Normal, n_shared: int) -> Factor:
     scale = np.ldexp(1.0, -(np.frexp(np.maximum(np.diag(matrix), np.finfo(float).tiny))[1] // 2))
     matrix *= scale[:, None]
     matrix *= scale
-    upper = cho_factor(matrix.T, lower=False, overwrite_a=True)[0]  # in place: it is symmetric
+    upper = lapack.factorized(matrix.T)  # in place: it is symmetric
     return Factor(normal.gram, prior, scale, upper)
 
 

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from firmware_bridge.sources import open_log
-from rtid.daemon import jobs
+from rtid.daemon import jobs, realtime
 from rtid.daemon import status as st
 from rtid.daemon.analyst import Analyst, _receive
 from rtid.daemon.helper import Helper
@@ -162,7 +164,7 @@ def test_a_snapshot_passes_a_queue_behind_a_solve() -> None:
     """The helper takes two minutes of batches from its pipe, and saves, while nothing is done."""
     handover = jobs.Handover(7, None, publish=False, store=True)  # type: ignore[arg-type]
     items: list[jobs.Job | None] = [*(batch() for _ in range(600)), handover, None]
-    saved, waiting = list[int](), Waiting(16 << 20)
+    saved, ended, waiting = list[int](), list[int](), Waiting(16 << 20)
 
     class FromPipe:
         def receive(self) -> jobs.Job | None:
@@ -174,12 +176,12 @@ def test_a_snapshot_passes_a_queue_behind_a_solve() -> None:
 
     thread = threading.Thread(
         target=_receive,
-        args=(FromPipe(), Saver(), waiting),
+        args=(FromPipe(), Saver(), waiting, lambda: ended.append(saved[-1])),
         daemon=True,
     )
     thread.start()
     thread.join(10.0)
-    assert saved == [7] and not thread.is_alive()
+    assert saved == ended == [7] and not thread.is_alive()
     taken = 0
     while waiting.get() is not None:
         taken += 1
@@ -203,6 +205,30 @@ def test_what_must_be_on_the_disk_goes_ahead(monkeypatch: pytest.MonkeyPatch) ->
     urgent = jobs.Handover(3, None, publish=False, store=True)  # type: ignore[arg-type]
     helper.put(urgent, first=True)
     assert helper._next() is urgent and helper.queued == 100
+
+
+def test_what_is_to_be_saved_hastens_the_helper(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its main thread, which may hold the interpreter, and before it is sent."""
+    done = list[str]()
+    monkeypatch.setattr(Helper, "_run", lambda self: None)
+    monkeypatch.setattr(realtime, "hasten", lambda number: done.append(f"hastens {number}"))
+    pipe = SimpleNamespace(send=lambda job: done.append(type(job).__name__))
+    helper = Helper("none", [], lambda answer: None)
+    helper.put(batch())
+    helper.put(jobs.Handover(3, None, publish=False, store=True))  # type: ignore[arg-type]
+    helper._stopping = True
+    helper._feed(pipe, SimpleNamespace(pid=77))  # type: ignore[arg-type]
+    assert done == ["Batch", "hastens 77", "Handover", "NoneType"]
+
+
+def test_a_thread_is_hastened_for_a_while() -> None:
+    """Where the system grants it, and no thread beside it."""
+    thread = threading.get_native_id()
+    before = os.getpriority(os.PRIO_PROCESS, thread)
+    with realtime.hastened():
+        meanwhile = os.getpriority(os.PRIO_PROCESS, thread)
+    assert meanwhile in (before, realtime.HASTY)
+    assert os.getpriority(os.PRIO_PROCESS, thread) == before
 
 
 def test_what_was_overtaken_does_not_replace_what_is_newer(tmp_path: Path) -> None:

@@ -107,6 +107,16 @@ def test_a_save_that_took_long_counts_for_the_next_ones(keeper: Keeper) -> None:
     assert 0.64 <= keeper._core.save_s < 0.9
 
 
+def test_a_snapshot_is_told_at_once(keeper: Keeper) -> None:
+    """The age that is told is what a kill costs."""
+    keeper._core.save_s = 0.0
+    keeper._answers.append(jobs.SavedSnapshot(1, "state-0.npz", time.monotonic() - 0.5))
+    keeper._listen()
+    keeper._look()
+    told = read(keeper._facts.folder)
+    assert told.store.age_s is not None and 0.5 <= told.store.age_s < 5.0
+
+
 @pytest.mark.parametrize("alarm", ["implausible", "signal_range"])
 def test_a_sensor_that_cannot_be_believed_teaches_nothing(keeper: Keeper, alarm: str) -> None:
     """Learning is held from the alarm to its end; what is implausible has already been learned."""

@@ -83,13 +83,15 @@ def test_row_36_upkeep(figure: Figure, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_row_36_handovers(figure: Figure) -> None:
     """Publishing and storing: each due one once, and at most one in a tick.
 
-    The next save begins earlier by what the last one took, but by half of its period at most.
+    The next save begins earlier by what the last one took, half a second at least, but by half of
+    its period at most.
     """
     rng, wrong = np.random.default_rng(37), 0
     for _ in range(PERIODS):
         publish_ns, store_ns = (round(1e9 * 10.0 ** rng.uniform(-6.0, 5.0)) for _ in range(2))
         save_s = 10.0 ** rng.uniform(-6.0, 5.0)
-        after_ns = (publish_ns, max(store_ns - round(1e9 * save_s), store_ns - store_ns // 2))
+        early_ns = max(round(1e9 * save_s), 500_000_000)
+        after_ns = (publish_ns, max(store_ns - early_ns, store_ns - store_ns // 2))
         now_ns = np.cumsum(np.rint(1e9 * 10.0 ** rng.uniform(-4.0, 1.0, STAMPS))).astype(int)
         done: list[tuple[bool, bool]] = []
         core: Any = SimpleNamespace(
