@@ -6,6 +6,7 @@ those of nonlinearbenchmark.org (Schoukens and Noel, 2017).
 
 from __future__ import annotations
 
+import re
 import shlex
 from pathlib import Path
 
@@ -15,13 +16,14 @@ from scipy.integrate import solve_ivp
 
 from rtid.cli.init import init
 from rtid.plain import FloatArray, silent
-from rtid.project.guess import RoleCandidate
+from rtid.project.guess import RoleCandidate, named, propose
 from rtid.project.plant_file import load_plant
 from rtid.study.quick import quick
 from rtid.study.quick_machine import Given
-from rtid.study.quick_plant import QuickPlant, moves_itself
+from rtid.study.quick_plant import QuickPlant, equations_of, moves_itself
 from rtid.study.rate_pairs import RatePair
 from rtid.study.structures import BODIES, VESSELS
+from rtid.trace.quick_source import open_source
 from rtid.ui import desk
 
 
@@ -87,8 +89,39 @@ def test_what_stands_where_it_is_left_is_a_rate() -> None:
     assert moves_itself(t_s, u, x) < 0.02
 
 
+@pytest.mark.parametrize("is_vessel", [True, False])
+def test_the_law_is_told_by_the_record_and_not_by_its_names(
+    tmp_path: Path, is_vessel: bool
+) -> None:
+    """Two in a row, in volts: by roots or by straight lines, whatever the columns are called."""
+    rng = np.random.default_rng([31, is_vessel])
+    u = commands(rng, 900, 30, 0.5, 6.0)
+
+    def rates(_: float, x: FloatArray, u: float) -> list[float]:
+        if is_vessel:
+            first, last = 0.06 * np.sqrt(np.maximum(x, 0.0))
+        else:
+            first, last = 0.025 * x
+        return [0.045 * u - first, first - last]
+
+    y = solved(rates, [4.0, 4.0], u, 4.0)[:, 1] + 0.02 * rng.standard_normal(len(u))
+    for name in ("tank", "oven"):
+        file = tmp_path / f"{name}.csv"
+        rows = np.column_stack([4.0 * np.arange(len(u)), u, y])
+        np.savetxt(file, rows, "%.4f", ",", header=f"t_s,pump_V,{name}_level_V", comments="")
+        source = open_source(file, None)
+        given = named(source.signals, {"u": "pump_V", "x": f"{name}_level_V"})
+        found = equations_of(file, source, given)
+        assert found is not None and found.structure is (VESSELS if is_vessel else BODIES)[1]
+
+
+def test_volts_behind_a_name_are_no_velocity() -> None:
+    volts, speed = (RoleCandidate(n, "", "", 0.0, 10.0) for n in ("y_est_V", "v_ist"))
+    assert "v" not in propose([volts]) and propose([volts, speed])["v"].name == "v_ist"
+
+
 @pytest.mark.slow
-def test_measured_tanks_go_the_way_of_equations(shared: Path) -> None:
+def test_measured_tanks_go_the_way_of_equations(shared: Path, tmp_path: Path) -> None:
     """0.669 -> 0.263 V on the record of the table that judges."""
     table = shared / "data" / "real" / "cascaded_tanks.csv"
     looked = quick(table)
@@ -100,3 +133,12 @@ def test_measured_tanks_go_the_way_of_equations(shared: Path) -> None:
     assert refitted.errors(refitted.first)["validation"][0] == pytest.approx(0.669, abs=0.002)
     assert refitted.errors(refitted.last)["validation"][0] == pytest.approx(0.263, abs=0.003)
     assert looked.diagnosis.found[0].key == ("overflow", "x1")
+    renamed = tmp_path / "record.csv"
+    words = table.read_text()
+    for old, new in {"u_": "drive_", "y_": "probe_"}.items():
+        words = re.sub(rf"\b{old}(est|val)_V", rf"{new}\1", words)
+    renamed.write_text(words)
+    source = open_source(renamed, None)
+    roles = named(source.signals, {"u": "drive_est", "x": "probe_est"})
+    other = equations_of(renamed, source, roles)
+    assert other is not None and other.structure is VESSELS[1]

@@ -27,6 +27,8 @@ from firmware_bridge.sources.unpacked import Budget
 
 NUMBER_BYTES = 8
 MOST_US = 2.0**62  # of a time stamp
+PERIODS, OFTEN = 1.5, 0.95  # of the usual step: more is a gap; share of the steps that are usual
+ALIKE = 0.1  # of a step: so near to a multiple it is one
 TIME_NAMES = ("t", "time", "timestamp", "zeit")  # with or without a unit behind: t_ms, time_s
 TIME_UNITS = {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
 TIME_UNITS |= {"sec": 1.0, "seconds": 1.0, "msec": 1e-3, "usec": 1e-6, "h": 3600.0}
@@ -96,7 +98,7 @@ def to_samples(table: Table, assembly: Assembly) -> tuple[Samples, dict[str, int
     """Samples of the roles in `assembly` (signal = column), and refusals by reason.
 
     Rows with a missing value ("not_available") or whose time does not grow ("out_of_order") are
-    refused.  A step of more than 1.5 median steps, and the first row, carry GAP; all carry ROW.
+    refused.  A step that is a gap (`longest_step`), and the first row, carry GAP; all carry ROW.
     """
     t_us = table.t_us()
     values = np.column_stack([_role(table, s, len(t_us)) for s in assembly.signals])
@@ -111,11 +113,25 @@ def to_samples(table: Table, assembly: Assembly) -> tuple[Samples, dict[str, int
     flags = np.full(len(t_us), ROW, np.uint8)
     if len(t_us) > 1:
         steps = np.diff(t_us)
-        gaps = steps > 1.5 * np.median(steps)
+        gaps = steps > longest_step(steps)
         flags[1:][gaps] |= GAP
         add_counts(counts, {"gap": int(gaps.sum())})
     flags[:1] |= GAP
     return Samples(tuple(s.name for s in assembly.signals), t_us, values, flags), counts
+
+
+def longest_step(steps: NDArray[np.int64]) -> float:
+    """What a step (n,) may take that is no gap, us: 1.5 median steps, of even rows.
+
+    Where more than 5 % are longer, and no multiples of the usual step as behind rows that are lost,
+    no two steps are alike: 1.5 times what 95 % stay below.
+    """
+    usual = float(np.median(steps))
+    often, long = float(np.quantile(steps, OFTEN)), steps[steps > PERIODS * usual] / max(usual, 1.0)
+    is_lost = np.abs(long - np.round(long)) < ALIKE
+    if often <= PERIODS * usual or np.mean(is_lost) > 0.5:
+        return PERIODS * usual
+    return PERIODS * often
 
 
 def _role(table: Table, source: SignalSource, n: int) -> NDArray[np.float64]:

@@ -41,7 +41,8 @@ def with_disturbance(
 
     def excess(size: float) -> float:
         machine = disturbed(model, size)
-        return one_pass(machine, chunk, prepare(machine, chunk), revision, None, False).rho - 1.0
+        rho = one_pass(machine, chunk, prepare(machine, chunk), revision, None, False).rho
+        return rho - 1.0 if rho >= 0.0 else np.inf  # rows of next to no noise: nothing but rounding
 
     if excess(0.0) <= 0.0:
         return model

@@ -36,6 +36,7 @@ from rtid.units import limit
 SCHEMA = 1
 LONG_STEP = 0.2  # share of the delay: a shorter step changes little
 TOGETHER = "delay and lag together are"
+CALLED = {"delay": "the delay is", "time_constant": "the lag is"}
 WORTH = 2.0  # times better that an experiment must be to be proposed
 NOBODY_LOOKED = "Not examined: the diagnosis has no column for it here."
 VISIBLE = 2e-3  # share of a column that must be left beside the maps
@@ -377,19 +378,23 @@ def advice(result: Result, unseen: tuple[Unseen, ...]) -> tuple[str, ...]:
 def _of_held_commands(result: Result) -> list[str]:
     """How much longer a delay is where a command may have changed long before its row.
 
-    A lag is to first order a delay as long as it: where they are not told apart, it is their sum.
+    A lag is to first order a delay as long as it: where they are not told apart, it is their sum,
+    and one in front of what integrates is as much too short.
     """
     fit = result.last
-    step_s = float(np.median(np.diff(fit.chunk[:, 0])))
+    steps = np.diff(fit.chunk[:, 0])
+    steps = steps[steps <= fit.model.gates.max_gap_s]
+    step_s = float(np.mean(steps**2) / np.mean(steps))  # an event falls into long ones more often
     timings = [(t, psi) for t, psi in fit.revision.timings if t.where == COMMAND]
-    delays = [(t.effect, psi[0]) for t, psi in timings if t.parameters == ("delay",)]
+    known = (("delay",),) if fit.model.has_pressures else (("delay",), ("time_constant",))
+    delays = [(t.effect, t.parameters[0], psi[0]) for t, psi in timings if t.parameters in known]
     tied = {f.key[0] for f in result.found if any(where == COMMAND for _, where in f.alike)}
     return [
         f"A row comes each {1e3 * step_s:.0f} ms, and the command may have changed up to that long "
-        f"before it: from the command itself {TOGETHER if name in tied else 'the delay is'} "
+        f"before it: from the command itself {TOGETHER if name in tied else CALLED[kind]} "
         f"{1e3 * delay:.0f} to {1e3 * (delay + step_s):.0f} ms, "
         f"{1e3 * (delay + 0.5 * step_s):.0f} ms on average."
-        for name, delay in delays
+        for name, kind, delay in delays
         if step_s > LONG_STEP * delay
     ]
 

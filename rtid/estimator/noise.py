@@ -19,12 +19,14 @@ from rtid.plain import FloatArray
 
 ORDERS = range(2, 9)
 WINDOW = 32  # differences per window: shorter than the time between two steps of a command
+FEWEST = 4  # windows that tell of a noise
 QUIET = 0.25  # the quantile of the windows that the floor starts from
 LIKELY = 0.999  # of the clean windows lie below the limit that counts as quiet
 ROUNDING = 1e-8  # share of the largest value below which steps are rounding errors
 FEW_LEVELS = 6
 HELD_SHARE = 0.3  # of equal neighbours, from which on repeats are looked at
 EVEN = 0.01  # scatter of the sampling intervals up to which plain differences do
+OFTEN, GAP = 0.95, 1.5  # times what so many steps stay below: a longer one is a gap
 FINEST = 2.0**-24  # of a signal's span, that its sensor tells at best; what is less is no noise
 SINGLE_RUNS = 0.2  # share of values that come once, up to which a signal is held
 
@@ -133,7 +135,7 @@ class _Floor:
 def _floor(t_s: FloatArray, values: FloatArray, order: int) -> _Floor | None:
     """Noise from the order-th differences in quiet windows; None where there are too few."""
     squares = _windows(t_s, values, order)
-    if len(squares) < 4:
+    if len(squares) < FEWEST:
         return None
     squares = _of_a_sensor(squares, values)
     # A correlated sum of squares scatters like one of fewer, independent ones.
@@ -170,11 +172,16 @@ def _windows(t_s: FloatArray, values: FloatArray, order: int) -> FloatArray:
         if even
         else _divided(t_s, values, order)
     )
-    uneven = np.abs(spacing - np.median(spacing)) > 0.5 * np.median(spacing)
-    across = np.convolve(uneven, np.ones(order), "valid") > 0
     n = len(difference) // WINDOW * WINDOW
-    whole = ~across[:n].reshape(-1, WINDOW).any(axis=1)
-    return np.asarray(np.mean(difference[:n].reshape(-1, WINDOW) ** 2, axis=1)[whole])
+    squares = np.mean(difference[:n].reshape(-1, WINDOW) ** 2, axis=1)
+    uneven = np.abs(spacing - np.median(spacing)) > 0.5 * np.median(spacing)
+    broken = (spacing > GAP * np.quantile(spacing, OFTEN)) | (spacing <= 0.0)
+    for apart in (uneven, broken):  # the latter where no two steps are alike
+        across = np.convolve(apart, np.ones(order), "valid") > 0
+        whole = ~across[:n].reshape(-1, WINDOW).any(axis=1)
+        if np.count_nonzero(whole) >= FEWEST:
+            break
+    return np.asarray(squares[whole])
 
 
 def _divided(t_s: FloatArray, values: FloatArray, order: int) -> FloatArray:

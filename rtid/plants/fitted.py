@@ -56,8 +56,23 @@ def refit(plant: Plant, record: PlantRecord, add: tuple[Key, ...] = ()) -> Plant
 
 def with_effect(model: PlantModel, key: Key) -> PlantModel | None:
     """The model with one effect more, fitted; None where the plant cannot be run with it."""
+    rough = roughly(model, key)
+    return rough and continued(rough)
+
+
+def roughly(model: PlantModel, key: Key) -> PlantModel | None:
+    """The same after a few runs from the best starts: what it may become is seen there."""
     insertion = sized(insert(model.fit.plant, *key), model.fit)
-    return _fitted(insertion, model, starts(insertion, model.fit))
+    return _roughly_fitted(insertion, model, starts(insertion, model.fit))
+
+
+def continued(model: PlantModel) -> PlantModel:
+    """A model that was fitted roughly, fitted on from there."""
+    rough = model.fit
+    parts = rough.plant, rough.simulator.record, rough.values
+    steps = rough.simulator.sub_steps
+    done = fit(*parts, most_runs=QUICK_RUNS, sub_steps=steps, fixed_step=True)
+    return replace(model, fit=done)
 
 
 def polished(model: PlantModel) -> PlantModel:
@@ -84,13 +99,15 @@ def without(model: PlantModel, key: Key, known_fits: Iterable[PlantFit] = ()) ->
 
 
 def exchanged(model: PlantModel, reduced: PlantModel, key: Key) -> PlantModel | None:
-    """The reduced model with another effect, started from its own values and from the model's."""
+    """The reduced model with another effect, roughly, from its own values and from the model's."""
     insertion = sized(insert(reduced.fit.plant, *key), reduced.fit)
     lanes = np.vstack([starts(insertion, reduced.fit), starts(insertion, model.fit)])
-    return _fitted(insertion, reduced, lanes)
+    return _roughly_fitted(insertion, reduced, lanes)
 
 
-def _fitted(insertion: Insertion, beside: PlantModel, lanes: FloatArray) -> PlantModel | None:
+def _roughly_fitted(
+    insertion: Insertion, beside: PlantModel, lanes: FloatArray
+) -> PlantModel | None:
     simulator = beside.fit.simulator
     stiff = any(added.kind == RATE for added in insertion.added)
     plant_fit = fit(
@@ -98,7 +115,7 @@ def _fitted(insertion: Insertion, beside: PlantModel, lanes: FloatArray) -> Plan
         simulator.record,
         lanes,
         polished=POLISHED,
-        most_runs=QUICK_RUNS,
+        most_runs=0,
         sub_steps=max(simulator.sub_steps, STIFF_STEPS if stiff else 1),
         fixed_step=True,
     )

@@ -1,8 +1,9 @@
 """Which effect is missing in a plant, by the error of its free run.
 
-Forward: every effect at every place is fitted beside the model so far, the best one is added.  One
-that hides behind a larger one looks insignificant, because a residual that remembers is worth few
-samples; so the search goes on until two in a row are insignificant.  Backward: what the final model
+Forward: every effect at every place is fitted roughly beside the model so far, the best few to the
+end, and the best one is added.  One that hides behind a larger one looks insignificant, because a
+residual that remembers is worth few samples; so the search goes on until two in a row are
+insignificant, and takes both back where they are so together too.  Backward: what the final model
 can do without goes, and each effect that stays is held against every other in its place.  Only the
 identification part is looked at.  At the end a record that nobody has fitted may refute effects:
 one with which the error there does not fall is not named.
@@ -16,7 +17,15 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rtid.plain import FloatArray, Key, Progress, silent
-from rtid.plants.fitted import PlantModel, exchanged, polished, refit, with_effect, without
+from rtid.plants.fitted import (
+    PlantModel,
+    continued,
+    exchanged,
+    polished,
+    refit,
+    roughly,
+    without,
+)
 from rtid.plants.insertion import everywhere
 from rtid.plants.output_error import PlantFit
 from rtid.plants.plant import Plant, PlantRecord
@@ -24,10 +33,12 @@ from rtid.plants.statistics import f_test
 from rtid.plants.validation import left_out, rms, sensor_noise
 
 ALPHA = 0.01  # chance of a false alarm over all candidates of a round
+PROMISING = 3  # of the effects beside a model, those that are fitted to the end
 PATIENCE = 2  # insignificant additions in a row that end the search
 MOST = 6  # effects that are added at most
 MATERIAL = 0.003  # of the output's spread: what an effect must take off the held-out error
 TOLD_APART = 12.0  # of twice the log likelihood: by so much a rival must be worse
+HOPELESS = 4.0 * TOLD_APART  # a rival that is so much worse after a few runs is not fitted on
 BETTER = 2.0  # of the information criterion: what an exchange must gain
 CLEAN = 1.2  # mean square of the residual in units of the sensors' noise
 EXPLAINED = 0.8  # of the misfit: less, with something left behind, is no explanation
@@ -134,7 +145,7 @@ def diagnose(
         progress("checking on unseen data", 0.85)
         last, missings, refuted = _confirmed(search, last, missings, unseen)
     progress("looking at what was not found", 0.9)
-    rivals = tuple(_candidates(search, last, 0.9, 1.0) if with_limits else ())
+    rivals = tuple(map(continued, _candidates(search, last, 0.9, 1.0) if with_limits else ()))
     noise = sensor_noise(plant, record)
     verdict = _verdict(first, last, missings, noise)
     path, negligible = tuple(search.path), tuple(search.negligible)
@@ -149,29 +160,31 @@ def rho(model: PlantModel, noise: FloatArray) -> float:
 
 def _grown(search: _Search, model: PlantModel) -> PlantModel:
     """Add the best effect again and again."""
-    insignificant = 0
+    sure = model
     search.fits.append(model.fit)
     for k in range(MOST):
         candidates = _candidates(search, model, 0.05 + 0.5 * k / MOST, 0.05 + 0.5 * (k + 1) / MOST)
         if not candidates:
             break
-        best = polished(min(candidates, key=lambda c: c.fit.sse))
-        significant = chance(model, best) < ALPHA / len(candidates)
-        insignificant = 0 if significant else insignificant + 1
+        rough = sorted(candidates, key=lambda c: c.fit.sse)
+        best = polished(min((continued(c) for c in rough[:PROMISING]), key=lambda c: c.fit.sse))
+        least = ALPHA / len(candidates)
+        if chance(model, best) < least:
+            sure = best
         model = best
         search.fits.append(model.fit)
         search.path.append((model.keys[-1], model.fit.rmse))
-        if insignificant == PATIENCE:
-            break
+        if len(model.keys) - len(sure.keys) == PATIENCE:
+            return sure if chance(sure, model) >= least else model
     return model
 
 
 def _candidates(search: _Search, model: PlantModel, begin: float, end: float) -> list[PlantModel]:
-    """The model with every possible effect more, one at a time; begin, end: of the whole work."""
+    """The model with every possible effect more, roughly, one at a time; begin, end: of it all."""
     keys, models = everywhere(model.fit.plant), []
     for k, key in enumerate(keys):
         search.progress(f"trying {key[0]} at {key[1]}", begin + (end - begin) * k / len(keys))
-        models.append(with_effect(model, key))
+        models.append(roughly(model, key))
     return [m for m in models if m is not None]
 
 
@@ -257,13 +270,19 @@ def _rivals(search: _Search, less: PlantModel, model: PlantModel, key: Key) -> l
             search.progress(f"trying {other[0]} for {key[0]}", 0.7)
             rival = exchanged(model, less, other)
             models += [rival] if rival is not None else []
-    return models
+    models.sort(key=lambda m: m.fit.sse)
+    close = max(PROMISING, sum(_gap(m, model) < HOPELESS for m in models))
+    return [*map(continued, models[:close]), *models[close:]]
+
+
+def _gap(rival: PlantModel, model: PlantModel) -> float:
+    """By how much of twice the log likelihood a rival is worse."""
+    return float(model.fit.worth * np.log(rival.fit.sse / model.fit.sse))
 
 
 def _alike(model: PlantModel, rivals: list[PlantModel]) -> tuple[Key, ...]:
     """Effects that do as well as far as the record can tell."""
-    worse = model.fit.worth * np.log([m.fit.sse / model.fit.sse for m in rivals])
-    close = [m for m, gap in zip(rivals, worse, strict=True) if gap < TOLD_APART]
+    close = [m for m in rivals if _gap(m, model) < TOLD_APART]
     return tuple(m.keys[-1] for m in sorted(close, key=lambda m: m.fit.sse))
 
 

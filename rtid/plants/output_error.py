@@ -31,7 +31,7 @@ INFINITE_RANGE = 10.0  # of the start value, where a parameter has no bounds
 
 @dataclass(frozen=True)
 class PlantFit:
-    """A fitted plant: values (unknowns,), residual (n, outputs), jacobian (n, outputs, unknowns).
+    """A fitted plant: values (unknowns,), residual (n, outputs), in the plant's units.
 
     The residual is NaN where nothing was measured or used.
     """
@@ -41,8 +41,15 @@ class PlantFit:
     output: FloatArray
     states: FloatArray
     residual: FloatArray
-    jacobian: FloatArray
     mask: BoolArray
+
+    @cached_property
+    def jacobian(self) -> FloatArray:
+        """How the outputs change with the values (n, outputs, unknowns), in their units."""
+        everywhere, moved = np.ones_like(self.mask), np.ones(len(self.values), bool)
+        whole = FitProblem(self.simulator, self.values, moved, everywhere)
+        slopes = whole.slopes(self.values / whole.step) / whole.step
+        return slopes.reshape(*self.residual.shape, len(self.values)) * whole.scale[:, None]
 
     @property
     def plant(self) -> Plant:
@@ -132,7 +139,8 @@ def fit(
     """Fit all unknowns, or only the parameters, or only (later) initial values of the states.
 
     starts (lanes, unknowns): where to start, the best of them are polished; None draws them between
-    the bounds.  mask (n, outputs): which outputs count.  sub_steps: at least so many per sample,
+    the bounds.  most_runs: of the last fit, 0 for a rough one.  mask (n, outputs): which outputs
+    count.  sub_steps: at least so many per sample,
     exactly so many with a fixed step.  All in the plant's units.
     """
     used = record.used if mask is None else mask & record.used
@@ -181,20 +189,16 @@ def _best_start(
     order = np.argsort(cost)[:polished]
     if len(order) > 1:  # a few steps show which starts lead to the same place
         rough = [problem.solve(lanes[k], ROUGH_RUNS, ROUGH) for k in order]
-        return problem.solve(min(rough, key=lambda r: r[1])[0], most_runs)[0]
-    return problem.solve(lanes[order[0]], most_runs)[0]
+        best = min(rough, key=lambda r: r[1])[0]
+        return problem.solve(best, most_runs)[0] if most_runs else best
+    return problem.solve(lanes[order[0]], most_runs or ROUGH_RUNS)[0]
 
 
 def _finished(problem: FitProblem, values: FloatArray) -> PlantFit:
     simulator = problem.simulator
     y, states = simulator.run(values[:, None])
     residual = np.where(problem.mask, simulator.record.y - y[:, :, 0], np.nan)
-    whole = FitProblem(simulator, values, np.ones(len(values), bool), np.ones_like(problem.mask))
-    slopes = whole.slopes(values / whole.step) / whole.step
-    jacobian = slopes.reshape(*residual.shape, len(values)) * whole.scale[:, None]
-    return PlantFit(
-        simulator, values, y[:, :, 0], states[:, :, 0], residual, jacobian, problem.mask
-    )
+    return PlantFit(simulator, values, y[:, :, 0], states[:, :, 0], residual, problem.mask)
 
 
 def drawn(unknowns: tuple[PlantParameter, ...], n: int = STARTS) -> FloatArray:

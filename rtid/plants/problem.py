@@ -1,7 +1,8 @@
 """The least-squares problem of a free run, in unknowns of size one.
 
-Errors come for many sets of values at once, and so does the Jacobian: by central differences in one
-run of all lanes.
+Errors come for many sets of values at once, and so does the Jacobian: by differences in one run of
+all lanes, which costs little more than that of one.  On the way to the least squares they are
+one-sided, and come with the error itself; what is told of a fit is by central ones.
 """
 
 from __future__ import annotations
@@ -57,6 +58,7 @@ class FitProblem:
         unknowns = simulator.plant.unknowns
         self.step, (self.low, self.high) = steps(unknowns), bounds(unknowns)
         self.scale = scales(simulator)
+        self._last: tuple[FloatArray, FloatArray, FloatArray] | None = None
 
     def errors(self, lanes: FloatArray) -> FloatArray:
         """Errors (samples used, lanes), scaled, for values (unknowns, lanes)."""
@@ -72,7 +74,24 @@ class FitProblem:
 
     def error(self, z: FloatArray) -> FloatArray:
         """Errors (samples used,), scaled, of one set."""
-        return self.errors(self.full(z)[:, None])[:, 0]
+        return self._at(z)[0]
+
+    def one_sided(self, z: FloatArray) -> FloatArray:
+        """Jacobian (samples used, open unknowns), scaled, by the run that gave the error at z."""
+        return self._at(z)[1]
+
+    def _at(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Error and one-sided Jacobian at z, which are asked for one after the other."""
+        if self._last is not None and np.array_equal(self._last[0], z):
+            return self._last[1:]
+        values, index = self.full(z), np.flatnonzero(self.open)
+        h = ROUNDING * self.step[index]
+        h = np.where(values[index] + h > self.high[index], -h, h)
+        lanes = np.repeat(values[:, None], 1 + len(index), axis=1)
+        lanes[index, 1 + np.arange(len(index))] += h
+        e = self.errors(lanes)
+        self._last = z.copy(), e[:, 0], (e[:, 1:] - e[:, :1]) / (h / self.step[index])
+        return self._last[1:]
 
     def slopes(self, z: FloatArray) -> FloatArray:
         """Jacobian (samples used, open unknowns), scaled, by central differences, in one run."""
@@ -98,7 +117,7 @@ class FitProblem:
         done = least_squares(
             self.error,
             at,
-            self.slopes,
+            self.one_sided,
             (low, high),
             x_scale="jac",
             max_nfev=most,

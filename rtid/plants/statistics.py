@@ -8,7 +8,6 @@ The residual of a free run remembers: n samples are worth n / tau independent on
 from __future__ import annotations
 
 import numpy as np
-from scipy.signal import fftconvolve
 from scipy.stats import f as fisher
 
 from rtid.plain import FloatArray
@@ -18,8 +17,9 @@ WINDOW = 5.0  # lags in units of tau over which correlation is summed (Sokal)
 
 def autocovariance(e: FloatArray) -> FloatArray:
     """Autocovariance (n,) of a series about zero, in its unit squared; NaN counts as zero."""
-    e = np.nan_to_num(e)
-    return np.asarray(fftconvolve(e, e[::-1])[len(e) - 1 :] / len(e))
+    n = len(e)
+    spectrum = np.fft.rfft(np.nan_to_num(e), 2 * n)  # with as many zeros behind: no lag wraps
+    return np.asarray(np.fft.irfft(np.abs(spectrum) ** 2, 2 * n)[:n] / n)
 
 
 def memory(e: FloatArray) -> tuple[float, int]:
@@ -52,9 +52,8 @@ def covariance(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
         e = residual[:, o]
         _, m = memory(e)
         taper = autocovariance(e)[:m] * (1.0 - np.arange(m) / m) * len(e) / max(used.sum() - p, 1)
-        kernel = np.concatenate([taper[:0:-1], taper])
         normal += j.T @ j
-        middle += j.T @ fftconvolve(j, kernel[:, None], mode="same", axes=0)
+        middle += j.T @ _spread(j, taper)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
     inverse = np.linalg.pinv(normal * scale * scale[:, None], rcond=1e-14, hermitian=True)
     inverse *= scale * scale[:, None]
@@ -65,3 +64,12 @@ def f_test(before: float, after: float, more: int, worth: float, parameters: int
     """Chance that so many more parameters take the sum of squares down by accident."""
     dof = max(worth - parameters, 1.0)
     return float(fisher.sf(max(before / after - 1.0, 0.0) * dof / more, more, dof))
+
+
+def _spread(j: FloatArray, taper: FloatArray) -> FloatArray:
+    """Sum of columns (n, p) at all lags below m, weighed by the taper (m,) of the lag; (n, p)."""
+    size = len(j) + len(taper)
+    weights = np.zeros(size)
+    weights[: len(taper)], weights[size - len(taper) + 1 :] = taper, taper[:0:-1]
+    spectrum = np.fft.rfft(j, size, axis=0) * np.fft.rfft(weights)[:, None]
+    return np.asarray(np.fft.irfft(spectrum, size, axis=0)[: len(j)])

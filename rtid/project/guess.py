@@ -12,7 +12,7 @@ from firmware_bridge.catalog import Catalog
 from firmware_bridge.sources.table import Table, is_time
 from rtid.errors import RtidError
 from rtid.project.references import KIND_DIMENSIONS
-from rtid.units import find_unit, nearest, said, split_name, units_of, words_of
+from rtid.units import COMMAND_DIMENSIONS, find_unit, nearest, said, split_name, units_of, words_of
 
 _PRESSURE = {"p", "pressure", "press", "pres", "prs", "druck"}
 _WANTED_NOT_MEASURED = {"ref", "reference", "set", "setpoint", "target", "desired", "demand", "des"}
@@ -177,6 +177,8 @@ def is_wanted(candidate: RoleCandidate) -> bool:
 def _score(role: Role, candidate: RoleCandidate) -> float:
     """Positive if the candidate may play the role."""
     words = words_of(candidate.stem)
+    if role.kind == "velocity":  # a "_V" behind other words are volts
+        words = words_of(split_name(candidate.name, COMMAND_DIMENSIONS)[0])
     unit = find_unit(candidate.unit)
     fits = unit is not None and unit.dimension in KIND_DIMENSIONS[role.kind]
     if (candidate.unit and not fits) or (words & _WANTED_NOT_MEASURED and role.kind != "command"):

@@ -3,7 +3,8 @@
     d state / dt = f(command),   or   y = f(command),   y = sum of f over commands alike
 
 The pair is told by units, by the words that both names share and by how much of the rate the
-command explains.  An acceleration or a force is y itself; commands whose names differ in a number
+command explains.  An acceleration or a force is y itself, and so is a speed that follows its
+command and whose rate does not, as a motor's on its stand; commands whose names differ in a number
 share one map.  A speed of rotation that gives nearly all of the rate is a pump that drives
 (`rtid.study.quick_drive`), a force beside a pressure and no command is an area's
 (`rtid.study.quick_pressed`).
@@ -38,6 +39,7 @@ from rtid.units import COMMAND_DIMENSIONS, find_unit, words_of
 
 MEASURED, FLOWING = ("acceleration", "force"), ("velocity",)  # forces over a velocity: a damper's
 TURNING, DRIVEN = ("rotation",), 0.7  # share of the rate's variance that a pump's speed gives
+SPEEDS, FOLLOWS = ("velocity", "rotation"), 0.7  # share of a speed that a command itself gives
 STATES = ("length", "velocity", "angle", "rotation", "temperature")
 DRIVES = {"u", "cmd", "command", "valve", "spool", "pwm", "duty", "motor", "throttle", "lever"}
 MOVES = {"x", "pos", "position", "v", "speed", "velocity", "angle", "omega", "temp", "temperature"}
@@ -122,6 +124,9 @@ def pairs_of(path: Path, source: Source, given: Mapping[str, RoleCandidate]) -> 
             if command.name == state.name:
                 continue
             pair = _pair(t_s, table.columns, command, state)
+            if pair.share <= LEAST_SHARE and _is_speed(state):
+                itself = _measured_pair(table.columns, command, (), state)
+                pair = itself if itself.share > FOLLOWS else pair
             if pair.share > LEAST_SHARE or {"u", "x"} <= given.keys():
                 alike = len(words_of(command.stem) & words_of(state.stem) - {"u", "x"})
                 is_first = {first.get("u"), first.get("x")} == {command, state}
@@ -197,6 +202,11 @@ def alike_commands(
         for s in signals
         if s.name != command.name and NUMBER.search(s.stem) and NUMBER.sub("", s.stem) == stem
     )
+
+
+def _is_speed(state: RoleCandidate) -> bool:
+    unit = find_unit(state.unit)
+    return unit is not None and unit.dimension in SPEEDS
 
 
 def _measured_pair(
