@@ -34,7 +34,8 @@ RECORD_S, LEARN_S, HALF_SAMPLE_S = 44.0, 32.0, 0.5e-3
 LEVER, TURNS_MPS = 200.0, 0.02  # rad/m; a motor's mean speed, in that of the cylinder
 LAMINAR_PA, P_SET_PA, WIDER = 3e4, 1.0e6, 1.5
 SAFE_V = 1.0  # below it the valves pass nothing, as their user declares
-LEAK = {"": 0.0, "internal_leakage_laminar": 4e-12}  # m3/s/Pa
+LEAK, LAG, VOLUME = "internal_leakage_laminar", "spool_lag_first_order", "extra_dead_volume"
+SIZES = {LEAK: 4e-12, LAG: 5e-3, VOLUME: 4e-4}  # m3/s/Pa, s, m3
 
 MODEL = """
 model Machine
@@ -42,7 +43,7 @@ model Machine
   Real pb(start = {pb0}, fixed = true, nominal = 1e6);
   Real x(start = {x0}, fixed = true);
   Real v(start = 0.0, fixed = true);
-  Real wp(start = 0.0, fixed = true);
+  Real wp(start = 0.0, fixed = true);{more}
   Real ps; Real xr; Real vr; Real demand; Real u; Real load;
   Real qpa; Real qat; Real qpb; Real qbt; Real learning;
 equation
@@ -59,7 +60,7 @@ equation
   u = {band} * tanh(demand / 0.004) + {gain} * demand
     + learning * (0.3 * sin(11.0 * time) + 0.25 * sin(29.0 * time + 1.0)
     + 0.2 * sin(53.0 * time + 2.0));
-  der(wp) = (u - wp) / {lag};
+  der(wp) = ({sent} - wp) / {lag};{pilot}
 {edges}
   der(pa) * ({va}) / {beta} = qpa - qat - {da} * v - {leak} * (pa - pb);
   der(pb) * ({vb}) / {beta} = qpb - qbt + {db} * v + {leak} * (pa - pb);
@@ -68,6 +69,8 @@ equation
     - {viscous} * v;
 end Machine;
 """
+PILOT = """
+  der(wu) = (u - wu) / {late};"""  # a pilot stage in front of the spool
 OPENING = "max(0.0, {way} * wp - {band})"
 EDGE = """  q{edge} = {k} * ({opening}^2 / (0.1 + {opening})) * ({dp})
     / sqrt(sqrt(({dp}) * ({dp}) + {laminar}));"""
@@ -77,7 +80,10 @@ METERED = "({dp}) * {p_set} / sqrt(sqrt(({dp})^4 + {p_set}^4))"
 
 @dataclass(frozen=True)
 class Textbook:
-    """A machine of a kind with this number; hidden: a leak from a to b, or nothing."""
+    """A machine of a kind with this number; hidden: one of SIZES, or nothing.
+
+    A leak from a to b, a pilot stage's lag before the spool's own, a volume behind both ports.
+    """
 
     kind: str
     seed: int
@@ -128,18 +134,24 @@ class Textbook:
         shape = dp / np.sqrt(np.sqrt(dp * dp + LAMINAR_PA**2))
         return np.asarray(self.gain(edge) * above**2 / (0.1 + above) * shape)
 
+    def hidden_size(self, effect: str) -> float:
+        """Of an effect, SI, where it is hidden in this machine; else 0."""
+        return SIZES[effect] if self.hidden == effect else 0.0
+
     @property
     def text(self) -> str:
         """The model."""
         plant, c = self.drawn, self.drawn.constants
         lever = LEVER if self.kind == MOTOR else 1.0
         p_b, middle = 0.3 * plant.p_supply_pa, 0.5 * c.stroke_m
+        dead_a, dead_b = (v + self.hidden_size(VOLUME) for v in (c.v0_a_m3, c.v0_b_m3))
         volumes = (
-            f"{c.v0_a_m3} + {c.area_a_m2} * x",
-            (f"{c.v0_b_m3} + {c.area_b_m2} * ({c.stroke_m} - x)"),
+            f"{dead_a} + {c.area_a_m2} * x",
+            (f"{dead_b} + {c.area_b_m2} * ({c.stroke_m} - x)"),
         )
         if self.kind == MOTOR:
-            volumes = f"{c.v0_a_m3}", f"{c.v0_b_m3}"
+            volumes = f"{dead_a}", f"{dead_b}"
+        late = self.hidden_size(LAG)
         return MODEL.format(
             edges="\n".join(self._edges()), va=volumes[0], vb=volumes[1],
             pa0=(c.gravity_n + p_b * c.area_b_m2) / c.area_a_m2, pb0=p_b, x0=lever * middle,
@@ -147,7 +159,9 @@ class Textbook:
             amplitude=0.065 * lever, slope=0.5 * (3.14 - 0.628) / LEARN_S, ps=plant.p_supply_pa,
             force=c.gravity_n / lever, lever=lever, band=plant.controller.deadband_v,
             gain=plant.controller.volts_per_mps, lag=plant.lag_s + HALF_SAMPLE_S, beta=c.beta_pa,
-            da=c.area_a_m2 / lever, db=c.area_b_m2 / lever, leak=LEAK[self.hidden],
+            da=c.area_a_m2 / lever, db=c.area_b_m2 / lever, leak=self.hidden_size(LEAK),
+            sent="wu" if late else "u", pilot=PILOT.format(late=late) if late else "",
+            more="\n  Real wu(start = 0.0, fixed = true);" if late else "",
             inertia=c.mass_kg / lever**2, coulomb=c.coulomb_n / lever, creep=0.004 * lever,
             viscous=c.viscous_nspm / lever**2,
         )  # fmt: skip
