@@ -6,6 +6,7 @@ A row comes after the command that it tells.  A lag is told from the row, and fr
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -60,25 +61,46 @@ def test_the_noise_of_a_sensor_that_is_read_at_any_time() -> None:
     assert found.sd == pytest.approx(0.01, rel=0.1)
 
 
-def test_a_lag_is_told_from_the_command_itself(tmp_path: Path) -> None:
-    """Decimal commas, rows 5 to 25 ms apart: the lag is 9 ms too short from row to row."""
-    rng = np.random.default_rng(3)
+def boom(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """Command (n,), % about its neutral, and position (n,), mm."""
     u = steps_of(rng, -30.0, 30.0)
     u *= np.where(np.abs(np.cumsum(u)) > 6e5, 0.2, 1.0)
     spool = late(u)
     rate = np.where(spool > 6, 9.0 * (spool - 6), np.where(spool < -4, 6.5 * (spool + 4), 0.0))
-    x = 300.0 + MS * np.cumsum(rate)
-    at = rows(rng, 5, 26)
-    table = tmp_path / "bagger.csv"
-    lines = [f"{k};{50 + u[k]:.1f};{x[k] + 0.02 * rng.standard_normal():.2f}" for k in at]
+    return u, 300.0 + MS * np.cumsum(rate) + 0.02 * rng.standard_normal(N)
+
+
+def in_one_row(file: Path, rng: np.random.Generator) -> None:
+    """Decimal commas, rows 5 to 25 ms apart: the lag is 9 ms too short from row to row."""
+    u, x = boom(rng)
+    lines = [f"{k};{50 + u[k]:.1f};{x[k]:.2f}" for k in rows(rng, 5, 26)]
     head = "Zeit [ms];Joystick (%);Weg Ausleger [mm]\n"
-    table.write_text(head + "\n".join(lines).replace(".", ",") + "\n")
+    file.write_text(head + "\n".join(lines).replace(".", ",") + "\n")
+
+
+def in_turn(file: Path, rng: np.random.Generator) -> None:
+    """Each signal when it comes, the other one blank: no row was whole, and there was no plant."""
+    u, x = boom(rng)
+    lines = {k: f"{MS * k:.3f},{50 + u[k]:.1f}," for k in range(3, N, 20)}
+    lines |= {k: f"{MS * k:.3f},,{x[k]:.2f}" for k in rows(rng, 14, 19).tolist() if k not in lines}
+    words = "\n".join(lines[k] for k in sorted(lines))
+    file.write_text(f"t_s,lever_pct,boom_mm\n{words}\n")
+
+
+@pytest.mark.parametrize("written", [in_one_row, in_turn])
+def test_a_lag_is_told_from_the_command_itself(
+    tmp_path: Path, written: Callable[[Path, np.random.Generator], None]
+) -> None:
+    table = tmp_path / "bagger.csv"
+    written(table, np.random.default_rng(3))
     words = said("quick", table)
     print(words)
     found = re.search(r"the lag is (\d+) to (\d+) ms, (\d+) ms on average", " ".join(words.split()))
     assert found is not None
     low, high, usual = (int(n) for n in found.groups())
-    assert low < 1e3 * LAG_S < high and usual == pytest.approx(1e3 * LAG_S, abs=5)
+    own = 20 * (written is in_turn)  # ms: a command that is written so often is older still
+    assert low < 1e3 * LAG_S < high + own
+    assert usual == pytest.approx(1e3 * LAG_S - own / 2, abs=6)
 
 
 def test_a_speed_that_follows_its_command_is_what_the_map_gives(tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ from firmware_bridge.sources.unpacked import Budget
 NUMBER_BYTES = 8
 MOST_US = 2.0**62  # of a time stamp
 PERIODS, OFTEN = 1.5, 0.95  # of the usual step: more is a gap; share of the steps that are usual
+IN_TURN = 0.2  # share of blank rows, from which on a column is written in turn with others
 ALIKE = 0.1  # of a step: so near to a multiple it is one
 TIME_NAMES = ("t", "time", "timestamp", "zeit")  # with or without a unit behind: t_ms, time_s
 TIME_UNITS = {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
@@ -99,9 +100,13 @@ def to_samples(table: Table, assembly: Assembly) -> tuple[Samples, dict[str, int
 
     Rows with a missing value ("not_available") or whose time does not grow ("out_of_order") are
     refused.  A step that is a gap (`longest_step`), and the first row, carry GAP; all carry ROW.
+    A command that rows tell in turn with others acts until its next one (`held`).
     """
     t_us = table.t_us()
     values = np.column_stack([_role(table, s, len(t_us)) for s in assembly.signals])
+    for k, signal in enumerate(assembly.signals):
+        if signal.command:
+            values[:, k] = held(t_us, values[:, k])
     counts: dict[str, int] = {}
     finite = np.isfinite(values).all(axis=1)
     before = np.maximum.accumulate(np.concatenate([[np.iinfo(np.int64).min], t_us[:-1]]))
@@ -118,6 +123,21 @@ def to_samples(table: Table, assembly: Assembly) -> tuple[Samples, dict[str, int
         add_counts(counts, {"gap": int(gaps.sum())})
     flags[:1] |= GAP
     return Samples(tuple(s.name for s in assembly.signals), t_us, values, flags), counts
+
+
+def held(t: NDArray[Any], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A command (n,) with its blanks filled by the last one, where rows are often blank.
+
+    A logger that writes each signal when it comes leaves the others blank.  t (n,), any unit: what
+    is older than twice the usual interval between two commands is not known any more.
+    """
+    known = np.flatnonzero(np.isfinite(values))
+    if not 1 < len(known) < (1.0 - IN_TURN) * len(values):
+        return values
+    last = np.maximum(np.searchsorted(known, np.arange(len(values)), side="right") - 1, 0)
+    since = t - t[known[last]]
+    usual = np.median(np.diff(t[known]))
+    return np.where((since >= 0) & (since <= 2 * usual), values[known[last]], np.nan)
 
 
 def longest_step(steps: NDArray[np.int64]) -> float:

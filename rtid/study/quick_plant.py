@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from firmware_bridge.sources import read_table
+from firmware_bridge.sources.table import held
 from rtid.effects.filtering import filtered
 from rtid.errors import RtidError
 from rtid.plain import FloatArray, Progress, silent
@@ -141,7 +142,7 @@ def told_of(
         return None
     pair, table = pairs[0], read_table(path)
     t_s = table.seconds(source.keys["time_column"], source.keys["time_unit"])
-    u, y = table.columns[pair.command.name], table.columns[pair.state.name]
+    u, y = held(t_s, table.columns[pair.command.name]), table.columns[pair.state.name]
     whole = np.isfinite(t_s) & np.isfinite(u) & np.isfinite(y)
     t_s, u, y = t_s[whole], u[whole], y[whole]
     if not (KNOTS < len(t_s) <= MOST_ROWS) or moves_itself(t_s, u, y) < OWN_SHARE:

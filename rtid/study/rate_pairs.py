@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from firmware_bridge.sources import read_table
+from firmware_bridge.sources.table import held
 from rtid.plain import FloatArray
 from rtid.project.guess import ROLES, RoleCandidate, is_wanted, propose, with_unit
 from rtid.study.quick_drive import Drive, drive_of
@@ -125,7 +126,7 @@ def pairs_of(path: Path, source: Source, given: Mapping[str, RoleCandidate]) -> 
                 continue
             pair = _pair(t_s, table.columns, command, state)
             if pair.share <= LEAST_SHARE and _is_speed(state):
-                itself = _measured_pair(table.columns, command, (), state)
+                itself = _measured_pair(t_s, table.columns, command, (), state)
                 pair = itself if itself.share > FOLLOWS else pair
             if pair.share > LEAST_SHARE or {"u", "x"} <= given.keys():
                 alike = len(words_of(command.stem) & words_of(state.stem) - {"u", "x"})
@@ -134,12 +135,12 @@ def pairs_of(path: Path, source: Source, given: Mapping[str, RoleCandidate]) -> 
         for state in _candidates(source.signals, given.get("x"), MEASURED, set(), "x"):
             group = alike_commands(command, source.signals)
             for more in dict.fromkeys((group, ())):
-                pair = _measured_pair(table.columns, command, more, state)
+                pair = _measured_pair(t_s, table.columns, command, more, state)
                 if pair.share > LEAST_SHARE:
                     made.append((0, False, pair.share, pair))
     for command in _candidates(source.signals, given.get("u"), FLOWING, set(), "v"):
         for state in _candidates(source.signals, given.get("x"), MEASURED, set(), "x"):
-            pair = _measured_pair(table.columns, command, (), state)
+            pair = _measured_pair(t_s, table.columns, command, (), state)
             if pair.share > LEAST_SHARE:
                 made.append((0, False, pair.share, pair))
     best: list[RatePair] = []
@@ -210,13 +211,15 @@ def _is_speed(state: RoleCandidate) -> bool:
 
 
 def _measured_pair(
+    t_s: FloatArray,
     columns: Mapping[str, FloatArray],
     command: RoleCandidate,
     more: tuple[RoleCandidate, ...],
     state: RoleCandidate,
 ) -> RatePair:
     """y as a sum of one piecewise linear map over all commands."""
-    u, y = np.stack([columns[c.name] for c in (command, *more)], axis=1), columns[state.name]
+    u = np.stack([held(t_s, columns[c.name]) for c in (command, *more)], axis=1)
+    y = columns[state.name]
     whole = np.isfinite(u).all(axis=1) & np.isfinite(y)
     step = max(1, len(y) // MOST_LOOKED)
     u, y = u[whole][::step], y[whole][::step]
@@ -251,7 +254,7 @@ def _candidates(
 def _pair(
     t_s: FloatArray, columns: Mapping[str, FloatArray], command: RoleCandidate, state: RoleCandidate
 ) -> RatePair:
-    u, x = columns[command.name], columns[state.name]
+    u, x = held(t_s, columns[command.name]), columns[state.name]
     whole = np.isfinite(t_s) & np.isfinite(u) & np.isfinite(x)
     t_s, u, x = t_s[whole], u[whole], x[whole]
     rate = slope_of(t_s, x)

@@ -10,6 +10,7 @@ import numpy as np
 import tomlkit
 
 from firmware_bridge.sources import read_table
+from firmware_bridge.sources.table import held
 from rtid.plain import FloatArray
 from rtid.project.guess import RoleCandidate
 from rtid.study.quick_drive import drive_text
@@ -34,7 +35,7 @@ def rate_text(
     """TOML of the project of a pair, complete; more: further records that it is for."""
     table = read_table(path)
     t_s = table.seconds(source.keys["time_column"], source.keys["time_unit"])
-    us = np.stack([table.columns[c.name] for c in pair.commands], axis=1)
+    us = np.stack([held(t_s, table.columns[c.name]) for c in pair.commands], axis=1)
     x = table.columns[pair.state.name]
     whole = np.isfinite(t_s) & np.isfinite(us).all(axis=1) & np.isfinite(x)
     t_s, us, x = t_s[whole] - t_s[whole][0], us[whole] - _neutral(pair), x[whole]

@@ -17,7 +17,7 @@ from rtid.study.quick import quick
 from rtid.study.quick_rate import QuickRate
 from rtid.units import show_flow_as
 from tests.campaign.laws import Outcome, of_run, outcome_of
-from tests.campaign.modelica import LAG, LEAK, TEXTBOOK, VOLUME, Textbook
+from tests.campaign.modelica import LAG, LEAK, MOTOR, TEXTBOOK, VOLUME, Textbook
 from tests.campaign.modelica_drive import DriveByText
 from tests.campaign.report import leave
 from tests.campaign.test_kinds import leave_clean, leave_hidden
@@ -48,10 +48,12 @@ def test_a_clean_machine_of_the_textbook(kind: str) -> None:
 @pytest.mark.campaign
 @pytest.mark.parametrize("kind", TEXTBOOK)
 def test_what_is_hidden_in_a_machine_of_the_textbook(kind: str) -> None:
-    found = [o for hidden in (LEAK, LAG, VOLUME) for o in machines(kind, hidden)]
+    """A motor's volume does not change: one beside it is a softer oil, and matches."""
+    hidden = (LEAK, LAG) if kind == MOTOR else (LEAK, LAG, VOLUME)
+    found = [o for effect in hidden for o in machines(kind, effect)]
     for o in found:
         print(o.case.hidden, o.case.seed, o.verdict, *o.names)
-    assert len(found) == 3 * MACHINES
+    assert len(found) == len(hidden) * MACHINES
     assert leave_hidden(f"textbook {kind}", found) >= 0.95
 
 
