@@ -31,6 +31,7 @@ from numba.core.compiler_lock import global_compiler_lock
 from numba.extending import is_jitted
 
 from firmware_bridge.carried import adapt, take_over
+from firmware_bridge.kept_kernels import KEPT, load_light
 from firmware_bridge.kernel_parts import compiled_as
 
 WAIT_S = 120.0  # for another process that compiles the same: it may have been stopped
@@ -67,6 +68,7 @@ def cached(folder: Path | None, function: Callable[..., Any], **options: Any) ->
     finally:
         config.CACHE_DIR = before
     if is_jitted(kernel):  # not where NUMBA_DISABLE_JIT is set
+        load_light(kernel._cache)
         _compile_once(kernel, lock_of(folder, function))
     return kernel
 
@@ -84,7 +86,7 @@ def _compile_once(kernel: Any, lock: Path) -> None:
         if isinstance(signature, tuple) and signature in kernel.overloads:
             return compiled(signature)
         # numba's lock first, in every thread; a kernel that a part calls is still one for Python
-        with global_compiler_lock, alone(lock), compiled_as(JITCodeLibrary):
+        with global_compiler_lock, alone(lock), compiled_as(KEPT or JITCodeLibrary):
             adapt(Path(kernel.stats.cache_path), f"{module}.{kernel.__qualname__}")
             try:
                 return compiled(signature)

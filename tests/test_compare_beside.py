@@ -154,8 +154,8 @@ def test_shared_unknowns_are_as_told_and_the_maps_follow() -> None:
         normal.right[2:] - normal.gram[2:, :2] @ theta,
     )
     np.testing.assert_allclose(found.unknowns[2:], maps, rtol=1e-5, atol=1e-6)
-    left = misfit(normal, found.unknowns)
-    assert misfit(replaced.normal(), found.unknowns) == pytest.approx(left, rel=1e-6)
+    left = misfit(sums, found.unknowns)
+    assert misfit(replaced, found.unknowns) == pytest.approx(left, rel=1e-6)
 
 
 def test_an_effect_that_cannot_follow_is_taken_from_the_measured_pressures() -> None:

@@ -18,7 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.fft import irfft, next_fast_len, rfft
+from numpy.fft import irfft, rfft
 
 from rtid.compare.comparison import Comparison
 from rtid.model import COMMAND, PRESSURE, Machine
@@ -114,6 +114,8 @@ class _Series:
     """A centred series with gaps (zeros), its spectrum and its autocorrelation up to `most`."""
 
     def __init__(self, values: FloatArray, known: FloatArray, most: int) -> None:
+        from scipy.fft import next_fast_len  # noqa: PLC0415 - takes long to import
+
         self.n = len(values)
         self.size = next_fast_len(self.n + most + 1, real=True)
         self.spectrum, self.mask = rfft(values, self.size), rfft(known, self.size)

@@ -30,6 +30,7 @@ from rtid.plain import BoolArray, FloatArray, IntArray
 ROW_S = 10e-3  # positions measured within so long make one row
 SPAN = 10  # rows in which only few blocks move
 QUIET = 1e-9  # a block whose whitened state is smaller adds nothing to an innovation
+COLUMNS_AT_ONCE = 256  # of a triangle that is copied
 ENTRIES = 4  # per row, for which there is room at first
 
 
@@ -155,9 +156,18 @@ class EvidenceFactor:
         cov = np.zeros((len(self.scale) // TERMS, TERMS, TERMS))
         if len(cov):
             with one_thread():
-                inverse = dtrtri(self.upper, lower=0)[0]
+                inverse = dtrtri(_triangle(self.upper), lower=0, overwrite_c=1)[0]
             products.covariances(inverse.T, self.scale, cov)
         return cov
+
+
+def _triangle(upper: FloatArray) -> FloatArray:
+    """A copy of an upper triangle (n, n) in Fortran order; the rest of it takes no memory."""
+    copy = np.zeros(upper.shape, order="F")
+    for k in range(0, len(upper), COLUMNS_AT_ONCE):
+        end = k + COLUMNS_AT_ONCE
+        copy[:end, k:end] = upper[:end, k:end]
+    return copy
 
 
 def rows_of(

@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from scipy.special import chdtrc
 
 from rtid.diagnose.clean import Cut, cuts
 from rtid.diagnose.consequence import Consequence
@@ -22,7 +21,7 @@ from rtid.diagnose.regression import LIMIT_SD, Score
 from rtid.diagnose.remains import described
 from rtid.diagnose.trials import AcceptedEffect, detection_limit, physical
 from rtid.diagnose.verdict import MATERIAL, UNKNOWN, doubts_about, most_rho
-from rtid.diagnose.zeros import Zero
+from rtid.diagnose.zeros import Zero, by_chance
 from rtid.effects import catalogue
 from rtid.effects.column import Candidate
 from rtid.effects.law import is_of_rates
@@ -210,7 +209,7 @@ def _effect(result: Result, accepted: AcceptedEffect) -> FoundEffect:
         where=accepted.key[1],
         cannot_be_told_from=tuple(_named(result, accepted.key, key) for key in accepted.alike),
         parameters=parameters(result.last, accepted.key),
-        p_value=float(min(1.0, tests * chdtrc(accepted.n_parameters, accepted.gain))),
+        p_value=min(1.0, tests * by_chance(accepted.n_parameters, accepted.gain)),
         heldout_gain_pct=100.0 * (1.0 - after / before),
         heldout_residual_before_m3s=before,
         heldout_residual_after_m3s=after,
@@ -227,7 +226,7 @@ def _shown_too_much(result: Result, zero: Zero) -> FoundEffect:
         where=zero.signal,
         cannot_be_told_from=(),
         parameters={page.size.name: Value(zero.apart_pa, zero.std_pa, page.size.unit)},
-        p_value=float(chdtrc(1, (zero.apart_pa / zero.std_pa) ** 2)),
+        p_value=by_chance(1, (zero.apart_pa / zero.std_pa) ** 2),
         heldout_gain_pct=0.0,
         heldout_residual_before_m3s=left,
         heldout_residual_after_m3s=left,

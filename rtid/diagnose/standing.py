@@ -55,6 +55,7 @@ def fitted(
     first = few_excused(fine, rest)
     if first is fine:
         first = replace(first, rest=rest)
+    del fine  # its rows are large
     record = first.declared, chunk, first.weights, first.revision
     return with_spreads(one_pass(*record, first, bank=False))
 

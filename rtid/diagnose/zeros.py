@@ -16,7 +16,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.special import chdtrc
 
 from rtid.diagnose.consequence import BEND
 from rtid.diagnose.fit import Fit
@@ -94,7 +93,7 @@ def _solved(group: list[str], joints: tuple[Joint, ...]) -> Iterator[Zero]:
     variances = gains**2 @ sd**2 + (np.abs(gains) @ np.abs(drop)) ** 2 / UNIFORM**2
     left = shown - rows[:, 1:] @ apart
     chi2, freedom = float(left**2 @ weights), len(mine) - len(apart)
-    agrees = freedom > 0 and float(chdtrc(freedom, chi2)) > CONTRADICTS
+    agrees = freedom > 0 and by_chance(freedom, chi2) > CONTRADICTS
     spread = float(np.sqrt(max(1.0, chi2 / freedom))) if freedom else 1.0
     for k, signal in enumerate(group[1:]):
         through = [j for j in mine if signal in (j.source, j.sink)]
@@ -103,6 +102,13 @@ def _solved(group: list[str], joints: tuple[Joint, ...]) -> Iterator[Zero]:
         deviation = spread * float(np.sqrt(variances[k]))
         confirmed = agrees and len(partners) > 1
         yield Zero(signal, group[0], float(apart[k]), deviation, seconds, confirmed)
+
+
+def by_chance(freedom: int, chi2: float) -> float:
+    """How likely a sum of so many squares of unit variance is larger than chi2, 0 to 1."""
+    from scipy.special import chdtrc  # noqa: PLC0415 - takes long to import
+
+    return float(chdtrc(freedom, chi2))
 
 
 def _bent(fit: Fit, zero: Zero) -> Zero:

@@ -90,11 +90,11 @@ def largest_flows(model: Machine, sums: Sums, theta: FloatArray) -> FloatArray:
 
 
 def read_blocks(
-    model: Machine, sums: Sums, theta: FloatArray, cov: FloatArray, gram: FloatArray, now_s: float
+    model: Machine, sums: Sums, theta: FloatArray, cov: FloatArray, now_s: float
 ) -> Iterator[Block]:
     """All visited blocks.
 
-    theta (n,) and cov (n, n) in Taylor terms, gram (n, n): information of the rows.
+    theta (n,) and cov (n, n) in Taylor terms.
     """
     largest, means = largest_flows(model, sums, theta), mean_phi(sums.blocks)
     first = model.first_cells
@@ -103,8 +103,8 @@ def read_blocks(
         columns, edge = slice(at, at + TERMS), int(record["edge"])
         shape, rated = model.edges[edge].grid.shape, model.edges[edge].rated_q_m3s
         i, j = divmod(int(record["cell"]) - first[edge], shape[1])
-        used = at + np.flatnonzero(fitted_terms(model.edges[edge]))
-        condition = condition_of(gram[used[:, None], used])
+        used = np.flatnonzero(fitted_terms(model.edges[edge]))
+        condition = condition_of(record["gram"][used[:, None], used])
         variance = float(means[place] @ cov[columns, columns] @ means[place])
         sd_share = rated / largest[edge] * max(0.0, variance) ** 0.5
         status, reason = _status(model.gates, record, condition, sd_share, now_s)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rtid.estimator.factor import SHARED_PRIOR, Factor, misfit
-from rtid.estimator.sums import Normal, Sums
+from rtid.estimator.sums import Sums
 from rtid.kernels.layout import TERMS
 from rtid.model import Machine
 from rtid.plain import FloatArray
@@ -33,36 +33,37 @@ class Corrected:
     cost: float
 
 
-def plain(normal: Normal, factor: Factor) -> tuple[FloatArray, FloatArray]:
+def plain(sums: Sums, factor: Factor) -> tuple[FloatArray, FloatArray]:
     """The estimate (n,) without correction, and its covariance with the compliances (n, chambers).
 
     Both in the scaled units of the sums.
     """
-    return factor.theta(normal.right), factor.columns(len(normal.noise))
+    right = sums.right
+    units = np.eye(len(right), len(sums.noise))
+    solved = factor.theta(np.column_stack([right, units]))
+    return solved[:, 0], solved[:, 1:]
 
 
-def correct(
-    normal: Normal, theta: FloatArray, columns: FloatArray, leverage: FloatArray
-) -> Corrected:
+def correct(sums: Sums, theta: FloatArray, columns: FloatArray, leverage: FloatArray) -> Corrected:
     """Take the noise out of the compliances' information, and let the flow terms follow.
 
     theta (n,) and columns (n, chambers): as from `plain`; leverage (chambers,): share of the noise
     that the flow terms absorb (see `leverage_of`).  Where the motion holds no more information
     than the noise pretends, little is left, and the variance says so.
     """
-    n_c = len(normal.noise)
+    n_c = len(sums.noise)
     information = np.linalg.inv(columns[:n_c])
-    noise = np.diag(normal.noise * (1 - leverage))
-    least = SHARED_PRIOR + 3 * np.sqrt(2 / max(1, normal.rows)) * normal.noise
+    noise = np.diag(sums.noise * (1 - leverage))
+    least = SHARED_PRIOR + 3 * np.sqrt(2 / max(1, sums.rows)) * sums.noise
     rest, drawn = _at_least(information - noise, least)
     cov = np.linalg.inv(rest)
     basis = columns @ information
     shift = cov @ information @ theta[:n_c] - theta[:n_c]
     # noise times noise: its share of the rows' own variance adds to that of the product
-    noise_share = normal.noise / max(1, normal.rows)
+    noise_share = sums.noise / max(1, sums.rows)
     cov_change = cov + cov @ (noise * (1 + noise_share)) @ cov - columns[:n_c] + drawn
     shared = theta[:n_c] + shift
-    cost = misfit(normal, theta) + shift @ information @ shift - shared @ noise @ shared
+    cost = misfit(sums, theta) + shift @ information @ shift - shared @ noise @ shared
     return Corrected(theta + basis @ shift, basis, cov_change, float(cost))
 
 

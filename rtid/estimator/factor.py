@@ -11,7 +11,7 @@ from scipy.linalg import cho_solve
 from threadpoolctl import ThreadpoolController
 
 from rtid.estimator import lapack
-from rtid.estimator.sums import Normal
+from rtid.estimator.sums import Normal, Sums
 from rtid.kernels.normal import mirror, residual
 from rtid.plain import FloatArray
 
@@ -25,39 +25,41 @@ SHARED_PRIOR = 1e-2  # information on beta_nominal / beta: worth knowing it to a
 class Factor:
     """Cholesky factor of gram + prior, scaled to about unit information.
 
-    gram (n, n): the sums themselves, not a copy; prior (n,), on the diagonal; scale (n,): powers of
-    two, so that scaling changes no digit; upper (n, n), Fortran order: the factor in its upper
-    triangle, what was factorised in the other one.  A matrix of a rich map has 50 MB: there is one
-    beside the sums.
+    prior (n,), on the diagonal; scale (n,): powers of two, so that scaling changes no digit;
+    upper (n, n), Fortran order: the factor in its upper triangle, below it what was factorised;
+    diagonal (n,): its own, without the prior.  A matrix of a rich map has 50 MB: there is this one.
     """
 
-    gram: FloatArray
     prior: FloatArray
     scale: FloatArray
     upper: FloatArray
+    diagonal: FloatArray
 
     def theta(self, right: FloatArray) -> FloatArray:
-        """Solution (n,) for a right-hand side (n,), in the units of the sums, refined by one step.
+        """Solutions for right-hand sides, (n,) or (n, k), in the units of the sums, refined once.
 
         The residual is in twice the precision: the solution is that of the sums as they are, to
         about the square of condition number x rounding.
         """
-        theta = self._solved(right)
-        rest = residual(self.gram, theta, right) - self.prior * theta
-        return np.asarray(theta + self._solved(rest))
+        columns = np.atleast_2d(right.T).T * self.scale[:, None]
+        found = self._halves(columns)
+        rest = np.stack([self._rest(x, y) for x, y in zip(found.T, columns.T, strict=True)], 1)
+        theta = (found + self._halves(rest)) * self.scale[:, None]
+        return np.asarray(theta.reshape(right.shape))
 
-    def _solved(self, right: FloatArray) -> FloatArray:
-        scaled = cho_solve((self.upper, False), right * self.scale, check_finite=False)
-        return np.asarray(scaled * self.scale)
+    def _rest(self, theta: FloatArray, right: FloatArray) -> FloatArray:
+        """What a solution (n,) leaves of a right-hand side (n,), both scaled."""
+        left = residual(self.upper.T, self.diagonal, theta, right)
+        return np.asarray(left - self.prior * self.scale**2 * theta)
+
+    def _halves(self, columns: FloatArray) -> FloatArray:
+        """Solutions (n, k) for right-hand sides (n, k), both scaled."""
+        return np.asarray(cho_solve((self.upper, False), columns, check_finite=False))
 
     def solved(self, columns: FloatArray) -> FloatArray:
         """Solutions (n, k) for right-hand sides (n, k), in the units of the sums, not refined."""
         scale = self.scale[:, None]
-        return np.asarray(cho_solve((self.upper, False), columns * scale) * scale)
-
-    def columns(self, m: int) -> FloatArray:
-        """The first m columns (n, m) of the inverse."""
-        return np.stack([self.theta(unit) for unit in np.eye(m, len(self.scale))], axis=1)
+        return self._halves(columns * scale) * scale
 
     def cov(self, is_last: bool = False) -> FloatArray:
         """Inverse of gram + prior (n, n): covariance in the units of the sums.
@@ -70,22 +72,32 @@ class Factor:
         return np.asarray(inverse)
 
 
-def factorize(normal: Normal, n_shared: int) -> Factor:
-    """Factor of information + prior.  Raises LinAlgError where the sum is not definite."""
+def factorize(normal: Normal, n_shared: int, is_last: bool = False) -> Factor:
+    """Factor of information + prior.  Raises LinAlgError where the sum is not definite.
+
+    is_last: nobody asks for the matrix of `normal` any more, and it is written over.
+    """
     prior = np.full(len(normal.right), PRIOR_SD**-2)
     prior[:n_shared] = SHARED_PRIOR
-    matrix = normal.gram.copy()
+    matrix = normal.gram if is_last else normal.gram.copy()
+    own = matrix.diagonal().copy()
     matrix[np.diag_indices(len(prior))] += prior
     scale = np.ldexp(1.0, -(np.frexp(np.maximum(np.diag(matrix), np.finfo(float).tiny))[1] // 2))
     matrix *= scale[:, None]
     matrix *= scale
     upper = lapack.factorized(matrix.T)  # in place: it is symmetric
-    return Factor(normal.gram, prior, scale, upper)
+    return Factor(prior, scale, upper, own * scale**2)
 
 
-def misfit(normal: Normal, theta: FloatArray) -> float:
+def factor_of(sums: Sums) -> Factor:
+    """Factor of the information of sums, and their prior: one matrix."""
+    return factorize(sums.normal(), sums.n_shared, is_last=True)
+
+
+def misfit(sums: Sums, theta: FloatArray) -> float:
     """Sum of squares of the rows, of unit variance, that theta (n,) leaves."""
-    return float(normal.square - 2 * normal.right @ theta + theta @ normal.gram @ theta)
+    drawn = sums.times(theta[:, None])[:, 0] - 2 * sums.right
+    return float(sums.shared[0, 0] + drawn @ theta)
 
 
 @cache

@@ -13,7 +13,6 @@ from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaincinv
 
 from rtid.plain import FloatArray
 
@@ -221,4 +220,6 @@ def _settled(floors: list[_Floor]) -> tuple[float, float, int]:
 
 def _chi2(share: float, dof: float) -> float:
     """The quantile of chi2; `scipy.stats` takes half a second to import."""
+    from scipy.special import gammaincinv  # noqa: PLC0415 - takes long to import
+
     return 2.0 * float(gammaincinv(0.5 * dof, share))

@@ -15,7 +15,7 @@ import numpy as np
 
 from rtid.errors import ArgumentError, door
 from rtid.estimator.correction import correct, plain
-from rtid.estimator.factor import factorize, one_thread
+from rtid.estimator.factor import factor_of, one_thread
 from rtid.estimator.misfit import can_be_explained, count_misfit
 from rtid.estimator.missed import weighed
 from rtid.estimator.profile import Profile, profile
@@ -165,8 +165,6 @@ def excess(model: Machine, chunk: FloatArray, weights: Weights, leverage: FloatA
     chunk (n, 2 + signals), SI; leverage (chambers,): shares, as in `correct`.
     """
     sums = summed(model, chunk, weights)
-    normal = sums.normal()
     with one_thread():
-        first = plain(normal, factorize(normal, sums.n_shared))
-        corrected = correct(normal, *first, leverage)
-    return corrected.cost - normal.rows * len(model.chambers)
+        corrected = correct(sums, *plain(sums, factor_of(sums)), leverage)
+    return corrected.cost - sums.rows * len(model.chambers)

@@ -8,7 +8,7 @@ import numpy as np
 
 from rtid.estimator.blocks import Block, mean_flows, read_blocks, rms_slopes
 from rtid.estimator.correction import correct, leverage_of, plain
-from rtid.estimator.factor import PRIOR_SD, factorize, misfit, one_thread
+from rtid.estimator.factor import PRIOR_SD, factor_of, misfit, one_thread
 from rtid.estimator.state import State
 from rtid.estimator.sums import Sums, sums_of
 from rtid.estimator.windowed import overlaps, to_taylor
@@ -97,11 +97,11 @@ class Sketch:
 
 def sketch(model: Machine, sums: Sums) -> Sketch:
     """The estimate that weighs the next pass: no covariance, every term taken as learned."""
-    normal, n_c = sums.normal(), len(model.chambers)
-    leverage = leverage_of(model, sums, np.ones(len(normal.right)))
+    n_c = len(model.chambers)
     with one_thread():
-        factor = factorize(normal, sums.n_shared)
-        unknowns = theta = correct(normal, *plain(normal, factor), leverage).theta
+        factor = factor_of(sums)
+        leverage = leverage_of(model, sums, np.ones(len(factor.prior)))
+        unknowns = theta = correct(sums, *plain(sums, factor), leverage).theta
         if overlaps(model):
             theta = to_taylor(model, sums, factor.cov(), PRIOR_SD)[0] @ theta
     flow = mean_flows(model, sums, theta)
@@ -121,14 +121,14 @@ def solve(
     now_s: sample time, for blocks that have not been visited for long; counters: passed on.
     """
     sums = sums_of(learned)
-    normal, n_c, ns = sums.normal(), len(model.chambers), sums.n_shared
+    n_c, ns = len(model.chambers), sums.n_shared
     with one_thread():
-        factor = factorize(normal, ns)
-        first = plain(normal, factor)
+        factor = factor_of(sums)
+        first = plain(sums, factor)
         cov = factor.cov(is_last=True)
-        effective = np.einsum("ij,ij->i", cov, normal.gram)
+        effective = 1.0 - factor.prior * cov.diagonal()  # of cov @ gram, as cov inverts both
         leverage = leverage_of(model, sums, effective)
-        corrected = correct(normal, *first, leverage)
+        corrected = correct(sums, *first, leverage)
         _add(cov, corrected.basis @ corrected.cov_change, corrected.basis)
     influence, m = cov[:n_c].copy(), len(sums.blocks)
     tiles = cov[ns:, ns:].reshape(m, TERMS, m, TERMS)[np.arange(m), :, np.arange(m)]
@@ -136,14 +136,14 @@ def solve(
     if overlaps(model):
         change, cov = to_taylor(model, sums, cov, PRIOR_SD)
         theta, basis = change @ theta, change @ basis
-    dof = max(1, round(normal.rows * n_c - float(effective.sum())))
+    dof = max(1, round(sums.rows * n_c - float(effective.sum())))
     scales = np.array([term.scale for term in model.terms])
     return Solution(
         model=model,
         compliance=theta[:n_c] * sums.compliance,
         compliance_cov=cov[:n_c, :n_c] * np.outer(sums.compliance, sums.compliance),
-        blocks=tuple(read_blocks(model, sums, theta, cov, normal.gram, now_s)),
-        rho=misfit(normal, corrected.theta) / dof,
+        blocks=tuple(read_blocks(model, sums, theta, cov, now_s)),
+        rho=misfit(sums, corrected.theta) / dof,
         dof=dof,
         leverage=leverage,
         basis=basis,

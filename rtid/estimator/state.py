@@ -53,12 +53,22 @@ class State:
 
     def __post_init__(self) -> None:
         """Copy the arrays into one block of memory, which `kernel.advance` takes; keep views."""
-        arrays = self.arrays
-        self.memory = np.concatenate([array.view(np.uint8) for array in arrays])
-        ends = np.cumsum([array.nbytes for array in arrays]).tolist()
-        parts = zip(arrays, [0, *ends], ends, strict=False)
+        self._move([len(array) for array in self.arrays])
+
+    def _move(self, lengths: list[int]) -> None:
+        """Into new memory with tables of so many records, each as long as it is or longer."""
+        old = self.arrays
+        sizes = [n * array.itemsize for n, array in zip(lengths, old, strict=True)]
+        ends = np.cumsum(sizes).tolist()
+        self.memory = np.zeros(ends[-1], np.uint8)
+        parts = zip(old, [0, *ends], ends, strict=False)
         views = [self.memory[start:end].view(array.dtype) for array, start, end in parts]
         self.engine, self.cells, self.closed, self.blocks, self.pairs = views
+        for mine, array in zip(views, old, strict=True):
+            if mine is self.pairs and len(mine) > len(array):
+                move_pairs(self.engine, array, mine)
+            else:
+                mine[: len(array)] = array
         for name, table in zip(
             ("n_cells", "max_closed", "max_blocks", "max_pairs"), views[1:], strict=True
         ):
@@ -89,12 +99,10 @@ class State:
 
     def make_room(self) -> None:
         """Double the table that is full, of blocks or of pairs; nothing else changes."""
-        if self.engine[0]["n_slots"] + layout.MAX_OPEN > len(self.blocks):
-            extra = np.zeros(len(self.blocks), layout.BLOCK)
-            self.blocks = np.concatenate([self.blocks, extra])
-        else:
-            self.pairs = _rehash(self.engine, self.pairs)
-        self.__post_init__()
+        lengths = [len(array) for array in self.arrays]
+        is_blocks = self.engine[0]["n_slots"] + layout.MAX_OPEN > len(self.blocks)
+        lengths[3 if is_blocks else 4] *= 2
+        self._move(lengths)
 
     def settle(self) -> None:
         """Bring all sums up to date, in place."""
@@ -134,12 +142,6 @@ class State:
     def copy(self) -> State:
         """An independent copy that continues bit for bit like this one."""
         return State(*self.arrays)
-
-
-def _rehash(engine: RecordArray, pairs: RecordArray) -> RecordArray:
-    larger = np.zeros(2 * len(pairs), layout.PAIR)
-    move_pairs(engine, pairs, larger)
-    return larger
 
 
 @dataclass(frozen=True)

@@ -146,14 +146,24 @@ class Sums:
 
     def times(self, x: FloatArray) -> FloatArray:
         """The normal equations' matrix times x (n, k), in scaled units, without making it dense."""
-        ns, cross = self.n_shared, self.blocks["shared"][:, :, 1 : 1 + self.n_shared]
-        top, rest = x[:ns], x[ns:].reshape(len(self.blocks), TERMS, -1)
+        ns, cross = self.n_shared, self.crossed.reshape(len(self.blocks), TERMS, self.n_shared)
+        top, rest = x[:ns], x[ns:].reshape(len(self.blocks), TERMS, x.shape[1])
         low, high = self.pairs.T
         product = self.blocks["gram"] @ rest + cross @ top
         np.add.at(product, low, self.tiles @ rest[high])
         np.add.at(product, high, self.tiles.swapaxes(1, 2) @ rest[low])
         first = self.shared[1:, 1:] @ top + np.einsum("bis,bik->sk", cross, rest)
         return np.concatenate([first, product.reshape(-1, x.shape[1])])
+
+    def maps_alone(self) -> Sums:
+        """What they say of the maps where every shared unknown is known."""
+        return replace(self, shared=self.shared[:1, :1])
+
+    @property
+    def crossed(self) -> FloatArray:
+        """Products of the maps' columns with those of the shared unknowns (6 m, n_shared)."""
+        ns, m = self.n_shared, len(self.blocks)
+        return np.asarray(self.blocks["shared"][:, :, 1 : 1 + ns].reshape(TERMS * m, ns))
 
     @property
     def right(self) -> FloatArray:

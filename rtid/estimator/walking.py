@@ -22,7 +22,7 @@ import numpy as np
 
 from rtid.estimator.blocks import condition_of
 from rtid.estimator.correction import plain
-from rtid.estimator.factor import factorize
+from rtid.estimator.factor import factor_of
 from rtid.estimator.forgetting import ALL
 from rtid.estimator.state import fitted_terms
 from rtid.estimator.sums import Normal, Sums
@@ -48,8 +48,7 @@ class Gain:
 
 def gain_of(model: Machine, total: Sums) -> Gain:
     """What the gain multiplies by all that is known."""
-    normal = total.normal()
-    theta, _ = plain(normal, factorize(normal, total.n_shared))
+    theta, _ = plain(total, factor_of(total))
     terms = theta[total.n_shared :].reshape(-1, TERMS)
     return Gain(total.cells, np.where(_rests(model, total)[:, None], 0.0, terms))
 

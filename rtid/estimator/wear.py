@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rtid.estimator.factor import SHARED_PRIOR, factorize, one_thread
+from rtid.estimator.factor import SHARED_PRIOR, factor_of, one_thread
 from rtid.estimator.solution import Solution
 from rtid.estimator.sums import Sums
 from rtid.kernels.layout import TERMS
@@ -59,7 +59,7 @@ def wear_since(past: Sums, solution: Solution, total: Sums) -> tuple[Wear, Wear]
     n_c = len(news.noise)
     rest[:n_c] += (1 - solution.leverage) * news.noise * theta[:n_c]  # errors in variables
     with one_thread():
-        factor = factorize(total.normal(), ns)
+        factor = factor_of(total)
         solved = factor.solved(np.column_stack([seen, rest]))
     information = columns.T @ seen - seen.T @ solved[:, :-1]
     prior = np.repeat([SHARED_PRIOR, GAIN_PRIOR], [ns, len(model.edges)])

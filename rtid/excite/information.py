@@ -48,7 +48,7 @@ def of_blocks(machine: DrivenMachine, chunk: FloatArray) -> Information:
     gram = normal.gram[np.ix_(at, at)] + prior * np.eye(TERMS * m)
     maps = Normal(gram, normal.right[at], 0.0, normal.noise, normal.rows)
     with one_thread():
-        cov = factorize(maps, 0).cov().reshape(m, TERMS, m, TERMS)
+        cov = factorize(maps, 0, is_last=True).cov(is_last=True).reshape(m, TERMS, m, TERMS)
         tiles = cov[np.arange(m), :, np.arange(m)]
         information = np.linalg.inv(tiles) - prior * np.eye(TERMS) - PRIOR
     return Information(sums.cells[stayed], information, sums.blocks["rows"][stayed].astype(float))

@@ -14,6 +14,7 @@ from rtid.kernels.layout import TERMS
 from rtid.plain import FloatArray
 
 SPLIT = 2.0**27 + 1.0  # cuts a double into two halves of 26 bits, whose products are exact
+LANES = 8  # partial sums that grow side by side
 
 
 @kernel
@@ -63,25 +64,45 @@ def mirror(matrix: FloatArray, scale: FloatArray) -> None:
 
 
 @kernel
-def residual(matrix: FloatArray, theta: FloatArray, right: FloatArray) -> FloatArray:
-    """right - matrix theta (n,) in twice the precision, rounded once; matrix (n, n) symmetric.
+def residual(
+    matrix: FloatArray, diagonal: FloatArray, theta: FloatArray, right: FloatArray
+) -> FloatArray:
+    """right - symmetric matrix theta (n,) in twice the precision, rounded once.
 
-    Products and sums with what they round off: Dot2 of Ogita, Rump and Oishi, SIAM J. Sci. Comput.
-    26 (2005), for all rows at once.  Entries of 1e300 overflow; any units that fit.
+    matrix (n, n): what stands right of its diagonal is read, the rest may be anything; diagonal
+    (n,).  Products and sums with what they round off: Dot2 of Ogita, Rump and Oishi, SIAM J. Sci.
+    Comput. 26 (2005), for all rows at once, and LANES partial sums of each.  Entries of 1e300
+    overflow; any units that fit.
     """
-    total, lost = right.copy(), np.zeros(len(right))
-    for j in range(len(right)):
-        column, b = matrix[j], -theta[j]
-        b_high = SPLIT * b - (SPLIT * b - b)
-        b_low = b - b_high
-        for i in range(len(right)):
-            a = column[i]
-            a_high = SPLIT * a - (SPLIT * a - a)
-            a_low, p = a - a_high, a * b
-            p_lost = ((a_high * b_high - p) + a_high * b_low + a_low * b_high) + a_low * b_low
-            before = total[i]
-            after = before + p
-            back = after - before
-            total[i] = after
-            lost[i] += (before - (after - back)) + (p - back) + p_lost
+    n, total, lost = len(right), right.copy(), np.zeros(len(right))
+    own, own_lost = np.zeros(LANES), np.zeros(LANES)
+    for j in range(n):
+        row, b = matrix[j], theta[j]
+        _take(total, lost, j, diagonal[j], b)
+        for i in range(j + 1, n):
+            _take(total, lost, i, row[i], b)
+        whole = j + 1 + (n - j - 1) // LANES * LANES
+        for i in range(j + 1, whole, LANES):
+            for k in range(LANES):
+                _take(own, own_lost, k, row[i + k], theta[i + k])
+        for i in range(whole, n):
+            _take(total, lost, j, row[i], theta[i])
+        for k in range(LANES):
+            _take(total, lost, j, -1.0, own[k])
+            lost[j] += own_lost[k]
+            own[k] = own_lost[k] = 0.0
     return total + lost
+
+
+@inlined
+def _take(total: FloatArray, lost: FloatArray, i: int, a: float, b: float) -> None:
+    """total[i] -= a b; what rounding loses of product and sum goes to lost[i]."""
+    a_high = SPLIT * a - (SPLIT * a - a)
+    b_high = SPLIT * b - (SPLIT * b - b)
+    a_low, b_low, p = a - a_high, b - b_high, a * b
+    p_lost = ((a_high * b_high - p) + a_high * b_low + a_low * b_high) + a_low * b_low
+    before = total[i]
+    after = before - p
+    back = after - before
+    total[i] = after
+    lost[i] += (before - (after - back)) - (p + back) - p_lost

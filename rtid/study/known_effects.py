@@ -17,7 +17,6 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy import linalg
 
 from rtid.diagnose.clean import usable
 from rtid.diagnose.excuse import steady
@@ -34,7 +33,7 @@ from rtid.effects.record_view import RecordView
 from rtid.effects.terms import terms_of
 from rtid.errors import RtidError
 from rtid.estimator.estimator import to_chunk
-from rtid.estimator.factor import PRIOR_SD, SHARED_PRIOR, one_thread
+from rtid.estimator.factor import SHARED_PRIOR, factor_of, one_thread
 from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.limits import refuse_unfit
 from rtid.estimator.misfit import count_misfit
@@ -275,20 +274,16 @@ def told(sums: Sums, theta: FloatArray, cov: FloatArray) -> Sums:
 
     The residual at the solution stays what the rows leave; nothing is left to correct for noise.
     """
-    normal, ns = sums.normal(), sums.n_shared
-    gram, right = normal.gram, normal.right
-    maps = gram[ns:, ns:].copy()
-    maps[np.diag_indices(len(maps))] += PRIOR_SD**-2
-    both = np.column_stack([gram[ns:, :ns], right[ns:]])
-    with one_thread():  # in place: the matrix is large, and symmetric
-        upper = linalg.cho_factor(maps.T, overwrite_a=True, check_finite=False)
-        follow = linalg.cho_solve(upper, both, check_finite=False)
+    ns = sums.n_shared
+    own, right, cross = sums.shared[1:, 1:], sums.right, sums.crossed
+    with one_thread():
+        follow = factor_of(sums.maps_alone()).theta(np.column_stack([cross, right[ns:]]))
     information = np.linalg.inv(cov)
-    known = information - SHARED_PRIOR * np.eye(ns) + gram[:ns, ns:] @ follow[:, :ns]
-    drawn = information @ theta + gram[:ns, ns:] @ follow[:, ns]
+    known = information - SHARED_PRIOR * np.eye(ns) + cross.T @ follow[:, :ns]
+    drawn = information @ theta + cross.T @ follow[:, ns]
     shared = np.zeros_like(sums.shared)
     shared[1:, 1:], shared[1:, 0], shared[0, 1:] = known, drawn, drawn
     # both misfits have in common what they say of the maps
-    shared[0, 0] = normal.square - 2 * (right[:ns] - drawn) @ theta
-    shared[0, 0] += theta @ (gram[:ns, :ns] - known) @ theta
+    shared[0, 0] = sums.shared[0, 0] - 2 * (right[:ns] - drawn) @ theta
+    shared[0, 0] += theta @ (own - known) @ theta
     return replace(sums, shared=shared, noise=np.zeros_like(sums.noise))
