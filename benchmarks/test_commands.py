@@ -20,7 +20,7 @@ from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import SimulatedPlant
 
-DURATION_S, ROUNDS = 110.0, int(os.environ.get("ROUNDS", "3"))
+DURATION_S, SHORT_S, ROUNDS = 110.0, 60.0, int(os.environ.get("ROUNDS", "3"))
 BARE = "import numpy, numba, scipy.linalg, typer"
 # wide gates, as multiples of the bare imports: a factor that is lost is seen
 MOST = {"replay": 12.0, "export": 4.0, "compare": 9.0, "diagnose": 12.0}
@@ -54,18 +54,27 @@ def spent(*arguments: str, code: str = "") -> Spent:
     """Run Python code, or a command of rtid without what it says."""
     words = ("-c", code) if code else ("-m", "rtid", *arguments)
     meter = [sys.executable, "-S", "-c", METER, *words]
-    done = subprocess.run(meter, stdout=subprocess.PIPE, check=True)
+    kept = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
+    done = subprocess.run(meter, stdout=subprocess.PIPE, env=kept, check=True)
     status, seconds, peak_mb = json.loads(done.stdout)
     assert status == 0, words
     return Spent(seconds, peak_mb)
 
 
+def recorded(path: Path, duration_s: float) -> tuple[str, str, str]:
+    """A simulated record beside its project file, as a command takes them."""
+    log, project = path.with_suffix(".blf"), path.with_suffix(".toml")
+    write_run(log, simulate(SimulatedPlant(), "rich", 1, duration_s), 1, "rich")
+    return str(log), "-p", str(project)
+
+
 def test_commands(benchmark: Any, tmp_path: Path) -> None:
     """After one another, the first ones without anything that is kept."""
-    run = simulate(SimulatedPlant(), "rich", 1, DURATION_S)
-    write_run(tmp_path / "run.blf", run, 1, "rich")
-    given = str(tmp_path / "run.blf"), "-p", str(tmp_path / "run.toml")
+    given, short = (
+        recorded(tmp_path / name, s) for name, s in (("run", DURATION_S), ("short", SHORT_S))
+    )
     steps: dict[str, Sequence[str]] = {
+        f"replay of {SHORT_S:g} s, learned anew": ("replay", *short, "--no-cache"),
         "replay, learned anew": ("replay", *given, "--no-cache"),
         "diagnose, learned anew": ("diagnose", *given, "--no-cache"),
         "replay": ("replay", *given),

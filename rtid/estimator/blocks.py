@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -89,6 +90,18 @@ def largest_flows(model: Machine, sums: Sums, theta: FloatArray) -> FloatArray:
     )
 
 
+class _Seen(NamedTuple):
+    """What a block's record says of its data."""
+
+    edge: int
+    cell: int
+    rows: int
+    dwell_s: float
+    last_s: float
+    judged: float
+    surprise: float
+
+
 def read_blocks(
     model: Machine, sums: Sums, theta: FloatArray, cov: FloatArray, now_s: float
 ) -> Iterator[Block]:
@@ -96,58 +109,56 @@ def read_blocks(
 
     theta (n,) and cov (n, n) in Taylor terms.
     """
-    largest, means = largest_flows(model, sums, theta), mean_phi(sums.blocks)
-    first = model.first_cells
-    for place, record in enumerate(sums.blocks):
-        at = sums.n_shared + TERMS * place
-        columns, edge = slice(at, at + TERMS), int(record["edge"])
-        shape, rated = model.edges[edge].grid.shape, model.edges[edge].rated_q_m3s
-        i, j = divmod(int(record["cell"]) - first[edge], shape[1])
-        used = np.flatnonzero(fitted_terms(model.edges[edge]))
-        condition = condition_of(record["gram"][used[:, None], used])
-        variance = float(means[place] @ cov[columns, columns] @ means[place])
-        sd_share = rated / largest[edge] * max(0.0, variance) ** 0.5
-        status, reason = _status(model.gates, record, condition, sd_share, now_s)
+    ns, m, means = sums.n_shared, len(sums.blocks), mean_phi(sums.blocks)
+    tiles = cov[ns:, ns:].reshape(m, TERMS, m, TERMS)[np.arange(m), :, np.arange(m)]
+    rated = np.array([edge.rated_q_m3s for edge in model.edges])[sums.blocks["edge"]]
+    variance = np.einsum("mi,mij,mj->m", means, tiles, means)
+    most = largest_flows(model, sums, theta)[sums.blocks["edge"]]
+    sd_share = (rated / most * np.sqrt(np.maximum(0.0, variance))).tolist()
+    terms = theta[ns:].reshape(m, TERMS) * rated[:, None]
+    tiles *= rated[:, None, None] ** 2
+    condition = conditions(model, sums.blocks).tolist()
+    seen = map(_Seen, *(sums.blocks[name].tolist() for name in _Seen._fields))
+    for k, of in enumerate(seen):
+        status, reason = _status(model.gates, of, condition[k], sd_share[k], now_s)
+        progress = _progress(model.gates, of.rows, condition[k], sd_share[k])
+        at = divmod(of.cell - model.first_cells[of.edge], model.edges[of.edge].grid.shape[1])
         yield Block(
-            edge,
-            i,
-            j,
-            theta[columns] * rated,
-            cov[columns, columns] * rated**2,
-            means[place],
-            int(record["rows"]),
-            float(record["dwell_s"]),
-            float(record["last_s"]),
-            condition,
-            status,
-            reason,
-            _progress(model.gates, int(record["rows"]), condition, sd_share),
-        )
+            of.edge, *at, terms[k], tiles[k], means[k], of.rows, of.dwell_s, of.last_s,
+            condition[k], status, reason, progress,
+        )  # fmt: skip
 
 
-def condition_of(gram: FloatArray) -> float:
-    """Condition number of Phi'Phi (n, n), scaled units; inf where a term was never excited."""
-    values = np.linalg.eigvalsh(gram)
-    return float(values[-1] / values[0]) if values[0] > 0 else np.inf
+def conditions(model: Machine, blocks: RecordArray) -> FloatArray:
+    """Condition number of each block's Phi'Phi in local coordinates (m,), of the terms it has.
+
+    inf where a term was never excited.
+    """
+    condition = np.full(len(blocks), np.inf)
+    for k, edge in enumerate(model.edges):
+        here, used = np.flatnonzero(blocks["edge"] == k), np.flatnonzero(fitted_terms(edge))
+        values = np.linalg.eigvalsh(blocks["gram"][here[:, None, None], used[:, None], used])
+        told = values[:, 0] > 0
+        condition[here[told]] = values[told, -1] / values[told, 0]
+    return condition
 
 
 def _status(
-    gates: Gates, record: np.void, condition: float, sd_share: float, now_s: float
+    gates: Gates, of: _Seen, condition: float, sd_share: float, now_s: float
 ) -> tuple[str, str]:
     """Status and the reason why a block is not valid, in words."""
-    rows, judged = int(record["rows"]), float(record["judged"])
-    if rows < gates.min_rows:
-        return LEARNING, f"{rows} rows, {gates.min_rows} needed"
-    if judged >= gates.min_rows and record["surprise"] > gates.max_surprise * judged:
-        times = float(record["surprise"]) / judged
+    if of.rows < gates.min_rows:
+        return LEARNING, f"{of.rows} rows, {gates.min_rows} needed"
+    if of.judged >= gates.min_rows and of.surprise > gates.max_surprise * of.judged:
+        times = of.surprise / of.judged
         return INVALID, f"the machine contradicts it: misfit {times:.1f} times the noise's variance"
     if not condition <= gates.condition_limit:
         return LEARNING, f"condition number {condition:.1e} above {gates.condition_limit:.0e}"
     if sd_share > gates.max_sd_share:
         known, limit = 100 * sd_share, 100 * gates.max_sd_share
         return LEARNING, f"flow known to {known:.2g} % of the largest, limit {limit:.2g} %"
-    if now_s - record["last_s"] > gates.stale_s:
-        return STALE, f"not visited for {now_s - record['last_s']:.0f} s"
+    if now_s - of.last_s > gates.stale_s:
+        return STALE, f"not visited for {now_s - of.last_s:.0f} s"
     return VALID, ""
 
 

@@ -34,7 +34,7 @@ def lowest(
     start: FloatArray,
     bounds: Sequence[tuple[float, float]],
 ) -> Lowest:
-    """Walk from the simplex `start` (n + 1, n), in any units, its first point within bounds (n,)."""
+    """Walk from a simplex `start` (n + 1, n), in any units, its first point within bounds (n,)."""
     walk = _Walk(function, start, np.array(bounds))
     most = MOST_VALUES * start.shape[1]
     while walk.calls < most and not walk.is_there():

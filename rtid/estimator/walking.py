@@ -20,11 +20,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rtid.estimator.blocks import condition_of
+from rtid.estimator.blocks import conditions
 from rtid.estimator.correction import plain
 from rtid.estimator.factor import factor_of
 from rtid.estimator.forgetting import ALL
-from rtid.estimator.state import fitted_terms
 from rtid.estimator.sums import Normal, Sums
 from rtid.kernels.layout import TERMS
 from rtid.model import Machine
@@ -78,12 +77,10 @@ def walked(past: Sums, news: Sums, gain: Gain, variance: float) -> Sums:
 
 def _rests(model: Machine, total: Sums) -> BoolArray:
     """The blocks (m,) in which a command stands still at an end of its map."""
-    rests = np.zeros(len(total.blocks), bool)
+    condition = conditions(model, total.blocks)
+    rests = condition > model.gates.condition_limit
     for k, record in enumerate(total.blocks):
         edge = model.edges[int(record["edge"])]
         i = (int(record["cell"]) - model.first_cells[int(record["edge"])]) // edge.grid.shape[1]
-        used = np.flatnonzero(fitted_terms(edge))
-        is_end = i in (0, edge.grid.shape[0] - 1)
-        condition = condition_of(record["gram"][used[:, None], used])
-        rests[k] = is_end and condition > model.gates.condition_limit
-    return rests
+        rests[k] &= i in (0, edge.grid.shape[0] - 1)
+    return np.asarray(rests)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rtid.effects.record_view import RecordView
-from rtid.plain import BoolArray, FloatArray
+from rtid.plain import BoolArray, FloatArray, IntArray
 
 BINS, LEAST = 40, 20  # of the opening; intervals that a bin must have
 LEAST_PA = 5e4  # of a drop, below which it is mostly noise
@@ -76,22 +76,45 @@ def _measured(view: RecordView, i: int) -> Gauge:
     w, (drop, size), alpha = view.along[:, i, 0], _drop(view, i), ORIFICE
     open_ = view.inside & (w > 0.0) & (np.abs(drop) > LEAST_PA)
     w, size, forward = w[open_], size[open_], (view.flow(i) * np.sign(drop))[open_]
+    bins = _Bins.of(w)
     for _ in range(ROUNDS):
-        gauge = _medians(w, forward / size**alpha, alpha)
+        gauge = bins.medians(forward / size**alpha, alpha)
         alpha = _exponent(forward, gauge.at(w), size, alpha)
-    return _medians(w, forward / size**alpha, alpha)
+    return bins.medians(forward / size**alpha, alpha)
 
 
-def _medians(w: FloatArray, gains: FloatArray, alpha: float) -> Gauge:
-    """Medians of the gains (n,) over the openings w (n,)."""
-    border = np.linspace(0.0, float(w.max(initial=1.0)), BINS + 1)
-    place = np.clip(np.searchsorted(border, w, side="right") - 1, 0, BINS - 1)
-    full = [k for k in range(BINS) if np.count_nonzero(place == k) >= LEAST]
-    if not full:
-        return Gauge(np.zeros(1), np.zeros(1), alpha)
-    middle = 0.5 * (border[full] + border[[k + 1 for k in full]])
-    usual = [max(0.0, float(np.median(gains[place == k]))) for k in full]
-    return Gauge(middle, np.array(usual), alpha)
+@dataclass(frozen=True)
+class _Bins:
+    """Bins of the opening that hold enough: order (n,) of the values by bin, middle (m,), V.
+
+    first, last (m,): a bin's places in that order.
+    """
+
+    order: IntArray
+    middle: FloatArray
+    first: IntArray
+    last: IntArray
+
+    @classmethod
+    def of(cls, w: FloatArray) -> _Bins:
+        """Bins of openings w (n,), V."""
+        border = np.linspace(0.0, float(w.max(initial=1.0)), BINS + 1)
+        place = np.clip(np.searchsorted(border, w, side="right") - 1, 0, BINS - 1)
+        last = np.cumsum(np.bincount(place, minlength=BINS))
+        first = np.append(0, last[:-1])
+        full = np.flatnonzero(last - first >= LEAST)
+        middle = 0.5 * (border[full] + border[full + 1])
+        order = np.argsort(place.astype(np.int16), kind="stable")
+        return cls(order, middle, first[full], last[full])
+
+    def medians(self, gains: FloatArray, alpha: float) -> Gauge:
+        """Medians of the gains (n,) over the openings."""
+        if not len(self.middle):
+            return Gauge(np.zeros(1), np.zeros(1), alpha)
+        gains = gains[self.order]
+        parts = zip(self.first.tolist(), self.last.tolist(), strict=True)
+        usual = [max(0.0, float(np.median(gains[first:last]))) for first, last in parts]
+        return Gauge(self.middle, np.array(usual), alpha)
 
 
 def _exponent(forward: FloatArray, gain: FloatArray, size: FloatArray, alpha: float) -> float:

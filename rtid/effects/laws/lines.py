@@ -40,7 +40,7 @@ AT_VALVE, AT_CYLINDER = (f"{FREQUENCY}_sensor_at_{end}" for end in ("valve", "cy
 RADPS, VOLUMES_M3, RESISTANCES = (130.0, 200.0, 300.0, 450.0, 700.0), (2e-4, 6e-4), (2e8, 2e9)
 LARGEST = 3.0  # times the bank's own size that a column of it may have
 QUICK_S = 2e-3  # half width of the parabolas
-STEPS = 4  # of the section's equations in an interval of the record
+DOUBLINGS = 2  # of a step of the section's equations until it is an interval of the record
 
 
 def lines(view: RecordView, effect: Effect) -> Iterator[Cause]:
@@ -147,33 +147,24 @@ def _section(
     """Fill through (n - 1,), m3/s: the mean of q over each interval.
 
     C dd/dt = drive - opens d - q,  I dq/dt = d - R q:  drive m3/s, opens m3/s/Pa, both (n - 1,).
+    A step of the trapezoidal rule is q, d -> M (q, d) + v, and what q adds up to over it is
+    r (q, d) + s; two of them in a row are such a step again.
     """
-    q, d = drive[0], resistance * drive[0]
+    q, d, steps = drive[0], resistance * drive[0], 2**DOUBLINGS
+    half_a, half_b = 0.5 / (steps * inertance), 0.5 / (steps * soft)
     for k in range(len(drive)):
-        h = dt_s[k] / STEPS
-        total = 0.0
-        for _ in range(STEPS):
-            before = q
-            q, d = _trapezoid(q, d, drive[k], opens[k], h, inertance, soft, resistance)
-            total += 0.5 * (q + before)
-        through[k] = total / STEPS
-
-
-@kernel
-def _trapezoid(
-    q: float,
-    d: float,
-    drive: float,
-    opens: float,
-    h: float,
-    inertance: float,
-    soft: float,
-    resistance: float,
-) -> tuple[float, float]:
-    """q and d after h seconds: C dd/dt = drive - opens d - q,  I dq/dt = d - R q."""
-    a, b = 0.5 * h / inertance, 0.5 * h / soft
-    left, right = 1.0 + a * resistance, 1.0 + b * opens
-    from_q = (1.0 - a * resistance) * q + a * d
-    from_d = (1.0 - b * opens) * d - b * q + 2.0 * b * drive
-    det = left * right + a * b
-    return (right * from_q + a * from_d) / det, (left * from_d - b * from_q) / det
+        a, b = half_a * dt_s[k], half_b * dt_s[k]
+        left, right = 1.0 + a * resistance, 1.0 + b * opens[k]
+        share = 1.0 / (left * right + a * b)
+        m00, m01 = (right * (2.0 - left) - a * b) * share, 2.0 * a * share
+        m10, m11 = -2.0 * b * share, (left * (2.0 - right) - a * b) * share
+        v0, v1 = a * 2.0 * b * drive[k] * share, left * 2.0 * b * drive[k] * share
+        r0, r1, s = 0.5 * (1.0 + m00), 0.5 * m01, 0.5 * v0
+        for _ in range(DOUBLINGS):
+            s += s + r0 * v0 + r1 * v1
+            r0, r1 = r0 + r0 * m00 + r1 * m10, r1 + r0 * m01 + r1 * m11
+            v0, v1 = v0 + m00 * v0 + m01 * v1, v1 + m10 * v0 + m11 * v1
+            both, cross = m00 + m11, m01 * m10
+            m00, m01, m10, m11 = m00 * m00 + cross, m01 * both, m10 * both, m11 * m11 + cross
+        through[k] = (r0 * q + r1 * d + s) / steps
+        q, d = m00 * q + m01 * d + v0, m10 * q + m11 * d + v1
