@@ -30,7 +30,7 @@ from rtid.daemon.guard import PROOF, TRUST, Guard, candidate_of, with_wear
 from rtid.daemon.map_check import Judge
 from rtid.daemon.offering import Offering
 from rtid.daemon.pipe import Pipe
-from rtid.daemon.realtime import SWITCH_S, hasten
+from rtid.daemon.realtime import SWITCH_S, give_way, hasten
 from rtid.daemon.shadow import Shadow
 from rtid.daemon.status import EffectStatus
 from rtid.daemon.waiting import MOST_BYTES, Waiting
@@ -448,12 +448,13 @@ def main() -> None:
     begun, waiting = Queue[Analyst](), Waiting(MOST_BYTES)
     nice = os.getpriority(os.PRIO_PROCESS, 0) + NICE
 
-    def give_way() -> None:
-        os.setpriority(os.PRIO_PROCESS, os.getpid(), nice)  # the main thread alone
+    def saved() -> None:
+        give_way(os.getpid(), nice)  # the main thread alone
 
     def receive() -> None:
-        hasten(threading.get_native_id())
-        _receive(pipe, begun.get(), waiting, give_way)
+        analyst = begun.get()
+        hasten(threading.get_native_id(), loaded.sections.daemon.priority > 0)
+        _receive(pipe, analyst, waiting, saved)
 
     receiver = threading.Thread(target=receive, daemon=True)
     receiver.start()  # before this thread, and all that it starts, is nice: to save does not wait
@@ -462,7 +463,7 @@ def main() -> None:
     analyst = Analyst(loaded, Path(folder), answer)
     try:
         analyst.begin()
-        give_way()  # not before: until it is ready nothing of what is learned is saved
+        saved()  # not before: until it is ready nothing of what is learned is saved
         answer(jobs.Ready())
         begun.put(analyst)
         while (job := waiting.get()) is not None:

@@ -95,6 +95,10 @@ class Daemon:
         """The newest status; None before the bus is open."""
         return self._keeper.status if self._keeper is not None else None
 
+    @property
+    def _priority(self) -> int:
+        return self._project.sections.daemon.priority
+
     def stop(self) -> None:
         """End in good order, from any thread or a signal handler, also before the bus is open."""
         self._stopping = True
@@ -112,7 +116,8 @@ class Daemon:
         with _locked(folder / LOCK_FILE):
             learner = compiled(self._learner)
             restored = self._restore(learner)
-            analyst = Helper(ANALYST, [str(self._project.path), str(folder)], self._hear)
+            words, priority = [str(self._project.path), str(folder)], self._priority
+            analyst = Helper(ANALYST, words, self._hear, is_real_time=priority > 0)
             diagnosing = Diagnosing(self._project, self._answers.append)
             coaching = Coaching(self._project, self._generations.folder, self._answers.append)
             try:
@@ -202,7 +207,7 @@ class Daemon:
 
     def _prepare(self) -> tuple[str, bool]:
         """Scheduling and memory of the loop's thread, as far as the system grants it."""
-        priority = self._project.sections.daemon.priority
+        priority = self._priority
         realtime.settle_interpreter()
         realtime.sharpen_timer()
         if not priority:

@@ -32,7 +32,7 @@ class Helper:
     """One `python -m MODULE FD ARGUMENTS...`; `answer` is called from its own thread.
 
     failures counts how often it had to be started again; with `ended` it is not, and its end is
-    answered by that.
+    answered by that.  is_real_time: so is the loop, and what is to be saved comes next to it.
     """
 
     def __init__(
@@ -41,8 +41,9 @@ class Helper:
         arguments: list[str],
         answer: Callable[[Answer], None],
         ended: Answer | None = None,
+        is_real_time: bool = False,
     ) -> None:
-        self._ended = ended
+        self._ended, self._is_real_time = ended, is_real_time
         self._command = [sys.executable, "-m", module]
         self._arguments, self._answer = arguments, answer
         self._jobs: deque[Job] = deque()
@@ -157,7 +158,7 @@ class Helper:
         """Send what there is to do; what is to be saved must not wait behind other work."""
         while (job := self._next()) is not None:
             if isinstance(job, Handover) and job.store:
-                realtime.hasten(process.pid)  # its main thread, which holds the interpreter
+                realtime.hasten(process.pid, self._is_real_time)  # it holds the interpreter
             pipe.send(job)
         pipe.send(None)
 

@@ -56,12 +56,25 @@ def favour_threads() -> None:
                 os.sched_setscheduler(number, policy, os.sched_param(BESIDE))
 
 
-def hasten(thread: int) -> bool:
-    """Let an ordinary thread, of any process of this user, come before other ordinary work."""
+def hasten(thread: int, is_real_time: bool = False) -> None:
+    """Let a thread, of any process of this user, come before ordinary work, as far as granted.
+
+    Beside a loop of real-time priority as one of those next to it: nice counts within a session or
+    service alone, where the system groups its work by these.
+    """
+    policy, priority = os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(BESIDE)
+    with contextlib.suppress(OSError):
+        if is_real_time:
+            os.sched_setscheduler(thread, policy, priority)
     with contextlib.suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, thread, HASTY)
-        return True
-    return False
+
+
+def give_way(thread: int, nice: int) -> None:
+    """The end of that: an ordinary thread which lets other work come first."""
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(thread, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
+    os.setpriority(os.PRIO_PROCESS, thread, nice)
 
 
 @contextlib.contextmanager

@@ -211,14 +211,14 @@ def test_what_is_to_be_saved_hastens_the_helper(monkeypatch: pytest.MonkeyPatch)
     """Its main thread, which may hold the interpreter, and before it is sent."""
     done = list[str]()
     monkeypatch.setattr(Helper, "_run", lambda self: None)
-    monkeypatch.setattr(realtime, "hasten", lambda number: done.append(f"hastens {number}"))
+    monkeypatch.setattr(realtime, "hasten", lambda *what: done.append(f"hastens {what}"))
     pipe = SimpleNamespace(send=lambda job: done.append(type(job).__name__))
     helper = Helper("none", [], lambda answer: None)
     helper.put(batch())
     helper.put(jobs.Handover(3, None, publish=False, store=True))  # type: ignore[arg-type]
     helper._stopping = True
     helper._feed(pipe, SimpleNamespace(pid=77))  # type: ignore[arg-type]
-    assert done == ["Batch", "hastens 77", "Handover", "NoneType"]
+    assert done == ["Batch", "hastens (77, False)", "Handover", "NoneType"]
 
 
 def test_a_thread_is_hastened_for_a_while() -> None:
@@ -229,6 +229,30 @@ def test_a_thread_is_hastened_for_a_while() -> None:
         meanwhile = os.getpriority(os.PRIO_PROCESS, thread)
     assert meanwhile in (before, realtime.HASTY)
     assert os.getpriority(os.PRIO_PROCESS, thread) == before
+
+
+def test_a_thread_that_is_hastened_gives_way_again() -> None:
+    """Beside a loop of real-time priority, where that is granted; another thread is not asked."""
+    found = list[tuple[int, int]]()
+
+    def seen(thread: int) -> None:
+        policy = os.sched_getscheduler(thread) & ~os.SCHED_RESET_ON_FORK
+        found.append((policy, os.getpriority(os.PRIO_PROCESS, thread)))
+
+    def run() -> None:
+        thread = threading.get_native_id()
+        seen(thread)
+        realtime.hasten(thread, is_real_time=True)
+        seen(thread)
+        realtime.give_way(thread, found[0][1])
+        seen(thread)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join()
+    policy, nice = found[0]
+    assert found[2] == found[0]
+    assert found[1][0] in (policy, os.SCHED_RR) and found[1][1] in (nice, realtime.HASTY)
 
 
 def test_what_was_overtaken_does_not_replace_what_is_newer(tmp_path: Path) -> None:
