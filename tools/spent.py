@@ -19,10 +19,15 @@ SPENT = defaultdict[str, float](float)  # by test, s
 WORKERS: list[float] = []  # each from its start to its end, s
 
 
+def own_s(times: os.times_result) -> float:
+    """Processor time of this process so far."""
+    return times.user + times.system
+
+
 def used_s() -> float:
-    """Processor time of this process so far, and of those that it has waited for."""
+    """The same with the processes that it has waited for."""
     times = os.times()
-    return times.user + times.system + times.children_user + times.children_system
+    return own_s(times) + times.children_user + times.children_system
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
@@ -62,7 +67,9 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
     """The whole, and the slowest."""
     if len(SPENT) <= SLOWEST:
         return
-    whole_s, tests_s = sum(WORKERS) + used_s(), sum(SPENT.values())
+    # The workers are children of the terminal's process, and have told what they took.
+    whole_s = sum(WORKERS) + own_s(os.times()) if WORKERS else used_s()
+    tests_s = sum(SPENT.values())
     terminalreporter.section(f"{whole_s:.0f} s of processor time, {tests_s:.0f} of them in tests")
     for name, spent_s in sorted(SPENT.items(), key=lambda item: -item[1])[:SLOWEST]:
         terminalreporter.write_line(f"{spent_s:7.1f} s {spent_s / tests_s:5.1%}  {name}")
