@@ -20,7 +20,9 @@ SHARES = st.floats(1e-3, 1e3)
     ("seed", "law", "effect", "where"),
     [
         (6201, "laminar", "external_leakage_laminar", "a"),
-        (6202, "asymmetric", "internal_leakage_laminar", "a-b"),
+        pytest.param(
+            *(6202, "asymmetric", "internal_leakage_laminar", "a-b"), marks=pytest.mark.campaign
+        ),
     ],
 )
 def test_twice_the_size_is_named_and_what_is_not_significant_is_not(

@@ -8,7 +8,12 @@ from tests.campaign.laws import Case, judged
 
 
 @pytest.mark.parametrize(
-    ("seed", "law"), [(5043, "compensated"), (5043, "choking"), (5051, "jump")]
+    ("seed", "law"),
+    [
+        pytest.param(5043, "compensated", marks=pytest.mark.campaign),
+        (5043, "choking"),
+        (5051, "jump"),
+    ],
 )
 def test_a_clean_sweep_with_noisy_pressures_matches(seed: int, law: str) -> None:
     """A line or a gas, both negligible, stayed in the model, and its moduli contradicted.
