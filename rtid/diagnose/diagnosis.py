@@ -42,7 +42,6 @@ from rtid.diagnose.trials import (
     scored,
 )
 from rtid.diagnose.verdict import (
-    CLEAR,
     INSUFFICIENT,
     MATCHES,
     MATERIAL,
@@ -65,7 +64,8 @@ LATER_GAIN = 25.0  # chi2 of every effect behind the first
 OF_LINES = "dead volume"  # the declared size that the oil of a line adds to
 MOST = 6  # effects that are added at most
 WORSE = 1.02  # held-out residual, as a share, that an immaterial effect may not raise
-LEFT = 0.4  # of a misfit that unseen data show clearly: what explains it may leave so much
+CLEAR = 1.5  # times the variance of the sensors' noise, from which unseen data show a misfit ...
+LEFT = 0.4  # ... of which what explains it may leave so much
 MOST_NEGLIGIBLE = 4  # that are looked at
 NOTICED = 0.01  # of the degrees of freedom: chi2 from which an immaterial effect stays in the model
 SHARE = 0.4  # of the misfit left that a cause must explain, once most of the first is explained,

@@ -13,7 +13,6 @@ from rtid.diagnose.trials import MATCH_RHO, TrialState
 from rtid.estimator.validity import Doubt, doubts
 from rtid.model import PROPORTIONAL, Machine
 
-CLEAR = 1.5  # times the variance of the sensors' noise, from which a misfit is clear
 MATERIAL = 0.003  # of the rms flow: what an effect must change of the held-out residual
 NAMED = 0.8  # of the misfit that effects must explain to be named where something else remains
 MOST_CUT = 0.5  # of the record, that may be lost to pressures at an end of their range
@@ -35,15 +34,6 @@ def is_slight(residual: Residual) -> bool:
     """True where what is left beyond the sensors' noise is immaterial for the flow."""
     beyond = max(0.0, residual.rms_m3s**2 - residual.floor_m3s**2)
     return float(np.sqrt(beyond)) < MATERIAL * residual.flow_m3s
-
-
-def _is_weak(last: Fit, after: Residual) -> bool:
-    """True where a misfit is less than clear, and nothing of it matters on unseen data.
-
-    Nobody declares the sensors' noise to a tenth, and no grid gives a curve exactly: of clean
-    machines on somebody's grid two of ten had rho 1.11 and 1.13, and 0.1 to 0.2 % of flow left.
-    """
-    return last.rho < CLEAR and is_slight(after)
 
 
 def most_rho(fit: Fit) -> float:
@@ -82,8 +72,7 @@ def verdict(
         is_open = bool(state.negligible) or is_slight(after)
         if not is_unseen and is_open and max(first.rho, rho_of_all(last)) >= most_rho(last):
             return INSUFFICIENT
-        is_right = last.rho < most_rho(last) or (is_unseen and _is_weak(last, after))
-        return MATCHES if is_right and not doubts_about(last) else UNKNOWN
+        return MATCHES if last.rho < most_rho(last) and not doubts_about(last) else UNKNOWN
     rest = last.held.sse - last.regression.dof
     explained = 1.0 - rest / state.excess if state.excess > 0 else 1.0
     # a rate without pressures is disturbed by whatever moves the machine: unseen data have judged
