@@ -21,11 +21,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.linalg import cho_solve, cholesky, solve_triangular
 
-from rtid.estimator.simplex import Lowest, lowest
 from rtid.model import Edge
 from rtid.plain import FloatArray
 
@@ -165,9 +165,18 @@ def _descend(
     surprise: Callable[[FloatArray], float],
     start: tuple[float, ...],
     bounds: tuple[tuple[float, float], ...],
-) -> Lowest:
+) -> Any:
+    from scipy.optimize import minimize  # noqa: PLC0415 - takes long to import
+
     steps = np.diag([1.5, 1.5, 1.5, 0.2][: len(start)])
-    return lowest(surprise, np.vstack([start, np.array(start) + steps]), bounds)
+    simplex = np.vstack([start, np.array(start) + steps])
+    return minimize(
+        surprise,
+        np.array(start),
+        method="Nelder-Mead",
+        bounds=bounds,
+        options={"xatol": 0.05, "fatol": 0.05, "initial_simplex": simplex},
+    )
 
 
 def wiener(low: FloatArray, high: FloatArray) -> FloatArray:
@@ -187,7 +196,7 @@ def fit_law(edge: Edge, data: GainData) -> OrificeLaw:
     conditioned = _Conditioned(scale, data, knots, sizes)
     orifice = _descend(lambda x: conditioned.surprise(np.append(x, 0.0)), ORIFICE[:3], SEARCH[:3])
     other = _descend(conditioned.surprise, OTHER_LAW, SEARCH)
-    clear = other.value < orifice.value - CLEARLY
+    clear = other.fun < orifice.fun - CLEARLY
     best = other.x if clear else np.append(orifice.x, 0.0)
     return conditioned.law(_strength(best))
 
