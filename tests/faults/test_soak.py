@@ -43,7 +43,7 @@ pytestmark = pytest.mark.soak
 SHARE = float(os.environ.get("RTID_SOAK", "1"))
 KILLS = int(os.environ.get("RTID_SOAK_KILLS", "50"))
 QUICK = "publish_s = 5\nstore_s = 2\n"
-PROMPT = "priority = 60\n"  # as on a busy computer: the loop, and what saves next to it
+PRIORITIES = {"ordinary": "", "priority 60": "priority = 60\n"}  # the loop's, and what saves
 ALL_OF_IT = "record_mb = 2000\n"  # what is heard through 300 kills stays in the recording
 FULL_BUS_HZ = 8000.0
 WARM_S = 120.0  # the ring of samples is full, all blocks of the minute have been visited
@@ -118,17 +118,19 @@ def test_row_14_overruns_of_our_own(full_bus: FullBus, figure: Figure) -> None:
     figure(14, "overruns beyond those of the empty loop", beyond, 0.001)
 
 
-def test_row_17_killed_at_random(tmp_path: Path, figure: Figure) -> None:
+@pytest.mark.parametrize("priority", PRIORITIES)
+def test_row_17_killed_at_random(priority: str, tmp_path: Path, figure: Figure) -> None:
     """At random moments of a run over the same minute again and again, saved every 2 s.
 
     Against a learner of what the daemons have heard: what is sent while one starts nobody hears,
     and a third of such a motion knows another map by half a per cent, without any kill.
     """
+    settings = QUICK + PRIORITIES[priority] + ALL_OF_IT
     kills, chance, group = max(3, round(KILLS * SHARE)), random.Random(50), a_group()
     restored, ages_s = list[str](), list[float]()
     with sender(group, SECONDS, loops=100 * max(1, kills // 50)):
         for k in range(kills + 1):
-            with daemon(tmp_path, settings=QUICK + PROMPT + ALL_OF_IT, group=group) as running:
+            with daemon(tmp_path, settings=settings, group=group) as running:
                 running.wait(running.is_its_own)
                 running.wait(lambda s: s.store.age_s is not None)
                 time.sleep(chance.uniform(0.0, 4.0))
@@ -143,16 +145,18 @@ def test_row_17_killed_at_random(tmp_path: Path, figure: Figure) -> None:
                 else:
                     running.stop()
     began_anew = sum(text.startswith("fresh") for text in restored[1:])
-    figure(17, f"of {kills} restarts that began anew", began_anew, 0)
+    figure(17, f"{priority}: of {kills} restarts that began anew", began_anew, 0)
     torn = [*running.folder.rglob("*.refused.npz")]
-    figure(17, f"torn files after {kills} kills", len(torn), 0)
-    figure(17, "age of the newest snapshot at a kill, median", sorted(ages_s)[kills // 2], unit="s")
+    figure(17, f"{priority}: torn files after {kills} kills", len(torn), 0)
+    age = f"{priority}: age of the newest snapshot"
+    figure(17, f"{age} at a kill, median", sorted(ages_s)[kills // 2], unit="s")
     learned, whole = stored(running.folder, machine().project).estimator, heard(running.folder)
     lost = whole.counters["samples"] - learned.counters["samples"]
-    figure(17, "motion that a kill has cost, of what was heard", 1e-3 * lost / kills, unit="s")
-    figure(17, f"drift after {kills} kills against no kill, of what was heard",
+    cost_s = 1e-3 * lost / kills
+    figure(17, f"{priority}: motion that a kill has cost, of what was heard", cost_s, unit="s")
+    figure(17, f"{priority}: drift after {kills} kills against no kill, of what was heard",
            drift(whole.solution(), learned.solution()), 0.01)  # fmt: skip
-    figure(17, f"age of the newest snapshot at {kills} kills, largest", max(ages_s), 3.0, "s")
+    figure(17, f"{age} at {kills} kills, largest", max(ages_s), 3.0, "s")
 
 
 @dataclass(frozen=True)
