@@ -20,7 +20,7 @@ from rtid.diagnose.consequence import (
 from rtid.diagnose.contest import contest, trials_of
 from rtid.diagnose.exact import carried_on
 from rtid.diagnose.excuse import few_excused
-from rtid.diagnose.fit import Fit, fit, with_covariances
+from rtid.diagnose.fit import MATCH_RHO, Fit, fit, with_covariances
 from rtid.diagnose.joined import joints
 from rtid.diagnose.nameable import Reach, reaches
 from rtid.diagnose.parts import AddedEffect
@@ -31,7 +31,6 @@ from rtid.diagnose.spread import with_spreads
 from rtid.diagnose.standing import Standing, stand, with_bank
 from rtid.diagnose.trials import (
     GAIN,
-    MATCH_RHO,
     AcceptedEffect,
     Trial,
     TrialState,
@@ -50,7 +49,6 @@ from rtid.diagnose.verdict import (
     UNKNOWN,
     can_judge,
     doubts_about,
-    most_rho,
     verdict,
 )
 from rtid.diagnose.zeros import Zero, zeros
@@ -201,7 +199,7 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
             return None
         trial, alike = contest(state, present, best, trials)
         now = with_covariances(carried_on(state, present, trial), like=present)
-        if now.rho >= most_rho(now) and not trial.is_timing and is_at_a_bound(now):
+        if now.rho >= now.most_rho and not trial.is_timing and is_at_a_bound(now):
             continue
         if not trial.is_timing and is_spread_alone(present, now, least):
             continue
@@ -248,7 +246,7 @@ def taken_in(
         return None
     does = consequence(present, now, own_flow)
     misfit = present.held.sse - present.regression.dof
-    is_needed = present.rho >= most_rho(present) and trial.gain > SHARE * misfit
+    is_needed = present.rho >= present.most_rho and trial.gain > SHARE * misfit
     if is_needed and is_seen_again(now, last, after):
         return does
     return does if (does.is_material or is_needed) and is_stable(now, trial) else None

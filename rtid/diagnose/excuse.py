@@ -16,10 +16,10 @@ import numpy as np
 from rtid.diagnose.fit import Fit, columns_of_effects, fit, one_pass
 from rtid.diagnose.residual import effect_values
 from rtid.effects.extra import with_extra_flow
-from rtid.estimator.misfit import Misfit, can_be_explained, residual_of
+from rtid.estimator.misfit import Misfit, can_be_explained, count_misfit, residual_of
 from rtid.estimator.missed import excusing, misses
 from rtid.estimator.record import summed
-from rtid.estimator.solution import sketch
+from rtid.estimator.solution import sketch, solve
 from rtid.model import Machine
 from rtid.plain import FloatArray
 
@@ -69,6 +69,13 @@ def left_over(present: Fit) -> Misfit:
     model, chunk = _machine(present)
     weights = present.weights
     return residual_of(model, chunk, weights, sketch(model, summed(model, chunk, weights)))
+
+
+def counted(present: Fit) -> FloatArray:
+    """Covariance of the compliances (chambers, chambers), 1/Pa2, what the blocks miss counted."""
+    model, chunk = _machine(present)
+    solution = solve(model, summed(model, chunk, present.weights))
+    return count_misfit(model, chunk, present.weights, solution).compliance_cov
 
 
 def _machine(present: Fit) -> tuple[Machine, FloatArray]:

@@ -15,12 +15,12 @@ from rtid.diagnose.contest import alike_ones
 from rtid.diagnose.diagnosis import LEAST_SHARE, taken_in
 from rtid.diagnose.exact import carried_on, exact_trials, is_inside, key_of, with_pump
 from rtid.diagnose.excuse import few_excused
+from rtid.diagnose.fit import MATCH_RHO
 from rtid.diagnose.report import Value
 from rtid.diagnose.spread import with_spreads
 from rtid.diagnose.standing import Standing, with_bank
 from rtid.diagnose.trials import (
     GAIN,
-    MATCH_RHO,
     TIE,
     TIE_SHARE,
     Trial,

@@ -40,6 +40,8 @@ HALVINGS = 2  # of one step, before it is given up
 WHOLLY = 1e8  # information of a coefficient that is 1, the effect being what its shape says
 RIDGE = 1e-9  # of the square of a timing's or a shape's column: more than rounding leaves
 WEIGHED = 0.05  # share by which the compliances may differ that weigh the rows alike
+MATCH_RHO = 1.10  # largest rho of a model that matches, of a record that is long enough
+BAND_SD = 3.0  # standard deviations of rho that a record's own length gives it
 NO_COV = np.zeros((0, TERMS, TERMS))  # of maps whose covariance nobody asked for
 
 
@@ -94,6 +96,16 @@ class Fit:
     def rho(self) -> float:
         """Residual variance in units of the sensors' noise."""
         return self.regression.rho(self.held)
+
+    @property
+    def spread_of_rho(self) -> float:
+        """How far from 1 so long a record lets rho be, in `BAND_SD` standard deviations."""
+        return BAND_SD * float(np.sqrt(2.0 / max(1.0, self.regression.dof)))
+
+    @property
+    def most_rho(self) -> float:
+        """The largest rho of a model that matches: of any record, and wider for a short one."""
+        return max(MATCH_RHO, 1.0 + self.spread_of_rho)
 
     @property
     def freedom(self) -> float:

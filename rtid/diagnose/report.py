@@ -20,7 +20,7 @@ from rtid.diagnose.nameable import clearest
 from rtid.diagnose.regression import LIMIT_SD, Score
 from rtid.diagnose.remains import described
 from rtid.diagnose.trials import AcceptedEffect, detection_limit, physical
-from rtid.diagnose.verdict import MATERIAL, UNKNOWN, doubts_about, most_rho
+from rtid.diagnose.verdict import MATERIAL, UNKNOWN, told_doubts
 from rtid.diagnose.zeros import Zero, by_chance
 from rtid.effects import catalogue
 from rtid.effects.column import Candidate
@@ -187,14 +187,14 @@ def diagnosis(result: Result) -> Diagnosis:
         beta_pa=tuple(1.0 / float(c) if c else float("inf") for c in words.compliance),
         lag_s=words.weights.lag_s,
         lag_sd_s=words.lag_sd_s,
-        something_remains=last.rho >= most_rho(last) or result.verdict == UNKNOWN,
+        something_remains=last.rho >= last.most_rho or result.verdict == UNKNOWN,
         held_out_judged=result.held_out_judged,
         not_found=unseen,
         negligible=tuple(
             Small(effect, where, share) for (effect, where), share in result.negligible.items()
         ),
         advice=advice(result, unseen),
-        doubts=doubts_about(last),
+        doubts=told_doubts(last),
         cut=cuts(last.declared, last.chunk),
         disturbance=max(chamber.disturbance for chamber in last.declared.chambers),
         zeros=result.zeros,

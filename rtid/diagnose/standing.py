@@ -7,8 +7,8 @@ from functools import cached_property
 
 from rtid.diagnose.clean import as_measured, usable
 from rtid.diagnose.excuse import few_excused
-from rtid.diagnose.finer import fine_enough
-from rtid.diagnose.fit import Fit, fit, one_pass, prepare
+from rtid.diagnose.finer import fine_enough, halved_throughout
+from rtid.diagnose.fit import Fit, fit, one_pass, prepare, with_covariances
 from rtid.diagnose.parts import AddedEffect, recall
 from rtid.diagnose.residual import Residual, residual
 from rtid.diagnose.spread import with_spreads
@@ -56,6 +56,7 @@ def fitted(
     if first is fine:
         first = replace(first, rest=rest)
     del fine  # its rows are large
+    first = halved_throughout(with_covariances(first))
     record = first.declared, chunk, first.weights, first.revision
     return with_spreads(one_pass(*record, first, bank=False))
 

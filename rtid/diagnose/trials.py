@@ -33,7 +33,6 @@ TIE, TIE_SHARE = 12.0, 0.03  # causes within so much of the best gain are not to
 SHARE_OF_BEST = 0.2  # of the best gain that a cause must have for its shape to be refined
 ROUNDS = 8  # of refinement, each with half the step of the last
 SETTLED = 2e-3  # of the gain: what a round must add for another one
-MATCH_RHO = 1.10  # largest rho of a model that matches
 
 
 @dataclass(frozen=True)

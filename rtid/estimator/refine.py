@@ -41,6 +41,14 @@ def halved(model: Machine, misfit: Misfit, clearly: float = CLEARLY) -> Machine:
     return _on(model, [_halved(edge, excess, clearly).grid for edge, excess in pairs])
 
 
+def halved_along(model: Machine, axis: int) -> Machine:
+    """The machine with all intervals halved along an axis: 0 the command, 1 the pressure drop.
+
+    Of maps that do not change along it, and of proportional ones, none is.
+    """
+    return _on(model, [_halved_along(edge, axis) for edge in model.edges])
+
+
 def missing_commands(model: Machine, misfit: Misfit) -> list[list[int]]:
     """Per edge, the intervals of its command that miss the flow most; of its owner where shared."""
     return [
@@ -112,6 +120,15 @@ def _halved(edge: Edge, excess: Excess, clearly: float) -> Edge:
     axes = [_worst(excess, axis, clearly) if edge.terms != whole else [] for axis, whole in WHOLE]
     u, dp = (_split(b, k) for b, k in zip((edge.grid.u_v, edge.grid.dp_pa), axes, strict=True))
     return replace(edge, grid=Grid(u, dp))
+
+
+def _halved_along(edge: Edge, axis: int) -> Grid:
+    borders = [edge.grid.u_v, edge.grid.dp_pa]
+    n = len(borders[axis]) - 1
+    is_whole = edge.basis == PROPORTIONAL or (axis, edge.terms) in WHOLE
+    if not is_whole and 2 * n < MAX_BORDERS:
+        borders[axis] = _split(borders[axis], list(range(n)))
+    return Grid(*borders)
 
 
 def _worst(excess: Excess, axis: int, clearly: float) -> list[int]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from rtid.diagnose.clean import Cut
+from rtid.diagnose.fit import MATCH_RHO
 from rtid.diagnose.report import Diagnosis, FoundEffect, Unseen, Value
-from rtid.diagnose.trials import MATCH_RHO
 from rtid.diagnose.verdict import INSUFFICIENT, MATCHES, MATERIAL, UNKNOWN
 from rtid.effects.page import title
 from rtid.tell.story import Chart, Story, Table

@@ -17,7 +17,7 @@ from rtid.sim.random_plants import draw
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from rtid.tell.diagnosed import sentences
-from tests.campaign.laws import Case, judged
+from tests.campaign.laws import Case, declared, judged
 from tests.diagnose.records import record
 
 
@@ -64,6 +64,37 @@ def test_what_is_slight_and_more_than_noise_is_no_match(unexplained: Diagnosis) 
     )  # fmt: skip
     assert slight.is_slight
     assert any("The model is right to 0.3 %" in text for text in sentences(slight))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "law", ["choking", pytest.param("compensated", marks=pytest.mark.campaign)]
+)
+def test_a_curve_that_all_blocks_miss_by_a_little_is_no_alarm(law: str) -> None:
+    """On somebody's grid rho was 1.11 and 1.13: half the width along one axis explains it."""
+    case = Case(5101, law, "rich_record")
+    found = judged(case)
+    assert found is not None
+    assert found.said.verdict == "matches" and not found.said.something_remains
+    assert found.present.rho < 1.0 + found.present.spread_of_rho
+    halved = [
+        tuple(
+            round(np.ptp(old) / len(old) * len(new) / np.ptp(new))
+            for old, new in ((e.grid.u_v, f.grid.u_v), (e.grid.dp_pa, f.grid.dp_pa))
+        )
+        for e, f in zip(declared(case, found.run).edges, found.present.declared.edges, strict=True)
+    ]
+    assert all(sorted(axes) == [1, 2] for axes in halved)
+
+
+@pytest.mark.slow
+def test_a_weak_leak_is_no_curve_of_the_maps() -> None:
+    """It left rho 1.25: a grid of half the width leaves half of that, and is not taken."""
+    case = Case(5101, "orifice", "rich_record", "external_leakage_laminar", 1.5e-13)
+    found = judged(case)
+    assert found is not None
+    assert [effect.effect for effect in found.said.found] == ["external_leakage_laminar"]
+    assert found.present.declared.n_cells < 1.2 * declared(case, found.run).n_cells
 
 
 @pytest.mark.slow

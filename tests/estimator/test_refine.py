@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from rtid.diagnose.fit import MATCH_RHO
 from rtid.diagnose.standing import fitted
-from rtid.diagnose.trials import MATCH_RHO
 from rtid.estimator.estimator import to_chunk
 from rtid.estimator.record import fit_record
 from rtid.model import Grid, Machine
