@@ -1,6 +1,7 @@
 """What the live page costs: the daemon's loop with and without it, and the memory of its tab.
 
-`python -m benchmarks.live_page [--slice 4] [--pairs 60] [--minutes 10] [--priority 60]`
+`python -m benchmarks.live_page [--slice 4] [--pairs 60] [--minutes 10] [--priority 60] [--busy 8]
+[--pictures FOLDER]`
 
 Daemon, machine (on the test bus) and page server are processes of their own, the page is open in
 Chromium.  Slices without and with it alternate, because the host steals time at random: for the
@@ -9,7 +10,10 @@ is no part of what is measured.  Of each second the daemon tells the p99 of its 
 lateness; the ratio of the medians of two neighbouring slices is taken, its interval by resampling
 pairs.  Beside it stands the processor time of server and browser.  Then the page stays open: the
 script heap after a collection and the private memory of its process, sampled every ten seconds; the
-growth is the slope after the first fifth.  Whatever hangs, it ends after twice the time it should.
+growth is the slope after the first fifth.  Meanwhile the page is watched: how long one status
+stands until the next is drawn, how long the curves stand still, how dense the scope is.  --busy: so
+many processes that do nothing but compute run beside it all.  Whatever hangs, it ends after twice
+the time it should.
 """
 
 from __future__ import annotations
@@ -35,6 +39,7 @@ from rtid.daemon.status import StatusError, read
 from rtid.sim.random_plants import draw
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
+from rtid.ui.live_scope import KEPT_S
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -44,6 +49,32 @@ CHANNEL = f"239.74.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"
 SEED, SETTLE_S, SAMPLE_S, WARM = 3, 1.5, 10.0, 0.2
 PATIENCE_S, END_S = 120.0, 30.0
 UPDATES = "() => Number(document.querySelector('#seen').textContent)"
+# gaps between two statuses that were drawn, and between two places of the curves, ms
+WATCH = """() => {
+  window.watched = { told: [], moved: [] };
+  const last = {};
+  const note = (name, value, now) => {
+    if (last[name] && last[name][0] === value) return;
+    if (last[name]) window.watched[name].push(now - last[name][1]);
+    last[name] = [value, now];
+  };
+  const look = (now) => {
+    const told = document.querySelector("#seen").textContent;
+    note("told", told, now);
+    const curves = document.querySelector("#live_scope .slide");
+    note("moved", told + (curves && getComputedStyle(curves).transform), now);
+    requestAnimationFrame(look);
+  };
+  requestAnimationFrame(look);
+}"""
+DRAWN = """() => ["#live_scope .scope", "#live_planes .plane", "#live_planes circle",
+  "#live_health .scope", "#live_learning .card"]
+  .map((one) => `${one} ${document.querySelectorAll(one).length}`).join(", ")"""
+POINTS = (
+    "() => document.querySelector('#live_scope polygon').getAttribute('points').split(' ').length"
+)
+BUSY = "while True: pass"
+WIDTHS, PICTURE_HIGH = (390, 1280), 900
 FloatArray = NDArray[np.float64]
 
 
@@ -166,6 +197,7 @@ def memory(browser: Browser, page: Page, url: str, minutes: float) -> tuple[floa
     """Updates per second, and minutes, script heap and private memory (n, 3), MB."""
     page.goto(f"{url}#live")
     page.wait_for_selector("#live_learning progress")
+    page.evaluate(WATCH)
     cdp = page.context.new_cdp_session(page)
     cdp.send("Performance.enable")
     begun, first = time.monotonic(), page.evaluate(UPDATES)
@@ -202,6 +234,24 @@ def report_memory(rate: float, sizes: FloatArray) -> None:
           f"what stays {heap:+.2f} and {private:+.1f} MB in 30 minutes")  # fmt: skip
 
 
+def report_watched(page: Page) -> None:
+    """How the page moved since it was told to WATCH, and what is on it."""
+    for name, gaps in page.evaluate("() => window.watched").items():
+        middle, high, most = np.quantile(gaps, [0.5, 0.99, 1.0])
+        print(f"{name}: {len(gaps)} times, every {middle:.0f} ms (median), p99 {high:.0f}, "
+              f"longest {most:.0f} ms")  # fmt: skip
+    dense_hz = page.evaluate(POINTS) / 2 / KEPT_S
+    print(f"scope: {dense_hz:.1f} values a second and signal; drawn: {page.evaluate(DRAWN)}")
+
+
+def pictures(page: Page, folder: Path) -> None:
+    """Of the whole page, narrow and wide."""
+    for width in WIDTHS:
+        page.set_viewport_size({"width": width, "height": PICTURE_HIGH})
+        page.wait_for_timeout(1e3 * SETTLE_S)
+        page.screenshot(path=folder / f"live_{width}.png", full_page=True)
+
+
 def _too_late(number: int, frame: object) -> None:
     raise SystemExit("it took twice as long as it should: see what hangs")
 
@@ -215,12 +265,16 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=60)
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--priority", type=int, default=60)
+    parser.add_argument("--busy", type=int, default=0)
+    parser.add_argument("--pictures", type=Path)
     wanted = parser.parse_args()
     needed_s = 2 * wanted.pairs * (wanted.slice + SETTLE_S) + 60 * wanted.minutes + PATIENCE_S
     signal.signal(signal.SIGALRM, _too_late)
     signal.alarm(round(2 * needed_s))
     with ExitStack() as stack, sync_playwright() as running:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        for _ in range(wanted.busy):
+            stack.callback(end, subprocess.Popen([sys.executable, "-c", BUSY]))
         state, url, server = machine(stack, folder, 2 * needed_s, wanted.priority)
         browser = running.chromium.launch(executable_path="/usr/bin/chromium", args=FLAGS)
         page = browser.new_page()
@@ -232,6 +286,9 @@ def main() -> None:
             report_cost(cost(state, server, wanted.slice, wanted.pairs))
         if wanted.minutes:
             report_memory(*memory(browser, page, url, wanted.minutes))
+            report_watched(page)
+        if wanted.pictures:
+            pictures(page, wanted.pictures)
         browser.close()
 
 
