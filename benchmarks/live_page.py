@@ -273,9 +273,9 @@ def main() -> None:
     signal.alarm(round(2 * needed_s))
     with ExitStack() as stack, sync_playwright() as running:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        for _ in range(wanted.busy):
-            stack.callback(end, subprocess.Popen([sys.executable, "-c", BUSY]))
         state, url, server = machine(stack, folder, 2 * needed_s, wanted.priority)
+        for _ in range(wanted.busy):
+            stack.callback(end, subprocess.Popen([sys.executable, "-c", BUSY], text=True))
         browser = running.chromium.launch(executable_path="/usr/bin/chromium", args=FLAGS)
         page = browser.new_page()
         page.set_default_timeout(1e3 * PATIENCE_S)
