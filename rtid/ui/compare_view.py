@@ -73,7 +73,7 @@ class CompareView(PageView):
         if not self.has_runs:
             return f"chamber {name}: flow"
         fits = ", ".join(
-            f"{_fit(part.runs[self.run].fit_percent[c])} {NAMES.get(title, title)}"
+            f"{_fit(part.fits[self.run][c])} {NAMES.get(title, title)}"
             for title, part in self.look.parts.items()
             if part.runs
         )
