@@ -23,7 +23,7 @@ from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from rtid.study.revisions import add
 from rtid.study.spans import added_parts
-from rtid.tell.diagnosed import sentences
+from rtid.tell.diagnosed import LIMITS_SAY, limits, sentences
 from rtid.tell.report import page
 from rtid.tell.report_file import Reported, report
 from rtid.tell.report_story import ReportStory
@@ -161,6 +161,8 @@ def test_every_effect_not_found_is_listed_once(leaking: Reported) -> None:
     rows = reader.tags.count("tr")
     assert rows > len(unseen)
     assert all(u.reason in words for u in unseen if not u.visible)
+    assert LIMITS_SAY in words
+    assert all(size in words for u in unseen if u.visible for size in limits(u))
 
 
 def test_a_model_that_matches_and_its_history(

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from rtid.diagnose.clean import Cut
 from rtid.diagnose.fit import MATCH_RHO
+from rtid.diagnose.regression import LIMIT_SD
 from rtid.diagnose.report import Diagnosis, FoundEffect, Unseen, Value
 from rtid.diagnose.verdict import INSUFFICIENT, MATCHES, MATERIAL, UNKNOWN
 from rtid.effects.page import title
@@ -16,7 +17,11 @@ from rtid.units import CONVENTION, Z95, limit
 SLIGHTLY_CUT = 1e-3  # of a record: less is not worth a sentence
 MOST_BENDS = 2  # maps that a sentence names
 SHOWN = 14  # rows of the table of what was not found
-LIMITS = ("seen from", "named from")  # sizes of what was not found: significant; and it matters
+LIMITS = ("seen from", "named from")  # sizes of what was not found
+LIMITS_SAY = (
+    f"Seen from: the size that stands out by {LIMIT_SD:g} standard deviations of this record. "
+    "Named from: the size that also matters; where that is empty, none is known."
+)
 
 
 def story(diagnosis: Diagnosis, evidence: Sequence[Chart] = ()) -> Story:
@@ -236,11 +241,8 @@ def _unseen_table(diagnosis: Diagnosis) -> Table:
         for u in listed
         if u.examined
     ]
-    title = (
-        "not found: the size from which on it is significant here, and from which on it is named"
-    )
     heads = ("effect", "where", *LIMITS, "remark~")
-    return Table(title, heads, rows[: 3 * SHOWN], keys=2)
+    return Table(f"not found. {LIMITS_SAY}", heads, rows[: 3 * SHOWN], keys=2)
 
 
 def limits(unseen: Unseen) -> tuple[str, str]:

@@ -18,7 +18,7 @@ from rtid.tell import stills as still_pictures
 from rtid.tell.charts.dependence import before_and_after
 from rtid.tell.charts.maps import maps, slices
 from rtid.tell.charts.over_time import flows
-from rtid.tell.diagnosed import LIMITS, heading, limits, sentences
+from rtid.tell.diagnosed import LIMITS, LIMITS_SAY, heading, limits, sentences
 from rtid.tell.history import history_table
 from rtid.tell.html import rendered
 from rtid.tell.report_page import embedded, key_figures, page_of
@@ -217,7 +217,7 @@ def _ranking(story: ReportStory) -> Story:
     least = float(np.sqrt(GAIN))
     words = f"{least:g} sd: significant", "coefficient in units of its standard deviation, alone"
     drawn = Bars("ranking", "", bars, least, *words, caption, is_log=True)
-    head = ("effect", "where", "sd before", "sd after", "coefficient", "detection limit")
+    head = ("effect", "where", "sd before", "sd after", "coefficient", *LIMITS)
     return Story("Candidates", (drawn, Table("", head, [_candidate(r) for r in ranked])))
 
 
@@ -229,8 +229,8 @@ def _candidate(ranked: Ranked) -> tuple[str, ...]:
         value += ", not possible"
     before = "" if ranked.before is None else f"{ranked.before:.1f}"
     after = "in the model" if ranked.after is None else f"{ranked.after:.1f}"
-    least = "" if ranked.limit is None else limit(ranked.limit, ranked.limit_unit)
-    return title(ranked.key[0]), ranked.key[1], before, after, value, least
+    least = limits(ranked.unseen) if ranked.unseen else ("", "")
+    return title(ranked.key[0]), ranked.key[1], before, after, value, *least
 
 
 def _not_found(unseen: tuple[Unseen, ...], ranking: tuple[Ranked, ...]) -> tuple[Story, ...]:
@@ -243,12 +243,8 @@ def _not_found(unseen: tuple[Unseen, ...], ranking: tuple[Ranked, ...]) -> tuple
         for u in seen
     ]
     blind = [(title(u.effect), u.where, u.reason) for u in hidden]
-    says = (
-        f"Seen from: the size that stands out by {LIMIT_SD:g} standard deviations of this record. "
-        "Named from: the size that also matters."
-    )
     head = ("effect", "where", *LIMITS, "remark")
-    parts: list[StoryPart] = [says, Table("", head, rows)]
+    parts: list[StoryPart] = [LIMITS_SAY, Table("", head, rows)]
     if hidden:
         parts.append(Table("What this record cannot show", ("effect", "where", "why"), blind))
     return (Story("Looked for and not found", tuple(parts)),)

@@ -20,7 +20,7 @@ from rtid.diagnose.excuse import steady
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.regression import Score
 from rtid.diagnose.remains import filtered
-from rtid.diagnose.report import Diagnosis, parameters
+from rtid.diagnose.report import Diagnosis, Unseen, parameters
 from rtid.diagnose.residual import Residual, residual
 from rtid.diagnose.trials import physical, scored
 from rtid.diagnose.verdict import LEAST_ROWS
@@ -46,8 +46,8 @@ class Ranked:
     """A candidate: effect and place, clarity in standard deviations before and after (None: found).
 
     value, std, unit: its coefficient beside the last model, or as fitted; is_possible: of a sign
-    and size that physics allows; per_shape: the value of a
-    timing of which the coefficient is a share, "" where it is none; limit: detection limit, SI.
+    and size that physics allows; per_shape: the value of a timing
+    of which the coefficient is a share; unseen: what of it would have been found, where it was not.
     """
 
     key: Key
@@ -58,8 +58,7 @@ class Ranked:
     unit: str
     is_possible: bool = True
     per_shape: tuple[float, str] | None = None
-    limit: float | None = None
-    limit_unit: str = ""
+    unseen: Unseen | None = None
 
 
 @dataclass(frozen=True)
@@ -192,7 +191,7 @@ def ranked(result: Result, diagnosis: Diagnosis) -> tuple[Ranked, ...]:
     before = {key: np.sqrt(score.gain) for key, (_, score) in _best(result.first).items()}
     last = _best(result.last)
     inside = {accepted.key for accepted in result.found}  # a sensor's zero is no column of the fit
-    limits = {(u.effect, u.where): u for u in diagnosis.not_found if u.visible}
+    unseen = {(u.effect, u.where): u for u in diagnosis.not_found if u.visible}
     ranked = []
     for key in {**before, **last, **dict.fromkeys(inside)}:
         last_rank = (
@@ -200,11 +199,9 @@ def ranked(result: Result, diagnosis: Diagnosis) -> tuple[Ranked, ...]:
         )
         if last_rank is None:
             continue
-        limit, sd = limits.get(key), before.get(key)
-        rank = replace(last_rank, key=key, before=None if sd is None else float(sd))
-        if limit is not None:
-            rank = replace(rank, limit=limit.detection_limit, limit_unit=limit.unit)
-        ranked.append(rank)
+        sd = before.get(key)
+        clear = None if sd is None else float(sd)
+        ranked.append(replace(last_rank, key=key, before=clear, unseen=unseen.get(key)))
     ranked.sort(key=lambda r: (r.key not in inside, -(r.before or r.after or 0.0)))
     return tuple(ranked)
 

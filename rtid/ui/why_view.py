@@ -14,7 +14,7 @@ from rtid.effects import effect as page_of
 from rtid.effects.page import Effect as Page
 from rtid.effects.page import EffectError, readable, title
 from rtid.tell.charts.theme import NARROWEST_PX, beside
-from rtid.tell.diagnosed import LIMITS, heading, hidden, judged, limits, percent, said
+from rtid.tell.diagnosed import LIMITS, LIMITS_SAY, heading, hidden, judged, limits, percent, said
 from rtid.tell.html import button, clearness, table, text
 from rtid.tell.live import PanelPlot
 from rtid.tell.report_story import Ranked
@@ -205,8 +205,9 @@ def _unseen(diagnosis: Diagnosis) -> list[str]:
     head = ("effect", "where", *LIMITS, "remark")
     parts = []
     if seen:
+        says = f'<p class="says">{text(LIMITS_SAY)}</p>'
         rows = [(*_place(u), *map(text, limits(u)), text(u.reason)) for u in seen]
-        parts.append("<h3>Looked for and not found</h3>" + table(head, rows))
+        parts.append(f"<h3>Looked for and not found</h3>{says}{table(head, rows)}")
     if blind:
         hidden = [(*_place(u), text(u.reason)) for u in blind]
         parts.append("<h3>This record cannot show</h3>" + table(("effect", "where", "why"), hidden))
