@@ -337,6 +337,19 @@ class Study:
         self._light()
         return made
 
+    def rest(self) -> None:
+        """Let go of what the fits make again from the record when it is asked for: 0.5 kB a sample.
+
+        A page waits in a study for hours.
+        """
+        known = vars(self)
+        if "diagnosed" in known:
+            made = self.diagnosed.result
+            made = replace(made, first=replace(made.first), last=replace(made.last))
+            known["diagnosed"] = replace(self.diagnosed, result=made)
+        if "standing" in known:
+            known["standing"] = replace(self.standing, fit=replace(self.standing.fit))
+
     def tried(self, effect: str, where: str = "") -> Extension:
         """The model with one effect more, fitted once.  Raises RefusedError."""
         made: dict[tuple[str, str], Extension] = vars(self).setdefault("_tried", {})

@@ -169,15 +169,17 @@ class Desk:
         """What is missing in the newest revision."""
         study = self._stack[-1].study
         said = study.diagnosis()
-        return RankedDiagnosis(
-            said, ranked(study.diagnosed.result, said), charts_of(study.evidence, study.remainder)
-        )
+        ranking = ranked(study.diagnosed.result, said)
+        evidence = charts_of(study.evidence, study.remainder)
+        study.rest()
+        return RankedDiagnosis(said, ranking, evidence)
 
     def prepare(self, effect: str, where: str) -> None:
         """Add an effect to nothing but memory, so that adding it takes no time."""
         last, key = self._stack[-1], (effect, where)
         if key not in last.ready:
             last.ready[key] = look(with_effect(last.study, effect, where, "").replay)
+            last.study.rest()
 
     def add(self, effect: str, where: str, reason: str) -> Addition:
         """The newest revision with one effect more."""

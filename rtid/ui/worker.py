@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -52,6 +53,7 @@ def serve(pipe: Connection, folder: Path, stop: Event) -> None:
     folder: for what is large in an answer; stop: is set when nobody waits for the job any more.
     """
     os.nice(POLITE)  # the page comes first
+    sys.modules.setdefault("asammdf", None)  # type: ignore[arg-type]  # as `cli.main` does
     from rtid.ui.desk import Desk  # noqa: PLC0415 - only the worker imports the estimator's weight
 
     def progress(text: str, share: float) -> None:
