@@ -10,7 +10,7 @@ from __future__ import annotations
 import getpass
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from math import floor, log10
 from pathlib import Path
@@ -19,6 +19,7 @@ from rtid.daemon.acceptance import Acceptance, ask
 from rtid.daemon.calendar import calendar_table, notes, side_by_side, trend, two_spans
 from rtid.daemon.status import (
     Advice,
+    Alarm,
     Distribution,
     EdgeHealth,
     MessageHealth,
@@ -212,26 +213,37 @@ def _counts(counts: dict[str, int]) -> str:
 
 
 def _alarms(status: Status, now_s: float) -> str:
-    lines = []
-    for alarm in status.alarms[:MOST_ALARMS]:
-        is_on = alarm.until_unix_s is None
-        since = _age(max(0.0, now_s - alarm.since_unix_s))
-        clock = time.strftime("%H:%M:%S", time.localtime(alarm.since_unix_s))
-        word = f"since {clock}, for {since}" if is_on else f"at {clock}, over"
-        dot = _dot("failed" if is_on else "ok")
-        seconds = _seconds(alarm.trace)
-        lines.append(
-            f"<li>{dot}<b>{text(alarm.name)}</b> {text(alarm.text)} ({word}){seconds}</li>"
-        )
+    alike: dict[tuple[str, bool], list[Alarm]] = {}
+    for alarm in status.alarms:
+        alike.setdefault((alarm.name, alarm.until_unix_s is None), []).append(alarm)
+    lines = [_same_alarms(alarms, now_s) for alarms in list(alike.values())[:MOST_ALARMS]]
     shown = "".join(lines) or '<li><span class="dot ok"></span>none</li>'
     return f'<h3>Alarms</h3><ul style="list-style:none;padding:0;margin:0">{shown}</ul>'
 
 
-def _seconds(trace: str) -> str:
+def _same_alarms(alarms: Sequence[Alarm], now_s: float) -> str:
+    """Alarms of one name, newest first: what the newest says, and the seconds of each."""
+    newest, is_on = alarms[0], alarms[0].until_unix_s is None
+    since = _age(max(0.0, now_s - newest.since_unix_s))
+    clock = _clock(newest)
+    word = f"since {clock}, for {since}" if is_on else f"at {clock}, over"
+    if len(alarms) > 1:
+        word += f"; {len(alarms)} times since {_clock(alarms[-1])}"
+    dot = _dot("failed" if is_on else "ok")
+    seconds = "".join(_seconds(alarm, alarm is newest) for alarm in alarms[:MOST_ALARMS])
+    return f"<li>{dot}<b>{text(newest.name)}</b> {text(newest.text)} ({word}){seconds}</li>"
+
+
+def _clock(alarm: Alarm) -> str:
+    return time.strftime("%H:%M:%S", time.localtime(alarm.since_unix_s))
+
+
+def _seconds(alarm: Alarm, is_newest: bool) -> str:
     """A button that opens the recorded seconds around an alarm."""
-    if not trace:
+    if not alarm.trace:
         return ""
-    return " " + button("look at its seconds", "look", kind="link", name=trace)
+    words = "look at its seconds" if is_newest else f"at {_clock(alarm)}"
+    return " " + button(words, "look", kind="link", name=alarm.trace)
 
 
 def _decisions(status: Status, asking: Question | None, follows: bool) -> str:

@@ -149,3 +149,18 @@ def test_a_follower_cannot_decide(tmp_path: Path) -> None:
         assert len(buttons) == 2 and all(" disabled" in button for button in buttons)
         shown = live.fragments(asking)["live_health"]
         assert " disabled" not in "".join(re.findall(r"<button [^>]*data-do[^>]*>", shown))
+
+
+def test_what_alarms_again_and_again_takes_one_line_with_the_seconds_of_each(
+    tmp_path: Path,
+) -> None:
+    often = tuple(
+        Alarm("overload", f"{k} ticks", NOW - 60 * k, NOW - 60 * k + 5, "loop", f"seconds {k}")
+        for k in range(1, 31)
+    )
+    silent = Alarm("message_silent", "no Pressures", NOW - 1, None)
+    write(tmp_path, replace(status(), alarms=(silent, *often)))
+    health = Live(tmp_path, lambda: NOW).fragments()["live_health"]
+    oldest = time.strftime("%H:%M:%S", time.localtime(NOW - 1800))
+    assert health.count("<b>overload</b>") == 1 and f"30 times since {oldest}" in health
+    assert "<b>message_silent</b>" in health and 'data-name="seconds 2"' in health
