@@ -28,6 +28,8 @@ def softened(model: Machine, chunk: FloatArray, weights: Weights, revision: Revi
     """
     view = RecordView.without_map(model, chunk, weights.compliance)
     more = np.zeros((view.n, len(model.chambers)))
+    if not (model.measured or revision.sizes):
+        return more
     if model.measured:
         return more + behind_softness(model, behind_s(revision.timings), view.step_s)
     softness = total_softness(view, revision.sizes)

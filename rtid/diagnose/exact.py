@@ -111,7 +111,7 @@ def opens_at(view: RecordView) -> float:
     """
     at = []
     for i, edge in enumerate(view.model.edges):
-        w, s = view.along[:, i, 0], root(pressure_drop(view.model, edge, view.chunk[:, 2:]))
+        w, s = view.opening(i), root(pressure_drop(view.model, edge, view.chunk[:, 2:]))
         s = 0.5 * (s[1:] + s[:-1])
         here = view.inside & (w > 0.0) & (np.abs(s) > LEAST_ROOT)
         if np.count_nonzero(here) > BINS**2:

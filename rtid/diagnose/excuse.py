@@ -54,12 +54,13 @@ def _excused(present: Fit, most: float, rest: Misfit | None = None) -> Fit:
     """A fit without the say of blocks that miss the flow, where they are at most such a share."""
     if present.weights.missed.any() or not can_be_explained(present.sent):
         return present
-    rest = rest or left_over(present)
+    rest = rest or left_over(present.unfactored())
     missing = misses(present.model, rest)
     if not 0.0 < missing.share <= most:
         return present
     weights = excusing(present.model, present.sent, present.weights, rest, missing.hot)
-    return fit(present.declared, present.chunk, weights, present.revision, present, bank=False)
+    start = present.unfactored()
+    return fit(present.declared, present.chunk, weights, present.revision, start, bank=False)
 
 
 def left_over(present: Fit) -> Misfit:

@@ -44,12 +44,12 @@ def fine_enough(present: Fit) -> tuple[Fit, Misfit | None]:
     """
     if not can_be_explained(present.sent):
         return present, None
-    rest = left_over(present)
-    finest = _finest(present, rest)
-    if finest is present:
+    declared = present.declared
+    present, rest = _finest(present, left_over(present))  # the first one's rows are large
+    if present.declared is declared:
         return present, rest
-    record = finest.declared, finest.chunk, finest.weights, finest.revision
-    return fit(*record, finest, bank=False), None
+    record = present.declared, present.chunk, present.weights, present.revision
+    return fit(*record, present, bank=False), None
 
 
 def halved_throughout(present: Fit) -> Fit:
@@ -76,8 +76,8 @@ def halved_throughout(present: Fit) -> Fit:
     return present
 
 
-def _finest(present: Fit, rest: Misfit) -> Fit:
-    """A pass on the finest grid that is worth it; rest: what the present one leaves."""
+def _finest(present: Fit, rest: Misfit) -> tuple[Fit, Misfit]:
+    """A pass on the finest grid that is worth it, and what it leaves; rest: the present one's."""
     clearly = CLEARLY
     for _ in range(ROUNDS):
         machine = halved(present.declared, rest, clearly)
@@ -90,7 +90,7 @@ def _finest(present: Fit, rest: Misfit) -> Fit:
             break
         else:
             clearly = HARDLY
-    return present
+    return present, rest
 
 
 def on_grids(model: Machine, grids: Iterable[Grid], hysteresis: float) -> Machine:
@@ -108,7 +108,8 @@ def _better(present: Fit, rest: Misfit, machine: Machine) -> tuple[Fit, Misfit] 
     trial = _on_grid(present, machine)
     if not _is_worth(present, trial):
         return None
-    after, here = left_over(trial), in_halved(present.declared, machine, rest)
+    after = left_over(trial.unfactored())  # the next finer grid lets go of it anyway
+    here = in_halved(present.declared, machine, rest)
     gone = _beyond(after, here) < LEFT * _beyond(rest, here)
     return (trial, after) if gone else None
 
@@ -127,10 +128,10 @@ def _about_a_jump(present: Fit, rest: Misfit) -> tuple[Fit, Misfit] | None:
 
 def _on_grid(present: Fit, machine: Machine) -> Fit:
     """A pass of the present revision on the grid of another machine."""
-    known, weights = present.weights, prepare(machine, present.chunk)
+    known, weights = present.unfactored().weights, prepare(machine, present.chunk)
     weights = replace(weights, lag_s=known.lag_s, compliance=known.compliance)
     record = machine, present.chunk, weights, present.revision
-    return one_pass(*record, None, bank=False, thorough=False)
+    return one_pass(*record, None, bank=False, thorough=False, sent=present.sent)
 
 
 def _beyond(rest: Misfit, here: BoolArray) -> float:

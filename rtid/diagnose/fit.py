@@ -161,6 +161,12 @@ class Fit:
         """The same without the rows, and without what can be made again."""
         return replace(self, rows=None)
 
+    def unfactored(self) -> Fit:
+        """The same, the factor of its rows let go: one with other rows is made beside it."""
+        if self.rows is not None:
+            self.rows.forget()
+        return self
+
     def column(self, candidate: Candidate) -> int:
         """Column of a candidate."""
         return self.first + self.columns.candidates.index(candidate)
@@ -202,7 +208,8 @@ def fit(
     for _ in range(PASSES):
         if step is None or halvings > HALVINGS:
             break
-        fitted = one_pass(model, chunk, step.weights, step.revision, best, False, thorough=False)
+        start = best.unfactored()
+        fitted = one_pass(model, chunk, step.weights, step.revision, start, False, thorough=False)
         if is_worse(fitted, best):
             step, halvings = halfway(best, step), halvings + 1
         else:
@@ -225,16 +232,18 @@ def one_pass(
     thorough: bool = True,
     before: MapTerms | None = None,
     suspects: tuple[Effect, ...] = (),
+    sent: FloatArray | None = None,
 ) -> Fit:
     """Fit with the timing parameters where they are; more: causes to add with other shapes.
 
     chunk (n, 2 + signals), SI: the record as declared.  start: the fit whose map gives the
-    columns, or `before`, the map alone.  thorough = False: without the covariances of the maps,
+    columns, or `before`, the map alone; sent: the record as it reaches the spools, where known.
+    thorough = False: without the covariances of the maps,
     and with them what the priors leave of their freedom.
     """
     if revision.replaces_lag:
         weights = replace(weights, lag_s=0.0)
-    declared, sent = model, _sent(start, model, chunk, revision)
+    declared, sent = model, _sent(start, model, chunk, revision) if sent is None else sent
     model = split(declared)
     soft = softened(model, sent, weights, revision)
     known = _same_rows(start, sent, weights, soft)
@@ -264,7 +273,9 @@ def one_pass(
     is_same = start is not None and known is not None and start.revision == revision
     rest = start.rest if start is not None and is_same and not revision.effects else None
     fitted = Fit(declared, *parts, flowmap, first, shapes, rows, suspects, rest)
-    vars(fitted).update(model=model, sent=sent, view=view)  # what is made when it is missing
+    vars(fitted).update(model=model, sent=sent)  # what is made when it is missing
+    if bank or revision.effects:  # nobody else asks for what the map says along the record
+        vars(fitted).update(view=view)
     return with_covariances(fitted) if thorough else fitted
 
 

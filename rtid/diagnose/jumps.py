@@ -97,7 +97,7 @@ def _column(present: Fit, rest: Misfit, step: Jump) -> Volumes:
     model, view = present.model, present.view
     flows = []
     for i, edge in enumerate(model.edges):
-        opening = view.along[:, i, 0]
+        opening = view.opening(i)
         moves = np.maximum(np.abs(np.gradient(opening)), 1e-9)
         beyond = np.clip((opening - step.w_v) / moves + 0.5, 0.0, 1.0)
         place = (rest.cells[:, i] - model.first_cells[i]) // edge.grid.shape[1]

@@ -23,6 +23,8 @@ TURNS = 0.05  # share of changes that reverse the one before: 2/3 for noise, nex
 UNKNOWN = 10.0  # standard deviation of the flow in a block that was never visited, rated flows
 NONE = np.zeros(0)
 SMOOTH_S = 0.02  # half width of the window for derivatives of pressures, without delay
+AT_ONCE = 1 << 14  # intervals that are followed in one go
+OPENING, FLOW, SLOPE_U, SLOPE_DP, FLOW_SD = range(5)  # what `follow_map` tells of each
 
 
 def has_noise(values: FloatArray) -> bool:
@@ -59,18 +61,24 @@ class MapTerms:
 
 
 @dataclass(frozen=True)
-class RecordView:
-    """chunk (n, 2 + signals); compliance (chambers,) 1/Pa; along as from `follow_map`, 0 for NaN.
+class Beside:
+    """What a record is followed with: weights of the rows, and the map along which it runs."""
 
-    inside (n - 1,): every open edge is on its grid, and the record has no gap.  taught: the record
-    that the map is of, where this is another one.
+    weights: Weights
+    map: MapTerms
+
+
+@dataclass(frozen=True)
+class RecordView:
+    """chunk (n, 2 + signals); compliance (chambers,) 1/Pa; beside: what it is followed with.
+
+    taught: the record that the map is of, where this is another one.
     """
 
     model: Machine
     chunk: FloatArray
     compliance: FloatArray
-    along: FloatArray
-    inside: BoolArray
+    beside: Beside | None = None
     taught: RecordView | None = None
 
     @classmethod
@@ -83,29 +91,14 @@ class RecordView:
         taught: RecordView | None = None,
     ) -> RecordView:
         """The record beside a fitted map; chunk (n, 2 + signals), SI."""
-        rated = np.repeat(
-            [e.rated_q_m3s for e in model.maps],
-            [e.grid.shape[0] * e.grid.shape[1] for e in model.maps],
-        )
-        theta, cov = np.zeros((model.n_cells, TERMS)), np.zeros((0, TERMS, TERMS))
-        theta[flowmap.cells] = flowmap.terms * rated[flowmap.cells, None]
-        if len(flowmap.cov):
-            cov = np.eye(TERMS) * (UNKNOWN * rated[:, None, None]) ** 2
-            cov[flowmap.cells] = flowmap.cov * rated[flowmap.cells, None, None] ** 2
-        state = build(model, weights)
-        along = np.empty((5, len(model.edges), len(chunk) - 1)).transpose(2, 1, 0)
-        cell = np.empty(along.shape[:2], np.int64)
-        follow_map(state.engine, state.cells, theta, cov, chunk, along, cell)
-        inside = np.isfinite(along[:, 0, 0])
-        along[~inside] = 0.0
-        return cls(model, chunk, weights.compliance, along, inside, taught)
+        return cls(model, chunk, weights.compliance, Beside(weights, flowmap), taught)
 
     @classmethod
     def without_map(
         cls, model: Machine, chunk: FloatArray, compliance: FloatArray = NONE
     ) -> RecordView:
         """The record's signals and volumes alone; chunk (n, 2 + signals), compliance 1/Pa."""
-        return cls(model, chunk, compliance, np.zeros((0, 0, 5)), np.zeros(0, bool))
+        return cls(model, chunk, compliance)
 
     @property
     def n(self) -> int:
@@ -189,20 +182,64 @@ class RecordView:
 
     def flow(self, i: int) -> FloatArray:
         """Flow of edge i by the fitted map (n - 1,), m3/s."""
-        return np.asarray(self.along[:, i, 1])
+        return self._along(FLOW)[i]
 
     def slope_u(self, i: int) -> FloatArray:
         """dQ/dw of edge i (n - 1,), m3/s/V."""
-        return np.asarray(self.along[:, i, 2])
+        return self._along(SLOPE_U)[i]
 
     def slope_dp(self, i: int) -> FloatArray:
         """dQ/ddp of edge i (n - 1,), m3/s/Pa."""
-        return np.asarray(self.along[:, i, 3])
+        return self._along(SLOPE_DP)[i]
+
+    def opening(self, i: int) -> FloatArray:
+        """Mean command at the spool of edge i over the intervals (n - 1,), V."""
+        return self._along(OPENING)[i]
 
     def flow_sd(self) -> FloatArray:
         """Largest standard deviation of open edges (n - 1,), as a share of the rated flow."""
         rated = np.array([edge.rated_q_m3s for edge in self.model.edges])
-        return np.asarray((self.along[:, :, 4] / rated).max(axis=1))
+        return np.asarray((self._followed((FLOW_SD,))[FLOW_SD] / rated[:, None]).max(axis=0))
+
+    @cached_property
+    def inside(self) -> BoolArray:
+        """Intervals (n - 1,) without a gap in which every open edge is on its grid."""
+        self._along(SLOPE_U)  # every pass tells it
+        return self.inside
+
+    def _along(self, what: int) -> FloatArray:
+        """What the map says along the record (edges, n - 1), and what is asked for beside it."""
+        if what not in self._said:
+            group = (FLOW, SLOPE_DP) if what in (FLOW, SLOPE_DP) else (what,)
+            self._said.update(self._followed(group))
+        return self._said[what]
+
+    @cached_property
+    def _said(self) -> dict[int, FloatArray]:
+        """What was asked for of what the map says."""
+        return {}
+
+    def _followed(self, asked: tuple[int, ...]) -> dict[int, FloatArray]:
+        """What the map says along the record, each (edges, n - 1), 0 where it says nothing.
+
+        Block by block: all of it at once takes several times the memory of the record.
+        """
+        assert self.beside is not None  # a record without a map has nothing to be followed
+        model, n = self.model, len(self.chunk)
+        n_edges, state = len(model.edges), build(model, self.beside.weights)
+        theta, cov = _of_all_cells(model, self.beside.map, FLOW_SD in asked)
+        out = {k: np.zeros((n_edges, n)) for k in asked}
+        inside, room = np.zeros(n, bool), np.empty((5, n_edges, AT_ONCE)).transpose(2, 1, 0)
+        cell = np.empty(room.shape[:2], np.int64)
+        for first in range(0, n, AT_ONCE):
+            part = room[: n - first]
+            here = slice(first, first + len(part))
+            follow_map(state.engine, state.cells, theta, cov, self.chunk, first, part, cell)
+            inside[here] = np.isfinite(part[:, 0, 0])
+            for k, series in out.items():
+                np.copyto(series[:, here], part[:, :, k].T, where=inside[here])
+        vars(self)["inside"] = inside[1:]
+        return {k: series[:, 1:] for k, series in out.items()}
 
     def smooth(self, values: FloatArray, derivative: int = 0) -> FloatArray:
         """Values (n,) without most of their noise and delay, or their rate; any unit."""
@@ -229,3 +266,19 @@ class RecordView:
         """True where the pressure of every chamber that has one is measured."""
         kinds = {s.name: s.kind for s in self.model.signals} | {"": PRESSURE}
         return all(kinds.get(c.pressure) == PRESSURE for c in self.model.chambers)
+
+
+def _of_all_cells(
+    model: Machine, flowmap: MapTerms, has_cov: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Terms (cells, 6), m3/s, and their covariance (cells, 6, 6), or (0, 6, 6), of all blocks."""
+    rated = np.repeat(
+        [e.rated_q_m3s for e in model.maps],
+        [e.grid.shape[0] * e.grid.shape[1] for e in model.maps],
+    )
+    theta, cov = np.zeros((model.n_cells, TERMS)), np.zeros((0, TERMS, TERMS))
+    theta[flowmap.cells] = flowmap.terms * rated[flowmap.cells, None]
+    if has_cov and len(flowmap.cov):
+        cov = np.eye(TERMS) * (UNKNOWN * rated[:, None, None]) ** 2
+        cov[flowmap.cells] = flowmap.cov * rated[flowmap.cells, None, None] ** 2
+    return theta, cov

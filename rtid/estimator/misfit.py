@@ -135,8 +135,12 @@ def _residual(
 
 def _of_chamber(model: Machine, cells: Cells, chamber: int) -> Cells:
     """One number per row: which blocks the edges of a chamber are in."""
-    edges = [i for i, e in enumerate(model.edges) if e.sign(model.chambers[chamber]) != 0]
-    return np.unique(cells[:, edges], axis=0, return_inverse=True)[1].reshape(-1)
+    place = np.zeros(len(cells), np.int64)
+    for i, edge in enumerate(model.edges):
+        if edge.sign(model.chambers[chamber]) != 0:
+            place = place * (model.n_cells + 1) + cells[:, i] + 1
+            place = np.unique(place, return_inverse=True)[1]  # small again, in the same order
+    return place
 
 
 def _crossed(scores: FloatArray, clusters: list[Cells]) -> FloatArray:

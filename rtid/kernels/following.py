@@ -22,27 +22,29 @@ def follow_map(
     theta: FloatArray,
     cov: FloatArray,
     chunk: FloatArray,
+    first: int,
     along: FloatArray,
     cell: IntArray,
 ) -> None:
-    """Means over each interval of what a map says along a record; outputs changed in place.
+    """Means over intervals of what a map says along a record; outputs changed in place.
 
-    engine (1,), cells: a freshly built state; theta (cells, 6) m3/s, cov (cells, 6, 6) its
-    covariance, or empty.  along (n - 1, edges, 5): opening command w in V, Q in m3/s, dQ/dw in
-    m3/s/V, dQ/ddp in m3/s/Pa, standard deviation of Q; all but w are 0 where shut, all NaN where
-    the record has a gap or the point is off the grid.  cell (n - 1, edges): grid cell or -1.
+    engine (1,), cells: a freshly built state, or as the samples before the first left it; theta
+    (cells, 6) m3/s, cov (cells, 6, 6) its covariance, or empty.  along (m, edges, 5), of the
+    intervals that end with sample `first` and the m - 1 next ones, NaN for the one before sample 0:
+    opening command w in V, Q in m3/s, dQ/dw in m3/s/V, dQ/ddp in m3/s/Pa, standard deviation of Q;
+    all but w are 0 where shut, all NaN where the record has a gap or the point is off the grid.
+    cell (m, edges): grid cell or -1.
     """
     e = engine[0]
-    for k in range(len(chunk)):
+    for k in range(first, first + len(along)):
         whole, joined, _ = take(e, chunk, k)
         sample, flags = e.sample, int(e.sample[1])
         if joined:
-            _map_at(e, theta, cov, along[k - 1], cell[k - 1])
+            _map_at(e, theta, cov, along[k - first], cell[k - first])
             remember(e, sample)
             continue
-        if k > 0:
-            along[k - 1] = np.nan
-            cell[k - 1] = SHUT
+        along[k - first] = np.nan
+        cell[k - first] = SHUT
         e.running = 0
         if whole and (flags & ROW_FLAG) != 0:
             begin(e, sample)

@@ -196,11 +196,11 @@ def test_the_map_is_followed_with_its_slopes() -> None:
 
     def flows(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         state = build(model)
-        along = np.empty((len(samples) - 1, len(model.edges), 5))
+        along = np.empty((len(samples), len(model.edges), 5))
         cell = np.empty(along.shape[:2], np.int64)
         cov = np.zeros((model.n_cells, TERMS, TERMS))
-        follow_map(state.engine, state.cells, theta, cov, samples, along, cell)
-        return along, cell
+        follow_map(state.engine, state.cells, theta, cov, samples, 0, along, cell)
+        return along[1:], cell[1:]
 
     along, cell = flows(chunk)
     shifted = chunk.copy()

@@ -26,7 +26,7 @@ OFTEN = 0.05  # share of the samples that a command rests at an end of its range
 def gain_drift(view: RecordView, effect: Effect) -> Iterator[Cause]:
     """What a drift of a share per second adds, beside a rate that is measured itself."""
     model = view.model
-    if model.measured and len(view.along):
+    if model.measured and view.beside is not None:
 
         def column(_: Shape) -> Volumes:
             seen_s = (view.taught or view).t_s

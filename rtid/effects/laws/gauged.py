@@ -49,7 +49,7 @@ def _into(view: RecordView, c: int) -> tuple[FloatArray, FloatArray]:
     for i, edge in enumerate(view.model.edges):
         if sign := edge.sign(view.model.chambers[c]):
             gauge, (drop, size) = _gauge(view.taught or view, i), _drop(view, i)
-            through = gauge.at(view.along[:, i, 0]) * size**gauge.alpha
+            through = gauge.at(view.opening(i)) * size**gauge.alpha
             through *= np.minimum(1.0, np.abs(drop) / size)
             flow += sign * np.sign(drop) * through
             slope += gauge.alpha * through / size
@@ -73,7 +73,7 @@ def _gauge(view: RecordView, i: int) -> Gauge:
 
 
 def _measured(view: RecordView, i: int) -> Gauge:
-    w, (drop, size), alpha = view.along[:, i, 0], _drop(view, i), ORIFICE
+    w, (drop, size), alpha = view.opening(i), _drop(view, i), ORIFICE
     open_ = view.inside & (w > 0.0) & (np.abs(drop) > LEAST_PA)
     w, size, forward = w[open_], size[open_], (view.flow(i) * np.sign(drop))[open_]
     bins = _Bins.of(w)
