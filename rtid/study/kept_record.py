@@ -25,7 +25,7 @@ from rtid.plain import FloatArray, Progress
 from rtid.project import Project
 from rtid.trace.learner import Learner, catalog_of, listen, virtual_bus
 from rtid.trace.measured import with_sums
-from rtid.trace.reading import NoSamplesError, Trace, assemble
+from rtid.trace.reading import AT_ONCE, NoSamplesError, Trace, assemble
 
 if TYPE_CHECKING:
     from rtid.study.known_effects import KnownEffect
@@ -74,12 +74,13 @@ class MessageAges:
 
 def as_on_board(project: Project, model: Machine, trace: Trace) -> Estimator:
     """The estimate from the frames, through the gates of the daemon; a table has passed its own."""
-    if trace.frames is None:
+    if trace.log is None:
         live = Estimator(model)
         live.update(trace.samples)
         return live
     learner = Learner(model, catalog_of(project), project.assembly, project.flows)
-    learner.push(trace.frames)
+    for part in trace.log.read().chunks(AT_ONCE):
+        learner.push(part)
     learner.finish()
     return learner.estimator
 
@@ -88,11 +89,11 @@ def through_bus(
     project: Project, model: Machine, trace: Trace, speed: float, progress: Progress
 ) -> Estimator:
     """The estimate from the same frames, sent over a virtual bus."""
-    if trace.frames is None:
+    if trace.log is None:
         raise RtidError(f"{trace.path}: a table has no frames for a bus", "give a CAN log", 2)
     learner = Learner(model, catalog_of(project), project.assembly, project.flows)
-    n = max(1, len(trace.frames))
-    with virtual_bus(trace.frames, speed) as (source, is_over):
+    n = max(1, len(trace.log))
+    with virtual_bus(trace.log.read(), speed) as (source, is_over):
         for state in listen(source, learner, is_over):
             progress("learning from the bus", 0.2 + 0.3 * state.frames / n)
     return learner.estimator
@@ -121,9 +122,9 @@ def _white_noise(samples: Samples, signal: Signal) -> float:
 def aged(project: Project, model: Machine, trace: Trace) -> tuple[Trace, MessageAges]:
     """The trace at the message ages that it shows, where nobody has declared them."""
     tolerance, nothing = project.offset_tolerance_s, np.zeros(0)
-    if not tolerance or trace.frames is None:
+    if not tolerance or trace.log is None:
         return trace, MessageAges(nothing, nothing)
-    catalog, frames = catalog_of(project), trace.frames
+    catalog, frames = catalog_of(project), trace.log.read()
     span_s = taught_s(project)
 
     def shifted(offsets_s: FloatArray) -> Samples:
@@ -144,8 +145,8 @@ def aged(project: Project, model: Machine, trace: Trace) -> tuple[Trace, Message
 
 
 def within(chunk: FloatArray, span_s: tuple[float, float]) -> FloatArray:
-    """Rows of a chunk (n, 2 + signals), SI, with span_s[0] <= t < span_s[1]."""
-    return chunk[(chunk[:, 0] >= span_s[0]) & (chunk[:, 0] < span_s[1])]
+    """Rows of a chunk (n, 2 + signals), SI, with span_s[0] <= t < span_s[1]: a view of it."""
+    return chunk[slice(*np.searchsorted(chunk[:, 0], span_s))]
 
 
 def taught_s(project: Project) -> tuple[float, float]:

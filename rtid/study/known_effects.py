@@ -32,7 +32,6 @@ from rtid.effects.record_view import MapTerms as KnownMap
 from rtid.effects.record_view import RecordView
 from rtid.effects.terms import terms_of
 from rtid.errors import RtidError
-from rtid.estimator.estimator import to_chunk
 from rtid.estimator.factor import SHARED_PRIOR, factor_of, one_thread
 from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.limits import refuse_unfit
@@ -164,8 +163,9 @@ def learn_beside(fit: Fit, machine: Acting, chunk: FloatArray) -> RecordFit:
     """
     model, weights = machine.model, fit.weights
     state = run(model, chunk, weights)
-    shared = told(Sums.of(state), *_told(fit, machine))
-    solution = solve(model, shared, counters=state.counters)
+    counters, sums = state.counters, Sums.ended(state)
+    del state  # its tables are large
+    solution = solve(model, told(sums, *_told(fit, machine)), counters=counters)
     solution = count_misfit(model, chunk, weights, solution)
     lag_sd_s = 0.0
     if not fit.revision.replaces_lag and model.lag.tolerance_s > 0:
@@ -198,8 +198,8 @@ def replayed(
     sensors.
     """
     fit = steady(present)
-    whole = to_chunk(machine, trace.samples, int(trace.samples.t_us[0]))
-    acts, record = learn_acting(fit, usable(fit.declared, whole), taught_s(project))
+    whole = usable(fit.declared, trace.chunk(machine))
+    acts, record = learn_acting(fit, whole, taught_s(project))
     record = _judged(present, record)
     added = known_effects(present, acts, [section.key for section in project.sections.parts])
     record = replace(record, offsets_s=ages.offsets_s, offsets_sd_s=ages.sd_s)
@@ -233,8 +233,7 @@ def held_against(
 
     fine: the machine on the grids of the fit; fit: the steady one, None where it has no effects.
     """
-    whole = to_chunk(machine, trace.samples, int(trace.samples.t_us[0]))
-    chunk = usable(fine, whole)
+    chunk = usable(fine, trace.chunk(machine))
     acts = acting(fit, chunk) if fit is not None else Acting(fine, chunk, (), ())
     if fit is not None and acts.measured:  # on flows that the map knows where the fit has none
         acts = acting(fit, chunk, publish(record.solution))

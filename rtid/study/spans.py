@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from rtid.diagnose.parts import AddedEffect
 from rtid.effects import catalogue
-from rtid.estimator.estimator import to_chunk
 from rtid.model import Machine
 from rtid.plain import FloatArray
 from rtid.project import Project
@@ -50,7 +49,7 @@ def parts(project: Project, model: Machine, trace: Trace) -> tuple[FloatArray, F
 
 def _whole(model: Machine, trace: Trace) -> tuple[FloatArray, float]:
     """All samples, and when the last quarter begins, of the motion where the machine rests then."""
-    chunk = to_chunk(model, trace.samples, int(trace.samples.t_us[0]))
+    chunk = trace.chunk(model)
     x = chunk[:, 2 + model.column(model.position)]
     return chunk, last_part_from(chunk[:, 0], x, HELD_OUT_SHARE)
 

@@ -76,7 +76,7 @@ class LearnedStory:
                 "schema": SCHEMA,
                 "trace": str(trace.path),
                 "duration_s": trace.duration_s,
-                "frames": None if trace.frames is None else len(trace.frames),
+                "frames": None if trace.log is None else len(trace.log),
                 "samples": len(trace.samples),
                 "refused": trace.counters,
                 "gates": self.result.live.counters,
@@ -139,7 +139,7 @@ class LearnedStory:
     def _trace(self) -> Iterator[str]:
         trace, counters = self.result.trace, self.result.live.counters
         rate = (len(trace.samples) - 1) / max(trace.duration_s, 1e-9)
-        frames = "" if trace.frames is None else f"{len(trace.frames):,} frames, "
+        frames = "" if trace.log is None else f"{len(trace.log):,} frames, "
         yield (
             f"{trace.path.name}: {trace.duration_s:.1f} s, {frames}"
             f"{len(trace.samples):,} samples ({rate:.0f} per second)"

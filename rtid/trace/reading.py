@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -13,33 +14,68 @@ from firmware_bridge.config import Assembly
 from firmware_bridge.frames import Frames
 from firmware_bridge.j1939 import Network, known_as
 from firmware_bridge.samples import Samples, join
-from firmware_bridge.sources import open_file
+from firmware_bridge.sources import open_file, open_log
 from firmware_bridge.sources.table import Table, to_samples
 from rtid.errors import RtidError, door
+from rtid.estimator.estimator import to_chunk
+from rtid.model import Machine
+from rtid.plain import FloatArray
 from rtid.project import Project
 from rtid.trace.learner import catalog_of
 from rtid.trace.measured import with_sums
 from rtid.trace.neutral import about_neutral
 from rtid.trace.table import declared
 
+AT_ONCE = 1 << 17  # frames that are assembled in one go: each may become a sample
+KEPT = 1 << 19  # frames that are few, 12 MB
+
 
 class NoSamplesError(RtidError):
     """The trace holds nothing that the project can use; the text says what it does hold."""
 
 
+class Log:
+    """The frames of a log: kept where they are few, and read again where they are many."""
+
+    def __init__(self, path: Path, frames: Frames) -> None:
+        self._path, self._count = path, len(frames)
+        self._kept = frames if len(frames) <= KEPT else None
+
+    def __len__(self) -> int:
+        return self._count
+
+    def read(self) -> Frames:
+        """All of them, in order of arrival; raises LogError where the file is there no longer."""
+        return open_log(self._path) if self._kept is None else self._kept
+
+
 @dataclass(frozen=True)
 class Trace:
-    """What a trace yields: complete samples, refusals by reason, and the frames (None: a table)."""
+    """What a trace yields: complete samples, refusals by reason, and its log (None: a table)."""
 
     path: Path
     samples: Samples
     counters: dict[str, int]
-    frames: Frames | None
+    log: Log | None
 
     @property
     def duration_s(self) -> float:
         """From the first to the last sample."""
         return float(self.samples.t_us[-1] - self.samples.t_us[0]) * 1e-6
+
+    def chunk(self, model: Machine) -> FloatArray:
+        """All samples as the kernels take them (n, 2 + signals), SI; made once, not to be changed.
+
+        [s since the first sample, flags, signals of the model].
+        """
+        names = tuple(signal.name for signal in model.signals)
+        if names not in self._chunks:
+            self._chunks[names] = to_chunk(model, self.samples, int(self.samples.t_us[0]))
+        return self._chunks[names]
+
+    @cached_property
+    def _chunks(self) -> dict[tuple[str, ...], FloatArray]:
+        return {}
 
 
 @door
@@ -53,7 +89,21 @@ def read_trace(project: Project, path: str | Path) -> Trace:
         return _not_empty(Trace(path, samples, counters, None), project)
     samples, counters = assemble(catalog_of(project), project.assembly, content)
     samples = with_sums(project, samples)
-    return _not_empty(Trace(path, samples, counters, content), project)
+    trace = _not_empty(Trace(path, samples, counters, Log(path, content)), project)
+    return _within_chunk(trace, project.model)
+
+
+def _within_chunk(trace: Trace, model: Machine) -> Trace:
+    """The trace with the values of its samples where the kernels take them: nothing is kept twice.
+
+    As it is where the model has other signals, or in another order.
+    """
+    if tuple(signal.name for signal in model.signals) != trace.samples.names:
+        return trace
+    chunk = trace.chunk(model)
+    made = replace(trace, samples=replace(trace.samples, values=chunk[:, 2:]))
+    vars(made)["_chunks"] = {trace.samples.names: chunk}
+    return made
 
 
 def assemble(
@@ -63,7 +113,7 @@ def assemble(
     assembler = Assembler(catalog, assembly)
     matched = Network(catalog, assembly.messages).push(frames)
     _refuse_mixed(matched, catalog, assembly)
-    parts = [assembler.push(matched), assembler.finish()]
+    parts = [*(assembler.push(part) for part in matched.chunks(AT_ONCE)), assembler.finish()]
     return join(parts), assembler.counters
 
 
@@ -85,14 +135,14 @@ def _not_empty(trace: Trace, project: Project) -> Trace:
     if len(trace.samples):
         return trace
     wanted = ", ".join(m.name for m in project.assembly.messages)
-    if trace.frames is None:
+    if trace.log is None:
         raise NoSamplesError(f"{trace.path}: the table has no complete row")
-    ids, counts = np.unique(trace.frames.can_id & 0x7FFFFFFF, return_counts=True)
+    ids, counts = np.unique(trace.log.read().can_id & 0x7FFFFFFF, return_counts=True)
     common = ", ".join(f"0x{i:X} ({n})" for n, i in sorted(zip(counts, ids, strict=True))[:-6:-1])
     refused = ", ".join(f"{reason} {n}" for reason, n in trace.counters.items()) or "nothing"
     described = ", ".join(str(place.file) for place in project.databases)
     raise NoSamplesError(
-        f"{trace.path}: no complete sample in {len(trace.frames)} frames. "
+        f"{trace.path}: no complete sample in {len(trace.log)} frames. "
         f"Wanted: {wanted}. Refused: {refused}. Most frequent ids: {common or 'none'}",
         f"does {described} describe this bus? `rtid check` shows what the trace holds",
     )
