@@ -173,3 +173,27 @@ def test_no_test_can_send_on_a_real_bus(no_real_bus: list[str]) -> None:
     assert bus.reached_the_wire == 0
     assert len(no_real_bus) == 1
     no_real_bus.clear()
+
+
+FREED = """
+import numpy as np
+from rtid.cli.main import return_large_memory
+
+def anonymous_mb():
+    with open("/proc/self/status") as status:
+        return next(int(line.split()[1]) for line in status if line.startswith("RssAnon")) / 1024
+
+return_large_memory()
+del_first = np.ones(3_000_000)
+del del_first  # glibc would keep the next one of this size
+large, stays = np.ones(3_000_000), np.ones(12_000)
+before = anonymous_mb()
+del large
+print(before - anonymous_mb())
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="of the C library of Linux")
+def test_freed_memory_goes_back_to_the_system() -> None:
+    done = subprocess.run([sys.executable, "-c", FREED], capture_output=True, text=True, check=True)
+    assert float(done.stdout) > 20.0
