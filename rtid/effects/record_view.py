@@ -61,7 +61,7 @@ class MapTerms:
 
 
 @dataclass(frozen=True)
-class Beside:
+class WithMap:
     """What a record is followed with: weights of the rows, and the map along which it runs."""
 
     weights: Weights
@@ -78,7 +78,7 @@ class RecordView:
     model: Machine
     chunk: FloatArray
     compliance: FloatArray
-    beside: Beside | None = None
+    beside: WithMap | None = None
     taught: RecordView | None = None
 
     @classmethod
@@ -91,7 +91,7 @@ class RecordView:
         taught: RecordView | None = None,
     ) -> RecordView:
         """The record beside a fitted map; chunk (n, 2 + signals), SI."""
-        return cls(model, chunk, weights.compliance, Beside(weights, flowmap), taught)
+        return cls(model, chunk, weights.compliance, WithMap(weights, flowmap), taught)
 
     @classmethod
     def without_map(

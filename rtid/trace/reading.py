@@ -59,6 +59,11 @@ class Trace:
     log: Log | None
 
     @property
+    def frames(self) -> Frames | None:
+        """All frames of a log; None for a table."""
+        return None if self.log is None else self.log.read()
+
+    @property
     def duration_s(self) -> float:
         """From the first to the last sample."""
         return float(self.samples.t_us[-1] - self.samples.t_us[0]) * 1e-6
