@@ -25,6 +25,7 @@ from rtid.effects.laws import causes
 from rtid.estimator.estimator import to_chunk
 from rtid.estimator.flowmap import EXTRAPOLATED, VALID, EdgeMap
 from rtid.estimator.published import publish
+from rtid.estimator.solution import Solution
 from rtid.model import Edge, Grid, Lag, Machine
 from rtid.plain import FloatArray, Key
 from rtid.project.template import U_STEPS, nice
@@ -34,7 +35,7 @@ from rtid.sim.hidden import hide
 from rtid.sim.random_plants import draw, draw_hidden
 from rtid.sim.run import Run, Sensors, SimulationError, simulate
 from rtid.sim.simulated_plant import EDGES, SimulatedPlant
-from rtid.study.known_effects import acting, learn_beside
+from rtid.study.known_effects import learn_acting
 from tests.campaign import diagnoses
 from tests.campaign.diagnoses import judge, truth
 
@@ -180,13 +181,6 @@ class Judged:
     said: Diagnosis
     last: Fit
 
-    @property
-    def beta_sd_pa(self) -> FloatArray:
-        """Of the moduli that are told, (chambers,)."""
-        words = steady(self.last)
-        beta = 1.0 / words.compliance
-        return np.asarray(np.sqrt(np.diag(words.compliance_cov)) * beta**2)
-
 
 def outcomes(cases: Iterable[Case]) -> Iterator[Outcome]:
     """Outcomes of all machines that could be simulated, on WORKERS processes."""
@@ -241,13 +235,19 @@ def answer(case: Case) -> Answer | None:
         (size,) = first.parameters.values()
         z, half = (abs(size.value) - abs(true)) / size.std, 1.96 * size.std / abs(true)
     is_hidden = first is not None and first.hidden_in_map is not None
-    beta, true = np.array(said.beta_pa), case.plant.constants.beta_pa
-    sd = found.beta_sd_pa
+    true, solution = case.plant.constants.beta_pa, told(found.last)
+    beta, sd = solution.beta_pa, solution.beta_sd_pa
     left = said.heldout_residual_after_m3s / said.noise_floor_m3s
     return Answer(
         case, judgement, said.verdict, first.effect if first else "", is_hidden, z, half,
         (beta - true) / sd, 1.96 * sd / true, left, time.process_time() - began,
     )  # fmt: skip
+
+
+def told(fit: Fit) -> Solution:
+    """The maps and moduli of a fit, with the intervals that replay tells."""
+    words = steady(fit)
+    return learn_acting(words, words.chunk)[1].solution
 
 
 def _taught(case: Case) -> float:
@@ -283,9 +283,7 @@ def outcome_of(case: Hiding, judgement: Judged, began: float) -> Outcome:
     """What was said beside the truth; began: the processor time at the start, s."""
     plant, run, present = judgement.plant, judgement.run, judgement.present
     said = judgement.said
-    words = steady(present)
-    acts = acting(words, words.chunk)
-    solution = learn_beside(words, acts, acts.chunk).solution
+    solution = told(present)
     flowmap, n = publish(solution), len(judgement.taught)
     pairs = zip(solution.model.edges, flowmap.edges, strict=True)
     of = [_points(edge, learned, plant, run, n) for edge, learned in pairs]
