@@ -60,11 +60,11 @@ def halved_throughout(present: Fit) -> Fit:
     an alarm at rho 1.11 and 1.13 it fell by 10 standard deviations more, and 0.3 of the misfit were
     left.  Of weak effects 0.5 and more stay: a leak that left rho 1.25 left 1.12.
     """
-    if not 1.0 + present.spread_of_rho <= present.rho < LITTLE or not can_be_explained(
-        present.sent
-    ):
+    is_little = 1.0 + present.spread_of_rho <= present.rho < LITTLE
+    is_small = len(present.map.cells) <= MOST_BLOCKS
+    if not (is_little and is_small and can_be_explained(present.sent)):
         return present
-    plain = with_covariances(_on_grid(present, present.declared))
+    plain = with_covariances(_on_grid(present, present.declared)).light()
     for axis in (1, 0):
         trial = with_covariances(_on_grid(present, halved_along(present.declared, axis)))
         more = max(1.0, plain.regression.dof - trial.regression.dof)
