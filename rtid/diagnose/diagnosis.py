@@ -6,7 +6,7 @@ significant, possible and material; when nothing more is, the verdict follows fr
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 from rtid.diagnose.consequence import (
@@ -133,7 +133,9 @@ def searched(standing: Standing, progress: Progress = silent) -> Result:
     apart = zeros(present, joined)
     if said == MATCHES and any(zero.matters for zero in apart):
         said = MISSING
-    reach = {} if said == INSUFFICIENT else reaches(present, scores, last.flow_m3s)
+    reach = {}
+    if said != INSUFFICIENT:
+        reach = reaches(present, scores, last.flow_m3s, clearest_gain(result))
     return Result(
         first, present.light(), result, negligible, scores, before, last, said, parts,
         held_out_judged=judged, zeros=apart, reach=reach,
@@ -284,8 +286,12 @@ def is_within_a_form(state: TrialState, trial: Trial) -> bool:
     internal leak, whose gap widens with pressure, took 49,560 of chi2, and a relief valve that the
     maps would have hidden took 291 beside it.
     """
-    most = max((f.gain for f in state.found), default=0.0)
-    return trial.gain < ALIKE**2 * most
+    return trial.gain < ALIKE**2 * clearest_gain(state.found)
+
+
+def clearest_gain(found: Iterable[AcceptedEffect]) -> float:
+    """chi2 that the clearest effect found has taken; 0 without any."""
+    return max((effect.gain for effect in found), default=0.0)
 
 
 def _with_bank(state: TrialState, now: Fit) -> tuple[Fit, Residual]:

@@ -12,14 +12,14 @@ motion shows more, a smaller effect is named as well (one of a tenth was).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rtid.diagnose.bank import add_shapes, add_timing, offer
 from rtid.diagnose.commands import commands
-from rtid.diagnose.consequence import BEND, BENT, HIDDEN_GAIN, OWN, SOFTER
+from rtid.diagnose.consequence import ALIKE, BEND, BENT, HIDDEN_GAIN, OWN, SOFTER
 from rtid.diagnose.evidence import Rows, project
 from rtid.diagnose.regression import LIMIT_SD, Score
 from rtid.diagnose.residual import KNOWN
@@ -41,7 +41,8 @@ class Reach:
     """What leaving out one unit of a column does; sd: of its size.
 
     left: of the rms flow, what nothing else follows; own: its own flow, inf for a timing; bend: of
-    a map's largest flow, the most of all; softer: of a modulus, where its interval is the narrower.
+    a map's largest flow, the most of all; softer: of a modulus, where its interval is the narrower;
+    gain: chi2 that it must take to be named where only the maps show it.
     """
 
     sd: float
@@ -49,6 +50,7 @@ class Reach:
     own: float
     bend: float
     softer: float
+    gain: float = HIDDEN_GAIN
 
     @property
     def named_from(self) -> float:
@@ -56,7 +58,7 @@ class Reach:
         shown = MATERIAL / max(min(self.left, BENT * self.own), NOTHING)
         own = self.own if np.isfinite(self.own) else 0.0
         matters = max(own / OWN, self.bend / BEND, self.softer / SOFTER, NOTHING)
-        hidden = max(float(np.sqrt(HIDDEN_GAIN)) * self.sd, 1.0 / matters)
+        hidden = max(float(np.sqrt(self.gain)) * self.sd, 1.0 / matters)
         return max(LIMIT_SD * self.sd, min(shown, hidden))
 
 
@@ -71,11 +73,12 @@ def clearest(scores: list[tuple[Candidate, Score]]) -> dict[Key, tuple[Candidate
 
 
 def reaches(
-    fit: Fit, scores: list[tuple[Candidate, Score]], flow_m3s: float
+    fit: Fit, scores: list[tuple[Candidate, Score]], flow_m3s: float, found: float = 0.0
 ) -> dict[Candidate, Reach]:
     """What each cause beside a fit does, by its clearest column; flow_m3s: rms of the flows.
 
-    fit: with its rows and its bank; without them nothing is said.
+    fit: with its rows and its bank; without them nothing is said.  found: chi2 that the clearest
+    effect of it took, of which what the maps would hide must take a hundredth.
     """
     if fit.rows is None or not fit.map.cells.size or not flow_m3s > 0.0:
         return {}
@@ -85,7 +88,9 @@ def reaches(
         for candidate, score in clearest(scores).values()
         if np.isfinite(score.sd)
     ]
-    return dict(_reaches(fit, fit.rows, wanted, flow_m3s))
+    gain = max(HIDDEN_GAIN, ALIKE**2 * found)
+    of = _reaches(fit, fit.rows, wanted, flow_m3s)
+    return {candidate: replace(reach, gain=gain) for candidate, reach in of}
 
 
 def _reaches(

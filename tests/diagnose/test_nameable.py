@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -46,4 +48,6 @@ def test_it_is_significant_and_no_smaller_where_less_is_left(
     assert reach.named_from >= LIMIT_SD * sd
     weaker = Reach(sd, 0.5 * left / sd, 0.5 * own / sd, 0.5 * bend / sd, 0.5 * softer / sd)
     assert weaker.named_from >= reach.named_from
+    beside = replace(reach, left=0.0, gain=1e4)  # less may be what a clear effect's law leaves
+    assert beside.named_from >= 1e2 * sd
     assert Reach(sd, 0.0, np.inf, 0.0, 0.0).named_from > 1e290, "nothing that matters: never"
