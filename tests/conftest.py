@@ -20,6 +20,7 @@ from can.interfaces.udp_multicast import UdpMulticastBus
 from can.interfaces.virtual import VirtualBus
 from hypothesis import settings
 
+from rtid.units import FLOW, show_flow_as
 from tests.left import Here, left_since, of_this_run
 
 # Two test workers fill two cores already, and OpenBLAS' idle threads spin: a diagnosis of the tanks
@@ -103,6 +104,13 @@ def own_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         )  # what a test trusts, its user does not
         patch.setattr(tempfile, "tempdir", str(folder))
         yield folder
+
+
+@pytest.fixture(scope="module", autouse=True)
+def flows_are_flows() -> Iterator[None]:
+    """Whatever a module's last plant has shown its flows as, the next module begins anew."""
+    yield
+    show_flow_as(FLOW)
 
 
 @pytest.fixture(autouse=True)
