@@ -217,7 +217,7 @@ def _ranking(story: ReportStory) -> Story:
     least = float(np.sqrt(GAIN))
     words = f"{least:g} sd: significant", "coefficient in units of its standard deviation, alone"
     drawn = Bars("ranking", "", bars, least, *words, caption, is_log=True)
-    head = ("effect", "where", "sd before", "sd after", "coefficient", *LIMITS)
+    head = ("effect", "where", "sd before", "sd after", "coefficient", LIMITS[0])
     return Story("Candidates", (drawn, Table("", head, [_candidate(r) for r in ranked])))
 
 
@@ -229,8 +229,8 @@ def _candidate(ranked: Ranked) -> tuple[str, ...]:
         value += ", not possible"
     before = "" if ranked.before is None else f"{ranked.before:.1f}"
     after = "in the model" if ranked.after is None else f"{ranked.after:.1f}"
-    least = limits(ranked.unseen) if ranked.unseen else ("", "")
-    return title(ranked.key[0]), ranked.key[1], before, after, value, *least
+    seen_from = limits(ranked.unseen)[0] if ranked.unseen else ""
+    return title(ranked.key[0]), ranked.key[1], before, after, value, seen_from
 
 
 def _not_found(unseen: tuple[Unseen, ...], ranking: tuple[Ranked, ...]) -> tuple[Story, ...]:
