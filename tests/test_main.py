@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -194,6 +195,19 @@ print(before - anonymous_mb())
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="of the C library of Linux")
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library has no mallopt")
 def test_freed_memory_goes_back_to_the_system() -> None:
     done = subprocess.run([sys.executable, "-c", FREED], capture_output=True, text=True, check=True)
     assert float(done.stdout) > 20.0
+
+
+@pytest.mark.parametrize("size", ["", "much", "1048576"])
+def test_the_user_s_own_setting_of_the_c_library_stays(
+    monkeypatch: pytest.MonkeyPatch, size: str
+) -> None:
+    """Whatever it says: glibc passes over what is no number."""
+    environment = {"MALLOC_TRIM_THRESHOLD_": size}
+    monkeypatch.setattr(os, "environ", environment)
+    main.return_large_memory()
+    assert environment["MALLOC_TRIM_THRESHOLD_"] == size
+    assert environment["MALLOC_MMAP_THRESHOLD_"].isdecimal()

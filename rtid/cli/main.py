@@ -183,14 +183,14 @@ def return_large_memory() -> None:
     glibc learns from each that is freed to keep the next one, between small things that stay: 20 MB
     of a replay of a minute, 60 of one of ten minutes.  Another library has no `mallopt`.
     """
-    for _, name, size in MEMORY:
-        os.environ.setdefault(name, str(size))  # read at a process's start
+    ours = [option for option in MEMORY if option[1] not in os.environ]  # the user's own stay
+    os.environ.update({name: str(size) for _, name, size in ours})  # read at a process's start
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError, TypeError):
         return
-    for option, name, _ in MEMORY:
-        mallopt(option, int(os.environ[name]))
+    for option, _, size in ours:
+        mallopt(option, size)
 
 
 def main() -> NoReturn:
