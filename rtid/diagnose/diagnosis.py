@@ -289,9 +289,9 @@ def is_within_a_form(state: TrialState, trial: Trial) -> bool:
     return trial.gain < ALIKE**2 * clearest_gain(state.found)
 
 
-def clearest_gain(found: Iterable[AcceptedEffect]) -> float:
+def clearest_gain(effects: Iterable[AcceptedEffect]) -> float:
     """chi2 that the clearest effect found has taken; 0 without any."""
-    return max((effect.gain for effect in found), default=0.0)
+    return max((effect.gain for effect in effects), default=0.0)
 
 
 def _with_bank(state: TrialState, now: Fit) -> tuple[Fit, Residual]:

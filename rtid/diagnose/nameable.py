@@ -73,12 +73,12 @@ def clearest(scores: list[tuple[Candidate, Score]]) -> dict[Key, tuple[Candidate
 
 
 def reaches(
-    fit: Fit, scores: list[tuple[Candidate, Score]], flow_m3s: float, found: float = 0.0
+    fit: Fit, scores: list[tuple[Candidate, Score]], flow_m3s: float, clearest_gain: float = 0.0
 ) -> dict[Candidate, Reach]:
     """What each cause beside a fit does, by its clearest column; flow_m3s: rms of the flows.
 
-    fit: with its rows and its bank; without them nothing is said.  found: chi2 that the clearest
-    effect of it took, of which what the maps would hide must take a hundredth.
+    fit: with its rows and its bank; without them nothing is said.  clearest_gain: chi2 that its
+    clearest effect took, of which what the maps would hide must take a hundredth.
     """
     if fit.rows is None or not fit.map.cells.size or not flow_m3s > 0.0:
         return {}
@@ -88,7 +88,7 @@ def reaches(
         for candidate, score in clearest(scores).values()
         if np.isfinite(score.sd)
     ]
-    gain = max(HIDDEN_GAIN, ALIKE**2 * found)
+    gain = max(HIDDEN_GAIN, ALIKE**2 * clearest_gain)
     of = _reaches(fit, fit.rows, wanted, flow_m3s)
     return {candidate: replace(reach, gain=gain) for candidate, reach in of}
 
