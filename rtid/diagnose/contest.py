@@ -62,17 +62,21 @@ def alike_ones(
 
 
 def contest(
-    state: TrialState, present: Fit, best: Trial, trials: list[Trial]
+    state: TrialState, present: Fit, best: Trial, trials: list[Trial], finished: dict[Key, Trial]
 ) -> tuple[Trial, tuple[Key, ...]]:
     """The cause to add, and those that this record does not tell from it.
 
     Where several look alike each is refitted to the end, and the best of them is asked again; among
-    equals the one with the fewest parameters is taken.
+    equals the one with the fewest parameters is taken.  finished: trials beside the same fit that
+    have been refitted before; those that are now come to them.
     """
     rivals = [t for t in trials if t.key in alike_ones(state, present, best, trials)]
     if not rivals:
         return best, ()
-    refitted = [_finished(state, present, t) for t in (best, *rivals)]
+    for t in (best, *rivals):
+        if t.key not in finished:
+            finished[t.key] = _finished(state, present, t)
+    refitted = [finished[t.key] for t in (best, *rivals)]
     best = max(refitted, key=lambda t: t.gain)
     alike = alike_ones(state, present, best, refitted)
     equals = [best, *(t for t in refitted if t.key in alike)]

@@ -194,12 +194,13 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
     """
     least = LATER_GAIN if state.found or state.given else GAIN
     trials = [t for t in trials_of(state, present) if t.gain > least]
+    finished: dict[Key, Trial] = {}
     for best in sorted(trials, key=lambda t: -t.gain):
         if best.key in state.negligible or len(state.negligible) == MOST_NEGLIGIBLE:
             continue
         if not _explains(state, present, best):
             return None
-        trial, alike = contest(state, present, best, trials)
+        trial, alike = contest(state, present, best, trials, finished)
         now = with_covariances(carried_on(state, present, trial), like=present)
         if now.rho >= now.most_rho and not trial.is_timing and is_at_a_bound(now):
             continue

@@ -12,6 +12,7 @@ from rtid.diagnose.contest import REFUTED, alike_ones, contest
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.trials import TIE, TIE_SHARE, Trial
 from rtid.effects.column import Candidate
+from rtid.plain import Key
 
 DOF = 4000.0
 
@@ -76,18 +77,35 @@ def refits(monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
 def test_alone_it_is_taken_without_a_refit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_finished", lambda *_: pytest.fail("refitted"))
     best, other = trial("leak", 1000), trial("air", 100)
-    assert contest(state(), present(2000), best, [best, other]) == (best, ())
+    assert contest(state(), present(2000), best, [best, other], {}) == (best, ())
 
 
 def test_a_refit_decides_between_two_that_look_alike(refits: dict[str, float]) -> None:
     refits.update(leak=1000, air=3000)
     best, other = trial("leak", 1000), trial("air", 990)
-    chosen, rest = contest(state(), present(5000), best, [best, other])
+    chosen, rest = contest(state(), present(5000), best, [best, other], {})
     assert (chosen.key, chosen.gain, rest) == (("air", "a"), 3000, ())
 
 
 def test_of_equals_the_one_with_the_fewest_parameters(refits: dict[str, float]) -> None:
     best, other = trial("relief", 1000, 1.0, 2.0), trial("leak", 995)
-    chosen, rest = contest(state(), present(5000), best, [best, other])
+    chosen, rest = contest(state(), present(5000), best, [best, other], {})
     assert chosen.key == ("leak", "a")
     assert rest == (("relief", "a"),)
+
+
+def test_what_was_refitted_beside_the_same_fit_is_not_refitted_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    refitted: list[str] = []
+
+    def finished_(_state: Any, _present: Any, t: Trial) -> Trial:
+        refitted.append(t.key[0])
+        return t
+
+    monkeypatch.setattr(module, "_finished", finished_)
+    leak, air, sag = trial("leak", 1000), trial("air", 998), trial("sag", 996)
+    finished: dict[Key, Trial] = {}
+    for best, *rivals in ([leak, air, sag], [air, sag], [sag, leak]):
+        contest(state(), present(5000), best, [best, *rivals], finished)
+    assert refitted == ["leak", "air", "sag"]
