@@ -23,7 +23,8 @@ from rtid.diagnose.excuse import few_excused, left_over
 from rtid.diagnose.fit import Fit, fit, one_pass, prepare, with_covariances
 from rtid.diagnose.jumps import cut_at_jumps
 from rtid.estimator.misfit import Misfit, can_be_explained
-from rtid.estimator.refine import CLEARLY, halved, halved_along, in_halved
+from rtid.estimator.refine import CLEARLY, halved, halved_along, in_halved, parents
+from rtid.estimator.state import Weights
 from rtid.model import Grid, Machine
 from rtid.plain import BoolArray
 
@@ -48,8 +49,7 @@ def fine_enough(present: Fit) -> tuple[Fit, Misfit | None]:
     present, rest = _finest(present, left_over(present))  # the first one's rows are large
     if present.declared is declared:
         return present, rest
-    record = present.declared, present.chunk, present.weights, present.revision
-    return fit(*record, present, bank=False), None
+    return _finished(present), None
 
 
 def halved_throughout(present: Fit) -> Fit:
@@ -69,8 +69,7 @@ def halved_throughout(present: Fit) -> Fit:
         trial = with_covariances(_on_grid(present, halved_along(present.declared, axis)))
         more = max(1.0, plain.regression.dof - trial.regression.dof)
         if plain.held.sse - trial.held.sse > more + BY_CHANCE * float(np.sqrt(2.0 * more)):
-            record = trial.declared, trial.chunk, trial.weights, trial.revision
-            better = with_covariances(few_excused(fit(*record, trial, bank=False)))
+            better = with_covariances(few_excused(_finished(trial)))
             if better.rho - 1.0 < LEFT * (present.rho - 1.0):
                 return better
     return present
@@ -127,11 +126,22 @@ def _about_a_jump(present: Fit, rest: Misfit) -> tuple[Fit, Misfit] | None:
 
 
 def _on_grid(present: Fit, machine: Machine) -> Fit:
-    """A pass of the present revision on the grid of another machine."""
-    known, weights = present.unfactored().weights, prepare(machine, present.chunk)
-    weights = replace(weights, lag_s=known.lag_s, compliance=known.compliance)
+    """A pass of the present revision on a finer grid, its rows weighed as they are.
+
+    So chi2 of the two can be compared; what the coarse blocks miss is excused no longer.
+    """
+    known = present.unfactored().weights
+    slopes = known.slopes[parents(present.declared, machine)]
+    weights = Weights(slopes, known.compliance, known.lag_s)
     record = machine, present.chunk, weights, present.revision
     return one_pass(*record, None, bank=False, thorough=False, sent=present.sent)
+
+
+def _finished(trial: Fit) -> Fit:
+    """The revision fitted to the end on its new grid, whose own slopes weigh the rows."""
+    known, weights = trial.unfactored().weights, prepare(trial.declared, trial.chunk)
+    weights = replace(weights, lag_s=known.lag_s, compliance=known.compliance)
+    return fit(trial.declared, trial.chunk, weights, trial.revision, trial, bank=False)
 
 
 def _beyond(rest: Misfit, here: BoolArray) -> float:

@@ -14,7 +14,7 @@ import numpy as np
 from rtid.estimator.misfit import Misfit
 from rtid.kernels.layout import MAX_BORDERS
 from rtid.model import COMMAND_ONLY, DROP_ONLY, PROPORTIONAL, Edge, Grid, Machine
-from rtid.plain import BoolArray, FloatArray
+from rtid.plain import BoolArray, FloatArray, IntArray
 
 AT_ONCE = 2  # intervals halved per axis and edge in one round
 CLEARLY = 4.0  # standard deviations above unit variance
@@ -77,6 +77,17 @@ def in_halved(model: Machine, finer: Machine, misfit: Misfit) -> BoolArray:
         place = misfit.cells[:, i] - model.first_cells[i]
         here |= (place >= 0) & (u[:, None] | dp).ravel()[np.maximum(place, 0)]
     return here
+
+
+def parents(model: Machine, finer: Machine) -> IntArray:
+    """Per cell of a finer machine's maps (cells,), the model's cell that its middle lies in."""
+    result, first = [np.zeros(0, np.int64)], 0
+    for edge, new in zip(model.maps, finer.maps, strict=True):
+        pairs = (edge.grid.u_v, new.grid.u_v), (edge.grid.dp_pa, new.grid.dp_pa)
+        u, dp = (np.searchsorted(coarse, 0.5 * (b[1:] + b[:-1])) - 1 for coarse, b in pairs)
+        result.append(first + (u[:, None] * edge.grid.shape[1] + dp).ravel())
+        first += edge.grid.shape[0] * edge.grid.shape[1]
+    return np.concatenate(result)
 
 
 def excesses(model: Machine, misfit: Misfit) -> list[Excess]:

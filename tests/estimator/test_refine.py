@@ -9,6 +9,7 @@ from rtid.diagnose.fit import MATCH_RHO
 from rtid.diagnose.standing import fitted
 from rtid.estimator.estimator import to_chunk
 from rtid.estimator.record import fit_record
+from rtid.estimator.refine import halved_along, parents
 from rtid.model import Grid, Machine
 from rtid.plain import FloatArray
 from rtid.sim.declare import declared_model, default_grid
@@ -77,3 +78,26 @@ def test_what_is_missing_is_no_jump() -> None:
     fit = fitted(model, chunk)
     assert fit.declared.n_cells == model.n_cells
     assert fit.rho > 2.0
+
+
+def test_a_cell_of_a_halved_interval_lies_in_the_cell_that_was_halved() -> None:
+    _, model, _ = machine(5, coarse=True)
+    for axis in (0, 1):
+        finer = halved_along(model, axis)
+        at = parents(model, finer)
+        assert len(at) == finer.n_cells > model.n_cells
+        assert (np.bincount(at, minlength=model.n_cells) >= 1).all()
+        coarse, fine = ([_middles(e.grid)[axis] for e in m.maps] for m in (model, finer))
+        off = np.abs(np.concatenate(coarse)[at] - np.concatenate(fine))
+        width = np.concatenate([_widths(e.grid)[axis] for e in model.maps])
+        assert (off < 0.5 * width[at]).all()
+    assert (parents(model, model) == np.arange(model.n_cells)).all()
+
+
+def _middles(grid: Grid) -> list[FloatArray]:
+    u, dp = (0.5 * (b[1:] + b[:-1]) for b in (grid.u_v, grid.dp_pa))
+    return [x.ravel() for x in np.meshgrid(u, dp, indexing="ij")]
+
+
+def _widths(grid: Grid) -> list[FloatArray]:
+    return [x.ravel() for x in np.meshgrid(np.diff(grid.u_v), np.diff(grid.dp_pa), indexing="ij")]
