@@ -8,7 +8,6 @@ one-sided, and come with the error itself; what is told of a fit is by central o
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from rtid.plain import BoolArray, FloatArray
 from rtid.plants.plant import PlantError, PlantParameter
@@ -109,6 +108,8 @@ class FitProblem:
         self, start: FloatArray, most: int, tolerance: float = FINE
     ) -> tuple[FloatArray, float]:
         """Best scaled values (open unknowns,) from a start, and half their sum of squares."""
+        from scipy.optimize import least_squares  # noqa: PLC0415 - takes long to import
+
         low = self.low[self.open] / self.step[self.open]
         high = self.high[self.open] / self.step[self.open]
         at = start[self.open] / self.step[self.open]

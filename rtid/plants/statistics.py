@@ -8,7 +8,7 @@ The residual of a free run remembers: n samples are worth n / tau independent on
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import f as fisher
+from scipy.special import fdtrc
 
 from rtid.plain import FloatArray
 
@@ -63,7 +63,7 @@ def covariance(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
 def f_test(before: float, after: float, more: int, worth: float, parameters: int) -> float:
     """Chance that so many more parameters take the sum of squares down by accident."""
     dof = max(worth - parameters, 1.0)
-    return float(fisher.sf(max(before / after - 1.0, 0.0) * dof / more, more, dof))
+    return float(fdtrc(more, dof, max(before / after - 1.0, 0.0) * dof / more))
 
 
 def _spread(j: FloatArray, taper: FloatArray) -> FloatArray:

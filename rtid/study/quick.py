@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -33,7 +33,6 @@ from rtid.study.quick_machine import (
     first_machine,
     fitted_machine,
 )
-from rtid.study.quick_plant import QuickPlant, quick_plant
 from rtid.study.quick_project import DEAD_VOLUME, head_of, of_channels, of_missing, project_text
 from rtid.study.quick_rate import QuickRate, quick_rate
 from rtid.study.rate_pairs import driven_pairs, pressed_pairs
@@ -43,6 +42,9 @@ from rtid.trace.quick_data import BAD, Point, level_of, points
 from rtid.trace.quick_source import Source, open_source, roles_of
 from rtid.trace.reading import NoSamplesError
 from rtid.trace.signals import Recording, read_recording
+
+if TYPE_CHECKING:
+    from rtid.study.quick_plant import QuickPlant
 
 SCHEMA = 1
 TURNS = 2  # signs that may have to be turned round
@@ -155,6 +157,8 @@ def quick(
     guessed = proposal.with_named(proposal.propose(source.signals), named)
     is_table = "time_column" in source.keys
     if is_table and _is_rate(path, source, guessed, named):
+        from rtid.study.quick_plant import quick_plant  # noqa: PLC0415 - brings the plants with it
+
         by_equations = None if more else quick_plant(path, source, named, progress)
         return by_equations or quick_rate(path, source, named, progress, more, held_out)
     if more:
