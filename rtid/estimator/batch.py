@@ -116,18 +116,19 @@ def column_rates(
     moments, owners = _moments(track.opening, dt, weights.lag_s), model.owners
     for i, edge in enumerate(model.edges):
         dp = pressure_drop(model, edge, values)
-        for k in np.flatnonzero(track.cells[:, i, 0] >= 0):
-            ends = dp[end[k] - 1 : end[k] + 1]
-            for a, b in _windows(edge, track.cells[k, i]):
+        ends = np.stack([dp[end - 1], dp[end]], axis=1)
+        w = _at_gauss_points(track.opening[:, i], dt, weights.lag_s)
+        for cell in np.unique(track.cells[track.cells[:, i, 0] >= 0, i], axis=0):
+            here = np.flatnonzero((track.cells[:, i] == cell).all(axis=1))
+            for a, b in _windows(edge, cell):
                 if edge.basis != TAYLOR:
-                    w = _at_gauss_points(track.opening[k, i], dt[k], weights.lag_s)
-                    phi = _windowed_terms(edge, a, b, w, ends)
+                    phi = _windowed_terms(edge, a, b, w[here], ends[here])
                 else:
-                    phi = _terms(edge, a, b, moments[k, i], ends)
+                    phi = _terms(edge, a, b, moments[here, i], ends[here])
                 at = place[(owners[i], a, b)]
                 for c, chamber in enumerate(model.chambers):
                     flow = edge.sign(chamber) * edge.rated_q_m3s * phi * fitted_terms(edge)
-                    out[k, c, :, at : at + 6] += flow
+                    out[here, c, :, at : at + 6] += flow
     return out, blocks
 
 
@@ -178,28 +179,33 @@ def _visited(model: Machine, track: Track) -> Blocks:
     return tuple(seen)
 
 
-def _at_gauss_points(opening: FloatArray, dt: float, lag_s: float) -> FloatArray:
-    """Lagged command at the two Gauss points of one interval (2,)."""
-    command, start = opening
-    t = GAUSS_POINTS * dt
+def _at_gauss_points(opening: FloatArray, dt: FloatArray, lag_s: float) -> FloatArray:
+    """Lagged command at the two Gauss points of each interval (intervals, 2)."""
+    command, start = opening[:, :1], opening[:, 1:]
+    t = GAUSS_POINTS * dt[:, None]
     return np.asarray(command + (start - command) * (np.exp(-t / lag_s) if lag_s > 0 else 0 * t))
 
 
 def _windowed_terms(edge: Edge, i: int, j: int, w: FloatArray, dp: FloatArray) -> FloatArray:
-    """(2, 6): windowed terms at both ends of an interval, on the line through two Gauss points."""
-    drop = dp[0] + GAUSS_POINTS * (dp[1] - dp[0])
+    """(intervals, 2, 6): windowed terms at both ends, on the line through two Gauss points.
+
+    w, dp (intervals, 2): the command at the Gauss points, the pressure drop at the ends.
+    """
+    drop = dp[:, :1] + GAUSS_POINTS * np.diff(dp)
     axis = _local_cosines if edge.basis == LAPPED else _blended
     along_u = _proportional if edge.basis == PROPORTIONAL else axis
     a, b = along_u(edge.grid.u_v, i, w), axis(edge.grid.dp_pa, j, drop)
-    phi = np.stack([a[k] * b[m] for k, m in ((0, 0), (1, 0), (0, 1), (2, 0), (0, 2), (1, 1))])
-    slope = (phi[:, 1] - phi[:, 0]) / (GAUSS_POINTS[1] - GAUSS_POINTS[0])
-    return np.stack([phi.mean(axis=1) - 0.5 * slope, phi.mean(axis=1) + 0.5 * slope])
+    pairs = ((0, 0), (1, 0), (0, 1), (2, 0), (0, 2), (1, 1))
+    phi = np.stack([a[k] * b[m] for k, m in pairs], axis=-1)
+    half = 0.5 * (phi[:, 1] - phi[:, 0]) / (GAUSS_POINTS[1] - GAUSS_POINTS[0])
+    mean = phi.mean(axis=1)
+    return np.stack([mean - half, mean + half], axis=1)
 
 
 def _window(border: FloatArray, i: int, at: FloatArray) -> FloatArray:
-    """Window (12) of block i (points,): none falls at the grid's ends."""
+    """Window (12) of block i, for each point of an array: none falls at the grid's ends."""
     n, width = len(border) - 1, np.diff(border)
-    window = np.ones(len(at))
+    window = np.ones(at.shape)
     if i > 0:
         t = (at - border[i]) / (0.5 * min(width[i - 1], width[i]))
         window = np.sin(np.pi / 4 * (1 + np.clip(t, -1, 1)))
@@ -210,20 +216,20 @@ def _window(border: FloatArray, i: int, at: FloatArray) -> FloatArray:
 
 
 def _local_cosines(border: FloatArray, i: int, at: FloatArray) -> FloatArray:
-    """(3, points): the window times cos(pi (k + 1/2) s); the last block's cosines are even."""
+    """(3, *points): the window times cos(pi (k + 1/2) s); the last block's cosines are even."""
     s = (at - border[i]) / (border[i + 1] - border[i])
     shift = 0.5 if i < len(border) - 2 else 0.0
-    return np.stack([_window(border, i, at) * np.cos(np.pi * (k + shift) * s) for k in range(3)])
+    return _window(border, i, at) * np.stack([np.cos(np.pi * (k + shift) * s) for k in range(3)])
 
 
 def _blended(border: FloatArray, i: int, at: FloatArray) -> FloatArray:
-    """(3, points): the window's square times 1, xi and xi^2."""
+    """(3, *points): the window's square times 1, xi and xi^2."""
     xi = (2 * at - border[i] - border[i + 1]) / (border[i + 1] - border[i])
-    return _window(border, i, at) ** 2 * np.stack([np.ones(len(at)), xi, xi**2])
+    return _window(border, i, at) ** 2 * np.stack([np.ones(at.shape), xi, xi**2])
 
 
 def _proportional(border: FloatArray, i: int, at: FloatArray) -> FloatArray:
-    """(3, points): w within block i as a share of its far end, and nothing else."""
+    """(3, *points): w within block i as a share of its far end, and nothing else."""
     last = i == len(border) - 2
     inside = (at >= border[i]) & ((at <= border[i + 1]) if last else (at < border[i + 1]))
     share = np.where(inside, at / np.abs(border[i : i + 2]).max(), 0.0)
@@ -245,19 +251,22 @@ def _moments(opening: FloatArray, dt: FloatArray, lag_s: float) -> FloatArray:
 
 
 def _terms(edge: Edge, i: int, j: int, moments: FloatArray, dp: FloatArray) -> FloatArray:
-    """(2, 6): the terms at both ends of an interval, their mean exact for the moving command."""
+    """(intervals, 2, 6): the terms at both ends, their mean exact for the moving command.
+
+    moments (intervals, 3) of the command, dp (intervals, 2) at the ends.
+    """
     u, p = edge.grid.u_v, edge.grid.dp_pa
     uc, hu = 0.5 * (u[i] + u[i + 1]), 0.5 * (u[i + 1] - u[i])
     pc, hp = 0.5 * (p[j] + p[j + 1]), 0.5 * (p[j + 1] - p[j])
-    m1, m2, mt = moments
+    m1, m2, mt = moments.T
     xi, xi2 = (m1 - uc) / hu, (m2 - 2 * uc * m1 + uc**2) / hu**2
-    eta = (dp - pc) / hp
-    mean_eta2 = (eta[0] ** 2 + eta[0] * eta[1] + eta[1] ** 2) / 3
-    cross = xi * eta.mean() + mt / hu * (eta[1] - eta[0])
-    mean = np.array([1.0, xi, eta.mean(), xi2, mean_eta2, cross])
-    rise = eta[1] - eta[0]
-    half = 0.5 * np.array([0, 0, rise, 0, eta[1] ** 2 - eta[0] ** 2, xi * rise])
-    return np.stack([mean - half, mean + half])
+    first, last = (dp.T - pc) / hp
+    rise, middle, none = last - first, 0.5 * (first + last), np.zeros(len(dp))
+    square = (first**2 + first * last + last**2) / 3
+    cross = xi * middle + mt / hu * rise
+    mean = np.stack([none + 1.0, xi, middle, xi2, square, cross], axis=1)
+    half = 0.5 * np.stack([none, none, rise, none, last**2 - first**2, xi * rise], axis=1)
+    return np.stack([mean - half, mean + half], axis=1)
 
 
 def position_noise(model: Machine, values: FloatArray, weights: Weights) -> FloatArray:
