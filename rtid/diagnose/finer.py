@@ -64,7 +64,9 @@ def halved_throughout(present: Fit) -> Fit:
     is_small = len(present.map.cells) <= MOST_BLOCKS
     if not (is_little and is_small and can_be_explained(present.sent)):
         return present
-    plain = with_covariances(_on_grid(present, present.declared)).light()
+    plain = present
+    if present.weights.missed.any():  # what its blocks are excused hides what halving would gain
+        plain = with_covariances(_on_grid(present, present.declared)).light()
     for axis in (1, 0):
         trial = with_covariances(_on_grid(present, halved_along(present.declared, axis)))
         more = max(1.0, plain.regression.dof - trial.regression.dof)
