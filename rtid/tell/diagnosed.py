@@ -16,6 +16,7 @@ from rtid.units import CONVENTION, Z95, limit
 
 SLIGHTLY_CUT = 1e-3  # of a record: less is not worth a sentence
 MOST_BENDS = 2  # maps that a sentence names
+LEAST_FLOOR = 5e-5  # of the rms flow: a floor below it is shown as 0.00 %, which no sensor has
 SHOWN = 14  # rows of the table of what was not found
 LIMITS = ("seen from", "named from")  # sizes of what was not found
 LIMITS_SAY = (
@@ -140,7 +141,6 @@ def heading(diagnosis: Diagnosis) -> tuple[str, str]:
 
 def _head(diagnosis: Diagnosis) -> str:
     share = percent(diagnosis, diagnosis.heldout_residual_before_m3s)
-    floor = percent(diagnosis, diagnosis.noise_floor_m3s)
     words = heading(diagnosis)[1]
     if diagnosis.verdict == INSUFFICIENT:
         return f"{words}{_left(diagnosis)}."
@@ -151,7 +151,7 @@ def _head(diagnosis: Diagnosis) -> str:
             else f"{diagnosis.rho_after:.3g}"
         )
         return (
-            f"{words}: held-out error {share} of the rms flow, the sensors' floor is {floor}; "
+            f"{words}: held-out error {share} of the rms flow{_floor(diagnosis, ', ')}; "
             f"residual variance {rho} times the noise's."
         )
     return (
@@ -177,8 +177,7 @@ def _one(diagnosis: Diagnosis, effect: FoundEffect) -> str:
     before = percent(diagnosis, effect.heldout_residual_before_m3s)
     after = percent(diagnosis, effect.heldout_residual_after_m3s)
     does = hidden(effect) or (
-        f"Adding it lowers the held-out error from {before} to {after}; the sensors' floor is "
-        f"{percent(diagnosis, diagnosis.noise_floor_m3s)}."
+        f"Adding it lowers the held-out error from {before} to {after}{_floor(diagnosis)}."
     )
     text = f"{title(effect.effect)} at {effect.where}: {sizes}. {does}"
     if effect.cannot_be_told_from:
@@ -217,6 +216,13 @@ def percent(diagnosis: Diagnosis, residual_m3s: float) -> str:
     if not diagnosis.rms_flow_m3s > 0.0:
         return quantity(Value(residual_m3s, float("nan"), "m3/s"))
     return f"{100 * residual_m3s / diagnosis.rms_flow_m3s:.2f} %"
+
+
+def _floor(diagnosis: Diagnosis, joined: str = "; ") -> str:
+    """What the sensors alone leave; nothing where no noise of a sensor stands apart."""
+    if not diagnosis.noise_floor_m3s > LEAST_FLOOR * diagnosis.rms_flow_m3s:
+        return ""
+    return f"{joined}the sensors' floor is {percent(diagnosis, diagnosis.noise_floor_m3s)}"
 
 
 def _found_table(diagnosis: Diagnosis) -> Table:
@@ -260,7 +266,6 @@ def judged(diagnosis: Diagnosis) -> str:
 def said(diagnosis: Diagnosis) -> str:
     """The verdict and the next step."""
     rest = percent(diagnosis, diagnosis.heldout_residual_before_m3s)
-    floor = f"the sensors' floor is {percent(diagnosis, diagnosis.noise_floor_m3s)}"
     match diagnosis.verdict:
         case "insufficient_data":
             known = remains(diagnosis) or "Nothing can be said about what is missing."
@@ -272,25 +277,25 @@ def said(diagnosis: Diagnosis) -> str:
         case "matches":
             here = "With what was added, the" if diagnosis.added else "The"
             return (
-                f"{here} {judged(diagnosis)} is {rest} of the rms flow; {floor}. "
+                f"{here} {judged(diagnosis)} is {rest} of the rms flow{_floor(diagnosis)}. "
                 f"{remains(diagnosis)}"
             )
         case "unknown":
             return (
-                f"No known effect explains the {judged(diagnosis)} of {rest}; {floor}. Next: Where "
-                "shows which signals it follows; an effect of your own goes into the project file "
-                "as a formula."
+                f"No known effect explains the {judged(diagnosis)} of {rest}{_floor(diagnosis)}. "
+                "Next: Where shows which signals it follows; an effect of your own goes into the "
+                "project file as a formula."
             )
-    return _first(diagnosis, diagnosis.found[0], floor)
+    return _first(diagnosis, diagnosis.found[0])
 
 
-def _first(diagnosis: Diagnosis, first: FoundEffect, floor: str) -> str:
+def _first(diagnosis: Diagnosis, first: FoundEffect) -> str:
     sizes = list(first.parameters.values())
     big = f", {quantity(sizes[0])} (95 %)" if len(sizes) == 1 else ""
     before = percent(diagnosis, first.heldout_residual_before_m3s)
     after = percent(diagnosis, first.heldout_residual_after_m3s)
     does = hidden(first) or (
-        f"Adding it lowers the {judged(diagnosis)} from {before} to {after}; {floor}."
+        f"Adding it lowers the {judged(diagnosis)} from {before} to {after}{_floor(diagnosis)}."
     )
     words = f"{title(first.effect)} at {first.where}{big}. {does} {remains(diagnosis)}".rstrip()
     if first.cannot_be_told_from:

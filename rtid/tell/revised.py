@@ -10,7 +10,7 @@ from rtid.diagnose.report import Value
 from rtid.effects.page import title
 from rtid.project.history import ADD, UNDO, Change
 from rtid.study.revisions import Revised, undo_command
-from rtid.tell.diagnosed import with_convention
+from rtid.tell.diagnosed import LEAST_FLOOR, with_convention
 from rtid.tell.history import SCHEMA, plain
 from rtid.tell.story import Bar, Bars
 from rtid.tell.terminal import bars, make_console
@@ -65,8 +65,9 @@ def _errors(errors: Mapping[str, Any]) -> list[str]:
             f"times the noise's before, {rho['after']:.3g} after."
         )
     if len(held_out) == 2 and floor is not None:
+        words = f"; the sensors' floor is {floor:.2f} %" if floor > 100 * LEAST_FLOOR else ""
         lines.append(
-            f"Held-out part: error {_fall(held_out)}; the sensors' floor is {floor:.2f} % "
+            f"Held-out part: error {_fall(held_out)}{words} "
             f"(over the {errors.get('judged_s', 0.0):.1f} s where the map is known)."
         )
     shown = tuple(Bar(name, value) for name, value in held_out.items())

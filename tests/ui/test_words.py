@@ -48,6 +48,12 @@ def test_what_was_found_is_named_with_its_size_and_the_fall_of_the_error() -> No
     )
 
 
+def test_a_floor_of_nothing_is_no_floor() -> None:
+    """Where one disturbance stands for all that the command does not say, no sensor has a part."""
+    diagnosis = replace(told(KEY).diagnosis, noise_floor_m3s=0.0)
+    assert "from 2.00 % to 0.20 %. " in said(diagnosis) and "floor" not in said(diagnosis)
+
+
 def test_a_set_leaves_the_choice_to_the_user() -> None:
     words = said(told(KEY, alike=("hose_compliance (b)",)).diagnosis)
     assert "cannot tell it from hose compliance: the choice is yours" in words
