@@ -94,11 +94,13 @@ class Beside:
         return self._solved(more)[0]
 
     def weights(self, more: Timings, like: Weights) -> Weights:
-        """Those like others, with the compliances that more timings give on the coarse map.
+        """Those like others, with the lag and the compliances beside which more timings were found.
 
-        A delay that is missing bends the modulus by more than rows may be weighed apart.
+        A delay that is missing bends the modulus by more than rows may be weighed apart, and had
+        the lag stand for a part of it: both at once left 447,893 of chi2 where nothing left 97,557.
         """
         theta, n_c = self._solved(more)[1], len(self.search.model.chambers)
+        like = replace(like, lag_s=self.search.weights.lag_s)
         if not self.search.model.has_pressures or len(theta) < n_c:
             return like
         low, high = sorted(1.0 / bound for bound in self.search.model.beta_bounds_pa)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import savgol_filter
@@ -67,6 +69,22 @@ def test_a_late_command_is_closed_in_on() -> None:
     weights = beside.weights(((delay, psi),), fit.weights)
     assert weights.compliance == pytest.approx(alone.compliance, rel=SIZED)  # no second pass
     assert not np.allclose(fit.weights.compliance, alone.compliance, rtol=SIZED, atol=0.0)
+
+
+def test_a_lag_that_has_stood_for_the_delay_is_not_counted_beside_it() -> None:
+    """A lag of 6 ms too much, as a fit without the delay finds it, with the delay whole beside it,
+    was refitted to a chi2 far above that of no delay at all: what was late was named a slow spool.
+    """
+    model, chunk, _ = record("input_delay", 12e-3)
+    weights = prepare(model, chunk)
+    bent = replace(weights, lag_s=weights.lag_s + 6e-3)
+    fit = one_pass(model, chunk, bent, Revision(), None, False, thorough=False)
+    delay = timing("input_delay")
+    late = ((delay, (12e-3,)),)
+    begun = Search(model, chunk).beside(fit).weights(late, bent)
+    assert begun.lag_s == weights.lag_s
+    found, double = (tried(model, chunk, w, Revision((), late)) for w in (begun, bent))
+    assert found.rho < 1.5 and double.rho > 5.0 * found.rho
 
 
 def test_a_bank_ends_where_it_falls() -> None:
