@@ -73,7 +73,9 @@ def tour(page: Page, folder: Path) -> None:
     page.click("#verdict button.main")
     page.wait_for_selector("text=Residual per block")
     shoot(page, folder, "7_added")
-    page.wait_for_function("() => document.querySelector('#verdict h1').textContent !== 'Added'")
+    page.wait_for_function(
+        "() => (document.querySelector('#verdict h1')?.textContent ?? 'Added') !== 'Added'"
+    )
     shoot(page, folder, "8_added_and_diagnosed")
     page.keyboard.press("1")
     shoot(page, folder, "9_compare_after")

@@ -219,7 +219,8 @@ def test_from_the_verdict_to_the_falling_bar_and_back(
     page.keyboard.press("2")  # its first picture is the one that explains most
     page.wait_for_selector("#where.shown canvas")
     page.wait_for_function(
-        "() => document.querySelector('#signal_select').value === 'Internal leakage, laminar (a-b)'"
+        "() => document.querySelector('#signal_select')?.value"
+        " === 'Internal leakage, laminar (a-b)'"
     )
     shown = "m => m.type === 'Title' && m.text.startsWith('before: ')"
     page.wait_for_function(f"() => [...Bokeh.documents[0].all_models].some({shown})")
@@ -249,7 +250,9 @@ def test_from_the_verdict_to_the_falling_bar_and_back(
     wide, narrow = widths(opened)
     assert narrow < 0.3 * wide
     assert project.read_bytes() == untouched  # nothing is written until it is asked for
-    page.wait_for_function("() => document.querySelector('#verdict h1').textContent !== 'Added'")
+    page.wait_for_function(
+        "() => (document.querySelector('#verdict h1')?.textContent ?? 'Added') !== 'Added'"
+    )
     page.click("#add_bars >> text=Undo")
     page.wait_for_function(f"() => document.querySelectorAll('{BARS}').length === 1")
     assert project.read_bytes() == untouched
