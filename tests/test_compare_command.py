@@ -6,12 +6,10 @@ import csv
 import json
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import typer
-from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
 from firmware_bridge.sources import read_table
@@ -23,7 +21,6 @@ from rtid.estimator.estimator import Estimator
 from rtid.maps.files import read_map
 from rtid.project import load
 from rtid.sim.simulated_plant import SimulatedPlant
-from rtid.tell import stills
 from rtid.trace.reading import read_trace
 from rtid.trace.snapshot import save
 from tests.replays import shared_replays  # noqa: F401
@@ -115,11 +112,7 @@ def later(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_two_projects_on_one_trace(
-    trace: Path, coarse: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    only_new = {"beside", "where_validation_coarse"}  # the others are drawn for one project above
-    monkeypatch.setattr(stills, "save", lambda figure, path: _save(figure, path, only_new))
+def test_two_projects_on_one_trace(trace: Path, coarse: Path, tmp_path: Path) -> None:
     arguments = ("compare", trace, "-p", trace.with_suffix(".toml"), "--against", coarse)
     text = call(*arguments, "--pictures", tmp_path)
     assert "With the run map" in text
@@ -128,14 +121,6 @@ def test_two_projects_on_one_trace(
     assert "Run minus coarse" in text
     names = {path.stem for path in tmp_path.iterdir()}
     assert names >= {"beside", "pressure_run", "pressure_coarse", "where_validation_coarse"}
-
-
-def _save(figure: Figure, path: Path, wanted: set[str], save: Any = stills.save) -> Path:
-    """Draw what is wanted; of the rest an empty file."""
-    if path.stem in wanted:
-        return Path(save(figure, path))
-    path.touch()
-    return path
 
 
 def test_two_traces_with_one_project(trace: Path, later: Path) -> None:
