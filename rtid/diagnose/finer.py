@@ -49,7 +49,7 @@ def fine_enough(present: Fit) -> tuple[Fit, Misfit | None]:
     present, rest = _finest(present, left_over(present))  # the first one's rows are large
     if present.declared is declared:
         return present, rest
-    return _finished(present), None
+    return _to_the_end(present), None
 
 
 def halved_throughout(present: Fit) -> Fit:
@@ -71,7 +71,7 @@ def halved_throughout(present: Fit) -> Fit:
         trial = with_covariances(_on_grid(present, halved_along(present.declared, axis)))
         more = max(1.0, plain.regression.dof - trial.regression.dof)
         if plain.held.sse - trial.held.sse > more + BY_CHANCE * float(np.sqrt(2.0 * more)):
-            better = with_covariances(few_excused(_finished(trial)))
+            better = with_covariances(few_excused(_to_the_end(trial)))
             if better.rho - 1.0 < LEFT * (present.rho - 1.0):
                 return better
     return present
@@ -139,7 +139,7 @@ def _on_grid(present: Fit, machine: Machine) -> Fit:
     return one_pass(*record, None, bank=False, thorough=False, sent=present.sent)
 
 
-def _finished(trial: Fit) -> Fit:
+def _to_the_end(trial: Fit) -> Fit:
     """The revision fitted to the end on its new grid, whose own slopes weigh the rows."""
     known, weights = trial.unfactored().weights, prepare(trial.declared, trial.chunk)
     weights = replace(weights, lag_s=known.lag_s, compliance=known.compliance)
