@@ -27,6 +27,7 @@ class Pty:
         for end in (self.master, self._slave):
             tty.setraw(end)
         self.name = os.ttyname(self._slave)
+        self._sending = threading.Lock()  # an adapter's answer never stands within a frame's line
 
     def unplug(self) -> None:
         """Close both ends; harmless when called again."""
@@ -40,7 +41,7 @@ class Pty:
 
         def write() -> None:
             view = memoryview(stream)
-            with contextlib.suppress(OSError):  # unplugged meanwhile
+            with contextlib.suppress(OSError), self._sending:  # unplugged meanwhile
                 while view:
                     view = view[os.write(self.master, view[:2048]) :]
 
@@ -58,7 +59,9 @@ class Pty:
                     pending += os.read(self.master, 256)
                     *commands, pending = pending.split(b"\r")
                     for command in commands:
-                        os.write(self.master, reply(command))
+                        answer = reply(command)
+                        with self._sending:
+                            os.write(self.master, answer)
 
         thread = threading.Thread(target=run, daemon=True)
         thread.start()
