@@ -20,7 +20,7 @@ from rtid.diagnose.revision import Revision
 from rtid.diagnose.thinned import Thinning
 from rtid.effects.column import Columns
 from rtid.effects.law import Volumes
-from rtid.effects.laws.timing import COMMAND, Psi, TimingLaw
+from rtid.effects.laws.timing import COMMAND, Psi, TimingLaw, lagged
 from rtid.estimator.state import Weights
 from rtid.model import Grid, Machine
 from rtid.plain import FloatArray
@@ -48,7 +48,12 @@ def _thinned(border: FloatArray) -> FloatArray:
 
 
 class Search:
-    """Costs of revisions on the coarse map of one record, thinned out."""
+    """Costs of revisions on the coarse map of one record, thinned out.
+
+    The declared lag is applied before the thinning, as every timing is.  Applied to the thinned
+    record, whose step is longer than most lags, it left more than a spool of second order that
+    stands in its place: for a delay of 0.69 ms 14,293 beside 10,933, where it is now 11,260.
+    """
 
     def __init__(self, model: Machine, chunk: FloatArray) -> None:
         self.thinning = Thinning.of(model, chunk)
@@ -56,24 +61,31 @@ class Search:
         self.split = split(self.model)
         self.declared, self.chunk = model, chunk
         self.step_s = float(np.median(np.diff(chunk[:, 0])))
-        self.commands = commands(model, chunk)
+        self._given = commands(model, chunk).values()
         self.record = self.thinning.record(model, chunk)
-        self.weights: Weights = prepare(self.model, self.record)
+        weights = prepare(self.model, self.record)
+        self.lag_s, self.weights = weights.lag_s, replace(weights, lag_s=0.0)
 
     def beside(self, fit: Fit) -> Beside:
         """Costs beside a fit."""
         return Beside(self, fit)
 
     def sent(self, timings: Timings) -> FloatArray:
-        """The thinned record (n // m, 2 + signals), SI, of the split machine."""
+        """The thinned record (n // m, 2 + signals), SI, of the split machine, its spools' lag in.
+
+        The commands of the split machine stand behind its columns.
+        """
+        record = self.record
         if any(timing.where != COMMAND for timing, _ in timings):
-            whole = transformed(self.declared, self.chunk, timings)
-            return self.thinning.record(self.split, whole)
-        sent = [
-            self.thinning.command(through(u, d, self.step_s, timings))
-            for d, u in self.commands.values()
-        ]
-        return np.column_stack([self.record, *sent])
+            whole = transformed(self.declared, self.chunk, timings)[:, : self.chunk.shape[1]]
+            record = self.thinning.record(self.declared, whole)
+        lag_s = 0.0 if any(timing.replaces_lag for timing, _ in timings) else self.lag_s
+        sent = [self._thinned(through(u, d, self.step_s, timings), lag_s) for d, u in self._given]
+        return np.column_stack([record, *sent])
+
+    def _thinned(self, command: FloatArray, lag_s: float) -> FloatArray:
+        """A command (n,) behind a lag, as over the intervals (n // m,) of the thinned record."""
+        return self.thinning.command(lagged(command, self.step_s, (lag_s,)) if lag_s else command)
 
 
 class Beside:
@@ -100,7 +112,7 @@ class Beside:
         the lag stand for a part of it: both at once left 447,893 of chi2 where nothing left 97,557.
         """
         theta, n_c = self._solved(more)[1], len(self.search.model.chambers)
-        like = replace(like, lag_s=self.search.weights.lag_s)
+        like = replace(like, lag_s=self.search.lag_s)
         if not self.search.model.has_pressures or len(theta) < n_c:
             return like
         low, high = sorted(1.0 / bound for bound in self.search.model.beta_bounds_pa)
@@ -110,10 +122,7 @@ class Beside:
     def _solved(self, more: Timings) -> tuple[float, FloatArray]:
         """The cost with more timings, and the coefficients of compliances and effects."""
         search, timings = self.search, (*self.timings, *more)
-        weights = search.weights
-        if any(t.replaces_lag for t, _ in timings):
-            weights = replace(weights, lag_s=0.0)
-        sent = search.sent(timings)
+        weights, sent = search.weights, search.sent(timings)
         soft = softened(search.split, sent, weights, Revision((), timings))
         rows = rows_of(search.split, sent, weights, ROW_S, soft, search.thinning.m)
         self.most_rows = max(self.most_rows, rows.n)
