@@ -160,11 +160,13 @@ def interval(
     and now (signals + 1,) are scratch.
     """
     s, h, code, trial = 0.0, min(1.0, h), INSIDE, slopes[STAGES]
+    off = _rates(e, theta, theta_beta, overlap, foot, x0, x1, dt, s, p, now, slopes[0])
+    off_first = off
     for _ in range(MOST_STEPS):
         h = min(h, 1.0 - s)
         error = 0.0
-        beyond = False
-        for stage in range(STAGES):
+        beyond = off_first
+        for stage in range(1, STAGES):
             for c in range(e.n_chambers):
                 trial[c] = p[c]
                 for j in range(stage):
@@ -185,10 +187,12 @@ def interval(
         factor = SAFETY * (TOLERANCE_PA / max(error, 1e-30)) ** 0.2
         if error <= TOLERANCE_PA:
             s += h
+            off_first = off
             if beyond:
                 code = BEYOND
             for c in range(e.n_chambers):
-                p[c] = trial[c]  # the last stage is the new state
+                p[c] = trial[c]  # the last stage is the new state, and the next step's first
+                slopes[0, c] = slopes[STAGES - 1, c]
                 if _is_away(e, c, p[c]):
                     return RAN_AWAY, 1.0
         if s >= 1.0 - 1e-12:
@@ -272,10 +276,11 @@ def sides(
     for c in range(e.n_chambers):
         now[e.p_column[c]] = p[c]
     f0, f1, beyond = 0.0, 0.0, False
+    behind = math.exp(-s * dt / e.lag_s) if e.lag_s > 0.0 else 0.0
     for i in range(e.n_edges):
         w = e.held_v[i]
-        if e.start_v[i] != w and e.lag_s > 0.0:
-            w += (e.start_v[i] - w) * math.exp(-s * dt / e.lag_s)
+        if e.start_v[i] != w:
+            w += (e.start_v[i] - w) * behind
         if w > e.safe_v[i]:
             dp = now[e.source[i]] - now[e.sink[i]]
             q, off = map_flow(e, theta, i, overlap, w, dp)
