@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from rtid.diagnose.contest import alike_ones
-from rtid.diagnose.diagnosis import LEAST_SHARE, taken_in
+from rtid.diagnose.diagnosis import LEAST_SHARE, Result, taken_in
 from rtid.diagnose.exact import carried_on, exact_trials, is_inside, key_of, with_pump
 from rtid.diagnose.excuse import few_excused
 from rtid.diagnose.fit import MATCH_RHO
@@ -87,6 +87,25 @@ def extend(present: Standing, effect: str, where: str = "") -> Extension:
     if best.is_timing and effect != PUMP.effect and best.fit and not is_inside(best.fit):
         raise _nothing(tried)
     return tried
+
+
+def as_diagnosed(present: Standing, result: Result, key: Key) -> Extension | None:
+    """The model with what alone its diagnosis has added: its last fit is the one of `extend`.
+
+    None where that began elsewhere, as from a form that was looked for or a refit among rivals.
+    """
+    before, after = present.fit.revision, result.last.revision
+    is_alone = [effect.key for effect in result.found] == [key]
+    if not is_alone or len(before.timings) != len(after.timings):
+        return None
+    added = after.effects[len(before.effects) :]
+    scores = {candidate: score.gain for candidate, score in scored(present.fit)}
+    if len(added) != 1 or added[0].shape or scores.get(added[0]) != result.found[0].gain:
+        return None
+    trial = Trial(key, result.found[0].gain, after)
+    having = Standing(present.state, result.last)
+    against = tuple(_against(present, having, trial))
+    return Extension(key, trial.gain, present, having, against, _better(present, trial))
 
 
 def _nothing(tried: Extension) -> RefusedError:

@@ -18,7 +18,7 @@ from rtid.compare import Reference
 from rtid.diagnose.clean import as_measured, usable
 from rtid.diagnose.diagnosis import Result, search, searched
 from rtid.diagnose.disturbance import with_disturbance
-from rtid.diagnose.extend import Extension, extend
+from rtid.diagnose.extend import Extension, as_diagnosed, extend
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.partial import Exhibit, exhibits
 from rtid.diagnose.parts import AddedEffect
@@ -358,9 +358,16 @@ class Study:
             if is_zero(effect):
                 made[effect, where] = zeroed.tried(self, effect, where)
             else:
-                present: Standing = vars(self).get("_onward") or self.standing
-                made[effect, where] = extend(present, effect, where)
+                made[effect, where] = self._as_diagnosed(effect, where) or extend(
+                    vars(self).get("_onward") or self.standing, effect, where
+                )
         return made[effect, where]
+
+    def _as_diagnosed(self, effect: str, where: str) -> Extension | None:
+        """What the diagnosis has fitted to its end, where that was of this very model."""
+        if "diagnosed" not in vars(self) or "_onward" in vars(self):
+            return None
+        return as_diagnosed(self.standing, self.diagnosed.result, (effect, where))
 
     def having(
         self, standing: Standing, sections: tuple[AddedSection, ...], is_final: bool = True
