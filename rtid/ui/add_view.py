@@ -59,7 +59,7 @@ class AddView(PageView):
 
     def refresh(self) -> None:
         """The newest revision, and the one before it if there is one."""
-        revisions = self.bench.session.revisions
+        revisions = self.bench.session.seen
         after = revisions[-1].look if len(revisions) > 1 else None
         self._before.show(revisions[-2].look if after else revisions[-1].look)
         self._after.show(after)
@@ -130,9 +130,9 @@ def _heading(session: Session) -> str:
 
 def _planes(session: Session) -> str:
     """The residual maps before and after the last change, one colour scale."""
-    if len(session.revisions) < 2:
+    if len(session.seen) < 2 or not session.revisions[-1].is_seen:
         return ""
-    looks = [revision.look for revision in session.revisions[-2:]]
+    looks = [revision.look for revision in session.seen[-2:]]
     part = "validation" if "validation" in looks[0].parts else next(iter(looks[0].parts))
     every = [b for look in looks for b in look.parts[part].blocks]
     values = [b.residual_rms_m3s for b in every if isfinite(b.residual_rms_m3s)]
@@ -177,7 +177,7 @@ def _actions(session: Session) -> str:
         )
     made += " " + button("Undo", "undo", off=last is None or last.is_saved)
     label = f"Save {unsaved} to the project" if unsaved else "Nothing to save"
-    made += " " + button(label, "save", off=not unsaved)
+    made += " " + button(label, "save", off=not unsaved or session.seen != session.revisions)
     made += " " + button("Write the report", "export", what="report")
     return f"<p>{made}</p>"
 

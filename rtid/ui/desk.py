@@ -11,7 +11,6 @@ from pathlib import Path
 from rtid.compare import Reference
 from rtid.diagnose.report import Diagnosis
 from rtid.errors import RtidError
-from rtid.estimator.flowmap import FlowMap
 from rtid.maps.files import formats
 from rtid.plain import Progress
 from rtid.project import load
@@ -63,11 +62,10 @@ class RankedDiagnosis:
 
 @dataclass(frozen=True)
 class Addition:
-    """An effect that was added: the new revision, its errors, what to say of it."""
+    """An effect that was added, or dropped: the new model, its errors, what to say of it."""
 
     section: AddedSection
     sections: tuple[AddedSection, ...]
-    look: Look
     note: str
 
 
@@ -94,22 +92,29 @@ class Saved:
 
 @dataclass
 class _Revision:
-    """A study with the effects of its revision, its map, and what led to it.
+    """A study with the effects of its revision, and what led to it.
 
-    What it shows is the page's: the worker would hold the record once more.
+    What it shows is the page's: the worker would hold the record once more.  seen: until the page
+    asks for it; ready: the next ones, by effect, place and reason.
     """
 
     study: Study
-    flowmap: FlowMap
     kind: str = ""
     section: AddedSection | None = None
+    note: str = ""
     is_saved: bool = False
-    ready: dict[tuple[str, str], Look] = field(default_factory=dict)
+    seen: Look | None = None
+    ready: dict[tuple[str, str, str], _Revision] = field(default_factory=dict)
 
     @property
     def sections(self) -> tuple[AddedSection, ...]:
         """The effects of the model."""
         return self.study.project.sections.added
+
+
+def _addition(made: _Revision) -> Addition:
+    assert made.section is not None
+    return Addition(made.section, made.sections, made.note)
 
 
 class Desk:
@@ -152,7 +157,7 @@ class Desk:
         study, self._opening = self._opening or Study(project, trace, self._progress), None
         learned, read = study.replay, study.trace
         self._progress("simulating the pressures", 0.8)
-        seen, first = look(learned), _Revision(study, learned.map, is_saved=True)
+        seen, first = look(learned), _Revision(study, is_saved=True)
         self._stack = [first]
         return Opened(
             study.project.name,
@@ -174,24 +179,38 @@ class Desk:
         study.rest()
         return RankedDiagnosis(said, ranking, evidence)
 
-    def prepare(self, effect: str, where: str) -> None:
-        """Add an effect to nothing but memory, so that adding it takes no time."""
-        last, key = self._stack[-1], (effect, where)
-        if key not in last.ready:
-            last.ready[key] = look(with_effect(last.study, effect, where, "").replay)
-            last.study.rest()
+    def tried(self, effect: str, where: str, reason: str) -> Addition:
+        """What adding an effect would change; it is added to nothing but memory."""
+        return _addition(self._with(effect, where, reason))
+
+    def prepare(self, effect: str, where: str, reason: str) -> None:
+        """Have ready what the page shows once an effect is added."""
+        ready = self._with(effect, where, reason)
+        ready.seen = ready.seen or look(ready.study.replay)
 
     def add(self, effect: str, where: str, reason: str) -> Addition:
         """The newest revision with one effect more."""
+        self._stack.append(self._with(effect, where, reason))
+        return _addition(self._stack[-1])
+
+    def look(self) -> Look:
+        """What the newest revision shows, once."""
         last = self._stack[-1]
-        against = "; ".join(last.study.tried(effect, where).against)
-        reason = f"forced: {against}" if against else reason
-        study = with_effect(last.study, effect, where, reason)
         self._progress("learning the maps again", 0.6)
-        seen = last.ready.get((effect, where)) or look(study.replay)
-        section = study.project.sections.added[-1]
-        self._stack.append(_Revision(study, seen.flowmap, ADD, section))
-        return Addition(section, study.project.sections.added, seen, against)
+        seen, last.seen = last.seen or look(last.study.replay), None
+        return seen
+
+    def _with(self, effect: str, where: str, reason: str) -> _Revision:
+        """The newest revision with one effect more, fitted once."""
+        last, key = self._stack[-1], (effect, where, reason)
+        if key not in last.ready:
+            against = "; ".join(last.study.tried(effect, where).against)
+            reason = f"forced: {against}" if against else reason
+            study = with_effect(last.study, effect, where, reason)
+            last.study.rest()
+            section = study.project.sections.added[-1]
+            last.ready[key] = _Revision(study, ADD, section, against)
+        return last.ready[key]
 
     def back(self, kept: int) -> None:
         """Forget all revisions but the first ones."""
@@ -204,9 +223,8 @@ class Desk:
         if gone is None:
             raise RtidError(f"{effect} at {where} is not part of the model")
         study, errors = without(last.study, gone)
-        seen, section = look(study.replay), gone.model_copy(update={"errors": errors})
-        self._stack.append(_Revision(study, seen.flowmap, DROP, section))
-        return Addition(section, study.project.sections.added, seen, "")
+        self._stack.append(_Revision(study, DROP, gone.model_copy(update={"errors": errors})))
+        return _addition(self._stack[-1])
 
     def save(self) -> Saved:
         """Write the changes of this session to the project file, each a line of its history."""
@@ -247,7 +265,7 @@ class Desk:
             raise RtidError(f"{wish.suffix!r} is no format", f"one of {', '.join(formats())}")
         self._progress("laying out the tables", 0.5)
         last = self._stack[-1]
-        return release(last.study, last.flowmap, wish)
+        return release(last.study, last.study.map, wish)
 
     def foretell(self, way: Way) -> Sending:
         """What sending the daemon's offer would change, as the records have it."""

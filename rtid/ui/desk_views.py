@@ -31,7 +31,7 @@ class Bench:
     @property
     def look(self) -> Look:
         """The newest revision of the model, held against the record."""
-        return self.session.revisions[-1].look
+        return self.session.seen[-1].look
 
 
 class DeskViews:

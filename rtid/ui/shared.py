@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,14 +28,21 @@ if TYPE_CHECKING:
 
 Listener = Callable[[str], None]
 LOADING, READY, FAILED = "loading", "ready", "failed"
-STOPPABLE = ("read", "open", "diagnose", "prepare", "add", "drop", "glance", "judge")
+STOPPABLE = (
+    *("read", "open", "diagnose", "tried", "prepare", "add", "drop", "look"),
+    *("glance", "judge"),
+)
 STOPPED = "Stopped", "nothing has been learned from this record"
+NAMED = "named by the diagnosis"  # why an effect was added
 ROLE = "role"  # what pages hear when another browser comes, goes or takes over
 
 
 @dataclass
 class ShownRevision:
-    """A model of the stack; change: what led to it, "" for the first."""
+    """A model of the stack; change: what led to it, "" for the first.
+
+    look: where it is not `is_seen` yet, that of the model before; ready: additions that are fitted.
+    """
 
     look: Look
     sections: tuple[AddedSection, ...]
@@ -43,6 +51,8 @@ class ShownRevision:
     told: RankedDiagnosis | None = None
     note: str = ""  # what speaks against the change
     is_saved: bool = False
+    is_seen: bool = True
+    ready: dict[Key, Addition] = field(default_factory=dict)
 
 
 @dataclass
@@ -62,7 +72,6 @@ class Session:
     opened: Opened | None = None
     revisions: list[ShownRevision] = field(default_factory=list)
     listeners: list[Listener] = field(default_factory=list)
-    prepared: set[tuple[int, Key]] = field(default_factory=set)
     pages: Counter[int] = field(default_factory=Counter)  # open ones by browser
     writer: int | None = None  # the browser that works on the record
     arrival: Arrival | None = None  # before there is a project
@@ -128,6 +137,11 @@ class Session:
         return self.revisions[-1] if self.revisions else None
 
     @property
+    def seen(self) -> list[ShownRevision]:
+        """The revisions that can be shown: the newest one may still be learned."""
+        return [revision for revision in self.revisions if revision.is_seen]
+
+    @property
     def named(self) -> Key | None:
         """The one effect that the newest diagnosis names first; None: none, or a set."""
         ranked = self.last.told if self.last else None
@@ -137,15 +151,20 @@ class Session:
         return effects[0].effect, effects[0].where
 
     def add(self, effect: str, where: str) -> None:
-        """Make an effect part of the model."""
-        if self.worker.is_busy and not self.is_prepared((effect, where)):
-            self.doing = "finishing what was begun"
+        """Make an effect part of the model; one that is fitted already is told at once."""
         last = self.last
         named = last.told.diagnosis.found if last and last.told else ()
-        chosen = (effect, where) in [(f.effect, f.where) for f in named]
-        reason = "named by the diagnosis" if chosen else "chosen by name"
+        is_named = (effect, where) in [(f.effect, f.where) for f in named]
+        asked = "add", effect, where, NAMED if is_named else "chosen by name"
+        ready = last.ready.get((effect, where)) if last else None
+        if ready is not None:
+            self.worker.ask(*asked, then=ignore, failed=self._not_looked)
+            self._added("add")(ready)
+            return
+        if self.worker.is_busy:
+            self.doing = "finishing what was begun"
         self._is_adding = True
-        self.ask("add", effect, where, reason, then=self._added("add"))
+        self.ask(*asked, then=self._added("add"))
 
     def drop(self, effect: str, where: str) -> None:
         """Take an effect out of the model."""
@@ -159,6 +178,7 @@ class Session:
             self._forget()
             self.revisions.pop()
             self._step_back()
+            self.tell("state")  # words first: pictures take longer
             self.tell("looks")
             self._diagnose()
 
@@ -169,6 +189,7 @@ class Session:
         if not self.revisions:
             self.state, self.trouble = FAILED, STOPPED
         else:
+            self.revisions = self.seen
             self._step_back()
         self.tell("state")
 
@@ -193,8 +214,9 @@ class Session:
             self.open()
 
     def save(self) -> None:
-        """Write the changes of this session to the project file."""
-        self.ask("save", then=self._saved)
+        """Write the changes of this session to the project file, once they are learned."""
+        if self.seen == self.revisions:
+            self.ask("save", then=self._saved)
 
     def export(self, what: str) -> None:
         """Write a report beside the record."""
@@ -246,10 +268,6 @@ class Session:
         if self.trace is None and recorded:
             self.trace, self.state = recorded[:2][-1], LOADING  # that it came in
             self.open()
-
-    def is_prepared(self, key: Key) -> bool:
-        """True where adding it takes no time."""
-        return (len(self.revisions), key) in self.prepared
 
     def tell(self, what: str) -> None:
         """Let all pages know that something has changed: "state", "looks", "told", ROLE."""
@@ -314,25 +332,35 @@ class Session:
         """Have the next revision ready before the user asks for it."""
         effects = revision.told.diagnosis.found if revision.told else ()
         if effects and revision is self.last:
-            key, number = (effects[0].effect, effects[0].where), len(self.revisions)
+            key = effects[0].effect, effects[0].where
 
-            def ready(_: None) -> None:
-                self.prepared.add((number, key))
-                self.tell("state")
+            def ready(addition: Addition) -> None:
+                revision.ready[key] = addition
 
-            self.worker.ask("prepare", *key, then=ready, failed=lambda _: None)
+            self.worker.ask("tried", *key, NAMED, then=ready, failed=ignore)
+            self.worker.ask("prepare", *key, NAMED, then=ignore, failed=ignore)
 
     def _added(self, change: str) -> Callable[[Addition], None]:
         def added(result: Addition) -> None:
+            shown = self.revisions[-1].look
             revision = ShownRevision(
-                result.look, result.sections, change, result.section, note=result.note
+                shown, result.sections, change, result.section, note=result.note, is_seen=False
             )
             self.revisions.append(revision)
             self._is_adding = False
-            self.tell("looks")
-            self._diagnose()
+            self.ask("look", then=partial(self._looked, revision), failed=self._not_looked)
 
         return added
+
+    def _looked(self, revision: ShownRevision, look: Look) -> None:
+        revision.look, revision.is_seen = look, True
+        self.tell("looks")
+        self._diagnose()
+
+    def _not_looked(self, error: RtidError) -> None:
+        self.revisions = self.seen
+        self._step_back()
+        self._failed(error)
 
     def _saved(self, saved: Saved) -> None:
         for revision in self.revisions:

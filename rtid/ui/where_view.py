@@ -43,7 +43,7 @@ class WhereView(PageView):
 
     def __init__(self, bench: Bench) -> None:
         super().__init__(bench)
-        self._shown, look = bench.session.revisions[-1], bench.look
+        self._shown, look = bench.session.seen[-1], bench.look
         self.part = "validation" if "validation" in look.parts else next(iter(look.parts))
         self.quantity = "residual"
         self._time = bench.time
@@ -71,7 +71,7 @@ class WhereView(PageView):
 
     def refresh(self) -> None:
         """The newest revision, and the names of all."""
-        revisions = self.bench.session.revisions
+        revisions = self.bench.session.seen
         names = [f"{k} {name_of(r, k)}" for k, r in enumerate(revisions)]
         self.revisions = names if len(names) > 1 else []
         self.revision, self._shown = names[-1], revisions[-1]
@@ -126,7 +126,7 @@ class WhereView(PageView):
             self._asked = name
         elif what == "revision" and name in self.revisions:
             self.revision = name
-            self._shown = self.bench.session.revisions[self.revisions.index(name)]
+            self._shown = self.bench.session.seen[self.revisions.index(name)]
         self.show()
 
     def mark(self, keys: Sequence[Key], words: str) -> None:

@@ -113,8 +113,9 @@ def test_a_record_is_opened_diagnosed_and_the_next_step_is_made_ready() -> None:
     assert "looks" in heard
     assert worker.answer(told(KEY)) == "diagnose"
     assert session.named == KEY
-    assert worker.answer() == "prepare"
-    assert session.is_prepared(KEY)
+    assert [method for method, *_ in worker.jobs] == ["tried", "prepare"]
+    worker.answer(addition())
+    worker.answer()
     assert not worker.is_busy  # nothing is added or saved by itself
 
 
@@ -127,13 +128,11 @@ def test_a_record_that_cannot_be_read_says_why() -> None:
 
 def test_add_and_undo_leave_the_file_alone() -> None:
     session, worker, _ = begun()
-    worker.answer(opened())
-    worker.answer(told(KEY))
-    worker.answer()
+    diagnosed(worker)
     session.add(*KEY)
     assert named(session) is None  # while it is being added nobody can add it twice
-    added = SimpleNamespace(look="second look", sections=(section(),), section=section(), note="")
-    assert worker.answer(added) == "add"
+    assert worker.answer(addition()) == "add"
+    assert worker.answer("second look") == "look"
     assert looks(session) == ["first look", "second look"]
     assert worker.answer(told()) == "diagnose"
     session.undo()
@@ -144,28 +143,69 @@ def test_add_and_undo_leave_the_file_alone() -> None:
     assert not worker.is_busy  # there is nothing more to take back
 
 
-def second() -> Any:
-    return SimpleNamespace(look="second look", sections=(section(),), section=section(), note="")
+def addition(note: str = "") -> Any:
+    return SimpleNamespace(sections=(section(),), section=section(), note=note)
+
+
+def diagnosed(worker: FakeWorker) -> None:
+    """The record is opened and diagnosed; nothing more is made ready."""
+    for result in (opened(), told(KEY)):
+        worker.answer(result)
+    for _ in range(2):
+        worker.refuse("no")
+
+
+def test_what_is_fitted_is_added_at_once_and_can_be_shown_later() -> None:
+    session, worker, heard = begun()
+    for result in (opened(), told(KEY), addition()):
+        worker.answer(result)
+    assert worker.is_doing("prepare")
+    heard.clear()
+    session.add(*KEY)
+    assert [method for method, *_ in worker.jobs] == ["prepare", "add", "look"]
+    assert "Added" in strip(session) and set(heard) == {"state"}
+    assert looks(session) == ["first look"] * 2 and len(session.seen) == 1
+    session.save()
+    assert len(worker.jobs) == 3, "what is not learned yet is not saved"
+    for result in (None, addition(), "second look"):
+        worker.answer(result)
+    assert looks(session) == ["first look", "second look"] and "looks" in heard
+    assert worker.answer(told()) == "diagnose"
+
+
+def test_what_cannot_be_shown_yet_is_taken_back_or_stopped_or_fails() -> None:
+    for way in ("undo", "stop", "fails"):
+        session, worker, _ = begun()
+        for result in (opened(), told(KEY), addition(), None):
+            worker.answer(result)
+        session.add(*KEY)
+        if way == "fails":
+            worker.answer(addition())
+            worker.refuse("the disk is full")
+        else:
+            session.undo() if way == "undo" else session.stop()
+        assert looks(session) == ["first look"] and named(session) == KEY
+        assert worker.jobs[-1][:2] == ("back", (1,))
+        assert session.trouble[0] == ("the disk is full" if way == "fails" else "")
 
 
 def test_what_is_undone_is_gone_while_the_worker_still_looks_at_it() -> None:
     session, worker, heard = begun()
-    for result in (opened(), told(KEY), None):
-        worker.answer(result)
+    diagnosed(worker)
     session.add(*KEY)
-    worker.answer(second())
+    worker.answer(addition())
+    worker.answer("second look")
     assert worker.is_doing("diagnose")
     heard.clear()
     session.undo()
-    assert looks(session) == ["first look"] and heard == ["looks"]
+    assert looks(session) == ["first look"] and heard == ["state", "looks"]
     assert [(method, arguments) for method, arguments, _ in worker.jobs] == [("back", (1,))]
     assert named(session) == KEY and session.doing == ""
 
 
 def test_an_addition_that_is_being_made_is_stopped_by_undo() -> None:
     session, worker, _ = begun()
-    for result in (opened(), told(KEY), None):
-        worker.answer(result)
+    diagnosed(worker)
     session.add(*KEY)
     session.undo()
     assert [method for method, *_ in worker.jobs] == ["back"]  # should it have been made meanwhile
@@ -195,8 +235,7 @@ def test_a_record_that_is_not_opened_after_all_may_be_opened_again() -> None:
 
 def test_what_is_written_cannot_be_stopped() -> None:
     session, worker, _ = begun()
-    for result in (opened(), told(KEY), None):
-        worker.answer(result)
+    diagnosed(worker)
     session.save()
     session.stop()
     assert worker.answer(SimpleNamespace(note="wrote m.toml")) == "save"
@@ -204,10 +243,10 @@ def test_what_is_written_cannot_be_stopped() -> None:
 
 def test_what_was_saved_is_not_taken_back_here() -> None:
     session, worker, _ = begun()
-    for result in (opened(), told(KEY), None):
-        worker.answer(result)
+    diagnosed(worker)
     session.add(*KEY)
-    worker.answer(SimpleNamespace(look="l", sections=(section(),), section=section(), note=""))
+    worker.answer(addition())
+    worker.answer("l")
     worker.answer(told())
     session.save()
     assert worker.answer(SimpleNamespace(note="wrote m.toml")) == "save"
@@ -218,9 +257,7 @@ def test_what_was_saved_is_not_taken_back_here() -> None:
 
 def test_a_refusal_is_shown_and_the_work_goes_on() -> None:
     session, worker, heard = begun()
-    worker.answer(opened())
-    worker.answer(told(KEY))
-    worker.answer()
+    diagnosed(worker)
     session.add("external_leakage_laminar", "a")
     worker.refuse("it does not lower the held-out error")
     assert session.trouble[0] == "it does not lower the held-out error"
@@ -250,8 +287,8 @@ def test_what_speaks_against_a_change_stays_in_sight() -> None:
             worker.answer(result)
     session.add(*KEY)
     note = "it does not lower the held-out error: 0.19 % without it, 0.20 % with it"
-    worker.answer(SimpleNamespace(look="l", sections=(section(),), section=section(), note=note))
-    for _ in range(2):  # while the model is diagnosed, and behind it
+    worker.answer(addition(note))
+    for _ in range(3):  # while the model is learned, and diagnosed, and behind it
         words = strip(session)
         assert "against the evidence" in words
         assert note in words
@@ -277,9 +314,11 @@ def test_the_strip_says_what_to_do_next() -> None:
     assert "Looking for what is missing" in strip(session)
     worker.answer(told(KEY))
     assert 'data-do="add" data-effect="internal_leakage_laminar"' in strip(session)
-    worker.answer()
+    for _ in range(2):
+        worker.refuse("no")
     session.add(*KEY)
-    worker.answer(SimpleNamespace(look="l", sections=(section(),), section=section(), note=""))
+    worker.answer(addition())
+    worker.answer("l")
     assert "Added" in strip(session)
     worker.answer(told())
     assert "The model matches" in strip(session)
