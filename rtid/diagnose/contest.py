@@ -79,9 +79,21 @@ def contest(
     refitted = [finished[t.key] for t in (best, *rivals)]
     best = max(refitted, key=lambda t: t.gain)
     alike = alike_ones(state, present, best, refitted)
-    equals = [best, *(t for t in refitted if t.key in alike)]
+    equals = [best, *(t for t in refitted if t.key in alike and not _is_beaten(t, refitted))]
     chosen = min(equals, key=lambda t: (t.n_parameters, -t.gain))
     return chosen, tuple(t.key for t in equals if t.key != chosen.key)
+
+
+def _is_beaten(trial: Trial, others: list[Trial]) -> bool:
+    """True of a whole that explains less than a simpler cause, to the end of both.
+
+    A line without inertia is a dead volume: with an inertia that the record refuses it is none of
+    those that cannot be told from one.
+    """
+    return trial.is_whole and any(
+        other.n_parameters < trial.n_parameters and trial.gain < other.gain - TIE
+        for other in others
+    )
 
 
 def _finished(state: TrialState, present: Fit, trial: Trial) -> Trial:

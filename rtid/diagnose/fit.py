@@ -17,7 +17,7 @@ from rtid.diagnose.bank import add_shapes, add_timing, offer
 from rtid.diagnose.commands import commands, split, transformed
 from rtid.diagnose.equations import regression_of, softened
 from rtid.diagnose.evidence import Rows, project, rows_of
-from rtid.diagnose.moving import halfway, is_as_good, is_worse, moved, reweighed
+from rtid.diagnose.moving import halfway, is_as_good, is_worse, moved, reweighed, steadied
 from rtid.diagnose.regression import Estimate, Regression
 from rtid.diagnose.revision import Revision
 from rtid.effects.column import Candidate, Cause, Columns
@@ -214,7 +214,8 @@ def fit(
             step, halvings = halfway(best, step), halvings + 1
         else:
             halvings = 0
-            best, step = fitted, None if is_as_good(fitted, best) else moved(fitted)
+            step = None if is_as_good(fitted, best) else steadied(moved(fitted), fitted, best)
+            best = fitted
         del fitted  # its rows are large
     if not bank:
         return best

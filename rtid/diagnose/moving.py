@@ -73,6 +73,23 @@ def reweighed(fit: Fit) -> Weights | None:
     return replace(fit.weights, compliance=compliance)
 
 
+def steadied(step: Step | None, fit: Fit, before: Fit) -> Step | None:
+    """The step of a fit, its compliances halfway where they would swing back from the fit before.
+
+    A line's column is made with the compliance that weighs the rows, and the larger that is the
+    less it leaves to the chamber: both went from bound to bound and back until the passes were
+    used up.  What swings alike to both sides of a point is at it in one such step.
+    """
+    if step is None:
+        return None
+    target, now = step.weights.compliance, fit.weights.compliance
+    swings = (target - now) * (now - before.weights.compliance) < 0.0
+    if not swings.any():
+        return step
+    compliance = np.where(swings, 0.5 * (target + now), target)
+    return replace(step, weights=replace(step.weights, compliance=compliance))
+
+
 def halfway(best: Fit, step: Step) -> Step:
     """Half the way from a fit to a step that went too far."""
     old, new = best.revision, step.revision

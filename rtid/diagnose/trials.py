@@ -53,7 +53,12 @@ class Trial:
         """Parameters that the cause brings."""
         if self.is_timing:
             return len(self.revision.timings[-1][1])
-        return len(self.effect.shape) + (not self.effect.is_whole)
+        return len(self.effect.shape) + (not self.is_whole)
+
+    @property
+    def is_whole(self) -> bool:
+        """True of a cause of several parts that its shape alone describes."""
+        return not self.is_timing and self.effect.is_whole
 
     @property
     def effect(self) -> Candidate:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,7 +12,7 @@ from rtid.diagnose import contest as module
 from rtid.diagnose.contest import REFUTED, alike_ones, contest
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.trials import TIE, TIE_SHARE, Trial
-from rtid.effects.column import Candidate
+from rtid.effects.column import WHOLE, Candidate
 from rtid.plain import Key
 
 DOF = 4000.0
@@ -109,3 +110,21 @@ def test_what_was_refitted_beside_the_same_fit_is_not_refitted_again(
     for best, *rivals in ([leak, air, sag], [air, sag], [sag, leak]):
         contest(state(), present(5000), best, [best, *rivals], finished)
     assert refitted == ["leak", "air", "sag"]
+
+
+def test_a_whole_that_explains_less_than_a_simple_cause_is_no_equal_of_it(
+    refits: dict[str, float],
+) -> None:
+    """A line that has a dead volume in it explains as much, whatever its inertia is."""
+    volume = trial("volume", 1000, 0.0)
+    candidate = replace(trial("line", 990, 1.0, 2.0, 3.0).effect, parameter=WHOLE)
+    line = Trial(("line", "a"), 990, Revision(effects=(candidate,)))
+    for gain, equals in ((1000 - TIE + 1, (line.key,)), (1000 - TIE - 1, ())):
+        refits.update(line=gain)
+        chosen, rest = contest(state(), present(5000), volume, [volume, line], {})
+        assert (chosen.key, rest) == (volume.key, equals)
+    refits.update(line=1000 - TIE - 1)
+    other = trial("hose", 990, 1.0, 2.0, 3.0)
+    refits.update(hose=1000 - TIE - 1)
+    _, rest = contest(state(), present(5000), volume, [volume, line, other], {})
+    assert rest == (other.key,)

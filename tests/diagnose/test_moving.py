@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from rtid.diagnose.fit import Fit, fit, one_pass, prepare
-from rtid.diagnose.moving import REACH, Step, halfway, is_as_good, is_worse, moved
+from rtid.diagnose.moving import REACH, Step, halfway, is_as_good, is_worse, moved, steadied
 from rtid.diagnose.revision import Revision
+from rtid.effects.laws.lines import AT_CYLINDER
 from rtid.effects.laws.timing import TIMINGS, TimingLaw
 from rtid.estimator.state import Weights
 from rtid.model import Lag
+from rtid.sim.random_plants import draw
 from tests.diagnose.records import record
 
 DELAY_S = 12e-3
@@ -102,3 +104,25 @@ def test_a_lag_that_would_leave_its_range_is_held() -> None:
     done = fit(model, chunk, replace(weights(), lag_s=1e-3), Revision(), bank=False)
     assert 0.0 <= done.weights.lag_s <= 1e-3 + 3 * 1e-4 + 1e-12
     assert np.isnan(replace(done, declared=replace(model, lag=Lag(1e-3, 0.0))).lag_sd_s)
+
+
+def test_a_compliance_that_would_swing_back_goes_half_the_way() -> None:
+    fit_, c = at(11e-3), weights().compliance
+    before = replace(fit_, weights=replace(fit_.weights, compliance=c * [2.0, 1.5]))
+    step = Step(late(11e-3), replace(fit_.weights, compliance=c * [1.4, 0.8]))
+    now = steadied(step, fit_, before)
+    assert now is not None
+    assert now.weights.compliance == pytest.approx(c * [1.2, 0.8])
+    assert steadied(step, fit_, fit_) is step and steadied(None, fit_, before) is None
+
+
+def test_a_line_that_is_fitted_to_a_dead_volume_leaves_the_oil_as_it_is() -> None:
+    """It went from one bound of the compliance to the other and ended at half as much again."""
+    model, chunk, _ = record("extra_dead_volume", 1e-3, seed=4)
+    start = prepare(model, chunk)
+    offered = one_pass(model, chunk, start, Revision(), None, True).columns.candidates
+    lines = (c for c in offered if c.effect == "line_dynamics" and c.where == "both")
+    line = next(c for c in lines if AT_CYLINDER in c.shape_names)
+    line = replace(line, shape=(450.0, 4e-4, 2e8))
+    done = fit(model, chunk, start, Revision(effects=(line,)), bank=False)
+    assert done.weights.compliance * draw(4).beta_pa == pytest.approx([1.0, 1.0], abs=0.25)
