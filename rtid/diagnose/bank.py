@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from rtid.diagnose.commands import change_of
 from rtid.diagnose.revision import Revision
 from rtid.effects.column import Candidate, Cause, Columns
 from rtid.effects.law import Shape, Volumes
-from rtid.effects.laws import cause_of, causes
+from rtid.effects.laws import add_echoes, cause_of, causes
 from rtid.effects.laws.common import supply_change
 from rtid.effects.laws.pump import demand
 from rtid.effects.laws.sensors import late
@@ -22,6 +22,25 @@ from rtid.estimator.state import Weights
 from rtid.plain import FloatArray
 
 LAG_STEP_S = 5e-5
+
+
+def columns_of(
+    view: RecordView, condense: Callable[[FloatArray], FloatArray],
+    sent: dict[str, tuple[int, FloatArray]], weights: Weights, revision: Revision,
+    bank: bool = False, more: Iterable[tuple[Cause, Shape]] = (), suspects: tuple[Effect, ...] = (),
+) -> tuple[Columns, int, tuple[tuple[int, int], ...]]:  # fmt: skip
+    """Every column of a fit behind the compliances, echoes last, as `fit.one_pass` has them.
+
+    condense: as of `Columns`; sent: the commands (n,), V, before any timing.  With the number of
+    timings' columns, and effect and nonlinear parameter of each column of shapes.
+    """
+    columns = Columns(condense)
+    n_timing = add_timing(view, columns, sent, weights, revision)
+    shapes = tuple(add_shapes(view, columns, revision))
+    offer(view, columns, revision, bank, more, suspects)
+    slopes = [(cause_of(view, e), e.shape, k) for i, k in shapes for e in [revision.effects[i]]]
+    add_echoes(view, columns, n_timing, slopes)
+    return columns, n_timing, shapes
 
 
 def add_timing(

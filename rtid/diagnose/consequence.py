@@ -2,9 +2,9 @@
 
 A free map swallows what is nearly a function of (u, dp): a leak of a tenth of the flow may leave a
 held-out residual at the sensors' floor, and a map that is as much wrong.  So an effect matters by
-its consequence.  It is believed where it is *stable*: the sizes from two halves of the record, and
-from a grid of half the spacing, agree with the size from all of it within their joint 95 %, or a
-tenth.
+its consequence.  It is believed where it is *stable*: the sizes in two halves of the record agree,
+its maps being one (`halves`), and that from a grid of half the spacing agrees with them, within
+their joint 95 %, or a tenth.
 
     bend of a map = rms(Q_without - Q_with) / largest Q_with,  over the intervals of the record
 """
@@ -16,10 +16,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rtid.diagnose.commands import split
+from rtid.diagnose.evidence import rows_of
 from rtid.diagnose.fit import Fit, one_pass
+from rtid.diagnose.halves import between_halves
 from rtid.diagnose.residual import is_known
 from rtid.diagnose.trials import Trial
 from rtid.effects.record_view import RecordView
+from rtid.kernels.layout import TERMS
 from rtid.model import PROPORTIONAL, Grid, Machine
 from rtid.plain import FloatArray
 from rtid.units import Z95
@@ -35,7 +39,6 @@ ALIKE = 0.1
 # inertance of a line that was not there reached 56, stable, and moved a modulus by 3 %
 HIDDEN_GAIN = 100.0
 BENT = 3.0  # times its own flow that an effect may gain: it also bends the maps when it is missing
-PART = 0.5  # of the record, each of the two
 
 
 @dataclass(frozen=True)
@@ -93,48 +96,52 @@ def _softer(present: Fit, now: Fit) -> Iterator[tuple[str, float]]:
 def is_stable(now: Fit, trial: Trial) -> bool:
     """True where the halves of the record, and a finer grid, give the size that all of it gives.
 
-    Halves that could not tell the size from nothing confirm nothing.
+    Halves that could not tell the size from nothing confirm nothing; a finer grid is asked where
+    it leaves the record's rows any freedom.
     """
-    whole = _size(now, trial)
-    middle = int(PART * len(now.chunk))
-    parts = now.chunk[:middle], now.chunk[middle:]
-    first, last = (_size(_again(now, now.declared, part), trial) for part in parts)
-    tells = Z95 * float(np.hypot(first[1], last[1])) < abs(whole[0])
-    if not tells or not _agree(first, last):
+    column, value, sd = _size(now, trial)
+    apart, apart_sd = between_halves(now, column)
+    if Z95 * apart_sd >= abs(value) or not _is_alike(value, apart, apart_sd):
         return False
-    return _agree(whole, _size(_again(now, finer(now.declared), now.chunk), trial))
+    on_finer = _on_finer(now)
+    if on_finer is None:
+        return True
+    _, other, other_sd = _size(on_finer, trial)
+    return _is_alike(value, value - other, float(np.hypot(sd, other_sd)))
 
 
-def _again(now: Fit, machine: Machine, chunk: FloatArray) -> Fit:
-    """The same revision on another grid or part, chunk (n, 2 + signals), SI; one pass is near."""
-    weights = now.weights
-    if machine is not now.declared:
-        of_cells = weights.slopes, weights.missed
-        slopes, missed = (_spread(now.declared, machine, each) for each in of_cells)
-        weights = replace(weights, slopes=slopes, missed=missed)
-    return one_pass(machine, chunk, weights, now.revision, None, False, thorough=False)
+def _on_finer(now: Fit) -> Fit | None:
+    """The same revision on a grid of half the spacing, one pass being near; None for no freedom."""
+    machine, weights = finer(now.declared), now.weights
+    slopes, missed = (
+        _spread(now.declared, machine, each) for each in (weights.slopes, weights.missed)
+    )
+    weights = replace(weights, slopes=slopes, missed=missed)
+    rows = rows_of(split(machine), now.sent, weights)
+    if rows.n <= TERMS * len(rows.cells):
+        return None
+    return one_pass(machine, now.chunk, weights, now.revision, None, False, thorough=False)
 
 
-def _size(fit: Fit, trial: Trial) -> tuple[float, float]:
-    """The first parameter of the effect that was tried last, and its standard deviation."""
-    spread = float(np.sqrt(max(1.0, fit.rho)))
+def _size(fit: Fit, trial: Trial) -> tuple[int, float, float]:
+    """The first free parameter of what was tried last: column, value, standard deviation."""
     if trial.is_timing:
         k = len(fit.revision.timings) - 1
         column = fit.timing_columns(k)[0]
         value = fit.revision.timings[k][1][0] + fit.estimate.value(column)
     elif (effect := fit.revision.effects[-1]).is_whole and (free := fit.shape_columns(effect)):
-        column = free.get(0, min(free.values()))
-        value = effect.shape[0] + (fit.estimate.value(column) if 0 in free else 0.0)
+        first = min(free)
+        column = free[first]
+        value = effect.shape[first] + fit.estimate.value(column)
     else:
         column = fit.column(effect)
         value = fit.held.value(column)
-    return value, spread * fit.estimate.sd(column)
+    return column, value, fit.estimate.sd(column) * float(np.sqrt(max(1.0, fit.rho)))
 
 
-def _agree(a: tuple[float, float], b: tuple[float, float]) -> bool:
-    (value, sd), (other, other_sd) = a, b
-    apart = abs(value - other)
-    return apart <= max(Z95 * float(np.hypot(sd, other_sd)), ALIKE * abs(value))
+def _is_alike(value: float, apart: float, sd: float) -> bool:
+    """True for a difference of sizes that their deviation explains, or that is a tenth of them."""
+    return abs(apart) <= max(Z95 * sd, ALIKE * abs(value))
 
 
 def finer(machine: Machine) -> Machine:

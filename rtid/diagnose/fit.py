@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from rtid.diagnose.bank import add_shapes, add_timing, offer
+from rtid.diagnose.bank import columns_of
 from rtid.diagnose.commands import commands, split, transformed
 from rtid.diagnose.equations import regression_of, softened
 from rtid.diagnose.evidence import Rows, project, rows_of
@@ -22,7 +22,7 @@ from rtid.diagnose.regression import Estimate, Regression
 from rtid.diagnose.revision import Revision
 from rtid.effects.column import Candidate, Cause, Columns
 from rtid.effects.law import Shape, Volumes
-from rtid.effects.laws import add_echoes, cause_of
+from rtid.effects.laws import cause_of
 from rtid.effects.laws.response import behind_s
 from rtid.effects.page import Effect
 from rtid.effects.record_view import MapTerms, RecordView
@@ -251,13 +251,9 @@ def one_pass(
     rows = known or rows_of(model, sent, weights, soft=soft)
     before = start.map if start else before or _map_alone(model, rows)
     view = RecordView.of(model, sent, weights, before)
-    columns = Columns(rows.condensed)
-    n_timing = add_timing(view, columns, commands(declared, chunk), weights, revision)
-    shapes = tuple(add_shapes(view, columns, revision))
+    given = rows.condensed, commands(declared, chunk), weights, revision
+    columns, n_timing, shapes = columns_of(view, *given, bank, more, suspects)
     first = 1 + len(model.chambers) + n_timing + len(shapes)
-    offer(view, columns, revision, bank, more, suspects)
-    slopes = [(cause_of(view, e), e.shape, k) for i, k in shapes for e in [revision.effects[i]]]
-    add_echoes(view, columns, n_timing, slopes)
     projected = project(rows, columns.released())
     dof = float(rows.n - TERMS * len(rows.cells))
     regression = regression_of(model, weights, revision, projected, columns, rows, dof)

@@ -95,23 +95,25 @@ def test_advice_never_asks_for_what_the_record_has(result: Result) -> None:
     assert not list(would_separate(has_both, FLOW))
 
 
-Sizes = list[tuple[float, float]]  # value and sd: of all, of both halves, on the finer grid
+Size = tuple[float, float]  # value and standard deviation
 
 
 @pytest.mark.parametrize(
-    ("sizes", "is_believed"),
+    ("whole", "apart", "on_finer", "is_believed"),
     [
-        ([(1.0, 0.02), (1.01, 0.03), (0.98, 0.03), (1.0, 0.03)], True),
-        ([(1.0, 0.02), (1.4, 0.03), (0.7, 0.03), (1.0, 0.03)], False),  # ends half-way
-        ([(1.0, 0.02), (1.4, 0.90), (0.7, 0.90), (1.0, 0.03)], False),  # halves tell nothing
-        ([(1.0, 0.02), (1.01, 0.03), (0.98, 0.03), (0.5, 0.03)], False),  # the grid made it
+        ((1.0, 0.02), (0.03, 0.04), (1.0, 0.03), True),
+        ((1.0, 0.02), (0.70, 0.04), (1.0, 0.03), False),  # ends half-way
+        ((1.0, 0.02), (0.70, 0.90), (1.0, 0.03), False),  # halves tell nothing
+        ((1.0, 0.02), (0.03, 0.04), (0.5, 0.03), False),  # the grid made it
     ],
 )
 def test_a_size_must_be_that_of_both_halves_and_of_a_finer_grid(
-    result: Result, monkeypatch: pytest.MonkeyPatch, sizes: Sizes, is_believed: bool
-) -> None:
-    told = iter(sizes)
-    monkeypatch.setattr(evidence, "_size", lambda *_: next(told))
+    result: Result, monkeypatch: pytest.MonkeyPatch,
+    whole: Size, apart: Size, on_finer: Size, is_believed: bool,
+) -> None:  # fmt: skip
+    told = iter((whole, on_finer))
+    monkeypatch.setattr(evidence, "_size", lambda *_: (0, *next(told)))
+    monkeypatch.setattr(evidence, "between_halves", lambda *_: apart)
     last, accepted = result.last, result.found[0]
     assert is_stable(last, Trial(accepted.key, accepted.gain, last.revision)) == is_believed
 

@@ -1,0 +1,76 @@
+"""One size over all of a record: asked of its halves beside one map, which leaves them a say."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rtid.diagnose.consequence import is_stable
+from rtid.diagnose.fit import Fit, fit, one_pass, prepare
+from rtid.diagnose.halves import between_halves
+from rtid.diagnose.revision import Revision
+from rtid.diagnose.trials import Trial, best_by_key, scored
+from rtid.estimator.estimator import to_chunk
+from rtid.kernels.engine import GAP_FLAG
+from rtid.model import Machine
+from rtid.plain import FloatArray, Key
+from rtid.sim.demand import IDENTIFICATION
+from rtid.sim.run import simulate
+from tests.campaign.laws import RECORD_S, Case, declared
+from tests.diagnose.records import record
+
+LEAK, VOLUME = ("external_leakage_laminar", "a"), ("extra_dead_volume", "a")
+MOTIONS = ("sweep", "rich")
+
+
+def beside(model: Machine, chunk: FloatArray, key: Key) -> tuple[Fit, Trial]:
+    """The fit with a cause of the catalogue."""
+    first = one_pass(model, chunk, prepare(model, chunk), Revision(), None, True)
+    candidate, score = best_by_key(first, scored(first))[key]
+    now = fit(model, chunk, first.weights, Revision((candidate,)), bank=False)
+    return now, Trial(key, score.gain, now.revision)
+
+
+def sizes(now: Fit) -> tuple[float, float, float]:
+    """Of all of the record, and what its first half has more, with the deviation of that."""
+    column = now.column(now.revision.effects[-1])
+    return now.held.value(column), *between_halves(now, column)
+
+
+@pytest.mark.parametrize(
+    ("key", "strength", "motion"),
+    [(key, size, motion) for key, size in ((LEAK, 1e-12), (VOLUME, 1e-4)) for motion in MOTIONS],
+)
+def test_what_is_there_all_the_time_has_one_size(key: Key, strength: float, motion: str) -> None:
+    """Also of what is stored, the pressures' noise being taken out of either half."""
+    model, chunk, _ = record(key[0], strength, 4, motion, key[1])
+    size, apart, sd = sizes(beside(model, chunk, key)[0])
+    assert abs(apart) < max(3.0 * sd, 0.01 * size)
+    assert sd < 0.1 * size
+
+
+def test_what_ends_half_way_has_two() -> None:
+    """A machine that leaks, and behind a gap the same one that does not."""
+    (model, leaky, _), (_, tight, _) = (record(LEAK[0], v, 4, where="a") for v in (1e-12, 0.0))
+    half = len(leaky) // 2
+    chunk = np.concatenate([leaky[:half], tight[half:]])
+    chunk[half, 1] = int(chunk[half, 1]) | GAP_FLAG
+    now, trial = beside(model, chunk, LEAK)
+    _, apart, sd = sizes(now)
+    assert apart == pytest.approx(1e-12, rel=0.1) and sd < 0.05 * apart
+    assert not is_stable(now, trial)
+
+
+@pytest.mark.slow
+def test_halves_of_a_short_record_on_a_wide_grid_have_their_say() -> None:
+    """A seat's leak in 32 s on the grid of `rtid init`: halves with maps of their own had 36
+    degrees of freedom and less than none, so that 40 standard deviations were "negligible".
+    """
+    case = Case(6101, "choking", "rich_record", "valve_seat_leakage")
+    run = simulate(case.plant, case.motion, case.seed, RECORD_S, case.sensors)
+    model = declared(case, run)
+    chunk = to_chunk(model, run.samples, 0)
+    now, trial = beside(model, chunk[chunk[:, 0] < IDENTIFICATION * RECORD_S], (LEAK[0], "b"))
+    size, apart, sd = sizes(now)
+    assert abs(apart) < 0.1 * size and sd < 0.1 * size
+    assert is_stable(now, trial)
