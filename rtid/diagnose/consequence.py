@@ -35,8 +35,9 @@ SOFTER = 0.01  # of the modulus: its move, if beyond its 95 % interval without t
 # a law is not quite the catalogue's.  The halves of a leak whose gap widens with pressure were 3 %
 # apart, 3.8 of their joint standard deviations; without this it was not named at all
 ALIKE = 0.1
-# chi2 of what the maps have taken in: ten standard deviations of its size.  On a clean sweep the
-# inertance of a line that was not there reached 56, stable, and moved a modulus by 3 %
+# chi2 of what the maps have taken in, for each number that describes it: ten standard deviations.
+# On a clean sweep the inertance of a line that was not there reached 56, stable, and moved a
+# modulus by 3 %; for a dead volume on another a line took 115, three of its numbers at 4 to 5
 HIDDEN_GAIN = 100.0
 BENT = 3.0  # times its own flow that an effect may gain: it also bends the maps when it is missing
 

@@ -243,7 +243,7 @@ def taken_in(
     One that takes moduli out of what they can be is nothing that the maps have hidden: on a clean
     sweep a line took both from 1030 MPa to 1660 and 1860, stable, and 3 % off the residual.
     """
-    if trial.gain < HIDDEN_GAIN or after.rms_m3s > WORSE * last.rms_m3s:
+    if trial.gain < HIDDEN_GAIN * trial.n_parameters or after.rms_m3s > WORSE * last.rms_m3s:
         return None
     if not _is_as_credible(present, now):
         return None

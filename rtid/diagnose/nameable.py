@@ -88,9 +88,16 @@ def reaches(
         for candidate, score in clearest(scores).values()
         if np.isfinite(score.sd)
     ]
-    gain = max(HIDDEN_GAIN, ALIKE**2 * clearest_gain)
-    of = _reaches(fit, fit.rows, wanted, flow_m3s)
-    return {candidate: replace(reach, gain=gain) for candidate, reach in of}
+    least = ALIKE**2 * clearest_gain
+    return {
+        candidate: replace(reach, gain=max(HIDDEN_GAIN * _numbers(candidate), least))
+        for candidate, reach in _reaches(fit, fit.rows, wanted, flow_m3s)
+    }
+
+
+def _numbers(candidate: Candidate) -> int:
+    """Those that describe it; the column of a timing is the whole of one."""
+    return len(candidate.shape) if candidate.where == COMMAND else candidate.n_parameters
 
 
 def _reaches(

@@ -53,7 +53,7 @@ class Trial:
         """Parameters that the cause brings."""
         if self.is_timing:
             return len(self.revision.timings[-1][1])
-        return len(self.effect.shape) + (not self.is_whole)
+        return self.effect.n_parameters
 
     @property
     def is_whole(self) -> bool:

@@ -55,6 +55,11 @@ class Candidate:
         return self.parameter == WHOLE
 
     @property
+    def n_parameters(self) -> int:
+        """Numbers that describe it."""
+        return len(self.shape) + (not self.is_whole)
+
+    @property
     def key(self) -> tuple[str, str]:
         """Candidates that differ in shape alone are one cause."""
         return self.effect, self.where

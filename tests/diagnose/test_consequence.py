@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from rtid.diagnose import consequence as evidence
+from rtid.diagnose import diagnosis as search_module
 from rtid.diagnose.consequence import Consequence, finer, is_stable
 from rtid.diagnose.diagnosis import (
     Result,
@@ -19,6 +20,7 @@ from rtid.diagnose.diagnosis import (
 from rtid.diagnose.experiment import FLOW, would_separate
 from rtid.diagnose.report import Diagnosis, diagnosis
 from rtid.diagnose.residual import Residual, is_known
+from rtid.diagnose.revision import Revision
 from rtid.diagnose.trials import Trial, TrialState
 from rtid.diagnose.verdict import MATERIAL
 from rtid.effects.record_view import RecordView
@@ -116,6 +118,20 @@ def test_a_size_must_be_that_of_both_halves_and_of_a_finer_grid(
     monkeypatch.setattr(evidence, "between_halves", lambda *_: apart)
     last, accepted = result.last, result.found[0]
     assert is_stable(last, Trial(accepted.key, accepted.gain, last.revision)) == is_believed
+
+
+@pytest.mark.parametrize(("shape", "is_believed"), [((), True), ((1.0, 2.0), False)])
+def test_each_number_of_what_is_hidden_must_stand_out(
+    result: Result, monkeypatch: pytest.MonkeyPatch, shape: tuple[float, ...], is_believed: bool
+) -> None:
+    """A line of three numbers took 115 of chi2 where a dead volume was hidden, and was named."""
+    monkeypatch.setattr(search_module, "is_stable", lambda *_: True)
+    (accepted,) = result.found
+    (leak,) = result.last.revision.effects
+    trial = Trial(accepted.key, 250.0, Revision((replace(leak, shape=shape),)))
+    residuals = result.before, result.after
+    does = search_module.taken_in(result.first, result.last, trial, 0.1, *residuals)
+    assert (does is not None) == is_believed
 
 
 @pytest.mark.parametrize(
