@@ -14,6 +14,7 @@ from rtid.project import load
 from rtid.study.compared import TraceComparison, compare_trace, study
 from rtid.study.replay import replay
 from rtid.study.revisions import add
+from tests.replays import shared_replays  # noqa: F401
 from tests.rig import figures
 
 PROJECT = Path(__file__).parents[1] / "rtid" / "project" / "examples" / "cylinder.toml"

@@ -23,6 +23,7 @@ from rtid.study.revisions import add, without
 from rtid.study.study import Study
 from rtid.ui.desk import Desk
 from tests.diagnose.stops import STEP_S, against_the_stops
+from tests.replays import shared_replays  # noqa: F401
 
 ZERO, BIAS = "pressure_sensor_bias", 0.25e6
 STOPS = ((9.0, 3.0), (-9.0, 3.0))

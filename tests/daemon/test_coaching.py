@@ -22,6 +22,7 @@ from rtid.project import Project, load
 from rtid.sim.run import simulate
 from rtid.trace.snapshot import Generations
 from tests.excite.machines import machine, write_project
+from tests.replays import shared_replays  # noqa: F401
 
 NUMBER, LEAK = 7, "external_leakage_laminar"
 
