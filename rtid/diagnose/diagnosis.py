@@ -216,6 +216,7 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
             does = taken_in(present, now, trial, own, last, after)
         what = trial.key, alike, trial.gain, trial.n_parameters
         if is_shown or does is not None:
+            present.unread()  # what is read beside the next one is as large
             kept, after = _with_bank(state, now)
             state.found.append(AcceptedEffect(*what, last, after, does))
             return kept, after

@@ -31,6 +31,7 @@ ROW_S = 10e-3  # positions measured within so long make one row
 SPAN = 10  # rows in which only few blocks move
 QUIET = 1e-9  # a block whose whitened state is smaller adds nothing to an innovation
 COLUMNS_AT_ONCE = 256  # of a triangle that is copied
+AT_ONCE = 16  # given columns that are put beside one another
 ENTRIES = 4  # per row, for which there is room at first
 
 
@@ -105,8 +106,11 @@ class Rows:
         columns = np.zeros((rows, n_c, first + len(given)))
         columns[:, :, :first] = self.own
         nothing = np.zeros(rows)
-        for c in range(n_c if given else 0):
-            columns[:, c, first:] = np.stack([v.get(c, nothing) for v in given]).T
+        for k in range(0, len(given), AT_ONCE):  # all of a chamber at once would be there twice
+            part = given[k : k + AT_ONCE]
+            for c in range(n_c):
+                here = columns[:, c, first + k : first + k + len(part)]
+                here[:] = np.stack([v.get(c, nothing) for v in part]).T
         return columns
 
     @cached_property

@@ -167,6 +167,11 @@ class Fit:
             self.rows.forget()
         return self
 
+    def unread(self) -> Fit:
+        """The same, what was read along its record let go: who asks for it again reads it anew."""
+        vars(self).pop("view", None)
+        return self
+
     def column(self, candidate: Candidate) -> int:
         """Column of a candidate."""
         return self.first + self.columns.candidates.index(candidate)

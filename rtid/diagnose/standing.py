@@ -87,5 +87,5 @@ def stand(
 def with_bank(present: Fit, suspects: tuple[Effect, ...] = ()) -> Fit:
     """A fit where it is, with every candidate beside it."""
     record = present.declared, present.chunk, present.weights, present.revision
-    banked = one_pass(*record, present, bank=True, suspects=suspects)
+    banked = one_pass(*record, present.unread(), bank=True, suspects=suspects)
     return with_spreads(banked) if present.spreads else banked

@@ -345,10 +345,12 @@ class Study:
         known = vars(self)
         if "diagnosed" in known:
             made = self.diagnosed.result
-            made = replace(made, first=replace(made.first), last=replace(made.last))
+            made = replace(made, first=made.first.light(), last=made.last.light())
             known["diagnosed"] = replace(self.diagnosed, result=made)
-        if "standing" in known:
-            known["standing"] = replace(self.standing, fit=replace(self.standing.fit))
+        for name in ("standing", "_onward"):
+            if name in known:
+                known[name] = replace(known[name], fit=known[name].fit.light())
+        known.pop("_tried", None)  # it can be made again of these
 
     def tried(self, effect: str, where: str = "") -> Extension:
         """The model with one effect more, fitted once.  Raises RefusedError."""

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
@@ -74,6 +76,16 @@ def serve(pipe: Connection, folder: Path, stop: Event) -> None:
             return
         except Exception as error:
             pipe.send(("refused", in_words(method, error)))
+        give_back()
+
+
+def give_back() -> None:
+    """Give back to the system what was freed: glibc keeps what lies between small things that stay.
+
+    Behind the diagnosis of ten minutes at 1 kHz that was 430 MB of 750; another library has none.
+    """
+    with suppress(AttributeError, OSError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def ignore(*_: object) -> None:

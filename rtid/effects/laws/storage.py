@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import partial
+from itertools import chain
 
 import numpy as np
 
@@ -37,9 +38,9 @@ def add_echoes(
     def echo_of(cause: Cause, shape: Shape) -> Volumes:
         return _echo(view, cause.at(shape), noise)
 
-    echoes = [cause.slope_of(partial(echo_of, cause), shape, k) for cause, shape, k in slopes]
-    echoes += [_echo(view, candidate, noise) for candidate in columns.candidates]
-    for k, by_chamber in enumerate(echoes):
+    of_slopes = (cause.slope_of(partial(echo_of, cause), shape, k) for cause, shape, k in slopes)
+    of_all = (_echo(view, candidate, noise) for candidate in columns.candidates)
+    for k, by_chamber in enumerate(chain(of_slopes, of_all)):  # one at a time: each is a record
         if by_chamber:
             columns.echo_of[1 + n_c + first + k] = 1 + n_c + columns.add(by_chamber)
 
