@@ -24,7 +24,7 @@ from rtid.sim.run import simulate
 from rtid.study.revisions import add
 from rtid.study.spans import added_parts
 from rtid.tell.diagnosed import LIMITS_SAY, limits, sentences
-from rtid.tell.report import page
+from rtid.tell.report import page, stills
 from rtid.tell.report_file import Reported, report
 from rtid.tell.report_story import ReportStory
 from tests.replays import shared_replays  # noqa: F401
@@ -245,6 +245,18 @@ def test_a_record_of_which_nothing_could_be_judged_has_a_page_too(leaking: Repor
     assert "Too little motion to tell." in words
     assert "No flow of this record could be judged." in words
     assert "nan" not in words.split()
+
+
+def test_a_floor_of_nothing_is_no_floor(leaking: Reported) -> None:
+    """Where one disturbance stands for all that the command does not say, no sensor has a part."""
+    told = leaking.told
+    found = replace(told.diagnosed.diagnosis, noise_floor_m3s=0.0)
+    story = replace(told, diagnosed=replace(told.diagnosed, diagnosis=found))
+    reader = Reader()
+    reader.feed(page(story))
+    words = " ".join(reader.words)
+    assert "0.00 %" not in words and "sensors' floor" not in words and "not known" in words
+    assert not stills(story)["errors"].axes[0].get_lines()
 
 
 def test_the_same_story_gives_the_same_page(leaking: Reported) -> None:

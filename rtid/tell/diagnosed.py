@@ -11,12 +11,11 @@ from rtid.diagnose.report import Diagnosis, FoundEffect, Unseen, Value
 from rtid.diagnose.verdict import INSUFFICIENT, MATCHES, MATERIAL, UNKNOWN
 from rtid.effects.page import title
 from rtid.tell.story import Chart, Story, Table
-from rtid.tell.words import VERDICTS, quantity
+from rtid.tell.words import VERDICTS, is_floor, quantity
 from rtid.units import CONVENTION, Z95, limit
 
 SLIGHTLY_CUT = 1e-3  # of a record: less is not worth a sentence
 MOST_BENDS = 2  # maps that a sentence names
-LEAST_FLOOR = 5e-5  # of the rms flow: a floor below it is shown as 0.00 %, which no sensor has
 SHOWN = 14  # rows of the table of what was not found
 LIMITS = ("seen from", "named from")  # sizes of what was not found
 LIMITS_SAY = (
@@ -151,7 +150,7 @@ def _head(diagnosis: Diagnosis) -> str:
             else f"{diagnosis.rho_after:.3g}"
         )
         return (
-            f"{words}: held-out error {share} of the rms flow{_floor(diagnosis, ', ')}; "
+            f"{words}: held-out error {share} of the rms flow{floored(diagnosis, ', ')}; "
             f"residual variance {rho} times the noise's."
         )
     return (
@@ -177,7 +176,7 @@ def _one(diagnosis: Diagnosis, effect: FoundEffect) -> str:
     before = percent(diagnosis, effect.heldout_residual_before_m3s)
     after = percent(diagnosis, effect.heldout_residual_after_m3s)
     does = hidden(effect) or (
-        f"Adding it lowers the held-out error from {before} to {after}{_floor(diagnosis)}."
+        f"Adding it lowers the held-out error from {before} to {after}{floored(diagnosis)}."
     )
     text = f"{title(effect.effect)} at {effect.where}: {sizes}. {does}"
     if effect.cannot_be_told_from:
@@ -218,9 +217,9 @@ def percent(diagnosis: Diagnosis, residual_m3s: float) -> str:
     return f"{100 * residual_m3s / diagnosis.rms_flow_m3s:.2f} %"
 
 
-def _floor(diagnosis: Diagnosis, joined: str = "; ") -> str:
+def floored(diagnosis: Diagnosis, joined: str = "; ") -> str:
     """What the sensors alone leave; nothing where no noise of a sensor stands apart."""
-    if not diagnosis.noise_floor_m3s > LEAST_FLOOR * diagnosis.rms_flow_m3s:
+    if not is_floor(diagnosis.noise_floor_m3s, diagnosis.rms_flow_m3s):
         return ""
     return f"{joined}the sensors' floor is {percent(diagnosis, diagnosis.noise_floor_m3s)}"
 
@@ -277,12 +276,12 @@ def said(diagnosis: Diagnosis) -> str:
         case "matches":
             here = "With what was added, the" if diagnosis.added else "The"
             return (
-                f"{here} {judged(diagnosis)} is {rest} of the rms flow{_floor(diagnosis)}. "
+                f"{here} {judged(diagnosis)} is {rest} of the rms flow{floored(diagnosis)}. "
                 f"{remains(diagnosis)}"
             )
         case "unknown":
             return (
-                f"No known effect explains the {judged(diagnosis)} of {rest}{_floor(diagnosis)}. "
+                f"No known effect explains the {judged(diagnosis)} of {rest}{floored(diagnosis)}. "
                 "Next: Where shows which signals it follows; an effect of your own goes into the "
                 "project file as a formula."
             )
@@ -295,7 +294,7 @@ def _first(diagnosis: Diagnosis, first: FoundEffect) -> str:
     before = percent(diagnosis, first.heldout_residual_before_m3s)
     after = percent(diagnosis, first.heldout_residual_after_m3s)
     does = hidden(first) or (
-        f"Adding it lowers the {judged(diagnosis)} from {before} to {after}{_floor(diagnosis)}."
+        f"Adding it lowers the {judged(diagnosis)} from {before} to {after}{floored(diagnosis)}."
     )
     words = f"{title(first.effect)} at {first.where}{big}. {does} {remains(diagnosis)}".rstrip()
     if first.cannot_be_told_from:

@@ -10,6 +10,7 @@ from typing import Any
 from rtid.project.history import UNDO, Change, standing
 from rtid.tell.story import Table
 from rtid.tell.terminal import make_console
+from rtid.tell.words import is_floor
 
 SCHEMA = 1
 
@@ -31,7 +32,7 @@ def history_table(changes: Sequence[Change]) -> Table:
             f"{c.change} {c.effect}:{c.where}" + (" (taken back)" if taken_back else ""),
             _arrow(c.errors.get("identification_pct", {})),
             _arrow(c.errors.get("heldout_pct", {})),
-            f"{c.errors['noise_floor_pct']:.2f}" if "noise_floor_pct" in c.errors else "",
+            f"{floor:.2f}" if is_floor(floor := c.errors.get("noise_floor_pct")) else "",
             c.reason,
         ))  # fmt: skip
     heads = ("|", "date", "change", "identification|", "held-out|", "floor|", "reason~")

@@ -58,25 +58,27 @@ def static(*names: str) -> str:
 def error_bars(shown: Sequence[tuple[str, float, bool]], floor: float) -> str:
     """Name, error in % and whether it is only expected, against the sensors' floor in %."""
     known = [value for _, value, _ in shown if isfinite(value)]
-    most = 1.12 * max(*known, floor if isfinite(floor) else 0.0, 1e-9)
+    has_floor = isfinite(floor)
+    most = 1.12 * max(*known, floor if has_floor else 0.0, 1e-9)
     rows, before = "", 100.0
     for k, (name, value, is_foretold) in enumerate(shown):
         width = 100 * value / most if isfinite(value) else 0.0
         kind = "first" if k == 0 and len(shown) > 1 else "foretold" if is_foretold else ""
-        rows += _bar(name, value, kind, width, before, 100 * floor / most)
+        line = f'<div class="floor" style="left:{100 * floor / most:.2f}%"></div>'
+        rows += _bar(name, value, kind, width, before, line if has_floor else "")
         before = width
     return f'<div class="bars">{rows}</div>'
 
 
-def _bar(name: str, value: float, kind: str, width: float, start: float, floor: float) -> str:
-    """One bar, `width` % of the track; it grows or shrinks from `start`."""
+def _bar(name: str, value: float, kind: str, width: float, start: float, floor: str) -> str:
+    """One bar, `width` % of the track; it grows or shrinks from `start`; floor: the dashed line."""
     is_long = width > INSIDE
     place = f"right:{100 - width:.2f}%" if is_long else f"left:{width:.2f}%"
     return (
         f'<div class="name">{text(name)}</div><div class="track"><div class="bar {kind}" '
         f'style="width:{width:.2f}%;--from:{start:.2f}%" data-error="{value:.4f}"></div>'
         f'<span class="{"in" if is_long else ""}" style="{place}">{value:.2f} %</span>'
-        f'<div class="floor" style="left:{floor:.2f}%"></div></div>'
+        f"{floor}</div>"
     )
 
 

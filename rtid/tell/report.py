@@ -25,7 +25,7 @@ from rtid.tell.report_page import embedded, key_figures, page_of
 from rtid.tell.report_story import Ranked, ReportStory
 from rtid.tell.report_tables import coverage, parameters, settings
 from rtid.tell.story import Bar, Bars, Chart, Planes, Story, StoryPart, Table
-from rtid.tell.words import named, quantity
+from rtid.tell.words import is_floor, named, quantity
 from rtid.units import CONVENTION, MPA, flow_name, limit, lpm
 
 NOTHING = "No flow of this record could be judged."
@@ -101,9 +101,11 @@ def _key_figures(story: ReportStory) -> dict[str, str]:
     beta = " / ".join(f"{MPA * b:.0f}" for b in diagnosis.beta_pa)
     if diagnosis.found:
         before, rho = f"{before} → {after}", f"{rho} → {diagnosis.rho_after:.3g}"
+    floor_m3s = diagnosis.noise_floor_m3s
+    has_floor = is_floor(floor_m3s, diagnosis.rms_flow_m3s)
     return {
         f"error on the {PARTS[story.judges]}, of the rms flow": before,
-        "what the sensors alone leave": _percent(story, diagnosis.noise_floor_m3s),
+        "what the sensors alone leave": _percent(story, floor_m3s) if has_floor else "not known",
         "residual variance, of the noise": rho,
         f"bulk modulus {' / '.join(story.chambers)}": f"{beta} MPa",
     }
@@ -143,7 +145,8 @@ def _errors(story: ReportStory) -> Story:
         f"{flow_name()}: {steps[len(_saved(story))][1]:.2f} % for the model as it is"
     )
     caption += f", {steps[-1][1]:.2f} % with everything that was found." if diagnosis.found else "."
-    caption += f" Dashed: what the sensors' noise alone leaves, {floor:.2f} %."
+    if is_floor(floor):
+        caption += f" Dashed: what the sensors' noise alone leaves, {floor:.2f} %."
     if not story.judges:
         caption += (
             " The map is known over too little of the held-out part of this record, so these "
@@ -154,7 +157,8 @@ def _errors(story: ReportStory) -> Story:
         for k, (name, value) in enumerate(steps)
     )
     words = f"sensors' floor {floor:.2f} %", f"error on the {part} in % of the rms flow"
-    return Story(f"Error on the {part}", (Bars("errors", "", bars, floor, *words, caption),))
+    shown = floor if is_floor(floor) else float("nan")
+    return Story(f"Error on the {part}", (Bars("errors", "", bars, shown, *words, caption),))
 
 
 def _flows(story: ReportStory) -> Story:
@@ -187,9 +191,10 @@ def _dependences(story: ReportStory) -> Story:
         "Mean residual over bins of position, pressures, the signals that explain most of it and "
         "time, over the whole record, with its 95 % interval, and the share of the "
         "residual's variance that the bins explain. "
-        "A trend says what the model misses; a right model lies on the zero line. The sensors' "
-        f"noise is {lpm() * floor_m3s:.2g} {flow_name()} rms."
+        "A trend says what the model misses; a right model lies on the zero line."
     )
+    if is_floor(floor_m3s, story.diagnosed.diagnosis.rms_flow_m3s):
+        caption += f" The sensors' noise is {lpm() * floor_m3s:.2g} {flow_name()} rms."
     return Story(heading_, (before_and_after(story.chambers, models, floor_m3s, caption),))
 
 

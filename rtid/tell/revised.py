@@ -10,11 +10,11 @@ from rtid.diagnose.report import Value
 from rtid.effects.page import title
 from rtid.project.history import ADD, UNDO, Change
 from rtid.study.revisions import Revised, undo_command
-from rtid.tell.diagnosed import LEAST_FLOOR, with_convention
+from rtid.tell.diagnosed import with_convention
 from rtid.tell.history import SCHEMA, plain
 from rtid.tell.story import Bar, Bars
 from rtid.tell.terminal import bars, make_console
-from rtid.tell.words import quantity
+from rtid.tell.words import is_floor, quantity
 
 
 def show(done: Revised) -> None:
@@ -65,13 +65,13 @@ def _errors(errors: Mapping[str, Any]) -> list[str]:
             f"times the noise's before, {rho['after']:.3g} after."
         )
     if len(held_out) == 2 and floor is not None:
-        words = f"; the sensors' floor is {floor:.2f} %" if floor > 100 * LEAST_FLOOR else ""
+        words = f"; the sensors' floor is {floor:.2f} %" if is_floor(floor) else ""
         lines.append(
             f"Held-out part: error {_fall(held_out)}{words} "
             f"(over the {errors.get('judged_s', 0.0):.1f} s where the map is known)."
         )
     shown = tuple(Bar(name, value) for name, value in held_out.items())
-    return lines + bars(Bars("", "", shown, nan if floor is None else floor, "floor", ""))
+    return lines + bars(Bars("", "", shown, floor if is_floor(floor) else nan, "floor", ""))
 
 
 def _fall(pair: Mapping[str, float]) -> str:

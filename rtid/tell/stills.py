@@ -275,10 +275,12 @@ def _bars(chart: Bars) -> Figure:
     values = [max(start, bar.value) for bar in chart.bars]
     colours = [BAR_COLOURS.get(bar.kind, BLUE) for bar in chart.bars]
     axis.barh(y, np.subtract(values, start), 0.62, left=start, color=colours)
-    axis.axvline(chart.limit, color=INK, lw=1.1, ls=(0, (5, 3)))
-    axis.annotate(chart.limit_name, (chart.limit, -0.72), (4, 0), va="center",
-                  textcoords="offset points", fontsize=8)  # fmt: skip
-    most = max([chart.limit, *values])
+    most = max(values)
+    if np.isfinite(chart.limit):
+        axis.axvline(chart.limit, color=INK, lw=1.1, ls=(0, (5, 3)))
+        axis.annotate(chart.limit_name, (chart.limit, -0.72), (4, 0), va="center",
+                      textcoords="offset points", fontsize=8)  # fmt: skip
+        most = max(most, chart.limit)
     if chart.is_log:
         axis.set_xscale("log")
         axis.set_xlim(WEAKEST, 1.5 * max(2 * chart.limit, most))

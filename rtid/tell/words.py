@@ -5,7 +5,7 @@ VERDICTS: a kind, for the colour, and the heading.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeGuard
 
 from rtid.effects.page import title
 from rtid.units import with_unit
@@ -20,6 +20,16 @@ VERDICTS = {
     "unknown": ("open", "Something unknown is missing"),
     "insufficient_data": ("open", "Too little motion to tell"),
 }
+
+LEAST_FLOOR = 5e-5  # of the rms flow: a floor below it is shown as 0.00 %, which no sensor has
+
+
+def is_floor(floor: float | None, flow: float = 100.0) -> TypeGuard[float]:
+    """Whether a sensors' floor is told: where one disturbance stands for all, no sensor's does.
+
+    floor: in the unit of the rms flow, or in % of it.
+    """
+    return floor is not None and floor > LEAST_FLOOR * flow
 
 
 def quantity(value: Value) -> str:

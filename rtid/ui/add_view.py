@@ -21,7 +21,7 @@ from rtid.tell.charts.theme import INK_TAG
 from rtid.tell.charts.time_plots import TimePlots
 from rtid.tell.colours import BLUE, ORANGE
 from rtid.tell.html import button, error_bars, table, text
-from rtid.tell.words import quantity
+from rtid.tell.words import is_floor, quantity
 from rtid.ui.desk_views import Bench
 from rtid.ui.shared import Session, ShownRevision
 from rtid.ui.views import PageView
@@ -79,7 +79,10 @@ class _Revised:
 
 
 def errors_of(session: Session) -> tuple[list[tuple[str, float, bool]], float]:
-    """Name, held-out error in % of the rms flow, and whether it is expected; the sensors' floor."""
+    """Name, held-out error in % of the rms flow, and whether it is expected; the sensors' floor.
+
+    The floor is NaN where none is told.
+    """
     bars: list[tuple[str, float, bool]] = []
     floor = float("nan")
     for k, revision in enumerate(session.revisions):
@@ -97,7 +100,7 @@ def errors_of(session: Session) -> tuple[list[tuple[str, float, bool]], float]:
         diagnosis = session.last.told.diagnosis
         after = 100 * diagnosis.found[0].heldout_residual_after_m3s / diagnosis.rms_flow_m3s
         bars.append((f"+ {title(diagnosis.found[0].effect)}, foretold", after, True))
-    return bars, floor
+    return bars, floor if is_floor(floor) else float("nan")
 
 
 def name_of(revision: ShownRevision, number: int) -> str:
@@ -113,10 +116,11 @@ def bars(session: Session) -> str:
     shown, floor = errors_of(session)
     if not any(isfinite(value) for _, value, _ in shown):
         return '<h2>The error of the model</h2><p class="says">It is being measured.</p>'
+    dashed = f"; dashed: what the sensors alone leave, {floor:.2f} %" if isfinite(floor) else ""
     return (
         f"<h2>{_heading(session)}</h2>{error_bars(shown, floor)}"
-        f'<p class="key">in % of the rms flow; dashed: what the sensors alone leave, '
-        f"{floor:.2f} %</p>{_actions(session)}{_planes(session)}{_effects(session)}"
+        f'<p class="key">in % of the rms flow{dashed}</p>'
+        f"{_actions(session)}{_planes(session)}{_effects(session)}"
         f"{_history(session, shown)}"
     )
 
@@ -224,10 +228,11 @@ def sentence(session: Session) -> str:
     if len(session.revisions) > 1:
         before, after = shown[len(session.revisions) - 2][1], shown[len(session.revisions) - 1][1]
         kept = session.revisions[-1].is_saved
+        words = f", the sensors' floor is {floor:.2f} %" if isfinite(floor) else ""
         return (
             f'{measured}, <b style="color:var(--before)">—</b> before the last change, '
             f'<b style="color:var(--bar)">—</b> after it. The error went from {before:.2f} % to '
-            f"{after:.2f} %, the sensors' floor is {floor:.2f} %. "
+            f"{after:.2f} %{words}. "
             + ("The project file has it." if kept else "Next: save, or undo; the project file is "
                "as it was until you save.")
         )  # fmt: skip

@@ -14,7 +14,17 @@ from rtid.effects import effect as page_of
 from rtid.effects.page import Effect as Page
 from rtid.effects.page import EffectError, readable, title
 from rtid.tell.charts.theme import NARROWEST_PX, beside
-from rtid.tell.diagnosed import LIMITS, LIMITS_SAY, heading, hidden, judged, limits, percent, said
+from rtid.tell.diagnosed import (
+    LIMITS,
+    LIMITS_SAY,
+    floored,
+    heading,
+    hidden,
+    judged,
+    limits,
+    percent,
+    said,
+)
 from rtid.tell.html import button, clearness, table, text
 from rtid.tell.live import PanelPlot
 from rtid.tell.report_story import Ranked
@@ -126,9 +136,8 @@ def _found(diagnosis: Diagnosis, effect: FoundEffect) -> str:
     return (
         f'<div class="card"><h2 class="found">{_link(effect.effect, title(effect.effect))} '
         f"at {text(effect.where)}</h2><dl>{sizes}<dt>{judged(diagnosis)}</dt><dd>"
-        f"{percent(diagnosis, before)} → <b>{percent(diagnosis, after)}</b> of the rms flow; the "
-        f"sensors' "
-        f"floor is {percent(diagnosis, diagnosis.noise_floor_m3s)}</dd><dt>explains as much</dt>"
+        f"{percent(diagnosis, before)} → <b>{percent(diagnosis, after)}</b> of the rms flow"
+        f"{floored(diagnosis)}</dd><dt>explains as much</dt>"
         f"<dd>{text(told_apart)}</dd><dt>by chance</dt><dd>"
         f"{_chance(effect.p_value)}</dd></dl>{text(hidden(effect))}{_choices(effect)}</div>"
     )

@@ -9,7 +9,7 @@ import pytest
 from rtid.diagnose.report import Value
 from rtid.tell.diagnosed import said
 from rtid.tell.html import clearness, error_bars
-from rtid.tell.words import quantity
+from rtid.tell.words import is_floor, quantity
 from rtid.units import limit
 from tests.ui.test_session import KEY, told
 
@@ -52,6 +52,7 @@ def test_a_floor_of_nothing_is_no_floor() -> None:
     """Where one disturbance stands for all that the command does not say, no sensor has a part."""
     diagnosis = replace(told(KEY).diagnosis, noise_floor_m3s=0.0)
     assert "from 2.00 % to 0.20 %. " in said(diagnosis) and "floor" not in said(diagnosis)
+    assert [is_floor(share) for share in (None, NAN, 0.0, 0.005, 0.006)] == [False] * 4 + [True]
 
 
 def test_a_set_leaves_the_choice_to_the_user() -> None:
@@ -82,6 +83,7 @@ def test_bars_are_as_long_as_their_errors() -> None:
     assert 'width:89.29%;--from:100.00%" data-error="2.0000"' in html
     assert 'width:22.32%;--from:89.29%" data-error="0.5000"' in html
     assert html.count('class="floor" style="left:11.16%"') == 2
+    assert "floor" not in error_bars([("before", 2.0, False)], NAN)
 
 
 def test_clearness_tells_what_is_left_once_the_cause_is_in_the_model() -> None:
