@@ -8,6 +8,7 @@ import logging
 import re
 import secrets
 import signal
+import threading
 import time
 import zlib
 from collections.abc import Callable
@@ -305,8 +306,6 @@ def start(
     live page; test_bus: maps may be sent over a bus that anybody may write to.  Raises RtidError
     where the port is taken.
     """
-    if trace is not None or project is None:
-        import_module("rtid.ui.desk_views")  # now, not while somebody waits for a picture
     logging.getLogger("bokeh.server.views.ws").setLevel(logging.ERROR)  # a tab may be closed
     loop, sockets = IOLoop.current(), _bound(host, port)
     session = _session(project, trace, Worker(loop.add_callback), sheet, state, test_bus)
@@ -328,6 +327,9 @@ def start(
     # is here already is not looked at again.
     gc.collect()
     gc.freeze()
+    if trace is not None or project is None:  # now, not while somebody waits for a picture
+        ahead = partial(import_module, "rtid.ui.desk_views")
+        threading.Thread(target=ahead, name="rtid-ahead", daemon=True).start()
     url = f"http://{_in_url(host)}:{door.port}/?{TOKEN}={door.token}"
     return Workbench(server, guarded, session, url, turns)
 
