@@ -161,6 +161,7 @@ class Session:
             self.worker.ask(*asked, then=ignore, failed=self._not_looked)
             self._added("add")(ready)
             return
+        self.worker.forget("prepare")  # that would be waited for, and can be made afterwards
         if self.worker.is_busy:
             self.doing = "finishing what was begun"
         self._is_adding = True

@@ -173,6 +173,15 @@ def test_what_is_fitted_is_added_at_once_and_can_be_shown_later() -> None:
     assert worker.answer(told()) == "diagnose"
 
 
+def test_what_is_not_fitted_yet_does_not_wait_for_more_than_the_fit() -> None:
+    session, worker, _ = begun()
+    for result in (opened(), told(KEY)):
+        worker.answer(result)
+    assert [method for method, *_ in worker.jobs] == ["tried", "prepare"]
+    session.add(*KEY)
+    assert [method for method, *_ in worker.jobs] == ["tried", "add"]
+
+
 def test_what_cannot_be_shown_yet_is_taken_back_or_stopped_or_fails() -> None:
     for way in ("undo", "stop", "fails"):
         session, worker, _ = begun()
