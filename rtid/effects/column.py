@@ -135,11 +135,16 @@ class Cause:
         return self.slope_of(self.column, shape, k)
 
     def slope_of(self, make: Callable[[Shape], Volumes], shape: Shape, k: int) -> Volumes:
-        """Derivative of anything made with a shape, by differences."""
+        """Derivative of anything made with a shape, by differences within the bounds.
+
+        Beyond them nothing need exist: with a negative volume a line's oil explodes.
+        """
         step = SLOPE_STEP * self.spacing(k)
-        above, below = ((*shape[:k], shape[k] + s, *shape[k + 1 :]) for s in (step, -step))
+        least, most = self.bounds(k)
+        ends = max(shape[k] - step, least), min(shape[k] + step, most)
+        below, above = ((*shape[:k], end, *shape[k + 1 :]) for end in ends)
         low = make(below)
-        return {c: (high - low[c]) / (2.0 * step) for c, high in make(above).items()}
+        return {c: (high - low[c]) / (ends[1] - ends[0]) for c, high in make(above).items()}
 
     def about(self, shape: Shape, step: float) -> tuple[Shape, ...]:
         """Shapes that differ from one in one parameter by up to `step` of its axis' spacing."""

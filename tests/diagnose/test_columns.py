@@ -44,6 +44,17 @@ def opening() -> float:
     return float(np.quantile(view().pressure(0), 0.6))
 
 
+@pytest.mark.parametrize("volume_m3", [1.4e-5, 5e-5])
+def test_the_derivative_of_a_small_line_is_taken_where_a_line_can_be(volume_m3: float) -> None:
+    """From a negative volume on it exploded, and with it the whole diagnosis of a machine."""
+    line = cause("line_dynamics", "both")
+    radps, resistance, step_m3 = 827.0, 5e8, 1e-7
+    slope = line.slope((radps, volume_m3, resistance), 1)[0]
+    up, down = (line.column((radps, volume_m3 + s, resistance))[0] for s in (step_m3, -step_m3))
+    exact = (up - down) / (2.0 * step_m3)
+    assert np.sqrt(np.mean((slope - exact) ** 2)) < 0.5 * np.sqrt(np.mean(exact**2))
+
+
 def test_a_relief_valve_lets_out_above_its_opening_pressure() -> None:
     p = view().pressure(0)
     out = np.maximum(0.0, p - opening())
