@@ -49,12 +49,14 @@ from rtid.diagnose.verdict import (
     UNKNOWN,
     can_judge,
     doubts_about,
+    told_doubts,
     verdict,
 )
 from rtid.diagnose.zeros import Zero, zeros
 from rtid.effects.column import Candidate
 from rtid.effects.laws.lines import LINE
 from rtid.effects.page import Effect, catalogue, correcting
+from rtid.estimator.validity import Doubt
 from rtid.model import Machine
 from rtid.plain import FloatArray, Key, Progress, silent
 
@@ -86,6 +88,7 @@ class Result:
     held_out_judged: bool = True  # False: too little of it is known, and the record itself judged
     zeros: tuple[Zero, ...] = ()  # of the pressure sensors, where valves have joined them at rest
     reach: Mapping[Candidate, Reach] = field(default_factory=dict)  # of what was not found
+    doubts: tuple[Doubt, ...] = ()  # of the last fit's moduli, by what its blocks miss
 
 
 def search(
@@ -124,8 +127,10 @@ def searched(standing: Standing, progress: Progress = silent) -> Result:
     if can_judge(before):
         present, last = _extended(state, present, before)
     state.found = [beside_its_line(state, told_apart(state, effect)) for effect in state.found]
-    said = verdict(state, first, present, last, judged)
+    doubted = told_doubts(present)
+    said = verdict(state, first, present, last, doubted, judged)
     if said == UNKNOWN:  # what explains a part of it only is not named, and not counted
+        doubted = told_doubts(first) if state.found else doubted
         present, last, state.found = first, before, []
     present = with_spreads(present)
     result, negligible, scores = tuple(state.found), state.negligible, scored(present)
@@ -138,7 +143,7 @@ def searched(standing: Standing, progress: Progress = silent) -> Result:
         reach = reaches(present, scores, last.flow_m3s, clearest_gain(result))
     return Result(
         first, present.light(), result, negligible, scores, before, last, said, parts,
-        held_out_judged=judged, zeros=apart, reach=reach,
+        held_out_judged=judged, zeros=apart, reach=reach, doubts=doubted,
     )  # fmt: skip
 
 

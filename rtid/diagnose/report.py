@@ -20,7 +20,7 @@ from rtid.diagnose.nameable import clearest
 from rtid.diagnose.regression import LIMIT_SD, Score
 from rtid.diagnose.remains import described
 from rtid.diagnose.trials import AcceptedEffect, detection_limit, physical
-from rtid.diagnose.verdict import MATERIAL, UNKNOWN, told_doubts
+from rtid.diagnose.verdict import MATERIAL, UNKNOWN
 from rtid.diagnose.zeros import Zero, by_chance
 from rtid.effects import catalogue
 from rtid.effects.column import Candidate
@@ -194,7 +194,7 @@ def diagnosis(result: Result) -> Diagnosis:
             Small(effect, where, share) for (effect, where), share in result.negligible.items()
         ),
         advice=advice(result, unseen),
-        doubts=told_doubts(last),
+        doubts=result.doubts,
         cut=cuts(last.declared, last.chunk),
         disturbance=max(chamber.disturbance for chamber in last.declared.chambers),
         zeros=result.zeros,

@@ -61,11 +61,17 @@ def told_doubts(fit: Fit) -> tuple[Doubt, ...]:
 
 
 def verdict(
-    state: TrialState, first: Fit, last: Fit, after: Residual, is_unseen: bool = True
+    state: TrialState,
+    first: Fit,
+    last: Fit,
+    after: Residual,
+    doubted: tuple[Doubt, ...],
+    is_unseen: bool = True,
 ) -> str:
     """The verdict on a search from the first to the last fit, and what that leaves of a part.
 
-    is_unseen: the part is not the one that taught the maps, which may have taken an effect in.
+    doubted: of the last fit, `told_doubts`; is_unseen: the part is not the one that taught the
+    maps, which may have taken an effect in.
     """
     has_moved = last.regression.rows >= least_evidence(last.declared) and len(last.map.cells) > 0
     is_whole = float(np.mean(saturated(last.declared, last.chunk))) <= MOST_CUT
@@ -79,7 +85,7 @@ def verdict(
         is_open = bool(state.negligible) or is_slight(after)
         if not is_unseen and is_open and max(first.rho, rho_of_all(last)) >= last.most_rho:
             return INSUFFICIENT
-        return MATCHES if last.rho < last.most_rho and not told_doubts(last) else UNKNOWN
+        return MATCHES if last.rho < last.most_rho and not doubted else UNKNOWN
     rest = last.held.sse - last.regression.dof
     explained = 1.0 - rest / state.excess if state.excess > 0 else 1.0
     # a rate without pressures is disturbed by whatever moves the machine: unseen data have judged

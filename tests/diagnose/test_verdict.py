@@ -10,14 +10,18 @@ import numpy as np
 import pytest
 
 from rtid.cli import main
+from rtid.diagnose import verdict as verdicts
 from rtid.diagnose.diagnosis import search
+from rtid.diagnose.excuse import counted
+from rtid.diagnose.fit import Fit
 from rtid.diagnose.report import Diagnosis, diagnosis
+from rtid.plain import FloatArray
 from rtid.sim.hidden import hide
 from rtid.sim.random_plants import draw
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from rtid.tell.diagnosed import sentences
-from tests.campaign.laws import Case, declared, judged
+from tests.campaign.laws import RECORD_S, Case, declared, judged, of_run
 from tests.diagnose.records import record
 
 
@@ -103,3 +107,25 @@ def test_what_the_law_of_a_leak_misses_is_no_effect_of_its_own() -> None:
     found = judged(Case(5101, "flow_force", "rich_record", "internal_leakage_laminar", 7.08e-13))
     assert found is not None
     assert [effect.effect for effect in found.said.found] == ["internal_leakage_laminar"]
+
+
+@pytest.mark.slow
+def test_an_area_too_wide_makes_moduli_contradict_and_that_is_counted_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """By 3 %: all of its chamber's maps are as much too wide, and its dead volume too small."""
+    counts = []
+
+    def counting(fit: Fit) -> FloatArray:
+        counts.append(fit)
+        return counted(fit)
+
+    monkeypatch.setattr(verdicts, "counted", counting)
+    case = Case(13, "orifice")
+    run = simulate(case.plant, case.motion, case.seed, RECORD_S, case.sensors)
+    model = declared(case, run)
+    a, b = model.chambers
+    wide = replace(model, chambers=(a, replace(b, area_m2=1.03 * b.area_m2)))
+    said = of_run(case.plant, run, wide).said
+    assert said.verdict == "unknown" and "contradict" in said.doubts[0].reason
+    assert len(counts) == 1
