@@ -18,11 +18,13 @@ import numpy as np
 
 from rtid.diagnose.commands import split
 from rtid.diagnose.evidence import rows_of
+from rtid.diagnose.excuse import counted
 from rtid.diagnose.fit import Fit, one_pass
 from rtid.diagnose.halves import between_halves
 from rtid.diagnose.residual import is_known
 from rtid.diagnose.trials import Trial
 from rtid.effects.record_view import RecordView
+from rtid.estimator.misfit import can_be_explained
 from rtid.kernels.layout import TERMS
 from rtid.model import PROPORTIONAL, Grid, Machine
 from rtid.plain import FloatArray
@@ -63,12 +65,17 @@ class Consequence:
 
 
 def consequence(present: Fit, now: Fit, own_share: float) -> Consequence:
-    """Of leaving out what `now` has and `present` has not; own_share: of its flow, inf if none."""
-    return Consequence(
-        own_share if np.isfinite(own_share) else float("nan"),
-        tuple(_bends(present, now)),
-        tuple(_softer(present, now)),
-    )
+    """Of leaving out what `now` has and `present` has not; own_share: of its flow, inf if none.
+
+    A modulus moves where it leaves the interval that is told without the effect, in which what the
+    blocks miss is counted: on the clean sweep of a compensated machine that was 170 % wide, and
+    6.6 %, beyond what the noise alone gives, made the position sensor 2.3 ms late.
+    """
+    softer = tuple(_softer(present, now, present.compliance_cov))
+    if softer and can_be_explained(present.sent):
+        softer = tuple(_softer(present, now, counted(present)))
+    own = own_share if np.isfinite(own_share) else float("nan")
+    return Consequence(own, tuple(_bends(present, now)), softer)
 
 
 def _bends(present: Fit, now: Fit) -> Iterator[tuple[str, float]]:
@@ -84,8 +91,9 @@ def _bends(present: Fit, now: Fit) -> Iterator[tuple[str, float]]:
             yield edge.name, float(np.sqrt(np.mean((flow - other)[open_] ** 2))) / largest
 
 
-def _softer(present: Fit, now: Fit) -> Iterator[tuple[str, float]]:
-    half = Z95 * np.sqrt(np.maximum(np.diag(present.compliance_cov), 0.0))
+def _softer(present: Fit, now: Fit, cov: FloatArray) -> Iterator[tuple[str, float]]:
+    """Chamber and move of each modulus beyond its interval by a covariance (chambers, chambers)."""
+    half = Z95 * np.sqrt(np.maximum(np.diag(cov), 0.0))
     moves = now.compliance - present.compliance
     for chamber, was, move, within in zip(
         now.model.chambers, present.compliance, moves, half, strict=True
