@@ -258,7 +258,8 @@ def taken_in(
     is_needed = present.rho >= present.most_rho and trial.gain > SHARE * misfit
     if is_needed and is_seen_again(now, last, after):
         return does
-    return does if (does.is_material or is_needed) and is_stable(now, trial) else None
+    is_wanted = does.is_material or is_needed
+    return does if is_wanted and is_stable(now, trial, is_needed) else None
 
 
 def is_spread_alone(present: Fit, now: Fit, least: float) -> bool:

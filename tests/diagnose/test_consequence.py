@@ -117,7 +117,8 @@ def test_a_size_must_be_that_of_both_halves_and_of_a_finer_grid(
     monkeypatch.setattr(evidence, "_size", lambda *_: (0, *next(told)))
     monkeypatch.setattr(evidence, "between_halves", lambda *_: apart)
     last, accepted = result.last, result.found[0]
-    assert is_stable(last, Trial(accepted.key, accepted.gain, last.revision)) == is_believed
+    trial = Trial(accepted.key, accepted.gain, last.revision)
+    assert is_stable(last, trial, is_needed=True) == is_believed
 
 
 @pytest.mark.parametrize(("share", "moves"), [(1e-6, True), (1.0, False)])
