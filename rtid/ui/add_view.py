@@ -227,14 +227,15 @@ def sentence(session: Session) -> str:
     measured = '<b style="color:var(--ink)">—</b> measured'
     if len(session.revisions) > 1:
         before, after = shown[len(session.revisions) - 2][1], shown[len(session.revisions) - 1][1]
-        kept = session.revisions[-1].is_saved
+        last = session.revisions[-1]
         words = f", the sensors' floor is {floor:.2f} %" if isfinite(floor) else ""
         return (
             f'{measured}, <b style="color:var(--before)">—</b> before the last change, '
             f'<b style="color:var(--bar)">—</b> after it. The error went from {before:.2f} % to '
             f"{after:.2f} %{words}. "
-            + ("The project file has it." if kept else "Next: save, or undo; the project file is "
-               "as it was until you save.")
+            + ("The project file has it." if last.is_saved else
+               "Its pictures follow once its maps are learned." if not last.is_seen else
+               "Next: save, or undo; the project file is as it was until you save.")
         )  # fmt: skip
     now = f'{measured}, <b style="color:var(--before)">—</b> the model as it is'
     if session.named is not None:

@@ -14,6 +14,7 @@ from rtid.errors import RtidError
 from rtid.project.added import AddedSection, ParameterSection
 from rtid.tell.story import Story
 from rtid.trace.glance import Curve
+from rtid.ui.add_view import sentence
 from rtid.ui.headline import strip
 from rtid.ui.sending import Sending, Way
 from rtid.ui.shared import FAILED, LOADING, READY, ROLE, Session
@@ -164,12 +165,14 @@ def test_what_is_fitted_is_added_at_once_and_can_be_shown_later() -> None:
     session.add(*KEY)
     assert [method for method, *_ in worker.jobs] == ["prepare", "add", "look"]
     assert "Added" in strip(session) and set(heard) == {"state"}
+    assert sentence(session).endswith("Its pictures follow once its maps are learned.")
     assert looks(session) == ["first look"] * 2 and len(session.seen) == 1
     session.save()
     assert len(worker.jobs) == 3, "what is not learned yet is not saved"
     for result in (None, addition(), "second look"):
         worker.answer(result)
     assert looks(session) == ["first look", "second look"] and "looks" in heard
+    assert "Next: save, or undo" in sentence(session)
     assert worker.answer(told()) == "diagnose"
 
 
