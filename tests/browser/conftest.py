@@ -32,6 +32,7 @@ FLAGS = [
 ]
 SIZE = {"width": 1366, "height": 768}
 SEED, DURATION_S = 3, 40.0
+UNTOUCHED = "untouched.toml"  # a copy of the project, to which the workbench's tests save
 PATIENCE_MS = 120_000  # cold kernels on a loaded machine
 COOKIES: dict[str, list[Any]] = {}  # of the browser that has opened an address
 
@@ -83,6 +84,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     machine = hide_wish(draw(SEED), "internal_leakage_laminar=strong")
     run = simulate(machine, "rich", SEED, DURATION_S)
     trace, _, project = write_run(folder / "worn.parquet", run, SEED, "rich")
+    shutil.copy(project, folder / UNTOUCHED)
     return trace, project
 
 

@@ -11,7 +11,7 @@ from PIL import Image
 
 from rtid.project import load
 from rtid.tell.report_file import Reported, report
-from tests.browser.conftest import SIZE
+from tests.browser.conftest import SIZE, UNTOUCHED
 from tests.browser.geometry import SIZES, assert_clear
 
 if TYPE_CHECKING:
@@ -26,9 +26,9 @@ DRAWN = """() => [...Bokeh.documents].flatMap(d => [...d.all_models])
 
 @pytest.fixture(scope="module")
 def written(recorded: tuple[Path, Path]) -> Reported:
-    trace, project = recorded
-    folder = trace.parent
-    return report(load(project), trace, folder / "r.html", pictures=folder / "stills")
+    trace, folder = recorded[0], recorded[0].parent
+    project = load(folder / UNTOUCHED)
+    return report(project, trace, folder / "r.html", pictures=folder / "stills")
 
 
 @pytest.mark.slow
