@@ -16,6 +16,7 @@ from rtid.diagnose.trials import (
     scored,
     with_effect,
 )
+from rtid.effects.laws.lines import lines_at, stores_at
 from rtid.effects.laws.sensors import sensor_timings
 from rtid.effects.laws.timing import COMMAND
 from rtid.plain import Key
@@ -85,13 +86,16 @@ def contest(
 
 
 def _is_beaten(trial: Trial, others: list[Trial]) -> bool:
-    """True of a whole that explains less than a simpler cause, to the end of both.
+    """True of a line that explains less than what it stores does alone, to the end of both.
 
     A line without inertia is a dead volume: with an inertia that the record refuses it is none of
     those that cannot be told from one.
     """
-    return trial.is_whole and any(
-        other.n_parameters < trial.n_parameters and trial.gain < other.gain - TIE
+    where = trial.key[1]
+    return trial.key in lines_at(where) and any(
+        other.key in stores_at(where)
+        and other.n_parameters < trial.n_parameters
+        and trial.gain < other.gain - TIE
         for other in others
     )
 

@@ -54,14 +54,13 @@ from rtid.diagnose.verdict import (
 )
 from rtid.diagnose.zeros import Zero, zeros
 from rtid.effects.column import Candidate
-from rtid.effects.laws.lines import LINE
-from rtid.effects.page import Effect, catalogue, correcting
+from rtid.effects.laws.lines import lines_at, stores_at
+from rtid.effects.page import Effect
 from rtid.estimator.validity import Doubt
 from rtid.model import Machine
 from rtid.plain import FloatArray, Key, Progress, silent
 
 LATER_GAIN = 25.0  # chi2 of every effect behind the first
-OF_LINES = "dead volume"  # the declared size that the oil of a line adds to
 MOST = 6  # effects that are added at most
 WORSE = 1.02  # held-out residual, as a share, that an immaterial effect may not raise
 CLEAR = 1.5  # times the variance of the sensors' noise, from which unseen data show a misfit ...
@@ -158,12 +157,11 @@ def beside_its_line(state: TrialState, stored: AcceptedEffect) -> AcceptedEffect
 
     The line of 1.2 m that left 1.61e-4 m3 was named a dead volume of 1.70e-4 m3 and an inertance.
     """
-    name, where = stored.key
-    if name not in {page.name for page in correcting(OF_LINES)}:
+    where = stored.key[1]
+    if stored.key not in stores_at(where):
         return stored
-    lines_of_any = {page.name for page in catalogue().values() if page.law == LINE}
     beside = [f.key for f in state.found] + [part.key for part in state.given]
-    lines = [key for key in beside if key[1] == where and key[0] in lines_of_any]
+    lines = [key for key in beside if key in lines_at(where)]
     return replace(stored, alike=tuple(dict.fromkeys((*stored.alike, *lines))))
 
 

@@ -56,11 +56,6 @@ class Trial:
         return self.effect.n_parameters
 
     @property
-    def is_whole(self) -> bool:
-        """True of a cause of several parts that its shape alone describes."""
-        return not self.is_timing and self.effect.is_whole
-
-    @property
     def effect(self) -> Candidate:
         """The candidate of a cause with a column of its own."""
         return self.revision.effects[-1]

@@ -28,12 +28,13 @@ from rtid.effects.column import WHOLE, Candidate, Cause
 from rtid.effects.filtering import fitted
 from rtid.effects.law import Shape, Volumes, chambers_by_place
 from rtid.effects.laws.gauged import gauged
-from rtid.effects.page import Effect
+from rtid.effects.page import Effect, catalogue, correcting
 from rtid.effects.record_view import RecordView
 from rtid.kernels.jit import kernel
-from rtid.plain import FloatArray
+from rtid.plain import FloatArray, Key
 
 LINE = "line"  # the law's name
+OF_LINES = "dead volume"  # the declared size that the oil of a line adds to
 FREQUENCY = "natural_frequency"
 AT_VALVE, AT_CYLINDER = (f"{FREQUENCY}_sensor_at_{end}" for end in ("valve", "cylinder"))
 # to begin with: natural frequencies of 12 to 2 m of hose, volumes, and the loss of laminar flow
@@ -56,6 +57,16 @@ def lines(view: RecordView, effect: Effect) -> Iterator[Cause]:
             )  # fmt: skip
             axes = RADPS, VOLUMES_M3, RESISTANCES
             yield Cause(candidate, partial(_of_chambers, column, view, at), axes)
+
+
+def lines_at(where: str) -> set[Key]:
+    """The effects of the catalogue that are a line at a place."""
+    return {(page.name, where) for page in catalogue().values() if page.law == LINE}
+
+
+def stores_at(where: str) -> set[Key]:
+    """What a line stores at a place, each by itself: its oil, and its wall."""
+    return {(page.name, where) for page in correcting(OF_LINES)}
 
 
 def _of_chambers(
