@@ -175,7 +175,7 @@ class Page:
             words, offer = f"{others} following", ""
         else:
             return ""
-        return f'<span class="role"><span title="{words}">{words}</span>{offer}</span>'
+        return f'<span class="acting role"><span title="{words}">{words}</span>{offer}</span>'
 
     def _prepare(self) -> None:
         """Make a view that nobody looks at yet."""

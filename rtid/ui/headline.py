@@ -43,7 +43,7 @@ def work_line(session: Session) -> str:
     if session.doing:
         stop = button("Stop", "stop", kind="link") if session.can_stop else ""
         return (
-            f'<div class="role"><span>{text(session.doing)} ...</span><progress max="1" '
+            f'<div class="acting">{_in_full(session.doing + " ...")}<progress max="1" '
             f'value="{session.share:.2f}" aria-label="progress"></progress>{stop}</div>'
         )
     return _in_full(session.note) if session.note else ""
