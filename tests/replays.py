@@ -16,6 +16,7 @@ import pickle
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from types import CodeType, FunctionType, MethodType
 from typing import Any
@@ -26,8 +27,10 @@ from firmware_bridge.kernel_cache import alone
 from rtid.diagnose.diagnosis import search, searched
 from rtid.diagnose.report import diagnosis
 from rtid.diagnose.standing import fitted
+from rtid.diagnose.trials import TrialState
 from rtid.estimator.published import publish
 from rtid.excite.exciting import excite
+from rtid.plain import silent
 from rtid.sim.run import simulate
 from tests.left import OF_RUN
 
@@ -98,12 +101,17 @@ def _digest(apart: str, arguments: tuple[Any, ...], named: list[tuple[str, Any]]
         if not callable(value)
     ]
     text = io.BytesIO()
-    _Named(text).dump((apart, told))
+    pickler = _Named(text)
+    pickler.fast = True  # a value and a copy of it are one, wherever either stands
+    pickler.dump((apart, told))
     return hashlib.sha256(text.getbuffer()).hexdigest()[:32]
 
 
 class _Named(pickle.Pickler):
-    """Functions by what they do: a law may be a function within another, which no pickle takes."""
+    """Functions by what they do: a law may be a function within another, which no pickle takes.
+
+    Objects without what they have worked out of themselves by then, or who hears of a search.
+    """
 
     def reducer_override(self, item: Any) -> Any:
         if isinstance(item, MethodType):
@@ -113,7 +121,20 @@ class _Named(pickle.Pickler):
             return str, (item.__qualname__,), (item.__module__, item.__code__, cells)
         if isinstance(item, CodeType):
             return str, (item.co_name,), (item.co_code, item.co_names, item.co_consts)
-        return NotImplemented
+        kind: Any = type(item)
+        if isinstance(item, TrialState):  # each search begins anew, whoever hears of it
+            item = replace(item.anew(silent), _coarse=None)
+        elif not _lazy(kind):
+            return NotImplemented
+        state = {k: value for k, value in vars(item).items() if k not in _lazy(kind)}
+        return str, (kind.__qualname__,), state
+
+
+@functools.cache
+def _lazy(kind: type) -> frozenset[str]:
+    """What such an object works out of itself when it is first asked for it."""
+    members = inspect.getmembers_static(kind, lambda v: isinstance(v, functools.cached_property))
+    return frozenset(name for name, _ in members)
 
 
 def _replace(others: dict[Callable[..., Any], Callable[..., Any]]) -> None:

@@ -4,12 +4,20 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from copy import deepcopy
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from rtid.diagnose.trials import TrialState
+from rtid.effects.record_view import RecordView
+from rtid.plain import silent
+from rtid.project import load
 from tests.left import OF_RUN
 from tests.replays import _digest, _once
+
+MODEL = load(Path(__file__).parents[1] / "rtid/project/examples/cylinder.toml").model
 
 
 def adding(number: float) -> Callable[[float], float]:
@@ -26,6 +34,21 @@ def test_laws_are_told_apart_by_what_they_do() -> None:
     assert digest([adding(1.0)]) != digest([adding(2.0)])
     assert digest([adding(1.0)]) != digest([digest])
     assert digest(1.0, adding) == digest(1.0, digest), "whom to tell does not count"
+
+
+def test_what_was_worked_out_or_copied_meanwhile_does_not_count() -> None:
+    chunk = np.arange(12.0).reshape(3, 4)
+    fresh, asked = (RecordView.without_map(MODEL, chunk) for _ in range(2))
+    assert asked.step_s == 4.0
+    assert digest(fresh, fresh) == digest(asked, asked) == digest(fresh, deepcopy(asked))
+    assert digest(fresh, fresh) != digest(fresh, RecordView.without_map(MODEL, chunk + 1.0))
+
+
+def test_whoever_hears_of_a_search_it_is_the_same() -> None:
+    chunk = np.zeros((2, 9))
+    heard, unheard = (TrialState(MODEL, chunk, chunk, by) for by in (lambda *_: None, silent))
+    assert digest([heard]) == digest([unheard])
+    assert digest([heard]) != digest([TrialState(MODEL, chunk + 1.0, chunk, silent)])
 
 
 def test_a_file_is_another_one_once_it_was_written_anew(tmp_path: Path) -> None:
