@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -16,6 +17,7 @@ from rtid.sim.random_plants import draw
 from rtid.study.look import look
 from rtid.study.study import Study
 from rtid.ui.headline import work_line
+from rtid.ui.server import Workbench
 from rtid.ui.views import VIEWS
 from tests.browser.conftest import DURATION_S, SEED, Opened, open_page
 from tests.browser.geometry import SIZES, assert_clear
@@ -396,12 +398,19 @@ def test_every_view_can_be_seen_at_every_width(opened: Opened) -> None:
         assert page.evaluate("() => document.documentElement.scrollHeight <= innerHeight")
 
 
+@pytest.fixture(scope="module")
+def judged(browser: Browser, bench: Workbench) -> Iterator[Page]:
+    """One page with a verdict for all widths: at the end it is looked at in each of them."""
+    for opened in open_page(browser, bench):
+        opened.go()
+        opened.page.wait_for_selector("#verdict h1 >> text=/model|missing|motion/")
+        yield opened.page
+
+
 @pytest.mark.parametrize("width", [390, 800, 1024, 1280, 1920])
-def test_stop_and_words_stand_beside_a_long_record_s_name(opened: Opened, width: int) -> None:
+def test_stop_and_words_stand_beside_a_long_record_s_name(judged: Page, width: int) -> None:
     """At 1280 px the name took the room of both, and Stop was three dots; at 1024 it was gone."""
-    opened.go()
-    page = opened.page
-    page.wait_for_selector("#verdict h1 >> text=/model|missing|motion/")
+    page = judged
     page.set_viewport_size({"width": width, "height": 800})
     working: Any = SimpleNamespace(
         trouble=("", ""), doing="learning", can_stop=True, share=0.5, note=""
