@@ -54,10 +54,16 @@ def shared_replays(request: pytest.FixtureRequest) -> Iterator[None]:
 
 
 def _apart(tests: dict[str, Any]) -> str:
-    """The test that runs, where it changes the program and must not share; else ""."""
+    """The test that runs, where it changes the program and must not share; else "".
+
+    `EACH_APART` in a module: all of its tests do, by their fixtures.
+    """
     name = os.environ.get("PYTEST_CURRENT_TEST", "").rpartition(" ")[0]
     test = tests.get(name.rpartition("::")[2].partition("[")[0])
-    return name if test and "monkeypatch" in inspect.signature(test).parameters else ""
+    if test is None:
+        return ""
+    changes = "EACH_APART" in tests or "monkeypatch" in inspect.signature(test).parameters
+    return name if changes else ""
 
 
 def _once(

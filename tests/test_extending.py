@@ -28,9 +28,11 @@ from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import SimulatedPlant
 from rtid.study import kept
 from rtid.study.on_board import on_board
+from tests.replays import shared_replays  # noqa: F401
 
 PAGE = Path(__file__).parents[1] / "docs" / "extending.md"
 TRACE = Path("the trace")
+EACH_APART = True  # `replays`: what is installed for one test is no other one's
 GAP = """
 [effects.gap]
 flow = "p_a - p_b"
