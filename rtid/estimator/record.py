@@ -74,7 +74,7 @@ def fit_record(
         model = replace(model, lag=replace(model.lag, tolerance_s=0.0))
     tolerance = np.zeros(0) if offset_tolerance_s is None else offset_tolerance_s
     first = sketch(model, summed(model, chunk))
-    weights = _excused(model, chunk, refined(model, first, model.lag.nominal_s))
+    weights, known = _excused(model, chunk, refined(model, first, model.lag.nominal_s))
     lag_sd_s, offsets, offsets_sd = 0.0, np.zeros(len(tolerance)), np.zeros(len(tolerance))
     if model.lag.tolerance_s > 0 or len(tolerance):
         result = _nuisance(model, assemble or (lambda _: chunk), weights, first.leverage, tolerance)
@@ -83,18 +83,30 @@ def fit_record(
         chunk = assemble(offsets) if assemble else chunk
         if len(tolerance):  # the first weights came from shifted signals
             weights = refined(model, sketch(model, summed(model, chunk, weights)), weights.lag_s)
-    weights = _excused(model, chunk, weights)
-    state = run(model, chunk, weights)
-    solution = solve(model, state, counters=state.counters)
-    solution = count_misfit(model, chunk, weights, solution)
+        known = None
+    if known is None:
+        weights, known = _excused(model, chunk, weights)
+    solution = count_misfit(model, chunk, weights, known or _solved(model, chunk, weights))
     return RecordFit(solution, weights, lag_sd_s, offsets, offsets_sd)
 
 
-def _excused(model: Machine, chunk: FloatArray, weights: Weights) -> Weights:
-    """The weights with those blocks excused whose terms miss the flow (`missed`)."""
+def _excused(
+    model: Machine, chunk: FloatArray, weights: Weights
+) -> tuple[Weights, Solution | None]:
+    """The weights with those blocks excused whose terms miss the flow (`missed`).
+
+    With them the solution, where none is and it is known.
+    """
     if not can_be_explained(chunk):
-        return weights
-    return weighed(model, chunk, weights, solve(model, run(model, chunk, weights)))
+        return weights, None
+    solution = _solved(model, chunk, weights)
+    better = weighed(model, chunk, weights, solution)
+    return better, solution if better is weights else None
+
+
+def _solved(model: Machine, chunk: FloatArray, weights: Weights) -> Solution:
+    state = run(model, chunk, weights)
+    return solve(model, state, counters=state.counters)
 
 
 def _nuisance(
