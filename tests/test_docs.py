@@ -31,6 +31,7 @@ from rtid.maps.files import WRITERS, write_map
 from rtid.project import load
 from rtid.project.schema import ExciteSection
 from tests.flow_maps import machine, orifice, solved
+from tests.replays import shared_replays  # noqa: F401
 from tools.api import PAGE, page
 
 ROOT = Path(__file__).parents[1]

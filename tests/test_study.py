@@ -31,6 +31,7 @@ from rtid.study.seed import CLASSES
 from rtid.study.study import Study
 from rtid.tell.arrays import ArrayStudy
 from rtid.ui.desk import Desk
+from tests.replays import shared_replays  # noqa: F401
 
 DURATION_S = 25.0
 LEAK = "internal_leakage_laminar", "a-b"
