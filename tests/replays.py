@@ -29,13 +29,14 @@ from rtid.diagnose.report import diagnosis
 from rtid.diagnose.standing import fitted
 from rtid.diagnose.trials import TrialState
 from rtid.estimator.published import publish
+from rtid.excite.design import candidates
 from rtid.excite.exciting import excite
 from rtid.plain import silent
 from rtid.sim.run import simulate
 from tests.left import OF_RUN
 
 SHARED: tuple[Callable[..., Any], ...] = (
-    *(simulate, search, searched, diagnosis, publish, excite),
+    *(simulate, search, searched, diagnosis, publish, candidates, excite),
 )
 LARGE: tuple[Callable[..., Any], ...] = (fitted,)  # tens of MB each: kept by a module alone
 ROOT = str(Path(__file__).parents[1])
