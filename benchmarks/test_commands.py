@@ -13,6 +13,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
+from time import perf_counter
 from typing import Any, NamedTuple
 
 from benchmarks.interleave import report
@@ -24,6 +25,7 @@ DURATION_S, SHORT_S, ROUNDS = 110.0, 60.0, int(os.environ.get("ROUNDS", "3"))
 BARE = "import numpy, numba, scipy.linalg, typer"
 # wide gates, as multiples of the bare imports: a factor that is lost is seen
 MOST = {"replay": 12.0, "export": 4.0, "compare": 9.0, "diagnose": 12.0}
+MOST_COLD = 75.0
 ASKED = {
     "replay": "2 s, 200 MB (of 60 s)",
     "export": "1.5 s",
@@ -50,12 +52,12 @@ print(json.dumps([status, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024])
 """
 
 
-def spent(*arguments: str, code: str = "") -> Spent:
-    """Run Python code, or a command of rtid without what it says."""
+def spent(*arguments: str, code: str = "", **settings: str) -> Spent:
+    """Run Python code, or a command of rtid without what it says, in an environment."""
     words = ("-c", code) if code else ("-m", "rtid", *arguments)
     meter = [sys.executable, "-S", "-c", METER, *words]
     kept = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
-    done = subprocess.run(meter, stdout=subprocess.PIPE, env=kept, check=True)
+    done = subprocess.run(meter, stdout=subprocess.PIPE, env=kept | settings, check=True)
     status, seconds, peak_mb = json.loads(done.stdout)
     assert status == 0, words
     return Spent(seconds, peak_mb)
@@ -102,6 +104,32 @@ def test_commands(benchmark: Any, tmp_path: Path) -> None:
     )
     for row in rows[1:]:
         assert row["ratio"] <= MOST[_command(row["name"])], row
+
+
+def test_cold_start(benchmark: Any, tmp_path: Path) -> None:
+    """The first command on a machine where no kernel is compiled, and the same once they are."""
+    given = recorded(tmp_path / "short", SHORT_S)
+    commands = {"quick": ("quick", given[0]), "replay": ("replay", *given, "--no-cache")}
+
+    def rounds() -> dict[str, Spent]:
+        times = {BARE: spent(code=BARE)}
+        for name, command in commands.items():
+            kept = {"NUMBA_CACHE_DIR": str(tmp_path / f"kernels-{name}")}
+            for state in ("cold", "warm"):
+                start = perf_counter()
+                times[f"{name}, {state}"] = spent(*command, **kept)
+                clock_s[f"{name}, {state}"] = perf_counter() - start
+        return times
+
+    clock_s: dict[str, float] = {}
+    times = benchmark.pedantic(rounds, rounds=1)
+    rows = [_row(name, [one], times[BARE].seconds) for name, one in times.items()]
+    for row in rows[1:]:
+        row["text"] += f", {clock_s[row['name']]:.1f} s by the clock"
+        if row["name"].endswith("cold"):
+            row["asked"] = "25 s, 10 s by the clock"
+            assert row["ratio"] <= MOST_COLD, row
+    report(benchmark, f"Nothing compiled yet, {SHORT_S:g} s at 1 kHz", "command", rows)
 
 
 def _command(name: str) -> str:

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from firmware_bridge import kernel_parts
 from firmware_bridge.kernel_cache import cache_folder, cached
 
 Record = Any  # one row of a structured array
@@ -21,6 +21,7 @@ Records = NDArray[Any]  # a structured array; its dtype is named in the text
 Integer = int | np.integer[Any]
 
 
+COUNTED = dict.fromkeys(kernel_parts.UNCOUNTED, True)
 _HERE = Path(__file__).parent
 _FOLDER = cache_folder("bridge", _HERE, _HERE.rglob("*.py"))
 
@@ -31,5 +32,5 @@ def kernel(function: Callable[..., Any]) -> Any:
 
 
 def inlined(function: Callable[..., Any]) -> Any:
-    """Compile a part of a kernel; always inlined."""
-    return njit(forceinline=True, no_cfunc_wrapper=True)(function)
+    """Insert a part into the kernels that call it; it may allocate."""
+    return kernel_parts.part(function, forceinline=True, **COUNTED)

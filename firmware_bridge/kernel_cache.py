@@ -33,7 +33,10 @@ from numba.extending import is_jitted
 from firmware_bridge.carried import adapt, take_over
 from firmware_bridge.kept_kernels import KEPT, load_light
 from firmware_bridge.kernel_parts import compiled_as
+from firmware_bridge.lean_compiler import OPTIONS
 
+# what the compiled code hangs on beside its sources
+COMPILER = [Path(__file__).with_name(f"{name}.py") for name in ("kernel_parts", "lean_compiler")]
 WAIT_S = 120.0  # for another process that compiles the same: it may have been stopped
 
 
@@ -43,7 +46,7 @@ def cache_folder(name: str, beside: Path, sources: Iterable[Path]) -> Path | Non
     The first of NUMBA_CACHE_DIR, __pycache__ beside the sources, the user's cache and the system's
     folder for temporary files that holds them or takes them.
     """
-    name = f"{name}-{_digest(sources)}"
+    name = f"{name}-{_digest([*sources, *COMPILER])}"
     for folder in (place / name for place in _places(beside)):
         if _is_writable(folder):
             take_over(folder, beside)
@@ -60,6 +63,7 @@ def cache_folder(name: str, beside: Path, sources: Iterable[Path]) -> Path | Non
 
 def cached(folder: Path | None, function: Callable[..., Any], **options: Any) -> Any:
     """`njit` of a function, kept in the folder where there is one."""
+    options = {"no_cfunc_wrapper": True} | OPTIONS | options  # nothing is called from C
     if folder is None:
         return njit(**options)(function)
     before, config.CACHE_DIR = config.CACHE_DIR, str(folder)

@@ -16,12 +16,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from numba import njit
+from llvmlite import binding as llvm
+from numba import njit, types
 from numba.core import codegen as numba_codegen
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.cpu import CPUTargetOptions
 from numba.core.registry import cpu_target
 from numba.extending import is_jitted
+
+from firmware_bridge.lean_compiler import OPTIONS
 
 UNCOUNTED = {"_nrt": False} if hasattr(CPUTargetOptions, "_nrt") else {}
 _NEEDED = ("finalize", "codegen", "_optimize_functions", "_raise_if_finalized", "_reload_init",
@@ -33,13 +36,35 @@ class _Linked(numba_codegen.JITCodeLibrary):  # type: ignore[misc]
     """A library that is only ever linked into others: no optimisation, no machine code."""
 
     def finalize(self) -> None:
-        """Take in what this part calls."""
+        """Take in nothing: what this part calls is linked once, into the kernel."""
         self._raise_if_finalized()
-        for library in dict.fromkeys(self._linking_libraries):
+        for library in self._called():
             self._reload_init.update(library._reload_init)
-            self._final_module.link_in(library._get_module_for_linking(), preserve=True)
         self._finalize_dynamic_globals()
         self._finalized = True
+
+    def _called(self) -> list[Any]:
+        """The libraries of all that this part calls, each once."""
+        called = dict.fromkeys(self._linking_libraries)
+        for library in self._linking_libraries:
+            called |= dict.fromkeys(library._called() if isinstance(library, _Linked) else ())
+        return list(called)
+
+    def _get_module_for_linking(self) -> Any:
+        self._ensure_finalized()
+        whole = self._alone().clone()
+        for library in self._called():
+            is_part = isinstance(library, _Linked)
+            module = library._alone() if is_part else library._get_module_for_linking()
+            whole.link_in(module, preserve=True)
+        return whole
+
+    def _alone(self) -> Any:
+        """The code of the part itself, which others may hold as well."""
+        for function in self._final_module.functions:
+            if not function.is_declaration and function.linkage == llvm.Linkage.external:
+                function.linkage = llvm.Linkage.linkonce_odr
+        return self._final_module
 
     def get_pointer_to_function(self, name: str) -> int:
         """None: Python cannot call it."""
@@ -90,14 +115,15 @@ def part(function: Callable[..., Any], **options: Any) -> Any:
 
     Tests may call it from Python: then it is compiled once more, as a function of its own.
     """
-    linked = {"forceinline": False} | UNCOUNTED | options  # else it takes them from its caller
+    inherited = {"forceinline": False}  # from its caller, if it is not said
+    linked = inherited | UNCOUNTED | OPTIONS | options
     dispatcher = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **linked)(function)
     if is_jitted(dispatcher):  # not where NUMBA_DISABLE_JIT is set
         compiled, alone = dispatcher.compile, njit(**options)(function)
 
         def compile_linked(signature: Any) -> Any:
-            with compiled_as(LINKED):
-                return compiled(signature)
+            with compiled_as(LINKED):  # once for all constants: LLVM puts them in where they are
+                return compiled(tuple(types.unliteral(kind) for kind in signature))
 
         def compile_alone(*arguments: Any) -> Any:
             with global_compiler_lock, compiled_as(numba_codegen.JITCodeLibrary):
