@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy import ascontiguousarray  # as `advance`, by its own name: looked up at each sample
 from numpy.typing import NDArray
 
 from rtid.estimator.limits import most_open, refuse_unfit
-from rtid.kernels import engine as kernel
 from rtid.kernels import housekeeping, layout
-from rtid.kernels.engine import ROW_FLAG
+from rtid.kernels.engine import ROW_FLAG, advance
 from rtid.kernels.recent import move_pairs
 from rtid.model import (
     BASES,
@@ -52,7 +52,7 @@ class State:
     memory: NDArray[np.uint8] = field(init=False)
 
     def __post_init__(self) -> None:
-        """Copy the arrays into one block of memory, which `kernel.advance` takes; keep views."""
+        """Copy the arrays into one block of memory, for the kernel `advance`; keep views."""
         self._move([len(array) for array in self.arrays])
 
     def _move(self, lengths: list[int]) -> None:
@@ -80,12 +80,12 @@ class State:
 
     def advance(self, chunk: FloatArray) -> None:
         """Take samples (n, 2 + signals), rows [t_s, flags, values...]; tables grow as needed."""
-        chunk = np.ascontiguousarray(chunk)  # or each layout in memory compiles the kernel anew
-        taken = kernel.advance(self.memory, chunk)
-        while taken < len(chunk):
+        chunk = ascontiguousarray(chunk)  # or each layout in memory compiles the kernel anew
+        rest = advance(self.memory, chunk)
+        while rest:
             self.make_room()
-            chunk = chunk[taken:]
-            taken = kernel.advance(self.memory, chunk)
+            chunk = chunk[-rest:]
+            rest = advance(self.memory, chunk)
 
     @property
     def arrays(self) -> tuple[RecordArray, RecordArray, RecordArray, RecordArray, RecordArray]:

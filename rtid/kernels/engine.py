@@ -73,7 +73,7 @@ def advance(memory: Any, chunk: FloatArray) -> int:
 
     memory: the records of `layout` one after the other as bytes, changed in place (one argument:
     each costs a call from Python as much as the arithmetic of a block).  Returns the number of
-    samples taken: fewer than n when blocks or pairs must be enlarged first (see `needs_room`).
+    samples that are left: some when blocks or pairs must be enlarged first (see `needs_room`).
     """
     e = memory[:ENGINE_BYTES].view(ENGINE)[0]
     a = ENGINE_BYTES
@@ -84,11 +84,11 @@ def advance(memory: Any, chunk: FloatArray) -> int:
     block, pair = memory[c:d].view(BLOCK), memory[d:].view(PAIR)
     for k in range(len(chunk)):
         if needs_room(e, block, pair):
-            return k
+            return len(chunk) - k
         for j in range(2 + e.n_signals):  # a view of the row would be counted, atomically
             e.sample[j] = chunk[k, j]
         _take(e, cell, ringing, block, pair)
-    return len(chunk)
+    return 0
 
 
 @inlined
