@@ -9,6 +9,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PatchCollection
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
@@ -27,6 +28,7 @@ LABELS = {
     PRIOR: "no data: rated value",
     SHUT: "shut",
 }
+DPI = 160
 GAP = 5.0  # usual steps: no line across a longer one
 INSIDE = 0.25  # of the axis: a longer bar has its figure inside
 WEAKEST = 0.1  # left end of a logarithmic scale
@@ -85,10 +87,18 @@ def label_outer(axes: Sequence[Axes], x: str, y: str) -> None:
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Write the picture in the format that the suffix names (.png, .svg), without a date."""
+    """Write the picture in the format that the suffix names (.png, .svg), without a date.
+
+    A PNG goes past `savefig`, which draws all of it once more, to lay it out before.
+    """
     with mpl.rc_context(STYLE):
-        dated: dict[str, str | None] | None = {"Date": None} if path.suffix == ".svg" else None
-        figure.savefig(path, dpi=160, metadata=dated)
+        if path.suffix == ".png":
+            figure.set_dpi(DPI)
+            canvas: Any = FigureCanvasAgg(figure)
+            canvas.print_png(path)
+        else:
+            dated: dict[str, str | None] | None = {"Date": None} if path.suffix == ".svg" else None
+            figure.savefig(path, dpi=DPI, metadata=dated)
     return path
 
 
