@@ -1,10 +1,12 @@
-"""What everything shares: array types, progress that nobody watches, and the one to-JSON."""
+"""What everything shares: array types, unwatched progress, the one to-JSON, memory given back."""
 
 from __future__ import annotations
 
+import ctypes
 import dataclasses
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -33,3 +35,12 @@ def plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [plain(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def give_back() -> None:
+    """Give back to the system what was freed: glibc keeps what lies between small things that stay.
+
+    Behind the diagnosis of ten minutes at 1 kHz that was 430 MB of 750; another library has none.
+    """
+    with suppress(AttributeError, OSError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)

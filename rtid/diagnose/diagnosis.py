@@ -120,8 +120,7 @@ def searched(standing: Standing, progress: Progress = silent) -> Result:
         if not can_judge(before):
             state.judges_itself = True
             before = state.left(first)
-    bare = _bare(state, first)
-    state.excess = bare.held.sse - bare.regression.dof
+    state.excess = _excess(state, first)
     present, first, last = first, first.light(), before
     if can_judge(before):
         present, last = _extended(state, present, before)
@@ -179,12 +178,13 @@ def _extended(state: TrialState, first: Fit, before: Residual) -> tuple[Fit, Res
     return _look_back(state, present, last)
 
 
-def _bare(state: TrialState, first: Fit) -> Fit:
-    """The fit without any effect."""
-    if not state.given:
-        return first
-    weights = replace(first.weights, lag_s=state.model.lag.nominal_s)
-    return fit(state.model, state.chunk, weights, Revision(), bank=False)
+def _excess(state: TrialState, first: Fit) -> float:
+    """chi2 beyond the noise that a fit without any effect leaves."""
+    bare = first
+    if state.given:
+        weights = replace(first.weights, lag_s=state.model.lag.nominal_s)
+        bare = fit(state.model, state.chunk, weights, Revision(), bank=False)
+    return bare.held.sse - bare.regression.dof
 
 
 def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Residual] | None:

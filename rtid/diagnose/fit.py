@@ -259,6 +259,7 @@ def one_pass(
     given = rows.condensed, commands(declared, chunk), weights, revision
     columns, n_timing, shapes = columns_of(view, *given, bank, more, suspects)
     first = 1 + len(model.chambers) + n_timing + len(shapes)
+    view.rest()
     projected = project(rows, columns.released())
     dof = float(rows.n - TERMS * len(rows.cells))
     regression = regression_of(model, weights, revision, projected, columns, rows, dof)
@@ -321,7 +322,9 @@ def tried(model: Machine, chunk: FloatArray, weights: Weights, revision: Revisio
     fitted = one_pass(model, chunk, weights, revision, None, False, thorough=False)
     better = reweighed(fitted)
     if better is not None:
-        fitted = one_pass(model, chunk, better, revision, fitted, False, thorough=False)
+        start, sent = fitted.light(), fitted.sent
+        del fitted  # its rows are large, and weighed otherwise
+        fitted = one_pass(model, chunk, better, revision, start, False, thorough=False, sent=sent)
     return fitted.light()
 
 

@@ -17,13 +17,14 @@ from rtid.estimator.state import Weights, build
 from rtid.kernels.following import follow_map
 from rtid.kernels.layout import TERMS
 from rtid.model import PRESSURE, Edge, Machine
-from rtid.plain import BoolArray, FloatArray, IntArray
+from rtid.plain import BoolArray, FloatArray, IntArray, give_back
 
 TURNS = 0.05  # share of changes that reverse the one before: 2/3 for noise, next to 0 for motion
 UNKNOWN = 10.0  # standard deviation of the flow in a block that was never visited, rated flows
 NONE = np.zeros(0)
 SMOOTH_S = 0.02  # half width of the window for derivatives of pressures, without delay
 AT_ONCE = 1 << 14  # intervals that are followed in one go
+LONG = 1 << 18  # samples of a record that is read again rather than kept: 4 minutes at 1 kHz
 OPENING, FLOW, SLOPE_U, SLOPE_DP, FLOW_SD = range(5)  # what `follow_map` tells of each
 
 
@@ -200,6 +201,13 @@ class RecordView:
         """Largest standard deviation of open edges (n - 1,), as a share of the rated flow."""
         rated = np.array([edge.rated_q_m3s for edge in self.model.edges])
         return np.asarray((self._followed((FLOW_SD,))[FLOW_SD] / rated[:, None]).max(axis=0))
+
+    def rest(self) -> None:
+        """Let go of what a long record gives again when it is asked for: 0.3 kB a sample."""
+        if self.n >= LONG:
+            for made in ("_said", "inside", "_signals", "x_m", "seen", "t_s", "dt_s"):
+                vars(self).pop(made, None)
+            give_back()
 
     @cached_property
     def inside(self) -> BoolArray:

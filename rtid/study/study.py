@@ -201,6 +201,7 @@ class Study:
         present = self._light()
         self.progress("learning the maps", 0.5)
         made, steady = replayed(self.project, present, self.machine, *self._aged)
+        vars(self)["fitted"] = replace(present, rest=None)  # it was for the steady fit
         counters = self.trace.counters
         self._keep(LEARNED, Learned.of(made.fit, made.added, steady, counters))
         return made

@@ -173,10 +173,12 @@ class Desk:
     def diagnose(self) -> RankedDiagnosis:
         """What is missing in the newest revision."""
         study = self._stack[-1].study
+        study.rest()  # of what led to it
         said = study.diagnosis()
         ranking = ranked(study.diagnosed.result, said)
-        evidence = charts_of(study.evidence, study.remainder)
         study.rest()
+        evidence = charts_of(study.evidence, study.remainder)
+        study.rest()  # of what the evidence was made of
         return RankedDiagnosis(said, ranking, evidence)
 
     def tried(self, effect: str, where: str, reason: str) -> Addition:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import sys
 import threading
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
@@ -19,7 +17,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from rtid.errors import RtidError
-from rtid.plain import Progress
+from rtid.plain import Progress, give_back
 from rtid.ui.parcel import packed
 
 Then = Callable[[Any], None]
@@ -77,15 +75,6 @@ def serve(pipe: Connection, folder: Path, stop: Event) -> None:
         except Exception as error:
             pipe.send(("refused", in_words(method, error)))
         give_back()
-
-
-def give_back() -> None:
-    """Give back to the system what was freed: glibc keeps what lies between small things that stay.
-
-    Behind the diagnosis of ten minutes at 1 kHz that was 430 MB of 750; another library has none.
-    """
-    with suppress(AttributeError, OSError, TypeError):
-        ctypes.CDLL(None).malloc_trim(0)
 
 
 def ignore(*_: object) -> None:
