@@ -52,18 +52,21 @@ def ui(
         if path is not None and not path.exists():
             raise RtidError(f"{path}: no such file", "rtid ui TRACE -p PROJECT")
     refuse_without_bokeh()
-    from rtid.project import load
-    from rtid.project.folder import state_folder
-    from rtid.ui.server import Workbench, serve
+    from rtid.ui.worker import started
 
-    folder = state or (state_folder(load(project)) if project else None)
+    is_record = trace is not None and project is not None
+    # the worker imports beside the server
+    with TemporaryDirectory(prefix="rtid-ui-") as scrap, started(ahead=is_record) as worker:
+        from rtid.project import load
+        from rtid.project.folder import state_folder
+        from rtid.ui.server import Workbench, serve
 
-    def ready(bench: Workbench) -> None:
-        print(f"{bench.url}  (Ctrl-C ends it)", flush=True)
-        if open_page:
-            typer.launch(_doorstep(bench.url, Path(scrap)).as_uri())
+        def ready(bench: Workbench) -> None:
+            print(f"{bench.url}  (Ctrl-C ends it)", flush=True)
+            if open_page:
+                typer.launch(_doorstep(bench.url, Path(scrap)).as_uri())
 
-    with TemporaryDirectory(prefix="rtid-ui-") as scrap:
+        folder = state or (state_folder(load(project)) if project else None)
         serve(
             ready,
             project=project,
@@ -73,6 +76,7 @@ def ui(
             port=port,
             sheet=sheet,
             test_bus=test_bus,
+            worker=worker,
         )
 
 

@@ -299,16 +299,19 @@ def start(
     port: int = 0,
     sheet: Path | None = None,
     test_bus: bool = False,
+    worker: Worker | None = None,
 ) -> Workbench:
     """Begin to serve on the current event loop; port 0: any that is free.
 
     project: None where there is none yet; state: folder in which a daemon keeps its state, for the
-    live page; test_bus: maps may be sent over a bus that anybody may write to.  Raises RtidError
-    where the port is taken.
+    live page; test_bus: maps may be sent over a bus that anybody may write to; worker: one that was
+    started ahead.  Raises RtidError where the port is taken.
     """
+    worker = worker or Worker()
     logging.getLogger("bokeh.server.views.ws").setLevel(logging.ERROR)  # a tab may be closed
     loop, sockets = IOLoop.current(), _bound(host, port)
-    session = _session(project, trace, Worker(loop.add_callback), sheet, state, test_bus)
+    worker.on_loop = loop.add_callback
+    session = _session(project, trace, worker, sheet, state, test_bus)
     turns = Turns(loop.call_later)
     door = Door(host, port=sockets[0].getsockname()[1])
     guarded = _guarded(door, session, Live(state), turns)

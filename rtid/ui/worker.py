@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
@@ -21,6 +22,7 @@ from rtid.plain import Progress, give_back
 from rtid.ui.parcel import packed
 
 Then = Callable[[Any], None]
+OnLoop = Callable[[Callable[[], None]], None]
 OUR_PACKAGES = ("rtid", "firmware_bridge")  # their errors are meant for the user
 POLITE = 5
 ENDED = "the worker has ended", "start `rtid ui` again"
@@ -77,6 +79,18 @@ def serve(pipe: Connection, folder: Path, stop: Event) -> None:
         give_back()
 
 
+@contextmanager
+def started(*, ahead: bool) -> Iterator[Worker]:
+    """A worker, its process begun at once with `ahead`, and ended in the end."""
+    worker = Worker()
+    if ahead:
+        worker.warm()
+    try:
+        yield worker
+    finally:
+        worker.stop()
+
+
 def ignore(*_: object) -> None:
     """What came of a job that nobody waits for."""
 
@@ -91,10 +105,13 @@ def in_words(method: str, error: Exception) -> tuple[str, str]:
 
 
 class Worker:
-    """The server's side: `ask` returns at once, answers arrive through `on_loop`."""
+    """The server's side: `ask` returns at once, answers arrive through `on_loop`.
 
-    def __init__(self, on_loop: Callable[[Callable[[], None]], None]) -> None:
-        self._on_loop = on_loop
+    on_loop: calls something on the thread that asks; it must be there before the first job is.
+    """
+
+    def __init__(self, on_loop: OnLoop | None = None) -> None:
+        self.on_loop = on_loop
         self._jobs: list[Job] = []
         self._pipe: Connection | None = None
         self._process: BaseProcess | None = None
@@ -144,6 +161,10 @@ class Worker:
         if self._folder is not None:
             self._folder.cleanup()
 
+    def warm(self) -> None:
+        """Start the process ahead of the first job: it imports while others do something else."""
+        self._pipe = self._pipe or self._start()
+
     def _start(self) -> Connection:
         """The process, started with the first job: a page that only looks on needs none."""
         context = get_context("spawn")
@@ -161,7 +182,8 @@ class Worker:
     def _begin(self) -> None:
         job = self._jobs[0]
         try:
-            self._pipe = self._pipe or self._start()
+            self.warm()
+            assert self._pipe is not None
             self._pipe.send((job.method, job.arguments))
         except OSError:
             self._take("refused", ENDED)
@@ -172,11 +194,15 @@ class Worker:
             try:
                 kind, content = pipe.recv()
             except (EOFError, OSError):
-                self._on_loop(partial(self._take, "refused", ENDED))
+                self._hear("refused", ENDED)
                 return
             if kind == "done":
                 content = content.value()
-            self._on_loop(partial(self._take, kind, content))
+            self._hear(kind, content)
+
+    def _hear(self, kind: str, content: Any) -> None:
+        if self.on_loop is not None:  # without one nobody has asked for anything
+            self.on_loop(partial(self._take, kind, content))
 
     def _take(self, kind: str, content: Any) -> None:
         if not self._jobs:
