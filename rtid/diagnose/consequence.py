@@ -145,11 +145,16 @@ def _again(now: Fit, machine: Machine, chunk: FloatArray, weights: Weights) -> F
 
 
 def _size(fit: Fit, trial: Trial) -> tuple[int, float, float]:
-    """The first free parameter of what was tried last: column, value, standard deviation."""
+    """The first free parameter of what was tried last: column, value, standard deviation.
+
+    One at its bound is no size: a pump that only gives way at its limit has no droop.
+    """
     if trial.is_timing:
         k = len(fit.revision.timings) - 1
-        column = fit.timing_columns(k)[0]
-        value = fit.revision.timings[k][1][0] + fit.estimate.value(column)
+        timing, psi = fit.revision.timings[k]
+        j = next((j for j in range(len(psi)) if timing.is_free(psi, j)), 0)
+        column = fit.timing_columns(k)[j]
+        value = psi[j] + fit.estimate.value(column)
     elif (effect := fit.revision.effects[-1]).is_whole and (free := fit.shape_columns(effect)):
         first = min(free)
         column = free[first]

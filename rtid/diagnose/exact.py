@@ -32,29 +32,32 @@ DROOPS, PUMP_LIMITS, STIFFNESSES = (0.1, 0.7), (0.8, 0.93, 0.98), (1e9, 1e10, 1e
 
 
 def with_pump(state: TrialState, present: Fit, trials: list[Trial]) -> list[Trial]:
-    """A supply that sags is refitted exactly, from where its first-order forms point."""
-    first = [t for t in trials if t.effect.effect == PUMP.effect]
-    rest = [t for t in trials if t.effect.effect != PUMP.effect]
-    if not first:
-        return rest
+    """A supply that sags is refitted exactly: its first-order forms only say whether it may.
+
+    They may point to a supply that rises: on a fine grid the maps have followed most of a sag.
+    """
+    key = PUMP.effect, present.view.supply_name
+    first = [t for t in trials if t.key == key]
+    rest = [t for t in trials if t.key != key]
     bar = PROMISING * max((t.gain for t in rest), default=0.0)
-    if first[0].gain < bar and not _sags(state, present, bar):
+    if not any(t.gain >= bar for t in first) and not _sags(state, present, key, bar):
         return rest
     psi = state.coarse.beside(present).polished(PUMP, _pumps(present))
     timings = (*present.revision.timings, (PUMP, psi))
     revision = replace(present.revision, timings=timings)
     now = fit(state.model, state.chunk, present.weights, revision, bank=False)
     gain = present.held.sse - now.held.sse
-    return [*rest, Trial(first[0].key, gain, now.revision, now.light(), True)]
+    return [*rest, Trial(key, gain, now.revision, now.light(), True)]
 
 
-def _sags(state: TrialState, present: Fit, bar: float) -> bool:
+def _sags(state: TrialState, present: Fit, key: Key, bar: float) -> bool:
     """True where the supply is declared constant, and a pump explains more than a bar from afar.
 
-    A sag that is not small bends the maps: its first-order forms say little of it.
+    A sag that is not small bends the maps: its first-order forms say little of it.  key: of the
+    pump, which the fit may have already.
     """
-    view = present.view
-    if present.rho < LARGE or np.ptp(view.signal(view.supply_name)) > 0.0:
+    is_open = key[1] and not present.revision.has(key)
+    if not is_open or present.rho < LARGE or np.ptp(present.view.signal(key[1])) > 0.0:
         return False
     beside = state.coarse.beside(present)
     return max(beside.gain(PUMP, psi) for psi in _pumps(present)) >= bar
@@ -211,4 +214,4 @@ def is_inside(now: Fit) -> bool:
     """True where the timing that was added last did not end at a bound, nor at nothing."""
     timing, psi = now.revision.timings[-1]
     sd = now.estimate.sd(now.timing_columns(len(now.revision.timings) - 1)[0])
-    return timing.low[0] * 1.01 < psi[0] < timing.high[0] * 0.99 and psi[0] > 3.0 * sd
+    return timing.is_free(psi, 0) and psi[0] > 3.0 * sd

@@ -7,7 +7,7 @@ import pytest
 
 from rtid.diagnose.consequence import HIDDEN_GAIN, is_stable
 from rtid.diagnose.fit import Fit, fit, one_pass, prepare
-from rtid.diagnose.halves import between_halves
+from rtid.diagnose.halves import between_halves, first_half
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.trials import Trial, best_by_key, scored
 from rtid.estimator.estimator import to_chunk
@@ -85,3 +85,12 @@ def test_what_polynomials_miss_alike_in_both_halves_is_no_leak() -> None:
     """A clean sweep that matches without it: one size, 1.2 times the flow, and 174 of chi2."""
     now, trial = of_case(Case(5111, "flow_force", "sweep_record"))
     assert trial.gain > HIDDEN_GAIN and not is_stable(now, trial)
+
+
+@pytest.mark.parametrize("begins", [0, 300, 900])
+def test_half_of_a_column_that_begins_late_is_half_of_its_square(begins: int) -> None:
+    """A pump that is asked for more than it gives in the second half alone."""
+    column = np.where(np.arange(1000) < begins, 0.0, 1.0)
+    is_first = first_half({0: column, 1: -2.0 * column})
+    middle = begins + (1000 - begins) // 2 if begins > 500 else 500
+    assert is_first.sum() == middle and is_first[:middle].all()

@@ -5,10 +5,12 @@ Its labels are read here and nowhere else; nothing is tuned to them.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from rtid.diagnose.report import Diagnosis
@@ -111,6 +113,20 @@ def test_an_undeclared_lag_is_found(shared: Path, tmp_path: Path) -> None:
     (own,) = found.found
     assert own.effect == "spool_lag_first_order"
     assert own.parameters["time_constant"].value == pytest.approx(1.3e-3, abs=0.2e-3)
+
+
+@pytest.mark.slow
+def test_a_sag_is_named_on_a_grid_that_follows_most_of_it(shared: Path, tmp_path: Path) -> None:
+    """On the grid of `rtid quick` its first order is a supply that rises: it was `unknown`."""
+    u_v = ", ".join(f"{v:.3f}" for v in np.linspace(1.06, 8.09, 25))
+    dp_mpa = ", ".join(f"{v:.3f}" for v in 10.0 * np.linspace(0.0, 1.0, 13) ** 2)
+    grids = f"u_grid_v = [{u_v}]\ndp_grid_mpa = [{dp_mpa}]\n"
+    text, n = re.subn(r"u_grid_v = .*\ndp_grid_mpa = .*\n", grids, rig.PROJECT.read_text())
+    assert n == 1
+    project = tmp_path / "project.toml"
+    project.write_text(text)
+    (named,) = diagnosed(shared, 14, tmp_path, project).found
+    assert named.effect == "supply_sag"
 
 
 @pytest.mark.slow

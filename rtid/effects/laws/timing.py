@@ -29,6 +29,7 @@ SHUT_V = 0.02  # of an opening that fades: as little passes nothing
 LAG_S = "time_constant"
 DEAD_BAND = "dead_band"  # behind which a lag may sit
 USUAL_STEP_S = 0.01  # up to which the banks are those of the pages
+AT_BOUND = 1.01  # times a bound, within which a parameter is at it
 
 
 @dataclass(frozen=True)
@@ -81,6 +82,10 @@ class TimingLaw:
         bank = tuple(longer(psi) for psi in self.bank)
         low, high = longer(self.low), longer(self.high)
         return replace(self, bank=bank, low=min(self.low, low), high=max(self.high, high))
+
+    def is_free(self, psi: Psi, k: int) -> bool:
+        """True where parameter k is not at a bound."""
+        return AT_BOUND * self.low[k] < psi[k] < self.high[k] / AT_BOUND
 
     def strength(self, psi: Psi) -> float:
         """How much a command is changed, 0 for not at all."""
