@@ -38,6 +38,7 @@ TOGETHER = "delay and lag together are"
 CALLED = {"delay": "the delay is", "time_constant": "the lag is"}
 WORTH = 2.0  # times better that an experiment must be to be proposed
 NOBODY_LOOKED = "Not examined: the diagnosis has no column for it here."
+NOT_TOLD = "what the maps' blocks miss looks like it in this record"
 VISIBLE = 2e-3  # share of a column that must be left beside the maps
 HYDRAULIC = ("flow", "storage", "timing", "supply", "map")
 
@@ -305,13 +306,16 @@ def _not_found(result: Result) -> tuple[Unseen, ...]:
 
 
 def _limit(result: Result, candidate: Candidate, score: Score) -> Unseen:
-    limit, unit, is_possible = _sized(
-        result.last, candidate, detection_limit(score, result.last.rho)
-    )
+    by, known = result.reach.get(candidate.key, (candidate, None))
+    doubtful = known.not_believed(score) if known and by == candidate else 0.0
+    least = max(detection_limit(score, result.last.rho), doubtful)
+    limit, unit, is_possible = _sized(result.last, candidate, least)
     visible = score.visible > VISIBLE and is_possible
-    known = result.reach.get(candidate)
-    named_from, _, may_be = _sized(result.last, candidate, known.named_from if known else np.inf)
-    if candidate.key in result.negligible:
+    from_ = max(known.named_from, doubtful) if known else np.inf
+    named_from, _, may_be = _sized(result.last, by, from_)
+    if doubtful:
+        reason = f"not confirmed: {NOT_TOLD}"
+    elif candidate.key in result.negligible:
         reason = "present, negligible: it changes next to nothing on the held-out part"
     elif visible:
         reason = ""

@@ -19,9 +19,10 @@ import numpy as np
 from rtid.diagnose.diagnosis import searched
 from rtid.diagnose.excuse import steady
 from rtid.diagnose.fit import Fit
-from rtid.diagnose.report import Diagnosis, diagnosis
+from rtid.diagnose.report import Diagnosis, Unseen, diagnosis
 from rtid.diagnose.standing import fitted, stand
 from rtid.effects.laws import causes
+from rtid.effects.laws.timing import RATE
 from rtid.estimator.estimator import to_chunk
 from rtid.estimator.flowmap import EXTRAPOLATED, VALID, EdgeMap
 from rtid.estimator.published import publish
@@ -31,7 +32,8 @@ from rtid.plain import FloatArray, Key
 from rtid.project.template import U_STEPS, nice
 from rtid.sim.declare import declared_model, default_grid
 from rtid.sim.demand import IDENTIFICATION, VALIDATION
-from rtid.sim.hidden import hide
+from rtid.sim.extra_physics import Planted
+from rtid.sim.hidden import HIDDEN, hide
 from rtid.sim.random_plants import draw, draw_hidden
 from rtid.sim.run import Run, Sensors, SimulationError, simulate
 from rtid.sim.simulated_plant import EDGES, SimulatedPlant
@@ -154,7 +156,9 @@ class Answer:
 
     judgement: as of `diagnoses.judge`; is_hidden: named where the maps had taken it in; size_z:
     error of its size in stated standard deviations, NaN where it is not one number; beta_z, half
-    (chambers,) as of an outcome; left: of the held-out part, in units of the sensors' noise.
+    (chambers,) as of an outcome; left: of the held-out part, in units of the sensors' noise;
+    of_limit: the size that is hidden over the one from which the record says that it is named, 0
+    where it says that no possible one would be; NaN where the record names it, or cannot be asked.
     """
 
     case: Case
@@ -168,6 +172,7 @@ class Answer:
     beta_half: FloatArray
     left: float
     seconds: float
+    of_limit: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -241,7 +246,27 @@ def answer(case: Case) -> Answer | None:
     return Answer(
         case, judgement, said.verdict, first.effect if first else "", is_hidden, z, half,
         (beta - true) / sd, 1.96 * sd / true, left, time.process_time() - began,
+        of_limit(case.plant.hidden[0], said.not_found),
     )  # fmt: skip
+
+
+def of_limit(hidden: Planted, unseen: Iterable[Unseen]) -> float:
+    """A hidden size over the one from which a record says that it is named, as of `Answer`.
+
+    A slow spool is the stronger the lower its frequency; what sits in no chamber, or in both, is
+    asked for where it would be named; a share that boils out has another unit on its page.
+    """
+    true = truth(hidden.name)
+    limits = {u.where: u for u in unseen if u.effect == true and u.examined}
+    at = limits.get(hidden.where or "both")
+    if at is None and len(limits) == 1:
+        (at,) = limits.values()
+    if at is None or HIDDEN[hidden.name].unit != at.unit:
+        return float("nan")
+    if at.named_from is None:
+        return 0.0
+    size = hidden.strength / at.named_from
+    return 1.0 / size if at.unit == RATE else size
 
 
 def told(fit: Fit) -> Solution:

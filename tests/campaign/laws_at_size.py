@@ -108,7 +108,7 @@ def of_hidden(motion: str, found: list[Answer], clean_left: float) -> str:
     wide = np.concatenate([o.beta_half for o in found if o.judgement in (RIGHT, IN_SET)])
     left = [o.left for o in found if o.judgement in (RIGHT, IN_SET)]
     wrong = ", ".join(f"{o.case.hidden} as {o.named}" for o in found if o.judgement == WRONG)
-    unseen = Counter(o.case.hidden for o in found if o.judgement not in (RIGHT, IN_SET, WRONG))
+    missed = [o for o in found if o.judgement not in (RIGHT, IN_SET, WRONG)]
     near = sum(x <= MOST_LEFT * clean_left for x in left)
     parts = [
         ", ".join(f"{judgement} {n}" for judgement, n in said.most_common()),
@@ -118,9 +118,25 @@ def of_hidden(motion: str, found: list[Answer], clean_left: float) -> str:
         f"left at most 1.15 x a clean machine's {_share(near, len(left))}",
         f"median {np.median([o.seconds for o in found]):.1f} s of processor time",
         f"wrong: {wrong or 'none'}",
-        f"not named: {', '.join(f'{name} {k}' for name, k in unseen.items()) or 'none'}",
+        f"not named: {of_missed(missed)}",
     ]
     return "; ".join(parts)
+
+
+def of_missed(missed: list[Answer]) -> str:
+    """Each that is not named, and how large it is beside the limit that its record itself states.
+
+    Below it nothing else was promised: "named from" is what a reader is told.
+    """
+    if not missed:
+        return "none"
+    limits = [getattr(o, "of_limit", np.nan) for o in missed]  # kept ones may be older
+    below = sum(size < 1.0 for size in limits)
+    each = ", ".join(
+        f"{o.case.hidden}{'' if np.isnan(size) else f' ({size:.2g} of it)'}"
+        for o, size in zip(missed, limits, strict=True)
+    )
+    return f"{len(missed)}, {below} of them below the limit that the record states: {each}"
 
 
 def of_clean(found: list[Outcome]) -> str:
