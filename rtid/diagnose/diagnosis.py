@@ -17,7 +17,7 @@ from rtid.diagnose.consequence import (
     consequence,
     is_stable,
 )
-from rtid.diagnose.contest import contest, trials_of
+from rtid.diagnose.contest import contest, hardly_worse, trials_of
 from rtid.diagnose.exact import carried_on
 from rtid.diagnose.excuse import few_excused
 from rtid.diagnose.fit import MATCH_RHO, Fit, fit, with_covariances
@@ -27,6 +27,7 @@ from rtid.diagnose.parts import AddedEffect
 from rtid.diagnose.regression import Score
 from rtid.diagnose.residual import Residual
 from rtid.diagnose.revision import Revision
+from rtid.diagnose.softer import Softer, softer
 from rtid.diagnose.spread import with_spreads
 from rtid.diagnose.standing import Standing, stand, with_bank
 from rtid.diagnose.trials import (
@@ -41,6 +42,7 @@ from rtid.diagnose.trials import (
     scored,
 )
 from rtid.diagnose.verdict import (
+    AMBIGUOUS,
     INSUFFICIENT,
     MATCHES,
     MATERIAL,
@@ -49,6 +51,7 @@ from rtid.diagnose.verdict import (
     UNKNOWN,
     can_judge,
     doubts_about,
+    explained,
     told_doubts,
     verdict,
 )
@@ -89,6 +92,7 @@ class Result:
     # of what was not found: the column that tells it, and what it does
     reach: Mapping[Key, tuple[Candidate, Reach]] = field(default_factory=dict)
     doubts: tuple[Doubt, ...] = ()  # of the last fit's moduli, by what its blocks miss
+    softer: Softer | None = None  # a chamber that stores more than its oil, by the other one
 
 
 def search(
@@ -128,11 +132,15 @@ def searched(standing: Standing, progress: Progress = silent) -> Result:
     state.found = [beside_its_line(state, told_apart(state, effect)) for effect in state.found]
     doubted = told_doubts(present)
     said = verdict(state, first, present, last, doubted, judged)
+    soft = stored(state, first, present, said)
+    if soft is not None:
+        said = AMBIGUOUS
+        state.negligible = {k: v for k, v in state.negligible.items() if k not in soft.causes}
     if said == UNKNOWN:  # what explains a part of it only is not named, and not counted
         doubted = told_doubts(first) if state.found else doubted
         present, last, state.found = first, before, []
-    elif not state.found and matches_as_it_stands(first, present):
-        present, last, doubted = with_bank(first, state.suspects), before, ()
+    elif not state.found and (soft or matches_as_it_stands(first, present)):
+        present, last, doubted = with_bank(first, state.suspects), before, told_doubts(first)
     present = with_spreads(present)
     result, negligible, scores = tuple(state.found), state.negligible, scored(present)
     joined = tuple(joint for part in record for joint in joints(present, part, scores))
@@ -145,7 +153,25 @@ def searched(standing: Standing, progress: Progress = silent) -> Result:
     return Result(
         first, present.light(), result, negligible, scores, before, last, said, parts,
         held_out_judged=judged, zeros=apart, reach=reach, doubts=doubted,
+        softer=soft,
     )  # fmt: skip
+
+
+def stored(state: TrialState, first: Fit, last: Fit, said: str) -> Softer | None:
+    """What a chamber stores more, where nothing is named and the other one tells it.
+
+    last: with what was seen and is not named; said: the verdict so far.  Where the record does not
+    match as it stands, this must explain most of its misfit.
+    """
+    if state.found or said not in (MATCHES, UNKNOWN):
+        return None
+    soft = softer(first)
+    if soft is None or any(part.key in soft.causes for part in state.given):
+        return None
+    if first.rho < first.most_rho:
+        return soft
+    of_it = last.revision.effects and all(e.key in soft.causes for e in last.revision.effects)
+    return soft if of_it and explained(state, last) >= NAMED else None
 
 
 def matches_as_it_stands(first: Fit, last: Fit) -> bool:
@@ -231,6 +257,9 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
         is_form = is_form_of_another(state, trial.key) or is_within_a_form(state, trial)
         if not (is_shown or is_form):
             does = taken_in(present, now, trial, own, last, after)
+        if does is not None:
+            more = hardly_worse(state, trial, finished, HIDDEN_GAIN)
+            alike = tuple(dict.fromkeys((*alike, *more)))
         what = trial.key, alike, trial.gain, trial.n_parameters
         if is_shown or does is not None:
             present.unread()  # what is read beside the next one is as large

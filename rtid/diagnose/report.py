@@ -19,6 +19,7 @@ from rtid.diagnose.fit import Fit
 from rtid.diagnose.nameable import clearest
 from rtid.diagnose.regression import LIMIT_SD, Score
 from rtid.diagnose.remains import described
+from rtid.diagnose.softer import Softer
 from rtid.diagnose.trials import AcceptedEffect, detection_limit, physical
 from rtid.diagnose.verdict import MATERIAL, UNKNOWN
 from rtid.diagnose.zeros import Zero, by_chance
@@ -173,6 +174,7 @@ def diagnosis(result: Result) -> Diagnosis:
     last, effects = result.last, tuple(_effect(result, f) for f in result.found)
     if result.verdict != UNKNOWN:  # what explains a part of it only is not named
         effects += tuple(_shown_too_much(result, z) for z in result.zeros if z.matters)
+        effects += (_stored(result, result.softer),) if result.softer else ()
     words = steady(last)
     unseen = _not_found(result)
     return Diagnosis(
@@ -235,6 +237,23 @@ def _shown_too_much(result: Result, zero: Zero) -> FoundEffect:
     )
 
 
+def _stored(result: Result, soft: Softer) -> FoundEffect:
+    """What a chamber stores beyond its oil: its modulus has taken it in, whatever the residual."""
+    page, left = catalogue()[soft.causes[0][0]], result.after.rms_m3s
+    size = Value(soft.volume_m3, soft.volume_sd_m3, page.size.unit)
+    return FoundEffect(
+        effect=page.name,
+        where=soft.chamber,
+        cannot_be_told_from=tuple(name for name, _ in soft.causes[1:]),
+        parameters={page.size.name: size},
+        p_value=by_chance(1, (soft.share / soft.share_sd) ** 2),
+        heldout_gain_pct=0.0,
+        heldout_residual_before_m3s=left,
+        heldout_residual_after_m3s=left,
+        hidden_in_map=HiddenInMap(None, {}, {soft.chamber: soft.share}, ()),
+    )
+
+
 def _hidden(fit: Fit, effect: str, does: Consequence | None) -> HiddenInMap | None:
     if does is None:
         return None
@@ -287,6 +306,7 @@ def _not_found(result: Result) -> tuple[Unseen, ...]:
     """Every effect of the catalogue that concerns this machine and was not added."""
     best = clearest(result.scores)
     listed = {f.key for f in result.found} | {p.key for p in result.given}
+    listed |= set(result.softer.causes) if result.softer else set()
     seen = [
         _limit(result, candidate, score)
         for key, (candidate, score) in best.items()
@@ -370,6 +390,9 @@ def advice(result: Result, unseen: tuple[Unseen, ...]) -> tuple[str, ...]:
             page = pages.get(f.key[0])
             if page is not None and key[0] in page.confounders:
                 lines.append(f"To tell {f.key[0]} from {key[0]}: {page.separates}")
+    if result.softer:
+        name = result.softer.causes[0][0]
+        lines.append(f"To tell {name} in chamber {result.softer.chamber}: {pages[name].separates}")
     hidden = sorted({u.effect for u in unseen if not u.visible and u.examined})
     for name in hidden:
         page = pages.get(name)

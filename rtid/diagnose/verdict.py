@@ -86,9 +86,14 @@ def verdict(
         if not is_unseen and is_open and max(first.rho, rho_of_all(last)) >= last.most_rho:
             return INSUFFICIENT
         return MATCHES if last.rho < last.most_rho and not doubted else UNKNOWN
-    rest = last.held.sse - last.regression.dof
-    explained = 1.0 - rest / state.excess if state.excess > 0 else 1.0
     # a rate without pressures is disturbed by whatever moves the machine: unseen data have judged
-    if last.declared.has_pressures and last.rho >= last.most_rho and explained < NAMED:
+    doubtful = last.declared.has_pressures and last.rho >= last.most_rho
+    if doubtful and explained(state, last) < NAMED:
         return INSUFFICIENT if state.judges_itself else UNKNOWN
     return AMBIGUOUS if any(f.alike for f in state.found[:1]) else MISSING
+
+
+def explained(state: TrialState, last: Fit) -> float:
+    """Share of the misfit without any effect that a fit explains."""
+    rest = last.held.sse - last.regression.dof
+    return 1.0 - rest / state.excess if state.excess > 0 else 1.0

@@ -132,10 +132,11 @@ def of_missed(missed: list[Answer]) -> str:
         return "none"
     limits = [getattr(o, "of_limit", np.nan) for o in missed]  # kept ones may be older
     below = sum(size < 1.0 for size in limits)
-    each = ", ".join(
-        f"{o.case.hidden}{'' if np.isnan(size) else f' ({size:.2g} of it)'}"
-        for o, size in zip(missed, limits, strict=True)
-    )
+    words = [
+        "" if np.isnan(size) else f" ({size:.2g} of it)" if size else " (no possible size is named)"
+        for size in limits
+    ]
+    each = ", ".join(o.case.hidden + text for o, text in zip(missed, words, strict=True))
     return f"{len(missed)}, {below} of them below the limit that the record states: {each}"
 
 
