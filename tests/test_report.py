@@ -209,6 +209,7 @@ def test_a_disk_that_refuses_leaves_no_half_file(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("rtid.tell.report_file.tell", told)
+    monkeypatch.setattr("rtid.tell.report_file.page", lambda _story: "drawn elsewhere")
     monkeypatch.setattr("rtid.tell.report_file.os.replace", refuse)
     found = leaking.told.diagnosed
     with pytest.raises(RtidError, match="No space left"):
