@@ -176,11 +176,10 @@ def main(kind: str, first: str, last: str) -> None:
     clean = kept(CLEAN)
     for motion, record in MOTIONS.items():
         if found := [o for o in clean if o.case.motion == record]:
-            seeds = sorted({o.case.seed for o in found})
+            seeds = ", ".join(map(str, sorted({o.case.seed for o in found})))
             leave(
-                f"clean valves of ten laws, {motion}, at a reduced size", of_clean(found),
-                "at most 1 % of 420; rho 1.00 +- 0.02; 93 to 97 %",
-                f"{len(found)} machines, 44 s, seeds {', '.join(map(str, seeds))}",
+                f"clean valves of ten laws, {motion}, seeds {seeds}", of_clean(found),
+                "at most 1 % of 420; rho 1.00 +- 0.02; 93 to 97 %", f"{len(found)} machines, 44 s",
             )  # fmt: skip
     if weak := kept(LIMIT):
         named = sum(o.judgement in (RIGHT, IN_SET) for o in weak)
@@ -196,9 +195,11 @@ def main(kind: str, first: str, last: str) -> None:
         )  # fmt: skip
     ratio = float(np.median([o.left for o in clean])) if clean else 1.0
     for motion in MOTIONS:
-        if found := kept(motion):
+        everyone = kept(motion)
+        for seed in sorted({o.case.seed for o in everyone}):
+            found = [o for o in everyone if o.case.seed == seed]
             leave(
-                f"effects in valves of ten laws, {motion}, at a reduced size",
+                f"effects in valves of ten laws, {motion}, seed {seed}",
                 of_hidden(motion, found, ratio), "named 95 %, no wrong name; 93 to 97 %",
                 f"{len(found)} machines, middle, 44 s",
             )  # fmt: skip
