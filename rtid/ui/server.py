@@ -31,11 +31,12 @@ from bokeh.util.token import check_token_signature, get_session_id, get_token_pa
 from tornado.escape import url_escape
 from tornado.httpserver import HTTPServer
 from tornado.httputil import HTTPHeaders, HTTPMessageDelegate, HTTPServerRequest
-from tornado.ioloop import IOLoop
+from tornado.ioloop import IOLoop, PeriodicCallback
 from tornado.netutil import bind_sockets
 from tornado.web import OutputTransform, RequestHandler
 
 from rtid.errors import RtidError
+from rtid.plain import give_back
 from rtid.ui.arrival import Arrival, choose
 from rtid.ui.browser_page import build
 from rtid.ui.live_page import Live
@@ -58,6 +59,7 @@ MOST_PAGES = 24  # that are open at once
 MOST_SOCKETS = 2  # of one page: one that comes back after a break has two for a moment
 MOST_MESSAGE = 2**20  # bytes that a page may send at once
 BODY_S = 10.0  # that the body of a request may take; none is read
+TRIM_MS = 5e3  # between two times that freed memory goes back: a picture's message is 20 MB
 CSP = "Content-Security-Policy"
 WELCOME = """<!DOCTYPE html><meta charset="utf-8"><link rel="icon" href="data:,"><title>rtid</title>
 <noscript><meta http-equiv="refresh" content="0;url=/"></noscript>
@@ -282,11 +284,13 @@ class Workbench:
     session: Session
     url: str
     turns: Turns
+    trimming: PeriodicCallback
 
     def stop(self) -> None:
         """End server and worker; call from the loop's thread."""
         self.session.worker.stop()
         self.server.stop()
+        self.trimming.stop()
         self.turns.stop()
         gc.unfreeze()
 
@@ -334,7 +338,9 @@ def start(
         ahead = partial(import_module, "rtid.ui.desk_views")
         threading.Thread(target=ahead, name="rtid-ahead", daemon=True).start()
     url = f"http://{_in_url(host)}:{door.port}/?{TOKEN}={door.token}"
-    return Workbench(server, guarded, session, url, turns)
+    trimming = PeriodicCallback(give_back, TRIM_MS)
+    trimming.start()
+    return Workbench(server, guarded, session, url, turns, trimming)
 
 
 def _bound(host: str, port: int) -> list[socket]:
