@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from rtid.diagnose.fit import Fit
 
 NOTHING = 1e-300
+VISIBLE = 2e-3  # share of a column that must be left beside the maps
 
 
 @dataclass(frozen=True)
@@ -81,23 +82,24 @@ class Reach:
 def clearest(scores: list[tuple[Candidate, Score]]) -> dict[Key, tuple[Candidate, Score]]:
     """The column of each cause whose size the record tells best.
 
-    Of a timing, the one as strong as its own limit: a column is made for one strength, and a share
-    of 0.01 of one for 60 ms is no delay of 0.6 ms.  Of a cause whose form may be nothing, the one
-    without: of a volume that is 4 ms late a quarter is seen of one that is not late.
+    Of a timing, the one as strong as its own limit, of those that the record shows: a column is
+    made for one strength, and a share of 0.01 of one for 60 ms is no delay of 0.6 ms.  Of a cause
+    whose form may be nothing, the one without: of a volume that is 4 ms late a quarter is seen of
+    one that is not late.
     """
     best: dict[Key, tuple[Candidate, Score]] = {}
     for candidate, score in scores:
         known = best.get(candidate.key)
-        if known is None or _rank(candidate, score.sd) < _rank(known[0], known[1].sd):
+        if known is None or _rank(candidate, score) < _rank(*known):
             best[candidate.key] = candidate, score
     return best
 
 
-def _rank(candidate: Candidate, sd: float) -> tuple[bool, float]:
+def _rank(candidate: Candidate, score: Score) -> tuple[bool, float]:
     """The less, the rather its column tells the limit of a cause."""
     if candidate.where == COMMAND:
-        return False, off_its_own(LIMIT_SD * sd)
-    return any(candidate.shape), sd
+        return score.visible <= VISIBLE, off_its_own(LIMIT_SD * score.sd)
+    return any(candidate.shape), score.sd
 
 
 def off_its_own(share: float) -> float:

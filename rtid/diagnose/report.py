@@ -16,7 +16,7 @@ from rtid.diagnose.diagnosis import Result
 from rtid.diagnose.excuse import steady
 from rtid.diagnose.experiment import limits, would_separate
 from rtid.diagnose.fit import Fit
-from rtid.diagnose.nameable import clearest
+from rtid.diagnose.nameable import VISIBLE, clearest
 from rtid.diagnose.regression import LIMIT_SD, Score
 from rtid.diagnose.remains import described
 from rtid.diagnose.softer import Softer
@@ -40,7 +40,6 @@ CALLED = {"delay": "the delay is", "time_constant": "the lag is"}
 WORTH = 2.0  # times better that an experiment must be to be proposed
 NOBODY_LOOKED = "Not examined: the diagnosis has no column for it here."
 NOT_TOLD = "what the maps' blocks miss looks like it in this record"
-VISIBLE = 2e-3  # share of a column that must be left beside the maps
 HYDRAULIC = ("flow", "storage", "timing", "supply", "map")
 
 
