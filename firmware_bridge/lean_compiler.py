@@ -7,8 +7,8 @@ are, go through memory.  Each `+` is looked up among all types that numba knows,
 loops are written as they end, signatures of arithmetic are remembered, and idle passes are left out
 where nothing is allocated.
 
-`pipeline_class` is numba's own way to change its compiler; what its parts are called is not
-promised.  Where one is gone, `OPTIONS` is empty: kernels compile slower, with the same results.
+`pipeline_class` is numba's own way to change its compiler; what its parts do is not promised.  With
+a numba that was not tried, `OPTIONS` is empty: kernels compile slower, with the same results.
 """
 
 from __future__ import annotations
@@ -19,12 +19,14 @@ from math import prod
 from typing import Any, ClassVar
 
 from llvmlite.ir import Constant
+from numba import version_info
 from numba.core import cgutils, ir, lowering, typed_passes, types
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import LoweringPass, PassManager, _pass_registry, register_pass
 from numba.core.datamodel import default_manager
 from numba.core.postproc import PostProcessor
 
+TRIED = {(0, 68)}  # versions of numba with which `tests/bridge/test_lean_compiler.py` passes
 NUMBERS = (types.Integer, types.Float, types.Boolean)
 TUPLE, RANGE = types.BaseTuple, types.RangeIteratorType  # type: ignore[attr-defined]
 _NAMES = ("add sub mul truediv floordiv mod lt le gt ge eq ne and_ or_ xor lshift rshift neg pos "
@@ -317,7 +319,9 @@ REPLACED = {
 
 
 def _is_known() -> bool:
-    """Whether numba's compiler is still made of what is changed here."""
+    """Whether this numba was tried, and its compiler is made of what is changed here."""
+    if version_info.short not in TRIED:
+        return False
     lower = lowering.Lower
     names = {*dir(lower), *lower._find_singly_assigned_variable.__code__.co_names}
     array, loop = types.Array(types.float64, 1, "C"), types.range_iter64_type

@@ -151,3 +151,9 @@ def test_this_numba_has_it(monkeypatch: pytest.MonkeyPatch) -> None:
     assert OPTIONS
     monkeypatch.setattr(lean_compiler, "_NEEDED", ("a name that numba never had",))
     assert not lean_compiler._is_known()
+
+
+def test_a_numba_that_was_not_tried_compiles_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What its parts are called may stay, and what they do change."""
+    monkeypatch.setattr(lean_compiler, "TRIED", {(0, 1)})
+    assert not lean_compiler._is_known()
