@@ -9,7 +9,7 @@ from pathlib import Path
 
 from firmware_bridge.sources.errors import LogError
 
-MAX_BYTES = 540_000_000  # of a BLF log 11.2 million frames: an hour at 3,100 frames a second
+MAX_BYTES = 500_000_000  # of a BLF log 10.4 million frames: an hour at 2,900 frames a second
 FREE_BYTES = 64_000_000  # below this no ratio is too large
 MAX_RATIO = 250
 
