@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from rtid.diagnose import halves
 from rtid.diagnose.consequence import HIDDEN_GAIN, is_stable
 from rtid.diagnose.fit import Fit, fit, one_pass, prepare
 from rtid.diagnose.halves import between_halves, first_half
@@ -94,3 +95,13 @@ def test_half_of_a_column_that_begins_late_is_half_of_its_square(begins: int) ->
     is_first = first_half({0: column, 1: -2.0 * column})
     middle = begins + (1000 - begins) // 2 if begins > 500 else 500
     assert is_first.sum() == middle and is_first[:middle].all()
+
+
+def test_a_half_that_has_nothing_of_an_effect_confirms_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A column that is in one row alone: it was divided by nothing."""
+    now, trial = beside(*record(LEAK[0], 1e-12, 4, where="a")[:2], LEAK)
+    monkeypatch.setattr(halves, "first_half", lambda volumes: np.zeros(len(volumes[0]), bool))
+    assert sizes(now)[1:] == (0.0, np.inf)
+    assert not is_stable(now, trial, is_needed=True)

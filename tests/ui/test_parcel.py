@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from multiprocessing import active_children
 from pathlib import Path
 from queue import Queue
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from rtid.ui.parcel import LARGE, packed
-from rtid.ui.worker import Worker
+from rtid.ui.worker import Worker, started
 
 MANY, PATIENCE_S = LARGE // 8 + 1, 120.0
 
@@ -54,3 +55,20 @@ def test_a_job_that_nobody_waits_for_any_more_is_not_heard_of(tmp_path: Path) ->
         calls.get(timeout=PATIENCE_S)()
     assert done == [None]
     worker.stop()
+
+
+def test_a_process_that_was_begun_ahead_takes_the_first_job_and_is_ended() -> None:
+    done = list[object]()
+    calls: Queue[Callable[[], None]] = Queue()
+    with started(ahead=True) as worker:
+        (process,) = active_children()
+        worker.on_loop = calls.put
+        worker.ask("back", 1, then=done.append, failed=done.append)
+        calls.get(timeout=PATIENCE_S)()
+        assert active_children() == [process]
+    assert done == [None] and not process.is_alive()
+
+
+def test_nothing_is_begun_for_a_page_that_only_looks_on() -> None:
+    with started(ahead=False):
+        assert not active_children()
