@@ -39,7 +39,7 @@ TOGETHER = "delay and lag together are"
 CALLED = {"delay": "the delay is", "time_constant": "the lag is"}
 WORTH = 2.0  # times better that an experiment must be to be proposed
 NOBODY_LOOKED = "Not examined: the diagnosis has no column for it here."
-NOT_TOLD = "what the maps' blocks miss looks like it in this record"
+NOT_CONFIRMED = "not confirmed: what the maps' blocks miss may look like it in this record"
 HYDRAULIC = ("flow", "storage", "timing", "supply", "map")
 
 
@@ -333,7 +333,7 @@ def _limit(result: Result, candidate: Candidate, score: Score) -> Unseen:
     from_ = max(known.named_from, doubtful) if known else np.inf
     named_from, _, may_be = _sized(result.last, by, from_)
     if doubtful:
-        reason = f"not confirmed: {NOT_TOLD}"
+        reason = NOT_CONFIRMED
     elif candidate.key in result.negligible:
         reason = "present, negligible: it changes next to nothing on the held-out part"
     elif visible:

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from rtid.diagnose.clean import Cut
 from rtid.diagnose.fit import MATCH_RHO
 from rtid.diagnose.regression import LIMIT_SD
-from rtid.diagnose.report import Diagnosis, FoundEffect, Unseen, Value
+from rtid.diagnose.report import NOT_CONFIRMED, Diagnosis, FoundEffect, Unseen, Value
 from rtid.diagnose.verdict import INSUFFICIENT, MATCHES, MATERIAL, UNKNOWN
 from rtid.effects.page import title
 from rtid.tell.story import Chart, Story, Table
-from rtid.tell.words import VERDICTS, is_floor, quantity
+from rtid.tell.words import VERDICTS, is_floor, named, quantity
 from rtid.units import CONVENTION, Z95, limit
 
 SLIGHTLY_CUT = 1e-3  # of a record: less is not worth a sentence
@@ -48,15 +48,26 @@ def sentences(diagnosis: Diagnosis) -> list[str]:
     lines += _zeros(diagnosis)
     if rest := remains(diagnosis):
         lines.append(rest)
-    if diagnosis.negligible:
-        names = ", ".join(f"{title(s.effect)} ({s.where})" for s in diagnosis.negligible)
-        lines.append(
-            f"Seen, but too small on this motion to be sized: {names}."
-            if diagnosis.verdict == "insufficient_data"
-            else f"Too small to matter, if there at all: {names}."
-        )
+    lines += seen_and_not_named(diagnosis)
     doubts = [f"{doubt.text[0].upper()}{doubt.text[1:]}" for doubt in diagnosis.doubts]
     return lines + doubts + [f"{text}" for text in diagnosis.advice[:4]]
+
+
+def seen_and_not_named(diagnosis: Diagnosis) -> list[str]:
+    """What is significant: too small to matter, or of a size that nothing confirms."""
+    doubtful = {
+        (u.effect, u.where): f" of {quantity(Value(u.detection_limit, float('nan'), u.unit))}"
+        for u in diagnosis.not_found
+        if u.reason == NOT_CONFIRMED and u.detection_limit is not None
+    }
+    keys = [(s.effect, s.where) for s in diagnosis.negligible]
+    small = ", ".join(named(key) for key in keys if key not in doubtful)
+    large = ", ".join(named(key) + doubtful[key] for key in keys if key in doubtful)
+    how = "Too small to matter, if there at all"
+    if diagnosis.verdict == INSUFFICIENT:
+        how = "Seen, but too small on this motion to be sized"
+    lines = {how: small, "Seen, not confirmed, as what the maps miss may look like it": large}
+    return [f"{words}: {which}." for words, which in lines.items() if which]
 
 
 def _not_judged(cut: Cut) -> str:

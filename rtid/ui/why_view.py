@@ -24,6 +24,7 @@ from rtid.tell.diagnosed import (
     limits,
     percent,
     said,
+    seen_and_not_named,
 )
 from rtid.tell.html import button, clearness, table, text
 from rtid.tell.live import PanelPlot
@@ -104,7 +105,7 @@ def fragments(ranked: RankedDiagnosis | None, page: str, may_add: bool) -> dict[
     parts += _unseen(diagnosis)
     if not diagnosis.found:
         kind, head = heading(diagnosis)
-        words = f"{said(diagnosis)}{_present(diagnosis)}"
+        words = " ".join([said(diagnosis), *seen_and_not_named(diagnosis)])
         parts.insert(
             0, f'<div class="card"><h2 class="{kind}">{text(head)}</h2>{text(words)}</div>'
         )
@@ -114,12 +115,6 @@ def fragments(ranked: RankedDiagnosis | None, page: str, may_add: bool) -> dict[
 
 def _link(name: str, label: str) -> str:
     return button(label, "page", kind="link", name=name) if name in catalogue() else text(label)
-
-
-def _present(diagnosis: Diagnosis) -> str:
-    """What is there and changes next to nothing."""
-    names = ", ".join(named((s.effect, s.where)) for s in diagnosis.negligible)
-    return f" Too small to matter, if there at all: {names}." if names else ""
 
 
 def _found(diagnosis: Diagnosis, effect: FoundEffect) -> str:

@@ -7,6 +7,7 @@ from functools import cache
 import pytest
 
 from rtid.diagnose.softer import softer
+from rtid.tell.diagnosed import seen_and_not_named
 from tests.campaign.diagnoses import IN_SET, RIGHT, judge
 from tests.campaign.diagnoses import Case as Hidden
 from tests.campaign.laws import Answer, Case, answer, judged
@@ -70,3 +71,12 @@ def test_the_moduli_of_a_clean_sweep_are_alike() -> None:
     found = judged(Case(5051, "compensated", SWEEP))
     assert found is not None
     assert softer(found.present) is None and found.said.verdict == "matches"
+
+
+def test_what_nothing_confirms_is_not_called_too_small() -> None:
+    """A leak of twice the flow, forty times the one that is there: it is what the maps miss."""
+    found = judged(Case(6101, "compensated", SWEEP, "external_leakage_laminar"))
+    assert found is not None
+    small, doubtful = seen_and_not_named(found.said)
+    assert small.startswith("Too small to matter") and "leakage" not in small
+    assert "not confirmed" in doubtful and "External leakage, laminar (b) of 2.8" in doubtful
