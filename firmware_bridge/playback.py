@@ -20,6 +20,7 @@ from firmware_bridge import frames as fr
 from firmware_bridge.sources import serial_port
 from firmware_bridge.sources.live import SourceError
 from firmware_bridge.sources.port import split_baudrate
+from firmware_bridge.sources.udp import hear_one_group
 
 AS_FAST_AS_POSSIBLE = float("inf")
 SEND_TIMEOUT_S = 5.0  # a full queue of a virtual bus would block the sender for ever
@@ -137,6 +138,7 @@ class BusSink:
             self._bus = can.Bus(self._channel, interface=self._interface, **options)
         except (can.CanError, OSError, ValueError) as error:
             raise SendError(f"cannot open {self._interface} {self._channel}: {error}", 2) from error
+        hear_one_group(self._bus)
         try:
             yield self
         finally:

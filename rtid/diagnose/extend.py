@@ -17,6 +17,7 @@ from rtid.diagnose.exact import carried_on, exact_trials, is_inside, key_of, wit
 from rtid.diagnose.excuse import few_excused
 from rtid.diagnose.fit import MATCH_RHO
 from rtid.diagnose.report import Value
+from rtid.diagnose.softer import softer
 from rtid.diagnose.spread import with_spreads
 from rtid.diagnose.standing import Standing, with_bank
 from rtid.diagnose.trials import (
@@ -83,7 +84,8 @@ def extend(present: Standing, effect: str, where: str = "") -> Extension:
     now = carried_on(state, present.fit, best)
     after = Standing(state, with_spreads(with_bank(few_excused(now), state.suspects)))
     against = tuple(_against(present, after, best))
-    tried = Extension(best.key, best.gain, present, after, against, _better(present, best))
+    better = (against and _declared(present, best)) or _better(present, best)
+    tried = Extension(best.key, best.gain, present, after, against, better)
     if best.is_timing and effect != PUMP.effect and best.fit and not is_inside(best.fit):
         raise _nothing(tried)
     return tried
@@ -106,6 +108,14 @@ def as_diagnosed(present: Standing, result: Result, key: Key) -> Extension | Non
     having = Standing(present.state, result.last)
     against = tuple(_against(present, having, trial))
     return Extension(key, trial.gain, present, having, against, _better(present, trial))
+
+
+def _declared(present: Standing, trial: Trial) -> str:
+    """How to have an effect that a modulus tells and its rows do not; "" where there is none."""
+    told_by_modulus = softer(present.fit)
+    if told_by_modulus is None or trial.key not in told_by_modulus.causes:
+        return ""
+    return told_by_modulus.remedy
 
 
 def _nothing(tried: Extension) -> RefusedError:

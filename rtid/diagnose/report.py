@@ -391,6 +391,7 @@ def advice(result: Result, unseen: tuple[Unseen, ...]) -> tuple[str, ...]:
                 lines.append(f"To tell {f.key[0]} from {key[0]}: {page.separates}")
     if result.softer:
         name = result.softer.causes[0][0]
+        lines.append(f"Where a drawing bears it out, {result.softer.remedy}.")
         lines.append(f"To tell {name} in chamber {result.softer.chamber}: {pages[name].separates}")
     hidden = sorted({u.effect for u in unseen if not u.visible and u.examined})
     for name in hidden:

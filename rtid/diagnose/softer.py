@@ -48,6 +48,14 @@ class Softer:
         """What it may be, the plainest first: one record does not tell them apart."""
         return (*sorted(stores_at(self.chamber)), *sorted(lines_at(self.chamber)))
 
+    @property
+    def remedy(self) -> str:
+        """What its rows do not size, its modulus does."""
+        return (
+            f"declare {1e3 * self.volume_m3:.3g} L more dead volume in [chambers.{self.chamber}], "
+            "by its modulus; its rows, which size what is added, hardly show it"
+        )
+
 
 def softer(fit: Fit) -> Softer | None:
     """The chamber of two that is clearly softer than the other; None where none is."""

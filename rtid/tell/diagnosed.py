@@ -205,9 +205,8 @@ def hidden(effect: FoundEffect) -> str:
     parts = [f"the map {name} ({_share(bend)} of its largest flow)" for name, bend in bends]
     parts += [f"beta {name} ({_share(abs(move))})" for name, move in does.beta.items()]
     own = f"; its own flow is {_share(does.own_flow)} of the rms flow" if does.own_flow else ""
-    text = (
-        f"The maps hide it: the error hardly shows it, yet without it {_and(parts)} are off{own}."
-    )
+    off = f"{_and(parts)} {'are' if len(parts) > 1 else 'is'} off"
+    text = f"The maps hide it: the error hardly shows it, yet without it {off}{own}."
     return f"{text} To separate it: {_and(list(does.separates))}." if does.separates else text
 
 

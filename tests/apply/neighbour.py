@@ -20,6 +20,7 @@ import numpy as np
 import tomlkit
 
 import rtid.project
+from firmware_bridge.sources.udp import hear_one_group
 from rtid.apply import offer as offered
 from rtid.apply.judge import KnownMap
 from rtid.apply.offer import Offer
@@ -45,6 +46,7 @@ class Neighbour:
         self.all: list[can.Message] = []
         self._stopped = threading.Event()
         self._bus = can.Bus(channel, interface=interface)
+        hear_one_group(self._bus)
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import can
 import pytest
 
+from firmware_bridge.sources.udp import hear_one_group
 from rtid.apply import offer as offered
 from rtid.cli.exits import Exit
 from tests.apply.neighbour import CAN_ID, Neighbour
@@ -40,6 +41,7 @@ class Listener:
 
     def __init__(self, group: str) -> None:
         self._bus = can.Bus(group, interface="udp_multicast")
+        hear_one_group(self._bus)
         self.heard: list[int] = []
         self._notifier = can.Notifier(self._bus, [self._take])
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Iterator
@@ -10,10 +11,12 @@ import pytest
 from firmware_bridge import frames as fr
 from firmware_bridge.assemble import Assembler
 from firmware_bridge.frames import EXTENDED, Frames
+from firmware_bridge.playback import BusSink
 from firmware_bridge.sources.can_bus import CanBus
 from firmware_bridge.sources.live import Source, SourceError
 from firmware_bridge.sources.serial_port import SerialPort
 from tests.bridge.machine import CATALOG, assembly, cycles, equal
+from tests.faults.process import a_group
 
 
 def collect(source: Source, n: int, limit_s: float = 10.0) -> Frames:
@@ -49,6 +52,20 @@ def test_filter_keeps_foreign_frames_out() -> None:
         assert len(source.read(0.05)) == 0
     sender.shutdown()
     assert got.can_id.tolist() == [0x120, 0x120 | EXTENDED]
+
+
+def test_a_sink_hears_its_own_group_alone() -> None:
+    """Two of python-can's test buses on one computer are one, as far as Linux delivers."""
+    groups = [a_group() for _ in range(2)]
+    with contextlib.ExitStack() as stack:
+        one, other = (
+            stack.enter_context(BusSink("udp_multicast", group, (0x701,)).armed())
+            for group in groups
+        )
+        speaker = stack.enter_context(can.Bus(groups[1], interface="udp_multicast"))
+        speaker.send(can.Message(arbitration_id=0x701, is_extended_id=False))
+        assert other.recv(10.0) is not None
+        assert one.recv(0.2) is None
 
 
 def test_receive_error_reaches_the_reader(monkeypatch: pytest.MonkeyPatch) -> None:

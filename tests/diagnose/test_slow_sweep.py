@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import pytest
 
+from rtid.diagnose.extend import extend
 from rtid.diagnose.softer import softer
+from rtid.diagnose.standing import stand
 from rtid.tell.diagnosed import seen_and_not_named
 from tests.campaign.diagnoses import IN_SET, RIGHT, judge
 from tests.campaign.diagnoses import Case as Hidden
-from tests.campaign.laws import Answer, Case, answer, judged
+from tests.campaign.laws import Answer, Case, answer, declared, judged, of_run
 
 SWEEP = "sweep_record"
+once = cache(judged)
 
 
 @cache
@@ -57,7 +61,7 @@ def test_what_one_chamber_stores_more_is_told_by_the_other(
 ) -> None:
     """The first "matched" with a line before both chambers, and 1487 MPa; the other was unknown."""
     case = Case(6101, law, SWEEP, effect)
-    found = judged(case)
+    found = once(case)
     assert found is not None
     assert judge(Hidden(case.seed, effect), found.said) == IN_SET
     (stored,) = found.said.found
@@ -66,16 +70,35 @@ def test_what_one_chamber_stores_more_is_told_by_the_other(
     assert abs(size.value - volume_m3) < 2.0 * size.std < 0.5 * volume_m3
 
 
+def test_what_a_modulus_tells_is_declared() -> None:
+    """Its rows size 0.14 L of it: added, it changes next to nothing; declared, nothing is left."""
+    case = Case(6101, "asymmetric", SWEEP, "extra_dead_volume")
+    found = once(case)
+    assert found is not None
+    stored = softer(found.present)
+    assert stored is not None
+    standing = stand(found.present.model, found.taught, found.taught, known=found.present)
+    tried = extend(standing, "extra_dead_volume", "b")
+    assert tried.against and tried.better == stored.remedy
+    assert "declare 0.4" in stored.remedy and "[chambers.b]" in stored.remedy
+
+    model = declared(case, found.run)
+    a, b = model.chambers
+    chambers = (a, replace(b, v0_m3=b.v0_m3 + stored.volume_m3))
+    again = of_run(found.plant, found.run, replace(model, chambers=chambers))
+    assert softer(again.present) is None and again.said.verdict == "matches"
+
+
 def test_the_moduli_of_a_clean_sweep_are_alike() -> None:
     """By the noise alone 1070 and 1170 MPa were 2.5 deviations apart."""
-    found = judged(Case(5051, "compensated", SWEEP))
+    found = once(Case(5051, "compensated", SWEEP))
     assert found is not None
     assert softer(found.present) is None and found.said.verdict == "matches"
 
 
 def test_what_nothing_confirms_is_not_called_too_small() -> None:
     """A leak of twice the flow, forty times the one that is there: it is what the maps miss."""
-    found = judged(Case(6101, "compensated", SWEEP, "external_leakage_laminar"))
+    found = once(Case(6101, "compensated", SWEEP, "external_leakage_laminar"))
     assert found is not None
     small, doubtful = seen_and_not_named(found.said)
     assert small.startswith("Too small to matter") and "leakage" not in small
