@@ -1,10 +1,11 @@
-"""What everything shares: array types, unwatched progress, the one to-JSON, memory given back."""
+"""What everything shares: array types, unwatched progress, the one to-JSON, memory."""
 
 from __future__ import annotations
 
 import ctypes
 import dataclasses
 import math
+import mmap
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
@@ -17,6 +18,8 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 Progress = Callable[[str, float], None]  # what is being done, and the share that is done
 Key = tuple[str, str]  # an effect and where it sits
+LARGE = 1 << 22  # bytes of an array for which numpy asks for huge pages
+OWN = {"flags": mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS} if hasattr(mmap, "MAP_PRIVATE") else {}
 
 
 def silent(_what: str, _share: float) -> None:
@@ -44,3 +47,13 @@ def give_back() -> None:
     """
     with suppress(AttributeError, OSError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)
+
+
+def half_used(n: int) -> FloatArray:
+    """Zeros (n, n) of which one triangle is used: the other takes no memory.
+
+    A huge page, which numpy asks for, would hold some of both.
+    """
+    if 8 * n * n < LARGE:
+        return np.zeros((n, n))
+    return np.ndarray((n, n), buffer=mmap.mmap(-1, 8 * n * n, **OWN))

@@ -9,7 +9,7 @@ and serves any given columns.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -25,7 +25,7 @@ from rtid.kernels import record_rows as kernel
 from rtid.kernels.engine import ROW_FLAG
 from rtid.kernels.layout import TERMS
 from rtid.model import Machine
-from rtid.plain import BoolArray, FloatArray, IntArray
+from rtid.plain import LARGE, BoolArray, FloatArray, IntArray, give_back, half_used
 
 ROW_S = 10e-3  # positions measured within so long make one row
 SPAN = 10  # rows in which only few blocks move
@@ -77,40 +77,64 @@ class Rows:
 
     def maps(self) -> FloatArray:
         """Products of the maps' columns: the lower triangle of an array (6 V, 6 V)."""
-        gram = np.zeros((TERMS * len(self.cells),) * 2)
+        gram = half_used(TERMS * len(self.cells))
         ringing.map_products(
             self.sign, self.start, self.block, self.terms, self.fresh, self.whiten, self.keep,
             SPAN, QUIET, gram,
         )  # fmt: skip
         return gram
 
-    def head(self, given: Iterable[Volumes]) -> tuple[FloatArray, FloatArray]:
+    def head(self, given: list[Volumes]) -> tuple[FloatArray, FloatArray]:
         """Products of [y | theta_beta | given]: among themselves (h, h), and of the maps (6 V, h).
 
-        given: condensed columns, chamber -> (rows,).
+        given: condensed columns, chamber -> (rows,), which are used up: a column is in memory once.
         """
-        given = list(given)
-        columns = self.columns(given)
-        products.whitened(columns, self.fresh, self.whiten, self.keep)
-        flat = columns.reshape(self.n, columns.shape[2])
+        at, first = 0, self.own.shape[2]
+        whole = np.empty((first + len(given), self.n))
+        cross = np.empty((TERMS * len(self.cells), len(whole)))
+        for columns in self._whitened(given):
+            here = slice(at, at := at + columns.shape[2])
+            whole[here] = columns.reshape(self.n, -1).T
+            cross[:, here] = self._cross(columns)
         with one_thread():
-            gram = flat.T @ flat
+            return whole @ whole.T, cross
+
+    def _whitened(self, given: list[Volumes]) -> Iterator[FloatArray]:
+        """The whitened rows (rows, chambers, few) of y and theta_beta, and of given, used up."""
+        columns = self.own.copy()
+        while True:
+            products.whitened(columns, self.fresh, self.whiten, self.keep)
+            yield columns
+            if not given:
+                return
+            columns = self._stacked(given[:AT_ONCE])
+            del given[:AT_ONCE]
+            if columns.nbytes >= LARGE:
+                give_back()
+
+    def _cross(self, columns: FloatArray) -> FloatArray:
+        """Products of the maps' columns with whitened (rows, chambers, m), used up: (6 V, m)."""
         products.adjoint(columns, self.fresh, self.whiten, self.keep)
         cross = np.zeros((TERMS * len(self.cells), columns.shape[2]))
         products.cross(columns, self.sign, self.start, self.block, self.terms, cross)
-        return gram, cross
+        return cross
 
     def columns(self, given: list[Volumes]) -> FloatArray:
         """What y, theta_beta and condensed columns add to the rows (rows, chambers, h), m3."""
         rows, n_c, first = self.own.shape
-        columns = np.zeros((rows, n_c, first + len(given)))
+        columns = np.empty((rows, n_c, first + len(given)))
         columns[:, :, :first] = self.own
-        nothing = np.zeros(rows)
-        for k in range(0, len(given), AT_ONCE):  # all of a chamber at once would be there twice
+        for k in range(0, len(given), AT_ONCE):  # all at once would be there twice
             part = given[k : k + AT_ONCE]
-            for c in range(n_c):
-                here = columns[:, c, first + k : first + k + len(part)]
-                here[:] = np.stack([v.get(c, nothing) for v in part]).T
+            columns[:, :, first + k : first + k + len(part)] = self._stacked(part)
+        return columns
+
+    def _stacked(self, given: list[Volumes]) -> FloatArray:
+        """Condensed columns beside one another (rows, chambers, m), m3."""
+        columns = np.zeros((*self.own.shape[:2], len(given)))
+        for k, volumes in enumerate(given):
+            for c, series in volumes.items():
+                columns[:, c, k] = series
         return columns
 
     @cached_property
@@ -167,7 +191,7 @@ class EvidenceFactor:
 
 def _triangle(upper: FloatArray) -> FloatArray:
     """A copy of an upper triangle (n, n) in Fortran order; the rest of it takes no memory."""
-    copy = np.zeros(upper.shape, order="F")
+    copy = half_used(len(upper)).T
     for k in range(0, len(upper), COLUMNS_AT_ONCE):
         end = k + COLUMNS_AT_ONCE
         copy[:end, k:end] = upper[:end, k:end]
@@ -276,8 +300,8 @@ class Projected:
         return self.factor.whole(rest).reshape(-1, TERMS)
 
 
-def project(rows: Rows, given: Iterable[Volumes]) -> Projected:
-    """Take the maps out of y, theta_beta and all given columns, condensed to the rows."""
+def project(rows: Rows, given: list[Volumes]) -> Projected:
+    """Take the maps out of y, theta_beta and all given columns, condensed to the rows: used up."""
     gram, cross = rows.head(given)
     half = rows.factor.half(cross)
     with one_thread():

@@ -373,7 +373,7 @@ def first_map(model: Machine, chunk: FloatArray, weights: Weights) -> MapTerms:
 
 
 def _map_alone(model: Machine, rows: Rows) -> MapTerms:
-    projected, n_c = project(rows, ()), len(model.chambers)
+    projected, n_c = project(rows, []), len(model.chambers)
     s = projected.schur
     theta = np.asarray(np.linalg.solve(s[1:, 1:] + SHARED_PRIOR * np.eye(n_c), s[1:, 0]))
     return MapTerms(rows.cells, projected.terms(list(range(1, 1 + n_c)), theta), NO_COV)

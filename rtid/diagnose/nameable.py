@@ -149,10 +149,10 @@ def _reaches(
     first, used = fit.first_given, list(fit.estimate.used)
     given = [columns[k - first] for k in used if k >= first]
     given += [columns[fit.column(candidate) - first] for candidate, _ in wanted]
-    projected = project(rows, given)
+    del columns  # all others are let go
+    projected, whole = project(rows, given.copy()), rows.columns(given)
     beside = [*range(1, first), *range(first, first + len(used) - n_c)]
     gram = projected.schur[np.ix_(beside, beside)] + np.diag(fit.regression.prior[used] + NOTHING)
-    whole = rows.columns(given)
     for k, (candidate, sd) in enumerate(wanted, first + len(used) - n_c):
         b = np.asarray(np.linalg.solve(gram, projected.schur[beside, k]), np.float64)
         flows = on_rows.flows(projected.terms(beside, b, k))

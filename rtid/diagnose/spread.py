@@ -52,9 +52,9 @@ def _spreads(fitted: Fit, rows: Rows) -> Iterator[tuple[int, float]]:
         if not total_softness(fitted.view, ((effect, 1.0),)).any():
             sized.append(fitted.column(effect))
     parts = [part for column in sized for part in _parts(given[column])]
-    condensed = (
+    condensed = [
         {c: rows.condensed(v) for c, v in one.items()} for one in (*given.values(), *parts)
-    )
+    ]
     s, n, base = project(rows, condensed).schur, fitted.first_given, list(given)
     prior, mean = (
         of[[*range(1, n), *base]] for of in (fitted.regression.prior, fitted.regression.mean)

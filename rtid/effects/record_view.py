@@ -149,7 +149,9 @@ class RecordView:
     @cached_property
     def seen(self) -> Seen:
         """The record as formulas and functions see it: everything by its name."""
-        return Seen(self.model, self.t_s, self.chunk[:, 2:])
+        seen = Seen(self.model, self.t_s, self.chunk[:, 2:])
+        vars(seen)["_signals"] = self._signals  # once for both
+        return seen
 
     @cached_property
     def held(self) -> frozenset[str]:
