@@ -6,6 +6,8 @@ document stays locked: the order of messages is the same, and others are answere
 
 from __future__ import annotations
 
+from collections.abc import Awaitable, Callable, Coroutine, Generator
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -46,6 +48,17 @@ class Packing(Protocol):  # type: ignore[misc]
         return await self._turns.packed(pack)
 
 
+@dataclass(frozen=True)
+class Later:
+    """What begins when it is awaited: a server that ends leaves changes that nobody awaits."""
+
+    begin: Callable[[], Coroutine[Any, Any, None]]
+
+    def __await__(self) -> Generator[Any, None, None]:
+        """Begin, and wait for the end."""
+        return self.begin().__await__()
+
+
 class Packed(ServerConnection):  # type: ignore[misc]
     """A connection whose changes of the document are packed when it is their turn.
 
@@ -53,8 +66,11 @@ class Packed(ServerConnection):  # type: ignore[misc]
     while the browser is still loading would otherwise be sent twice.
     """
 
-    async def send_patch_document(self, event: DocumentPatchedEvent) -> None:
+    def send_patch_document(self, event: DocumentPatchedEvent) -> Awaitable[None]:
         """Pack and send it; the document is locked until that is done."""
+        return Later(partial(self._send, event))
+
+    async def _send(self, event: DocumentPatchedEvent) -> None:
         if not self.protocol.has_given:
             return
         await self._socket.send_message(await self.protocol.packed("PATCH-DOC", [event]))

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import json
 import threading
 import time
+import warnings
 from asyncio import events
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -99,6 +101,22 @@ def test_what_changes_before_a_page_has_its_document_is_sent_with_it_alone(
 
     done(main())
     assert sent == ["PATCH-DOC"]
+
+
+def test_a_change_that_a_server_leaves_behind_as_it_ends_has_not_begun() -> None:
+    """A coroutine would tell at its end that nobody has awaited it."""
+
+    async def main() -> None:
+        turns = Turns(asyncio.get_running_loop().call_later)
+        connection = Packed(Packing(turns), None, None, SimpleNamespace(subscribe=id))
+        connection.send_patch_document(None)
+        turns.stop()
+
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        done(main())
+        gc.collect()
+    assert not said
 
 
 def test_a_document_is_packed_in_another_thread(monkeypatch: pytest.MonkeyPatch) -> None:
