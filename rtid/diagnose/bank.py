@@ -39,6 +39,7 @@ def columns_of(
     shapes = tuple(add_shapes(view, columns, revision))
     offer(view, columns, revision, bank, more, suspects)
     slopes = [(cause_of(view, e), e.shape, k) for i, k in shapes for e in [revision.effects[i]]]
+    view.rest()  # echoes ask little of it
     add_echoes(view, columns, n_timing, slopes)
     return columns, n_timing, shapes
 

@@ -214,6 +214,7 @@ def _extended(state: TrialState, first: Fit, before: Residual) -> tuple[Fit, Res
             break
         if present.rows is not None and present.rows is not added[0].rows:
             present.rows.forget()  # who asked holds on to the first fit
+        first.at_rest()
         present, last = added
     return _look_back(state, present, last)
 

@@ -160,7 +160,7 @@ def exact_trials(
     that end at nothing or at a bound, and so are no causes.
     """
     timings, coarse = [*_behind_openings(present, timings)], state.coarse.beside(present)
-    present.unfactored().view.rest()
+    present.unfactored().at_rest()
     gains = _from_afar(coarse, timings, other, hints, anywhere)
     most = max([other, *(gain for gain, _, _ in gains)])
     trials: dict[Key, Trial] = {}

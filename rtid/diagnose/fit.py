@@ -25,7 +25,7 @@ from rtid.effects.law import Shape, Volumes
 from rtid.effects.laws import cause_of
 from rtid.effects.laws.response import behind_s
 from rtid.effects.page import Effect
-from rtid.effects.record_view import MapTerms, RecordView
+from rtid.effects.record_view import LONG, MapTerms, RecordView
 from rtid.estimator.factor import PRIOR_SD, SHARED_PRIOR
 from rtid.estimator.misfit import Misfit
 from rtid.estimator.record import refined, summed
@@ -33,7 +33,7 @@ from rtid.estimator.solution import sketch
 from rtid.estimator.state import Weights
 from rtid.kernels.layout import TERMS
 from rtid.model import Machine
-from rtid.plain import FloatArray
+from rtid.plain import FloatArray, give_back
 
 PASSES = 10  # of Gauss-Newton
 HALVINGS = 2  # of one step, before it is given up
@@ -170,6 +170,13 @@ class Fit:
     def unread(self) -> Fit:
         """The same, what was read along its record let go: who asks for it again reads it anew."""
         vars(self).pop("view", None)
+        return self
+
+    def at_rest(self) -> Fit:
+        """The same, let go of what a long record gives again when it is asked for."""
+        if len(self.chunk) >= LONG:
+            vars(self.unread()).pop("sent", None)
+            give_back()
         return self
 
     def column(self, candidate: Candidate) -> int:

@@ -6,6 +6,7 @@ from inspect import unwrap
 
 import pytest
 
+from rtid.diagnose import fit
 from rtid.diagnose.diagnosis import searched
 from rtid.diagnose.report import diagnosis
 from rtid.diagnose.standing import stand
@@ -34,7 +35,8 @@ def test_a_long_record_is_judged_as_a_short_one(monkeypatch: pytest.MonkeyPatch)
     model, chunk, held_out = record(*DELAY)
     kept = diagnosis(searched(stand(model, chunk, held_out))).as_json()
     times = list[bool]()
-    monkeypatch.setattr(record_view, "LONG", 1)
+    for module in (record_view, fit):
+        monkeypatch.setattr(module, "LONG", 1)
     monkeypatch.setattr(record_view, "give_back", lambda: times.append(True))
     standing = stand(model, chunk, held_out)
     times.clear()
