@@ -121,5 +121,10 @@ def hardly_worse(
 
 
 def _finished(state: TrialState, present: Fit, trial: Trial) -> Trial:
-    now = carried_on(state, present, trial)
-    return replace(trial, gain=now.wins_over(present), revision=now.revision, fit=now.light())
+    return ended(present, trial, carried_on(state, present, trial, must_win=True))
+
+
+def ended(present: Fit, trial: Trial, now: Fit) -> Trial:
+    """A trial as it ended: `now`, from beside the present fit."""
+    gain = now.wins_over(present)
+    return replace(trial, gain=gain, revision=now.revision, fit=now.light(), has_ended=True)

@@ -17,7 +17,7 @@ from rtid.diagnose.consequence import (
     consequence,
     is_stable,
 )
-from rtid.diagnose.contest import contest, hardly_worse, trials_of
+from rtid.diagnose.contest import contest, ended, hardly_worse, trials_of
 from rtid.diagnose.exact import carried_on
 from rtid.diagnose.excuse import few_excused
 from rtid.diagnose.fit import MATCH_RHO, Fit, fit, with_covariances
@@ -239,16 +239,22 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
     least = LATER_GAIN if state.found or state.given else GAIN
     trials = [t for t in trials_of(state, present) if t.gain > least]
     finished: dict[Key, Trial] = {}
+    passed_over: set[Key] = set()
     for best in sorted(trials, key=lambda t: -t.gain):
         if best.key in state.negligible or len(state.negligible) == MOST_NEGLIGIBLE:
             continue
         if not _explains(state, present, best):
             return None
         trial, alike = contest(state, present, best, trials, finished)
-        now = with_covariances(carried_on(state, present, trial), like=present)
-        if now.rho >= now.most_rho and not trial.is_timing and is_at_a_bound(now):
+        if trial.key in passed_over:
             continue
+        now = with_covariances(carried_on(state, present, trial, must_win=True), like=present)
+        if not trial.is_timing and is_of_another_form(now):
+            passed_over.add(trial.key)
+            continue
+        finished.setdefault(trial.key, ended(present, trial, now))
         if not trial.is_timing and is_spread_alone(present, now, least):
+            passed_over.add(trial.key)
             continue
         after = state.left(now)
         own = own_share(state, now, trial, after)
@@ -302,6 +308,11 @@ def taken_in(
         return does
     is_wanted = does.is_material or is_needed
     return does if is_wanted and is_stable(now, trial, is_needed) else None
+
+
+def is_of_another_form(now: Fit) -> bool:
+    """True where a form of the last effect ended at a bound of its page, and misfit is left."""
+    return now.rho >= now.most_rho and is_at_a_bound(now)
 
 
 def is_spread_alone(present: Fit, now: Fit, least: float) -> bool:

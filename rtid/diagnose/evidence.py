@@ -33,6 +33,7 @@ QUIET = 1e-9  # a block whose whitened state is smaller adds nothing to an innov
 COLUMNS_AT_ONCE = 256  # of a triangle that is copied
 AT_ONCE = 16  # given columns that are put beside one another
 ENTRIES = 4  # per row, for which there is room at first
+LARGE = 2_000  # unknowns of a factor of 32 MB
 
 
 @dataclass(frozen=True)
@@ -142,9 +143,15 @@ class Rows:
         """Cholesky factor of the maps' products and their prior."""
         return EvidenceFactor.of(self.maps())
 
+    @cached_property
+    def covariances(self) -> FloatArray:
+        """Covariance of each block's terms (V, 6, 6): small, and kept where the factor is not."""
+        return self.factor.covariances()
+
     def forget(self) -> None:
-        """Let the factor go, which is large: who asks for it again makes it anew."""
-        vars(self).pop("factor", None)
+        """Let the factor go where it is large: who asks for it again makes it anew."""
+        if TERMS * len(self.cells) > LARGE:
+            vars(self).pop("factor", None)
 
 
 @dataclass(frozen=True)
@@ -178,7 +185,6 @@ class EvidenceFactor:
         with one_thread():
             return np.asarray(dtrtrs(self.upper, half)[0] * self.scale)
 
-    @cached_property
     def covariances(self) -> FloatArray:
         """Diagonal blocks (V, 6, 6) of the inverse: covariance of each block's terms."""
         cov = np.zeros((len(self.scale) // TERMS, TERMS, TERMS))

@@ -8,7 +8,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from rtid.diagnose.fit import Fit, fit, tried, with_rows_of
+from rtid.diagnose.fit import Fit, fit, one_pass, tried, with_rows_of
 from rtid.diagnose.regression import Score
 from rtid.diagnose.search import Beside
 from rtid.diagnose.trials import GAIN, Trial, TrialState, scored
@@ -178,12 +178,15 @@ def exact_trials(
     return list(trials.values())
 
 
-def carried_on(state: TrialState, present: Fit, trial: Trial) -> Fit:
-    """The fit with a trial's revision, to the end."""
+def carried_on(state: TrialState, present: Fit, trial: Trial, must_win: bool = False) -> Fit:
+    """The fit with a trial's revision, to the end; must_win: or until it is given up."""
     revision, weights, start = trial.revision, present.weights, present
     if trial.fit is not None:
         weights, start = trial.fit.weights, with_rows_of(present, trial.fit)
-    return fit(state.model, state.chunk, weights, revision, start, bank=False)
+    record = state.model, state.chunk, weights, revision, start
+    if trial.has_ended and not trial.is_timing:  # a lag and a delay go on to trade off
+        return one_pass(*record, bank=False, thorough=False)
+    return fit(*record, bank=False, other=present if must_win else None)
 
 
 def _from_afar(

@@ -28,12 +28,9 @@ FEW = 0.1
 KNOWN = 1e-4  # share by which the flow of an effect may differ from what is fitted
 
 
-def few_excused(present: Fit, rest: Misfit | None = None) -> Fit:
-    """The fit with the blocks excused that miss the flow, as it is where they are many.
-
-    rest: what it leaves, where that is known.
-    """
-    return _excused(present, FEW, rest)
+def few_excused(present: Fit) -> Fit:
+    """The fit with the blocks excused that miss the flow, as it is where they are many."""
+    return _excused(present, FEW)
 
 
 def steady(present: Fit) -> Fit:
@@ -50,17 +47,19 @@ def rho_of_all(present: Fit) -> float:
     return one_pass(*record, present, bank=False).rho
 
 
-def _excused(present: Fit, most: float, rest: Misfit | None = None) -> Fit:
+def _excused(present: Fit, most: float) -> Fit:
     """A fit without the say of blocks that miss the flow, where they are at most such a share."""
     if present.weights.missed.any() or not can_be_explained(present.sent):
         return present
-    rest = rest or left_over(present.unfactored())
+    rest = left_over(present.unfactored())
+    present = present.leaving(rest)
     missing = misses(present.model, rest)
     if not 0.0 < missing.share <= most:
         return present
     weights = excusing(present.model, present.sent, present.weights, rest, missing.hot)
-    start = present.unfactored()
-    return fit(present.declared, present.chunk, weights, present.revision, start, bank=False)
+    if not weights.missed.any():  # it comes and goes too fast to be the block's
+        return present
+    return fit(present.declared, present.chunk, weights, present.revision, present, bank=False)
 
 
 def left_over(present: Fit) -> Misfit:

@@ -37,6 +37,7 @@ from rtid.plain import FloatArray, give_back
 
 PASSES = 10  # of Gauss-Newton
 HALVINGS = 2  # of one step, before it is given up
+HOPELESS = 4  # passes in a row that leave the record less likely than it was
 WHOLLY = 1e8  # information of a coefficient that is 1, the effect being what its shape says
 RIDGE = 1e-9  # of the square of a timing's or a shape's column: more than rounding leaves
 WEIGHED = 0.05  # share by which the compliances may differ that weigh the rows alike
@@ -56,7 +57,7 @@ class Fit:
     where they are, to which `map` belongs and which everything else is judged by.
     shapes: (effect, nonlinear parameter) of each column of shapes.  rows: of the record, for
     another fit with the same commands and weights; large.  suspects: scored beside the catalogue.
-    rest: what the maps leave of the record where nothing was added, if somebody has asked before.
+    rest: what the maps leave of the record, if somebody has asked before.
     spreads: (column, how far its size is from one number), where somebody has asked (`spread`).
     """
 
@@ -167,6 +168,15 @@ class Fit:
             self.rows.forget()
         return self
 
+    def leaving(self, rest: Misfit) -> Fit:
+        """The same, with what its maps leave of the record; a long one has no room to keep it."""
+        if len(self.chunk) >= LONG:
+            return self
+        better = replace(self, rest=rest)
+        kept = {"model", "sent", "view"} & vars(self).keys()
+        vars(better).update({name: vars(self)[name] for name in kept})
+        return better
+
     def unread(self) -> Fit:
         """The same, what was read along its record let go: who asks for it again reads it anew."""
         vars(self).pop("view", None)
@@ -209,25 +219,26 @@ def fit(
     start: Fit | None = None,
     bank: bool = True,
     suspects: tuple[Effect, ...] = (),
+    other: Fit | None = None,
 ) -> Fit:
     """Fit a revision to chunk (n, 2 + signals), SI; start: the fit to begin with.
 
     bank: also make the columns of every candidate, to score them; suspects: effects of the user's
-    beside those of the catalogue.
+    beside those of the catalogue; other: the fit that it must win over, given up where it does not.
     """
     best = one_pass(model, chunk, weights, revision, start, False, thorough=False)
-    step, halvings = moved(best), 0
+    step, halvings, behind = moved(best), 0, 0
     for _ in range(PASSES):
-        if step is None or halvings > HALVINGS:
+        if step is None or halvings > HALVINGS or behind == HOPELESS:
             break
-        start = best.unfactored()
-        fitted = one_pass(model, chunk, step.weights, step.revision, start, False, thorough=False)
+        fitted = one_pass(model, chunk, step.weights, step.revision, best, False, thorough=False)
         if is_worse(fitted, best):
             step, halvings = halfway(best, step), halvings + 1
         else:
             halvings = 0
             step = None if is_as_good(fitted, best) else steadied(moved(fitted), fitted, best)
             best = fitted
+        behind = behind + 1 if other is not None and fitted.wins_over(other) < 0.0 else 0
         del fitted  # its rows are large
     if not bank:
         return best
@@ -260,6 +271,8 @@ def one_pass(
     model = split(declared)
     soft = softened(model, sent, weights, revision)
     known = _same_rows(start, sent, weights, soft)
+    if known is None and start is not None:
+        start.unfactored()
     rows = known or rows_of(model, sent, weights, soft=soft)
     before = start.map if start else before or _map_alone(model, rows)
     view = RecordView.of(model, sent, weights, before)
@@ -281,7 +294,7 @@ def one_pass(
     flowmap = MapTerms(rows.cells, projected.terms(list(fixed.used), fixed.theta), NO_COV)
     parts = chunk, weights, revision, before, columns, regression, estimate, fixed
     is_same = start is not None and known is not None and start.revision == revision
-    rest = start.rest if start is not None and is_same and not revision.effects else None
+    rest = start.rest if start is not None and is_same else None
     fitted = Fit(declared, *parts, flowmap, first, shapes, rows, suspects, rest)
     vars(fitted).update(model=model, sent=sent)  # what is made when it is missing
     if bank or revision.effects:  # nobody else asks for what the map says along the record
@@ -299,7 +312,7 @@ def with_covariances(fitted: Fit, like: Fit | None = None) -> Fit:
         return fitted
     cov = _covariances_of(like, fitted) if like is not None else None
     if cov is None:
-        cov = fitted.rows.factor.covariances
+        cov = fitted.rows.covariances
     freed = float(np.einsum("bii->", cov)) * PRIOR_SD**-2
     dof = fitted.rows.n - TERMS * len(fitted.rows.cells) + freed
     better = replace(

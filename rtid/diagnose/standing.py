@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 from rtid.diagnose.clean import as_measured, usable
@@ -52,9 +52,7 @@ def fitted(
     weights = prepare(model, chunk)
     revision = recall(model, chunk, weights, parts, suspects)
     fine, rest = fine_enough(fit(model, chunk, weights, revision, bank=False))
-    first = few_excused(fine, rest)
-    if first is fine:
-        first = replace(first, rest=rest)
+    first = few_excused(fine.leaving(rest) if rest else fine)
     del fine  # its rows are large
     first = halved_throughout(with_covariances(first))
     record = first.declared, chunk, first.weights, first.revision

@@ -39,7 +39,8 @@ SETTLED = 2e-3  # of the gain: what a round must add for another one
 class Trial:
     """A cause beside the model so far: what chi2 would fall by, and the revision with it.
 
-    fit: an exact refit, where there is one; is_timing: it transforms a command or the supply.
+    fit: an exact refit, where there is one; is_timing: it transforms a command or the supply;
+    has_ended: the refit was carried on to its end.
     """
 
     key: Key
@@ -47,6 +48,7 @@ class Trial:
     revision: Revision
     fit: Fit | None = None
     is_timing: bool = False
+    has_ended: bool = False
 
     @property
     def n_parameters(self) -> int:

@@ -26,6 +26,7 @@ SMOOTH_S = 0.02  # half width of the window for derivatives of pressures, withou
 AT_ONCE = 1 << 14  # intervals that are followed in one go
 LONG = 1 << 18  # samples of a record that is read again rather than kept: 4 minutes at 1 kHz
 OPENING, FLOW, SLOPE_U, SLOPE_DP, FLOW_SD = range(5)  # what `follow_map` tells of each
+ALL_BUT_SD = OPENING, FLOW, SLOPE_U, SLOPE_DP  # of a short record in one go
 
 
 def has_noise(values: FloatArray) -> bool:
@@ -221,7 +222,7 @@ class RecordView:
         """What the map says along the record (edges, n - 1), and what is asked for beside it."""
         if what not in self._said:
             group = (FLOW, SLOPE_DP) if what in (FLOW, SLOPE_DP) else (what,)
-            self._said.update(self._followed(group))
+            self._said.update(self._followed(group if self.n >= LONG else ALL_BUT_SD))
         return self._said[what]
 
     @cached_property

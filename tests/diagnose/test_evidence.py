@@ -99,18 +99,22 @@ def test_covariances_are_blocks_of_the_inverse() -> None:
     maps = rows.maps()
     full = np.tril(maps) + np.tril(maps, -1).T + np.eye(len(maps)) * PRIOR_SD**-2
     inverse = np.linalg.inv(full)
-    for v, cov in enumerate(rows.factor.covariances):
+    for v, cov in enumerate(rows.covariances):
         at = slice(TERMS * v, TERMS * (v + 1))
         size = np.sqrt(np.outer(np.diag(inverse[at, at]), np.diag(inverse[at, at])))
         assert np.abs((cov - inverse[at, at]) / size).max() < 1e-5
 
 
-def test_a_factor_that_was_let_go_is_made_anew() -> None:
+def test_a_factor_that_was_let_go_is_made_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A large one; of a small one nobody's memory is short."""
     model, chunk, _ = record()
     rows = rows_of(model, chunk[:2000], nominal_weights(model))
-    upper = rows.factor.upper.copy()
+    upper, cov = rows.factor.upper.copy(), rows.covariances
     rows.forget()
-    assert "factor" not in vars(rows)
+    assert "factor" in vars(rows)
+    monkeypatch.setattr(evidence, "LARGE", 10)
+    rows.forget()
+    assert "factor" not in vars(rows) and rows.covariances is cov
     assert np.array_equal(rows.factor.upper, upper)
 
 

@@ -97,6 +97,15 @@ def test_a_fit_ends_where_nothing_is_left_to_move(start_s: float) -> None:
     assert step is None or psi(step)[0] == pytest.approx(found, rel=0.01)
 
 
+def test_what_leaves_the_record_less_likely_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A line that never arrived took eleven passes of a clean record, all of them far behind."""
+    monkeypatch.setattr(fitting, "HOPELESS", 1)
+    model, chunk, _ = record("input_delay", DELAY_S)
+    start = model, chunk, weights(), late(2e-3)
+    gone_on, given_up = (fit(*start, bank=False, other=o) for o in (None, at(DELAY_S)))
+    assert gone_on.wins_over(given_up) > 100.0
+
+
 def test_a_lag_that_would_leave_its_range_is_held() -> None:
     """A machine that is later than declared: the lag's tolerance is no free parameter."""
     model, chunk, _ = record("input_delay", DELAY_S)

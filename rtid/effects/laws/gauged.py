@@ -113,7 +113,7 @@ class _Bins:
             return Gauge(np.zeros(1), np.zeros(1), alpha)
         gains = gains[self.order]
         parts = zip(self.first.tolist(), self.last.tolist(), strict=True)
-        usual = [max(0.0, float(np.median(gains[first:last]))) for first, last in parts]
+        usual = [max(0.0, _median(gains[first:last])) for first, last in parts]
         return Gauge(self.middle, np.array(usual), alpha)
 
 
@@ -124,8 +124,15 @@ def _exponent(forward: FloatArray, gain: FloatArray, size: FloatArray, alpha: fl
         return alpha
     low, high = np.quantile(size[wide], (1 / 3, 2 / 3))
     few, much = wide & (size <= low), wide & (size >= high)
-    off = [float(np.median(forward[at] / (gain * size**alpha)[at])) for at in (few, much)]
-    apart = float(np.log(np.median(size[much]) / np.median(size[few])))
+    off = [_median(forward[at] / (gain[at] * size[at] ** alpha)) for at in (few, much)]
+    apart = float(np.log(_median(size[much]) / _median(size[few])))
     if min(off) <= 0.0 or apart <= 0.0:
         return alpha
     return float(np.clip(alpha + np.log(off[1] / off[0]) / apart, 0.0, 1.0))
+
+
+def _median(values: FloatArray) -> float:
+    """Of two or more finite values (n,); numpy's own takes four times as long for some hundreds."""
+    middle = len(values) // 2
+    low, high = np.partition(values, (middle - 1, middle))[middle - 1 :][:2].tolist()
+    return 0.5 * (low + high) if len(values) % 2 == 0 else float(high)
