@@ -179,11 +179,11 @@ class EvidenceFactor:
             return np.asarray(dtrsm(1.0, self.upper, right.T, side=1, overwrite_b=1))
 
     def whole(self, half: FloatArray) -> FloatArray:
-        """Solution (6 V,) for what `half` gave of one right-hand side."""
-        if not len(half):
+        """Solutions (..., 6 V) for what `half` gave of one right-hand side, or of several."""
+        if not half.size:
             return half
         with one_thread():
-            return np.asarray(dtrtrs(self.upper, half)[0] * self.scale)
+            return np.asarray(dtrtrs(self.upper, half.T)[0].T * self.scale)
 
     def covariances(self) -> FloatArray:
         """Diagonal blocks (V, 6, 6) of the inverse: covariance of each block's terms."""
@@ -297,13 +297,13 @@ class Projected:
     half: FloatArray
     factor: EvidenceFactor
 
-    def terms(self, used: list[int], theta: FloatArray, column: int = 0) -> FloatArray:
-        """Terms (V, 6) of the maps with these coefficients of the columns used.
+    def terms(self, used: list[int], theta: FloatArray, column: int | slice = 0) -> FloatArray:
+        """Terms (..., V, 6) of the maps with these coefficients (..., used) of the columns used.
 
-        column: the one that all of them follow; y unless named.
+        column: the one that all of them follow, y unless named; or several, each with its own.
         """
         rest = self.half[column] - theta @ self.half[used]
-        return self.factor.whole(rest).reshape(-1, TERMS)
+        return self.factor.whole(rest).reshape(*rest.shape[:-1], -1, TERMS)
 
 
 def project(rows: Rows, given: list[Volumes]) -> Projected:

@@ -153,10 +153,11 @@ def _reaches(
     projected, whole = project(rows, given.copy()), rows.columns(given)
     beside = [*range(1, first), *range(first, first + len(used) - n_c)]
     gram = projected.schur[np.ix_(beside, beside)] + np.diag(fit.regression.prior[used] + NOTHING)
-    for k, (candidate, sd) in enumerate(wanted, first + len(used) - n_c):
-        b = np.asarray(np.linalg.solve(gram, projected.schur[beside, k]), np.float64)
-        flows = on_rows.flows(projected.terms(beside, b, k))
-        z = whole[:, :, k]
+    asked = slice(first + len(used) - n_c, None)
+    shares = np.asarray(np.linalg.solve(gram, projected.schur[beside, asked]).T, np.float64)
+    each = zip(wanted, shares, projected.terms(beside, shares, asked), strict=True)
+    for k, ((candidate, sd), b, terms) in enumerate(each, asked.start):
+        z, flows = whole[:, :, k], on_rows.flows(terms)
         left = z - whole[:, :, beside] @ b - on_rows.into_chambers(flows)
         softer = float(np.max(np.abs(b[:n_c]) * narrow, initial=0.0))
         own = np.inf if candidate.where == COMMAND else on_rows.rms(z) / flow_m3s
