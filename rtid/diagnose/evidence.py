@@ -33,7 +33,7 @@ QUIET = 1e-9  # a block whose whitened state is smaller adds nothing to an innov
 COLUMNS_AT_ONCE = 256  # of a triangle that is copied
 AT_ONCE = 16  # given columns that are put beside one another
 ENTRIES = 4  # per row, for which there is room at first
-LARGE = 2_000  # unknowns of a factor of 32 MB
+MANY = 2_000  # unknowns of a factor of 32 MB
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ class Rows:
 
     def forget(self) -> None:
         """Let the factor go where it is large: who asks for it again makes it anew."""
-        if TERMS * len(self.cells) > LARGE:
+        if TERMS * len(self.cells) > MANY:
             vars(self).pop("factor", None)
 
 

@@ -112,7 +112,7 @@ def test_a_factor_that_was_let_go_is_made_anew(monkeypatch: pytest.MonkeyPatch) 
     upper, cov = rows.factor.upper.copy(), rows.covariances
     rows.forget()
     assert "factor" in vars(rows)
-    monkeypatch.setattr(evidence, "LARGE", 10)
+    monkeypatch.setattr(evidence, "MANY", 10)
     rows.forget()
     assert "factor" not in vars(rows) and rows.covariances is cov
     assert np.array_equal(rows.factor.upper, upper)
