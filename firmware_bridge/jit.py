@@ -13,15 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge import kernel_parts
-from firmware_bridge.kernel_cache import cache_folder, cached
+from firmware_bridge.compiling import cache_folder, cached, part, uncounted
 
 Record = Any  # one row of a structured array
 Records = NDArray[Any]  # a structured array; its dtype is named in the text
 Integer = int | np.integer[Any]
 
-
-COUNTED = dict.fromkeys(kernel_parts.UNCOUNTED, True)
 _HERE = Path(__file__).parent
 _FOLDER = cache_folder("bridge", _HERE, _HERE.rglob("*.py"))
 
@@ -33,4 +30,4 @@ def kernel(function: Callable[..., Any]) -> Any:
 
 def inlined(function: Callable[..., Any]) -> Any:
     """Insert a part into the kernels that call it; it may allocate."""
-    return kernel_parts.part(function, forceinline=True, **COUNTED)
+    return part(function, forceinline=True, **uncounted(is_so=False))

@@ -52,7 +52,10 @@ def ui(
         if path is not None and not path.exists():
             raise RtidError(f"{path}: no such file", "rtid ui TRACE -p PROJECT")
     refuse_without_bokeh()
+    from firmware_bridge.compiling import do_without
     from rtid.ui.worker import started
+
+    do_without()  # the worker computes, the server shows
 
     is_record = trace is not None and project is not None
     # the worker imports beside the server

@@ -6,9 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from firmware_bridge import kernel_parts
-from firmware_bridge.kernel_cache import cache_folder, cached
-from firmware_bridge.kernel_parts import UNCOUNTED
+from firmware_bridge.compiling import cache_folder, cached, uncounted
+from firmware_bridge.compiling import part as linked
 
 # x / 0 is inf, as in numpy: a check and a branch less per division
 _OPTIONS = {"error_model": "numpy"}
@@ -23,14 +22,14 @@ def kernel(function: Callable[..., Any]) -> Any:
 
 def lean(function: Callable[..., Any]) -> Any:
     """Compile an entry point that allocates nothing: no references are counted."""
-    return cached(_FOLDER, function, **_OPTIONS, **UNCOUNTED)
+    return cached(_FOLDER, function, **_OPTIONS, **uncounted())
 
 
 def part(function: Callable[..., Any]) -> Any:
     """Compile a function that kernels call and Python does not; it allocates nothing."""
-    return kernel_parts.part(function, **_OPTIONS)
+    return linked(function, **_OPTIONS)
 
 
 def inlined(function: Callable[..., Any]) -> Any:
     """Insert a part into the kernels that call it: a call costs more than what it does."""
-    return kernel_parts.part(function, forceinline=True, **_OPTIONS)
+    return linked(function, forceinline=True, **_OPTIONS)

@@ -209,7 +209,8 @@ class Desk:
             against = "; ".join(last.study.tried(effect, where).against)
             reason = f"forced: {against}" if against else reason
             study = with_effect(last.study, effect, where, reason)
-            last.study.rest()
+            for rested in (last.study, study):
+                rested.rest()
             section = study.project.sections.added[-1]
             last.ready[key] = _Revision(study, ADD, section, against)
         return last.ready[key]
