@@ -31,6 +31,14 @@ def test_a_worn_place_is_as_wide_as_it_is() -> None:
     assert of("orifice", "position_dependent_leakage").judgement == RIGHT
 
 
+def test_a_pump_is_found_in_the_valley_of_its_own_lag() -> None:
+    """A slower, weaker one left rho 18; a line was named beside it, with oil of 19 GPa."""
+    found = answer(Case(6141, "jump", SWEEP, "supply_sag"))
+    assert found is not None
+    assert (found.judgement, found.named) == (RIGHT, "supply_sag")
+    assert abs(found.beta_z).max() < 3.0
+
+
 @pytest.mark.parametrize(
     ("law", "effect"),
     [
