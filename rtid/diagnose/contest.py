@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from rtid.diagnose.exact import carried_on, key_of, timing_trials, with_pump
 from rtid.diagnose.fit import Fit
+from rtid.diagnose.rivals import is_told_apart
 from rtid.diagnose.trials import (
     TIE,
     TIE_SHARE,
@@ -16,12 +17,14 @@ from rtid.diagnose.trials import (
     scored,
     with_effect,
 )
+from rtid.diagnose.verdict import told_doubts
 from rtid.effects.laws.lines import lines_at, stores_at
 from rtid.effects.laws.sensors import sensor_timings
 from rtid.effects.laws.timing import COMMAND
 from rtid.plain import Key
 
 REFUTED, WITHIN = 3.0, 0.05  # times the best cause's misfit; least misfit, of dof
+NEAR = 0.5  # of the best gain, that a cause must have to be nearly right where the best is no more
 
 
 def trials_of(state: TrialState, present: Fit) -> list[Trial]:
@@ -74,10 +77,7 @@ def contest(
     rivals = [t for t in trials if t.key in alike_ones(state, present, best, trials)]
     if not rivals:
         return best, ()
-    for t in (best, *rivals):
-        if t.key not in finished:
-            finished[t.key] = _finished(state, present, t)
-    refitted = [finished[t.key] for t in (best, *rivals)]
+    refitted = _all_finished(state, present, [best, *rivals], finished)
     best = max(refitted, key=lambda t: t.gain)
     alike = alike_ones(state, present, best, refitted)
     equals = [best, *(t for t in refitted if t.key in alike and not _is_beaten(t, refitted))]
@@ -118,6 +118,39 @@ def hardly_worse(
         and t.gain > max(behind, least_gain * t.n_parameters)
         and not _is_beaten(t, list(finished.values()))
     )
+
+
+def as_nearly_right(
+    state: TrialState, present: Fit, now: Fit, trials: list[Trial], finished: dict[Key, Trial]
+) -> tuple[Key, ...]:
+    """Causes that nothing but a misfit tells apart from the best one, which leaves it (`rivals`).
+
+    now: the fit with the best one.  A cause beside which moduli are impossible is refuted, where
+    they are possible beside that.
+    """
+    if not state.model.has_pressures or now.rho < now.most_rho:
+        return ()
+    bar = NEAR * now.wins_over(present)
+    near = [t for t in trials if t.gain > bar and not now.revision.has(t.key)]
+    near = [t for t in near if t.key not in state.negligible]
+    return tuple(
+        t.key
+        for t in _all_finished(state, present, near, finished)
+        if t.fit is not None
+        and t.gain > bar
+        and not (_is_beaten(t, list(finished.values())) or is_told_apart(now, t.fit))
+        and (told_doubts(now) or not told_doubts(t.fit))
+    )
+
+
+def _all_finished(
+    state: TrialState, present: Fit, trials: list[Trial], finished: dict[Key, Trial]
+) -> list[Trial]:
+    """Trials refitted to the end; those that have been before, as they are in `finished`."""
+    for t in trials:
+        if t.key not in finished:
+            finished[t.key] = _finished(state, present, t)
+    return [finished[t.key] for t in trials]
 
 
 def _finished(state: TrialState, present: Fit, trial: Trial) -> Trial:

@@ -17,7 +17,7 @@ from rtid.diagnose.consequence import (
     consequence,
     is_stable,
 )
-from rtid.diagnose.contest import contest, ended, hardly_worse, trials_of
+from rtid.diagnose.contest import as_nearly_right, contest, ended, hardly_worse, trials_of
 from rtid.diagnose.exact import carried_on
 from rtid.diagnose.excuse import few_excused
 from rtid.diagnose.fit import MATCH_RHO, Fit, fit, with_covariances
@@ -232,9 +232,8 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
     """Add the best cause that is significant and material; None when there is none.
 
     Material is what the held-out residual shows, or what the maps have taken in (`consequence`).
-    One that ends at a bound of its page and leaves misfit is of another form: it is passed over.
-    One that changes next to nothing is only listed, unless it explains a part of the misfit that
-    would be found in another guise.
+    One that is refuted is passed over.  One that changes next to nothing is only listed, unless it
+    explains a part of the misfit that would be found in another guise.
     """
     least = LATER_GAIN if state.found or state.given else GAIN
     trials = [t for t in trials_of(state, present) if t.gain > least]
@@ -249,13 +248,10 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
         if trial.key in passed_over:
             continue
         now = with_covariances(carried_on(state, present, trial, must_win=True), like=present)
-        if not trial.is_timing and is_of_another_form(now):
+        if is_refuted(present, now, trial, least):
             passed_over.add(trial.key)
             continue
         finished.setdefault(trial.key, ended(present, trial, now))
-        if not trial.is_timing and is_spread_alone(present, now, least):
-            passed_over.add(trial.key)
-            continue
         after = state.left(now)
         own = own_share(state, now, trial, after)
         share = min(material_share(last, after), BENT * own)
@@ -264,11 +260,13 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
         is_form = is_form_of_another(state, trial.key) or is_within_a_form(state, trial)
         if not (is_shown or is_form):
             does = taken_in(present, now, trial, own, last, after)
-        if does is not None:
-            more = hardly_worse(state, trial, finished, HIDDEN_GAIN)
+        is_named = is_shown or does is not None
+        if is_named:
+            more = () if does is None else hardly_worse(state, trial, finished, HIDDEN_GAIN)
+            more += as_nearly_right(state, present, now, trials, finished)
             alike = tuple(dict.fromkeys((*alike, *more)))
         what = trial.key, alike, trial.gain, trial.n_parameters
-        if is_shown or does is not None:
+        if is_named:
             present.unread()  # what is read beside the next one is as large
             kept, after = _with_bank(state, now)
             state.found.append(AcceptedEffect(*what, last, after, does))
@@ -318,6 +316,23 @@ def is_of_another_form(now: Fit) -> bool:
 def is_spread_alone(present: Fit, now: Fit, least: float) -> bool:
     """True where an effect only lets the rows be noisier, and makes the record no likelier."""
     return min(present.held.sse - now.held.sse, now.wins_over(present)) < least
+
+
+def is_refuted(present: Fit, now: Fit, trial: Trial, least: float) -> bool:
+    """True for a cause that is of another form, explains noise alone, or makes an oil impossible."""
+    if not trial.is_timing and (is_of_another_form(now) or is_spread_alone(present, now, least)):
+        return True
+    return makes_impossible(present, now)
+
+
+def makes_impossible(present: Fit, now: Fit) -> bool:
+    """True for a cause beside which an oil cannot be, by all that is told of it, that could before.
+
+    It takes what another law misses: of a sag that was half explained, a line before a chamber took
+    half of the rest, and left 19 GPa of oil there.
+    """
+    after = any(doubt.is_invalid for doubt in told_doubts(now))
+    return after and not any(doubt.is_invalid for doubt in told_doubts(present))
 
 
 def is_seen_again(now: Fit, last: Residual, after: Residual) -> bool:

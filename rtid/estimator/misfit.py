@@ -41,7 +41,7 @@ def count_misfit(
     if not len(scores):
         return solution
     cov = solution.compliance_cov / np.outer(solution.scale_pa, solution.scale_pa)
-    variance = _crossed(scores, [_of_chamber(model, cells, c) for c in range(len(cov))])
+    variance = crossed(scores, [_of_chamber(model, cells, c) for c in range(len(cov))])
     ratio = np.sqrt(np.maximum(1.0, variance / np.diag(cov)))
     return widen(solution, cov * np.outer(ratio, ratio) - cov)
 
@@ -143,15 +143,15 @@ def _of_chamber(model: Machine, cells: Cells, chamber: int) -> Cells:
     return place
 
 
-def _crossed(scores: FloatArray, clusters: list[Cells]) -> FloatArray:
+def crossed(scores: FloatArray, clusters: list[Cells]) -> FloatArray:
     """Variance (chambers,) of the sum of scores that are alike within either cluster."""
     if len(clusters) == 1:
         return _clustered(scores, clusters[0])
     both = clusters[0] * (clusters[1].max() + 1) + clusters[1]
     alone = [_clustered(scores, cluster) for cluster in clusters]
-    crossed = alone[0] + alone[1] - _clustered(scores, np.unique(both, return_inverse=True)[1])
+    together = _clustered(scores, np.unique(both, return_inverse=True)[1])
     # The difference of estimates can turn negative; the sum is at least as alike as in either.
-    return np.maximum(crossed, np.maximum(alone[0], alone[1]))
+    return np.maximum(alone[0] + alone[1] - together, np.maximum(alone[0], alone[1]))
 
 
 def _clustered(scores: FloatArray, cluster: Cells) -> FloatArray:

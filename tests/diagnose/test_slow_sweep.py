@@ -39,6 +39,14 @@ def test_a_pump_is_found_in_the_valley_of_its_own_lag() -> None:
     assert abs(found.beta_z).max() < 3.0
 
 
+def test_laws_that_are_both_nearly_right_are_a_set() -> None:
+    """Oil that boils out with the square of what lacks was air, by rows that miss the same flow."""
+    found = once(Case(6133, "jump", SWEEP, "cavitation"))
+    assert found is not None
+    assert judge(Hidden(6133, "cavitation"), found.said) == IN_SET
+    assert found.said.verdict == "ambiguous" and found.said.something_remains
+
+
 @pytest.mark.parametrize(
     ("law", "effect"),
     [

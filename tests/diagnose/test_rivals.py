@@ -1,0 +1,107 @@
+"""Two causes that both leave a misfit, and whether the blocks of a record tell them apart."""
+
+from __future__ import annotations
+
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rtid.diagnose import diagnosis, rivals
+from rtid.diagnose.diagnosis import makes_impossible
+from rtid.diagnose.fit import Fit, one_pass, prepare
+from rtid.diagnose.revision import Revision
+from rtid.diagnose.rivals import CLEARLY, is_told_apart, loss
+from rtid.diagnose.trials import best_by_key, scored, with_effect
+from rtid.plain import FloatArray
+from tests.diagnose.records import noisy, record
+
+ROWS, BLOCKS = 4000, 40
+
+
+@cache
+def fits() -> tuple[Fit, Fit]:
+    """Of a record with a leak: without an effect, and with it."""
+    model, chunk, _ = record("external_leakage_laminar", 3e-12)
+    weights = prepare(model, chunk)
+    plain = one_pass(model, chunk, weights, Revision(), None, bank=True)
+    leak = best_by_key(plain, scored(plain))["external_leakage_laminar", "a"][0]
+    revision = with_effect(plain, leak)
+    return plain, one_pass(model, chunk, weights, revision, plain, bank=False)
+
+
+def test_the_rows_lose_what_the_fit_loses() -> None:
+    plain, leaking = fits()
+    lost = [float(loss(fit, rivals._rows(fit)).sum()) for fit in (plain, leaking)]
+    assert leaking.wins_over(plain) > 1000.0
+    assert lost[0] - lost[1] == pytest.approx(leaking.wins_over(plain), rel=0.02)
+
+
+def test_a_leak_is_told_from_nothing_and_nothing_from_a_leak_never() -> None:
+    plain, leaking = fits()
+    assert is_told_apart(leaking, plain)
+    assert not is_told_apart(plain, leaking)
+    assert not is_told_apart(leaking, leaking)
+
+
+@pytest.fixture
+def differ(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Two fits of one chamber whose rows differ as given, in blocks of equal length."""
+    block = np.repeat(np.arange(BLOCKS), ROWS // BLOCKS)
+    rows = SimpleNamespace(own=np.zeros((ROWS, 1, 2)))
+    monkeypatch.setattr(rivals, "_rows", lambda fit: rows)
+    monkeypatch.setattr(rivals, "_blocks", lambda rows, chamber: block)
+
+    def told(apart: FloatArray) -> bool:
+        monkeypatch.setattr(rivals, "loss", lambda fit, rows: fit * apart)
+        return is_told_apart(0.0, 1.0)  # type: ignore[arg-type]
+
+    return told
+
+
+def test_what_one_block_likes_better_tells_nothing(differ: Any) -> None:
+    """All rows of a block miss the same flow: they are one witness, however many they are."""
+    rng = np.random.default_rng(1)
+    noise = noisy(rng, ROWS)
+    everywhere = noise + 2.0 * CLEARLY / np.sqrt(ROWS)
+    one_block = np.where(np.arange(ROWS) < ROWS // BLOCKS, everywhere.sum() / (ROWS // BLOCKS), 0.0)
+    assert differ(everywhere)
+    assert not differ(one_block)
+    assert not differ(noise - noise.mean())
+    assert not differ(-everywhere)
+
+
+def test_a_chamber_s_rows_are_in_the_blocks_of_its_own_edges() -> None:
+    plain, _ = fits()
+    rows = rivals._rows(plain)
+    of_a, of_b = (rivals._blocks(rows, c) for c in (0, 1))
+    for c, block in enumerate((of_a, of_b)):
+        moving = block < len(rows.cells)
+        assert moving.any() and (rows.sign[block[moving], c] != 0).all()
+        assert len(set(block[~moving])) == (~moving).sum() > 0  # each shut row is one alone
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "refuted"),
+    [
+        ((), (), False),
+        ((), (True,), True),
+        ((), (False,), False),  # moduli that contradict each other may be a wall's
+        ((True,), (True,), False),  # it was impossible before
+    ],
+)
+def test_a_cause_beside_which_no_oil_is_possible_is_refuted(
+    monkeypatch: pytest.MonkeyPatch,
+    before: tuple[bool, ...],
+    after: tuple[bool, ...],
+    refuted: bool,
+) -> None:
+    """A line beside a sag that was half explained left 19 GPa of oil."""
+
+    def told(fit: Any) -> tuple[Any, ...]:
+        return tuple(SimpleNamespace(is_invalid=invalid) for invalid in fit)
+
+    monkeypatch.setattr(diagnosis, "told_doubts", told)
+    assert makes_impossible(before, after) is refuted  # type: ignore[arg-type]
