@@ -206,8 +206,10 @@ class Desk:
         """The newest revision with one effect more, fitted once."""
         last, key = self._stack[-1], (effect, where, reason)
         if key not in last.ready:
-            against = "; ".join(last.study.tried(effect, where).against)
+            extension = last.study.tried(effect, where)
+            against = "; ".join(extension.against)
             reason = f"forced: {against}" if against else reason
+            against += f"; {extension.better}" if against and extension.better else ""
             study = with_effect(last.study, effect, where, reason)
             for rested in (last.study, study):
                 rested.rest()

@@ -118,6 +118,17 @@ def test_what_the_diagnosis_has_fitted_is_not_fitted_again(worn: tuple[Path, Pat
     assert known.after.fit.spreads == again.after.fit.spreads
 
 
+def test_what_would_do_better_stands_beside_what_speaks_against(worn: tuple[Path, Path]) -> None:
+    """What a modulus alone tells is to be declared: the page says so as the command does."""
+    trace, project = worn
+    desk = Desk(silent)
+    desk.open(project, trace, None)
+    words = desk.tried("extra_dead_volume", "b", "by name").note
+    tried = Study(project, trace).tried("extra_dead_volume", "b")
+    assert tried.against and tried.better
+    assert words == "; ".join((*tried.against, tried.better))
+
+
 def test_a_file_that_was_changed_meanwhile_is_not_overwritten(worn: tuple[Path, Path]) -> None:
     trace, project = worn
     copy = project.with_name("copy.toml")
