@@ -128,7 +128,7 @@ def as_nearly_right(
     now: the fit with the best one.  A cause beside which moduli are impossible is refuted, where
     they are possible beside that.
     """
-    if not state.model.has_pressures or now.rho < now.most_rho:
+    if not state.model.has_pressures:  # what disturbs the plant has no blocks
         return ()
     bar = NEAR * now.wins_over(present)
     near = [t for t in trials if t.gain > bar and not now.revision.has(t.key)]

@@ -260,15 +260,14 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
         is_form = is_form_of_another(state, trial.key) or is_within_a_form(state, trial)
         if not (is_shown or is_form):
             does = taken_in(present, now, trial, own, last, after)
-        is_named = is_shown or does is not None
-        if is_named:
-            more = () if does is None else hardly_worse(state, trial, finished, HIDDEN_GAIN)
-            more += as_nearly_right(state, present, now, trials, finished)
-            alike = tuple(dict.fromkeys((*alike, *more)))
-        what = trial.key, alike, trial.gain, trial.n_parameters
-        if is_named:
+        if is_shown or does is not None:
             present.unread()  # what is read beside the next one is as large
             kept, after = _with_bank(state, now)
+            more = () if does is None else hardly_worse(state, trial, finished, HIDDEN_GAIN)
+            if kept.rho >= kept.most_rho:
+                more += as_nearly_right(state, present, now, trials, finished)
+            alike = tuple(dict.fromkeys((*alike, *more)))
+            what = trial.key, alike, trial.gain, trial.n_parameters
             state.found.append(AcceptedEffect(*what, last, after, does))
             return kept, after
         state.negligible[trial.key] = share
@@ -276,6 +275,7 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
         if is_good and _is_noticed(present, trial):
             kept, after = _with_bank(state, now)
             if _is_shown_now(trial.key, min(material_share(last, after), BENT * own), state):
+                what = trial.key, alike, trial.gain, trial.n_parameters
                 state.found.append(AcceptedEffect(*what, last, after, None))
             else:
                 state.negligible |= dict.fromkeys(alike, share)
