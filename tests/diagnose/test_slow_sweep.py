@@ -39,12 +39,22 @@ def test_a_pump_is_found_in_the_valley_of_its_own_lag() -> None:
     assert abs(found.beta_z).max() < 3.0
 
 
-def test_laws_that_are_both_nearly_right_are_a_set() -> None:
-    """Oil that boils out with the square of what lacks was air, by rows that miss the same flow."""
-    found = once(Case(6133, "jump", SWEEP, "cavitation"))
+@pytest.mark.parametrize(
+    ("law", "effect", "remains"),
+    [
+        ("jump", "cavitation", True),
+        pytest.param("notch", "spool_lag_first_order", False, marks=pytest.mark.campaign),
+    ],
+)
+def test_laws_that_are_both_nearly_right_are_a_set(law: str, effect: str, remains: bool) -> None:
+    """Oil that boils out with the square of what lacks was air, by rows that miss the same flow.
+
+    What a lag leaves in few blocks alone is excused there: a late position sensor is no rival.
+    """
+    found = once(Case(6133, law, SWEEP, effect))
     assert found is not None
-    assert judge(Hidden(6133, "cavitation"), found.said) == IN_SET
-    assert found.said.verdict == "ambiguous" and found.said.something_remains
+    assert judge(Hidden(6133, effect), found.said) == IN_SET
+    assert found.said.verdict == "ambiguous" and found.said.something_remains is remains
 
 
 @pytest.mark.parametrize(
