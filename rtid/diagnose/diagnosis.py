@@ -320,9 +320,10 @@ def is_spread_alone(present: Fit, now: Fit, least: float) -> bool:
 
 def is_refuted(present: Fit, now: Fit, trial: Trial, least: float) -> bool:
     """True for a cause that is of another form, explains noise alone, or makes an oil impossible."""
-    if not trial.is_timing and (is_of_another_form(now) or is_spread_alone(present, now, least)):
-        return True
-    return makes_impossible(present, now)
+    if trial.is_timing:
+        return makes_impossible(present, now)
+    is_none = is_of_another_form(now) or is_spread_alone(present, now, least)
+    return is_none or makes_impossible(present, now)
 
 
 def makes_impossible(present: Fit, now: Fit) -> bool:
