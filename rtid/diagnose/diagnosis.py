@@ -319,7 +319,7 @@ def is_spread_alone(present: Fit, now: Fit, least: float) -> bool:
 
 
 def is_refuted(present: Fit, now: Fit, trial: Trial, least: float) -> bool:
-    """True for a cause that is of another form, explains noise alone, or makes an oil impossible."""
+    """True for a cause of another form, that explains noise alone, or makes an oil impossible."""
     if trial.is_timing:
         return makes_impossible(present, now)
     is_none = is_of_another_form(now) or is_spread_alone(present, now, least)
