@@ -145,11 +145,11 @@ def _reaches(
     fit: Fit, rows: Rows, wanted: list[tuple[Candidate, float]], flow_m3s: float
 ) -> Iterator[tuple[Candidate, Reach]]:
     on_rows, narrow = _OnRows.of(fit, rows), _narrowness(fit)
-    columns, n_c = _columns(fit, rows), len(fit.model.chambers)
-    first, used = fit.first_given, list(fit.estimate.used)
-    given = [columns[k - first] for k in used if k >= first]
-    given += [columns[fit.column(candidate) - first] for candidate, _ in wanted]
-    del columns  # all others are let go
+    n_c, first, used = len(fit.model.chambers), fit.first_given, list(fit.estimate.used)
+    at = [k - first for k in used if k >= first]
+    at += [fit.column(candidate) - first for candidate, _ in wanted]
+    columns = _columns(fit, rows, frozenset(at))
+    given = [columns[k] for k in at]
     projected, whole = project(rows, given.copy()), rows.columns(given)
     beside = [*range(1, first), *range(first, first + len(used) - n_c)]
     gram = projected.schur[np.ix_(beside, beside)] + np.diag(fit.regression.prior[used] + NOTHING)
@@ -165,9 +165,13 @@ def _reaches(
         yield candidate, reach
 
 
-def _columns(fit: Fit, rows: Rows) -> list[dict[int, FloatArray]]:
-    """All columns behind the compliances, in the order of a fit with its bank, on the rows."""
-    columns, sent = Columns(rows.condensed), commands(fit.declared, fit.chunk)
+def _columns(fit: Fit, rows: Rows, wanted: frozenset[int]) -> list[dict[int, FloatArray]]:
+    """The columns behind the compliances, in the order of a fit with its bank, on the rows.
+
+    Those that are not wanted are there by their number alone.
+    """
+    sent = commands(fit.declared, fit.chunk)
+    columns = Columns(rows.condensed, wanted=wanted)
     add_timing(fit.view, columns, sent, fit.weights, fit.revision)
     list(add_shapes(fit.view, columns, fit.revision))
     offer(fit.view, columns, fit.revision, True, (), fit.suspects)

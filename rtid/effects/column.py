@@ -188,18 +188,20 @@ class Columns:
     """Candidates and columns, in the order in which they were added.
 
     condense: what a series per interval (n - 1,) adds to the rows (rows,), which is all that is
-    kept, and only until it is `released`.
+    kept, and only until it is `released`; wanted: numbers of the columns of which it is; None: all.
     """
 
     condense: Callable[[FloatArray], FloatArray]
     candidates: list[Candidate] = field(default_factory=list)
     echo_of: dict[int, int] = field(default_factory=dict)  # column -> its echo's column
     n: int = 0
+    wanted: frozenset[int] | None = None
     _columns: list[Volumes] = field(default_factory=list)
 
     def add(self, volumes: Volumes) -> int:
         """Another column; its number."""
-        self._columns.append({c: self.condense(series) for c, series in volumes.items()})
+        kept = volumes if self.wanted is None or self.n in self.wanted else {}
+        self._columns.append({c: self.condense(series) for c, series in kept.items()})
         self.n += 1
         return self.n - 1
 
