@@ -95,7 +95,7 @@ class Rows:
         cross = np.empty((TERMS * len(self.cells), len(whole)))
         for columns in self._whitened(given):
             here = slice(at, at := at + columns.shape[2])
-            whole[here] = columns.reshape(self.n, -1).T
+            whole[here] = columns.reshape(self.n, columns.shape[2]).T  # of no rows as well
             cross[:, here] = self._cross(columns)
         with one_thread():
             return whole @ whole.T, cross

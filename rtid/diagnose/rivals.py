@@ -41,7 +41,7 @@ def is_told_apart(best: Fit, other: Fit) -> bool:
 
 
 def loss(fit: Fit, rows: Rows) -> FloatArray:
-    """-2 ln likelihood of each row (rows,) but for a constant; rows: those of the fit."""
+    """-2 ln likelihood of each row (rows,), dimensionless, but for a constant; rows: the fit's."""
     sent = commands(fit.declared, fit.chunk)
     columns, _, _ = columns_of(fit.view, rows.condensed, sent, fit.weights, fit.revision)
     theta = dict(zip(fit.held.used, fit.held.theta, strict=True))

@@ -144,7 +144,7 @@ def _of_chamber(model: Machine, cells: Cells, chamber: int) -> Cells:
 
 
 def crossed(scores: FloatArray, clusters: list[Cells]) -> FloatArray:
-    """Variance (chambers,) of the sum of scores that are alike within either cluster."""
+    """Variance (chambers,), in any unit, of the sum of scores alike within either cluster."""
     if len(clusters) == 1:
         return _clustered(scores, clusters[0])
     both = clusters[0] * (clusters[1].max() + 1) + clusters[1]
