@@ -20,7 +20,7 @@ from firmware_bridge import frames as fr
 from firmware_bridge.sources import serial_port
 from firmware_bridge.sources.live import SourceError
 from firmware_bridge.sources.port import split_baudrate
-from firmware_bridge.sources.udp import hear_one_group
+from firmware_bridge.sources.sockets import hear_one_group
 
 AS_FAST_AS_POSSIBLE = float("inf")
 SEND_TIMEOUT_S = 5.0  # a full queue of a virtual bus would block the sender for ever

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
-import socket
 from collections.abc import Iterable
 from typing import Any
 
@@ -13,9 +10,8 @@ import can
 from firmware_bridge import frames as fr
 from firmware_bridge.frames import EXTENDED, Frames
 from firmware_bridge.sources.live import POLL_S, LiveSource, SourceError
+from firmware_bridge.sources.sockets import enlarge_buffer
 from firmware_bridge.steps import Continuous
-
-RECEIVE_BUFFER_BYTES = 4 << 20  # the default loses thousands of frames in a stall of 2 s
 
 
 class CanBus(LiveSource[can.Message]):
@@ -48,7 +44,7 @@ class CanBus(LiveSource[can.Message]):
             self._bus = can.Bus(**self._options)
         except Exception as error:  # each interface raises its own kind
             raise SourceError(f"cannot open {self._name}: {error}") from error
-        _enlarge_buffer(self._bus)
+        enlarge_buffer(self._bus)
 
     def _receive(self) -> can.Message | None:
         return self._bus.recv(POLL_S)
@@ -64,11 +60,3 @@ def _filter(can_id: int) -> can.typechecking.CanFilter:
     extended = bool(can_id & EXTENDED)
     mask = 0x1FFF_FFFF if extended else 0x7FF
     return {"can_id": can_id & mask, "can_mask": mask, "extended": extended}
-
-
-def _enlarge_buffer(bus: can.BusABC) -> None:
-    """Ask the system for a large receive buffer, where the bus is a socket."""
-    with contextlib.suppress(Exception):  # not a socket, or refused: the default remains
-        twin = socket.socket(fileno=os.dup(bus.fileno()))
-        with twin:
-            twin.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)

@@ -9,29 +9,23 @@ stamp is stamped on arrival.  Nobody is authenticated.
 from __future__ import annotations
 
 import contextlib
-import os
 import socket
 import struct
 from collections.abc import Iterable
 from typing import Any
 
-import can
 import numpy as np
 
 from firmware_bridge import frames as fr
 from firmware_bridge.frames import EXTENDED, MAX_LENGTH, Frames, channel_number
 from firmware_bridge.sources.live import POLL_S, LiveSource, SourceError, now_us
+from firmware_bridge.sources.sockets import RECEIVE_BUFFER_BYTES
 from firmware_bridge.steps import Continuous
 
 PORT = 43113  # python-can's
 GROUP = "239.74.163.2"
-RECEIVE_BUFFER_BYTES = 4 << 20
 SO_RCVBUFFORCE = 33  # beyond the system's limit, for those who may
 MAX_DATAGRAM = 512
-OF_ALL_GROUPS = {  # of Linux, which Python does not name: the option's level and number
-    socket.AF_INET: (socket.IPPROTO_IP, 49),
-    socket.AF_INET6: (socket.IPPROTO_IPV6, 29),
-}
 
 Datagram = tuple[int, bytes]
 
@@ -146,15 +140,3 @@ def _joined(group: str, port: int) -> socket.socket:
         opened.close()
         raise
     return opened
-
-
-def hear_one_group(bus: can.BusABC) -> None:
-    """Let a udp_multicast bus of python-can hear its own group alone; others remain as they are.
-
-    It binds to every address, so that Linux gives it what any group of this computer is sent.
-    """
-    with contextlib.suppress(OSError, NotImplementedError):  # no socket: nothing to be asked
-        twin = socket.socket(fileno=os.dup(bus.fileno()))
-        with twin:
-            if option := OF_ALL_GROUPS.get(socket.AddressFamily(twin.family)):
-                twin.setsockopt(*option, 0)

@@ -20,7 +20,7 @@ import numpy as np
 import tomlkit
 
 import rtid.project
-from firmware_bridge.sources.udp import hear_one_group
+from firmware_bridge.sources.sockets import hear_one_group
 from rtid.apply import offer as offered
 from rtid.apply.judge import KnownMap
 from rtid.apply.offer import Offer

@@ -10,7 +10,7 @@ from pathlib import Path
 import can
 import pytest
 
-from firmware_bridge.sources.udp import hear_one_group
+from firmware_bridge.sources.sockets import hear_one_group
 from rtid.apply import offer as offered
 from rtid.cli.exits import Exit
 from tests.apply.neighbour import CAN_ID, Neighbour

@@ -1,12 +1,15 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import can
 import pytest
+from can.interfaces.virtual import VirtualBus
 
 from firmware_bridge import frames as fr
 from firmware_bridge.assemble import Assembler
@@ -15,6 +18,7 @@ from firmware_bridge.playback import BusSink
 from firmware_bridge.sources.can_bus import CanBus
 from firmware_bridge.sources.live import Source, SourceError
 from firmware_bridge.sources.serial_port import SerialPort
+from firmware_bridge.sources.sockets import enlarge_buffer, hear_one_group
 from tests.bridge.machine import CATALOG, assembly, cycles, equal
 from tests.faults.process import a_group
 
@@ -66,6 +70,21 @@ def test_a_sink_hears_its_own_group_alone() -> None:
         speaker.send(can.Message(arbitration_id=0x701, is_extended_id=False))
         assert other.recv(10.0) is not None
         assert one.recv(0.2) is None
+
+
+@pytest.mark.parametrize("asks", [enlarge_buffer, hear_one_group])
+def test_a_bus_that_is_no_socket_leaves_nothing_open(asks: Callable[[can.BusABC], None]) -> None:
+    """A port that was opened anew each second used up the process' descriptors."""
+
+    class OnPort(VirtualBus):
+        def fileno(self) -> int:
+            return at
+
+    with tempfile.TemporaryFile() as port, OnPort("on-port") as bus:
+        at = port.fileno()
+        before = len(os.listdir("/proc/self/fd"))
+        asks(bus)
+        assert len(os.listdir("/proc/self/fd")) == before
 
 
 def test_receive_error_reaches_the_reader(monkeypatch: pytest.MonkeyPatch) -> None:
