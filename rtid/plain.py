@@ -19,6 +19,7 @@ BoolArray = NDArray[np.bool_]
 Progress = Callable[[str, float], None]  # what is being done, and the share that is done
 Key = tuple[str, str]  # an effect and where it sits
 LARGE = 1 << 22  # bytes of an array for which numpy asks for huge pages
+SPARED = 1 << 24  # bytes that half a matrix must have to be worth pages that are small, and slower
 OWN = {"flags": mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS} if hasattr(mmap, "MAP_PRIVATE") else {}
 
 
@@ -52,9 +53,8 @@ def give_back() -> None:
 def half_used(n: int) -> FloatArray:
     """Zeros (n, n), for any unit, of which one triangle is used: the other takes no memory.
 
-    A huge page, which numpy asks for, would hold some of both; small pages take a small matrix a
-    tenth of its factor's time.
+    A huge page, which numpy asks for, would hold some of both.
     """
-    if 8 * n * n < 8 * LARGE:
+    if 4 * n * n < SPARED:
         return np.zeros((n, n))
     return np.ndarray((n, n), buffer=mmap.mmap(-1, 8 * n * n, **OWN))
