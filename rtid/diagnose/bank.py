@@ -25,23 +25,23 @@ LAG_STEP_S = 5e-5
 
 
 def columns_of(
-    view: RecordView, condense: Callable[[FloatArray], FloatArray],
+    view: RecordView, take: Callable[[Volumes, bool], object],
     sent: dict[str, tuple[int, FloatArray]], weights: Weights, revision: Revision,
     bank: bool = False, more: Iterable[tuple[Cause, Shape]] = (), suspects: tuple[Effect, ...] = (),
 ) -> tuple[Columns, int, tuple[tuple[int, int], ...]]:  # fmt: skip
     """Every column of a fit behind the compliances, echoes last, as `fit.one_pass` has them.
 
-    condense: as of `Columns`; sent: the commands (n,), V, before any timing.  With the number of
+    take: as of `Columns`; sent: the commands (n,), V, before any timing.  With the number of
     timings' columns, and effect and nonlinear parameter of each column of shapes.
     """
-    columns = Columns(condense)
+    columns = Columns(take)
     n_timing = add_timing(view, columns, sent, weights, revision)
     shapes = tuple(add_shapes(view, columns, revision))
     offer(view, columns, revision, bank, more, suspects)
     slopes = [(cause_of(view, e), e.shape, k) for i, k in shapes for e in [revision.effects[i]]]
     view.rest()  # echoes ask little of it
     add_echoes(view, columns, n_timing, slopes)
-    return columns, n_timing, shapes
+    return columns.ended(), n_timing, shapes
 
 
 def add_timing(
@@ -109,14 +109,10 @@ def offer(
     suspects: tuple[Effect, ...],
 ) -> None:
     """Columns of the revision's effects, and of all that is to be scored: suspects as well."""
-    if not bank:
-        for effect in revision.effects:
-            columns.offer(effect, cause_of(view, effect).column(effect.shape))
+    for effect in revision.effects:
+        columns.offer(effect, cause_of(view, effect).column(effect.shape), is_aside=False)
     for cause in causes(view, suspects) if bank else ():
-        present = [e for e in revision.effects if cause.makes(e)]
-        for effect in present:
-            columns.offer(effect, cause.column(effect.shape))
-        if not present and cause.offered:
+        if cause.offered and not any(map(cause.makes, revision.effects)):
             for shape in cause.shapes:
                 volumes = cause.column(shape)
                 if any(series.any() for series in volumes.values()):  # else it cannot act here

@@ -9,7 +9,6 @@ and serves any given columns.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -25,7 +24,7 @@ from rtid.kernels import record_rows as kernel
 from rtid.kernels.engine import ROW_FLAG
 from rtid.kernels.layout import TERMS
 from rtid.model import Machine
-from rtid.plain import LARGE, BoolArray, FloatArray, IntArray, give_back, half_used
+from rtid.plain import BoolArray, FloatArray, IntArray, half_used
 
 ROW_S = 10e-3  # positions measured within so long make one row
 SPAN = 10  # rows in which only few blocks move
@@ -85,35 +84,16 @@ class Rows:
         )  # fmt: skip
         return gram
 
-    def head(self, given: list[Volumes]) -> tuple[FloatArray, FloatArray]:
-        """Products of [y | theta_beta | given]: among themselves (h, h), and of the maps (6 V, h).
+    def on_rows(self, volumes: Volumes) -> Volumes:
+        """A column, condensed: chamber -> (rows,), m3."""
+        return {c: self.condensed(series) for c, series in volumes.items()}
 
-        given: condensed columns, chamber -> (rows,), which are used up: a column is in memory once.
-        """
-        at, first = 0, self.own.shape[2]
-        whole = np.empty((first + len(given), self.n))
-        cross = np.empty((TERMS * len(self.cells), len(whole)))
-        for columns in self._whitened(given):
-            here = slice(at, at := at + columns.shape[2])
-            whole[here] = columns.reshape(self.n, columns.shape[2]).T  # of no rows as well
-            cross[:, here] = self._cross(columns)
-        with one_thread():
-            return whole @ whole.T, cross
+    def whitened(self, columns: FloatArray) -> FloatArray:
+        """Whitened rows (rows, chambers, m) of what columns add, m3, in their place."""
+        products.whitened(columns, self.fresh, self.whiten, self.keep)
+        return columns
 
-    def _whitened(self, given: list[Volumes]) -> Iterator[FloatArray]:
-        """The whitened rows (rows, chambers, few) of y and theta_beta, and of given, used up."""
-        columns = self.own.copy()
-        while True:
-            products.whitened(columns, self.fresh, self.whiten, self.keep)
-            yield columns
-            if not given:
-                return
-            columns = self._stacked(given[:AT_ONCE])
-            del given[:AT_ONCE]
-            if columns.nbytes >= LARGE:
-                give_back()
-
-    def _cross(self, columns: FloatArray) -> FloatArray:
+    def cross(self, columns: FloatArray) -> FloatArray:
         """Products of the maps' columns with whitened (rows, chambers, m), used up: (6 V, m)."""
         products.adjoint(columns, self.fresh, self.whiten, self.keep)
         cross = np.zeros((TERMS * len(self.cells), columns.shape[2]))
@@ -122,15 +102,9 @@ class Rows:
 
     def columns(self, given: list[Volumes]) -> FloatArray:
         """What y, theta_beta and condensed columns add to the rows (rows, chambers, h), m3."""
-        rows, n_c, first = self.own.shape
-        columns = np.empty((rows, n_c, first + len(given)))
-        columns[:, :, :first] = self.own
-        for k in range(0, len(given), AT_ONCE):  # all at once would be there twice
-            part = given[k : k + AT_ONCE]
-            columns[:, :, first + k : first + k + len(part)] = self._stacked(part)
-        return columns
+        return np.concatenate([self.own, self.stacked(given)], axis=2)
 
-    def _stacked(self, given: list[Volumes]) -> FloatArray:
+    def stacked(self, given: list[Volumes]) -> FloatArray:
         """Condensed columns beside one another (rows, chambers, m), m3."""
         columns = np.zeros((*self.own.shape[:2], len(given)))
         for k, volumes in enumerate(given):
@@ -306,10 +280,72 @@ class Projected:
         return self.factor.whole(rest).reshape(*rest.shape[:-1], -1, TERMS)
 
 
+class Heading:
+    """Products of [y | theta_beta | given], h columns in all: those given are let go as they come.
+
+    Those that stand aside are met by those that do not, and by the maps; two of them have no
+    product, NaN.  All of a bank beside one another took 100 MB of ten minutes.
+    """
+
+    def __init__(self, rows: Rows) -> None:
+        self._rows, self._h = rows, 0
+        self._waiting: list[tuple[Volumes, bool]] = []
+        self._beside: list[tuple[IntArray, FloatArray]] = []  # columns, and their whitened rows
+        self._met: list[tuple[IntArray, IntArray, FloatArray]] = []
+        self._squares: list[FloatArray] = []
+        self._cross: list[FloatArray] = []
+        self._take(rows.own.copy(), np.zeros(rows.own.shape[2], bool))
+
+    def add(self, volumes: Volumes, is_aside: bool = False) -> None:
+        """Another column, chamber -> (n - 1,), m3."""
+        self.put(self._rows.on_rows(volumes), is_aside)
+
+    def put(self, column: Volumes, is_aside: bool = False) -> None:
+        """Another column, condensed: chamber -> (rows,), m3."""
+        self._waiting.append((column, is_aside))
+        if len(self._waiting) == AT_ONCE:
+            self._flush()
+
+    def _flush(self) -> None:
+        if not self._waiting:
+            return
+        given, aside = zip(*self._waiting, strict=True)
+        self._waiting = []
+        self._take(self._rows.stacked(list(given)), np.array(aside))
+
+    def _take(self, columns: FloatArray, aside: BoolArray) -> None:
+        """Meet what columns (rows, chambers, m) add to the rows, m3: used up."""
+        flat = self._rows.whitened(columns).reshape(self._rows.n, len(aside))
+        at = self._h + np.arange(len(aside))
+        self._h += len(aside)
+        if not aside.all():
+            self._beside.append((at[~aside], np.ascontiguousarray(flat[:, ~aside].T)))
+        with one_thread():
+            self._met += [(known, at, rows @ flat) for known, rows in self._beside]
+        self._squares.append(np.einsum("ij,ij->j", flat, flat))
+        self._cross.append(self._rows.cross(columns))
+
+    def products(self) -> tuple[FloatArray, FloatArray]:
+        """Among the columns (h, h), and of the maps with them (6 V, h)."""
+        self._flush()
+        gram = np.full((self._h, self._h), np.nan)
+        for a, b, met in self._met:
+            gram[np.ix_(a, b)], gram[np.ix_(b, a)] = met, met.T
+        np.fill_diagonal(gram, np.concatenate(self._squares))
+        return gram, np.hstack(self._cross)
+
+    def projected(self) -> Projected:
+        """The maps taken out of y, theta_beta and all given columns."""
+        gram, cross = self.products()
+        half = self._rows.factor.half(cross)
+        with one_thread():
+            schur = gram - half @ half.T
+        return Projected(0.5 * (schur + schur.T), gram.diagonal().copy(), half, self._rows.factor)
+
+
 def project(rows: Rows, given: list[Volumes]) -> Projected:
-    """Take the maps out of y, theta_beta and all given columns, condensed to the rows: used up."""
-    gram, cross = rows.head(given)
-    half = rows.factor.half(cross)
-    with one_thread():
-        schur = gram - half @ half.T
-    return Projected(0.5 * (schur + schur.T), gram.diagonal().copy(), half, rows.factor)
+    """Take the maps out of y, theta_beta and all given columns, condensed to the rows."""
+    heading = Heading(rows)
+    for column in given:
+        heading.put(column)
+    return heading.projected()

@@ -16,7 +16,7 @@ import numpy as np
 from rtid.diagnose.bank import columns_of
 from rtid.diagnose.commands import commands, split, transformed
 from rtid.diagnose.equations import regression_of, softened
-from rtid.diagnose.evidence import Rows, project, rows_of
+from rtid.diagnose.evidence import Heading, Rows, project, rows_of
 from rtid.diagnose.moving import halfway, is_as_good, is_worse, moved, reweighed, steadied
 from rtid.diagnose.regression import Estimate, Regression
 from rtid.diagnose.revision import Revision
@@ -276,11 +276,12 @@ def one_pass(
     rows = known or rows_of(model, sent, weights, soft=soft)
     before = start.map if start else before or _map_alone(model, rows)
     view = RecordView.of(model, sent, weights, before)
-    given = rows.condensed, commands(declared, chunk), weights, revision
+    heading = Heading(rows)
+    given = heading.add, commands(declared, chunk), weights, revision
     columns, n_timing, shapes = columns_of(view, *given, bank, more, suspects)
     first = 1 + len(model.chambers) + n_timing + len(shapes)
     view.rest()
-    projected = project(rows, columns.released())
+    projected = heading.projected()
     dof = float(rows.n - TERMS * len(rows.cells))
     regression = regression_of(model, weights, revision, projected, columns, rows, dof)
     weak = slice(first - len(shapes) - sum(len(psi) for _, psi in revision.timings), first)

@@ -35,8 +35,11 @@ def between_halves(fitted: Fit, column: int) -> tuple[float, float]:
     given = fitted.model, fitted.sent, fitted.weights
     rows = fitted.rows or rows_of(*given, soft=softened(*given, fitted.revision))
     sent = commands(fitted.declared, fitted.chunk)
-    columns, _, _ = columns_of(fitted.view, rows.condensed, sent, fitted.weights, fitted.revision)
-    whole, first = columns.released(), fitted.first_given
+    whole, first = list[Volumes](), fitted.first_given
+    columns, _, _ = columns_of(
+        fitted.view, lambda v, _: whole.append(rows.on_rows(v)), sent, fitted.weights,
+        fitted.revision,
+    )  # fmt: skip
     at, is_first = first + len(whole), first_half(whole[column - first])
     halved = [column, columns.echo_of[column]] if column in columns.echo_of else [column]
     columns.echo_of |= {at + k: at + 1 for k in range(len(halved) - 1)}

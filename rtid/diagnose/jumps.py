@@ -85,7 +85,7 @@ def _gains(present: Fit, rest: Misfit, steps: list[Jump]) -> FloatArray:
     rows = present.rows or rows_of(present.model, present.sent, present.weights)
     known = columns_of_effects(present)
     given = [*known, *(_column(present, rest, step) for step in steps)]
-    s = project(rows, [{c: rows.condensed(v) for c, v in g.items()} for g in given]).schur
+    s = project(rows, [rows.on_rows(g) for g in given]).schur
     n = present.first_given + len(known)
     inner = s[1:n, 1:n] + np.diag(np.maximum(1e-9 * np.diag(s)[1:n], 1e-300))
     left = s - s[:, 1:n] @ np.linalg.solve(inner, s[1:n])

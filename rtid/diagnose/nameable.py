@@ -11,7 +11,6 @@ motion shows more, a smaller effect is named as well (one of a tenth was).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -20,12 +19,13 @@ import numpy as np
 from rtid.diagnose.bank import add_shapes, add_timing, offer
 from rtid.diagnose.commands import commands
 from rtid.diagnose.consequence import ALIKE, BEND, BENT, HIDDEN_GAIN, OWN, SOFTER
-from rtid.diagnose.evidence import Rows, project
+from rtid.diagnose.evidence import AT_ONCE, Rows, project
 from rtid.diagnose.excuse import counted
 from rtid.diagnose.regression import LIMIT_SD, Score
 from rtid.diagnose.residual import KNOWN
 from rtid.diagnose.verdict import MATERIAL
 from rtid.effects.column import Candidate, Columns
+from rtid.effects.law import Volumes
 from rtid.effects.laws.timing import COMMAND
 from rtid.estimator.misfit import can_be_explained
 from rtid.kernels.explain import filter_rows
@@ -143,39 +143,76 @@ def _numbers(candidate: Candidate) -> int:
 
 def _reaches(
     fit: Fit, rows: Rows, wanted: list[tuple[Candidate, float]], flow_m3s: float
-) -> Iterator[tuple[Candidate, Reach]]:
-    on_rows, narrow = _OnRows.of(fit, rows), _narrowness(fit)
-    n_c, first, used = len(fit.model.chambers), fit.first_given, list(fit.estimate.used)
-    at = [k - first for k in used if k >= first]
-    at += [fit.column(candidate) - first for candidate, _ in wanted]
-    columns = _columns(fit, rows, frozenset(at))
-    given = [columns[k] for k in at]
-    projected, whole = project(rows, given.copy()), rows.columns(given)
-    beside = [*range(1, first), *range(first, first + len(used) - n_c)]
-    gram = projected.schur[np.ix_(beside, beside)] + np.diag(fit.regression.prior[used] + NOTHING)
-    asked = slice(first + len(used) - n_c, None)
-    shares = np.asarray(np.linalg.solve(gram, projected.schur[beside, asked]).T, np.float64)
-    each = zip(wanted, shares, projected.terms(beside, shares, asked), strict=True)
-    for k, ((candidate, sd), b, terms) in enumerate(each, asked.start):
-        z, flows = whole[:, :, k], on_rows.flows(terms)
-        left = z - whole[:, :, beside] @ b - on_rows.into_chambers(flows)
-        softer = float(np.max(np.abs(b[:n_c]) * narrow, initial=0.0))
-        own = np.inf if candidate.where == COMMAND else on_rows.rms(z) / flow_m3s
-        reach = Reach(sd, on_rows.rms(left) / flow_m3s, own, on_rows.bend(flows), softer)
-        yield candidate, reach
-
-
-def _columns(fit: Fit, rows: Rows, wanted: frozenset[int]) -> list[dict[int, FloatArray]]:
-    """The columns behind the compliances, in the order of a fit with its bank, on the rows.
-
-    Those that are not wanted are there by their number alone.
-    """
-    sent = commands(fit.declared, fit.chunk)
-    columns = Columns(rows.condensed, wanted=wanted)
-    add_timing(fit.view, columns, sent, fit.weights, fit.revision)
+) -> list[tuple[Candidate, Reach]]:
+    """What leaving out each wanted candidate does; with them the deviations of their sizes."""
+    at = {fit.column(candidate) - fit.first_given: (candidate, sd) for candidate, sd in wanted}
+    bench = _Bench(fit, rows, flow_m3s, at)
+    columns = Columns(bench.take)
+    add_timing(fit.view, columns, commands(fit.declared, fit.chunk), fit.weights, fit.revision)
     list(add_shapes(fit.view, columns, fit.revision))
     offer(fit.view, columns, fit.revision, True, (), fit.suspects)
-    return columns.released()
+    return bench.ended()
+
+
+class _Bench:
+    """Takes the columns of a bank as they come, and tells of a few at a time.
+
+    wanted: candidate and deviation of its size, by the number of its column behind the compliances.
+    """
+
+    def __init__(
+        self, fit: Fit, rows: Rows, flow_m3s: float, wanted: dict[int, tuple[Candidate, float]]
+    ) -> None:
+        self._fit, self._rows, self._flow_m3s, self._wanted = fit, rows, flow_m3s, wanted
+        self._on_rows, self._narrow = _OnRows.of(fit, rows), _narrowness(fit)
+        self._used = {k - fit.first_given for k in fit.estimate.used}
+        self._n, self._beside = 0, list[Volumes]()
+        self._asked = list[tuple[Candidate, float, Volumes]]()
+        self._told = list[tuple[Candidate, Reach]]()
+
+    def take(self, volumes: Volumes, _is_aside: bool) -> None:
+        """The next column; those in use come before those that are wanted."""
+        if self._n in self._used:
+            self._beside.append(self._rows.on_rows(volumes))
+        elif self._n in self._wanted:
+            self._asked.append((*self._wanted[self._n], self._rows.on_rows(volumes)))
+        self._n += 1
+        if len(self._asked) == AT_ONCE:
+            self._tell()
+
+    def ended(self) -> list[tuple[Candidate, Reach]]:
+        """What was told, all columns having come."""
+        self._tell()
+        return self._told
+
+    def _tell(self) -> None:
+        used, n = list(self._fit.estimate.used), self._fit.first_given + len(self._beside)
+        given = [*self._beside, *(volumes for _, _, volumes in self._asked)]
+        projected, whole = project(self._rows, given), self._rows.columns(given)
+        gram = projected.schur[1:n, 1:n] + np.diag(self._fit.regression.prior[used] + NOTHING)
+        shares = np.asarray(np.linalg.solve(gram, projected.schur[1:n, n:]).T, np.float64)
+        terms = projected.terms(list(range(1, n)), shares, slice(n, None))
+        for k, (candidate, sd, _) in enumerate(self._asked):
+            follows = whole[:, :, 1:n] @ shares[k]
+            reach = self._reach(candidate, sd, whole[:, :, n + k], follows, (shares[k], terms[k]))
+            self._told.append((candidate, reach))
+        self._asked = []
+
+    def _reach(
+        self,
+        candidate: Candidate,
+        sd: float,
+        z: FloatArray,
+        follows: FloatArray,
+        b: tuple[FloatArray, FloatArray],
+    ) -> Reach:
+        """Of z (rows, chambers), m3, of which the columns in use follow a part; b: X's numbers."""
+        on_rows, (shares, terms) = self._on_rows, b
+        flows = on_rows.flows(terms)
+        left = on_rows.rms(z - follows - on_rows.into_chambers(flows)) / self._flow_m3s
+        softer = np.max(np.abs(shares[: len(self._narrow)]) * self._narrow, initial=0.0)
+        own = np.inf if candidate.where == COMMAND else on_rows.rms(z) / self._flow_m3s
+        return Reach(sd, left, own, on_rows.bend(flows), float(softer))
 
 
 def _narrowness(fit: Fit) -> FloatArray:

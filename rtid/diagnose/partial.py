@@ -194,8 +194,7 @@ class _Bench:
         """A column, m3/s per unit (n - 1, chambers), less what everything else follows of it."""
         shared = self.fit.first_given
         given = [volumes, *others]
-        condensed = [{c: self.rows.condensed(v) for c, v in g.items()} for g in given]
-        projected = project(self.rows, condensed)
+        projected = project(self.rows, [self.rows.on_rows(g) for g in given])
         used = [*range(1, shared), *range(shared + 1, shared + len(given))]
         theta = _followed(projected, used, shared, self.fit.regression.prior[1:shared])
         terms = projected.terms(used, theta, shared)

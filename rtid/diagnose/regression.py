@@ -121,15 +121,3 @@ class Regression:
         cross = self.s[at, column]
         gram = self.s[np.ix_(at, at)] + np.diag(self.prior[at] + 1e-300)
         return float(square - cross @ np.linalg.solve(gram, cross))
-
-    def alike(self, used: tuple[int, ...], a: int, b: int) -> float:
-        """Correlation of two candidates after maps and columns in use are taken out."""
-        at = list(used)
-        both = [a, b]
-        gram = self.s[np.ix_(both, both)]
-        if at:
-            cross = self.s[np.ix_(at, both)]
-            inner = self.s[np.ix_(at, at)] + np.diag(self.prior[at] + 1e-300)
-            gram = gram - cross.T @ np.linalg.solve(inner, cross)
-        size = np.sqrt(max(gram[0, 0], 0.0) * max(gram[1, 1], 0.0))
-        return float(gram[0, 1] / size) if size > 0 else 0.0

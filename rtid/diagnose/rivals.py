@@ -21,6 +21,7 @@ from rtid.diagnose.commands import commands
 from rtid.diagnose.equations import softened
 from rtid.diagnose.evidence import Rows, rows_of
 from rtid.diagnose.fit import Fit
+from rtid.effects.law import Volumes
 from rtid.estimator.misfit import crossed
 from rtid.kernels import products
 from rtid.plain import FloatArray, IntArray
@@ -43,10 +44,13 @@ def is_told_apart(best: Fit, other: Fit) -> bool:
 def loss(fit: Fit, rows: Rows) -> FloatArray:
     """-2 ln likelihood of each row (rows,), dimensionless, but for a constant; rows: the fit's."""
     sent = commands(fit.declared, fit.chunk)
-    columns, _, _ = columns_of(fit.view, rows.condensed, sent, fit.weights, fit.revision)
+    given = list[Volumes]()
+    columns, _, _ = columns_of(
+        fit.view, lambda v, _: given.append(rows.on_rows(v)), sent, fit.weights, fit.revision
+    )
     theta = dict(zip(fit.held.used, fit.held.theta, strict=True))
     at = {fit.column(e): fit.first + columns.candidates.index(e) for e in fit.revision.effects}
-    by_column = rows.columns(columns.released())
+    by_column = rows.columns(given)
     left = by_column[:, :, 0].copy()
     for column, value in theta.items():
         left -= value * by_column[:, :, at.get(column, column)]

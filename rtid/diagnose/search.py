@@ -18,7 +18,6 @@ from rtid.diagnose.evidence import project, rows_of
 from rtid.diagnose.fit import Fit, columns_of_effects, prepare
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.thinned import Thinning
-from rtid.effects.column import Columns
 from rtid.effects.law import Volumes
 from rtid.effects.laws.timing import COMMAND, Psi, TimingLaw, lagged
 from rtid.estimator.state import Weights
@@ -128,10 +127,7 @@ class Beside:
         self.most_rows = max(self.most_rows, rows.n)
         if rows.n < KEPT * self.most_rows:
             return float("inf"), np.zeros(0)
-        columns = Columns(rows.condensed)
-        for volumes in self.volumes:
-            columns.add(volumes)
-        s = project(rows, columns.released()).schur
+        s = project(rows, [rows.on_rows(volumes) for volumes in self.volumes]).schur
         theta = np.linalg.lstsq(s[1:, 1:], s[1:, 0], rcond=1e-12)[0]
         return float(s[0, 0] - s[0, 1:] @ theta), np.asarray(theta)
 

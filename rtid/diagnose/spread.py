@@ -52,9 +52,7 @@ def _spreads(fitted: Fit, rows: Rows) -> Iterator[tuple[int, float]]:
         if not total_softness(fitted.view, ((effect, 1.0),)).any():
             sized.append(fitted.column(effect))
     parts = [part for column in sized for part in _parts(given[column])]
-    condensed = [
-        {c: rows.condensed(v) for c, v in one.items()} for one in (*given.values(), *parts)
-    ]
+    condensed = [rows.on_rows(column) for column in (*given.values(), *parts)]
     s, n, base = project(rows, condensed).schur, fitted.first_given, list(given)
     prior, mean = (
         of[[*range(1, n), *base]] for of in (fitted.regression.prior, fitted.regression.mean)
@@ -86,11 +84,12 @@ def _of_wholes(fitted: Fit) -> Iterator[tuple[int, float]]:
 
 def _given(fitted: Fit) -> dict[int, Volumes]:
     """Volumes per interval of every column of a fit behind those of the compliances."""
-    view, revision, raw = fitted.view, fitted.revision, Columns(np.asarray)
+    view, revision, given = fitted.view, fitted.revision, list[Volumes]()
+    raw = Columns(lambda volumes, _: given.append(volumes))
     add_timing(view, raw, commands(fitted.declared, fitted.chunk), fitted.weights, revision)
     list(add_shapes(view, raw, revision))
     columns = [*range(fitted.first_given, fitted.first), *map(fitted.column, revision.effects)]
-    return dict(zip(columns, [*raw.released(), *columns_of_effects(fitted)], strict=True))
+    return dict(zip(columns, [*given, *columns_of_effects(fitted)], strict=True))
 
 
 def _parts(volumes: Volumes) -> list[Volumes]:

@@ -17,7 +17,6 @@ import numpy as np
 from rtid.effects.law import LENGTH, Placed, Shape, Volumes, fitted_names
 from rtid.effects.page import SPREAD, Effect, Parameter, effect
 from rtid.effects.record_view import RecordView
-from rtid.plain import FloatArray
 
 STEPS = (-1.0, -0.5, 0.5, 1.0)  # about a shape, in steps of its axes
 SLOPE_STEP = 0.05  # the same, for derivatives
@@ -187,31 +186,28 @@ def _axis(view: RecordView, p: Parameter) -> Shape:
 class Columns:
     """Candidates and columns, in the order in which they were added.
 
-    condense: what a series per interval (n - 1,) adds to the rows (rows,), which is all that is
-    kept, and only until it is `released`; wanted: numbers of the columns of which it is; None: all.
+    take: is given each of them, a record long, as it comes, and whether it stands aside: as what is
+    scored by itself, and not beside the others that do.
     """
 
-    condense: Callable[[FloatArray], FloatArray]
+    take: Callable[[Volumes, bool], object]
     candidates: list[Candidate] = field(default_factory=list)
     echo_of: dict[int, int] = field(default_factory=dict)  # column -> its echo's column
     n: int = 0
-    wanted: frozenset[int] | None = None
-    _columns: list[Volumes] = field(default_factory=list)
+    n_beside: int = 0  # candidates that do not stand aside: the first ones
 
-    def add(self, volumes: Volumes) -> int:
+    def add(self, volumes: Volumes, is_aside: bool = False) -> int:
         """Another column; its number."""
-        kept = volumes if self.wanted is None or self.n in self.wanted else {}
-        self._columns.append({c: self.condense(series) for c, series in kept.items()})
+        self.take(volumes, is_aside)
         self.n += 1
         return self.n - 1
 
-    def offer(self, candidate: Candidate, volumes: Volumes) -> None:
+    def offer(self, candidate: Candidate, volumes: Volumes, is_aside: bool = True) -> None:
         """Another candidate; candidates come before echoes."""
         self.candidates.append(candidate)
-        self.add(volumes)
+        self.n_beside += not is_aside
+        self.add(volumes, is_aside)
 
-    def released(self) -> list[Volumes]:
-        """What all columns add to the rows, chamber -> (rows,); kept no longer."""
-        columns, self._columns = self._columns, []
-        self.condense = np.asarray  # which held the rows
-        return columns
+    def ended(self) -> Columns:
+        """The same, let go of what took them, which holds the rows."""
+        return replace(self, take=lambda volumes, is_aside: None)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from rtid.diagnose import evidence
-from rtid.diagnose.evidence import Rows, project, rows_of
+from rtid.diagnose.evidence import Heading, Rows, project, rows_of
 from rtid.effects.law import Volumes
 from rtid.estimator.factor import PRIOR_SD
 from rtid.estimator.record import run
@@ -26,9 +26,17 @@ from tests.diagnose.records import record
 ROOT = Path(__file__).parents[2]
 
 
+def head(rows: Rows, given: list[Volumes]) -> tuple[np.ndarray, np.ndarray]:
+    """Products of y, theta_beta and condensed columns among themselves, and of the maps."""
+    heading = Heading(rows)
+    for column in given:
+        heading.put(column)
+    return heading.products()
+
+
 def gram_of(rows: Rows, given: list[Volumes] | None = None) -> np.ndarray:
     """Products of all columns: head, then maps."""
-    own, cross = rows.head(given or [])
+    own, cross = head(rows, given or [])
     maps = rows.maps()
     maps = np.tril(maps) + np.tril(maps, -1).T
     return np.block([[own, cross.T], [cross, maps]])
@@ -85,10 +93,8 @@ def test_products_are_those_of_whole_rows(row_s: float) -> None:
     expected = whole.T @ whole
     size = np.sqrt(np.outer(np.diag(expected), np.diag(expected))) + 1e-300
     assert np.abs(np.tril(maps - expected) / size).max() < 1e-9
-    head = rows.own.copy()
-    products.whitened(head, rows.fresh, rows.whiten, rows.keep)
-    flat = head.reshape(rows.n, -1)
-    _, cross = rows.head([])
+    flat = rows.whitened(rows.own.copy()).reshape(rows.n, -1)
+    _, cross = head(rows, [])
     scale = np.sqrt(np.outer(np.diag(expected), (flat**2).sum(axis=0))) + 1e-300
     assert np.abs((cross - whole.T @ flat) / scale).max() < 1e-9
 
@@ -129,9 +135,23 @@ def test_a_given_column_is_its_own_sum() -> None:
         v = chamber.v0_m3 + chamber.sign * chamber.area_m2 * chunk[:, 2 + model.column("x")]
         series.append(-weights.compliance[c] * 0.5 * (v[1:] + v[:-1]) * np.diff(p))
     rows = rows_of(model, chunk, weights)
-    gram, _ = rows.head([{c: rows.condensed(s)} for c, s in enumerate(series)])
+    gram, _ = head(rows, [{c: rows.condensed(s)} for c, s in enumerate(series)])
     assert gram[3:5, 3:5] == pytest.approx(gram[1:3, 1:3], rel=1e-9)
     assert gram[0, 3:5] == pytest.approx(gram[0, 1:3], rel=1e-9)
+
+
+def test_columns_that_stand_aside_meet_the_others_alone() -> None:
+    model, chunk, _ = record()
+    rows = rows_of(model, chunk[:3000], nominal_weights(model))
+    rng, aside = np.random.default_rng(1), Heading(rows)
+    columns = [{c: rng.standard_normal(len(rows.own))} for c in (0, 1) for _ in range(20)]
+    for k, column in enumerate(columns):
+        aside.put(column, is_aside=k > 0)
+    all_of_them, seen = project(rows, columns), aside.projected()
+    told = np.isfinite(seen.schur)
+    assert told[:4].all() and told[:, :4].all() and (told.sum(axis=0)[4:] == 5).all()
+    assert seen.schur[told] == pytest.approx(all_of_them.schur[told], rel=1e-9)
+    assert seen.own == pytest.approx(all_of_them.own, rel=1e-12)
 
 
 def test_means_of_positions_keep_the_information() -> None:

@@ -40,9 +40,11 @@ def add_echoes(
 
     of_slopes = (cause.slope_of(partial(echo_of, cause), shape, k) for cause, shape, k in slopes)
     of_all = (_echo(view, candidate, noise) for candidate in columns.candidates)
+    beside = len(slopes) + columns.n_beside
     for k, by_chamber in enumerate(chain(of_slopes, of_all)):  # one at a time: each is a record
         if by_chamber:
-            columns.echo_of[1 + n_c + first + k] = 1 + n_c + columns.add(by_chamber)
+            echo = columns.add(by_chamber, is_aside=k >= beside)
+            columns.echo_of[1 + n_c + first + k] = 1 + n_c + echo
 
 
 def _echo(view: RecordView, candidate: Candidate, noise: Volumes) -> Volumes:
