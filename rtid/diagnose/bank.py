@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
-from rtid.diagnose.commands import change_of
+from rtid.diagnose.commands import change_of, half_of
 from rtid.diagnose.revision import Revision
 from rtid.effects.column import Candidate, Cause, Columns
 from rtid.effects.law import Shape, Volumes
@@ -56,8 +56,7 @@ def add_timing(
     if not revision.replaces_lag:
         above, below = weights.lag_s + LAG_STEP_S, max(0.0, weights.lag_s - LAG_STEP_S)
         change = {}
-        for name in sent:
-            u = view.signal(name)
+        for name, (_, u) in _at_spools(view).items():
             rise = lagged_command(u, dt_s, (above,)) - lagged_command(u, dt_s, (below,))
             change[name] = rise / (above - below)
         columns.add(opening_change(view, change))
@@ -90,10 +89,15 @@ def add_shapes(view: RecordView, columns: Columns, revision: Revision) -> Iterat
                 yield e, k
 
 
+def _at_spools(view: RecordView) -> dict[str, tuple[int, FloatArray]]:
+    """Direction and command (n,), V, as it reaches the spools, by the names of a split machine."""
+    return {half_of(e): (e.direction, view.signal(e.command)) for e in view.model.edges}
+
+
 def opening_change(view: RecordView, change: dict[str, FloatArray]) -> Volumes:
     """Volumes (n - 1,), m3, per chamber of a small change of commands (n,), V, in the blocks."""
     flows = [
-        view.slope_u(i) * edge.direction * change[edge.command][:-1]
+        view.slope_u(i) * edge.direction * change[half_of(edge)][:-1]
         for i, edge in enumerate(view.model.edges)
     ]
     n_c = len(view.model.chambers)
@@ -125,14 +129,13 @@ def offer(
 
 def _offer_timings(view: RecordView, columns: Columns, revision: Revision) -> None:
     """What each timing of the bank would change, first order in the opening; coefficient 1."""
-    names = {e.command: e.direction for e in view.model.edges}
+    halves = _at_spools(view)
     for timing in timings_of(view.model, view.t_s):
         if revision.has((timing.effect, COMMAND)) or timing.own_spools:
             continue
         for psi in timing.bank:
             change = {
-                name: timing.on(view.signal(name), d, view.step_s, psi) - view.signal(name)
-                for name, d in names.items()
+                name: timing.on(u, d, view.step_s, psi) - u for name, (d, u) in halves.items()
             }
             columns.offer(
                 Candidate(

@@ -1,7 +1,7 @@
 """The commands of a record as they reach the spools, and the supply as the pump holds it.
 
 Edges that open with u > 0 and with u < 0 may be parts of one spool or valves of their own (see
-`timing`), so the machine is given a command for either direction.
+`timing`), so the machine is given a command for either direction, once anything has a timing.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from rtid.effects.laws.response import behind_s
 from rtid.effects.laws.sensors import sensors_of
 from rtid.effects.laws.timing import COMMAND, SUPPLY, Psi, TimingLaw
 from rtid.effects.record_view import RecordView
-from rtid.model import Machine
+from rtid.model import Edge, Machine
 from rtid.plain import FloatArray
 
 Timings = tuple[tuple[TimingLaw, Psi], ...]
@@ -36,6 +36,16 @@ def _half(name: str, direction: int) -> str:
     return name + ("+" if direction > 0 else "-")
 
 
+def half_of(edge: Edge) -> str:
+    """The command of an edge and its direction, whether or not the machine is split."""
+    return _half(edge.command.rstrip("+-"), edge.direction)
+
+
+def behind(model: Machine, timings: Timings) -> Machine:
+    """The machine of a record that is `transformed`."""
+    return split(model) if timings else model
+
+
 def commands(model: Machine, chunk: FloatArray) -> dict[str, tuple[int, FloatArray]]:
     """Direction and command (n,), V, as sent, by the names of the split machine.
 
@@ -49,10 +59,13 @@ def commands(model: Machine, chunk: FloatArray) -> dict[str, tuple[int, FloatArr
 
 
 def transformed(model: Machine, chunk: FloatArray, timings: Timings) -> FloatArray:
-    """The record of the split machine: commands as the timings let them reach the spools.
+    """The record of the machine `behind` timings: commands as these let them reach the spools.
 
-    chunk (n, 2 + signals), SI; the commands of the split machine stand behind its columns.
+    chunk (n, 2 + signals), SI; the commands of the split machine stand behind its columns.  Without
+    timings it is the record as it is: a copy would be as large.
     """
+    if not timings:
+        return chunk
     dt_s = float(np.median(np.diff(chunk[:, 0])))
     sent = [through(u, d, dt_s, timings) for d, u in commands(model, chunk).values()]
     return _put_right(split(model), np.column_stack([chunk, *sent]), timings)

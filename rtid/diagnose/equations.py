@@ -27,12 +27,12 @@ def softened(model: Machine, chunk: FloatArray, weights: Weights, revision: Revi
     that of a measured rate stands behind its lag.
     """
     view = RecordView.without_map(model, chunk, weights.compliance)
-    more = np.zeros((view.n, len(model.chambers)))
+    nothing = np.broadcast_to(0.0, (view.n, len(model.chambers)))  # which takes no memory
     if not (model.measured or revision.sizes):
-        return more
+        return nothing
     if model.measured:
-        return more + behind_softness(model, behind_s(revision.timings), view.step_s)
-    softness = total_softness(view, revision.sizes)
+        return nothing + behind_softness(model, behind_s(revision.timings), view.step_s)
+    softness, more = total_softness(view, revision.sizes), np.empty(nothing.shape)
     for c, chamber in enumerate(model.chambers):
         plain = view.volume(c) * view.compliance[c]
         noise = variance(model, chamber.pressure) * model.pressure_share

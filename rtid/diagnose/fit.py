@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from rtid.diagnose.bank import columns_of
-from rtid.diagnose.commands import commands, split, transformed
+from rtid.diagnose.commands import behind, commands, transformed
 from rtid.diagnose.equations import regression_of, softened
 from rtid.diagnose.evidence import Heading, Rows, project, rows_of
 from rtid.diagnose.moving import halfway, is_as_good, is_worse, moved, reweighed, steadied
@@ -80,8 +80,8 @@ class Fit:
 
     @cached_property
     def model(self) -> Machine:
-        """The machine with split commands."""
-        return split(self.declared)
+        """The machine of the record as it reaches the spools."""
+        return behind(self.declared, self.revision.timings)
 
     @cached_property
     def sent(self) -> FloatArray:
@@ -268,7 +268,7 @@ def one_pass(
     if revision.replaces_lag:
         weights = replace(weights, lag_s=0.0)
     declared, sent = model, _sent(start, model, chunk, revision) if sent is None else sent
-    model = split(declared)
+    model = behind(declared, revision.timings)
     soft = softened(model, sent, weights, revision)
     known = _same_rows(start, sent, weights, soft)
     if known is None and start is not None:

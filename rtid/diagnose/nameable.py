@@ -182,7 +182,8 @@ class _Bench:
 
     def ended(self) -> list[tuple[Candidate, Reach]]:
         """What was told, all columns having come."""
-        self._tell()
+        if self._asked:
+            self._tell()
         return self._told
 
     def _tell(self) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from rtid.diagnose.commands import split, transformed
+from rtid.diagnose.commands import behind, transformed
 from rtid.diagnose.fit import first_map
 from rtid.diagnose.revision import Revision
 from rtid.effects.column import Candidate, Cause
@@ -63,7 +63,7 @@ def recall(
     fixed = [part for part, timing in told if timing is None]
     if not fixed:
         return Revision((), timings)
-    sent, whole = transformed(model, chunk, timings), split(model)
+    sent, whole = transformed(model, chunk, timings), behind(model, timings)
     view = RecordView.of(whole, sent, weights, first_map(whole, sent, weights))
     offered = causes(view, suspects)
     return Revision(tuple(_candidate(p, offered) for p in fixed), timings)

@@ -14,6 +14,7 @@ clusters: Cameron, Gelbach and Miller 2011).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
@@ -59,11 +60,11 @@ def can_be_explained(chunk: FloatArray) -> bool:
 class Misfit:
     """A fit held against its record, per interval (n - 1).
 
-    flow (n - 1, 2 x chambers): measured and modelled, m3/s; innovation (n - 1, chambers): whitened,
-    NaN where no row; cells (n - 1, edges): grid cell, -1 shut.
+    missed (n - 1, chambers): measured flow less modelled, m3/s; innovation (n - 1, chambers):
+    whitened, NaN where no row; cells (n - 1, edges): grid cell, -1 shut, in half of an index.
     """
 
-    flow: FloatArray
+    missed: FloatArray
     innovation: FloatArray
     cells: Cells
 
@@ -130,7 +131,8 @@ def _residual(
     flow, innovation = np.empty((n - 1, 2 * n_c)), np.empty((n - 1, n_c))
     cells = np.empty((n - 1, len(model.edges)), np.int64)
     explain(state.engine, state.cells, theta, compliance, chunk, flow, cells, innovation)
-    return Misfit(flow, innovation, cells)
+    missed = flow[:, 0::2] - flow[:, 1::2]
+    return Misfit(missed, innovation, cast("Cells", cells.astype(np.int32)))
 
 
 def _of_chamber(model: Machine, cells: Cells, chamber: int) -> Cells:

@@ -115,7 +115,7 @@ def _stays(
     c: int,
     edges: list[int],
 ) -> _Stays:
-    missed = residual.flow[:, 2 * c] - residual.flow[:, 2 * c + 1]
+    missed = residual.missed[:, c]
     dt, known = np.diff(chunk[:, 0]), np.isfinite(missed)
     moved = (np.diff(residual.cells[:, edges], axis=0) != 0).any(axis=1)
     cut = np.diff(np.floor(chunk[1:, 0] / STAY_S)) != 0

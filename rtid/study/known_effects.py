@@ -99,9 +99,6 @@ def acting(fit: Fit, chunk: FloatArray, published: FlowMap | None = None) -> Act
         of_terms = model.with_taylor_maps
         known = everywhere(of_terms, published)
         view = RecordView.of(of_terms, sent, fit.weights, known, fit.view)
-    if not fit.revision.timings:  # nothing was done to the commands
-        model, sent = fit.declared, chunk
-        model = with_positive_pressures(model, chunk)
     if fit.revision.replaces_lag:
         model = replace(model, lag=Lag())
     if lag_s := behind_s(fit.revision.timings):
