@@ -54,12 +54,7 @@ def add_timing(
     """
     dt_s, n = view.step_s, 0
     if not revision.replaces_lag:
-        above, below = weights.lag_s + LAG_STEP_S, max(0.0, weights.lag_s - LAG_STEP_S)
-        change = {}
-        for name, (_, u) in _at_spools(view).items():
-            rise = lagged_command(u, dt_s, (above,)) - lagged_command(u, dt_s, (below,))
-            change[name] = rise / (above - below)
-        columns.add(opening_change(view, change))
+        columns.add(opening_change(view, _slower(view, weights.lag_s)))
         n += 1
     for k, (timing, psi) in enumerate(revision.timings):
         for j in range(len(psi)):
@@ -75,6 +70,17 @@ def add_timing(
                 columns.add(opening_change(view, change))
             n += 1
     return n
+
+
+def _slower(view: RecordView, lag_s: float) -> dict[str, FloatArray]:
+    """How the commands at the spools (n,) follow the lag, V/s."""
+    above, below = lag_s + LAG_STEP_S, max(0.0, lag_s - LAG_STEP_S)
+
+    def slower(u: FloatArray) -> FloatArray:
+        rise = lagged_command(u, view.step_s, (above,)) - lagged_command(u, view.step_s, (below,))
+        return rise / (above - below)
+
+    return {name: slower(u) for name, (_, u) in _at_spools(view).items()}
 
 
 def add_shapes(view: RecordView, columns: Columns, revision: Revision) -> Iterator[tuple[int, int]]:

@@ -276,6 +276,7 @@ def one_pass(
     rows = known or rows_of(model, sent, weights, soft=soft)
     before = start.map if start else before or _map_alone(model, rows)
     view = RecordView.of(model, sent, weights, before)
+    view.rest()  # of what the rows took; nothing was read along it yet
     heading = Heading(rows)
     given = heading.add, commands(declared, chunk), weights, revision
     columns, n_timing, shapes = columns_of(view, *given, bank, more, suspects)

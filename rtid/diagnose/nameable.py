@@ -146,15 +146,15 @@ def _reaches(
 ) -> list[tuple[Candidate, Reach]]:
     """What leaving out each wanted candidate does; with them the deviations of their sizes."""
     at = {fit.column(candidate) - fit.first_given: (candidate, sd) for candidate, sd in wanted}
-    bench = _Bench(fit, rows, flow_m3s, at)
-    columns = Columns(bench.take)
+    gathering = _Gathering(fit, rows, flow_m3s, at)
+    columns = Columns(gathering.take)
     add_timing(fit.view, columns, commands(fit.declared, fit.chunk), fit.weights, fit.revision)
     list(add_shapes(fit.view, columns, fit.revision))
     offer(fit.view, columns, fit.revision, True, (), fit.suspects)
-    return bench.ended()
+    return gathering.ended()
 
 
-class _Bench:
+class _Gathering:
     """Takes the columns of a bank as they come, and tells of a few at a time.
 
     wanted: candidate and deviation of its size, by the number of its column behind the compliances.

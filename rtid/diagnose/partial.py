@@ -167,14 +167,17 @@ class _Bench:
         others = {key: v for key, (_, v) in self.effects.items() if key != named}
         whole = others if candidate.key == named else others | {named: self.effects[named][1]}
         scale = physical(self.fit, candidate, 1.0)
-        x = [self._left_of(volumes, list(v.values())) / scale for v in (others, whole)]
         view = RecordView.of(self.fit.model, self.fit.sent, self.fit.weights, self.fit.map)
+        x = [
+            behind_lag(self.fit, view, self._left_of(volumes, list(v.values())) / scale)
+            for v in (others, whole)
+        ]
         after = measured(view) - modelled(self.fit, view)
         before = after + self._given(named) * self._left_of(
             self.effects[named][1], list(others.values())
         )
-        rates = [behind_lag(self.fit, view, rate) for rate in (before, after, *x)]
-        _, parts = through_filter(view, rates)
+        rates = [behind_lag(self.fit, view, rate) for rate in (before, after)]
+        _, parts = through_filter(view, [*rates, *x])
         acting = [c for c, v in volumes.items() if np.any(v != 0.0)]
         rest = [part.T[acting].ravel() for part in parts]
         name = f"{candidate.effect}:{candidate.where}"

@@ -95,8 +95,11 @@ def residual(
     sent = transformed_like(fit, chunk)
     view = RecordView.of(fit.model, sent, fit.weights, fit.map, fit.view)
     flows = measured(view)
-    left, noise = flows - modelled(fit, view, leave_out), _noise(fit, view)
-    rates = [seen_rates(view, flows), behind_lag(fit, view, left), behind_lag(fit, view, noise)]
+    rates = [
+        seen_rates(view, flows),
+        behind_lag(fit, view, flows - modelled(fit, view, leave_out)),
+        behind_lag(fit, view, _noise(fit, view)),
+    ]
     t_s, (moved, left, noise) = through_filter(view, rates, everywhere)
     return Residual(t_s, moved, left, noise, fit.model.filter.rows_per_s)
 
@@ -135,13 +138,19 @@ def through_filter(
     Instants in s, rates in m3/s.  view: the record beside the map, whose unknown places are
     left out, or with `everywhere` those off its grid alone.
     """
-    rates_of_all = np.concatenate(rates, axis=1)
-    by = view.model.filter
-    rates_of_all[~(view.inside if everywhere else is_known(view))] = np.nan
+    by, lost = view.model.filter, ~(view.inside if everywhere else is_known(view))
+    for rate in rates:
+        lost |= np.isnan(rate).any(axis=1)
     period = 1.0 / by.rows_per_s
-    out = np.empty((int((view.t_s[-1] - view.t_s[0]) / period) + 2, 1 + rates_of_all.shape[1]))
-    n = filter_rows(view.t_s, rates_of_all, by.wn_rad_s, by.zeta, period, out)
-    return out[:n, 0], np.split(out[:n, 1:], len(rates), axis=1)
+    most, t_s = int((view.t_s[-1] - view.t_s[0]) / period) + 2, view.t_s[:0]
+    parts = list[FloatArray]()
+    for rate in rates:  # one at a time: all beside one another are as large as the record
+        out = np.empty((most, 1 + rate.shape[1]))
+        masked = np.where(lost[:, None], np.nan, rate)
+        n = filter_rows(view.t_s, masked, by.wn_rad_s, by.zeta, period, out)
+        t_s = out[:n, 0]
+        parts.append(out[:n, 1:])
+    return t_s, parts
 
 
 def transformed_like(fit: Fit, chunk: FloatArray) -> FloatArray:
