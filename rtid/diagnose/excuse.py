@@ -87,5 +87,6 @@ def _machine(present: Fit) -> tuple[Machine, FloatArray]:
     for columns, (_, value) in volumes:
         for c, volume in columns.items():
             flow[:, c] += value * volume / present.view.dt_s
+    present.view.rest()
     model, _, chunk = with_extra_flow(present.model, np.zeros(0), present.sent, flow)
     return replace(model, terms=tuple(replace(term, sd=KNOWN) for term in model.terms)), chunk

@@ -41,6 +41,7 @@ from rtid.ui.arrival import Arrival, choose
 from rtid.ui.browser_page import build
 from rtid.ui.live_page import Live
 from rtid.ui.packing import Packed, Packing
+from rtid.ui.parcel import unread
 from rtid.ui.release_form import PLACE as RELEASED
 from rtid.ui.security import TOKEN, Door, Refusal
 from rtid.ui.shared import Session
@@ -338,9 +339,15 @@ def start(
         ahead = partial(import_module, "rtid.ui.desk_views")
         threading.Thread(target=ahead, name="rtid-ahead", daemon=True).start()
     url = f"http://{_in_url(host)}:{door.port}/?{TOKEN}={door.token}"
-    trimming = PeriodicCallback(give_back, TRIM_MS)
+    trimming = PeriodicCallback(_let_go, TRIM_MS)
     trimming.start()
     return Workbench(server, guarded, session, url, turns, trimming)
+
+
+def _let_go() -> None:
+    """Give back what pictures took while they were drawn."""
+    unread()
+    give_back()
 
 
 def _bound(host: str, port: int) -> list[socket]:

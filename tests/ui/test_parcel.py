@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from rtid.ui.parcel import LARGE, packed
+from rtid.ui.parcel import LARGE, packed, unread
 from rtid.ui.worker import Worker, started
 
 MANY, PATIENCE_S = LARGE // 8 + 1, 120.0
@@ -34,6 +34,14 @@ def test_several_arrays_lie_one_behind_the_other(tmp_path: Path) -> None:
     arrays += [np.zeros((0, 2)), rng.normal(size=(MANY, 2))[:, 0]]  # empty, and with gaps
     taken = packed(arrays, tmp_path).value()
     assert all(np.array_equal(a, b) for a, b in zip(arrays, taken, strict=True))
+
+
+def test_what_was_let_go_is_read_again(tmp_path: Path) -> None:
+    value = np.arange(2.0 * MANY)
+    taken = packed(value, tmp_path).value()
+    assert np.array_equal(taken, value)
+    unread()
+    assert np.array_equal(taken, value)
 
 
 def test_what_is_small_needs_no_file(tmp_path: Path) -> None:
