@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks.interleave import Job, interleave, report
 from rtid.compare import compare, examine, learned, simulate
-from rtid.estimator.estimator import to_chunk
+from rtid.estimator.chunk import to_chunk
 from rtid.estimator.published import publish
 from rtid.estimator.record import fit_record
 from rtid.sim.declare import declared_model

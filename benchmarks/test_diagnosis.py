@@ -15,7 +15,7 @@ import pytest
 
 from benchmarks.interleave import report
 from rtid.diagnose.diagnosis import search
-from rtid.estimator.estimator import to_chunk
+from rtid.estimator.chunk import to_chunk
 from rtid.model import Machine
 from rtid.plain import FloatArray
 from rtid.sim.declare import declared_model

@@ -23,7 +23,7 @@ REMEDIES = {
     "Replay": "make it with rtid.study.replay.replay(project, path)",
     "Solution": "take it from an Estimator's solution(), or from a Replay's fit.solution",
     "Model": "take the model of a Project or of a Replay",
-    "ndarray": "give a NumPy array; rtid.estimator.estimator.to_chunk makes one from Samples",
+    "ndarray": "give a NumPy array; rtid.estimator.chunk.to_chunk makes one from Samples",
     "Path": "give a path as a text or a pathlib.Path",
 }
 

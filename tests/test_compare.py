@@ -10,7 +10,7 @@ import pytest
 
 from rtid.compare import ReferenceMap, block_rows, compare, deviations, learned, refitted
 from rtid.compare.reference import GainTable, MissingEdgeError
-from rtid.estimator.estimator import to_chunk
+from rtid.estimator.chunk import to_chunk
 from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.published import publish
 from rtid.estimator.record import RecordFit, fit_record

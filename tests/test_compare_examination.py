@@ -32,7 +32,7 @@ from rtid.compare.comparison import Comparison, Intervals
 from rtid.compare.cusum import factor, recursive_residuals
 from rtid.compare.motion import _roughness, _solve, smoothed
 from rtid.compare.tables import CAUSES, NEVER, cause_of
-from rtid.estimator.estimator import to_chunk
+from rtid.estimator.chunk import to_chunk
 from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.published import publish
 from rtid.estimator.record import RecordFit, fit_record

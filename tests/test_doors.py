@@ -14,7 +14,8 @@ import pytest
 from firmware_bridge.samples import Samples
 from rtid.errors import ArgumentError
 from rtid.estimator.batch import fit_batch
-from rtid.estimator.estimator import Estimator, to_chunk
+from rtid.estimator.chunk import to_chunk
+from rtid.estimator.estimator import Estimator
 from rtid.estimator.published import publish
 from rtid.estimator.record import fit_record
 from rtid.excite.exciting import excite

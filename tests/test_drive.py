@@ -15,7 +15,7 @@ import pytest
 from firmware_bridge.averaged import Averaged
 from firmware_bridge.samples import GAP, ROW, Samples, join
 from rtid.cli.exits import Exit
-from rtid.estimator.estimator import to_chunk
+from rtid.estimator.chunk import to_chunk
 from rtid.project import ProjectError, load
 from rtid.study.on_board import on_board
 from rtid.study.quick import quick

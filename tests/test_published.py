@@ -11,7 +11,7 @@ from scipy.stats import norm
 
 from rtid.compare.reference import GainTable, ReferenceMap
 from rtid.estimator import published
-from rtid.estimator.estimator import to_chunk
+from rtid.estimator.chunk import to_chunk
 from rtid.estimator.flowmap import EXTRAPOLATED, LEARNING, PRIOR, VALID, EdgeMap, FlowMap
 from rtid.estimator.monotone import FALLS, LIMIT, looked_at
 from rtid.estimator.prior import reference_map

@@ -17,7 +17,7 @@ from rtid.cli.exits import Exit
 from rtid.cli.main import run
 from rtid.compare.dead_band import dead_band
 from rtid.diagnose.disturbance import with_disturbance
-from rtid.estimator.estimator import to_chunk
+from rtid.estimator.chunk import to_chunk
 from rtid.plain import FloatArray
 from rtid.project import ProjectError, load
 from rtid.study.study import Study

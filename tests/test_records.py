@@ -11,7 +11,7 @@ import pytest
 from scipy.signal import savgol_filter
 
 from rtid.errors import RtidError
-from rtid.estimator.estimator import to_chunk
+from rtid.estimator.chunk import to_chunk
 from rtid.plain import FloatArray
 from rtid.project import ProjectError, load
 from rtid.study.quick import quick

@@ -18,7 +18,8 @@ from rtid.sim.random_plants import draw
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from rtid.study.replay import replay
-from rtid.trace.learner import Learner, catalog_of
+from rtid.trace.described import catalog_of
+from rtid.trace.learner import Learner
 from rtid.trace.reading import read_trace
 from rtid.trace.snapshot import SnapshotError
 from rtid.trace.snapshot import load as load_snapshot

@@ -12,7 +12,7 @@ import numpy as np
 from firmware_bridge.lookup import Table
 from firmware_bridge.samples import ROW
 from rtid.apply.judge import KnownMap
-from rtid.estimator.estimator import to_chunk
+from rtid.estimator.chunk import to_chunk
 from rtid.estimator.published import publish
 from rtid.estimator.record import fit_record
 from rtid.maps.lookup import sample

@@ -30,7 +30,7 @@ SECTIONS = {
             "rtid.study.replay:replay",
             "rtid.study.replay:Replay",
         ),
-        *("rtid.estimator.estimator:Estimator", "rtid.estimator.estimator:to_chunk"),
+        *("rtid.estimator.estimator:Estimator", "rtid.estimator.chunk:to_chunk"),
         *("rtid.tell.arrays:fit", "rtid.study.study:Study"),
         *("rtid.estimator.record:fit_record", "rtid.estimator.record:RecordFit"),
         *("rtid.estimator.solution:Solution", "rtid.estimator.blocks:Block"),

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from firmware_bridge.catalog import load
 from firmware_bridge.config import CYCLE, Assembly, SignalSource
-from rtid.estimator.estimator import to_chunk
+from rtid.estimator.chunk import to_chunk
 from rtid.model import (
     COMMAND,
     NONE,

@@ -19,7 +19,7 @@ from firmware_bridge.sources.live_bus import ON_PORTS
 from rtid.apply.answers import SHORT, heard
 from rtid.errors import RtidError
 from rtid.project import Project
-from rtid.trace.learner import catalog_of
+from rtid.trace.described import catalog_of
 from rtid.trace.state_files import opened
 
 TEST_BUSES = ("udp_multicast", "virtual")

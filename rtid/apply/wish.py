@@ -14,7 +14,7 @@ from rtid.apply.judge import Judgement, KnownMap, judge
 from rtid.apply.plan import ApplyError
 from rtid.apply.versions import Applied
 from rtid.errors import RtidError
-from rtid.estimator.estimator import to_chunk
+from rtid.estimator.chunk import to_chunk
 from rtid.maps.files import read_map
 from rtid.plain import FloatArray
 from rtid.project import Project

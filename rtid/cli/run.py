@@ -133,7 +133,7 @@ def _opener(loaded: Project, interface: str, channel: str) -> Callable[[], Sourc
     """How to open the bus, listening only, with the frames of the project alone."""
     from firmware_bridge.j1939 import Network
     from firmware_bridge.sources.live_bus import open_live
-    from rtid.trace.learner import catalog_of
+    from rtid.trace.described import catalog_of
 
     catalog = catalog_of(loaded)
     messages = loaded.assembly.messages

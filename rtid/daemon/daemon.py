@@ -40,7 +40,8 @@ from rtid.daemon.warm import compiled
 from rtid.errors import RtidError
 from rtid.project import Project
 from rtid.study.on_board import on_board
-from rtid.trace.learner import Learner, catalog_of
+from rtid.trace.described import catalog_of
+from rtid.trace.learner import Learner
 from rtid.trace.snapshot import Generations
 from rtid.trace.state_files import create
 

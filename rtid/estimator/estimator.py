@@ -12,8 +12,9 @@ from copy import deepcopy
 import numpy as np
 
 from firmware_bridge.samples import Samples
-from rtid.errors import door, require
+from rtid.errors import require
 from rtid.estimator.blocks import VALID
+from rtid.estimator.chunk import to_chunk
 from rtid.estimator.factor import one_thread
 from rtid.estimator.forgetting import faded, halved_surprise, without_surprise
 from rtid.estimator.ring import History
@@ -29,22 +30,6 @@ from rtid.plain import BoolArray, FloatArray, IntArray
 KNOWN = 0.05  # relative sd of the compliances up to which a map may judge rows
 AT_ONCE = 4096  # rows that are looked through for the next upkeep
 NO_STAMP_US = 2.0**53  # a time that is no number, or beyond whole microseconds in a float
-
-
-@door
-def to_chunk(model: Machine, samples: Samples, origin_us: int) -> FloatArray:
-    """The kernel's view of samples: (n, 2 + signals) = [s since origin_us, flags, values...].
-
-    Raises KeyError if a signal of the model is missing among the samples.
-    """
-    missing = [s.name for s in model.signals if s.name not in samples.names]
-    if missing:
-        raise KeyError(f"the samples lack {', '.join(missing)}")
-    chunk = np.empty((len(samples), 2 + len(model.signals)))
-    chunk[:, 0] = (samples.t_us - origin_us) * 1e-6
-    chunk[:, 1] = samples.flags
-    chunk[:, 2:] = samples.values[:, [samples.names.index(s.name) for s in model.signals]]
-    return chunk
 
 
 def stamps_us(chunk: FloatArray) -> tuple[IntArray, BoolArray]:

@@ -29,7 +29,8 @@ from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import SimulatedPlant
 from rtid.study.compared import TraceComparison, compare_trace
 from rtid.study.replay import replay
-from rtid.trace.learner import Learner, catalog_of, listen, virtual_bus
+from rtid.trace.described import catalog_of
+from rtid.trace.learner import Learner, listen, virtual_bus
 
 MOTION = "rich"
 WORN_MOTION, WORN_S = "rich_record", 110.0

@@ -15,7 +15,8 @@ import numpy as np
 from firmware_bridge.config import Assembly
 from firmware_bridge.samples import Samples
 from rtid.errors import RtidError
-from rtid.estimator.estimator import Estimator, to_chunk
+from rtid.estimator.chunk import to_chunk
+from rtid.estimator.estimator import Estimator
 from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.noise import estimate_noise
 from rtid.estimator.record import RecordFit, fit_record
@@ -23,7 +24,8 @@ from rtid.maps.prior_map import find_prior, published
 from rtid.model import Machine, Signal
 from rtid.plain import FloatArray, Progress
 from rtid.project import Project
-from rtid.trace.learner import Learner, catalog_of, listen, virtual_bus
+from rtid.trace.described import catalog_of
+from rtid.trace.learner import Learner, listen, virtual_bus
 from rtid.trace.measured import with_sums
 from rtid.trace.reading import AT_ONCE, NoSamplesError, Trace, assemble
 

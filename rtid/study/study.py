@@ -30,7 +30,8 @@ from rtid.diagnose.verdict import UNKNOWN
 from rtid.effects import Effect
 from rtid.effects.page import is_zero
 from rtid.errors import door
-from rtid.estimator.estimator import Estimator, to_chunk
+from rtid.estimator.chunk import to_chunk
+from rtid.estimator.estimator import Estimator
 from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.record import RecordFit
 from rtid.estimator.solution import Solution
@@ -142,6 +143,10 @@ class Study:
             progress("reading", 0.0)
             vars(self)["read"], self.records = read_records(project, paths)
             self.project = with_spans(project, self.records)
+
+    def take(self, read: Trace) -> None:
+        """Take a trace that was read before, as `read` would."""
+        vars(self)["read"] = read
 
     @cached_property
     def machine(self) -> Machine:

@@ -6,9 +6,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from firmware_bridge.catalog import Catalog
+from firmware_bridge.catalog import Catalog, load
 from firmware_bridge.frames import EXTENDED, Frames
 from firmware_bridge.j1939 import Network
+from rtid.errors import RtidError
+from rtid.project import Project
+
+
+def catalog_of(project: Project) -> Catalog:
+    """The bit layouts of the project's databases.  RtidError if it names none."""
+    if not project.databases:
+        raise RtidError(
+            f"{project.path}: source.dbc is missing", "name the DBC of the CAN trace", 2
+        )
+    named = project.sections.messages.items()
+    return load(project.databases).with_aliases({n: m.of for n, m in named if m.of is not None})
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ import numpy as np
 
 from firmware_bridge.assemble import Assembler
 from firmware_bridge.averaged import Averaged
-from firmware_bridge.catalog import Catalog, load
+from firmware_bridge.catalog import Catalog
 from firmware_bridge.config import CYCLE, Assembly
 from firmware_bridge.frames import Frames, add_counts, empty, to_messages
 from firmware_bridge.frozen import REASON as FROZEN
@@ -32,27 +32,16 @@ from firmware_bridge.senders import Senders
 from firmware_bridge.sources.can_bus import CanBus
 from firmware_bridge.sources.live import LiveSource
 from rtid.effects.flow_sums import FlowSums
-from rtid.errors import RtidError
-from rtid.estimator.estimator import Estimator, to_chunk
+from rtid.estimator.chunk import to_chunk
+from rtid.estimator.estimator import Estimator
 from rtid.model import COMMAND, MODE, Machine
 from rtid.plain import FloatArray
-from rtid.project import Project
 
 if TYPE_CHECKING:
     from rtid.effects.live import LiveFlow
     from rtid.effects.summed import RunningSum
 
 QUIET_READS = 5  # the bus is over when its sender has ended and so many reads found nothing
-
-
-def catalog_of(project: Project) -> Catalog:
-    """The bit layouts of the project's databases.  RtidError if it names none."""
-    if not project.databases:
-        raise RtidError(
-            f"{project.path}: source.dbc is missing", "name the DBC of the CAN trace", 2
-        )
-    named = project.sections.messages.items()
-    return load(project.databases).with_aliases({n: m.of for n, m in named if m.of is not None})
 
 
 class Learner:

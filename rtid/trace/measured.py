@@ -9,7 +9,7 @@ import numpy as np
 from firmware_bridge.averaged import Averaged
 from firmware_bridge.samples import Samples
 from rtid.effects.flow_sums import FlowSums
-from rtid.estimator.estimator import to_chunk
+from rtid.estimator.chunk import to_chunk
 from rtid.project import Project
 
 

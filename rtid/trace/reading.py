@@ -17,11 +17,11 @@ from firmware_bridge.samples import Samples, join
 from firmware_bridge.sources import open_file, open_log
 from firmware_bridge.sources.table import Table, to_samples
 from rtid.errors import RtidError, door
-from rtid.estimator.estimator import to_chunk
+from rtid.estimator.chunk import to_chunk
 from rtid.model import Machine
 from rtid.plain import FloatArray
 from rtid.project import Project
-from rtid.trace.learner import catalog_of
+from rtid.trace.described import catalog_of
 from rtid.trace.measured import with_sums
 from rtid.trace.neutral import about_neutral
 from rtid.trace.table import declared

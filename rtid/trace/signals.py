@@ -19,7 +19,7 @@ from rtid.errors import RtidError
 from rtid.plain import FloatArray
 from rtid.project import Project
 from rtid.trace.arrivals import Timing, timing
-from rtid.trace.learner import catalog_of
+from rtid.trace.described import catalog_of
 from rtid.trace.measured import with_sums
 from rtid.trace.neutral import about_neutral
 from rtid.trace.reading import assemble

@@ -31,7 +31,8 @@ from rtid.tell.quick_equations import plant_lines
 from rtid.tell.report_story import Ranked, ranked
 from rtid.tell.story import Chart
 from rtid.tell.words import VERDICTS
-from rtid.trace.glance import Curve, Glance, glance, glimpse
+from rtid.trace.glance import Glance, glance
+from rtid.ui.reader import Reader
 from rtid.ui.release_form import Released, ReleaseWish, release
 from rtid.ui.sending import Sending, Way, foretell, send
 from rtid.ui.upload import free_name
@@ -117,13 +118,19 @@ def _addition(made: _Revision) -> Addition:
     return Addition(made.section, made.sections, made.note)
 
 
-class Desk:
+class Desk(Reader):
     """One record and the stack of its revisions; every method is one job."""
 
     def __init__(self, progress: Progress) -> None:
-        self._progress = progress
+        super().__init__(progress)
         self._stack: list[_Revision] = []
-        self._opening: Study | None = None
+
+    @classmethod
+    def behind(cls, reader: Reader) -> Desk:
+        """The desk of a record that was read."""
+        desk = cls(reader._progress)
+        desk._read = reader._read
+        return desk
 
     def glance(self, file: Path, dbc: Path | None) -> Glance:
         """What is in a file that has no project."""
@@ -144,17 +151,15 @@ class Desk:
         kind, words = ("bad", "No verdict") if not looked.diagnosis else heading(looked.diagnosis)
         return Judged(kind, words, tuple(told)[:-2], project, project_text)
 
-    def read(self, project: Path, trace: Path) -> tuple[Curve, ...]:
-        """Read a record, which is then opened: its signals, before anything is learned."""
-        self._opening = study = Study(project, trace, self._progress)
-        return glimpse(study.machine, study.read.samples)
-
     def open(self, project: Path, trace: Path, sheet: Path | None) -> Opened:
         """Read and learn; the model has the effects that the project file has.
 
         sheet: data sheet or exported map to hold beside the learned one.
         """
-        study, self._opening = self._opening or Study(project, trace, self._progress), None
+        known, self._read = self._read, None
+        study = Study(known[0] if known else project, trace, self._progress)
+        if known:
+            study.take(known[1])
         learned, read = study.replay, study.trace
         self._progress("simulating the pressures", 0.8)
         seen, first = look(learned), _Revision(study, is_saved=True)

@@ -15,11 +15,14 @@ from multiprocessing.process import BaseProcess
 from multiprocessing.synchronize import Event
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rtid.errors import RtidError
 from rtid.plain import Progress, give_back
 from rtid.ui.parcel import packed
+
+if TYPE_CHECKING:
+    from rtid.ui.reader import Reader
 
 Then = Callable[[Any], None]
 OnLoop = Callable[[Callable[[], None]], None]
@@ -56,14 +59,14 @@ def serve(pipe: Connection, folder: Path, stop: Event) -> None:
     """
     os.nice(POLITE)  # the page comes first
     sys.modules.setdefault("asammdf", None)  # type: ignore[arg-type]  # as `cli.main` does
-    from rtid.ui.desk import Desk  # noqa: PLC0415 - only the worker imports the estimator's weight
+    from rtid.ui.reader import Reader  # noqa: PLC0415 - only the worker imports what reads
 
     def progress(text: str, share: float) -> None:
         if stop.is_set():
             raise StoppedError("stopped")
         pipe.send(("progress", (text, share)))
 
-    desk = Desk(progress)
+    desk = Reader(progress)
     while True:
         try:
             method, arguments = pipe.recv()
@@ -71,12 +74,20 @@ def serve(pipe: Connection, folder: Path, stop: Event) -> None:
             return
         stop.clear()
         try:
+            desk = desk if hasattr(desk, method) else _whole(desk)
             pipe.send(("done", packed(getattr(desk, method)(*arguments), folder)))
         except KeyboardInterrupt:
             return
         except Exception as error:
             pipe.send(("refused", in_words(method, error)))
         give_back()
+
+
+def _whole(reader: Reader) -> Reader:
+    """The desk of what was read: whoever waits for a record's signals need not wait for it."""
+    from rtid.ui.desk import Desk  # noqa: PLC0415 - the estimator's weight, a second or two
+
+    return Desk.behind(reader)
 
 
 @contextmanager

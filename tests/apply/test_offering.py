@@ -20,7 +20,7 @@ from rtid.apply.wish import Wish
 from rtid.daemon.jobs import Publication
 from rtid.daemon.offering import Offering
 from rtid.errors import RtidError
-from rtid.estimator.estimator import to_chunk
+from rtid.estimator.chunk import to_chunk
 from rtid.estimator.published import publish
 from rtid.estimator.solution import Solution
 from rtid.maps.files import provenance, write_map
@@ -29,7 +29,8 @@ from rtid.project import Project, load
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import SimulatedPlant
-from rtid.trace.learner import Learner, catalog_of
+from rtid.trace.described import catalog_of
+from rtid.trace.learner import Learner
 from tests.replays import shared_replays  # noqa: F401
 
 SECONDS, ROUGH_S, GOOD_S = 56.0, 8.0, 30.0

@@ -11,7 +11,7 @@ from multiprocessing import get_context
 from rtid.diagnose.diagnosis import search
 from rtid.diagnose.report import Diagnosis, diagnosis
 from rtid.diagnose.verdict import MATERIAL
-from rtid.estimator.estimator import to_chunk
+from rtid.estimator.chunk import to_chunk
 from rtid.sim.declare import declared_model
 from rtid.sim.hidden import HIDDEN, MECHANICAL, OUTSIDE, hide
 from rtid.sim.random_plants import draw, draw_hidden

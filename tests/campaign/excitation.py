@@ -16,7 +16,7 @@ import numpy as np
 
 from rtid.diagnose.diagnosis import search
 from rtid.diagnose.report import diagnosis
-from rtid.estimator.estimator import to_chunk
+from rtid.estimator.chunk import to_chunk
 from rtid.excite.exciting import excite
 from rtid.excite.motion_limits import Limits
 from rtid.excite.prediction import Prediction, assess, median_ratio

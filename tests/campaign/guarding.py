@@ -38,7 +38,8 @@ from rtid.sim.run import PlantChange, Run, simulate
 from rtid.sim.run_files import START_US
 from rtid.sim.sensing import P_A, P_B, P_S, Sensors, U, X
 from rtid.sim.simulated_plant import SimulatedPlant, Valve
-from rtid.trace.learner import Learner, catalog_of
+from rtid.trace.described import catalog_of
+from rtid.trace.learner import Learner
 from rtid.trace.snapshot import Generations
 
 PIECE = 600  # frames: 0.2 s

@@ -23,7 +23,7 @@ from rtid.diagnose.report import Diagnosis, Unseen, diagnosis
 from rtid.diagnose.standing import fitted, stand
 from rtid.effects.laws import causes
 from rtid.effects.laws.timing import RATE
-from rtid.estimator.estimator import to_chunk
+from rtid.estimator.chunk import to_chunk
 from rtid.estimator.flowmap import EXTRAPOLATED, VALID, EdgeMap
 from rtid.estimator.published import publish
 from rtid.estimator.solution import Solution

@@ -9,7 +9,7 @@ from multiprocessing import get_context
 
 import numpy as np
 
-from rtid.estimator.estimator import to_chunk
+from rtid.estimator.chunk import to_chunk
 from rtid.estimator.flowmap import VALID
 from rtid.estimator.record import RecordFit
 from rtid.estimator.state import build

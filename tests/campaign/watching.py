@@ -15,7 +15,8 @@ from rtid.sim.recording import write_run
 from rtid.sim.run import PlantChange, simulate
 from rtid.sim.run_files import START_US
 from rtid.sim.simulated_plant import SimulatedPlant
-from rtid.trace.learner import Learner, catalog_of
+from rtid.trace.described import catalog_of
+from rtid.trace.learner import Learner
 
 PUBLISH_S, PIECE = 10.0, 600  # frames: 0.2 s, as the loop hands them over
 

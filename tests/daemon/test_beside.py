@@ -23,7 +23,8 @@ from rtid.sim.run import simulate
 from rtid.sim.run_files import START_US
 from rtid.sim.simulated_plant import SimulatedPlant
 from rtid.study.on_board import learned_sizes, load_for, on_board
-from rtid.trace.learner import Learner, catalog_of
+from rtid.trace.described import catalog_of
+from rtid.trace.learner import Learner
 from rtid.trace.snapshot import SnapshotError, save
 from tests.faults.harness import drift, machine
 

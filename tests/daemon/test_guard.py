@@ -26,7 +26,8 @@ from rtid.daemon import jobs
 from rtid.daemon.analyst import Analyst
 from rtid.daemon.first import against_first
 from rtid.daemon.guard import Guard, State, candidate_of
-from rtid.estimator.estimator import Estimator, to_chunk
+from rtid.estimator.chunk import to_chunk
+from rtid.estimator.estimator import Estimator
 from rtid.estimator.published import publish
 from rtid.plain import FloatArray
 from rtid.sim.run import Run

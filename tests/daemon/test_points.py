@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from rtid.cli import main
-from rtid.estimator.estimator import Estimator, to_chunk
+from rtid.estimator.chunk import to_chunk
+from rtid.estimator.estimator import Estimator
 from rtid.project import Project, load
 from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import SimulatedPlant

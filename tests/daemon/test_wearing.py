@@ -12,7 +12,8 @@ from rtid.compare.foretelling import rated_m3s
 from rtid.daemon import jobs
 from rtid.daemon.calendar import trend as trend_of
 from rtid.daemon.wearing import LEAST, RATE, WearWatch
-from rtid.estimator.estimator import Estimator, to_chunk
+from rtid.estimator.chunk import to_chunk
+from rtid.estimator.estimator import Estimator
 from rtid.estimator.solution import Solution
 from rtid.estimator.sums import Sums
 from rtid.sim.run import simulate

@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 
-from rtid.estimator.estimator import to_chunk
+from rtid.estimator.chunk import to_chunk
 from rtid.model import Machine
 from rtid.plain import FloatArray
 from rtid.sim.declare import declared_model

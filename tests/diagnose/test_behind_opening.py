@@ -11,7 +11,7 @@ from rtid.diagnose.diagnosis import search
 from rtid.diagnose.exact import opens_at
 from rtid.diagnose.standing import fitted
 from rtid.effects.laws.timing import lagged, lagged_opening
-from rtid.estimator.estimator import to_chunk
+from rtid.estimator.chunk import to_chunk
 from rtid.model import Machine
 from rtid.plain import FloatArray
 from rtid.sim.declare import declared_model, default_grid

@@ -11,7 +11,7 @@ from rtid.diagnose.fit import Fit, fit, one_pass, prepare
 from rtid.diagnose.halves import between_halves, first_half
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.trials import Trial, best_by_key, scored
-from rtid.estimator.estimator import to_chunk
+from rtid.estimator.chunk import to_chunk
 from rtid.kernels.engine import GAP_FLAG
 from rtid.model import Machine
 from rtid.plain import FloatArray, Key

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rtid.estimator.estimator import to_chunk
+from rtid.estimator.chunk import to_chunk
 from rtid.estimator.flowmap import FlowMap
 from rtid.model import Machine
 from rtid.plain import FloatArray

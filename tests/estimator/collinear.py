@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rtid.estimator.estimator import to_chunk
+from rtid.estimator.chunk import to_chunk
 from rtid.model import Filter, Grid
 from rtid.plain import FloatArray
 from rtid.sim.closed_loop import DITHER, LOAD, V_REF, X_REF

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rtid.estimator.estimator import to_chunk
+from rtid.estimator.chunk import to_chunk
 from rtid.model import Grid
 from rtid.plain import FloatArray
 from rtid.sim.declare import declared_model, default_grid

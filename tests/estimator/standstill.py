@@ -12,7 +12,8 @@ from functools import cache
 
 import numpy as np
 
-from rtid.estimator.estimator import Estimator, to_chunk
+from rtid.estimator.chunk import to_chunk
+from rtid.estimator.estimator import Estimator
 from rtid.estimator.flowmap import VALID, FlowMap
 from rtid.estimator.published import publish
 from rtid.estimator.solution import Solution

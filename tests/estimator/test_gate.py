@@ -16,7 +16,8 @@ import pytest
 from firmware_bridge.samples import GAP as GAP_FLAG
 from firmware_bridge.samples import ROW as ROW_FLAG
 from rtid.estimator.blocks import VALID, Block
-from rtid.estimator.estimator import Estimator, to_chunk
+from rtid.estimator.chunk import to_chunk
+from rtid.estimator.estimator import Estimator
 from rtid.model import (
     COMMAND,
     POSITION,

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rtid.estimator.estimator import to_chunk
+from rtid.estimator.chunk import to_chunk
 from rtid.estimator.misfit import count_misfit
 from rtid.estimator.record import run
 from rtid.estimator.solution import Solution, solve

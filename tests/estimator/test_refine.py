@@ -7,7 +7,7 @@ import pytest
 
 from rtid.diagnose.fit import MATCH_RHO
 from rtid.diagnose.standing import fitted
-from rtid.estimator.estimator import to_chunk
+from rtid.estimator.chunk import to_chunk
 from rtid.estimator.record import fit_record
 from rtid.estimator.refine import halved_along, parents
 from rtid.model import Grid, Machine

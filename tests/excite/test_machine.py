@@ -12,7 +12,8 @@ import pytest
 from rtid.cli.main import run
 from rtid.compare.reference import theta_cells
 from rtid.errors import RtidError
-from rtid.estimator.estimator import Estimator, to_chunk
+from rtid.estimator.chunk import to_chunk
+from rtid.estimator.estimator import Estimator
 from rtid.excite import library
 from rtid.excite.design import _fitted, checked, tightened
 from rtid.excite.driving import SHUT, STEP_S, X_REF, Control, Piston

@@ -21,7 +21,8 @@ from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from rtid.sim.run_files import START_US
 from rtid.sim.simulated_plant import SimulatedPlant
-from rtid.trace.learner import Learner, catalog_of
+from rtid.trace.described import catalog_of
+from rtid.trace.learner import Learner
 from tests.faults.sender import PAUSE_S
 from tests.left import shared_folder
 

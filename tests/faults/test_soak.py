@@ -24,7 +24,8 @@ from rtid.sim.random_plants import draw
 from rtid.sim.recording import write_run
 from rtid.sim.run import PlantChange, simulate
 from rtid.sim.run_files import START_US, write_log
-from rtid.trace.learner import Learner, catalog_of
+from rtid.trace.described import catalog_of
+from rtid.trace.learner import Learner
 from rtid.trace.snapshot import Generations
 from tests.faults.conftest import Figure
 from tests.faults.harness import SECONDS, drift, loop, machine
