@@ -27,7 +27,7 @@ AT_ONCE = 1 << 14  # intervals that are followed in one go
 LONG = 1 << 18  # samples of a record that is read again rather than kept: 4 minutes at 1 kHz
 OPENING, FLOW, SLOPE_U, SLOPE_DP, FLOW_SD = range(5)  # what `follow_map` tells of each
 ALL_BUT_SD = OPENING, FLOW, SLOPE_U, SLOPE_DP  # of a short record in one go
-GROUPS_KEPT = 2  # of them, of a long record: with one it is followed twice as often
+AT_A_TIME = 2  # of them, of a long record: with one it is followed twice as often
 
 
 def has_noise(values: FloatArray) -> bool:
@@ -221,23 +221,19 @@ class RecordView:
 
     def _along(self, what: int) -> FloatArray:
         """What the map says along the record (edges, n - 1), and what is asked for beside it."""
-        group, said = self._group_of(what), self._said
-        if group not in said:
-            for old in list(said)[: len(said) + 1 - GROUPS_KEPT]:
+        said = self._said
+        if what not in said and self.n < LONG:
+            said.update(self._followed(ALL_BUT_SD))
+        elif what not in said:
+            for old in list(said)[: len(said) + 1 - AT_A_TIME]:
                 del said[old]
-            said[group] = self._followed(group)
-        said[group] = said.pop(group)  # the newest is the last
-        return said[group][what]
-
-    def _group_of(self, what: int) -> tuple[int, ...]:
-        """What is asked for in one go, with one of it."""
-        if self.n < LONG:
-            return ALL_BUT_SD
-        return (FLOW, SLOPE_DP) if what in (FLOW, SLOPE_DP) else (what,)
+            said.update(self._followed((what,)))
+        said[what] = said.pop(what)  # the newest is the last
+        return said[what]
 
     @cached_property
-    def _said(self) -> dict[tuple[int, ...], dict[int, FloatArray]]:
-        """The last groups that were asked for of what the map says."""
+    def _said(self) -> dict[int, FloatArray]:
+        """What was asked for last of what the map says."""
         return {}
 
     def _followed(self, asked: tuple[int, ...]) -> dict[int, FloatArray]:
