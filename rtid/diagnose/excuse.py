@@ -13,9 +13,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from rtid.diagnose.commands import split
 from rtid.diagnose.fit import Fit, columns_of_effects, fit, one_pass
 from rtid.diagnose.residual import effect_values
 from rtid.effects.extra import with_extra_flow
+from rtid.estimator.limits import most_open
 from rtid.estimator.misfit import Misfit, can_be_explained, count_misfit, residual_of
 from rtid.estimator.missed import excusing, misses
 from rtid.estimator.record import summed
@@ -78,15 +80,27 @@ def counted(present: Fit) -> FloatArray:
     return count_misfit(model, chunk, present.weights, solution).compliance_cov
 
 
+def _with_room(present: Fit) -> Machine:
+    """The machine of a fit, with room for as many blocks as where it is split.
+
+    Edges of either direction may be open at once there: memory that began anew at other moments
+    would judge a fit with a timing by another measure than one without.
+    """
+    model, most = present.model, most_open(split(present.declared))
+    room = model.recent_blocks - (most - most_open(model))
+    return replace(model, recent_blocks=max(room, 2 * most))
+
+
 def _machine(present: Fit) -> tuple[Machine, FloatArray]:
     """The machine of a fit, what its effects add to the flows being known, and the record."""
+    machine = _with_room(present)
     if not present.revision.effects:
-        return present.model, present.sent
+        return machine, present.sent
     flow = np.zeros((present.view.n - 1, len(present.model.chambers)))
     volumes = zip(columns_of_effects(present), effect_values(present), strict=True)
     for columns, (_, value) in volumes:
         for c, volume in columns.items():
             flow[:, c] += value * volume / present.view.dt_s
     present.view.rest()
-    model, _, chunk = with_extra_flow(present.model, np.zeros(0), present.sent, flow)
+    model, _, chunk = with_extra_flow(machine, np.zeros(0), present.sent, flow)
     return replace(model, terms=tuple(replace(term, sd=KNOWN) for term in model.terms)), chunk

@@ -144,10 +144,6 @@ class Study:
             vars(self)["read"], self.records = read_records(project, paths)
             self.project = with_spans(project, self.records)
 
-    def take(self, read: Trace) -> None:
-        """Take a trace that was read before, as `read` would."""
-        vars(self)["read"] = read
-
     @cached_property
     def machine(self) -> Machine:
         """The declared machine, with the sensors' noise, and what disturbs its rate if unknown."""

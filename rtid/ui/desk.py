@@ -159,7 +159,7 @@ class Desk(Reader):
         known, self._read = self._read, None
         study = Study(known[0] if known else project, trace, self._progress)
         if known:
-            study.take(known[1])
+            vars(study)["read"] = known[1]
         learned, read = study.replay, study.trace
         self._progress("simulating the pressures", 0.8)
         seen, first = look(learned), _Revision(study, is_saved=True)
