@@ -29,6 +29,7 @@ from tests.test_rate import said
 
 STRANGERS = Path(__file__).parents[2] / "shared/data/strangers"
 FULL, HZ, GRAVITY = 65535.0, 500.0, 9.80665
+SEEDS = 0, pytest.param(1, marks=pytest.mark.campaign)
 
 
 @pytest.fixture(autouse=True)
@@ -120,7 +121,7 @@ def lag_of(quick: QuickRate) -> float:
     return float(sizes[0]["time_constant"].value) if sizes else 0.0
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", SEEDS)
 def test_a_lag_behind_the_map_is_found_whatever_the_noise(tmp_path: Path, seed: int) -> None:
     rng = np.random.default_rng([20, seed])
     plant = Rotors.drawn(rng, "behind", knee=0.75)
@@ -130,7 +131,7 @@ def test_a_lag_behind_the_map_is_found_whatever_the_noise(tmp_path: Path, seed: 
     assert [c.name for c in quick.pair.commands] == [f"motor_{k}" for k in (1, 2, 3, 4)]
 
 
-@pytest.mark.parametrize("drift", [-0.004, 0.003])
+@pytest.mark.parametrize("drift", [pytest.param(-0.004, marks=pytest.mark.campaign), 0.003])
 def test_a_battery_that_empties_is_a_drift_of_the_gain(tmp_path: Path, drift: float) -> None:
     """Beside the lag, from the first half of a flight; none is named where there is none."""
     rng = np.random.default_rng([22, round(1e4 * abs(drift))])
@@ -178,7 +179,7 @@ def test_noise_does_not_make_the_lag_shorter(tmp_path: Path) -> None:
     assert behind_s(fit.revision.timings) == pytest.approx(plant.lag_s, rel=0.05)
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", SEEDS)
 def test_a_lag_before_the_map_is_none_behind_it(tmp_path: Path, seed: int) -> None:
     """A map with a knee passes it at another instant: the two places are told apart."""
     rng = np.random.default_rng([21, seed])
@@ -190,7 +191,7 @@ def test_a_lag_before_the_map_is_none_behind_it(tmp_path: Path, seed: int) -> No
     assert not any("map_lag" in other for other in found.cannot_be_told_from)
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", SEEDS)
 def test_nothing_is_named_where_nothing_is_late(tmp_path: Path, seed: int) -> None:
     rng = np.random.default_rng([22, seed])
     plant = Rotors.drawn(rng, "")

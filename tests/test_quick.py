@@ -85,7 +85,9 @@ def as_csv(path: Path, **values: np.ndarray) -> Path:
     return path
 
 
-@pytest.mark.parametrize("name", ["leak.blf", "leak.parquet"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("leak.blf", marks=pytest.mark.campaign), "leak.parquet"]
+)
 def test_a_leak_is_named_from_the_file_alone(folder: Path, name: str) -> None:
     found = told(folder / name)
     assert set(found["roles"]) == {"p_supply", "p_tank", "p_a", "p_b", "x", "v", "u"}
@@ -174,7 +176,9 @@ def test_a_volume_that_is_none_is_refused(folder: Path, volume: str) -> None:
     assert done.returncode == Exit.USAGE and "volumes" in done.stderr
 
 
-@pytest.mark.parametrize("what", ["x", "u", "chambers", "units"])
+@pytest.mark.parametrize(
+    "what", [pytest.param("x", marks=pytest.mark.campaign), "u", "chambers", "units"]
+)
 def test_signs_and_units_are_found(folder: Path, tmp_path: Path, what: str) -> None:
     c = columns(folder / "leak.parquet")
     x, u, a, b = c["x"], c["u"], c["p_a"], c["p_b"]
@@ -259,7 +263,7 @@ def test_data_that_cannot_bear_a_verdict_end_with_4(
     assert "No verdict" in done.stdout
 
 
-@pytest.mark.parametrize("is_noisy", [False, True])
+@pytest.mark.parametrize("is_noisy", [False, pytest.param(True, marks=pytest.mark.campaign)])
 def test_a_machine_that_rests_at_the_end_is_judged_by_the_end_of_its_motion(
     folder: Path, tmp_path: Path, is_noisy: bool
 ) -> None:

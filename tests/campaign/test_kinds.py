@@ -39,7 +39,7 @@ def test_a_spool_with_its_zero_off_raises_no_alarm() -> None:
     assert np.abs(found.beta_z).max() < 4.0 and np.abs(found.valid.error).mean() < 0.003
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_what_a_record_shows_that_is_too_short_for_its_grid() -> None:
     """No block is known well enough to judge by, and a leak was not even looked for."""
     found = outcome(KindCase(7011, COMPENSATED, hidden="internal_leakage_laminar"))

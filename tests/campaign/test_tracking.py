@@ -90,9 +90,9 @@ def percent(tracks: dict[str, Track], t_s: float) -> str:
     return ", ".join(f"{name} {100 * track.at(t_s):.2f} %" for name, track in tracks.items())
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_a_step_of_the_gain_is_learned_again() -> None:
-    """In the normal suite: shorter, and without the other two."""
+    """Shorter than below, and without the other two."""
     track = follow(Estimator, UPKEEP, lambda t: 1.0 if t <= 90 else 0.95, [(rich, 210.0)])
     print(f"map error {100 * track.at(90):.2f} % before; then {np.round(100 * track.rms[3:], 2)} %")
     assert track.at(90) < 0.005

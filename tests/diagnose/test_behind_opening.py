@@ -47,7 +47,7 @@ def test_a_valve_that_is_told_to_shut_still_closes() -> None:
     assert lagged_opening(np.full(9, -1.0), DT, (0.02, DEAD_V)) == pytest.approx(np.full(9, -1.0))
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_a_lag_behind_the_opening_is_no_delay_and_no_late_sensor() -> None:
     """It was 6 ms of delay and 21 ms of a late position, rho 1,881 -> 343."""
     model, chunk = record(30e-3)

@@ -70,7 +70,7 @@ def of_case(case: Case) -> tuple[Fit, Trial]:
     return beside(model, chunk[chunk[:, 0] < IDENTIFICATION * RECORD_S], (LEAK[0], "b"))
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_halves_of_a_short_record_on_a_wide_grid_have_their_say() -> None:
     """A seat's leak in 32 s on the grid of `rtid init`: halves with maps of their own had 36
     degrees of freedom and less than none, so that 40 standard deviations were "negligible".

@@ -34,7 +34,11 @@ def test_a_slow_signal_is_put_right_up_to_the_window() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("effect", "strength"), [("position_sensor_delay", 1.5e-3), ("pressure_sensor_lag", 2e-3)]
+    ("effect", "strength"),
+    [
+        pytest.param("position_sensor_delay", 1.5e-3, marks=pytest.mark.campaign),
+        ("pressure_sensor_lag", 2e-3),
+    ],
 )
 def test_a_late_sensor_is_named_and_sized(effect: str, strength: float) -> None:
     """It was "spool lag", or nothing: its derivative alone is no measure of it."""
