@@ -15,6 +15,7 @@ from rtid.trace.arrivals import GAP_PERIODS, Timing, timing
 from rtid.trace.coverage import Coverage, coverage
 from rtid.trace.plausible import Motion, looks_like, motion
 from rtid.trace.series import Series, SignalReport, describe
+from rtid.trace.spikes import SPIKE
 from rtid.units import limit, units_of, with_unit
 
 PERIOD_TOLERANCE = 0.1
@@ -72,7 +73,7 @@ def judge(
     """Judge samples and raw series (each signal at its own instants) against the declaration."""
     signals = tuple(describe(series) for series in series)
     moved, covered = motion(model, samples), coverage(model, samples)
-    findings = list(_timing(assembly, messages, samples))
+    findings = list(_timing(assembly, messages, samples, refused))
     timed = not any(finding.level == "error" for finding in findings)
     findings += _signals(model, series, signals)
     findings += _units(model, assembly, stroke_m, signals)
@@ -135,7 +136,9 @@ def _warning(subject: str, text: str, remedy: str) -> Finding:
     return Finding("warning", subject, text, remedy)
 
 
-def _timing(assembly: Assembly, messages: dict[str, Timing], samples: Samples) -> Iterator[Finding]:
+def _timing(
+    assembly: Assembly, messages: dict[str, Timing], samples: Samples, refused: dict[str, int]
+) -> Iterator[Finding]:
     periods = {message.name: message.period_s for message in assembly.messages}
     for name, arrivals in messages.items():
         period_s = periods.get(name, arrivals.median_s)
@@ -153,6 +156,9 @@ def _timing(assembly: Assembly, messages: dict[str, Timing], samples: Samples) -
         if arrivals.backward:
             text = f"{arrivals.backward} time stamps go back"
             yield _warning(name, text, "sort the log, or record with one clock")
+    if spiked := refused.get(SPIKE, 0):
+        text = f"{spiked} are left out: a sensor jumps away and back within milliseconds"
+        yield _warning("samples", text, "look at the sensors' plugs, cables and messages")
     if len(samples) == 0:
         remedy = "see the counters of refused frames; check counter, crc and data_id"
         yield _error("samples", "no complete sample could be made", remedy)

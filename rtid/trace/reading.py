@@ -11,7 +11,7 @@ import numpy as np
 from firmware_bridge.assemble import Assembler
 from firmware_bridge.catalog import Catalog
 from firmware_bridge.config import Assembly
-from firmware_bridge.frames import Frames
+from firmware_bridge.frames import Frames, add_counts
 from firmware_bridge.j1939 import Network, known_as
 from firmware_bridge.samples import Samples, join
 from firmware_bridge.sources import open_file, open_log
@@ -24,6 +24,7 @@ from rtid.project import Project
 from rtid.trace.described import catalog_of
 from rtid.trace.measured import with_sums
 from rtid.trace.neutral import about_neutral
+from rtid.trace.spikes import without_spikes
 from rtid.trace.table import declared
 
 AT_ONCE = 1 << 17  # frames that are assembled in one go: each may become a sample
@@ -89,13 +90,22 @@ def read_trace(project: Project, path: str | Path) -> Trace:
     path = Path(path)
     content = open_file(path)
     if isinstance(content, Table):
-        samples, counters = to_samples(*declared(project, content))
+        samples, counters = whole(project, *to_samples(*declared(project, content)))
         samples = with_sums(project, about_neutral(project, samples))
         return _not_empty(Trace(path, samples, counters, None), project)
-    samples, counters = assemble(catalog_of(project), project.assembly, content)
+    samples, counters = whole(project, *assemble(catalog_of(project), project.assembly, content))
     samples = with_sums(project, samples)
     trace = _not_empty(Trace(path, samples, counters, Log(path, content)), project)
     return _within_chunk(trace, project.model)
+
+
+def whole(
+    project: Project, samples: Samples, counters: dict[str, int]
+) -> tuple[Samples, dict[str, int]]:
+    """The samples of a record that can be looked at as a whole: without those that spike."""
+    rest, spiked = without_spikes(project.model, samples)
+    add_counts(counters, spiked)
+    return rest, counters
 
 
 def _within_chunk(trace: Trace, model: Machine) -> Trace:

@@ -22,7 +22,7 @@ from rtid.trace.arrivals import Timing, timing
 from rtid.trace.described import catalog_of
 from rtid.trace.measured import with_sums
 from rtid.trace.neutral import about_neutral
-from rtid.trace.reading import assemble
+from rtid.trace.reading import assemble, whole
 from rtid.trace.series import Series
 from rtid.trace.table import declared
 
@@ -62,7 +62,7 @@ def series_of(by_name: dict[str, Frames], catalog: Catalog) -> Iterator[tuple[st
 
 def _from_table(project: Project, content: Table) -> Recording:
     table, assembly = declared(project, content)
-    samples, refused = to_samples(table, assembly)
+    samples, refused = whole(project, *to_samples(table, assembly))
     samples = with_sums(project, about_neutral(project, samples))
     t_us = table.t_us()
     series = tuple(
@@ -81,7 +81,7 @@ def _from_log(project: Project, path: Path, frames: Frames) -> Recording:
     if not any(len(frames) for frames in chosen.values()):
         raise RtidError(*_nothing_wanted(path, frames, assembly, catalog))
     series = [s for m in assembly.messages for s in _series(chosen[m.name], m, assembly, catalog)]
-    samples, refused = assemble(catalog, assembly, frames)
+    samples, refused = whole(project, *assemble(catalog, assembly, frames))
     samples = with_sums(project, samples)
     timings = {name: timing(frames.t_us) for name, frames in chosen.items()}
     return Recording(path, tuple(series), timings, samples, refused, False)
