@@ -1,10 +1,10 @@
 """Values of a sensor that jump away and back within milliseconds: no oil and no piston does that.
 
-    s = max(x - opening(x), closing(x) - x),
+    s = max(c - opening(c), closing(o) - o),   c = closing(x), o = opening(x),
 
 the grey opening and closing over more samples than such a jump lasts: what is narrower is left in
-s, steps and slopes are not.  A spike stands out from what s usually is, from the sensor's noise and
-from what the signal covers.
+s, steps and slopes are not, and a peak's neighbour is no dip.  A spike stands out from what s
+usually is, from the sensor's noise and from what the signal covers.
 """
 
 from __future__ import annotations
@@ -51,7 +51,8 @@ def without_spikes(model: Machine, samples: Samples) -> tuple[Samples, dict[str,
 def _spikes(values: FloatArray, signal: Signal, longest: int) -> BoolArray:
     """Where values (n,) of a sensor, SI, belong to a spike of at most so many samples."""
     width = longest + 1
-    s = np.maximum(values - _opening(values, width), -_opening(-values, width) - values)
+    filled, cut = -_opening(-values, width), _opening(values, width)
+    s = np.maximum(filled - _opening(filled, width), -_opening(-cut, width) - cut)
     s[:longest] = s[-longest:] = 0.0  # what begins or ends there has no other side
     low, high = np.quantile(values, SPANNED)
     usual = TIMES * np.quantile(s, USUAL)
