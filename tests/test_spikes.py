@@ -64,7 +64,7 @@ def test_what_a_machine_does_is_kept(motion: str, seed: int) -> None:
             samples.names,
             samples.t_us[::every],
             samples.values[::every],
-            samples.flags[::every] | ROW,
+            (samples.flags[::every] | ROW).astype(np.uint8),
         )
         assert without_spikes(declared_model(plant), slower)[1] == {}
 

@@ -8,7 +8,7 @@ kind of file, "p_a [MPa]" or "p_a (MPa)"; the unit in the metadata goes before i
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -21,7 +21,7 @@ from firmware_bridge.config import Assembly, SignalSource
 from firmware_bridge.frames import add_counts
 from firmware_bridge.names import split_brackets, split_unit
 from firmware_bridge.samples import GAP, ROW, Samples
-from firmware_bridge.sources import mat
+from firmware_bridge.sources import mat, text_table
 from firmware_bridge.sources.errors import LogError
 from firmware_bridge.sources.unpacked import Budget
 
@@ -31,9 +31,12 @@ PERIODS, OFTEN = 1.5, 0.95  # of the usual step: more is a gap; share of the ste
 IN_TURN = 0.2  # share of blank rows, from which on a column is written in turn with others
 ALIKE = 0.1  # of a step: so near to a multiple it is one
 TIME_NAMES = ("t", "time", "timestamp", "zeit")  # with or without a unit behind: t_ms, time_s
+TIMES = {*TIME_NAMES, "datetime", "date_time", "uhrzeit", "zeitstempel", "elapsed_time", "x_value"}
 TIME_UNITS = {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
 TIME_UNITS |= {"sec": 1.0, "seconds": 1.0, "msec": 1e-3, "usec": 1e-6, "h": 3600.0}
 TIME_UNITS["\N{GREEK SMALL LETTER MU}s"] = 1e-6
+
+Column = tuple[str, NDArray[np.float64], str]  # title, values (n,) and unit, "" if unknown
 
 
 @dataclass(frozen=True)
@@ -88,7 +91,7 @@ class Table:
 
 def is_time(name: str) -> bool:
     """Whether a column looks like time: t, time_s, Zeit, t_ms."""
-    return _split_time(name)[0].lower() in TIME_NAMES
+    return _split_time(name)[0].lower().replace(" ", "_") in TIMES
 
 
 def _split_time(name: str) -> tuple[str, str]:
@@ -169,8 +172,9 @@ def read_parquet(path: Path) -> Table:
 
     file = pq.ParquetFile(path)
     fields = [field for field in file.schema_arrow if _is_number(field.type)]
-    Budget(path).take(file.metadata.num_rows * NUMBER_BYTES * (len(fields) + 1))
-    result = []
+    stamps = [field.name for field in file.schema_arrow if _is_stamp(field.type)]
+    Budget(path).take(file.metadata.num_rows * NUMBER_BYTES * (len(fields) + len(stamps) + 1))
+    result = list(_timed((name, file.read([name]).column(name), "") for name in stamps))
     for field in fields:
         numbers = _numbers(file.read([field.name]).column(field.name))
         meta = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
@@ -182,34 +186,22 @@ def read_parquet(path: Path) -> Table:
 
 
 def read_text(path: Path) -> Table:
-    """A table of text: .csv, .tsv, .txt; the delimiter is found, a decimal comma is known."""
-    from pyarrow import csv  # noqa: PLC0415
-
-    n_comments, header, first = _csv_head(path)
-    delimiter = max(";\t,", key=header.count)
-    decimal = "," if delimiter != "," and "," in first else "."
-    content = csv.read_csv(
-        path,
-        read_options=csv.ReadOptions(skip_rows=n_comments),
-        parse_options=csv.ParseOptions(delimiter=delimiter),
-        convert_options=csv.ConvertOptions(decimal_point=decimal, strings_can_be_null=True),
-    )
-    columns = zip(content.column_names, content.columns, strict=True)
-    return named_columns(path, [(t, _numbers(c), "") for t, c in columns if _is_number(c.type)])
+    """A table of text: .csv, .tsv, .txt; where its numbers begin is found, as is the delimiter."""
+    return named_columns(path, _timed(text_table.read(path)))
 
 
-def _csv_head(path: Path) -> tuple[int, str, str]:
-    """Number of leading comment lines (#), the header, and the first line of numbers."""
-    n_comments = 0
-    with path.open(encoding="utf-8-sig", errors="replace") as file:
-        for line in file:
-            if not line.startswith("#"):
-                return n_comments, line, file.readline()
-            n_comments += 1
-    raise LogError(f"{path}: holds nothing but comments")
+def _timed(
+    columns: Iterable[tuple[str, Any, str]],
+) -> Iterator[tuple[str, NDArray[np.float64], str]]:
+    """Titles, columns (n,) and units of what is a number, or a date or a time of day: in s."""
+    for title, column, unit in columns:
+        if _is_number(column.type):
+            yield title, _numbers(column), unit
+        elif (times := text_table.seconds(column)) is not None:
+            yield title, times, "s"
 
 
-def named_columns(path: Path, result: Iterable[tuple[str, NDArray[np.float64], str]]) -> Table:
+def named_columns(path: Path, result: Iterable[Column]) -> Table:
     """A table of titles with their columns (n,) and the units of the metadata.
 
     Columns whose names differ by the brackets alone keep them; of two of one title the second is
@@ -233,6 +225,13 @@ def _is_number(kind: Any) -> bool:
     from pyarrow import types  # noqa: PLC0415
 
     return bool(types.is_integer(kind) or types.is_floating(kind) or types.is_boolean(kind))
+
+
+def _is_stamp(kind: Any) -> bool:
+    """Whether a pyarrow type is a date with a time, or a time of day."""
+    from pyarrow import types  # noqa: PLC0415
+
+    return bool(types.is_timestamp(kind) or types.is_time(kind))
 
 
 def _numbers(column: Any) -> NDArray[np.float64]:

@@ -1,0 +1,210 @@
+"""Tables of text as loggers and spreadsheets write them: where the numbers begin, what is above.
+
+LabVIEW Measurement                    a preamble, or comments behind #
+Zeit;Druck A;Kolbenweg                 the names
+s;bar;mm                               perhaps a row of units
+01.03.2026 08:00:00,002;53,9;312,4     values: a decimal comma, a time of day or a date
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import date
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_bridge.names import split_brackets
+from firmware_bridge.sources.errors import LogError
+
+LOOKED_AT, LONGEST = 200, 1 << 16  # lines in which the names are looked for, characters of each
+DELIMITERS = ";\t,"
+MISSING = ("---", "--", "-", "?", "OL", "Overload", "#NV", "#DIV/0!", "#VALUE!")
+UTF_16 = (b"\xff\xfe", b"\xfe\xff")
+STAMP = re.compile(
+    r"\s*(?:(\d{1,4})([-./])(\d{1,2})\2(\d{1,4})[T ]\s*)?(\d{1,3}):(\d\d):(\d\d)(?:[.,](\d+))?"
+    r"\s*(?:Z|[+-]\d\d:?\d\d)?\s*"
+)
+COMMA = re.compile(r"\d,\d")  # a decimal one, where no comma parts the columns
+DAY_S = 86_400
+
+
+@dataclass(frozen=True)
+class Layout:
+    """first: number of lines above the values; names, units ("" if unknown), a pair per column."""
+
+    first: int
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    delimiter: str
+    decimal: str
+    encoding: str
+
+
+def read(path: Path) -> list[tuple[str, Any, str]]:
+    """Names, pyarrow columns, and units of a table of text; LogError, and pyarrow's errors."""
+    from pyarrow import csv as reader  # noqa: PLC0415  30 MB that only tables need
+
+    layout = layout_of(path)
+    missing = [*reader.ConvertOptions().null_values, *MISSING]
+    content = reader.read_csv(
+        path,
+        read_options=reader.ReadOptions(
+            skip_rows=layout.first, column_names=_apart(layout.names), encoding=layout.encoding
+        ),
+        parse_options=reader.ParseOptions(delimiter=layout.delimiter),
+        convert_options=reader.ConvertOptions(
+            decimal_point=layout.decimal,
+            strings_can_be_null=True,
+            null_values=missing,
+        ),
+    )
+    return list(zip(layout.names, content.columns, layout.units, strict=True))
+
+
+def layout_of(path: Path) -> Layout:
+    """Where a file's names stand and its values begin; LogError where it holds only comments."""
+    encoding, lines = _beginning(path)
+    written = [k for k, line in enumerate(lines) if line.strip() and not line.startswith("#")]
+    if not written:
+        raise LogError(f"{path}: holds nothing but comments")
+    tried = (_layout_from(lines, written[i:], encoding) for i in range(len(written)))
+    known = next((layout for layout in tried if layout), None)
+    return known or _plain(lines, written, encoding)
+
+
+def _beginning(path: Path) -> tuple[str, list[str]]:
+    """The encoding, as pyarrow names it, and the first lines."""
+    with path.open("rb") as file:
+        encoding = "utf-16" if file.read(2) in UTF_16 else "utf8"
+    code = "utf-16" if encoding == "utf-16" else "utf-8-sig"
+    with path.open(encoding=code, errors="surrogateescape") as file:
+        lines = [file.readline(LONGEST) for _ in range(LOOKED_AT)]
+    return encoding, [_decoded(line) for line in lines if line]
+
+
+def _decoded(line: str) -> str:
+    """A line whose bytes are no UTF-8 is one of Windows."""
+    return (
+        line.encode("utf-8", "surrogateescape").decode("cp1252", "replace")
+        if any("\udc80" <= letter <= "\udcff" for letter in line)
+        else line
+    )
+
+
+def _layout_from(lines: list[str], at: list[int], encoding: str) -> Layout | None:
+    """The layout, if the first of these lines holds the names; at: of all that are written on."""
+    for delimiter in DELIMITERS:
+        names, *rest = (_fields(lines[k], delimiter) for k in at[:3])
+        if len(names) < 2 or _are_values(names):
+            continue
+        for above, values in enumerate(rest, 1):
+            is_as_wide = len(names) - 1 <= len(values) <= len(names) and len(values) > 1
+            if is_as_wide and _are_values(values):
+                units = rest[0] if above == 2 else []
+                return _made(lines, at[above], names[: len(values)], units, delimiter, encoding)
+            if not 1 < len(values) <= len(names):
+                break
+    return None
+
+
+def _plain(lines: list[str], written: list[int], encoding: str) -> Layout:
+    """The first line that is written on holds the names, whatever follows."""
+    header = lines[written[0]]
+    delimiter = max(DELIMITERS, key=header.count)
+    return _made(lines, written[0] + 1, _fields(header, delimiter), [], delimiter, encoding)
+
+
+def _made(
+    lines: list[str], first: int, names: list[str], units: list[str], delimiter: str, encoding: str
+) -> Layout:
+    """A layout; units may be fewer than names."""
+    has_commas = delimiter != "," and any(COMMA.search(line) for line in lines[first:])
+    given = [*(split_brackets(f"x {unit}")[1] or unit for unit in units), *[""] * len(names)]
+    decimal = "," if has_commas else "."
+    return Layout(first, tuple(names), tuple(given[: len(names)]), delimiter, decimal, encoding)
+
+
+def _fields(line: str, delimiter: str) -> list[str]:
+    return [field.strip() for field in next(csv.reader([line.rstrip("\r\n")], delimiter=delimiter))]
+
+
+def _are_values(fields: list[str]) -> bool:
+    """Whether half of what is written is a number or a time, at least."""
+    written = [field for field in fields if field]
+    return 2 * sum(map(_is_value, written)) >= max(1, len(written))
+
+
+def _is_value(field: str) -> bool:
+    try:
+        float(field.replace(",", "."))
+    except ValueError:
+        return STAMP.fullmatch(field) is not None or field in MISSING
+    return True
+
+
+def _apart(names: tuple[str, ...]) -> list[str]:
+    """Names for pyarrow, which wants each once."""
+    return [f"{k} {name}" for k, name in enumerate(names)]
+
+
+def seconds(column: Any) -> NDArray[np.float64] | None:
+    """Times of day or dates (n,) of a pyarrow column, in s; None where it holds something else.
+
+    NaN where null.  Dates are counted from 1970, hours of a day from midnight: one that is earlier
+    than the one before is of the next day.
+    """
+    import pyarrow as pa  # noqa: PLC0415
+
+    kind = column.type
+    if pa.types.is_timestamp(kind) or pa.types.is_time(kind):
+        per_s = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}[kind.unit]
+        ticks = column.cast(pa.int32() if kind.bit_width == 32 else pa.int64())
+        times = np.asarray(ticks.cast(pa.float64(), safe=False).to_numpy()) / per_s
+        return times if pa.types.is_timestamp(kind) else _over_midnight(times)
+    if not pa.types.is_string(kind):
+        return None
+    stamps = np.fromiter(_stamps(column), np.float64, len(column))
+    known = stamps[np.isfinite(stamps)]
+    if not len(known):
+        return None
+    return stamps if known[0] >= DAY_S else _over_midnight(stamps)
+
+
+def _stamps(column: Any) -> Iterator[float]:
+    for text in column.to_pylist():
+        match = STAMP.fullmatch(text) if text else None
+        yield _second(match) if match else np.nan
+
+
+def _second(match: re.Match[str]) -> float:
+    one, _, two, three, hours, minutes, whole, part = match.groups()
+    days = _day(one, two, three) if one else 0
+    return DAY_S * days + 3600 * int(hours) + 60 * int(minutes) + float(f"{whole}.{part or 0}")
+
+
+@cache
+def _day(one: str, two: str, three: str) -> int:
+    """Days from 1970 to year-month-day, day.month.year, or month/day/year where no other is one."""
+    year, month, day = (one, two, three) if len(one) == 4 else (three, two, one)
+    if int(month) > 12:
+        month, day = day, month
+    try:
+        return (date(int(year), int(month), int(day)) - date(1970, 1, 1)).days
+    except ValueError:
+        return 0
+
+
+def _over_midnight(times: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Times of day (n,) that go on where a day ends; a step back of half a day is one."""
+    known = np.flatnonzero(np.isfinite(times))
+    steps = np.diff(times[known], prepend=times[known[:1]])
+    later = times.copy()
+    later[known] += DAY_S * np.cumsum(steps < -0.5 * DAY_S)
+    return later

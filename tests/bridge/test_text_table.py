@@ -1,0 +1,111 @@
+"""Tables of text as others write them: preambles, rows of units, dates, spreadsheets' encodings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from firmware_bridge.sources import LogError, read_table
+from firmware_bridge.sources.table import Table
+
+LABVIEW = "LabVIEW Measurement\nWriter_Version\t2\nSeparator\tTab\n***End_of_Header***\n"
+
+
+def read(tmp_path: Path, text: str | bytes, name: str = "t.csv") -> Table:
+    path = tmp_path / name
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return read_table(path)
+
+
+def columns(table: Table) -> dict[str, list[float]]:
+    return {name: column.tolist() for name, column in table.columns.items()}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "Zeit;Druck;Weg\ns;bar;mm\n0;1,5;2\n0,002;2,5;3\n",
+        "Zeit;Druck;Weg\n[s];[bar];[mm]\n0;1,5;2\n0,002;2,5;3\n",
+        "Zeit;Druck;Weg\n(s);(bar);(mm)\n0,000;1,5;2\n0,002;2,5;3\n",
+    ],
+)
+def test_a_row_of_units(tmp_path: Path, text: str) -> None:
+    table = read(tmp_path, text)
+    assert table.units == {"Zeit": "s", "Druck": "bar", "Weg": "mm"}
+    assert columns(table) == {"Zeit": [0, 0.002], "Druck": [1.5, 2.5], "Weg": [2, 3]}
+
+
+@pytest.mark.parametrize("comment", ["\tComment", ""])
+@pytest.mark.parametrize("end", ["\t", ""])
+def test_a_preamble_and_a_title_without_values(tmp_path: Path, comment: str, end: str) -> None:
+    rows = f"0.000\t1.5{end}\n0.001\t2.5{end}\n"
+    if end and not comment:
+        rows = rows.replace("\t\n", "\n")
+    table = read(tmp_path, f"{LABVIEW}\nX_Value\tVoltage{comment}\n{rows}", "t.txt")
+    assert columns(table) == {"X_Value": [0, 0.001], "Voltage": [1.5, 2.5]}
+    assert table.t_us().tolist() == [0, 1000]
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        ("2026-03-01T08:00:00.000", "2026-03-01T08:00:00.002"),
+        ("2026-03-01 08:00:00.000000", "2026-03-01 08:00:00.002000"),
+        ("2026-03-01T08:00:00.000Z", "2026-03-01T08:00:00.002Z"),
+        ("01.03.2026 08:00:00,000", "01.03.2026 08:00:00,002"),
+        ("3/1/2026 08:00:00.000", "3/1/2026 08:00:00.002"),
+        ("08:00:00.000", "08:00:00.002"),
+        ("23:59:59.999", "00:00:00.001"),
+        ("28.02.2026 23:59:59.999", "01.03.2026 00:00:00.001"),
+    ],
+)
+def test_dates_and_times_of_day(tmp_path: Path, first: str, second: str) -> None:
+    """Two milliseconds, whatever they are written as, over midnight too."""
+    table = read(tmp_path, f"timestamp;u\n{first};1\n{second};2\n")
+    assert np.diff(table.t_us()).tolist() == [2000]
+    assert table.units["timestamp"] == "s"
+
+
+def test_seconds_of_a_day_alone(tmp_path: Path) -> None:
+    """pyarrow takes them for a type of its own."""
+    assert np.diff(read(tmp_path, "Time,u\n08:00:00,1\n08:00:01,2\n").t_us()).tolist() == [10**6]
+
+
+def test_a_frame_of_pandas(tmp_path: Path) -> None:
+    """Its index of dates is a column of the file."""
+    index = pd.date_range("2026-03-01 08:00", periods=3, freq="2ms", name="timestamp")
+    pd.DataFrame({"u": [1.0, 2.0, 3.0]}, index=index).to_parquet(tmp_path / "t.parquet")
+    table = read_table(tmp_path / "t.parquet")
+    assert np.diff(table.t_us()).tolist() == [2000, 2000]
+    assert table.columns["u"].tolist() == [1, 2, 3]
+
+
+@pytest.mark.parametrize("code", ["utf-8", "utf-8-sig", "cp1252", "utf-16"])
+def test_a_spreadsheet_s_encoding(tmp_path: Path, code: str) -> None:
+    table = read(tmp_path, "Zeit [s];Öl [°C];Text\n0;40;für\n0,5;41;ß\n".encode(code))
+    assert columns(table) == {"Zeit": [0, 0.5], "Öl": [40, 41]}
+    assert table.units == {"Zeit": "s", "Öl": "°C"}
+
+
+def test_words_of_a_logger_for_nothing_are_missing_values(tmp_path: Path) -> None:
+    table = read(tmp_path, "t,p_a,p_b\n0,1,---\n1,OL,2\n2,3,#NV\n")
+    assert np.isnan(table.columns["p_a"]).tolist() == [False, True, False]
+    assert np.isnan(table.columns["p_b"]).tolist() == [True, False, True]
+
+
+def test_two_columns_of_one_name(tmp_path: Path) -> None:
+    assert columns(read(tmp_path, "t,u,u\n0,1,2\n")) == {"t": [0], "u": [1], "u.2": [2]}
+
+
+@pytest.mark.parametrize("text", ["# a\n# b\n", "words\nand more\n", "t,u\n"])
+def test_what_holds_no_numbers_is_refused(tmp_path: Path, text: str) -> None:
+    with pytest.raises(LogError, match=r"comments|numeric"):
+        read(tmp_path, text)
+
+
+def test_numbers_above_which_no_names_stand(tmp_path: Path) -> None:
+    """As before: the first line is taken for the names."""
+    assert columns(read(tmp_path, "0,1\n1,2\n2,3\n")) == {"0": [1, 2], "1": [2, 3]}
