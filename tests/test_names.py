@@ -19,6 +19,7 @@ from firmware_bridge import catalog
 from firmware_bridge.sources import read_table
 from rtid.cli.exits import Exit
 from rtid.cli.main import run
+from rtid.errors import RtidError
 from rtid.maps.datasheet import read_reference
 from rtid.plain import FloatArray
 from rtid.project import load
@@ -299,3 +300,57 @@ def test_a_data_sheet_may_name_its_units_in_either_way(tmp_path: Path) -> None:
         (table,) = read_reference(path).tables.values()
         found.append(table.gain.tolist())
     assert found[0] == found[1] == found[2]
+
+
+def test_a_machine_with_german_names(tmp_path: Path) -> None:
+    columns = machine()
+    names = {
+        "t": "Zeit", "u": "Ventilstrom [mA]", "x": "Kolbenweg [mm]", "p_a": "Druck A [bar]",
+        "p_b": "Druck B [bar]", "p_s": "Pumpendruck [bar]", "p_t": "Tankdruck [bar]",
+    }  # fmt: skip
+    path = written(tmp_path / "m.csv", {name: columns[key] for key, name in names.items()})
+    roles = roles_of(path, open_source(path, None))
+    assert {role: one.name for role, one in roles.items()} == {
+        "p_supply": "Pumpendruck", "p_tank": "Tankdruck", "p_a": "Druck A", "p_b": "Druck B",
+        "x": "Kolbenweg", "u": "Ventilstrom",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("factor", "unit"), [(1.0, "bar"), (0.1, "MPa"), (1e5, "Pa"), (0.35, "MPa"), (5.0, "bar")]
+)
+def test_the_unit_of_pressures_is_the_likeliest_of_a_hydraulic_machine(
+    tmp_path: Path, factor: float, unit: str
+) -> None:
+    """The supply stands at 70 times the factor: 7 are no 7 bar, and 24.5 no 24.5 bar."""
+    columns = machine()
+    for old, new in (("p_a", "press_a"), ("p_b", "press_b"), ("p_s", "press_p")):
+        columns[new] = factor * columns.pop(old)
+    del columns["p_t"]
+    path = written(tmp_path / "m.csv", columns)
+    roles = roles_of(path, open_source(path, None))
+    assert roles["p_supply"].name == "press_p"
+    assert {roles[r].unit for r in ("p_a", "p_b", "p_supply")} == {unit}
+
+
+def test_counts_of_a_converter_are_no_position(tmp_path: Path) -> None:
+    """20,000 were 20 km of stroke, and 115,000 L of dead volume."""
+    columns = machine()
+    columns["x"] = np.round(4000 + 16_000 * columns["x"] / 500)
+    path = written(tmp_path / "m.csv", columns)
+    with pytest.raises(RtidError, match="in no unit of length") as refused:
+        roles_of(path, open_source(path, None))
+    assert "x_mm" in str(refused.value.remedy)
+
+
+@pytest.mark.parametrize("overlap", [False, True])
+def test_a_coil_for_either_direction_is_one_command(tmp_path: Path, overlap: bool) -> None:
+    """Never at once: their difference; else they are two, of which one is taken."""
+    columns, way = machine(), machine()["u"]
+    del columns["u"], columns["spare"]
+    columns["out_pct"] = np.maximum(way, 0.0) + (3.0 if overlap else 0.0)
+    columns["valve_in_pct"] = np.maximum(-way, 0.0)
+    path = written(tmp_path / "m.csv", columns)
+    u = roles_of(path, open_source(path, None))["u"]
+    assert (u.name == "out_pct - valve_in_pct") is not overlap
+    assert u.unit == "%" and (overlap or u.low < -7.9 < 7.9 < u.high)

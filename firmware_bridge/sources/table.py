@@ -26,6 +26,7 @@ from firmware_bridge.sources.errors import LogError
 from firmware_bridge.sources.unpacked import Budget
 
 NUMBER_BYTES = 8
+MINUS = " - "  # between the names of two columns
 MOST_US = 2.0**62  # of a time stamp
 PERIODS, OFTEN = 1.5, 0.95  # of the usual step: more is a gap; share of the steps that are usual
 IN_TURN = 0.2  # share of blank rows, from which on a column is written in turn with others
@@ -50,9 +51,10 @@ class Table:
     def known_as(self, name: str) -> str:
         """The name under which a column is kept; LogError with the nearest name if there is none.
 
-        A column may be asked for with its unit as the file writes it, "p_s [Pa]".
+        A column may be asked for with its unit as the file writes it, "p_s [Pa]".  A difference is
+        kept as its first column.
         """
-        for known in (name, split_brackets(name)[0]):
+        for known in (name, split_brackets(name)[0], name.partition(MINUS)[0]):
             if known in self.columns:
                 return known
         close = get_close_matches(name, list(self.columns), 1, 0.5)
@@ -60,7 +62,13 @@ class Table:
         raise LogError(f"{self.path}: no numeric column {name!r}; {hint}")
 
     def column(self, name: str) -> NDArray[np.float64]:
-        """One column (n,), its unit in `units`; LogError with the nearest name if there is none."""
+        """One column (n,), its unit in `units`; LogError with the nearest name if there is none.
+
+        "out - in" is the difference of two: of a valve with a coil for either direction.
+        """
+        first, minus, second = name.partition(MINUS)
+        if minus and name not in self.columns:
+            return self.column(first) - self.column(second)
         return self.columns[self.known_as(name)]
 
     def time_name(self) -> str | None:
@@ -102,30 +110,33 @@ def to_samples(table: Table, assembly: Assembly) -> tuple[Samples, dict[str, int
     """Samples of the roles in `assembly` (signal = column), and refusals by reason.
 
     Rows with a missing value ("not_available") or whose time does not grow ("out_of_order") are
-    refused.  A step that is a gap (`longest_step`), and the first row, carry GAP; all carry ROW.
-    A command that rows tell in turn with others acts until its next one (`held`).
+    refused.  A step that is a gap (`longest_step`), and the first row, carry GAP.  Of rows that
+    tell signals in turn those with a command or the position are kept, the latter with ROW as all
+    others: a command acts until its next (`held`), a sensor is on the line to its next (`between`).
     """
     t_us = table.t_us()
     values = np.column_stack([_role(table, s, len(t_us)) for s in assembly.signals])
+    names = tuple(signal.name for signal in assembly.signals)
+    written, row = np.isfinite(values), names.index(assembly.row_signal)
+    commands = [k for k, signal in enumerate(assembly.signals) if signal.command]
     for k, signal in enumerate(assembly.signals):
-        if signal.command:
-            values[:, k] = held(t_us, values[:, k])
+        values[:, k] = (held if signal.command else between)(t_us, values[:, k])
     counts: dict[str, int] = {}
     finite = np.isfinite(values).all(axis=1)
     before = np.maximum.accumulate(np.concatenate([[np.iinfo(np.int64).min], t_us[:-1]]))
     later = t_us > before
     add_counts(counts, {"not_available": int((~finite).sum())})
     add_counts(counts, {"out_of_order": int((finite & ~later).sum())})
-    keep = finite & later
+    keep = finite & later & (written[:, row] | written[:, commands].any(axis=1))
     t_us, values = t_us[keep], values[keep]
-    flags = np.full(len(t_us), ROW, np.uint8)
-    if len(t_us) > 1:
-        steps = np.diff(t_us)
-        gaps = steps > longest_step(steps)
+    flags = np.where(written[keep, row], ROW, 0).astype(np.uint8)
+    between_rows = np.diff(t_us[flags == ROW])
+    if len(between_rows):
+        gaps = np.diff(t_us) > longest_step(between_rows)
         flags[1:][gaps] |= GAP
         add_counts(counts, {"gap": int(gaps.sum())})
     flags[:1] |= GAP
-    return Samples(tuple(s.name for s in assembly.signals), t_us, values, flags), counts
+    return Samples(names, t_us, values, flags), counts
 
 
 def held(t: NDArray[Any], values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -134,13 +145,35 @@ def held(t: NDArray[Any], values: NDArray[np.float64]) -> NDArray[np.float64]:
     A logger that writes each signal when it comes leaves the others blank.  t (n,), any unit: what
     is older than twice the usual interval between two commands is not known any more.
     """
-    known = np.flatnonzero(np.isfinite(values))
-    if not 1 < len(known) < (1.0 - IN_TURN) * len(values):
+    known = in_turn(values)
+    if not len(known):
         return values
     last = np.maximum(np.searchsorted(known, np.arange(len(values)), side="right") - 1, 0)
     since = t - t[known[last]]
     usual = np.median(np.diff(t[known]))
     return np.where((since >= 0) & (since <= 2 * usual), values[known[last]], np.nan)
+
+
+def between(t: NDArray[Any], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A sensor (n,) with its blanks filled by the line to its next value, where rows often are.
+
+    t (n,), any unit: no line spans more than twice the usual interval.
+    """
+    known = in_turn(values)
+    if not len(known):
+        return values
+    after = np.clip(np.searchsorted(known, np.arange(len(values))), 1, len(known) - 1)
+    spans = t[known[after]] - t[known[after - 1]]
+    line = np.interp(t, t[known], values[known], np.nan, np.nan)
+    is_near = spans <= 2 * np.median(np.diff(t[known]))
+    return np.where(is_near | np.isfinite(values), line, np.nan)
+
+
+def in_turn(values: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Indices at which a column (n,) is written, if in turn with others; else none."""
+    known = np.flatnonzero(np.isfinite(values))
+    is_often_blank = 1 < len(known) < (1.0 - IN_TURN) * len(values)
+    return known if is_often_blank else known[:0]
 
 
 def longest_step(steps: NDArray[np.int64]) -> float:

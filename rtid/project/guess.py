@@ -24,6 +24,12 @@ _ELSEWHERE = {
     *("accelerator", "accel", "pedal", "steering", "def", "scr", "filter", "cruise"),
 }
 MOST_PERCENT = 400.0  # a command of larger numbers counts
+# SI values between which the largest of a signal lies, the likeliest first: 40 to 700 bar
+LARGEST = {
+    "pressure": ((4e6, 70e6), (1e6, 70e6), (1e5, 70e6)),
+    "position": ((0.02, 5.0),),
+    "velocity": ((0.005, 5.0),),
+}
 _KIN = 0.25  # for each word that two signals of one cylinder share
 
 
@@ -64,16 +70,31 @@ def _role(name: str, kind: str, words: str, alone: str) -> Role:
 
 
 ROLES = (
-    _role("p_supply", "pressure", "supply pump pmp system main line sup outlet", "ps p0 pp psys"),
-    _role("p_tank", "pressure", "tank return reservoir drain", "pt pr pret"),
-    _role("p_a", "pressure", "a cap bore head piston 1 bottom base extend", "pa p1 pcap"),
-    _role("p_b", "pressure", "b rod ring annulus 2 top retract", "pb p2 prod"),
-    _role("x", "position", "x pos position stroke displacement length extension angle", "x s y"),
-    _role("v", "velocity", "v vel velocity speed", "v xdot"),
+    _role(
+        "p_supply",
+        "pressure",
+        "supply pump pmp system main line sup outlet pumpe pumpendruck systemdruck speisedruck",
+        "ps p0 pp psys pressp presp pressurep druckp",
+    ),
+    _role("p_tank", "pressure", "tank return reservoir drain tankdruck", "pt pr pret"),
+    _role(
+        "p_a", "pressure", "a cap bore head piston 1 bottom base extend kolbendruck", "pa p1 pcap"
+    ),
+    _role(
+        "p_b", "pressure", "b rod ring annulus 2 top retract stangendruck ringdruck", "pb p2 prod"
+    ),
+    _role(
+        "x",
+        "position",
+        "x pos position stroke displacement length extension angle weg kolbenweg zylinderweg hub",
+        "x s y",
+    ),
+    _role("v", "velocity", "v vel velocity speed geschwindigkeit", "v xdot"),
     _role(
         "u",
         "command",
-        "u cmd command valve vlv vpoc spool coil solenoid current pwm duty out",
+        "u cmd command valve vlv vpoc spool coil solenoid current pwm duty out voltage "
+        "ventil ventilstrom ventilspannung",
         "u i uv",
     ),
 )
@@ -169,6 +190,11 @@ def named(candidates: list[RoleCandidate], given: Mapping[str, str]) -> dict[str
     return {role: with_unit(known[name], kinds[role]) for role, name in given.items()}
 
 
+def may_be(role: str, candidate: RoleCandidate) -> bool:
+    """Whether a signal may play the role of this name."""
+    return any(_score(known, candidate) > 0.0 for known in ROLES if known.name == role)
+
+
 def is_wanted(candidate: RoleCandidate) -> bool:
     """Whether a name says that its signal is wanted, and not measured."""
     return bool(words_of(candidate.stem) & _WANTED_NOT_MEASURED)
@@ -202,16 +228,31 @@ def with_unit(candidate: RoleCandidate, role: Role) -> RoleCandidate:
     if candidate.unit:
         return candidate
     size = max(abs(candidate.low), abs(candidate.high))
-    limits = {"pressure": (1e5, 50e6), "position": (0.02, 5.0), "velocity": (0.005, 5.0)}
     if role.kind == "command":
         unit = "V" if size <= 12 else "%" if size <= MOST_PERCENT else "PWM"
         return replace(candidate, unit=unit, guessed_unit=True)
-    low, high = limits[role.kind]
     dimension = KIND_DIMENSIONS[role.kind][0]
+    names = (_likely(size, dimension, *limits) for limits in LARGEST[role.kind])
+    unit = next((name for name in names if name), units_of(dimension)[0].name)
+    return replace(candidate, unit=unit, guessed_unit=True)
+
+
+def _likely(size: float, dimension: str, low: float, high: float) -> str:
+    """The unit in which the largest value of a signal lies between two SI values; "" if none."""
     fitting = [u.name for u in units_of(dimension) if low <= size * u.factor <= high]
     preferred = [n for n in ("Pa", "bar", "m", "mm", "m/s", "mm/s", "MPa") if n in fitting]
-    unit = (preferred or fitting or [units_of(dimension)[0].name])[0]
-    return replace(candidate, unit=unit, guessed_unit=True)
+    return (preferred or fitting or [""])[0]
+
+
+def fits_no_unit(candidate: RoleCandidate, kind: str) -> bool:
+    """Whether a guessed unit is one in which no machine has such values: they are counts."""
+    unit = find_unit(candidate.unit)
+    size = max(abs(candidate.low), abs(candidate.high))
+    return (
+        candidate.guessed_unit
+        and unit is not None
+        and not any(low <= size * unit.factor <= high for low, high in LARGEST[kind])
+    )
 
 
 def _number(value: object, otherwise: float) -> float:

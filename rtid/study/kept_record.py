@@ -27,7 +27,7 @@ from rtid.project import Project
 from rtid.trace.described import catalog_of
 from rtid.trace.learner import Learner, listen, virtual_bus
 from rtid.trace.measured import with_sums
-from rtid.trace.reading import AT_ONCE, NoSamplesError, Trace, assemble
+from rtid.trace.reading import AT_ONCE, NoSamplesError, Trace, assemble, whole
 
 if TYPE_CHECKING:
     from rtid.study.known_effects import KnownEffect
@@ -132,7 +132,7 @@ def aged(project: Project, model: Machine, trace: Trace) -> tuple[Trace, Message
     def shifted(offsets_s: FloatArray) -> Samples:
         changes = dict(zip(tolerance, offsets_s, strict=True))
         moved = with_offsets(project.assembly, changes)
-        return with_sums(project, assemble(catalog, moved, frames)[0])
+        return with_sums(project, whole(project, *assemble(catalog, moved, frames))[0])
 
     def chunk_of(offsets_s: FloatArray) -> FloatArray:
         return _chunk(model, shifted(offsets_s), span_s)

@@ -51,9 +51,9 @@ def glance(path: Path, dbc: Path | None = None) -> Glance:
     source = open_source(path, dbc)
     proposed = proposal.propose(source.signals)
     units = {c.full_name: c.unit for c in (*source.signals, *proposed.values())}
-    values = dict(_values(path, dbc))
     roles = {role: c.full_name for role, c in proposed.items()}
     signals = [c.full_name for c in source.signals]
+    values = dict(_values(path, dbc, signals))
     names = [*roles.values(), *(n for n in signals if n not in roles.values())]
     curves = [
         Curve(n, units.get(n, ""), *extremes(values[n]))
@@ -78,11 +78,11 @@ def extremes(values: FloatArray, most: int = PIECES) -> tuple[FloatArray, FloatA
     return np.fmin.reduceat(values, at), np.fmax.reduceat(values, at)
 
 
-def _values(path: Path, dbc: Path | None) -> Iterator[tuple[str, FloatArray]]:
+def _values(path: Path, dbc: Path | None, names: list[str]) -> Iterator[tuple[str, FloatArray]]:
     """Values (n,) of every signal, by its full name."""
     content = open_file(path)
     if isinstance(content, Table):
-        yield from content.columns.items()
+        yield from ((name, content.column(name)) for name in names)
         return
     yield from _of_log(content, dbc)
 

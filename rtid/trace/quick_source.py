@@ -14,7 +14,7 @@ from firmware_bridge import catalog as catalogs
 from firmware_bridge.catalog import Catalog
 from firmware_bridge.frames import Frames
 from firmware_bridge.sources import open_file
-from firmware_bridge.sources.table import Table
+from firmware_bridge.sources.table import MINUS, Table
 from rtid.errors import RtidError
 from rtid.project import guess as proposal
 from rtid.project.guess import RoleCandidate
@@ -29,6 +29,7 @@ NEEDED = {
     "p_b": "the pressure of the other chamber",
 }
 NOBODY: Mapping[str, RoleCandidate] = MappingProxyType({})
+ACTS = 0.02  # share of its largest value from which on a command acts, and of the time that it does
 LEAST_STEP = 1e-6  # of a signal's range: computed values have no noise of their own
 
 
@@ -63,15 +64,35 @@ def _of_table(table: Table) -> Source:
     from rtid.trace.series import smallest_step  # noqa: PLC0415 - it brings the estimator with it
 
     time, unit = time_of(table)
-    signals = proposal.from_table(table)
+    signals = _one_command(table, proposal.from_table(table))
     steps = {}
     for candidate in signals:
-        values = table.columns[candidate.name]
+        values = table.column(candidate.name)
         span = candidate.high - candidate.low
         steps[candidate.name] = max(smallest_step(values[np.isfinite(values)]), LEAST_STEP * span)
     t_us = table.t_us()
     step_ms = 1e-3 * float(np.median(np.diff(t_us))) if len(t_us) > 1 else 0.0
     return Source({"time_column": time, "time_unit": unit}, signals, {}, steps, step_ms)
+
+
+def _one_command(table: Table, signals: list[RoleCandidate]) -> list[RoleCandidate]:
+    """The signals of a cylinder, its two commands, one for each direction, in one: "out - in"."""
+    if not {"p_a", "p_b"} <= proposal.propose(signals).keys():
+        return signals
+    commands = [c for c in signals if c.low >= 0.0 < c.high and proposal.may_be("u", c)]
+    for k, first in enumerate(commands):
+        for second in commands[k + 1 :]:
+            if first.unit == second.unit and _take_turns(table, first, second):
+                name = f"{first.name}{MINUS}{second.name}"
+                both = replace(first, name=name, low=-second.high)
+                return [both if c is first else c for c in signals if c is not second]
+    return signals
+
+
+def _take_turns(table: Table, first: RoleCandidate, second: RoleCandidate) -> bool:
+    """Whether both act, and never at once."""
+    acts = [table.column(c.name) > ACTS * c.high for c in (first, second)]
+    return bool(min(a.mean() for a in acts) > ACTS and not (acts[0] & acts[1]).any())
 
 
 def log_source(path: Path, frames: Frames, dbc: Path | None) -> Source:
@@ -132,6 +153,12 @@ def roles_of(
         raise RtidError(
             f"{path}: {roles['x'].name} is an angle, and only you know what position it means",
             "write a project file with its table: rtid init",
+        )
+    if proposal.fits_no_unit(roles["x"], "position"):
+        x = roles["x"]
+        raise RtidError(
+            f"{path}: {x.name} goes from {x.low:.4g} to {x.high:.4g}: in no unit of length",
+            f'counts of a converter? Give lengths, with the unit in the name, "{x.stem}_mm"',
         )
     return _alike(roles)
 

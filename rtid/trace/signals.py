@@ -14,9 +14,9 @@ from firmware_bridge.frames import Frames
 from firmware_bridge.j1939 import Network, known_as
 from firmware_bridge.samples import Samples
 from firmware_bridge.sources import open_file
-from firmware_bridge.sources.table import Table, to_samples
+from firmware_bridge.sources.table import Table, in_turn, to_samples
 from rtid.errors import RtidError
-from rtid.plain import FloatArray
+from rtid.plain import FloatArray, IntArray
 from rtid.project import Project
 from rtid.trace.arrivals import Timing, timing
 from rtid.trace.described import catalog_of
@@ -66,12 +66,19 @@ def _from_table(project: Project, content: Table) -> Recording:
     samples = with_sums(project, about_neutral(project, samples))
     t_us = table.t_us()
     series = tuple(
-        Series(source.name, t_us, _si(table.column(source.signal), source))
+        _of_column(source, t_us, table.column(source.signal))
         for source in assembly.signals
         if source.constant is None
     )
     messages = {table.path.name: timing(t_us)}
     return Recording(table.path, series, messages, samples, refused, True)
+
+
+def _of_column(source: SignalSource, t_us: IntArray, column: FloatArray) -> Series:
+    """A column (n,), unit of the file; of one told in turn with others what is written."""
+    known = in_turn(column)
+    at = known if len(known) else slice(None)
+    return Series(source.name, t_us[at], _si(column[at], source))
 
 
 def _from_log(project: Project, path: Path, frames: Frames) -> Recording:

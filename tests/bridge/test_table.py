@@ -12,7 +12,7 @@ from scipy.io import savemat
 from firmware_bridge.config import Assembly, SignalSource
 from firmware_bridge.samples import GAP, ROW
 from firmware_bridge.sources import LogError, read_table
-from firmware_bridge.sources.table import to_samples
+from firmware_bridge.sources.table import between, to_samples
 
 ROLES = Assembly(
     "cycle",
@@ -115,3 +115,39 @@ def test_a_number_that_no_sensor_sends_is_a_missing_value(tmp_path: Path) -> Non
     field = pa.field("p", pa.float64(), metadata={"scale": "1e300", "offset": "nan"})
     pq.write_table(pa.table([[1e300, 2.0]], pa.schema([field])), tmp_path / "t.parquet")
     assert np.isnan(read_table(tmp_path / "t.parquet").columns["p"]).all()
+
+
+def test_rows_that_tell_signals_in_turn(tmp_path: Path) -> None:
+    """Position at 0, 4, 8, pressure at 1, 5, 9 ms, command at 3 and 7: each has rows of its own."""
+    path = tmp_path / "t.csv"
+    rows = {0: "0,,", 1: ",1,", 3: ",,7", 4: "4,,", 5: ",5,", 7: ",,9", 8: "8,,", 9: ",9,"}
+    path.write_text("t_ms,x,p,u\n" + "".join(f"{t},{row}\n" for t, row in rows.items()))
+    sources = [SignalSource(name, signal=name, command=name == "u") for name in "xpu"]
+    samples, counts = to_samples(read_table(path), Assembly("cycle", tuple(sources), (), "x"))
+    assert samples.t_us.tolist() == [3000, 4000, 7000, 8000]
+    assert samples.values.tolist() == [[3, 3, 7], [4, 4, 7], [7, 7, 9], [8, 8, 9]]
+    assert (samples.flags & ROW).tolist() == [0, ROW, 0, ROW], "the position was measured"
+    assert counts == {"not_available": 3}
+
+
+def test_no_line_spans_what_is_missing() -> None:
+    """A sensor that is silent for long is not known in between."""
+    values = np.full(40, np.nan)
+    values[::4] = np.arange(0.0, 40.0, 4.0)
+    values[12:24] = np.nan
+    filled = between(np.arange(40), values)
+    known = np.isfinite(filled)
+    assert not known[9:24].any() and known[:9].all() and known[24:37].all()
+    assert np.array_equal(filled[known], np.arange(40.0)[known])
+
+
+def test_a_difference_of_two_columns(tmp_path: Path) -> None:
+    """A coil for either direction; a name that holds a minus is itself."""
+    path = tmp_path / "t.csv"
+    path.write_text("t,out [%],in [%],a - b\n0,30,0,1\n1,0,20,2\n")
+    table = read_table(path)
+    assert table.column("out - in").tolist() == [30, -20]
+    assert table.units[table.known_as("out - in")] == "%"
+    assert table.column("a - b").tolist() == [1, 2]
+    with pytest.raises(LogError, match="no numeric column 'off'"):
+        table.column("out - off")
