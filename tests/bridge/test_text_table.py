@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from firmware_bridge.sources import LogError, read_table
@@ -75,9 +76,11 @@ def test_seconds_of_a_day_alone(tmp_path: Path) -> None:
 
 
 def test_a_frame_of_pandas(tmp_path: Path) -> None:
-    """Its index of dates is a column of the file."""
-    index = pd.date_range("2026-03-01 08:00", periods=3, freq="2ms", name="timestamp")
-    pd.DataFrame({"u": [1.0, 2.0, 3.0]}, index=index).to_parquet(tmp_path / "t.parquet")
+    """Its index of dates is a column of the file, in nanoseconds."""
+    stamps = pa.array(
+        [1_772_352_000_000_000_000 + 2_000_000 * k for k in range(3)], pa.timestamp("ns")
+    )
+    pq.write_table(pa.table({"u": [1.0, 2.0, 3.0], "timestamp": stamps}), tmp_path / "t.parquet")
     table = read_table(tmp_path / "t.parquet")
     assert np.diff(table.t_us()).tolist() == [2000, 2000]
     assert table.columns["u"].tolist() == [1, 2, 3]
