@@ -170,7 +170,7 @@ def between(t: NDArray[Any], values: NDArray[np.float64]) -> NDArray[np.float64]
 
 
 def in_turn(values: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Indices at which a column (n,) is written, if in turn with others; else none."""
+    """Indices (k,) at which a column (n,), any unit, is written in turn with others; else none."""
     known = np.flatnonzero(np.isfinite(values))
     is_often_blank = 1 < len(known) < (1.0 - IN_TURN) * len(values)
     return known if is_often_blank else known[:0]
