@@ -36,6 +36,7 @@ from firmware_bridge.steps import Continuous
 
 PLUGINS = "rtid.formats"  # entry points of other packages: any name = a Format
 GZIP, GZIP_MAGIC = ".gz", b"\x1f\x8b"
+SPREADSHEETS = (".xlsx", ".xls", ".xlsm", ".ods")
 PACKED = {  # what unpacks them
     ".bz2": "bunzip2 -k",
     ".xz": "unxz -k",
@@ -183,6 +184,8 @@ def _known(inner: Unpacked) -> Format:
     if known is None:
         wrong = "".join(f"; {text}" for text in _formats()[1])
         suffix, all_known = inner.name.suffix, ", ".join(suffixes())
+        if suffix.lower() in SPREADSHEETS:
+            raise LogError(f"{inner.name}: a spreadsheet; save its sheet as .csv")
         raise LogError(f"{inner.name}: unknown suffix {suffix!r}; known are {all_known}{wrong}")
     return known
 
