@@ -74,13 +74,14 @@ def _longest(t_s: FloatArray, at_end: BoolArray) -> tuple[tuple[float, float], .
 
 
 def as_measured(model: Machine, chunk: FloatArray) -> Machine:
-    """The model with no noise on pressures that are no measurements but computed values.
+    """The model with no noise on pressures beside the chambers' that are computed, not measured.
 
-    chunk (n, 2 + signals), SI.
+    A chamber's pressure that is as smooth was filtered.  chunk (n, 2 + signals), SI.
     """
+    chambers = {chamber.pressure for chamber in model.chambers}
     signals = tuple(
         replace(s, noise=0.0, resolution=0.0)
-        if s.kind == PRESSURE and not has_noise(chunk[:, 2 + j])
+        if s.kind == PRESSURE and s.name not in chambers and not has_noise(chunk[:, 2 + j])
         else s
         for j, s in enumerate(model.signals)
     )
