@@ -107,5 +107,5 @@ def _cells(compared: TraceComparison, chunk: FloatArray) -> NDArray[np.int64]:
     cells = np.empty((n - 1, len(found.model.edges)), np.int64)
     theta, compliance = compared.flowmap.theta_cells(), found.fit.solution.compliance
     outputs = np.empty((n - 1, 2 * c)), cells, np.empty((n - 1, c))
-    explain(state.engine, state.cells, theta, compliance, chunk, np.zeros((n, c)), *outputs)
+    explain(state.engine, state.cells, theta, compliance, chunk, *outputs)
     return cells

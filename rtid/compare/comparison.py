@@ -183,8 +183,7 @@ def _hold(
     state = build(model.with_taylor_maps, candidate.weights)
     state.engine[0]["term_theta"][: len(terms)] = terms
     theta, compliance = candidate.theta, candidate.compliance
-    soft = np.zeros((len(chunk), c))
-    explain(state.engine, state.cells, theta, compliance, chunk, soft, flow, cell, innovation)
+    explain(state.engine, state.cells, theta, compliance, chunk, flow, cell, innovation)
     return _Held(np.ascontiguousarray(chunk[:, 0]), flow, cell, innovation)
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from rtid.diagnose.exact import carried_on, key_of, timing_trials, with_pump
-from rtid.diagnose.finer import LITTLE
-from rtid.diagnose.fit import Fit, one_pass
+from rtid.diagnose.fit import Fit
 from rtid.diagnose.rivals import is_told_apart
 from rtid.diagnose.trials import (
     TIE,
@@ -108,35 +107,28 @@ def hardly_worse(
 
     least_gain: chi2, per number, that such a cause must take to be named; what the maps miss of a
     clean machine takes as much, and so it is no difference between two.  A turbulent leak in mixed
-    valves fell 129 behind a laminar one of 2578, which was named alone.  One that explains more and
-    was set aside, since unseen data did not like it, is not told from what is named instead.
+    valves fell 129 behind a laminar one of 2578, which was named alone.
     """
     behind = best.gain - least_gain - TIE_SHARE * best.gain
     return tuple(
         t.key
         for t in finished.values()
         if t.key != best.key
-        and (t.key not in state.negligible or t.gain > best.gain)
+        and t.key not in state.negligible
         and t.gain > max(behind, least_gain * t.n_parameters)
         and not _is_beaten(t, list(finished.values()))
     )
 
 
 def as_nearly_right(
-    state: TrialState,
-    present: Fit,
-    now: Fit,
-    kept: Fit,
-    trials: list[Trial],
-    finished: dict[Key, Trial],
+    state: TrialState, present: Fit, now: Fit, trials: list[Trial], finished: dict[Key, Trial]
 ) -> tuple[Key, ...]:
     """Causes that nothing but a misfit tells apart from the best one, which leaves it (`rivals`).
 
-    now: the fit with the best one, kept: without the few blocks that miss the flow.  A cause beside
-    which moduli are impossible is refuted, where they are possible beside that.
+    now: the fit with the best one.  A cause beside which moduli are impossible is refuted, where
+    they are possible beside that.
     """
-    # what disturbs a plant without pressures has no blocks
-    if not state.model.has_pressures or now.rho < now.most_rho:
+    if not state.model.has_pressures:  # what disturbs the plant has no blocks
         return ()
     bar = NEAR * now.wins_over(present)
     near = [t for t in trials if t.gain > bar and not now.revision.has(t.key)]
@@ -146,25 +138,9 @@ def as_nearly_right(
         for t in _all_finished(state, present, near, finished)
         if t.fit is not None
         and t.gain > bar
-        and not _is_beaten(t, list(finished.values()))
-        and _is_nearly_right(t.fit, now, kept)
+        and not (_is_beaten(t, list(finished.values())) or is_told_apart(now, t.fit))
         and (told_doubts(now) or not told_doubts(t.fit))
     )
-
-
-def _is_nearly_right(other: Fit, now: Fit, kept: Fit) -> bool:
-    """True for a cause that the record does not tell from the best one, by its blocks.
-
-    Where a few blocks hold all that the best one misses, they have no say on either.  Oil that
-    boils out was air in all but 7 blocks of 450, where it left rho 1.22 for 1.04, 1.2 deviations;
-    a late position sensor left 1.67 for 0.96 of a delay, and is none of its rivals.
-    """
-    if kept.rho >= kept.most_rho:
-        return not is_told_apart(now, other)
-    weights = replace(other.weights, missed=kept.weights.missed)
-    record = other.declared, other.chunk, weights, other.revision
-    alike = one_pass(*record, other, bank=False, thorough=False)
-    return alike.rho < LITTLE and not is_told_apart(kept, alike)
 
 
 def _all_finished(

@@ -141,8 +141,7 @@ def searched(standing: Standing, progress: Progress = silent) -> Result:
         present, last, state.found = first, before, []
     elif not state.found and (soft or matches_as_it_stands(first, present)):
         present, last, doubted = with_bank(first, state.suspects), before, told_doubts(first)
-    named = {f.key for f in state.found} | {part.key for part in parts}
-    present = with_spreads(present, frozenset(e.key for e in present.revision.effects) - named)
+    present = with_spreads(present)
     result, negligible, scores = tuple(state.found), state.negligible, scored(present)
     joined = tuple(joint for part in record for joint in joints(present, part, scores))
     apart = zeros(present, joined)
@@ -265,7 +264,8 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
             present.unread()  # what is read beside the next one is as large
             kept, after = _with_bank(state, now)
             more = () if does is None else hardly_worse(state, trial, finished, HIDDEN_GAIN)
-            more += as_nearly_right(state, present, now, kept, trials, finished)
+            if kept.rho >= kept.most_rho:
+                more += as_nearly_right(state, present, now, trials, finished)
             alike = tuple(dict.fromkeys((*alike, *more)))
             what = trial.key, alike, trial.gain, trial.n_parameters
             state.found.append(AcceptedEffect(*what, last, after, does))

@@ -14,23 +14,19 @@ from dataclasses import replace
 import numpy as np
 
 from rtid.diagnose.commands import split
-from rtid.diagnose.equations import softened
-from rtid.diagnose.evidence import project, rows_of
-from rtid.diagnose.fit import NO_COV, Fit, columns_of_effects, fit, one_pass
+from rtid.diagnose.fit import Fit, columns_of_effects, fit, one_pass
 from rtid.diagnose.residual import effect_values
 from rtid.effects.extra import with_extra_flow
-from rtid.effects.record_view import MapTerms, of_all_cells
 from rtid.estimator.limits import most_open
-from rtid.estimator.misfit import Misfit, can_be_explained, count_misfit, held_against
+from rtid.estimator.misfit import Misfit, can_be_explained, count_misfit, residual_of
 from rtid.estimator.missed import excusing, misses
 from rtid.estimator.record import summed
-from rtid.estimator.solution import solve
+from rtid.estimator.solution import sketch, solve
 from rtid.model import Machine
 from rtid.plain import FloatArray
 
 # of the visited blocks: 1 in 100 on clean records, 4 in 10 with a leak of 2 % of the flow
 FEW = 0.1
-EACH = 0.0  # length of rows, s: every position is one
 KNOWN = 1e-4  # share by which the flow of an effect may differ from what is fitted
 
 
@@ -62,46 +58,19 @@ def _excused(present: Fit, most: float) -> Fit:
     missing = misses(present.model, rest)
     if not 0.0 < missing.share <= most:
         return present
-    record = present.model, present.sent, present.weights
-    weights = excusing(*record, rest, missing.hot, _of_samples(present))
+    weights = excusing(present.model, present.sent, present.weights, rest, missing.hot)
     if not weights.missed.any():  # it comes and goes too fast to be the block's
         return present
     return fit(present.declared, present.chunk, weights, present.revision, present, bank=False)
 
 
 def left_over(present: Fit) -> Misfit:
-    """What a fit leaves of every sample of its record, weighed as the fit weighs its rows."""
+    """What the maps of a fit leave of its record beside its effects."""
     if present.rest is not None:
         return present.rest
     model, chunk = _machine(present)
-    soft = _of_samples(present)
-    theta, _ = of_all_cells(model, _map_of_samples(present, soft))
-    beside = theta, present.compliance, np.ones(len(model.terms)), soft
-    return held_against(model.with_taylor_maps, chunk, present.weights, *beside)
-
-
-def _of_samples(present: Fit) -> FloatArray:
-    """What a fit's effects add to the white variance of each sample's equation (n, chambers)."""
-    record = present.model, present.sent, present.weights, present.revision
-    return softened(*record, EACH)
-
-
-def _map_of_samples(present: Fit, soft: FloatArray) -> MapTerms:
-    """The maps that follow every sample, not their means of 10 ms, beside all that a fit says.
-
-    soft (n, chambers), m6: as of `softened`.  What a working point does within the few rows of a
-    block that is hardly visited, its terms by the means do not follow.
-    """
-    rows = rows_of(present.model, present.sent, present.weights, row_s=EACH, soft=soft)
-    effects = [
-        {c: rows.condensed(volume) for c, volume in volumes.items()}
-        for volumes in columns_of_effects(present)
-    ]
-    n_c = len(present.model.chambers)
-    sizes = [value for _, value in effect_values(present)]
-    shared = np.concatenate([present.held.theta[:n_c], sizes])
-    terms = project(rows, effects).terms(list(range(1, 1 + len(shared))), shared)
-    return MapTerms(rows.cells, terms, NO_COV)
+    weights = present.weights
+    return residual_of(model, chunk, weights, sketch(model, summed(model, chunk, weights)))
 
 
 def counted(present: Fit) -> FloatArray:

@@ -25,23 +25,18 @@ from rtid.diagnose.fit import Fit, columns_of_effects
 from rtid.effects.column import Columns
 from rtid.effects.law import Volumes
 from rtid.effects.laws import total_softness
-from rtid.plain import FloatArray, Key
+from rtid.plain import FloatArray
 from rtid.units import UNIFORM
 
 PARTS = 4
 
 
-def with_spreads(fitted: Fit, unnamed: frozenset[Key] = frozenset()) -> Fit:
-    """A fit that knows how far its sizes are from one number; as it is without its rows.
-
-    unnamed: effects of it that nobody is told of.  What a law misses they may have taken in.
-    """
+def with_spreads(fitted: Fit) -> Fit:
+    """A fit that knows how far its sizes are from one number; as it is without its rows."""
     if fitted.rows is None or not (fitted.revision.effects or fitted.revision.timings):
         return fitted
-    spreads, moved = dict(_spreads(fitted, fitted.rows)), _moved_by(fitted, unnamed)
-    spreads |= dict(_of_wholes(fitted))
-    spreads |= {at: float(np.hypot(spreads.get(at, 0.0), move)) for at, move in moved.items()}
-    better = replace(fitted, spreads=tuple(spreads.items()))
+    spreads = (*_spreads(fitted, fitted.rows), *_of_wholes(fitted))
+    better = replace(fitted, spreads=spreads)
     vars(better).update(model=fitted.model, sent=fitted.sent, view=fitted.view)
     return better
 
@@ -85,26 +80,6 @@ def _of_wholes(fitted: Fit) -> Iterator[tuple[int, float]]:
             share = np.sqrt(rest / max(without.sse - fitted.held.sse, rest, 1e-300)) / UNIFORM
             for k, at in fitted.shape_columns(effect).items():
                 yield at, float(share * abs(effect.shape[k] * fitted.held.value(column)))
-
-
-def _moved_by(fitted: Fit, unnamed: frozenset[Key]) -> dict[int, float]:
-    """What sizes of effects move by, by column, where those that nobody is told of are left out.
-
-    As of a law's own form: it is anything between.  Beside a leak whose gap widens a relief valve
-    that changed next to nothing stayed in the model, and left the leak 6.4 % smaller, to 0.3 %.
-    """
-    rest = [e for e in fitted.revision.effects if e.key not in unnamed]
-    if len(rest) == len(fitted.revision.effects):
-        return {}
-    left_out = {
-        column
-        for e in fitted.revision.effects
-        if e.key in unnamed
-        for column in (fitted.column(e), *fitted.shape_columns(e).values())
-    }
-    without = fitted.regression.fit(tuple(k for k in fitted.held.used if k not in left_out))
-    moves = {at: without.value(at) - fitted.held.value(at) for at in map(fitted.column, rest)}
-    return {at: abs(move) / UNIFORM for at, move in moves.items()}
 
 
 def _given(fitted: Fit) -> dict[int, Volumes]:

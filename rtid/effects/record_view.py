@@ -244,7 +244,7 @@ class RecordView:
         assert self.beside is not None  # a record without a map has nothing to be followed
         model, n = self.model, len(self.chunk)
         n_edges, state = len(model.edges), build(model, self.beside.weights)
-        theta, cov = of_all_cells(model, self.beside.map, FLOW_SD in asked)
+        theta, cov = _of_all_cells(model, self.beside.map, FLOW_SD in asked)
         out = {k: np.zeros((n_edges, n)) for k in asked}
         inside, room = np.zeros(n, bool), np.empty((5, n_edges, AT_ONCE)).transpose(2, 1, 0)
         cell = np.empty(room.shape[:2], np.int64)
@@ -285,8 +285,8 @@ class RecordView:
         return all(kinds.get(c.pressure) == PRESSURE for c in self.model.chambers)
 
 
-def of_all_cells(
-    model: Machine, flowmap: MapTerms, has_cov: bool = False
+def _of_all_cells(
+    model: Machine, flowmap: MapTerms, has_cov: bool
 ) -> tuple[FloatArray, FloatArray]:
     """Terms (cells, 6), m3/s, and their covariance (cells, 6, 6), or (0, 6, 6), of all blocks."""
     rated = np.repeat(

@@ -18,7 +18,7 @@ from typing import cast
 
 import numpy as np
 
-from rtid.estimator.solution import Solution, widen
+from rtid.estimator.solution import Sketch, Solution, widen
 from rtid.estimator.state import Weights, build
 from rtid.kernels.engine import ROW_FLAG
 from rtid.kernels.explain import explain
@@ -69,35 +69,14 @@ class Misfit:
     cells: Cells
 
 
-def residual_of(model: Machine, chunk: FloatArray, weights: Weights, solution: Solution) -> Misfit:
-    """What a solution leaves of its record, chunk (n, 2 + signals) in SI."""
-    theta, terms = _cells_of(model, solution.cells, solution.unknowns), solution.terms_theta
-    return held_against(model, chunk, weights, theta, solution.compliance, terms)
-
-
-def held_against(
-    model: Machine,
-    chunk: FloatArray,
-    weights: Weights,
-    theta: FloatArray,
-    compliance: FloatArray,
-    terms: FloatArray,
-    soft: FloatArray | None = None,
+def residual_of(
+    model: Machine, chunk: FloatArray, weights: Weights, estimate: Solution | Sketch
 ) -> Misfit:
-    """What maps leave of a record, chunk (n, 2 + signals) in SI.
-
-    theta (cells, 6), m3/s: the maps; compliance (chambers,), 1/Pa; terms (terms,): of the shared
-    terms, in units of their scales; soft (n, chambers): white variance of each measured position's
-    equation, m6, beyond that of the model, none unless given.
-    """
-    n, n_c, state = len(chunk), len(model.chambers), build(model, weights)
-    state.engine[0]["term_theta"][: len(terms)] = terms
-    soft = np.zeros((n, n_c)) if soft is None else np.ascontiguousarray(soft)
-    flow, innovation = np.empty((n - 1, 2 * n_c)), np.empty((n - 1, n_c))
-    cells = np.empty((n - 1, len(model.edges)), np.int64)
-    explain(state.engine, state.cells, theta, compliance, chunk, soft, flow, cells, innovation)
-    missed = flow[:, 0::2] - flow[:, 1::2]
-    return Misfit(missed, innovation, cast("Cells", cells.astype(np.int32)))
+    """What an estimate leaves of its record, chunk (n, 2 + signals) in SI."""
+    n_c = len(model.chambers)
+    theta = _cells_of(model, estimate.cells, estimate.unknowns)
+    terms = estimate.unknowns[n_c : n_c + len(model.terms)]
+    return _residual(model, chunk, weights, theta, estimate.compliance, terms)
 
 
 def _scores(
@@ -106,13 +85,13 @@ def _scores(
     """w_k r_k (rows, chambers) about their mean, and the grid cells (rows, edges)."""
     theta, flows = _per_cell(model, solution)
     n_c, terms = len(solution.scale_pa), solution.terms_theta
-    misfit = held_against(model, chunk, weights, theta, solution.compliance, terms)
+    misfit = _residual(model, chunk, weights, theta, solution.compliance, terms)
     residual, cells = misfit.innovation, misfit.cells
     scores = np.empty((len(residual), len(solution.scale_pa)))
     for c, influence in enumerate(flows):
         moved = solution.compliance + solution.influence[c, :n_c] * solution.scale_pa
         shared = terms + solution.influence[c, n_c : n_c + len(terms)]
-        shifted = held_against(model, chunk, weights, theta + influence, moved, shared).innovation
+        shifted = _residual(model, chunk, weights, theta + influence, moved, shared).innovation
         scores[:, c] = ((residual - shifted) * residual).sum(axis=1)
     known = np.isfinite(scores).all(axis=1)
     scores, cells = scores[known], cells[known]
@@ -137,6 +116,23 @@ def _rated(model: Machine) -> tuple[FloatArray, list[int]]:
     """Rated flow and number of cells of each map."""
     rated = np.array([edge.rated_q_m3s for edge in model.maps])
     return rated, [edge.grid.shape[0] * edge.grid.shape[1] for edge in model.maps]
+
+
+def _residual(
+    model: Machine,
+    chunk: FloatArray,
+    weights: Weights,
+    theta: FloatArray,
+    compliance: FloatArray,
+    terms: FloatArray,
+) -> Misfit:
+    n, n_c, state = len(chunk), len(model.chambers), build(model, weights)
+    state.engine[0]["term_theta"][: len(terms)] = terms
+    flow, innovation = np.empty((n - 1, 2 * n_c)), np.empty((n - 1, n_c))
+    cells = np.empty((n - 1, len(model.edges)), np.int64)
+    explain(state.engine, state.cells, theta, compliance, chunk, flow, cells, innovation)
+    missed = flow[:, 0::2] - flow[:, 1::2]
+    return Misfit(missed, innovation, cast("Cells", cells.astype(np.int32)))
 
 
 def _of_chamber(model: Machine, cells: Cells, chamber: int) -> Cells:

@@ -18,7 +18,7 @@ from rtid.estimator.misfit import Misfit, residual_of
 from rtid.estimator.solution import Solution
 from rtid.estimator.state import Weights, variance
 from rtid.estimator.track import stored_per_pressure
-from rtid.model import Machine
+from rtid.model import Chamber, Machine
 from rtid.plain import BoolArray, FloatArray, IntArray
 
 HOT = 1.2  # mean squared innovation from which on a cell is weighed ...
@@ -43,19 +43,15 @@ def excusing(
     weights: Weights,
     residual: Misfit,
     hot: BoolArray,
-    soft: FloatArray | None = None,
 ) -> Weights:
     """The weights with `missed`, m6/s, for the hot cells (cells,), and for those that had it.
 
-    chunk (n, 2 + signals), SI; soft (n, chambers): white variance of each measured position's
-    equation, m6, beyond that of the model.
+    chunk (n, 2 + signals), SI.
     """
     hot = hot | (weights.missed > 0)
     if not hot.any():
         return weights
-    noise = _position_noise(model, chunk, weights) + (0.0 if soft is None else soft)
-    rates = _rates(model, chunk, weights, residual, noise[1:])
-    return replace(weights, missed=np.where(hot, rates, 0.0))
+    return replace(weights, missed=np.where(hot, _rates(model, chunk, weights, residual), 0.0))
 
 
 @dataclass(frozen=True)
@@ -95,17 +91,12 @@ class _Stays:
     excess_m6: FloatArray
 
 
-def _rates(
-    model: Machine, chunk: FloatArray, weights: Weights, residual: Misfit, white: FloatArray
-) -> FloatArray:
-    """Variance rate of the missed flow per cell (cells,), m6/s; 0 where the noise explains all.
-
-    white (n - 1, chambers): noise of one row at the end of each interval, m6.
-    """
+def _rates(model: Machine, chunk: FloatArray, weights: Weights, residual: Misfit) -> FloatArray:
+    """Variance rate of the missed flow per cell (cells,), m6/s; 0 where the noise explains all."""
     total, time_s = np.zeros(model.n_cells), np.zeros(model.n_cells)
     for c, chamber in enumerate(model.chambers):
         edges = [i for i, edge in enumerate(model.edges) if edge.sign(chamber) != 0]
-        stays = _stays(chunk, residual, white[:, c], c, edges)
+        stays = _stays(model, chunk, weights, residual, c, edges)
         for i in edges:
             cell = residual.cells[stays.first, i]
             here = (cell >= 0) & (stays.time_s > 0)
@@ -117,7 +108,12 @@ def _rates(
 
 
 def _stays(
-    chunk: FloatArray, residual: Misfit, white: FloatArray, c: int, edges: list[int]
+    model: Machine,
+    chunk: FloatArray,
+    weights: Weights,
+    residual: Misfit,
+    c: int,
+    edges: list[int],
 ) -> _Stays:
     missed = residual.missed[:, c]
     dt, known = np.diff(chunk[:, 0]), np.isfinite(missed)
@@ -125,21 +121,19 @@ def _stays(
     cut = np.diff(np.floor(chunk[1:, 0] / STAY_S)) != 0
     new = np.concatenate([[True], moved | cut | ~known[1:]])
     stay, n = np.cumsum(new) - 1, int(new.sum())
+    noise = _position_noise(model, chunk[1:], weights, c)
     volume = np.bincount(stay[known], (missed * dt)[known], n)
-    ends = 2.0 * np.bincount(stay, white, n) / np.bincount(stay, minlength=n)
+    ends = 2.0 * np.bincount(stay, noise, n) / np.bincount(stay, minlength=n)
     lasted = np.bincount(stay[known], dt[known], n).astype(np.float64)
     return _Stays(np.flatnonzero(new), lasted, np.asarray(volume**2 - ends, np.float64))
 
 
-def _position_noise(model: Machine, chunk: FloatArray, weights: Weights) -> FloatArray:
-    """White noise of one row of each chamber at each sample (n, chambers), m6."""
-    stiff = stored_per_pressure(model, chunk[:, 2:], weights.compliance)
-    of_x, share = variance(model, model.position), model.pressure_share
-    noise = [
-        chamber.area_m2**2 * of_x + stiff[:, c] ** 2 * variance(model, chamber.pressure) * share
-        for c, chamber in enumerate(model.chambers)
-    ]
-    return np.stack(noise, axis=1)
+def _position_noise(model: Machine, chunk: FloatArray, weights: Weights, c: int) -> FloatArray:
+    """White noise of one row of a chamber at each sample (n,), m6."""
+    chamber: Chamber = model.chambers[c]
+    stiff = stored_per_pressure(model, chunk[:, 2:], weights.compliance)[:, c]
+    position, pressure = (variance(model, s) for s in (model.position, chamber.pressure))
+    return np.asarray(chamber.area_m2**2 * position + stiff**2 * pressure * model.pressure_share)
 
 
 def _pressure_noise(model: Machine, weights: Weights, i: int) -> FloatArray:

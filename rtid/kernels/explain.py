@@ -30,7 +30,6 @@ def explain(
     theta: FloatArray,
     compliance: FloatArray,
     chunk: FloatArray,
-    soft: FloatArray,
     flow: FloatArray,
     cell: Any,
     innovation: FloatArray,
@@ -39,8 +38,7 @@ def explain(
 
     engine (1,), cells: a freshly built state (the engine is used up; its term_theta holds the
     coefficients of the shared terms); theta (cells, 6) m3/s in the basis of the state,
-    compliance (chambers,) 1/Pa, chunk (n, 2 + signals).  soft (n, chambers): white variance of a
-    row at each sample beyond that of the model, m6.  flow (n - 1, chambers, 2): measured
+    compliance (chambers,) 1/Pa, chunk (n, 2 + signals).  flow (n - 1, chambers, 2): measured
     s A v and modelled right-hand side of (14), mean over the interval, m3/s; NaN where the trace
     has a gap or the point is off the grid.  cell (n - 1, edges): grid cell, -1 shut.
     innovation (n - 1, chambers): whitened, unit variance for a perfect model; NaN where no row.
@@ -58,14 +56,12 @@ def explain(
             _one(e, cells, theta, compliance, sample, dt, flow[k - 1], cell[k - 1], gap)
             remember(e, sample)
             if (flags & ROW_FLAG) != 0:
-                _innovate(e, soft[k], gap, work, innovation[k - 1])
+                _innovate(e, gap, work, innovation[k - 1])
         else:
             e.running = 0
             gap[:] = 0.0
             if whole and (flags & ROW_FLAG) != 0:
                 begin(e, sample)
-                for c in range(e.n_chambers):
-                    e.cov[c, c] += soft[k, c]
 
 
 @inlined
@@ -127,21 +123,20 @@ def _windowed(e: Any, theta: FloatArray, i: int) -> float:
 
 
 @inlined
-def _innovate(e: Any, soft: FloatArray, gap: FloatArray, work: FloatArray, out: FloatArray) -> None:
+def _innovate(e: Any, gap: FloatArray, work: FloatArray, out: FloatArray) -> None:
     """Whitened innovation L^-1 gap, and the whitener's update P <- R S^-1 P, column by column.
 
-    soft (chambers,): more of R, m6; work (chambers, chambers) is scratch.
+    work (chambers, chambers) is scratch.
     """
-    more_a, more_b = soft[0], soft[e.n_chambers - 1]
-    first, second = innovations(e, gap, more_a, more_b)
+    first, second = innovations(e, gap, 0.0, 0.0)
     out[0] = first
     if e.n_chambers == 2:
         out[1] = second
-    fade(e, gap, more_a, more_b)
+    fade(e, gap)
     for c in range(e.n_chambers):
         for k in range(e.n_chambers):
             work[c, k] = e.cov[k, c]
-        fade(e, work[c], more_a, more_b)
+        fade(e, work[c])
     for c in range(e.n_chambers):
         for k in range(e.n_chambers):
             e.cov[k, c] = 0.5 * (work[c, k] + work[k, c])

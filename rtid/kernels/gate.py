@@ -64,4 +64,4 @@ def _follow(e: Any) -> None:
     for c in range(e.n_chambers):
         r = position_noise(e, c, c)
         e.gap_sd[c] *= r / (e.cov[c, c] + r)
-    fade(e, e.gap, 0.0, 0.0)
+    fade(e, e.gap)

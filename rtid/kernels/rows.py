@@ -56,14 +56,14 @@ def innovations(e: Any, d: Any, more_a: float, more_b: float) -> tuple[float, fl
 
 
 @inlined
-def fade(e: Any, d: Any, more_a: float, more_b: float) -> None:
-    """d <- R S^-1 d (chambers,) of one column at a row, in place; R and S with diag(more)."""
-    r00 = position_noise(e, 0, 0) + more_a
+def fade(e: Any, d: Any) -> None:
+    """d <- R S^-1 d (chambers,) of one column at a row, in place."""
+    r00 = position_noise(e, 0, 0)
     s00 = e.cov[0, 0] + r00
     if e.n_chambers == 1:
         d[0] *= r00 / s00
         return
-    r01, r11 = position_noise(e, 0, 1), position_noise(e, 1, 1) + more_b
+    r01, r11 = position_noise(e, 0, 1), position_noise(e, 1, 1)
     s01, s11 = e.cov[0, 1] + r01, e.cov[1, 1] + r11
     det = s00 * s11 - s01 * s01
     g0, g1 = (s11 * d[0] - s01 * d[1]) / det, (s00 * d[1] - s01 * d[0]) / det

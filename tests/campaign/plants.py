@@ -113,6 +113,8 @@ def assigned(model: Machine, fit: RecordFit, chunk: FloatArray) -> np.ndarray:
     state = build(model, fit.weights)
     cells = np.empty((n - 1, len(model.edges)), np.int64)
     theta = np.zeros((len(state.cells), 6))
-    outputs = np.zeros((n, c)), np.empty((n - 1, 2 * c)), cells, np.empty((n - 1, c))
-    explain(state.engine, state.cells, theta, fit.solution.compliance, chunk, *outputs)
+    flow, innovation = np.empty((n - 1, 2 * c)), np.empty((n - 1, c))
+    explain(
+        state.engine, state.cells, theta, fit.solution.compliance, chunk, flow, cells, innovation
+    )
     return cells

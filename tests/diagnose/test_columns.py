@@ -97,8 +97,7 @@ def test_softness_is_the_derivative_of_the_column_by_the_pressure(effect: str) -
     middle = own.shapes[len(own.shapes) // 2]  # behind a port, a single sample is not seen
     names = zip(own.candidate.shape_names, middle, strict=True)
     shape = tuple(0.0 if name == "port_lag" else value for name, value in names)
-    soft, lag_s = softness(view(), own.at(shape))
-    assert lag_s == 0.0
+    soft = softness(view(), own.at(shape))
     for k in (500, 9000, 21000):
         for c, taken in soft.items():
             changes = [stored_at(own, shape, k, c, s * SMALL_PA) for s in (1.0, -1.0)]

@@ -58,17 +58,12 @@ def _echo(view: RecordView, candidate: Candidate, noise: Volumes) -> Volumes:
     return {c: -np.diff(lagged(m * noise[c], view.step_s, lag_s)) for c, m in taken_up.items()}
 
 
-def softness(view: RecordView, candidate: Candidate) -> tuple[Volumes, float]:
-    """What one unit of a storage effect takes up per Pa, by chamber (n,), m3/Pa; {} for others.
-
-    With it how late that is, s.
-    """
+def softness(view: RecordView, candidate: Candidate) -> Volumes:
+    """What one unit of a storage effect takes up per Pa, by chamber (n,), m3/Pa; {} for others."""
     if candidate.law.law == LINE:
-        return line_softness(view, candidate), 0.0
+        return line_softness(view, candidate)
     placed = _placed(view, candidate)
-    if placed is None:
-        return {}, 0.0
-    return placed.softness(view, candidate.shape), placed.lag_s(candidate.shape)
+    return placed.softness(view, candidate.shape) if placed is not None else {}
 
 
 def _placed(view: RecordView, candidate: Candidate) -> Placed | None:
@@ -83,6 +78,6 @@ def total_softness(view: RecordView, sizes: Iterable[tuple[Candidate, float]]) -
     """What effects of these sizes take up per Pa (n, chambers), m3/Pa."""
     total = np.zeros((view.n, len(view.model.chambers)))
     for candidate, size in sizes:
-        for c, taken in softness(view, candidate)[0].items():
+        for c, taken in softness(view, candidate).items():
             total[:, c] += size * taken
     return total
