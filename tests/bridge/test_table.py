@@ -89,9 +89,10 @@ def test_clear_errors(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(b"\x00\x01garbage")
         with pytest.raises(LogError, match=name):
             read_table(tmp_path / name)
-    (tmp_path / "a.xlsx").write_bytes(b"x")
-    with pytest.raises(LogError, match="unknown suffix"):
-        read_table(tmp_path / "a.xlsx")
+    for name, words in (("a.xyz", "unknown suffix"), ("a.xlsx", "a spreadsheet; save its sheet")):
+        (tmp_path / name).write_bytes(b"x")
+        with pytest.raises(LogError, match=words):
+            read_table(tmp_path / name)
 
 
 def test_rig_table(shared: Path) -> None:
