@@ -344,13 +344,35 @@ def test_counts_of_a_converter_are_no_position(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("overlap", [False, True])
-def test_a_coil_for_either_direction_is_one_command(tmp_path: Path, overlap: bool) -> None:
+@pytest.mark.parametrize("prefix", ["", "valve - "])
+def test_a_coil_for_either_direction_is_one_command(
+    tmp_path: Path, overlap: bool, prefix: str
+) -> None:
     """Never at once: their difference; else they are two, of which one is taken."""
     columns, way = machine(), machine()["u"]
     del columns["u"], columns["spare"]
-    columns["out_pct"] = np.maximum(way, 0.0) + (3.0 if overlap else 0.0)
-    columns["valve_in_pct"] = np.maximum(-way, 0.0)
+    columns[f"{prefix}out_pct"] = np.maximum(way, -0.05) + (3.0 if overlap else 0.0)
+    columns[f"{prefix}valve_in_pct"] = np.maximum(-way, -0.05)  # currents, with their noise
     path = written(tmp_path / "m.csv", columns)
     u = roles_of(path, open_source(path, None))["u"]
-    assert (u.name == "out_pct - valve_in_pct") is not overlap
+    assert (u.name == f"{prefix}out_pct - {prefix}valve_in_pct") is not overlap
     assert u.unit == "%" and (overlap or u.low < -7.9 < 7.9 < u.high)
+
+
+def test_two_coils_that_are_told_in_turn_have_no_difference(tmp_path: Path) -> None:
+    """No row holds both: it was a column of nothing."""
+    columns, way = machine(), machine()["u"]
+    del columns["u"]
+    columns["out_pct"] = np.where(np.arange(1000) % 2, np.nan, np.maximum(way, 0.0))
+    columns["valve_in_pct"] = np.where(np.arange(1000) % 2, np.maximum(-way, 0.0), np.nan)
+    path = written(tmp_path / "m.csv", columns)
+    assert " - " not in roles_of(path, open_source(path, None))["u"].name
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e-6])
+def test_a_short_stroke_is_no_count(tmp_path: Path, factor: float) -> None:
+    """250 um in m: no unit makes a usual stroke of it, and it is not refused."""
+    columns = machine()
+    columns["x"] = factor * columns["x"]
+    path = written(tmp_path / "m.csv", columns)
+    assert roles_of(path, open_source(path, None))["x"].name == "x"

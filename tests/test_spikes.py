@@ -115,6 +115,25 @@ def test_of_a_slow_logger_the_position_alone_is_judged(
     assert np.flatnonzero(~np.isin(t_us, rest.t_us)).tolist() == gone
 
 
+def test_a_peak_on_lines_between_slow_messages_is_kept(model: Machine) -> None:
+    """Instants of three messages at 100 Hz, 1 ms apart: one pressure stands in three of them."""
+    t_us = (10_000 * np.arange(300)[:, None] + [0, 1000, 2000]).ravel()
+    measured_us, pulse = 10_000 * np.arange(300), np.full(300, 5e6)
+    pulse[50] = 8e6
+    column = np.interp(t_us, measured_us, pulse)
+    flags = np.full(len(t_us), ROW, np.uint8)
+    assert without_spikes(model, Samples(("p_a",), t_us, column[:, None], flags))[1] == {}
+
+
+def test_what_has_ever_smaller_spikes_ends(model: Machine) -> None:
+    """Each pass shows what is usual anew; a few of them are enough, whatever is left."""
+    t_us = 1000 * np.arange(20_000)
+    column = 5e6 + np.random.default_rng(0).standard_cauchy(20_000) ** 5
+    flags = np.full(20_000, ROW, np.uint8)
+    rest, _ = without_spikes(model, Samples(("p_a",), t_us, column[:, None], flags))
+    assert len(rest) > 10_000
+
+
 def test_too_few_to_know_what_is_usual(model: Machine, measured: Samples) -> None:
     few = measured.between(0.0, 0.05)
     column = few.column("p_a").copy()

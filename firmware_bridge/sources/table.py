@@ -54,7 +54,7 @@ class Table:
         A column may be asked for with its unit as the file writes it, "p_s [Pa]".  A difference is
         kept as its first column.
         """
-        for known in (name, split_brackets(name)[0], name.partition(MINUS)[0]):
+        for known in (name, split_brackets(name)[0], *self._difference(name)[:1]):
             if known in self.columns:
                 return known
         close = get_close_matches(name, list(self.columns), 1, 0.5)
@@ -66,10 +66,16 @@ class Table:
 
         "out - in" is the difference of two: of a valve with a coil for either direction.
         """
-        first, minus, second = name.partition(MINUS)
-        if minus and name not in self.columns:
-            return self.column(first) - self.column(second)
+        both = self._difference(name)
+        if both and name not in self.columns:
+            return self.columns[both[0]] - self.columns[both[1]]
         return self.columns[self.known_as(name)]
+
+    def _difference(self, name: str) -> tuple[str, ...]:
+        """The two columns of "out - in", whose names may hold a minus too; () of anything else."""
+        parts = name.split(MINUS)
+        halves = ((MINUS.join(parts[:k]), MINUS.join(parts[k:])) for k in range(1, len(parts)))
+        return next((pair for pair in halves if all(one in self.columns for one in pair)), ())
 
     def time_name(self) -> str | None:
         """The column that looks like time, by its name; None if none does."""
@@ -130,9 +136,9 @@ def to_samples(table: Table, assembly: Assembly) -> tuple[Samples, dict[str, int
     keep = finite & later & (written[:, row] | written[:, commands].any(axis=1))
     t_us, values = t_us[keep], values[keep]
     flags = np.where(written[keep, row], ROW, 0).astype(np.uint8)
-    between_rows = np.diff(t_us[flags == ROW])
-    if len(between_rows):
-        gaps = np.diff(t_us) > longest_step(between_rows)
+    row_steps = np.diff(t_us[flags == ROW])
+    if len(row_steps):
+        gaps = np.diff(t_us) > longest_step(row_steps)
         flags[1:][gaps] |= GAP
         add_counts(counts, {"gap": int(gaps.sum())})
     flags[:1] |= GAP
@@ -207,7 +213,7 @@ def read_parquet(path: Path) -> Table:
     fields = [field for field in file.schema_arrow if _is_number(field.type)]
     stamps = [field.name for field in file.schema_arrow if _is_stamp(field.type)]
     Budget(path).take(file.metadata.num_rows * NUMBER_BYTES * (len(fields) + len(stamps) + 1))
-    result = list(_timed((name, file.read([name]).column(name), "") for name in stamps))
+    result: list[Column] = []
     for field in fields:
         numbers = _numbers(file.read([field.name]).column(field.name))
         meta = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
@@ -215,6 +221,7 @@ def read_parquet(path: Path) -> Table:
         with np.errstate(over="ignore", invalid="ignore"):  # damaged ones: missing values
             values = offset + scale * numbers
         result.append((field.name, values, meta.get("unit", "")))
+    result += _timed((name, file.read([name]).column(name), "") for name in stamps)
     return named_columns(path, result)
 
 
@@ -223,14 +230,19 @@ def read_text(path: Path) -> Table:
     return named_columns(path, _timed(text_table.read(path)))
 
 
-def _timed(
-    columns: Iterable[tuple[str, Any, str]],
-) -> Iterator[tuple[str, NDArray[np.float64], str]]:
-    """Titles, columns (n,) and units of what is a number, or a date or a time of day: in s."""
+def _timed(columns: Iterable[tuple[str, Any, str]]) -> Iterator[Column]:
+    """Titles, columns (n,) and units of numbers, and then of dates and times of day: in s.
+
+    A time that is a number goes before one that is written: it may be the finer one.
+    """
+    others = []
     for title, column, unit in columns:
         if _is_number(column.type):
             yield title, _numbers(column), unit
-        elif (times := text_table.seconds(column)) is not None:
+        else:
+            others.append((title, column))
+    for title, column in others:
+        if (times := text_table.seconds(column)) is not None:
             yield title, times, "s"
 
 

@@ -13,7 +13,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import date
-from functools import cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from firmware_bridge.names import split_brackets
 from firmware_bridge.sources.errors import LogError
 
-LOOKED_AT, LONGEST = 200, 1 << 16  # lines in which the names are looked for, characters of each
+LOOKED_AT, LONGEST = 200, 1 << 20  # lines in which the names are looked for, characters of each
 DELIMITERS = ";\t,"
 MISSING = ("---", "--", "-", "?", "OL", "Overload", "#NV", "#DIV/0!", "#VALUE!")
 UTF_16 = (b"\xff\xfe", b"\xfe\xff")
@@ -32,7 +32,7 @@ STAMP = re.compile(
     r"\s*(?:Z|[+-]\d\d:?\d\d)?\s*"
 )
 COMMA = re.compile(r"\d,\d")  # a decimal one, where no comma parts the columns
-DAY_S = 86_400
+DAY_S, CENTURY = 86_400, 2000  # of years that are written with two digits
 
 
 @dataclass(frozen=True)
@@ -86,6 +86,8 @@ def _beginning(path: Path) -> tuple[str, list[str]]:
     code = "utf-16" if encoding == "utf-16" else "utf-8-sig"
     with path.open(encoding=code, errors="surrogateescape") as file:
         lines = [file.readline(LONGEST) for _ in range(LOOKED_AT)]
+    if any(len(line) == LONGEST for line in lines):
+        raise LogError(f"{path}: has a line of more than a million characters: no table of text")
     return encoding, [_decoded(line) for line in lines if line]
 
 
@@ -105,12 +107,11 @@ def _layout_from(lines: list[str], at: list[int], encoding: str) -> Layout | Non
         if len(names) < 2 or _are_values(names):
             continue
         for above, values in enumerate(rest, 1):
-            is_as_wide = len(names) - 1 <= len(values) <= len(names) and len(values) > 1
-            if is_as_wide and _are_values(values):
-                units = rest[0] if above == 2 else []
-                return _made(lines, at[above], names[: len(values)], units, delimiter, encoding)
-            if not 1 < len(values) <= len(names):
+            if not 1 < len(values) <= len(names) + (not values[-1]):  # a row may end in a delimiter
                 break
+            if len(values) >= len(names) - 1 and _are_values(values):
+                units, titles = rest[0] if above == 2 else [], [*names, ""][: len(values)]
+                return _made(lines, at[above], titles, units, delimiter, encoding)
     return None
 
 
@@ -168,13 +169,11 @@ def seconds(column: Any) -> NDArray[np.float64] | None:
         ticks = column.cast(pa.int32() if kind.bit_width == 32 else pa.int64())
         times = np.asarray(ticks.cast(pa.float64(), safe=False).to_numpy()) / per_s
         return times if pa.types.is_timestamp(kind) else _over_midnight(times)
-    if not pa.types.is_string(kind):
+    written = (value.as_py() for value in column if value.is_valid)
+    if not pa.types.is_string(kind) or not STAMP.fullmatch(next(written, "")):
         return None
     stamps = np.fromiter(_stamps(column), np.float64, len(column))
-    known = stamps[np.isfinite(stamps)]
-    if not len(known):
-        return None
-    return stamps if known[0] >= DAY_S else _over_midnight(stamps)
+    return stamps if np.nanmax(stamps) >= DAY_S else _over_midnight(stamps)
 
 
 def _stamps(column: Any) -> Iterator[float]:
@@ -189,14 +188,15 @@ def _second(match: re.Match[str]) -> float:
     return DAY_S * days + 3600 * int(hours) + 60 * int(minutes) + float(f"{whole}.{part or 0}")
 
 
-@cache
+@lru_cache(maxsize=100)
 def _day(one: str, two: str, three: str) -> int:
     """Days from 1970 to year-month-day, day.month.year, or month/day/year where no other is one."""
     year, month, day = (one, two, three) if len(one) == 4 else (three, two, one)
     if int(month) > 12:
         month, day = day, month
+    whole_year = int(year) + (CENTURY if len(year) < 3 else 0)
     try:
-        return (date(int(year), int(month), int(day)) - date(1970, 1, 1)).days
+        return (date(whole_year, int(month), int(day)) - date(1970, 1, 1)).days
     except ValueError:
         return 0
 

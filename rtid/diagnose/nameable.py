@@ -207,7 +207,10 @@ class _Gathering:
         follows: FloatArray,
         b: tuple[FloatArray, FloatArray],
     ) -> Reach:
-        """Of z (rows, chambers), m3, of which the columns in use follow a part; b: X's numbers."""
+        """Of z (rows, chambers), m3; follows: the part that the columns in use take of it.
+
+        b: their shares in it, and the terms of the maps that take theirs.
+        """
         on_rows, (shares, terms) = self._on_rows, b
         flows = on_rows.flows(terms)
         left = on_rows.rms(z - follows - on_rows.into_chambers(flows)) / self._flow_m3s

@@ -244,15 +244,12 @@ def _likely(size: float, dimension: str, low: float, high: float) -> str:
     return (preferred or fitting or [""])[0]
 
 
-def fits_no_unit(candidate: RoleCandidate, kind: str) -> bool:
-    """Whether a guessed unit is one in which no machine has such values: they are counts."""
+def is_beyond_units(candidate: RoleCandidate, kind: str) -> bool:
+    """Whether values in a unit that was guessed are larger than any machine's: they are counts."""
     unit = find_unit(candidate.unit)
+    most = max(high for _, high in LARGEST[kind])
     size = max(abs(candidate.low), abs(candidate.high))
-    return (
-        candidate.guessed_unit
-        and unit is not None
-        and not any(low <= size * unit.factor <= high for low, high in LARGEST[kind])
-    )
+    return candidate.guessed_unit and unit is not None and size * unit.factor > most
 
 
 def _number(value: object, otherwise: float) -> float:

@@ -79,7 +79,7 @@ def _one_command(table: Table, signals: list[RoleCandidate]) -> list[RoleCandida
     """The signals of a cylinder, its two commands, one for each direction, in one: "out - in"."""
     if not {"p_a", "p_b"} <= proposal.propose(signals).keys():
         return signals
-    commands = [c for c in signals if c.low >= 0.0 < c.high and proposal.may_be("u", c)]
+    commands = [c for c in signals if -c.low <= ACTS * c.high > 0.0 and proposal.may_be("u", c)]
     for k, first in enumerate(commands):
         for second in commands[k + 1 :]:
             if first.unit == second.unit and _take_turns(table, first, second):
@@ -90,9 +90,12 @@ def _one_command(table: Table, signals: list[RoleCandidate]) -> list[RoleCandida
 
 
 def _take_turns(table: Table, first: RoleCandidate, second: RoleCandidate) -> bool:
-    """Whether both act, and never at once."""
-    acts = [table.column(c.name) > ACTS * c.high for c in (first, second)]
-    return bool(min(a.mean() for a in acts) > ACTS and not (acts[0] & acts[1]).any())
+    """Whether both act, and at once only where one goes and the other comes."""
+    values = np.array([table.column(c.name) for c in (first, second)])
+    values = values[:, np.isfinite(values).all(axis=0)]  # rows may tell them in turn
+    acts = values > ACTS * np.array([[first.high], [second.high]])
+    shares = acts.mean(axis=1) if acts.size else np.zeros(2)
+    return bool(shares.min() > ACTS and acts.all(axis=0).mean() <= ACTS * shares.min())
 
 
 def log_source(path: Path, frames: Frames, dbc: Path | None) -> Source:
@@ -154,7 +157,7 @@ def roles_of(
             f"{path}: {roles['x'].name} is an angle, and only you know what position it means",
             "write a project file with its table: rtid init",
         )
-    if proposal.fits_no_unit(roles["x"], "position"):
+    if proposal.is_beyond_units(roles["x"], "position"):
         x = roles["x"]
         raise RtidError(
             f"{path}: {x.name} goes from {x.low:.4g} to {x.high:.4g}: in no unit of length",

@@ -12,7 +12,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from firmware_bridge.samples import GAP, Samples
 from rtid.model import POSITION, PRESSURE, Machine, Signal
@@ -20,10 +19,11 @@ from rtid.plain import BoolArray, FloatArray
 
 SPIKE = "spike"  # counter of the samples that are left out
 LASTS_S, LASTS = 5e-3, 3  # at most, and samples; one of the position may always be
+OFTEN = 0.95  # quantile of the steps that a spike's samples may be apart: most signals are on lines
 USUAL, TIMES = 0.98, 12.0  # quantile of s, and how far a spike stands above it
 LEAST_SD = 20.0  # of the sensor's noise
 LEAST_SHARE, SPANNED = 0.05, (0.01, 0.99)  # of what the signal covers between these quantiles
-FEWEST = 100  # samples, to know what is usual
+FEWEST, PASSES = 100, 5  # samples, to know what is usual; times that it is asked anew
 
 
 def without_spikes(model: Machine, samples: Samples) -> tuple[Samples, dict[str, int]]:
@@ -33,7 +33,10 @@ def without_spikes(model: Machine, samples: Samples) -> tuple[Samples, dict[str,
     better known what is usual: others may stand out.
     """
     rest = samples
-    while len(rest) >= FEWEST and (spiked := _any_spikes(model, rest)).any():
+    for _ in range(PASSES):
+        spiked = _any_spikes(model, rest)
+        if not spiked.any():
+            break
         flags = np.where(np.append(False, spiked[:-1]), rest.flags | GAP, rest.flags)
         kept = ~spiked
         rest = replace(rest, t_us=rest.t_us[kept], values=rest.values[kept], flags=flags[kept])
@@ -43,10 +46,12 @@ def without_spikes(model: Machine, samples: Samples) -> tuple[Samples, dict[str,
 
 def _any_spikes(model: Machine, samples: Samples) -> BoolArray:
     """Samples (n,) in which any pressure or the position spikes."""
-    step_s = 1e-6 * float(np.median(np.diff(samples.t_us)))
+    spiked = np.zeros(len(samples), bool)
+    if len(samples) < FEWEST:
+        return spiked
+    step_s = 1e-6 * float(np.quantile(np.diff(samples.t_us), OFTEN))
     most = min(LASTS, int(LASTS_S / step_s))
     longest = {PRESSURE: most, POSITION: max(1, most)}  # a piston is slower than oil
-    spiked = np.zeros(len(samples), bool)
     for signal in model.signals:
         if longest.get(signal.kind, 0) and signal.name in samples.names:
             spiked |= _spikes(samples.column(signal.name), signal, longest[signal.kind])
@@ -65,5 +70,11 @@ def _spikes(values: FloatArray, signal: Signal, longest: int) -> BoolArray:
 
 def _opening(values: FloatArray, width: int) -> FloatArray:
     """The grey opening of values (n,): the largest of the least of all runs of a width about it."""
-    least = sliding_window_view(values, width).min(axis=1)
-    return np.asarray(sliding_window_view(np.pad(least, width - 1, "edge"), width).max(axis=1))
+    least = np.minimum.reduce(_shifted(values, width))
+    return np.asarray(np.maximum.reduce(_shifted(np.pad(least, width - 1, "edge"), width)))
+
+
+def _shifted(values: FloatArray, width: int) -> list[FloatArray]:
+    """The values of all runs of a width, by their place in it."""
+    n = len(values) - width + 1
+    return [values[k : k + n] for k in range(width)]

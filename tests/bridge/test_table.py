@@ -145,10 +145,11 @@ def test_no_line_spans_what_is_missing() -> None:
 def test_a_difference_of_two_columns(tmp_path: Path) -> None:
     """A coil for either direction; a name that holds a minus is itself."""
     path = tmp_path / "t.csv"
-    path.write_text("t,out [%],in [%],a - b\n0,30,0,1\n1,0,20,2\n")
+    path.write_text("t,out [%],in [%],a - b,a - c\n0,30,0,1,5\n1,0,20,2,7\n")
     table = read_table(path)
     assert table.column("out - in").tolist() == [30, -20]
     assert table.units[table.known_as("out - in")] == "%"
     assert table.column("a - b").tolist() == [1, 2]
-    with pytest.raises(LogError, match="no numeric column 'off'"):
+    assert table.column("a - b - a - c").tolist() == [-4, -5]
+    with pytest.raises(LogError, match="no numeric column 'out - off'"):
         table.column("out - off")

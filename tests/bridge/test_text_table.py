@@ -61,6 +61,7 @@ def test_a_preamble_and_a_title_without_values(tmp_path: Path, comment: str, end
         ("08:00:00.000", "08:00:00.002"),
         ("23:59:59.999", "00:00:00.001"),
         ("28.02.2026 23:59:59.999", "01.03.2026 00:00:00.001"),
+        ("28.02.26 23:59:59.999", "01.03.26 00:00:00.001"),
     ],
 )
 def test_dates_and_times_of_day(tmp_path: Path, first: str, second: str) -> None:
@@ -112,3 +113,20 @@ def test_what_holds_no_numbers_is_refused(tmp_path: Path, text: str) -> None:
 def test_numbers_above_which_no_names_stand(tmp_path: Path) -> None:
     """As before: the first line is taken for the names."""
     assert columns(read(tmp_path, "0,1\n1,2\n2,3\n")) == {"0": [1, 2], "1": [2, 3]}
+
+
+def test_a_time_that_is_a_number_goes_before_one_that_is_written(tmp_path: Path) -> None:
+    """A date of whole seconds beside the time that counts."""
+    text = "timestamp,t_ms,u\n2026-03-01 08:00:00,0,1\n2026-03-01 08:00:00,2,2\n"
+    table = read(tmp_path, text)
+    assert table.time_name() == "t_ms" and table.t_us().tolist() == [0, 2000]
+
+
+def test_rows_that_end_in_a_delimiter(tmp_path: Path) -> None:
+    assert columns(read(tmp_path, "t;u\n0;1,5;\n1;2,5;\n")) == {"t": [0, 1], "u": [1.5, 2.5]}
+
+
+def test_a_line_without_end_is_no_table(tmp_path: Path) -> None:
+    """It was cut into lines of their own, and the numbers began in its middle."""
+    with pytest.raises(LogError, match="more than a million characters"):
+        read(tmp_path, "t,u," + "x," * 600_000 + "\n0,1\n")
