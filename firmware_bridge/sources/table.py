@@ -30,6 +30,7 @@ MINUS = " - "  # between the names of two columns
 MOST_US = 2.0**62  # of a time stamp
 PERIODS, OFTEN = 1.5, 0.95  # of the usual step: more is a gap; share of the steps that are usual
 IN_TURN = 0.2  # share of blank rows, from which on a column is written in turn with others
+APART = "in_turn"  # counter of the rows that give what they tell to others
 ALIKE = 0.1  # of a step: so near to a multiple it is one
 TIME_NAMES = ("t", "time", "timestamp", "zeit")  # with or without a unit behind: t_ms, time_s
 TIMES = {*TIME_NAMES, "datetime", "date_time", "uhrzeit", "zeitstempel", "elapsed_time", "x_value"}
@@ -116,33 +117,64 @@ def to_samples(table: Table, assembly: Assembly) -> tuple[Samples, dict[str, int
     """Samples of the roles in `assembly` (signal = column), and refusals by reason.
 
     Rows with a missing value ("not_available") or whose time does not grow ("out_of_order") are
-    refused.  A step that is a gap (`longest_step`), and the first row, carry GAP.  Of rows that
-    tell signals in turn those with a command or the position are kept, the latter with ROW as all
-    others: a command acts until its next (`held`), a sensor is on the line to its next (`between`).
+    refused.  A step that is a gap (`longest_step`), and the first row, carry GAP; all carry ROW.
+    Of rows that tell signals in turn those are taken that tell the sensor which comes most seldom;
+    the others ("in_turn") say what is between them.
     """
     t_us = table.t_us()
-    values = np.column_stack([_role(table, s, len(t_us)) for s in assembly.signals])
-    names = tuple(signal.name for signal in assembly.signals)
-    written, row = np.isfinite(values), names.index(assembly.row_signal)
-    commands = [k for k, signal in enumerate(assembly.signals) if signal.command]
-    for k, signal in enumerate(assembly.signals):
-        values[:, k] = (held if signal.command else between)(t_us, values[:, k])
+    columns = [_role(table, s, len(t_us)) for s in assembly.signals]
+    at = _rows(columns, [s.command for s in assembly.signals])
+    each = zip(columns, assembly.signals, strict=True)
+    values = np.column_stack([_at_rows(t_us, column, at, s.command) for column, s in each])
     counts: dict[str, int] = {}
+    add_counts(counts, {APART: len(t_us) - len(at)})
+    t_us = t_us[at]
     finite = np.isfinite(values).all(axis=1)
     before = np.maximum.accumulate(np.concatenate([[np.iinfo(np.int64).min], t_us[:-1]]))
     later = t_us > before
     add_counts(counts, {"not_available": int((~finite).sum())})
     add_counts(counts, {"out_of_order": int((finite & ~later).sum())})
-    keep = finite & later & (written[:, row] | written[:, commands].any(axis=1))
+    keep = finite & later
     t_us, values = t_us[keep], values[keep]
-    flags = np.where(written[keep, row], ROW, 0).astype(np.uint8)
-    row_steps = np.diff(t_us[flags == ROW])
-    if len(row_steps):
-        gaps = np.diff(t_us) > longest_step(row_steps)
+    flags = np.full(len(t_us), ROW, np.uint8)
+    if len(t_us) > 1:
+        steps = np.diff(t_us)
+        gaps = steps > longest_step(steps)
         flags[1:][gaps] |= GAP
         add_counts(counts, {"gap": int(gaps.sum())})
     flags[:1] |= GAP
-    return Samples(names, t_us, values, flags), counts
+    return Samples(tuple(s.name for s in assembly.signals), t_us, values, flags), counts
+
+
+def _rows(columns: list[NDArray[np.float64]], are_commands: list[bool]) -> NDArray[np.int64]:
+    """Indices (k,) of the rows to take of columns (n,): all, but of sensors told in turn.
+
+    Then of the one that comes most seldom: what is on a line between two values has less noise than
+    either, and next to none beside rows on the same line.
+    """
+    told = [
+        in_turn(c) for c, is_command in zip(columns, are_commands, strict=True) if not is_command
+    ]
+    return min((at for at in told if len(at)), key=len, default=np.arange(len(columns[0])))
+
+
+def _at_rows(
+    t_us: NDArray[np.int64], column: NDArray[np.float64], at: NDArray[np.int64], is_command: bool
+) -> NDArray[np.float64]:
+    """A column (n,) at rows (k,), unit of the column: what is told in turn from its neighbours.
+
+    A command acts until its next one (`held`): a row has its mean up to the next row.  A sensor is
+    on the line to its next value (`between`).
+    """
+    if not len(in_turn(column)):
+        return column[at]
+    if not is_command:
+        return between(t_us, column)[at]
+    acts, lasts = held(t_us, column), np.append(np.maximum(np.diff(t_us), 0), 0).astype(float)
+    whole, each = (
+        np.add.reduceat(part, at) for part in (lasts, np.where(lasts > 0.0, lasts * acts, 0.0))
+    )
+    return np.where(whole > 0.0, each / np.maximum(whole, 1.0), acts[at])
 
 
 def held(t: NDArray[Any], values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from firmware_bridge.config import Assembly
 from firmware_bridge.samples import Samples
+from firmware_bridge.sources.table import APART
 from rtid.model import Machine, Signal
 from rtid.trace.arrivals import GAP_PERIODS, Timing, timing
 from rtid.trace.coverage import Coverage, coverage
@@ -159,6 +160,10 @@ def _timing(
     if spiked := refused.get(SPIKE, 0):
         text = f"{spiked} are left out: a sensor jumps away and back within milliseconds"
         yield _warning("samples", text, "look at the sensors' plugs, cables and messages")
+    if refused.get(APART, 0):
+        text = "rows tell signals in turn: between its values a sensor is taken on a line"
+        remedy = "log all signals at one instant: what the oil does in between is left as a misfit"
+        yield _warning("samples", text, remedy)
     if len(samples) == 0:
         remedy = "see the counters of refused frames; check counter, crc and data_id"
         yield _error("samples", "no complete sample could be made", remedy)

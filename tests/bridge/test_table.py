@@ -12,7 +12,7 @@ from scipy.io import savemat
 from firmware_bridge.config import Assembly, SignalSource
 from firmware_bridge.samples import GAP, ROW
 from firmware_bridge.sources import LogError, read_table
-from firmware_bridge.sources.table import between, to_samples
+from firmware_bridge.sources.table import APART, between, to_samples
 
 ROLES = Assembly(
     "cycle",
@@ -118,17 +118,38 @@ def test_a_number_that_no_sensor_sends_is_a_missing_value(tmp_path: Path) -> Non
     assert np.isnan(read_table(tmp_path / "t.parquet").columns["p"]).all()
 
 
-def test_rows_that_tell_signals_in_turn(tmp_path: Path) -> None:
-    """Position at 0, 4, 8, pressure at 1, 5, 9 ms, command at 3 and 7: each has rows of its own."""
+def in_turn(tmp_path: Path, rows: dict[int, str]) -> tuple[list[int], list[list[float]]]:
+    """Times in ms and values of the samples of x, p and a command u, each in rows of its own."""
     path = tmp_path / "t.csv"
-    rows = {0: "0,,", 1: ",1,", 3: ",,7", 4: "4,,", 5: ",5,", 7: ",,9", 8: "8,,", 9: ",9,"}
     path.write_text("t_ms,x,p,u\n" + "".join(f"{t},{row}\n" for t, row in rows.items()))
     sources = [SignalSource(name, signal=name, command=name == "u") for name in "xpu"]
     samples, counts = to_samples(read_table(path), Assembly("cycle", tuple(sources), (), "x"))
-    assert samples.t_us.tolist() == [3000, 4000, 7000, 8000]
-    assert samples.values.tolist() == [[3, 3, 7], [4, 4, 7], [7, 7, 9], [8, 8, 9]]
-    assert (samples.flags & ROW).tolist() == [0, ROW, 0, ROW], "the position was measured"
-    assert counts == {"not_available": 3}
+    assert (samples.flags & ROW).all() and counts[APART] == len(rows) - len(samples)
+    return (samples.t_us // 1000).tolist(), samples.values.tolist()
+
+
+def test_rows_that_tell_signals_in_turn(tmp_path: Path) -> None:
+    """A pressure on the line to its next, a command by its mean up to the next row."""
+    rows = {
+        0: ",0,2",
+        2: ",2,",
+        3: ",,4",
+        4: "4,,",
+        6: ",6,",
+        7: ",,8",
+        8: "8,,",
+        9: ",9,",
+        10: ",,9",
+    }
+    assert in_turn(tmp_path, rows) == ([4, 8], [[4, 4, 5], [8, 8, 8.0]])
+
+
+def test_rows_are_those_of_the_sensor_that_comes_most_seldom(tmp_path: Path) -> None:
+    """The position on a line between its own: two such rows would tell of no noise."""
+    rows = {k: f"{k},," for k in range(0, 20, 2)} | {k: f",{k},3" for k in range(1, 20, 4)}
+    t_ms, values = in_turn(tmp_path, dict(sorted(rows.items())))
+    assert t_ms == [1, 5, 9, 13, 17]
+    assert values == [[t, t, 3] for t in t_ms]
 
 
 def test_no_line_spans_what_is_missing() -> None:
