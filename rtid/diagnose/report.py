@@ -5,7 +5,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -107,6 +108,7 @@ class Unseen:
     detection_limit: of four standard deviations; named_from: the size from which on it would have
     been named, which must also matter; None where no possible one would.
     examined: False where this machine and record have no column for it: nobody looked.
+    form: the numbers beside its size that the sizes are of, as the pressure at which a valve opens.
     """
 
     effect: str
@@ -117,6 +119,7 @@ class Unseen:
     reason: str
     examined: bool = True
     named_from: float | None = None
+    form: Mapping[str, Value] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -344,9 +347,21 @@ def _limit(result: Result, candidate: Candidate, score: Score) -> Unseen:
         reason = f"the maps follow {100 * (1 - score.visible**2):.2f} % of it in this record"
     largest = float(limit) if is_possible else None
     named = float(named_from) if may_be and known else None
-    return Unseen(
-        candidate.effect, candidate.where, largest, unit, bool(visible), reason, named_from=named
-    )
+    key = candidate.effect, candidate.where
+    at = _form(candidate)
+    return Unseen(*key, largest, unit, bool(visible), reason, named_from=named, form=at)
+
+
+def _form(candidate: Candidate) -> dict[str, Value]:
+    """Where and how what a column is of acts, as far as that has a unit: sizes of others differ.
+
+    A make-up valve that opens at 4.9 MPa is seen from a fiftieth of one that opens at 1.6 MPa on.
+    A timing's column is as strong as its own number says, and a line's size is made of its shape.
+    """
+    if candidate.where == COMMAND or candidate.is_whole:
+        return {}
+    named = zip(candidate.shape_names, candidate.shape, candidate.shape_units, strict=True)
+    return {n: Value(v, float("nan"), unit) for n, v, unit in named if v != 0.0 and unit != "1"}
 
 
 def _sized(fit: Fit, candidate: Candidate, coefficient: float) -> tuple[float, str, bool]:

@@ -252,7 +252,7 @@ def _found_table(diagnosis: Diagnosis) -> Table:
 def _unseen_table(diagnosis: Diagnosis) -> Table:
     listed: list[Unseen] = sorted(diagnosis.not_found, key=lambda u: not u.visible)
     rows = [
-        (u.effect, u.where, *(limits(u) if u.visible else ("cannot be seen", "")), u.reason)
+        (u.effect, u.where, *(limits(u) if u.visible else ("cannot be seen", "")), remark(u))
         for u in listed
         if u.examined
     ]
@@ -265,6 +265,12 @@ def limits(unseen: Unseen) -> tuple[str, str]:
     sizes = (unseen.detection_limit, unseen.named_from)
     seen, named = ("" if size is None else limit(size, unseen.unit) for size in sizes)
     return seen, named
+
+
+def remark(unseen: Unseen) -> str:
+    """Why an effect was not found, or what its limits are of where they are of one form alone."""
+    form = [f"{name.replace('_', ' ')} {quantity(v)}" for name, v in unseen.form.items()]
+    return unseen.reason or (f"with {', '.join(form)}" if form and unseen.visible else "")
 
 
 def judged(diagnosis: Diagnosis) -> str:

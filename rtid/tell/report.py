@@ -18,7 +18,7 @@ from rtid.tell import stills as still_pictures
 from rtid.tell.charts.dependence import before_and_after
 from rtid.tell.charts.maps import maps, slices
 from rtid.tell.charts.over_time import flows
-from rtid.tell.diagnosed import LIMITS, LIMITS_SAY, heading, limits, sentences
+from rtid.tell.diagnosed import LIMITS, LIMITS_SAY, heading, limits, remark, sentences
 from rtid.tell.history import history_table
 from rtid.tell.html import rendered
 from rtid.tell.report_page import embedded, key_figures, page_of
@@ -244,7 +244,12 @@ def _not_found(unseen: tuple[Unseen, ...], ranking: tuple[Ranked, ...]) -> tuple
     seen = [u for u in unseen if u.visible and u.detection_limit is not None]
     hidden = [u for u in unseen if u not in seen]
     rows = [
-        (title(u.effect), u.where, *limits(u), u.reason or _why_not(clear.get((u.effect, u.where))))
+        (
+            title(u.effect),
+            u.where,
+            *limits(u),
+            remark(u) or _why_not(clear.get((u.effect, u.where))),
+        )
         for u in seen
     ]
     blind = [(title(u.effect), u.where, u.reason) for u in hidden]

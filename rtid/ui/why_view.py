@@ -23,6 +23,7 @@ from rtid.tell.diagnosed import (
     judged,
     limits,
     percent,
+    remark,
     said,
     seen_and_not_named,
 )
@@ -210,7 +211,7 @@ def _unseen(diagnosis: Diagnosis) -> list[str]:
     parts = []
     if seen:
         says = f'<p class="says">{text(LIMITS_SAY)}</p>'
-        rows = [(*_place(u), *map(text, limits(u)), text(u.reason)) for u in seen]
+        rows = [(*_place(u), *map(text, limits(u)), text(remark(u))) for u in seen]
         parts.append(f"<h3>Looked for and not found</h3>{says}{table(head, rows)}")
     if blind:
         hidden = [(*_place(u), text(u.reason)) for u in blind]

@@ -254,14 +254,15 @@ def of_limit(hidden: Planted, unseen: Iterable[Unseen]) -> float:
     """A hidden size over the one from which a record says that it is named, as of `Answer`.
 
     A slow spool is the stronger the lower its frequency; what sits in no chamber, or in both, is
-    asked for where it would be named; a share that boils out has another unit on its page.
+    asked for where it would be named; a share that boils out has another unit on its page, and what
+    opens at a pressure has a limit for another one than the hidden one's.
     """
     true = truth(hidden.name)
     limits = {u.where: u for u in unseen if u.effect == true and u.examined}
     at = limits.get(hidden.where or "both")
     if at is None and len(limits) == 1:
         (at,) = limits.values()
-    if at is None or HIDDEN[hidden.name].unit != at.unit:
+    if at is None or at.form or HIDDEN[hidden.name].unit != at.unit:
         return float("nan")
     if at.named_from is None:
         return 0.0

@@ -14,7 +14,7 @@ from rtid.diagnose.report import Diagnosis, FoundEffect, diagnosis
 from rtid.effects import from_expression, names_of_model
 from rtid.model import Lag
 from rtid.sim.random_plants import draw
-from rtid.tell.diagnosed import sentences
+from rtid.tell.diagnosed import remark, sentences
 from tests.diagnose.records import record
 
 pytestmark = pytest.mark.hidden_effect
@@ -126,6 +126,17 @@ def test_what_was_not_found_has_a_limit() -> None:
     assert not by_name["pressure_sensor_bias"].visible
     assert not by_name["deadband_shift"].visible
     assert all(u.reason for u in found.not_found if not u.visible)
+
+
+def test_the_limit_of_a_valve_that_opens_says_at_which_pressure() -> None:
+    """One that opened at 1.3 MPa was missed at 22 times a limit that was of one at 4.9 MPa."""
+    unseen = diagnosed().not_found
+    opens = [u for u in unseen if u.effect in ("relief_valve", "makeup_valve") and u.visible]
+    assert opens and all("opening_pressure" in u.form for u in opens)
+    pressure = opens[0].form["opening_pressure"]
+    assert pressure.unit == "Pa" and 1e5 < pressure.value < 1e7
+    assert remark(opens[0]).startswith("with opening pressure") and "MPa" in remark(opens[0])
+    assert not any(u.form for u in unseen if u.effect == "external_leakage_laminar")
 
 
 def test_json_is_plain_and_versioned() -> None:
