@@ -34,6 +34,7 @@ FAR = 10.0  # rho above which what is missing would pass for a modulus, or for a
 NOISE = 4.0  # of chi2: two fits are as good as one another
 ENOUGH = 1e-3  # the same, of the misfit
 LEAST_LAG_S, LEAST_SHARE = 2e-5, 2e-3  # steps of a lag and of a timing that are not worth a pass
+STEEPEST = -4.0  # of what a compliance finds over what weighs it: a straight line through two fits
 LEAST_SPACING = 1e-3  # the same of a shape, of its axis' spacing
 
 
@@ -52,9 +53,7 @@ def moved(fit: Fit) -> Step | None:
         (timing, way.timed(k, timing, psi)) for k, (timing, psi) in enumerate(old.timings)
     )
     effects = tuple(way.reshaped(effect) for effect in old.effects)
-    sizes = tuple(
-        (e, fit.estimate.value(fit.column(o))) for e, o in zip(effects, old.effects, strict=True)
-    )
+    sizes = tuple((e, way.size(o)) for e, o in zip(effects, old.effects, strict=True))
     is_near = fit.regression.rho(fit.estimate) < FAR  # once all that may move has moved
     weights = replace(fit.weights, lag_s=way.lag_s(LAG_REACH if is_near else 1.0))
     if is_near or any(effect.is_whole for effect in old.effects):  # whose column knows the modulus
@@ -74,19 +73,22 @@ def reweighed(fit: Fit) -> Weights | None:
 
 
 def steadied(step: Step | None, fit: Fit, before: Fit) -> Step | None:
-    """The step of a fit, its compliances halfway where they would swing back from the fit before.
+    """The step of a fit, its compliances at rest where they would swing back from the fit before.
 
     A line's column is made with the compliance that weighs the rows, and the larger that is the
     less it leaves to the chamber: both went from bound to bound and back until the passes were
-    used up.  What swings alike to both sides of a point is at it in one such step.
+    used up.  Where a straight line through both fits finds what it was made with they are at rest;
+    halfway, which is that of a slope of -1, took 21 passes for one of -2.
     """
     if step is None:
         return None
-    target, now = step.weights.compliance, fit.weights.compliance
-    swings = (target - now) * (now - before.weights.compliance) < 0.0
+    target, now, was = step.weights.compliance, fit.weights.compliance, before.weights.compliance
+    swings = (target - now) * (now - was) < 0.0
     if not swings.any():
         return step
-    compliance = np.where(swings, 0.5 * (target + now), target)
+    slope = (target - _possible(before)) / np.where(swings, now - was, 1.0)
+    share = np.where(swings, 1.0 / (1.0 - np.clip(slope, STEEPEST, 0.0)), 1.0)
+    compliance = now + share * (target - now)
     return replace(step, weights=replace(step.weights, compliance=compliance))
 
 
@@ -133,9 +135,14 @@ def _weigh_alike(
 
 
 def _compliance(fit: Fit) -> FloatArray:
-    low, high = sorted(1.0 / bound for bound in fit.model.beta_bounds_pa)
-    target, now = np.clip(fit.compliance, low, high), fit.weights.compliance
+    target, now = _possible(fit), fit.weights.compliance
     return now if np.allclose(target, now, rtol=SIZED, atol=0.0) else target
+
+
+def _possible(fit: Fit) -> FloatArray:
+    """The compliances (chambers,) that a fit has found, 1/Pa, within what is declared."""
+    low, high = sorted(1.0 / bound for bound in fit.model.beta_bounds_pa)
+    return np.clip(fit.compliance, low, high)
 
 
 @dataclass(frozen=True)
@@ -165,7 +172,7 @@ class _Way:
         target = now + self.share * self.estimate.value(at)
         # one that is farther off already was let go there when less was missing
         target = float(np.clip(target, min(max(0.0, low), now), max(high, now)))
-        return target if abs(target - now) > max(self._least(at), LEAST_LAG_S) else now
+        return target if self._is_open(at) and abs(target - now) > LEAST_LAG_S else now
 
     def timed(self, k: int, timing: TimingLaw, psi: Psi) -> Psi:
         """The parameters of timing k to go on with."""
@@ -173,8 +180,8 @@ class _Way:
         for j, (value, at) in enumerate(zip(psi, self.found.timing_columns(k), strict=True)):
             target = value + self.share * self.estimate.value(at)
             target = float(np.clip(target, timing.low[j], timing.high[j]))
-            is_far = abs(target - value) > max(self._least(at), LEAST_SHARE * abs(value))
-            new.append(target if is_far else value)
+            is_far = abs(target - value) > LEAST_SHARE * abs(value)
+            new.append(target if is_far and self._is_open(at) else value)
         return tuple(new)
 
     def reshaped(self, effect: Candidate) -> Candidate:
@@ -183,7 +190,7 @@ class _Way:
         cause = cause_of(self.found.view, effect)
         for k, at in self.found.shape_columns(effect).items() if size else ():
             step = self.share * self.estimate.value(at) / size
-            if abs(step) > max(self._least(at) / abs(size), LEAST_SPACING * cause.spacing(k)):
+            if self._is_open(at) and abs(step) > LEAST_SPACING * cause.spacing(k):
                 shape[k] = float(np.clip(shape[k] + step, *cause.bounds(k)))
         return replace(effect, shape=tuple(shape))
 
@@ -196,9 +203,16 @@ class _Way:
         target = self.found.weights.lag_s + self.estimate.value(self.found.first_given)
         return not 0.0 <= target <= self._most_lag_s
 
-    def _least(self, column: int) -> float:
-        """The step of a column's parameter that is within its uncertainty."""
-        return SETTLED * float(np.sqrt(max(1.0, self.found.rho))) * self.estimate.sd(column)
+    def size(self, effect: Candidate) -> float:
+        """What the size of an effect comes to on the share of the way that is gone."""
+        column = self.found.column(effect)
+        now, then = (of.value(column) for of in (self.found.held, self.estimate))
+        return now + self.share * (then - now)
+
+    def _is_open(self, column: int) -> bool:
+        """True where the whole way of a parameter, not what may be gone of it, is no chance."""
+        sd = float(np.sqrt(max(1.0, self.found.rho))) * self.estimate.sd(column)
+        return abs(self.estimate.value(column)) > SETTLED * sd
 
     def _shares(self) -> Iterator[float]:
         """What each parameter admits of the step."""

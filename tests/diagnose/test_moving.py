@@ -16,6 +16,7 @@ from rtid.effects.laws.lines import AT_CYLINDER
 from rtid.effects.laws.timing import TIMINGS, TimingLaw
 from rtid.estimator.state import Weights
 from rtid.model import Lag
+from rtid.plain import FloatArray
 from tests.diagnose.records import record
 
 DELAY_S = 12e-3
@@ -115,14 +116,44 @@ def test_a_lag_that_would_leave_its_range_is_held() -> None:
     assert np.isnan(replace(done, declared=replace(model, lag=Lag(1e-3, 0.0))).lag_sd_s)
 
 
-def test_a_compliance_that_would_swing_back_goes_half_the_way() -> None:
-    fit_, c = at(11e-3), weights().compliance
-    before = replace(fit_, weights=replace(fit_.weights, compliance=c * [2.0, 1.5]))
-    step = Step(late(11e-3), replace(fit_.weights, compliance=c * [1.4, 0.8]))
+def weighing(weighs: FloatArray, finds: FloatArray) -> Fit:
+    """A fit whose rows are weighed by compliances (chambers,), 1/Pa, and which finds others."""
+    fit_ = at(11e-3)
+    theta = np.concatenate([finds / weighs, fit_.held.theta[2:]])
+    weighed = replace(fit_.weights, compliance=weighs)
+    return replace(fit_, weights=weighed, held=replace(fit_.held, theta=theta))
+
+
+def test_compliances_that_would_swing_back_go_where_they_are_at_rest() -> None:
+    """What they find falls by twice of what weighs them in one chamber, and rises in the other."""
+    rest, slope = weights().compliance, np.array([-2.0, 0.5])
+    before, fit_ = (weighing(w * rest, (1 + slope * (w - 1)) * rest) for w in (1.2, 0.9))
+    step = Step(late(11e-3), replace(fit_.weights, compliance=fit_.compliance))
     now = steadied(step, fit_, before)
     assert now is not None
-    assert now.weights.compliance == pytest.approx(c * [1.2, 0.8])
+    assert now.weights.compliance == pytest.approx(rest * [1.0, 0.95])
     assert steadied(step, fit_, fit_) is step and steadied(None, fit_, before) is None
+
+
+def test_what_is_hardly_known_goes_as_far_as_it_may_and_the_size_with_it() -> None:
+    """An exponent that was off by 1.7 +- 0.6 was to go by 0.1, which passed for its uncertainty."""
+    model, chunk, _ = record("entrained_air", 0.02, seed=5)
+    start = prepare(model, chunk)
+    offered = one_pass(model, chunk, start, Revision(), None, True).columns.candidates
+    air = next(c for c in offered if c.effect == "entrained_air" and c.where == "both")
+    air = replace(air, shape=(1.2,))
+    present = one_pass(model, chunk, start, Revision((air,)), None, False, thorough=False)
+    size, ((_, column),) = present.column(air), present.shape_columns(air).items()
+    known, at_ = present.estimate, [present.estimate.used.index(k) for k in (size, column)]
+    theta, cov = known.theta.copy(), known.cov.copy()
+    theta[at_] = np.array([0.5, -0.5 * 1.7]) * present.held.value(size)
+    cov[at_[1], at_[1]] = (0.6 * theta[at_[0]]) ** 2 / max(1.0, present.rho)
+    step = moved(replace(present, estimate=replace(known, theta=theta, cov=cov)))
+    assert step is not None
+    ((moved_air, weighs),) = step.revision.sizes
+    assert moved_air.shape == pytest.approx((1.1,))
+    gone = 0.1 / 1.7
+    assert weighs == pytest.approx(present.held.value(size) * (1.0 - 0.5 * gone))
 
 
 def test_a_line_s_fit_comes_to_rest_at_the_oil_that_weighs_its_rows(
