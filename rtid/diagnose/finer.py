@@ -70,7 +70,9 @@ def halved_throughout(present: Fit) -> Fit:
     for axis in (1, 0):
         trial = with_covariances(_on_grid(present, halved_along(present.declared, axis)))
         more = max(1.0, plain.regression.dof - trial.regression.dof)
-        if plain.held.sse - trial.held.sse > more + BY_CHANCE * float(np.sqrt(2.0 * more)):
+        is_clear = plain.held.sse - trial.held.sse > more + BY_CHANCE * float(np.sqrt(2.0 * more))
+        # where rho is no smaller, twice the blocks follow noise and effects alike
+        if is_clear and trial.rho < plain.rho:
             better = with_covariances(few_excused(_to_the_end(trial)))
             if better.rho - 1.0 < LEFT * (present.rho - 1.0):
                 return better
