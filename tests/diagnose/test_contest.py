@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -125,3 +126,21 @@ def test_a_line_that_explains_less_than_what_it_stores_is_no_equal_of_it(
     assert set(contest(state(), present(5000), leak, [leak, line, other], {})[1]) == {
         line.key, other.key,
     }  # fmt: skip
+
+
+def late(effect: str, sse: float) -> Trial:
+    """A timing that wins by 1000 less what it leaves, and what its moduli let in of the noise."""
+    fit: Any = SimpleNamespace(held=SimpleNamespace(sse=sse))
+    revision: Any = SimpleNamespace(timings=[(effect, (1e-3,))])
+    return Trial((effect, "a"), 1000.0, revision, fit=fit, is_timing=True)
+
+
+def test_times_are_compared_by_what_they_explain(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A position that is late wins by the oil beside it alone: a command may be late as well."""
+    monkeypatch.setattr(module, "_finished", lambda _state, _present, t: t)
+    position = replace(late("position", DOF + 20.0), gain=3000.0)
+    command, worse = late("command", DOF), replace(late("worse", DOF + 500.0), gain=2000.0)
+    trials = [position, replace(command, gain=1800.0), worse, trial("leak", 900.0)]
+    chosen, alike_to_it = contest(state(), present(4000), position, trials, {})
+    assert chosen.key[0] == "command", "it leaves least"
+    assert [name for name, _ in alike_to_it] == ["position"]

@@ -25,6 +25,16 @@ def test_a_late_signal_is_put_right_between_samples() -> None:
     assert ahead(late, DT_S, (0.0,)) == pytest.approx(late)
 
 
+@pytest.mark.parametrize("late_s", [0.0, 0.3e-3, 0.5e-3, 1.5e-3, 7.2e-3])
+def test_a_part_of_a_sample_leaves_the_noise_as_it_is(late_s: float) -> None:
+    """On the line between two samples it is half of it: any delay would explain the record."""
+    noise = np.random.default_rng(1).normal(0.0, 1.0, 100_000)
+    moved = ahead(noise, DT_S, (late_s,))
+    assert len(moved) == len(noise)
+    assert moved.var() == pytest.approx(1.0, abs=0.02)
+    assert abs(np.mean(moved[1:] * moved[:-1])) < 0.02, "still white"
+
+
 def test_a_slow_signal_is_put_right_up_to_the_window() -> None:
     tau_s, wn = 4e-3, 2 * np.pi * 5
     wave, phase = np.sin(wn * T_S), np.arctan(wn * tau_s)

@@ -23,6 +23,7 @@ from rtid.effects.record_view import RecordView
 from rtid.model import Machine
 from rtid.plain import FloatArray
 
+TAPS = 24  # of an allpass: what is cut off is 3e-12
 QUICK_S = 5e-3  # half width of the window for the rate of a slow sensor's pressure
 
 
@@ -59,9 +60,23 @@ def _late_position(view: RecordView) -> Volumes:
 
 
 def ahead(values: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
-    """What a sensor that is psi late would have shown (n,), linear between samples, any unit."""
-    at = np.arange(len(values))
-    return np.interp(at + psi[0] / dt_s, at, values)
+    """What a sensor that is psi late would have shown (n,), any unit.
+
+    A number of samples earlier, and a part of one later by Thiran's allpass of first order,
+
+        y_k = a x_k + x_k-1 - a y_k-1,    a = (1 - d) / (1 + d),    0.5 <= d < 1.5,
+
+    which is a delay of d samples to what is slow, and leaves white noise as white and as large.  On
+    the line between two samples it would be less, by half in their middle: of a command that came
+    5 ms late in a log of 200 Hz the position was named, late by 7.2 ms, at 0.71 of the noise.
+    """
+    steps = int(np.floor(psi[0] / dt_s + 1.5))
+    d = steps - psi[0] / dt_s
+    a = (1.0 - d) / (1.0 + d)
+    taps = np.concatenate([[a], (1.0 - a * a) * (-a) ** np.arange(TAPS)])
+    n = len(values)
+    earlier = np.concatenate([values[:1].repeat(TAPS), values, values[-1:].repeat(steps)])[steps:]
+    return np.convolve(earlier, taps)[TAPS : TAPS + n]
 
 
 def quickened(values: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
