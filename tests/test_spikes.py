@@ -139,3 +139,15 @@ def test_too_few_to_know_what_is_usual(model: Machine, measured: Samples) -> Non
     column = few.column("p_a").copy()
     column[20] = 0.0
     assert without_spikes(model, with_column(few, "p_a", column))[1] == {}
+
+
+def test_a_step_of_a_coarse_sensor_is_none(model: Machine) -> None:
+    """A tank of 1 bar in steps of 0.1, which now and then is at the next one."""
+    t_us = 1000 * np.arange(5000)
+    column = np.full(5000, 98e3)
+    column[np.arange(50, 5000, 400)] += 10e3
+    coarse = replace(
+        model, signals=tuple(replace(s, noise=0.0, resolution=10e3) for s in model.signals)
+    )
+    flags = np.full(5000, ROW, np.uint8)
+    assert without_spikes(coarse, Samples(("p_a",), t_us, column[:, None], flags))[1] == {}

@@ -15,6 +15,7 @@ from scipy.linalg import eigh
 from rtid.plain import FloatArray
 
 CLEARLY = 3.0  # standard deviations of the noise's own products by which a column must exceed it
+FAINTEST = 1e-200  # square of a column: what is fainter never acts
 VANISHED = 1e-10  # share of a column's square that rounding leaves
 LIMIT_SD = 4.0  # an effect of so many standard deviations would have been seen
 
@@ -74,9 +75,10 @@ class Regression:
         """Least squares on some columns, errors in variables taken out."""
         at = list(used)
         plain = self.s[np.ix_(at, at)] + np.diag(self.prior[at])
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(plain), np.finfo(float).tiny))
+        np.fill_diagonal(plain, np.where(plain.diagonal() > FAINTEST, plain.diagonal(), 1.0))
+        scale = 1.0 / np.sqrt(plain.diagonal())
         outer = np.outer(scale, scale)
-        noise = self._bounded(at, plain) * outer
+        noise = self._bounded(at, plain, outer) * outer
         inverse = np.linalg.inv(plain * outer - noise)
         right = (self.s[at, 0] + self.prior[at] * self.mean[at]) * scale
         theta = inverse @ right
@@ -86,15 +88,16 @@ class Regression:
         sse = float(left + self.prior[at] @ (theta - self.mean[at]) ** 2)
         return Estimate(used, theta, cov, sse)
 
-    def _bounded(self, at: list[int], plain: FloatArray) -> FloatArray:
-        """The noise's products, less where they leave too little: then nothing can be told."""
+    def _bounded(self, at: list[int], plain: FloatArray, outer: FloatArray) -> FloatArray:
+        """The noise's products, less where they leave too little: then nothing can be told.
+
+        outer (columns, columns): what makes the products of the columns 1, finite for any column.
+        """
         noise = self.noise[np.ix_(at, at)]
         if not noise.any():
             return noise
-        scale = 1.0 / np.sqrt(np.diag(plain))
         most = 1.0 - CLEARLY * np.sqrt(2.0 / max(1, self.rows))
         # the largest share that noise has of any combination of the columns
-        outer = np.outer(scale, scale)
         share = float(eigh(noise * outer, plain * outer, eigvals_only=True)[-1])
         return noise * min(1.0, most / share) if share > 0.0 else noise
 

@@ -112,7 +112,10 @@ def model_for(project: Project, samples: Samples) -> Machine:
 
 def _white_noise(samples: Samples, signal: Signal) -> float:
     """Noise of one signal beside its quantisation, which the model counts separately."""
-    result = estimate_noise(1e-6 * samples.t_us, samples.column(signal.name))
+    values = samples.column(signal.name)
+    if signal.resolution and len(values) and np.ptp(values) < signal.resolution:
+        return 0.0  # it stays within one step
+    result = estimate_noise(1e-6 * samples.t_us, values)
     if not np.isfinite(result.relative_sd):
         raise NoSamplesError(
             f"{len(samples)} samples do not tell the noise of {signal.name}",

@@ -64,8 +64,8 @@ def _spikes(values: FloatArray, signal: Signal, longest: int) -> BoolArray:
     s = np.maximum(values - _opening(values, width), -_opening(-values, width) - values)
     s[:longest] = s[-longest:] = 0.0  # what begins or ends there has no other side
     low, high = np.quantile(values, SPANNED)
-    usual = TIMES * np.quantile(s, USUAL)
-    return np.asarray(s > max(usual, LEAST_SD * signal.noise, LEAST_SHARE * (high - low)))
+    usual, sd = TIMES * np.quantile(s, USUAL), np.hypot(signal.noise, signal.resolution)
+    return np.asarray(s > max(usual, LEAST_SD * sd, LEAST_SHARE * (high - low)))
 
 
 def _opening(values: FloatArray, width: int) -> FloatArray:

@@ -76,3 +76,14 @@ def test_noise_alone_is_not_taken_for_information() -> None:
     estimate = r.fit((1, 2))
     assert np.isfinite(estimate.theta).all()
     assert abs(estimate.value(1)) < 3 * estimate.sd(1)
+
+
+@pytest.mark.parametrize("scale", [1e-157, 1e140])
+def test_columns_of_any_size_are_fitted(scale: float) -> None:
+    """What a law makes of a start far off: its products ended in "infs or NaNs"."""
+    rng = np.random.default_rng(5)
+    y, a, b = rng.standard_normal((3, 500))
+    r = regression(y + a, np.column_stack([a, scale * b]), np.array([0.01, 0.0]))
+    estimate = r.fit((1, 2))
+    assert estimate.value(1) == pytest.approx(1.0, abs=0.2)
+    assert np.isfinite(estimate.sse)
