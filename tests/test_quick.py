@@ -8,6 +8,7 @@ import subprocess
 from contextlib import redirect_stderr, redirect_stdout
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -22,10 +23,12 @@ from rtid.maps.flashed import read_flashed
 from rtid.project import load
 from rtid.project.guess import RoleCandidate
 from rtid.sim.hidden import hide_wish
+from rtid.sim.random_plants import draw
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import SimulatedPlant
 from rtid.study import quick_machine
+from rtid.study.quick_command import is_taken
 from rtid.study.quick_machine import (
     MOST_S,
     Given,
@@ -76,6 +79,16 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @cache
 def columns(table: Path) -> dict[str, np.ndarray]:
     return read_table(table).columns
+
+
+def sizes_of(plant: SimulatedPlant) -> tuple[object, ...]:
+    """What its user knows of a machine, as words of a command line."""
+    c = plant.constants
+    bore_m = np.sqrt(4 / np.pi * c.area_a_m2)
+    rod_m = np.sqrt(bore_m**2 - 4 / np.pi * c.area_b_m2)
+    volumes = f"{1e3 * c.v0_a_m3:.6f},{1e3 * c.v0_b_m3:.6f}"
+    mm = ("--bore", 1e3 * bore_m, "--rod", 1e3 * rod_m, "--stroke", 1e3 * c.stroke_m)
+    return *mm, "--dead-volume", volumes, "--lag", 1.3
 
 
 def as_csv(path: Path, **values: np.ndarray) -> Path:
@@ -234,6 +247,44 @@ def test_what_is_missing_has_a_name(tmp_path: Path) -> None:
     message = quick(tmp_path / "t.csv").stderr
     for word in ("position of the piston (x)", "command of the valves (u)", "foo [?]"):
         assert word in message
+
+
+@pytest.mark.slow
+def test_a_log_that_is_slower_than_the_controller(tmp_path: Path) -> None:
+    """A healthy machine at 50 of the controller's 1000 commands a second was `unknown`, at rho 5.
+
+    What was found of the command goes into the project, and says the same there.
+    """
+    run = simulate(draw(6201, law="mixed"), "sweep_record", 6201, 60.0)
+    units = {"u": "V", "x": "m"} | dict.fromkeys(("p_a", "p_b", "p_supply", "p_tank"), "Pa")
+    every = {f"{n}_of_{u}__": run.samples.column(n)[::20] for n, u in units.items()}
+    file = as_csv(tmp_path / "t.csv", t=1e-6 * run.samples.t_us[::20], **every)
+    document = told(file, *sizes_of(run.plant), "--save", tmp_path / "m.toml")
+    assert document["diagnosis"]["verdict"] == "matches"
+    assert any("sample of a faster one" in a["what"] for a in document["assumptions"])
+    project = load(tmp_path / "m.toml")
+    command = project.sections.signals["u"]
+    assert command.hold == "linear"
+    study = Study(project, file)
+    assert study.diagnosis().verdict == "matches"
+    assert study.diagnosis().rho_before == pytest.approx(document["diagnosis"]["rho_before"])
+
+
+@pytest.mark.parametrize(
+    ("held", "line", "is_better"),
+    [
+        (("unknown", 0, 9.0), ("insufficient_data", 0, 4.0), True),
+        (("missing", 1, 1.3), ("matches", 0, 1.0), True),
+        (("missing", 2, 1.3), ("ambiguous", 1, 1.0), True),
+        (("ambiguous", 1, 1.3), ("insufficient_data", 0, 1.2), False),
+        (("missing", 1, 1.0), ("missing", 2, 0.9), False),
+    ],
+)
+def test_what_was_named_is_not_given_up_for_less(held: Any, line: Any, is_better: bool) -> None:
+    def said(verdict: str, n: int, rho: float) -> Any:
+        return SimpleNamespace(verdict=verdict, found=n * [None], rho_after=rho)
+
+    assert is_taken(said(*line), said(*held)) == is_better
 
 
 @pytest.mark.parametrize(

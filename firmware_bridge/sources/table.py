@@ -30,6 +30,7 @@ MINUS = " - "  # between the names of two columns
 MOST_US = 2.0**62  # of a time stamp
 PERIODS, OFTEN = 1.5, 0.95  # of the usual step: more is a gap; share of the steps that are usual
 IN_TURN = 0.2  # share of blank rows, from which on a column is written in turn with others
+JUMP, JUMPS = "command_jump", 10.0  # counter of them; times what is usual of a moving command
 APART = "in_turn"  # counter of the rows that give what they tell to others
 ALIKE = 0.1  # of a step: so near to a multiple it is one
 TIME_NAMES = ("t", "time", "timestamp", "zeit")  # with or without a unit behind: t_ms, time_s
@@ -118,6 +119,8 @@ def to_samples(table: Table, assembly: Assembly) -> tuple[Samples, dict[str, int
 
     Rows with a missing value ("not_available") or whose time does not grow ("out_of_order") are
     refused.  A step that is a gap (`longest_step`), and the first row, carry GAP; all carry ROW.
+    So does what a command that is a sample of a faster one jumps to ("command_jump"): when, nobody
+    knows.
     Of rows that tell signals in turn those are taken that tell the sensor which comes most seldom;
     the others ("in_turn") say what is between them.
     """
@@ -125,7 +128,11 @@ def to_samples(table: Table, assembly: Assembly) -> tuple[Samples, dict[str, int
     columns = [_role(table, s, len(t_us)) for s in assembly.signals]
     at = _rows(columns, [s.command for s in assembly.signals])
     each = zip(columns, assembly.signals, strict=True)
-    values = np.column_stack([_at_rows(t_us, column, at, s.command) for column, s in each])
+    values = np.column_stack([_at_rows(t_us, column, at, s) for column, s in each])
+    jumped = np.zeros(len(at), bool)
+    for column, signal in zip(columns, assembly.signals, strict=True):
+        if signal.command and signal.hold != "zero":
+            jumped[1:] |= jumps(between(t_us, column)[at])
     counts: dict[str, int] = {}
     add_counts(counts, {APART: len(t_us) - len(at)})
     t_us = t_us[at]
@@ -135,8 +142,9 @@ def to_samples(table: Table, assembly: Assembly) -> tuple[Samples, dict[str, int
     add_counts(counts, {"not_available": int((~finite).sum())})
     add_counts(counts, {"out_of_order": int((finite & ~later).sum())})
     keep = finite & later
-    t_us, values = t_us[keep], values[keep]
-    flags = np.full(len(t_us), ROW, np.uint8)
+    t_us, values, jumped = t_us[keep], values[keep], jumped[keep]
+    flags = np.where(jumped, ROW | GAP, ROW).astype(np.uint8)
+    add_counts(counts, {JUMP: int(jumped.sum())})
     if len(t_us) > 1:
         steps = np.diff(t_us)
         gaps = steps > longest_step(steps)
@@ -159,18 +167,28 @@ def _rows(columns: list[NDArray[np.float64]], are_commands: list[bool]) -> NDArr
 
 
 def _at_rows(
-    t_us: NDArray[np.int64], column: NDArray[np.float64], at: NDArray[np.int64], is_command: bool
+    t_us: NDArray[np.int64], column: NDArray[np.float64], at: NDArray[np.int64], of: SignalSource
 ) -> NDArray[np.float64]:
     """A column (n,) at rows (k,), unit of the column: what is told in turn from its neighbours.
 
-    A command acts until its next one (`held`): a row has its mean up to the next row.  A sensor is
-    on the line to its next value (`between`).
+    A sensor is on the line to its next value (`between`).  A command acts until its next one
+    (`held`), or as a sample of what is faster is on the line to it, too: a row has its mean up to
+    the next row.
     """
-    if not len(in_turn(column)):
-        return column[at]
-    if not is_command:
+    if not of.command:
         return between(t_us, column)[at]
-    acts, lasts = held(t_us, column), np.append(np.maximum(np.diff(t_us), 0), 0).astype(float)
+    if of.hold == "zero":
+        return column[at] if not len(in_turn(column)) else _means(t_us, held(t_us, column), at)
+    line = between(t_us, column)
+    after = np.append(line[1:], line[-1:])
+    return _means(t_us, np.where(np.isfinite(after), 0.5 * (line + after), line), at)
+
+
+def _means(
+    t_us: NDArray[np.int64], acts: NDArray[np.float64], at: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Means (k,) from row to row of what acts (n,), any unit, from each stamp to the next."""
+    lasts = np.append(np.maximum(np.diff(t_us), 0), 0).astype(float)
     whole, each = (
         np.add.reduceat(part, at) for part in (lasts, np.where(lasts > 0.0, lasts * acts, 0.0))
     )
@@ -205,6 +223,22 @@ def between(t: NDArray[Any], values: NDArray[np.float64]) -> NDArray[np.float64]
     line = np.interp(t, t[known], values[known], np.nan, np.nan)
     is_near = spans <= 2 * np.median(np.diff(t[known]))
     return np.where(is_near | np.isfinite(values), line, np.nan)
+
+
+def jumps(u: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Steps (n - 1,) of a command u (n,), any unit, that stand out from those beside them.
+
+    None of one that trembles all the time: it has no others.
+    """
+    step = np.diff(u)
+    if len(step) < 3:
+        return np.zeros(len(step), bool)
+    alone = np.zeros(len(step))
+    alone[1:-1] = np.abs(step[1:-1] - 0.5 * (step[:-2] + step[2:]))
+    moving = alone[1:-1][step[1:-1] != 0.0]
+    usual = float(np.median(moving)) if len(moving) else 0.0
+    largest = np.maximum(alone, np.maximum(np.append(alone[1:], 0.0), np.append(0.0, alone[:-1])))
+    return (alone > JUMPS * usual) & (alone == largest) & (alone > 0.0)
 
 
 def in_turn(values: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -69,13 +69,26 @@ def rms_slopes(model: Machine, sums: Sums, theta: FloatArray) -> FloatArray:
     _, _, a, _, b, c = theta[sums.n_shared :].reshape(-1, TERMS).T
     square = a**2 * one + 4 * b**2 * eta2 + c**2 * xi2
     square += 4 * a * b * eta + 2 * a * c * xi + 4 * b * c * both
+    height = [np.tile(np.diff(e.grid.dp_pa), e.grid.shape[0]) for e in model.edges]
+    return _per(height, model, sums) * np.sqrt(np.maximum(square, 0.0))
+
+
+def rms_gains(model: Machine, sums: Sums, theta: FloatArray) -> FloatArray:
+    """Root mean square of dQ/dw over the data of each block (m,), m3/s/V; theta (n,) as above."""
+    one, xi, eta, xi2, eta2, both = mean_phi(sums.blocks).T
+    _, a, _, b, _, c = theta[sums.n_shared :].reshape(-1, TERMS).T
+    square = a**2 * one + 4 * b**2 * xi2 + c**2 * eta2
+    square += 4 * a * b * xi + 2 * a * c * eta + 4 * b * c * both
+    width = [np.repeat(np.diff(e.grid.u_v), e.grid.shape[1]) for e in model.edges]
+    return _per(width, model, sums) * np.sqrt(np.maximum(square, 0.0))
+
+
+def _per(size: list[FloatArray], model: Machine, sums: Sums) -> FloatArray:
+    """Rated flow over half the size of each block (m,); size: (cells,) by edge, any unit."""
     edge, place = sums.blocks["edge"], sums.blocks["cell"]
-    scale = [
-        2 * e.rated_q_m3s / np.tile(np.diff(e.grid.dp_pa), e.grid.shape[0]) for e in model.edges
-    ]
-    first = np.array(model.first_cells)[edge]
-    per_height = np.array([scale[e][p] for e, p in zip(edge, place - first, strict=True)])
-    return np.asarray(per_height * np.sqrt(np.maximum(square, 0.0)))
+    own = place - np.array(model.first_cells)[edge]
+    rated = np.array([e.rated_q_m3s for e in model.edges])[edge]
+    return np.asarray(2 * rated / [size[e][p] for e, p in zip(edge, own, strict=True)])
 
 
 def largest_flows(model: Machine, sums: Sums, theta: FloatArray) -> FloatArray:

@@ -20,7 +20,14 @@ from rtid.estimator.misfit import can_be_explained, count_misfit
 from rtid.estimator.missed import weighed
 from rtid.estimator.profile import Profile, profile
 from rtid.estimator.solution import Sketch, Solution, sketch, solve
-from rtid.estimator.state import State, Weights, build, nominal_weights, tell_unmarked
+from rtid.estimator.state import (
+    State,
+    Weights,
+    build,
+    nominal_weights,
+    tell_unmarked,
+    variance,
+)
 from rtid.estimator.sums import Sums
 from rtid.model import Edge, Machine
 from rtid.plain import FloatArray
@@ -149,7 +156,8 @@ def refined(model: Machine, sketched: Sketch, lag_s: float) -> Weights:
 
     The noise of a pressure enters by the slope that is fitted, not by the true one: where dp hardly
     moves in a block that slope is next to nothing, and the orifice's would count noise that is not
-    there.  No valve's flow rises faster than in proportion to dp.
+    there.  No valve's flow rises faster than in proportion to dp.  The noise of a command, known at
+    its samples only, enters by dQ/dw: as so much more noise of dp.
 
     A compliance outside its declared bounds tells that the motion did not show it.
     """
@@ -158,11 +166,22 @@ def refined(model: Machine, sketched: Sketch, lag_s: float) -> Weights:
     known = np.isfinite(sketched.flow_m3s)
     cells = sketched.cells[known]
     proportional = 2.0 * np.maximum(sketched.flow_m3s[known], 0.0) / span[cells]
-    slopes[cells] = np.minimum(sketched.slope[known], proportional)
+    by_command = sketched.gain[known] * _command_noise(model)[cells]
+    slopes[cells] = np.hypot(np.minimum(sketched.slope[known], proportional), by_command)
     low, high = 1 / model.beta_bounds_pa[1], 1 / model.beta_bounds_pa[0]
     possible = (sketched.compliance >= low) & (sketched.compliance <= high)
     compliance = np.where(possible, sketched.compliance, 1 / model.beta_nominal_pa)
     return Weights(slopes, compliance, lag_s)
+
+
+def _command_noise(model: Machine) -> FloatArray:
+    """Noise of the command over that of dp, for each cell (cells,), V/Pa."""
+    shares = []
+    for edge in model.maps:
+        noise = model.signals[model.column(edge.command)].noise
+        dp_pa2 = variance(model, edge.source) + variance(model, edge.sink)
+        shares.append(np.full(edge.grid.shape, noise / np.sqrt(dp_pa2) if dp_pa2 else 0.0).ravel())
+    return np.concatenate(shares)
 
 
 def _span(edge: Edge) -> FloatArray:

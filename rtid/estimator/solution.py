@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from rtid.estimator.blocks import Block, mean_flows, read_blocks, rms_slopes
+from rtid.estimator.blocks import Block, mean_flows, read_blocks, rms_gains, rms_slopes
 from rtid.estimator.correction import correct, leverage_of, plain
 from rtid.estimator.factor import PRIOR_SD, factor_of, misfit, one_thread
 from rtid.estimator.state import State
@@ -83,13 +83,14 @@ class Solution:
 class Sketch:
     """First estimate, no variances: compliance (chambers,), flow_m3s (blocks,), NaN: few rows.
 
-    slope (blocks,): root mean square of dQ/ddp over the data, m3/s/Pa; cells (blocks,): the grid
-    cells of the blocks; unknowns (n,): as of `Solution`.
+    slope, gain (blocks,): root mean squares of dQ/ddp and dQ/dw over the data, m3/s/Pa and m3/s/V;
+    cells (blocks,): the grid cells of the blocks; unknowns (n,): as of `Solution`.
     """
 
     compliance: FloatArray
     flow_m3s: FloatArray
     slope: FloatArray
+    gain: FloatArray
     cells: IntArray
     leverage: FloatArray
     unknowns: FloatArray
@@ -106,8 +107,8 @@ def sketch(model: Machine, sums: Sums) -> Sketch:
             theta = to_taylor(model, sums, factor.cov(), PRIOR_SD)[0] @ theta
     flow = mean_flows(model, sums, theta)
     flow[sums.blocks["rows"] < model.gates.min_rows] = np.nan
-    slope = rms_slopes(model, sums, theta)
-    return Sketch(theta[:n_c] * sums.compliance, flow, slope, sums.cells, leverage, unknowns)
+    slopes = rms_slopes(model, sums, theta), rms_gains(model, sums, theta)
+    return Sketch(theta[:n_c] * sums.compliance, flow, *slopes, sums.cells, leverage, unknowns)
 
 
 def solve(

@@ -26,6 +26,7 @@ from rtid.project import Project, load
 from rtid.project import guess as proposal
 from rtid.project.guess import RoleCandidate, unused
 from rtid.study.kept_record import model_for
+from rtid.study.quick_command import is_likelier, is_settled, is_taken, less_known, unlikeliness
 from rtid.study.quick_machine import (
     Assumption,
     Given,
@@ -36,7 +37,7 @@ from rtid.study.quick_machine import (
 from rtid.study.quick_project import DEAD_VOLUME, head_of, of_channels, of_missing, project_text
 from rtid.study.quick_rate import QuickRate, quick_rate
 from rtid.study.rate_pairs import driven_pairs, pressed_pairs
-from rtid.study.study import diagnose_trace
+from rtid.study.study import Study
 from rtid.trace.check import Report, judge
 from rtid.trace.quick_data import BAD, Point, level_of, points
 from rtid.trace.quick_source import Source, open_source, roles_of
@@ -210,14 +211,14 @@ def _of_cylinder(
         progress("judging the data", 0.1)
         judged = points(arranged.project.model, arranged.trace, arranged.report)
         judged += _noise(arranged.project, arranged.trace)
-        level, diagnosis = level_of(judged), None
+        level, diagnosis, machine = level_of(judged), None, arranged.machine
         if level != BAD:
-            diagnosis = _diagnosed(arranged.project, path, progress)
+            diagnosis, machine = _likeliest(file, path, source, arranged, progress)
     return Quick(
         path,
         source,
         arranged.roles,
-        arranged.machine,
+        machine,
         tuple(judged),
         level,
         diagnosis,
@@ -226,13 +227,33 @@ def _of_cylinder(
     )
 
 
-def _diagnosed(project: Project, path: Path, progress: Progress) -> Diagnosis:
+def _likeliest(
+    file: Path, path: Path, source: Source, arranged: Arranged, progress: Progress
+) -> tuple[Diagnosis, MachineSizes]:
+    """The diagnosis, and the machine of it: its command held, or known at its samples only."""
+    study, machine = Study(arranged.project, path, _later(progress)), arranged.machine
+    held = _diagnosed(study)
+    looser = [] if is_settled(held) else less_known(machine, study.machine, study.read.samples)
+    tried = [(Study(_project(file, path, source, arranged.roles, m), path), m) for m in looser]
+    if not tried or not is_likelier(tried[0][0], study):
+        return held, machine
+    study, on_a_line = min(tried, key=lambda pair: unlikeliness(pair[0].fitted))
+    said = _diagnosed(study)
+    return (said, on_a_line) if is_taken(said, held) else (held, machine)
+
+
+def _later(progress: Progress) -> Progress:
+    """What is done after the data are judged."""
+    return lambda text, share: progress(text, 0.1 + 0.9 * share)
+
+
+def _diagnosed(study: Study) -> Diagnosis:
     """The diagnosis; RtidError for data that its numerics cannot bear: they are anybody's."""
     try:
-        return diagnose_trace(project, path, lambda t, s: progress(t, 0.1 + 0.9 * s)).diagnosis
+        return study.diagnosis()
     except np.linalg.LinAlgError as error:
         raise RtidError(
-            f"{path}: the fit fails on this data ({error})",
+            f"{study.path}: the fit fails on this data ({error})",
             "record more motion; if it looks sound to you, please report it with the file",
         ) from error
 

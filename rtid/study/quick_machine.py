@@ -60,7 +60,9 @@ class MachineSizes:
     """Sizes and grids, SI; reversed: roles to be turned round.
 
     spans_s: the part of the record that teaches, and the one that judges; empty: not looked at yet.
-    goes_round: a motor, whose x is an angle.
+    goes_round: a motor, whose x is an angle.  command_hold, command_noise: how the command runs
+    between its samples, and what is unknown of it there, in its unit; command_step_s: from one to
+    the next of a sample of a faster one, which may act up to half of it later than on the line.
     """
 
     bore_m: float
@@ -78,6 +80,9 @@ class MachineSizes:
     reversed: frozenset[str] = frozenset()
     assumptions: tuple[Assumption, ...] = field(default=())
     goes_round: bool = False
+    command_hold: str = "zero"
+    command_noise: float = 0.0
+    command_step_s: float = 0.0
 
     @property
     def displacement_m3(self) -> float:
@@ -86,10 +91,15 @@ class MachineSizes:
 
 
 def lag_of(machine: MachineSizes) -> tuple[float, float]:
-    """The spools' lag and its tolerance, ms."""
-    if machine.lag_s is None:
-        return LAG_MS, LAG_TOLERANCE_MS
-    return 1e3 * machine.lag_s, 1e3 * LAG_SHARE * machine.lag_s
+    """The spools' lag and its tolerance, ms, with what a sample of a faster command may act late.
+
+    A controller that changes it n times a sample acts 1 / 2n of one later than on the line.
+    """
+    lag_ms, tolerance_ms = LAG_MS, LAG_TOLERANCE_MS
+    if machine.lag_s is not None:
+        lag_ms, tolerance_ms = 1e3 * machine.lag_s, 1e3 * LAG_SHARE * machine.lag_s
+    quarter_ms = 250.0 * machine.command_step_s
+    return lag_ms + quarter_ms, math.hypot(tolerance_ms, quarter_ms)
 
 
 def first_machine(roles: dict[str, RoleCandidate], given: Given) -> MachineSizes:

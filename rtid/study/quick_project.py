@@ -20,6 +20,7 @@ from rtid.units import LPM, units_of
 
 DEAD_VOLUME = "dead volume"  # as the pages call the declared size
 TANK_PA = 1e5
+HELD = "zero"  # how a command runs to its next sample, unless it is said
 DIGITS = 6  # of what is written
 SLOW_MS, GAP_STEPS = 20.0, 2.5  # a table with longer steps than the usual gate lets through
 
@@ -112,6 +113,8 @@ def _signals(
             section["noise"] = "estimate" if candidate.high > candidate.low else _least(candidate)
             if candidate.name in source.steps:
                 section["resolution"] = source.steps[candidate.name]
+        elif machine.command_noise or machine.command_hold != HELD:
+            section |= {"hold": machine.command_hold, "noise": _neat(machine.command_noise)}
         turned = role in machine.reversed
         if turned:
             section["scale"] = -1.0

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from scipy.io import savemat
 from firmware_bridge.config import Assembly, SignalSource
 from firmware_bridge.samples import GAP, ROW
 from firmware_bridge.sources import LogError, read_table
-from firmware_bridge.sources.table import APART, between, to_samples
+from firmware_bridge.sources.table import APART, JUMP, between, to_samples
 
 ROLES = Assembly(
     "cycle",
@@ -122,8 +123,9 @@ def in_turn(tmp_path: Path, rows: dict[int, str]) -> tuple[list[int], list[list[
     """Times in ms and values of the samples of x, p and a command u, each in rows of its own."""
     path = tmp_path / "t.csv"
     path.write_text("t_ms,x,p,u\n" + "".join(f"{t},{row}\n" for t, row in rows.items()))
-    sources = [SignalSource(name, signal=name, command=name == "u") for name in "xpu"]
-    samples, counts = to_samples(read_table(path), Assembly("cycle", tuple(sources), (), "x"))
+    command = SignalSource("u", signal="u", command=True, hold="zero")
+    sources = SignalSource("x", signal="x"), SignalSource("p", signal="p"), command
+    samples, counts = to_samples(read_table(path), Assembly("cycle", sources, (), "x"))
     assert (samples.flags & ROW).all() and counts[APART] == len(rows) - len(samples)
     return (samples.t_us // 1000).tolist(), samples.values.tolist()
 
@@ -150,6 +152,22 @@ def test_rows_are_those_of_the_sensor_that_comes_most_seldom(tmp_path: Path) -> 
     t_ms, values = in_turn(tmp_path, dict(sorted(rows.items())))
     assert t_ms == [1, 5, 9, 13, 17]
     assert values == [[t, t, 3] for t in t_ms]
+
+
+def test_a_command_that_is_a_sample_of_a_faster_one_is_on_a_line(tmp_path: Path) -> None:
+    """A row has its mean up to the next one; across a jump nothing is integrated."""
+    u = [0.0, 1.0, 2.0, 3.0, 4.1, 5.0, 9.0, 10.1, 11.0, 12.0]
+    path = tmp_path / "t.csv"
+    path.write_text("t_ms,x,u\n" + "".join(f"{10 * k},{k},{v}\n" for k, v in enumerate(u)))
+    signals = (
+        SignalSource("x", signal="x"),
+        SignalSource("u", signal="u", command=True, hold="linear"),
+    )
+    samples, counts = to_samples(read_table(path), Assembly("cycle", signals, (), "x"))
+    line = [*(0.5 * (a + b) for a, b in pairwise(u)), u[-1]]
+    assert samples.column("u").tolist() == pytest.approx(line)
+    assert np.flatnonzero(samples.flags & GAP).tolist() == [0, 6]
+    assert counts == {JUMP: 1}
 
 
 def test_no_line_spans_what_is_missing() -> None:

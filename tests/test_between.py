@@ -1,0 +1,64 @@
+"""What a log does not say of a command between its samples, against commands that are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from firmware_bridge.samples import ROW, Samples
+from firmware_bridge.sources.table import jumps
+from rtid.plain import FloatArray
+from rtid.trace.between import command_noise, unknown_between
+
+N, EACH, DT_S = 100_000, 20, 1e-3  # samples of the controller, of which each so many-th is logged
+T_S = np.linspace(0.0, DT_S * (N - 1), N)
+RNG = np.random.default_rng(3)
+WALK, TREMBLE = np.cumsum(RNG.normal(0.0, 0.01, N)), RNG.normal(0.0, 0.05, N)
+
+
+def of_sums(fine: FloatArray) -> float:
+    """What the line between logged samples misses of the sum of 20 of their steps, per step."""
+    u = fine[::EACH]
+    missed = fine.reshape(-1, EACH).mean(axis=1)[:-1] - 0.5 * (u[1:] + u[:-1])
+    whole = missed[: len(missed) // 20 * 20].reshape(-1, 20).sum(axis=1)
+    return float(np.sqrt(np.mean(whole**2) / 20))
+
+
+@pytest.mark.parametrize("fine", [WALK, TREMBLE, WALK + TREMBLE], ids=["walk", "tremble", "both"])
+def test_it_is_what_the_line_between_samples_misses(fine: FloatArray) -> None:
+    sd, step_s = unknown_between(T_S[::EACH], fine[::EACH])
+    assert sd == pytest.approx(of_sums(fine), rel=0.12)
+    assert step_s == pytest.approx(EACH * DT_S)
+
+
+def test_a_ramp_and_a_slow_swing_are_known() -> None:
+    for fine in (np.abs(T_S % 4.0 - 2.0), np.sin(np.pi * T_S)):
+        assert unknown_between(T_S[::EACH], fine[::EACH])[0] < 1e-3
+
+
+def test_a_jump_is_none_of_it() -> None:
+    """When it came, nobody knows: nothing is integrated across it."""
+    fine = 0.2 * WALK
+    fine[N // 2 :] += 4.0
+    step = jumps(fine[::EACH])
+    assert np.flatnonzero(step).tolist() == [N // 2 // EACH - 1]
+    sd, _ = unknown_between(T_S[::EACH], fine[::EACH])
+    assert sd == pytest.approx(unknown_between(T_S[::EACH], 0.2 * WALK[::EACH])[0], rel=0.01)
+
+
+def test_what_trembles_has_no_jumps_and_what_rests_tells_of_nothing() -> None:
+    assert not jumps(TREMBLE).any()
+    assert not jumps(np.zeros(9)).any()
+    assert not jumps(np.zeros(2)).any()
+    assert unknown_between(T_S[:200], np.zeros(200))[0] == 0.0
+
+
+def test_as_noise_of_what_is_read_oftener_it_is_larger() -> None:
+    """A command of each 20 ms among instants of each 5: so much noise at each gives as much."""
+    u = WALK[::EACH]
+    t_us = 1_000_000 * np.arange(4 * len(u)) // 200
+    column = np.repeat(u, 4)
+    samples = Samples(("u",), t_us, column[:, None], np.full(len(t_us), ROW, np.uint8))
+    sd, step_s = command_noise(samples, "u", 5e-3)
+    assert step_s == pytest.approx(20e-3)
+    assert sd == pytest.approx(2.0 * unknown_between(T_S[::EACH], u)[0], rel=0.05)
