@@ -48,15 +48,15 @@ def is_settled(said: Diagnosis) -> bool:
     return said.verdict == MATCHES
 
 
-def is_taken(line: Diagnosis, held: Diagnosis) -> bool:
-    """Whether what is said with the command on a line stands in place of what is said of it held.
+def is_taken(line: Diagnosis, first: Diagnosis) -> bool:
+    """Whether what is said with the command on a line stands in place of the first.
 
     What was named is not given up for a verdict that says less, nor for one that names more.
     """
     named = MISSING, AMBIGUOUS
-    if held.verdict not in named or line.verdict == MATCHES:
+    if first.verdict not in named or line.verdict == MATCHES:
         return True
-    is_simpler = len(line.found) <= len(held.found) and line.rho_after <= held.rho_after
+    is_simpler = len(line.found) <= len(first.found) and line.rho_after <= first.rho_after
     return line.verdict in named and is_simpler
 
 
@@ -65,14 +65,14 @@ def unlikeliness(fit: Fit) -> float:
     return float(fit.held.sse + fit.regression.log_noise) / max(1, fit.regression.rows)
 
 
-def is_likelier(line: Study, held: Study) -> bool:
-    """Whether a record is likelier with its command on a line than held.
+def is_likelier(line: Study, first: Study) -> bool:
+    """Whether a record is likelier with its command on a line than as it was first, held.
 
     On the same rows, weighed alike: a fit that takes an oil for 9 GPa has less of the pressures'
     noise to answer for.  Either is asked without what is missing: what is hidden in both tells of
     neither.
     """
-    fit, known = line.fitted, held.taught
+    fit, known = line.fitted, first.taught
     chunk, column = fit.chunk.copy(), 2 + line.machine.column("u")
     chunk[:, column] = known[np.searchsorted(known[:, 0], chunk[:, 0]), column]
     other = one_pass(fit.declared, chunk, fit.weights, fit.revision, None, False, thorough=False)
