@@ -85,7 +85,7 @@ def contest(
     refitted = _all_finished(state, present, [best, *rivals], finished)
     best = max(refitted, key=lambda t: t.gain)
     alike = alike_ones(state, present, best, refitted)
-    late = _as_late(state, best, refitted)
+    late = _as_late(state, best, refitted) if state.model.has_pressures else []
     equals = [best, *(t for t in refitted if t.key in alike and not _is_beaten(t, refitted))]
     if late:
         equals = sorted({t.key: t for t in (*equals, *late)}.values(), key=_left_by)
