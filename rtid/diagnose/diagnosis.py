@@ -57,7 +57,7 @@ from rtid.diagnose.verdict import (
 )
 from rtid.diagnose.zeros import Zero, zeros
 from rtid.effects.column import Candidate
-from rtid.effects.laws.lines import lines_at, stores_at
+from rtid.effects.laws.lines import is_sampled, lines_at, stores_at
 from rtid.effects.page import Effect
 from rtid.estimator.validity import Doubt
 from rtid.model import Machine
@@ -323,7 +323,17 @@ def is_refuted(present: Fit, now: Fit, trial: Trial, least: float) -> bool:
     if trial.is_timing:
         return makes_impossible(present, now)
     is_none = is_of_another_form(now) or is_spread_alone(present, now, least)
-    return is_none or makes_impossible(present, now)
+    return is_none or is_unsampled(now, trial) or makes_impossible(present, now)
+
+
+def is_unsampled(now: Fit, trial: Trial) -> bool:
+    """True for a line that rings faster than the samples of the record could show.
+
+    Healthy machines of 50 samples a second had lines of 450 to 825 rad/s: 157 is half of that.
+    """
+    is_line = trial.key in lines_at(trial.key[1])
+    own = [e for e in now.revision.effects if is_line and e.key == trial.key]
+    return any(not is_sampled(e.shape[0], now.view) for e in own)
 
 
 def makes_impossible(present: Fit, now: Fit) -> bool:

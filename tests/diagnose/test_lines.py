@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from rtid.diagnose.diagnosis import search
 from rtid.diagnose.report import FoundEffect, diagnosis
-from rtid.effects.laws.lines import AT_CYLINDER, AT_VALVE
+from rtid.effects.laws.lines import AT_CYLINDER, AT_VALVE, is_sampled
 from rtid.sim.extra_flows import HOSE_AREA_M2, INERTANCE_KGPM5
 from rtid.sim.random_plants import draw
 from tests.diagnose.records import record
@@ -43,3 +46,15 @@ def test_a_line_is_named_with_what_it_is(effect: str, end: str) -> None:
         value = line.parameters[name]
         assert value.value == pytest.approx(true, rel=within)
         assert abs(value.value - true) < 2.0 * value.std
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "radps", "is_seen"),
+    [(1000, 700, True), (200, 300, True), (200, 450, False), (50, 130, False)],
+)
+def test_a_line_that_rings_between_the_samples_is_none(
+    rate_hz: int, radps: float, is_seen: bool
+) -> None:
+    """Of a healthy machine at 50 Hz lines of 450 to 825 rad/s were named."""
+    view: Any = SimpleNamespace(dt_s=np.full(9, 1.0 / rate_hz))
+    assert is_sampled(radps, view) == is_seen

@@ -41,12 +41,19 @@ AT_VALVE, AT_CYLINDER = (f"{FREQUENCY}_sensor_at_{end}" for end in ("valve", "cy
 RADPS, VOLUMES_M3, RESISTANCES = (130.0, 200.0, 300.0, 450.0, 700.0), (2e-4, 6e-4), (2e8, 2e9)
 LARGEST = 3.0  # times the bank's own size that a column of it may have
 QUICK_S = 2e-3  # half width of the parabolas
+SWING = 0.5 * np.pi  # of a line's phase between two samples, beyond which nobody sees it ring
 DOUBLINGS = 2  # of a step of the section's equations until it is an interval of the record
 
 
 def lines(view: RecordView, effect: Effect) -> Iterator[Cause]:
-    """A line before one chamber or alike before both, seen by sensors at either end of it."""
+    """A line before one chamber or alike before both, seen by sensors at either end of it.
+
+    Of those whose ringing the record samples; none where it is too slow for any.
+    """
     known = {p.name: p for p in effect.parameters}
+    radps = tuple(w for w in RADPS if is_sampled(w, view))
+    if not radps:
+        return
     for place, at in chambers_by_place(view.model).items():
         for name, column in ((AT_VALVE, _at_valve), (AT_CYLINDER, _at_cylinder)):
             candidate = Candidate(
@@ -55,8 +62,13 @@ def lines(view: RecordView, effect: Effect) -> Iterator[Cause]:
                 shape_units=tuple(known[n].unit for n in (FREQUENCY, "volume", "resistance")),
                 page=effect,
             )  # fmt: skip
-            axes = RADPS, VOLUMES_M3, RESISTANCES
+            axes = radps, VOLUMES_M3, RESISTANCES
             yield Cause(candidate, partial(_of_chambers, column, view, at), axes)
+
+
+def is_sampled(radps: float, view: RecordView) -> bool:
+    """Whether a record has samples close enough for what rings at radps, rad/s."""
+    return bool(radps * np.median(view.dt_s) < SWING)
 
 
 def lines_at(where: str) -> set[Key]:
