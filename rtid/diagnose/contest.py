@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
 from rtid.diagnose.exact import carried_on, key_of, timing_trials, with_pump
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.rivals import is_told_apart
@@ -85,37 +83,30 @@ def contest(
     refitted = _all_finished(state, present, [best, *rivals], finished)
     best = max(refitted, key=lambda t: t.gain)
     alike = alike_ones(state, present, best, refitted)
-    late = _as_late(state, best, refitted) if state.model.has_pressures else []
     equals = [best, *(t for t in refitted if t.key in alike and not _is_beaten(t, refitted))]
-    if late:
-        equals = sorted({t.key: t for t in (*equals, *late)}.values(), key=_left_by)
-    chosen = min(equals, key=lambda t: (t.n_parameters, 0.0 if late else -t.gain))
+    if best.is_timing and state.model.has_pressures:
+        equals = [t for t in equals if not t.is_timing] + _as_late(state, present, refitted)
+    chosen = min(equals, key=lambda t: (t.n_parameters, -t.gain))
     return chosen, tuple(t.key for t in equals if t.key != chosen.key)
 
 
-def _as_late(state: TrialState, best: Trial, others: list[Trial]) -> list[Trial]:
-    """Other times that explain as much as the best one, by chi2 alone.
+def _as_late(state: TrialState, present: Fit, trials: list[Trial]) -> list[Trial]:
+    """The best of the times that were refitted, and those that are not told from it, by chi2 alone.
 
     All else by which they differ is the moduli beside them, and how much of the pressures' noise
     those let into the rows: that is as good as the noise that is declared.  A command that came
     5 ms late on a sweep was named a position, late by 6 ms, beside an oil of 1440 MPa for 926.
     """
-    most = _left_by(best) + TIE + TIE_SHARE * best.gain
-    return [
-        t
-        for t in others
-        if _are_times(t, best) and t.key not in state.negligible and _left_by(t) < most
-    ]
+    sse = present.held.sse
+    times = [replace(t, gain=sse - t.fit.held.sse) for t in trials if t.is_timing and t.fit]
+    best = max(times, key=lambda t: t.gain)
+    alike = {best.key, *alike_ones(state, present, best, times)}
+    return [t for t in times if t.key in alike]
 
 
 def _are_times(trial: Trial, best: Trial) -> bool:
     """Whether another trial and the best one both say how late something is."""
     return trial.is_timing and best.is_timing and trial.key != best.key
-
-
-def _left_by(trial: Trial) -> float:
-    """chi2 that a refitted trial leaves."""
-    return trial.fit.held.sse if trial.fit is not None else np.inf
 
 
 def _is_beaten(trial: Trial, others: list[Trial]) -> bool:

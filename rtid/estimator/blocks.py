@@ -63,32 +63,40 @@ def mean_flows(model: Machine, sums: Sums, theta: FloatArray) -> FloatArray:
     return np.asarray(rated[sums.blocks["edge"]] * (mean_phi(sums.blocks) * terms).sum(axis=1))
 
 
-def rms_slopes(model: Machine, sums: Sums, theta: FloatArray) -> FloatArray:
-    """Root mean square of dQ/ddp over the data of each block (m,), m3/s/Pa; theta (n,) as above."""
+def rms_slopes(model: Machine, sums: Sums, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Root mean squares of dQ/ddp and dQ/dw over the data of each block, both (m,); theta as above.
+
+    In m3/s/Pa and m3/s/V.
+    """
     one, xi, eta, xi2, eta2, both = mean_phi(sums.blocks).T
-    _, _, a, _, b, c = theta[sums.n_shared :].reshape(-1, TERMS).T
-    square = a**2 * one + 4 * b**2 * eta2 + c**2 * xi2
-    square += 4 * a * b * eta + 2 * a * c * xi + 4 * b * c * both
+    _, a, b, a2, b2, c = theta[sums.n_shared :].reshape(-1, TERMS).T
     height = [np.tile(np.diff(e.grid.dp_pa), e.grid.shape[0]) for e in model.edges]
-    return _per(height, model, sums) * np.sqrt(np.maximum(square, 0.0))
-
-
-def rms_gains(model: Machine, sums: Sums, theta: FloatArray) -> FloatArray:
-    """Root mean square of dQ/dw over the data of each block (m,), m3/s/V; theta (n,) as above."""
-    one, xi, eta, xi2, eta2, both = mean_phi(sums.blocks).T
-    _, a, _, b, _, c = theta[sums.n_shared :].reshape(-1, TERMS).T
-    square = a**2 * one + 4 * b**2 * xi2 + c**2 * eta2
-    square += 4 * a * b * xi + 2 * a * c * eta + 4 * b * c * both
     width = [np.repeat(np.diff(e.grid.u_v), e.grid.shape[1]) for e in model.edges]
-    return _per(width, model, sums) * np.sqrt(np.maximum(square, 0.0))
+    return (
+        _rms(model, sums, height, (b, 2 * b2, c), (one, eta, xi, eta2, xi2, both)),
+        _rms(model, sums, width, (a, 2 * a2, c), (one, xi, eta, xi2, eta2, both)),
+    )
 
 
-def _per(size: list[FloatArray], model: Machine, sums: Sums) -> FloatArray:
-    """Rated flow over half the size of each block (m,); size: (cells,) by edge, any unit."""
+def _rms(
+    model: Machine,
+    sums: Sums,
+    size: list[FloatArray],
+    slope: tuple[FloatArray, ...],
+    means: tuple[FloatArray, ...],
+) -> FloatArray:
+    """Of a + b z + c y over the data of each block (m,), where z runs along size (cells,) by edge.
+
+    slope: a, b and c; means: of 1, z, y, z^2, y^2 and z y; all (m,).
+    """
+    a, b, c = slope
+    one, z, y, z2, y2, zy = means
+    square = a**2 * one + b**2 * z2 + c**2 * y2 + 2 * (a * b * z + a * c * y + b * c * zy)
     edge, place = sums.blocks["edge"], sums.blocks["cell"]
     own = place - np.array(model.first_cells)[edge]
     rated = np.array([e.rated_q_m3s for e in model.edges])[edge]
-    return np.asarray(2 * rated / [size[e][p] for e, p in zip(edge, own, strict=True)])
+    half = 0.5 * np.array([size[e][p] for e, p in zip(edge, own, strict=True)])
+    return np.asarray(rated / half * np.sqrt(np.maximum(square, 0.0)))
 
 
 def largest_flows(model: Machine, sums: Sums, theta: FloatArray) -> FloatArray:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from rtid.estimator.blocks import Block, mean_flows, read_blocks, rms_gains, rms_slopes
+from rtid.estimator.blocks import Block, mean_flows, read_blocks, rms_slopes
 from rtid.estimator.correction import correct, leverage_of, plain
 from rtid.estimator.factor import PRIOR_SD, factor_of, misfit, one_thread
 from rtid.estimator.state import State
@@ -107,7 +107,7 @@ def sketch(model: Machine, sums: Sums) -> Sketch:
             theta = to_taylor(model, sums, factor.cov(), PRIOR_SD)[0] @ theta
     flow = mean_flows(model, sums, theta)
     flow[sums.blocks["rows"] < model.gates.min_rows] = np.nan
-    slopes = rms_slopes(model, sums, theta), rms_gains(model, sums, theta)
+    slopes = rms_slopes(model, sums, theta)
     return Sketch(theta[:n_c] * sums.compliance, flow, *slopes, sums.cells, leverage, unknowns)
 
 
