@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from firmware_bridge.samples import ROW, Samples
 from firmware_bridge.sources.table import jumps
 from rtid.plain import FloatArray
-from rtid.trace.between import command_noise, unknown_between
+from rtid.trace.between import unknown_between
 
 N, EACH, DT_S = 100_000, 20, 1e-3  # samples of the controller, of which each so many-th is logged
 T_S = np.linspace(0.0, DT_S * (N - 1), N)
@@ -51,14 +50,3 @@ def test_what_trembles_has_no_jumps_and_what_rests_tells_of_nothing() -> None:
     assert not jumps(np.zeros(9)).any()
     assert not jumps(np.zeros(2)).any()
     assert unknown_between(T_S[:200], np.zeros(200))[0] == 0.0
-
-
-def test_as_noise_of_what_is_read_oftener_it_is_larger() -> None:
-    """A command of each 20 ms among instants of each 5: so much noise at each gives as much."""
-    u = WALK[::EACH]
-    t_us = 1_000_000 * np.arange(4 * len(u)) // 200
-    column = np.repeat(u, 4)
-    samples = Samples(("u",), t_us, column[:, None], np.full(len(t_us), ROW, np.uint8))
-    sd, step_s = command_noise(samples, "u", 5e-3)
-    assert step_s == pytest.approx(20e-3)
-    assert sd == pytest.approx(2.0 * unknown_between(T_S[::EACH], u)[0], rel=0.05)

@@ -10,14 +10,16 @@ from dataclasses import replace
 
 import numpy as np
 
+from firmware_bridge.samples import GAP
 from rtid.effects.laws.pump import demand
 from rtid.effects.laws.response import behind_s
 from rtid.effects.laws.sensors import sensors_of
 from rtid.effects.laws.timing import COMMAND, SUPPLY, Psi, TimingLaw
 from rtid.effects.record_view import RecordView
 from rtid.model import Edge, Machine
-from rtid.plain import FloatArray
+from rtid.plain import FloatArray, IntArray
 
+GAP_STEPS = 1.5  # usual steps: what is marked as a gap and takes no longer is all there
 Timings = tuple[tuple[TimingLaw, Psi], ...]
 
 
@@ -84,7 +86,8 @@ def _put_right(model: Machine, chunk: FloatArray, timings: Timings) -> FloatArra
         if timing.of_sensor and not model.measured:
             for name in sensors_of(model, timing):
                 column = 2 + model.column(name)
-                chunk[:, column] = timing.apply(chunk[:, column].copy(), dt_s, psi)
+                runs = np.split(chunk[:, column], _gaps(chunk, dt_s))
+                chunk[:, column] = np.concatenate([timing.apply(r, dt_s, psi) for r in runs])
     for timing, psi in timings:
         if timing.where == SUPPLY:
             view = RecordView.without_map(model, chunk)
@@ -92,6 +95,13 @@ def _put_right(model: Machine, chunk: FloatArray, timings: Timings) -> FloatArra
                 demand(view), view.step_s, psi
             )
     return chunk
+
+
+def _gaps(chunk: FloatArray, dt_s: float) -> IntArray:
+    """Rows of a chunk (n, 2 + signals), SI, before which samples are missing, dt_s: usual step."""
+    steps = np.diff(chunk[:, 0], prepend=chunk[0, 0])
+    marked = chunk[:, 1].astype(np.int64) & GAP != 0
+    return np.flatnonzero(marked & (steps > GAP_STEPS * dt_s))
 
 
 def through(u: FloatArray, direction: int, dt_s: float, timings: Timings) -> FloatArray:

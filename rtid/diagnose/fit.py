@@ -43,6 +43,7 @@ RIDGE = 1e-9  # of the square of a timing's or a shape's column: more than round
 WEIGHED = 0.05  # share by which the compliances may differ that weigh the rows alike
 MATCH_RHO = 1.10  # largest rho of a model that matches, of a record that is long enough
 BAND_SD = 3.0  # standard deviations of rho that a record's own length gives it
+LEAST_COMPLIANCE = 1e-11  # 1/Pa: of an oil of 100 GPa, that weighs as nothing
 NO_COV = np.zeros((0, TERMS, TERMS))  # of maps whose covariance nobody asked for
 
 
@@ -322,6 +323,25 @@ def with_covariances(fitted: Fit, like: Fit | None = None) -> Fit:
     )
     vars(better).update(model=fitted.model, sent=fitted.sent, view=fitted.view)
     return better
+
+
+def settled_chi2(fitted: Fit) -> float:
+    """What a fit leaves of its rows, weighed for the noise of exactly what it has found.
+
+    A pressure that is measured has noise in what the chamber stores.  Were it free to be what it
+    was, at every row, chi2 so weighed would be all that is left of the likelihood (Deming): its
+    least is at the truth.  Compliances and sizes that are weighed a few per cent off are as much as
+    noise in it; and ln det in its place rewards an oil for being stiff.
+    """
+    old, found = fitted.revision, np.maximum(np.abs(fitted.compliance), LEAST_COMPLIANCE)
+    sizes = tuple((e, fitted.held.value(fitted.column(e))) for e in old.effects)
+    weights, revision = replace(fitted.weights, compliance=found), replace(old, sizes=sizes)
+    record = fitted.declared, fitted.chunk, weights, revision, fitted.light()
+    now = one_pass(*record, bank=False, thorough=False)
+    theta = dict(zip(fitted.held.used, fitted.held.theta, strict=True))
+    theta |= {1 + c: share for c, share in enumerate(fitted.compliance / found)}
+    at = {fitted.column(e): now.column(e) for e in old.effects}
+    return now.regression.chi2([at.get(c, c) for c in theta], np.array(list(theta.values())))
 
 
 def _covariances_of(like: Fit, fitted: Fit) -> FloatArray | None:

@@ -84,9 +84,13 @@ class Regression:
         theta = inverse @ right
         cov = inverse @ (plain * outer) @ inverse
         theta, cov = theta * scale, cov * outer
-        left = self.s[0, 0] - 2.0 * self.s[0, at] @ theta + theta @ self.s[np.ix_(at, at)] @ theta
-        sse = float(left + self.prior[at] @ (theta - self.mean[at]) ** 2)
+        sse = self.chi2(at, theta) + float(self.prior[at] @ (theta - self.mean[at]) ** 2)
         return Estimate(used, theta, cov, sse)
+
+    def chi2(self, at: list[int], theta: FloatArray) -> float:
+        """What theta (columns,), SI, of the columns `at` leaves of the rows, maps being free."""
+        s = self.s
+        return float(s[0, 0] - 2.0 * s[0, at] @ theta + theta @ s[np.ix_(at, at)] @ theta)
 
     def _bounded(self, at: list[int], plain: FloatArray, outer: FloatArray) -> FloatArray:
         """The noise's products, less where they leave too little: then nothing can be told.

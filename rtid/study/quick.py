@@ -26,7 +26,7 @@ from rtid.project import Project, load
 from rtid.project import guess as proposal
 from rtid.project.guess import RoleCandidate, unused
 from rtid.study.kept_record import model_for
-from rtid.study.quick_command import is_likelier, is_settled, is_taken, less_known, unlikeliness
+from rtid.study.quick_command import is_likelier, is_taken, less_known, unlikeliness
 from rtid.study.quick_machine import (
     Assumption,
     Given,
@@ -233,12 +233,17 @@ def _likeliest(
     """The diagnosis, and the machine of it: its command held, or known at its samples only."""
     study, machine = Study(arranged.project, path, _later(progress)), arranged.machine
     held = _diagnosed(study)
-    looser = [] if is_settled(held) else less_known(machine, study.machine, study.read.samples)
-    tried = [(Study(_project(file, path, source, arranged.roles, m), path), m) for m in looser]
-    if not tried or not is_likelier(tried[0][0], study):
+    if held.verdict == MATCHES or not arranged.trace.is_table:
         return held, machine
-    study, on_a_line = min(tried, key=lambda pair: unlikeliness(pair[0].fitted))
-    said = _diagnosed(study)
+    looser = less_known(machine, study.read.samples)
+    tried = [(Study(_project(file, path, source, arranged.roles, m), path), m) for m in looser]
+    try:
+        if not tried or not is_likelier(tried[0][0], study):
+            return held, machine
+        study, on_a_line = min(tried, key=lambda pair: unlikeliness(pair[0].fitted))
+        said = _diagnosed(study)
+    except (np.linalg.LinAlgError, RtidError):  # it cannot be had so: what was said before stands
+        return held, machine
     return (said, on_a_line) if is_taken(said, held) else (held, machine)
 
 

@@ -14,24 +14,23 @@ from dataclasses import replace
 import numpy as np
 
 from firmware_bridge.samples import Samples
-from rtid.diagnose.fit import Fit, one_pass
+from rtid.diagnose.fit import Fit, one_pass, settled_chi2
 from rtid.diagnose.report import Diagnosis
 from rtid.diagnose.verdict import AMBIGUOUS, MATCHES, MISSING
-from rtid.model import Machine
 from rtid.study.quick_machine import Assumption, MachineSizes
 from rtid.study.study import Study
-from rtid.trace.between import command_noise
+from rtid.trace.between import unknown_between
 
 FASTEST_S = 1.5e-3  # between two samples of a command: up to it a log is no slower than controllers
 SHARES = 0.0, 0.5, 1.0  # of what is unknown between its samples, that are tried as its noise
 
 
-def less_known(machine: MachineSizes, model: Machine, samples: Samples) -> list[MachineSizes]:
+def less_known(machine: MachineSizes, samples: Samples) -> list[MachineSizes]:
     """The machine with a command that is a sample of a faster one: known on a line, and less.
 
-    samples: with the command as it is written; none where they tell all of it.
+    samples: of a table, with the command as it is written; none where they tell all of it.
     """
-    sd, step_s = command_noise(samples, "u", model.pressure_period_s)
+    sd, step_s = unknown_between(np.multiply(1e-6, samples.t_us), samples.column("u"))
     if step_s < FASTEST_S or not sd:
         return []
     assumption = Assumption(
@@ -43,21 +42,18 @@ def less_known(machine: MachineSizes, model: Machine, samples: Samples) -> list[
     return [replace(line, command_noise=share * sd) for share in SHARES]
 
 
-def is_settled(said: Diagnosis) -> bool:
-    """Whether a verdict leaves nothing for a command that is less known."""
-    return said.verdict == MATCHES
-
-
 def is_taken(line: Diagnosis, first: Diagnosis) -> bool:
     """Whether what is said with the command on a line stands in place of the first.
 
-    What was named is not given up for a verdict that says less, nor for one that names more.
+    What was named is not given up for a verdict that says less, nor for one that names more, or
+    leaves more than noise.
     """
     named = MISSING, AMBIGUOUS
     if first.verdict not in named or line.verdict == MATCHES:
         return True
-    is_simpler = len(line.found) <= len(first.found) and line.rho_after <= first.rho_after
-    return line.verdict in named and is_simpler
+    is_simpler = len(line.found) <= len(first.found)
+    leaves_less = line.rho_after <= max(1.0, first.rho_after)
+    return line.verdict in named and is_simpler and leaves_less
 
 
 def unlikeliness(fit: Fit) -> float:
@@ -68,12 +64,17 @@ def unlikeliness(fit: Fit) -> float:
 def is_likelier(line: Study, first: Study) -> bool:
     """Whether a record is likelier with its command on a line than as it was first, held.
 
-    On the same rows, weighed alike: a fit that takes an oil for 9 GPa has less of the pressures'
-    noise to answer for.  Either is asked without what is missing: what is hidden in both tells of
-    neither.
+    On the same rows, each with its own lag and weighed for what it has found: a fit that takes an
+    oil for 9 GPa has less of the pressures' noise to answer for, and a line that is half a sample
+    late is as good as a command that is held.  One beside which no oil can be so stiff is none.
+    Either is asked without what is missing: what is hidden in both tells of neither.
     """
     fit, known = line.fitted, first.taught
     chunk, column = fit.chunk.copy(), 2 + line.machine.column("u")
     chunk[:, column] = known[np.searchsorted(known[:, 0], chunk[:, 0]), column]
-    other = one_pass(fit.declared, chunk, fit.weights, fit.revision, None, False, thorough=False)
-    return fit.held.sse < other.held.sse
+    weights = replace(fit.weights, lag_s=first.fitted.weights.lag_s)
+    held = one_pass(fit.declared, chunk, weights, fit.revision, None, False, thorough=False)
+    stiffest = 1.0 / max(fit.declared.beta_bounds_pa)
+    if held.compliance.min() < stiffest <= fit.compliance.min():
+        return True
+    return settled_chi2(fit) < settled_chi2(held)

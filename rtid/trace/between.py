@@ -14,9 +14,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.samples import Samples
 from firmware_bridge.sources.table import jumps
-from rtid.estimator.noise import measurements
 from rtid.plain import FloatArray
 
 FEWEST = 100  # differences that tell of it
@@ -28,7 +26,6 @@ def unknown_between(t_s: FloatArray, u: FloatArray) -> tuple[float, float]:
 
     t_s (n,): its stamps, s.  A command at rest is known, and not asked; 0 where too little moves.
     """
-    t_s, u = measurements(t_s, u)
     step_s = np.diff(t_s)
     usual_s = float(np.median(step_s)) if len(step_s) else 0.0
     moves = np.diff(u) != 0.0
@@ -46,12 +43,3 @@ def unknown_between(t_s: FloatArray, u: FloatArray) -> tuple[float, float]:
 def _three(values: NDArray[np.bool_]) -> FloatArray:
     """Sums (n - 2,) of three neighbours of values (n,)."""
     return np.convolve(values, np.ones(3), "valid")
-
-
-def command_noise(samples: Samples, name: str, period_s: float) -> tuple[float, float]:
-    """What is unknown of a command of samples, as noise of a sensor that is read once a period.
-
-    Beside it the usual step between its own samples, s.
-    """
-    sd, step_s = unknown_between(np.multiply(1e-6, samples.t_us), samples.column(name))
-    return sd * float(np.sqrt(step_s / (period_s or step_s or 1.0))), step_s

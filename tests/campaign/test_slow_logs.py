@@ -25,7 +25,7 @@ from tests.campaign.report import leave
 
 pytestmark = pytest.mark.campaign
 SEED, RECORD_S, LAG_S = 6203, 60.0, 1.3e-3
-TOO_SLOW = pytest.mark.xfail(reason="7 of 10 unknown or misnamed: what the oil does in between")
+TOO_SLOW = pytest.mark.xfail(reason="none matches: what the oil does between the samples")
 SPANS = dict.fromkeys(("p_a", "p_b", "p_supply", "p_tank"), 40e6)  # of 12 bits, Pa; x: the stroke
 NAMED = ("missing", "ambiguous")
 
