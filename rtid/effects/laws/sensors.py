@@ -7,6 +7,7 @@ The columns are the derivatives: what a unit more of T or tau would change, to f
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -24,7 +25,8 @@ from rtid.model import Machine
 from rtid.plain import FloatArray
 
 TAPS = 24  # of an allpass: what is cut off is 3e-12
-QUICK_S = 5e-3  # half width of the window for the rate of a slow sensor's pressure
+ENDS = 10  # samples that tell how a signal goes on beyond its ends
+QUIET = 0.5  # of a pressure's noise, that its rate may add to it once tau is put right
 
 
 def late_pressure(view: RecordView, effect: Effect) -> Iterator[Cause]:
@@ -66,22 +68,33 @@ def ahead(values: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
 
         y_k = a x_k + x_k-1 - a y_k-1,    a = (1 - d) / (1 + d),    0.5 <= d < 1.5,
 
-    which is a delay of d samples to what is slow, and leaves white noise as white and as large.  On
-    the line between two samples it would be less, by half in their middle: of a command that came
-    5 ms late in a log of 200 Hz the position was named, late by 7.2 ms, at 0.71 of the noise.
+    which is a delay of d samples to what is slow, and leaves white noise as white and as large;
+    before its first and behind its last value it goes on as it begins and ends.  On the line
+    between two samples noise would be less, by half in their middle: of a command that came 5 ms
+    late in a log of 200 Hz the position was named, late by 7.2 ms, at 0.71 of the noise.
     """
     steps = int(np.floor(psi[0] / dt_s + 1.5))
     d = steps - psi[0] / dt_s
     a = (1.0 - d) / (1.0 + d)
     taps = np.concatenate([[a], (1.0 - a * a) * (-a) ** np.arange(TAPS)])
-    n = len(values)
-    earlier = np.concatenate([values[:1].repeat(TAPS), values, values[-1:].repeat(steps)])[steps:]
+    n, few = len(values), min(ENDS, len(values) - 1)
+    if few < 1:
+        return values
+    at_start, at_end = (values[few] - values[0]) / few, (values[-1] - values[-1 - few]) / few
+    before = values[0] + at_start * np.arange(-TAPS, 0)
+    behind = values[-1] + at_end * np.arange(1, steps + 1)
+    earlier = np.concatenate([before, values, behind])[steps:]
     return np.convolve(earlier, taps)[TAPS : TAPS + n]
 
 
 def quickened(values: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
-    """What a sensor of time constant psi has seen (n,), by the rate of a parabola, any unit."""
-    half = max(2, round(QUICK_S / dt_s))
+    """What a sensor of time constant psi has seen (n,), by the rate of a parabola, any unit.
+
+    The parabola is the shortest that adds little noise: of m samples to either side tau over the
+    step and the root of m (m + 1) (2 m + 1) / 3.  Over 5 ms it smoothed what 1.08 ms let through,
+    found 1.15, and left a dead volume of 0.07 L.
+    """
+    half = max(1, math.ceil((1.5 * (psi[0] / (QUIET * dt_s)) ** 2) ** (1 / 3)))
     if len(values) < 2 * half + 1:
         return values
     return np.asarray(values + psi[0] * fitted(values, half, 1, dt_s))
