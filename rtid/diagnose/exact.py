@@ -9,19 +9,22 @@ from types import MappingProxyType
 import numpy as np
 
 from rtid.diagnose.fit import Fit, fit, one_pass, tried, with_rows_of
+from rtid.diagnose.moving import LAG_REACH
 from rtid.diagnose.regression import Score
 from rtid.diagnose.search import Beside
 from rtid.diagnose.trials import GAIN, Trial, TrialState, scored
 from rtid.effects.column import Candidate
 from rtid.effects.laws.pump import PUMP, demand
 from rtid.effects.laws.sensors import sensor_timings
-from rtid.effects.laws.timing import DEAD_BAND, Psi, TimingLaw, timings_of
+from rtid.effects.laws.timing import DEAD_BAND, Psi, TimingLaw, delayed, timings_of
 from rtid.effects.record_view import RecordView
 from rtid.estimator.orifice import root
 from rtid.estimator.track import pressure_drop
 from rtid.plain import FloatArray, Key
 
 LARGE = 1.5  # rho above which timing effects are refitted whatever their score
+SHARES = 0.25, 0.5  # of what a delay and the lag come to, at which the lag is tried
+UNEVEN = 0.01  # of the degrees of freedom: chi2 by which another share must be better
 CLOSE = 0.9  # timings whose coarse gain is this share of the best are refitted finely
 # where a valve opens: shares of its largest flow gain, bins of the command, least sqrt(dp)
 RISES, BINS, LEAST_ROOT = (0.15, 0.4), 40, 300.0
@@ -189,7 +192,31 @@ def carried_on(state: TrialState, present: Fit, trial: Trial, must_win: bool = F
     record = state.model, state.chunk, weights, revision, start
     if trial.has_ended and not trial.is_timing:  # a lag and a delay go on to trade off
         return one_pass(*record, bank=False, thorough=False)
-    return fit(*record, bank=False, other=present if must_win else None)
+    ended = fit(*record, bank=False, other=present if must_win else None)
+    return _split_anew(state, ended) if trial.is_timing else ended
+
+
+def _split_anew(state: TrialState, now: Fit) -> Fit:
+    """A delay and the lag of the spools, of which the sum is clear, from other shares of the sum.
+
+    A lag far below a sample is a part of one of delay, and there the cost is level: a fit stood
+    still at 4.85 ms of delay and 0.11 of lag, 3.80 and 1.2 being true, at 60 of chi2 above it.  By
+    the parts of samples the cost is uneven, by 20.
+    """
+    *others, (timing, psi) = now.revision.timings
+    lag, both = state.model.lag, psi[0] + now.weights.lag_s
+    best = now
+    for lag_s in (share * both for share in SHARES if timing.apply is delayed):
+        if abs(lag_s - lag.nominal_s) > LAG_REACH * lag.tolerance_s:
+            continue
+        revision = replace(now.revision, timings=(*others, (timing, (both - lag_s,))))
+        record = state.model, state.chunk, replace(now.weights, lag_s=lag_s), revision
+        trial = one_pass(*record, now.light(), bank=False, thorough=False)
+        if trial.held.sse < best.held.sse - UNEVEN * now.regression.dof:
+            best = trial
+    if best is now:
+        return now
+    return fit(state.model, state.chunk, best.weights, best.revision, best, bank=False)
 
 
 def _from_afar(

@@ -25,6 +25,7 @@ from rtid.diagnose.fit import Fit, columns_of_effects
 from rtid.effects.column import Columns
 from rtid.effects.law import Volumes
 from rtid.effects.laws import total_softness
+from rtid.effects.laws.timing import delayed
 from rtid.plain import FloatArray
 from rtid.units import UNIFORM
 
@@ -35,8 +36,12 @@ def with_spreads(fitted: Fit) -> Fit:
     """A fit that knows how far its sizes are from one number; as it is without its rows."""
     if fitted.rows is None or not (fitted.revision.effects or fitted.revision.timings):
         return fitted
-    spreads = (*_spreads(fitted, fitted.rows), *_of_wholes(fitted))
-    better = replace(fitted, spreads=spreads)
+    spreads: dict[int, float] = {}
+    for column, more in (
+        *_spreads(fitted, fitted.rows), *_of_wholes(fitted), *_of_delays(fitted)
+    ):  # fmt: skip
+        spreads[column] = float(np.hypot(spreads.get(column, 0.0), more))
+    better = replace(fitted, spreads=tuple(spreads.items()))
     vars(better).update(model=fitted.model, sent=fitted.sent, view=fitted.view)
     return better
 
@@ -80,6 +85,22 @@ def _of_wholes(fitted: Fit) -> Iterator[tuple[int, float]]:
             share = np.sqrt(rest / max(without.sse - fitted.held.sse, rest, 1e-300)) / UNIFORM
             for k, at in fitted.shape_columns(effect).items():
                 yield at, float(share * abs(effect.shape[k] * fitted.held.value(column)))
+
+
+def _of_delays(fitted: Fit) -> Iterator[tuple[int, float]]:
+    """Column and spread of each delay of a command beside a lag that is free, s.
+
+    A part of a sample shares a step out between two intervals, and what reaches the lag is wider
+    than it was by part (1 - part) step^2, as if the spools' lag were longer: their sum stays.
+    """
+    lag_s, step_s = fitted.weights.lag_s, fitted.view.step_s
+    if fitted.revision.replaces_lag or fitted.declared.lag.tolerance_s == 0.0:
+        return
+    for k, (timing, psi) in enumerate(fitted.revision.timings):
+        if timing.apply is delayed:
+            part = psi[0] / step_s % 1.0
+            wider = part * (1.0 - part) * step_s**2
+            yield fitted.timing_columns(k)[0], float(np.sqrt(lag_s**2 + wider) - lag_s)
 
 
 def _given(fitted: Fit) -> dict[int, Volumes]:

@@ -1,0 +1,90 @@
+"""A delay and the lag of the spools: what the record tells is their sum, and a part of a sample."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rtid.diagnose import exact
+from rtid.diagnose.revision import Revision
+from rtid.diagnose.spread import _of_delays
+from rtid.effects.laws.timing import COMMAND_LAWS, delayed
+from rtid.estimator.state import Weights
+from rtid.model import Lag
+
+STEP_S = 1e-3
+DELAY = COMMAND_LAWS["delay"][0]
+LAG = COMMAND_LAWS["lag"][0]
+
+
+def fitted(delay_s: float, lag_s: float, tolerance_s: float = 5e-3, sse: float = 3000.0) -> Any:
+    """What is asked of a fit with a delay."""
+    return SimpleNamespace(
+        weights=Weights(np.zeros(0), np.zeros(0), lag_s),
+        view=SimpleNamespace(step_s=STEP_S),
+        declared=SimpleNamespace(lag=Lag(0.0, tolerance_s)),
+        revision=Revision((), ((DELAY, (delay_s,)),), ()),
+        timing_columns=lambda k: range(3 + k, 4 + k),
+        held=SimpleNamespace(sse=sse),
+        regression=SimpleNamespace(dof=3000.0),
+        light=lambda: None,
+    )
+
+
+@pytest.mark.parametrize("part", [0.0, 0.2, 0.5, 0.9])
+def test_a_part_of_a_sample_is_as_wide_as_so_much_lag(part: float) -> None:
+    """Second moments about the mean of what a step becomes add: that of a lag is its square."""
+    u = np.r_[np.zeros(5), np.ones(5)]
+    rises = np.diff(delayed(u, STEP_S, ((3.0 + part) * STEP_S,)), prepend=0.0)
+    at = STEP_S * np.arange(len(u))
+    wide = float(rises @ at**2 - (rises @ at) ** 2)
+    assert wide == pytest.approx(part * (1.0 - part) * STEP_S**2, abs=1e-15)
+    lag_s = 1.2e-3
+    ((column, spread),) = _of_delays(fitted((3.0 + part) * STEP_S, lag_s))
+    assert column == 3 and (lag_s + spread) ** 2 == pytest.approx(lag_s**2 + wide, rel=1e-9)
+
+
+def test_beside_a_lag_that_is_known_nothing_is_shared() -> None:
+    assert not list(_of_delays(fitted(3.5e-3, 1e-3, tolerance_s=0.0)))
+
+
+@pytest.mark.parametrize(
+    ("better", "tolerance_s", "at"),
+    [
+        (60.0, 5e-3, 1.24),  # clearly better at a quarter of the sum
+        (20.0, 5e-3, None),  # no more than what parts of samples do
+        (60.0, 0.2e-3, None),  # the lag is known better than that
+    ],
+)
+def test_another_share_of_the_sum_is_taken_where_it_is_clearly_better(
+    better: float, tolerance_s: float, at: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried: list[tuple[float, float]] = []
+    now = fitted(4.85e-3, 0.11e-3)
+
+    def one_pass(
+        _model: Any, _chunk: Any, weights: Any, revision: Revision, *_: Any, **__: Any
+    ) -> Any:
+        delay_s = revision.timings[0][1][0]
+        tried.append((weights.lag_s, delay_s))
+        is_near = weights.lag_s < 2e-3
+        return fitted(delay_s, weights.lag_s, sse=3000.0 - better * is_near)
+
+    monkeypatch.setattr(exact, "one_pass", one_pass)
+    monkeypatch.setattr(exact, "fit", lambda _m, _c, weights, *_, **__: weights.lag_s)
+    lag = Lag(0.0, tolerance_s)
+    state: Any = SimpleNamespace(model=SimpleNamespace(lag=lag), chunk=None)
+    ended: Any = exact._split_anew(state, now)
+    assert (ended is now) if at is None else (1e3 * ended == pytest.approx(at))
+    assert all(lag_s + delay_s == pytest.approx(4.96e-3) for lag_s, delay_s in tried)
+    assert len(tried) == (0 if tolerance_s < 1e-3 else 2)
+
+
+def test_what_is_no_delay_is_let_be() -> None:
+    state: Any = SimpleNamespace(model=SimpleNamespace(lag=Lag(0.0, 5e-3)), chunk=None)
+    now = fitted(4.85e-3, 0.11e-3)
+    now.revision = Revision((), ((LAG, (4e-3,)),), ())
+    assert exact._split_anew(state, now) is now
