@@ -91,16 +91,17 @@ def _of_delays(fitted: Fit) -> Iterator[tuple[int, float]]:
     """Column and spread of each delay of a command beside a lag that is free, s.
 
     A part of a sample shares a step out between two intervals, and what reaches the lag is wider
-    than it was by part (1 - part) step^2, as if the spools' lag were longer: their sum stays.
+    than it was by part (1 - part) step^2, as if the spools' lag were longer: their sum stays.  It
+    may be as much longer as it is tolerated.
     """
     lag_s, step_s = fitted.weights.lag_s, fitted.view.step_s
-    if fitted.revision.replaces_lag or fitted.declared.lag.tolerance_s == 0.0:
-        return
+    most = 0.0 if fitted.revision.replaces_lag else fitted.declared.lag.tolerance_s
     for k, (timing, psi) in enumerate(fitted.revision.timings):
         if timing.apply is delayed:
             part = psi[0] / step_s % 1.0
             wider = part * (1.0 - part) * step_s**2
-            yield fitted.timing_columns(k)[0], float(np.sqrt(lag_s**2 + wider) - lag_s)
+            longer = float(np.sqrt(lag_s**2 + wider) - lag_s)
+            yield fitted.timing_columns(k)[0], min(longer, most)
 
 
 def _given(fitted: Fit) -> dict[int, Volumes]:

@@ -47,8 +47,9 @@ def test_a_part_of_a_sample_is_as_wide_as_so_much_lag(part: float) -> None:
     assert column == 3 and (lag_s + spread) ** 2 == pytest.approx(lag_s**2 + wide, rel=1e-9)
 
 
-def test_beside_a_lag_that_is_known_nothing_is_shared() -> None:
-    assert not list(_of_delays(fitted(3.5e-3, 1e-3, tolerance_s=0.0)))
+@pytest.mark.parametrize("tolerance_s", [0.0, 1e-5])
+def test_beside_a_lag_that_is_known_no_more_is_shared_than_is_tolerated(tolerance_s: float) -> None:
+    assert list(_of_delays(fitted(3.5e-3, 1e-3, tolerance_s))) == [(3, tolerance_s)]
 
 
 @pytest.mark.parametrize(
