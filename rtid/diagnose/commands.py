@@ -19,18 +19,27 @@ from rtid.effects.record_view import RecordView
 from rtid.model import Edge, Machine
 from rtid.plain import FloatArray, IntArray
 
+FADED = 1e-4  # of the largest command of a map, to which a spool's has faded that is shut
 GAP_STEPS = 1.5  # usual steps: what is marked as a gap and takes no longer is all there
 Timings = tuple[tuple[TimingLaw, Psi], ...]
 
 
 def split(model: Machine) -> Machine:
-    """The same machine with a command of its own for either direction of every command."""
+    """The same machine with a command of its own for either direction of every command.
+
+    Spools of their own come to rest shut: one that lags only fades, and stood open for ever, where
+    its map gives any flow of dp.  A relief valve was a lag of the spools, at 1.2 of the noise for
+    282.  An edge that is never shut stays so.
+    """
     signals, edges = list(model.signals), []
     for name in sorted({edge.command for edge in model.edges}):
         signal = model.signals[model.column(name)]
         signals += [replace(signal, name=_half(name, d)) for d in (1, -1)]
     for edge in model.edges:
-        edges.append(replace(edge, command=_half(edge.command, edge.direction)))
+        command, shut_v = _half(edge.command, edge.direction), edge.safe_band_v
+        if shut_v >= 0.0:
+            shut_v = max(shut_v, FADED * float(edge.grid.u_v[-1]))
+        edges.append(replace(edge, command=command, safe_band_v=shut_v))
     return replace(model, signals=tuple(signals), edges=tuple(edges))
 
 

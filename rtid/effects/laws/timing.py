@@ -25,7 +25,7 @@ from rtid.plain import FloatArray
 Psi = tuple[float, ...]
 COMMAND, SUPPLY = "command", "supply"  # what a timing transforms; else a sensor at its place
 RATE = "rad/s"  # unit of a parameter that does the more the smaller it is
-SHUT = 2e-3  # of the largest command, to which an opening has faded that passes nothing
+SHUT = 2e-3  # of the largest command, from which an opening counts for one
 LAG_S = "time_constant"
 DEAD_BAND = "dead_band"  # behind which a lag may sit
 USUAL_STEP_S = 0.01  # up to which the banks are those of the pages
@@ -97,16 +97,10 @@ class TimingLaw:
         return (float(np.clip(value, self.low[0], self.high[0])), *self.bank[0][1:])
 
     def on(self, command: FloatArray, direction: int, dt_s: float, psi: Psi) -> FloatArray:
-        """What reaches the spool of the edges of one direction (+1, -1).
-
-        A spool of its own comes to rest shut: one that only fades has a map for ever, that gives
-        any flow of dp.  A relief valve was a lag of the spools, at 1.2 of the noise for 282.
-        """
-        if not self.own_spools:
-            return self.apply(command, dt_s, psi)
-        own = direction * np.maximum(0.0, direction * command)
-        out, shut = self.apply(own, dt_s, psi), SHUT * float(np.abs(own).max())
-        return out * np.clip(np.abs(out) / shut - 1.0, 0.0, 1.0) if shut else out
+        """What reaches the spool of the edges of one direction (+1, -1)."""
+        if self.own_spools:
+            command = direction * np.maximum(0.0, direction * command)
+        return self.apply(command, dt_s, psi)
 
     def change(
         self, command: FloatArray, direction: int, dt_s: float, psi: Psi, k: int
