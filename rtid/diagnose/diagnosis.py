@@ -20,7 +20,7 @@ from rtid.diagnose.consequence import (
 from rtid.diagnose.contest import as_nearly_right, contest, ended, hardly_worse, trials_of
 from rtid.diagnose.exact import carried_on
 from rtid.diagnose.excuse import few_excused
-from rtid.diagnose.fit import MATCH_RHO, Fit, fit, settled_chi2, with_covariances
+from rtid.diagnose.fit import MATCH_RHO, Fit, fit, with_covariances
 from rtid.diagnose.joined import joints
 from rtid.diagnose.nameable import Reach, reaches
 from rtid.diagnose.parts import AddedEffect
@@ -327,16 +327,14 @@ def is_spread_alone(present: Fit, now: Fit, least: float) -> bool:
     fallen, wins = present.held.sse - now.held.sse, now.wins_over(present)
     if fallen < least or wins >= least:
         return fallen < least
-    return settled_chi2(present) - settled_chi2(now) < least + FEIGNED * (fallen - wins)
+    return present.settled_chi2 - now.settled_chi2 < least + FEIGNED * (fallen - wins)
 
 
 def is_refuted(present: Fit, now: Fit, trial: Trial, least: float) -> bool:
     """True for a cause of another form, that explains noise alone, or makes an oil impossible."""
-    is_none = is_spread_alone(present, now, least)
-    if trial.is_timing:
-        return is_none or makes_impossible(present, now)
-    is_none |= is_of_another_form(now)
-    return is_none or is_unsampled(now, trial) or makes_impossible(present, now)
+    if not trial.is_timing and (is_of_another_form(now) or is_unsampled(now, trial)):
+        return True
+    return makes_impossible(present, now) or is_spread_alone(present, now, least)
 
 
 def is_unsampled(now: Fit, trial: Trial) -> bool:

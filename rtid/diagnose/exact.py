@@ -204,10 +204,10 @@ def _split_anew(state: TrialState, now: Fit) -> Fit:
     the parts of samples the cost is uneven, by 20.
     """
     *others, (timing, psi) = now.revision.timings
-    lag, both = state.model.lag, psi[0] + now.weights.lag_s
+    both, nominal_s = psi[0] + now.weights.lag_s, state.model.lag.nominal_s
     best = now
     for lag_s in (share * both for share in SHARES if timing.apply is delayed):
-        if abs(lag_s - lag.nominal_s) > LAG_REACH * lag.tolerance_s:
+        if abs(lag_s - nominal_s) > LAG_REACH * now.lag_tolerance_s:
             continue
         revision = replace(now.revision, timings=(*others, (timing, (both - lag_s,))))
         record = state.model, state.chunk, replace(now.weights, lag_s=lag_s), revision

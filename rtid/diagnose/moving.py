@@ -165,8 +165,7 @@ class _Way:
     def lag_s(self, reach: float) -> float:
         """The declared lag to go on with, at most so many tolerances off."""
         now, at, lag = self.found.weights.lag_s, self.found.first_given, self.found.model.lag
-        is_fixed = self.found.revision.replaces_lag or lag.tolerance_s == 0.0
-        if is_fixed or at not in self.estimate.used:
+        if self.found.lag_tolerance_s == 0.0 or at not in self.estimate.used:
             return now
         low, high = (lag.nominal_s + k * reach * lag.tolerance_s for k in (-1.0, 1.0))
         target = now + self.share * self.estimate.value(at)

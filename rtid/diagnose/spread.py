@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from rtid.diagnose.bank import add_shapes, add_timing
 from rtid.diagnose.commands import commands
 from rtid.diagnose.evidence import Rows, project
 from rtid.diagnose.fit import Fit, columns_of_effects
+from rtid.diagnose.moving import LAG_REACH
 from rtid.effects.column import Columns
 from rtid.effects.law import Volumes
 from rtid.effects.laws import total_softness
@@ -37,9 +39,8 @@ def with_spreads(fitted: Fit) -> Fit:
     if fitted.rows is None or not (fitted.revision.effects or fitted.revision.timings):
         return fitted
     spreads: dict[int, float] = {}
-    for column, more in (
-        *_spreads(fitted, fitted.rows), *_of_wholes(fitted), *_of_delays(fitted)
-    ):  # fmt: skip
+    of_parts = _spreads(fitted, fitted.rows)
+    for column, more in chain(of_parts, _of_wholes(fitted), _of_delays(fitted)):
         spreads[column] = float(np.hypot(spreads.get(column, 0.0), more))
     better = replace(fitted, spreads=tuple(spreads.items()))
     vars(better).update(model=fitted.model, sent=fitted.sent, view=fitted.view)
@@ -91,17 +92,16 @@ def _of_delays(fitted: Fit) -> Iterator[tuple[int, float]]:
     """Column and spread of each delay of a command beside a lag that is free, s.
 
     A part of a sample shares a step out between two intervals, and what reaches the lag is wider
-    than it was by part (1 - part) step^2, as if the spools' lag were longer: their sum stays.  It
-    may be as much longer as it is tolerated.
+    than it was by part (1 - part) step^2, as if the spools' lag were longer: their sum stays.  At
+    200 samples a second the lag went as far as it may, 0.8 ms, and the delay took as much.
     """
     lag_s, step_s = fitted.weights.lag_s, fitted.view.step_s
-    most = 0.0 if fitted.revision.replaces_lag else fitted.declared.lag.tolerance_s
     for k, (timing, psi) in enumerate(fitted.revision.timings):
         if timing.apply is delayed:
             part = psi[0] / step_s % 1.0
             wider = part * (1.0 - part) * step_s**2
             longer = float(np.sqrt(lag_s**2 + wider) - lag_s)
-            yield fitted.timing_columns(k)[0], min(longer, most)
+            yield fitted.timing_columns(k)[0], min(longer, LAG_REACH * fitted.lag_tolerance_s)
 
 
 def _given(fitted: Fit) -> dict[int, Volumes]:

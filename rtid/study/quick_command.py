@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from firmware_bridge.samples import Samples
-from rtid.diagnose.fit import Fit, one_pass, settled_chi2
+from rtid.diagnose.fit import Fit, one_pass
 from rtid.diagnose.report import Diagnosis
 from rtid.diagnose.verdict import AMBIGUOUS, MATCHES, MISSING
 from rtid.study.quick_machine import Assumption, MachineSizes
@@ -77,4 +77,4 @@ def is_likelier(line: Study, first: Study) -> bool:
     stiffest = 1.0 / max(fit.declared.beta_bounds_pa)
     if held.compliance.min() < stiffest <= fit.compliance.min():
         return True
-    return settled_chi2(fit) < settled_chi2(held)
+    return fit.settled_chi2 < held.settled_chi2

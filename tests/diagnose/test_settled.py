@@ -9,9 +9,8 @@ from typing import Any
 
 import pytest
 
-from rtid.diagnose import diagnosis
 from rtid.diagnose.diagnosis import is_spread_alone
-from rtid.diagnose.fit import Fit, fit, one_pass, prepare, settled_chi2
+from rtid.diagnose.fit import Fit, fit, one_pass, prepare
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.trials import best_by_key, scored, with_effect
 from tests.diagnose.records import record
@@ -38,16 +37,16 @@ def weighed(plain: Fit, share: float) -> Fit:
 def test_it_is_the_same_however_the_rows_had_been_weighed() -> None:
     plain, _ = fits()
     settled = weighed(plain, 0.0)
-    assert settled_chi2(settled) == pytest.approx(settled.held.sse, rel=1e-3)
+    assert settled.settled_chi2 == pytest.approx(settled.held.sse, rel=1e-3)
     for share in (-0.1, 0.1):
         off = weighed(plain, share)
         assert abs(off.held.sse / settled.held.sse - 1.0) > 0.05, "it falls with the weights"
-        assert settled_chi2(off) == pytest.approx(settled.held.sse, rel=0.01)
+        assert off.settled_chi2 == pytest.approx(settled.held.sse, rel=0.01)
 
 
 def test_a_volume_that_is_none_explains_nothing_once_it_is_settled() -> None:
     plain, volume = fits()
-    assert abs(settled_chi2(plain) - settled_chi2(volume)) < 0.01 * plain.regression.dof
+    assert abs(plain.settled_chi2 - volume.settled_chi2) < 0.01 * plain.regression.dof
 
 
 @pytest.mark.parametrize(
@@ -61,12 +60,11 @@ def test_a_volume_that_is_none_explains_nothing_once_it_is_settled() -> None:
     ],
 )
 def test_what_only_spreads_the_rows_explains_nothing(
-    fallen: float, risen: float, settled: float, is_alone: bool, monkeypatch: pytest.MonkeyPatch
+    fallen: float, risen: float, settled: float, is_alone: bool
 ) -> None:
-    def of(sse: float) -> Any:
-        held = SimpleNamespace(sse=sse)
-        return SimpleNamespace(held=held, wins_over=lambda _: fallen - risen)
+    def of(sse: float, settled_chi2: float) -> Any:
+        of_record = {"held": SimpleNamespace(sse=sse), "settled_chi2": settled_chi2}
+        return SimpleNamespace(**of_record, wins_over=lambda _: fallen - risen)
 
-    present, now = of(9000.0), of(9000.0 - fallen)
-    monkeypatch.setattr(diagnosis, "settled_chi2", lambda f: settled if f is present else 0.0)
+    present, now = of(9000.0, settled), of(9000.0 - fallen, 0.0)
     assert is_spread_alone(present, now, LEAST) is is_alone

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from rtid.diagnose import exact
+from rtid.diagnose.moving import LAG_REACH
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.spread import _of_delays
 from rtid.effects.laws.timing import COMMAND_LAWS, delayed
@@ -25,7 +26,7 @@ def fitted(delay_s: float, lag_s: float, tolerance_s: float = 5e-3, sse: float =
     return SimpleNamespace(
         weights=Weights(np.zeros(0), np.zeros(0), lag_s),
         view=SimpleNamespace(step_s=STEP_S),
-        declared=SimpleNamespace(lag=Lag(0.0, tolerance_s)),
+        lag_tolerance_s=tolerance_s,
         revision=Revision((), ((DELAY, (delay_s,)),), ()),
         timing_columns=lambda k: range(3 + k, 4 + k),
         held=SimpleNamespace(sse=sse),
@@ -48,8 +49,8 @@ def test_a_part_of_a_sample_is_as_wide_as_so_much_lag(part: float) -> None:
 
 
 @pytest.mark.parametrize("tolerance_s", [0.0, 1e-5])
-def test_beside_a_lag_that_is_known_no_more_is_shared_than_is_tolerated(tolerance_s: float) -> None:
-    assert list(_of_delays(fitted(3.5e-3, 1e-3, tolerance_s))) == [(3, tolerance_s)]
+def test_no_more_is_shared_than_the_lag_may_be_moved(tolerance_s: float) -> None:
+    assert list(_of_delays(fitted(3.5e-3, 1e-3, tolerance_s))) == [(3, LAG_REACH * tolerance_s)]
 
 
 @pytest.mark.parametrize(
@@ -64,7 +65,7 @@ def test_another_share_of_the_sum_is_taken_where_it_is_clearly_better(
     better: float, tolerance_s: float, at: float | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tried: list[tuple[float, float]] = []
-    now = fitted(4.85e-3, 0.11e-3)
+    now = fitted(4.85e-3, 0.11e-3, tolerance_s)
 
     def one_pass(
         _model: Any, _chunk: Any, weights: Any, revision: Revision, *_: Any, **__: Any
@@ -76,8 +77,7 @@ def test_another_share_of_the_sum_is_taken_where_it_is_clearly_better(
 
     monkeypatch.setattr(exact, "one_pass", one_pass)
     monkeypatch.setattr(exact, "fit", lambda _m, _c, weights, *_, **__: weights.lag_s)
-    lag = Lag(0.0, tolerance_s)
-    state: Any = SimpleNamespace(model=SimpleNamespace(lag=lag), chunk=None)
+    state: Any = SimpleNamespace(model=SimpleNamespace(lag=Lag(0.0, tolerance_s)), chunk=None)
     ended: Any = exact._split_anew(state, now)
     assert (ended is now) if at is None else (1e3 * ended == pytest.approx(at))
     assert all(lag_s + delay_s == pytest.approx(4.96e-3) for lag_s, delay_s in tried)
