@@ -5,14 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from firmware_bridge.samples import GAP
+from rtid.diagnose.commands import transformed
 from rtid.diagnose.diagnosis import search
 from rtid.diagnose.parts import AddedEffect, recall
 from rtid.diagnose.report import Diagnosis, diagnosis
 from rtid.diagnose.standing import fitted
 from rtid.effects.law import BOTH
-from rtid.effects.laws.sensors import ahead, quickened, sensor_timings
+from rtid.effects.laws.sensors import QUIET, ahead, quickened, sensor_timings
 from rtid.study.seed import Seed
-from tests.diagnose.records import record
+from tests.diagnose.records import noisy, record
 
 DT_S = 1e-3
 T_S = DT_S * np.arange(4000)
@@ -33,6 +35,33 @@ def test_a_part_of_a_sample_leaves_the_noise_as_it_is(late_s: float) -> None:
     assert len(moved) == len(noise)
     assert moved.var() == pytest.approx(1.0, abs=0.02)
     assert abs(np.mean(moved[1:] * moved[:-1])) < 0.02, "still white"
+
+
+@pytest.mark.parametrize("tau_s", [1e-3, 4e-3, 15e-3])
+def test_a_slow_pressure_that_is_put_right_stays_quiet(tau_s: float) -> None:
+    """P = P_meas + tau dP_meas/dt: exact but for the window, which grows with tau."""
+    rate, inner = 2 * np.pi * 4.0, slice(50, -50)
+    seen = np.sin(rate * T_S)
+    right = seen + tau_s * rate * np.cos(rate * T_S)
+    assert np.abs(quickened(seen, DT_S, (tau_s,)) - right)[inner].max() < 0.03 * tau_s * rate
+    noise = noisy(np.random.default_rng(2), len(T_S))
+    more = (quickened(noise, DT_S, (tau_s,)) - noise)[inner]
+    assert 0.3 * QUIET < more.std() <= 1.05 * QUIET
+    assert quickened(noise, DT_S, (0.0,)) == pytest.approx(noise)
+
+
+def test_a_late_position_goes_on_at_its_ends_and_begins_anew_behind_a_gap() -> None:
+    """Held constant there it stood still for as long as it was late, at either side of each gap."""
+    model, chunk, _ = record()
+    rows, late_s = chunk[:2000].copy(), 5e-3
+    rows[1000:, 0] += 0.5
+    rows[1000, 1] = float(int(rows[1000, 1]) | GAP)
+    x = 2 + model.column(model.position)
+    rows[:1000, x], rows[1000:, x] = 0.1 + 0.2 * rows[:1000, 0], 0.4 - 0.1 * rows[1000:, 0]
+    (late,) = (t for t in sensor_timings(model) if t.where == model.position)
+    put_right = transformed(model, rows, ((late, (late_s,)),))[:, x]
+    slope = np.where(np.arange(2000) < 1000, 0.2, -0.1)
+    assert put_right == pytest.approx(rows[:, x] + slope * late_s, abs=1e-9)
 
 
 def test_a_slow_signal_is_put_right_up_to_the_window() -> None:

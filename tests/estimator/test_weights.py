@@ -17,19 +17,20 @@ from rtid.plain import FloatArray
 from rtid.sim.random_plants import draw
 from tests.diagnose.records import record
 
-SEED, STEP_V, STEP_PA = 3, 1e-3, 100.0
+STEP_V, STEP_PA = 1e-3, 100.0
 
 
 @cache
-def sketched() -> tuple[Machine, FloatArray, Sketch]:
-    model, chunk, _ = record(seed=SEED)
+def sketched(seed: int = 3) -> tuple[Machine, FloatArray, Sketch]:
+    model, chunk, _ = record(seed=seed)
     return model, chunk, sketch(model, summed(model, chunk))
 
 
-def test_slopes_are_those_of_the_valves_in_both_directions() -> None:
+@pytest.mark.parametrize("seed", [3, 7, 11])
+def test_slopes_are_those_of_the_valves_in_both_directions(seed: int) -> None:
     """Beside the plant's own laws, by differences, at the points of the record."""
-    model, chunk, said = sketched()
-    plant, off = draw(SEED), []
+    model, chunk, said = sketched(seed)
+    plant, off = draw(seed), []
     for edge, first in zip(model.edges, model.first_cells, strict=True):
         w = edge.direction * chunk[:, 2 + model.column(edge.command)]
         dp = pressure_drop(model, edge, chunk[:, 2:])
@@ -65,6 +66,6 @@ def test_noise_of_a_command_counts_as_that_much_more_noise_of_dp() -> None:
     cells = said.cells[k]
     expected = np.hypot(known[cells] * sd_dp, said.gain[k] * sd_v)
     assert expected == pytest.approx(less_known[cells] * sd_dp, rel=1e-6, abs=0)
-    assert np.median(less_known[cells] > 1.5 * known[cells]), "it does count"
+    assert np.mean(less_known[cells] > 1.5 * known[cells]) > 0.5, "it does count"
     untouched = np.setdiff1d(np.arange(model.n_cells), said.cells)
     assert np.array_equal(less_known[untouched], nominal_weights(loud).slopes[untouched])
