@@ -29,13 +29,16 @@ from rtid.plain import FloatArray, IntArray
 CLEARLY = 3.0  # standard deviations of the difference, by blocks
 
 
-def is_told_apart(best: Fit, other: Fit) -> bool:
-    """True where a record likes one fit of it clearly better than another one, by its blocks."""
+def is_told_apart(best: Fit, other: Fit, promise: float = 0.0) -> bool:
+    """True where a record likes one fit of it clearly better than another one, by its blocks.
+
+    promise: of -2 ln likelihood, what the other one may still gain.
+    """
     ours, theirs = _rows(best), _rows(other)
     if len(ours.own) != len(theirs.own):
         return True  # what has left the grids is no row: there is no difference row by row
     apart = loss(other, theirs) - loss(best, ours)
-    total = float(apart.sum())
+    total = float(apart.sum()) - promise
     about_mean = (apart - apart.mean())[:, None]
     blocks = [_blocks(ours, c) for c in range(ours.own.shape[1])]
     return total > CLEARLY * float(np.sqrt(crossed(about_mean, blocks)[0]))

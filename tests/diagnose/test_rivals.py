@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtid.diagnose import diagnosis, rivals
+from rtid.diagnose import contest, diagnosis, rivals
 from rtid.diagnose.diagnosis import makes_impossible
 from rtid.diagnose.fit import Fit, one_pass, prepare
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.rivals import CLEARLY, is_told_apart, loss
-from rtid.diagnose.trials import best_by_key, scored, with_effect
-from rtid.plain import FloatArray
+from rtid.diagnose.trials import Trial, TrialState, best_by_key, scored, with_effect
+from rtid.plain import FloatArray, silent
 from tests.diagnose.records import noisy, record
 
 ROWS, BLOCKS = 4000, 40
@@ -44,6 +44,28 @@ def test_a_leak_is_told_from_nothing_and_nothing_from_a_leak_never() -> None:
     assert is_told_apart(leaking, plain)
     assert not is_told_apart(plain, leaking)
     assert not is_told_apart(leaking, leaking)
+
+
+def test_what_is_out_of_reach_as_it_stands_is_told_apart_at_its_end_too() -> None:
+    """And what does the same as the best one, or next to it, is fitted to its end."""
+    plain, leaking = fits()
+    state = TrialState(plain.declared, plain.chunk, plain.chunk, silent)
+    trials = [
+        Trial(key, score.gain, with_effect(plain, candidate))
+        for key, (candidate, score) in best_by_key(plain, scored(plain)).items()
+        if score.gain > 0.2 * leaking.wins_over(plain)
+    ]
+    far = {t.key: contest._is_out_of_reach(state, plain, leaking, t) for t in trials}
+    assert not far["external_leakage_laminar", "a"] and sum(far.values()) > 0
+    for t in trials:
+        end = contest._finished(state, plain, t).fit
+        assert end is not None and (is_told_apart(leaking, end) or not far[t.key])
+
+
+def test_what_a_cause_may_still_gain_is_no_difference() -> None:
+    plain, leaking = fits()
+    assert is_told_apart(leaking, plain, 0.1 * leaking.wins_over(plain))
+    assert not is_told_apart(leaking, plain, leaking.wins_over(plain))
 
 
 @pytest.fixture
