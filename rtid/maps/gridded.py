@@ -52,21 +52,59 @@ class Gridded:
 Tables = tuple[Gridded, ...]
 
 
+@dataclass(frozen=True, eq=False)
+class _Finely:
+    """A map at many points: u (nu,), V, dp (nd,), Pa, flow (nu, nd), m3/s.
+
+    Drops lie evenly in their roots, as flows do; borders are kept to the last bit.
+    """
+
+    edge: EdgeMap
+    u: FloatArray
+    dp: FloatArray
+    flow: FloatArray
+
+    @classmethod
+    def of(cls, edge: EdgeMap) -> _Finely:
+        border_u, border_dp = edge.grid.u_v, edge.grid.dp_pa
+        u = lattice(border_u, _fine(border_u, FINE_U))
+        fine = _fine(border_dp, FINE_DP)
+        dp = drops(border_dp, lattice(root(border_dp), fine))
+        dp[::fine] = border_dp
+        return cls(edge, u, dp, edge.flow(u[:, None], dp[None, :]))
+
+    def on_nodes(self, u: FloatArray, dp: FloatArray) -> Gridded:
+        """The table on given nodes: u (nu,) in V, dp (nd,) in Pa, both rising."""
+        edge, flow = self.edge, self.edge.flow(u[:, None], dp[None, :])
+        words = edge.status_at(u[:, None], dp[None, :])
+        code = np.vectorize(STATUS.index, otypes=[float])(words)
+        miss = _miss(self.u, self.dp, self.flow, u, dp, flow)
+        return Gridded(edge.name, u, dp, flow, edge.sd(u[:, None], dp[None, :]), code, miss)
+
+    def smallest(self, share: float) -> Gridded:
+        """The table of fewest nodes that misses by no more than a share of the largest flow."""
+        allowed = share * max(float(np.abs(self.flow).max()), 1e-12)
+        tried = [_dealt(self.u, self.dp, self.flow, share, allowed, along_u) for along_u in DEALT]
+        at = min(tried, key=lambda nodes: len(nodes[0]) * len(nodes[1]))
+        return self.on_nodes(self.u[at[0]], self.dp[at[1]])
+
+
 def gridded(flowmap: FlowMap, share: float = ERROR_SHARE) -> Tables:
     """Every edge of a map; share: of the largest flow that interpolation may miss by."""
-    return tuple(_smallest(edge, share) for edge in flowmap.edges)
+    return tuple(_Finely.of(edge).smallest(share) for edge in flowmap.edges)
 
 
 def best_that_fits(flowmap: FlowMap, fits: Callable[[Tables], bool]) -> Tables:
     """The tables that miss least of those that fit.  Raises NoTableError where none does."""
+    edges = [_Finely.of(edge) for edge in flowmap.edges]
     low, high = LEAST_SHARE, MOST_SHARE
-    tables = gridded(flowmap, high)
+    tables = tuple(edge.smallest(high) for edge in edges)
     if not fits(tables):
         sizes = ", ".join(f"{g.name} {len(g.u_v)} x {len(g.dp_pa)}" for g in tables)
         raise NoTableError(f"no table is so small: {sizes} nodes miss half of the largest flow")
     for _ in range(SEARCHED):
         share = float(np.sqrt(low * high))
-        tried = gridded(flowmap, share)
+        tried = tuple(edge.smallest(share) for edge in edges)
         if fits(tried):
             tables, high = tried, share
         else:
@@ -76,19 +114,7 @@ def best_that_fits(flowmap: FlowMap, fits: Callable[[Tables], bool]) -> Tables:
 
 def on_nodes(edge: EdgeMap, u: FloatArray, dp: FloatArray) -> Gridded:
     """The table of an edge on given nodes: u (nu,) in V, dp (nd,) in Pa, both rising."""
-    flow = edge.flow(u[:, None], dp[None, :])
-    words = edge.status_at(u[:, None], dp[None, :])
-    code = np.vectorize(STATUS.index, otypes=[float])(words)
-    miss = _miss(*_points(edge), u, dp, flow)
-    return Gridded(edge.name, u, dp, flow, edge.sd(u[:, None], dp[None, :]), code, miss)
-
-
-def _smallest(edge: EdgeMap, share: float) -> Gridded:
-    u, dp, flow = _points(edge)
-    allowed = share * max(float(np.abs(flow).max()), 1e-12)
-    tried = [_dealt(u, dp, flow, share, allowed, along_u) for along_u in DEALT]
-    at = min(tried, key=lambda nodes: len(nodes[0]) * len(nodes[1]))
-    return on_nodes(edge, u[at[0]], dp[at[1]])
+    return _Finely.of(edge).on_nodes(u, dp)
 
 
 def _dealt(
@@ -143,19 +169,6 @@ def _miss(
     )
     off = np.abs(table - exact)[inside]
     return float(off.max(initial=0.0)) / max(float(np.abs(exact).max()), 1e-12)
-
-
-def _points(edge: EdgeMap) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Commands (n,), V, drops (m,), Pa, and the map's flow there (n, m), m3/s.
-
-    Drops lie evenly in their roots, as flows do; borders are kept to the last bit.
-    """
-    border_u, border_dp = edge.grid.u_v, edge.grid.dp_pa
-    u = lattice(border_u, _fine(border_u, FINE_U))
-    fine = _fine(border_dp, FINE_DP)
-    dp = drops(border_dp, lattice(root(border_dp), fine))
-    dp[::fine] = border_dp
-    return u, dp, edge.flow(u[:, None], dp[None, :])
 
 
 def _fine(border: FloatArray, most: int) -> int:

@@ -25,6 +25,7 @@ from rtid.errors import RtidError
 from rtid.estimator.flowmap import EdgeMap
 from rtid.estimator.inverse import on_lattice
 from rtid.estimator.orifice import root
+from rtid.kernels.chords import far_apart
 from rtid.model import Edge
 from rtid.plain import FloatArray
 
@@ -96,26 +97,8 @@ def refined(x: FloatArray, exact: FloatArray, allowed: float, fine: int) -> Inde
     Every fine-th is one from the start; between two of these each node is as far from the one
     before as it can be.
     """
-    at = [0]
-    for end in range(fine, len(x), fine):
-        while at[-1] < end:
-            at.append(_farthest(x, exact, allowed, at[-1], end))
-    return np.array(at)
-
-
-def _farthest(x: FloatArray, exact: FloatArray, allowed: float, start: int, end: int) -> int:
-    """The last index up to `end` to which a chord from `start` misses by no more than allowed."""
-    good, bad = start + 1, end + 1
-    while bad - good > 1:
-        tried = end if bad > end else (good + bad) // 2
-        inner = slice(start, tried + 1)
-        share = ((x[inner] - x[start]) / (x[tried] - x[start]))[:, None]
-        chord = exact[start] + share * (exact[tried] - exact[start])
-        if np.abs(chord - exact[inner]).max() <= allowed:
-            good = tried
-        else:
-            bad = tried
-    return good
+    at = np.empty(len(x), np.int64)
+    return at[: far_apart(x, np.ascontiguousarray(exact), allowed, fine, at)]
 
 
 def _borders(published: EdgeMap) -> tuple[FloatArray, FloatArray]:
