@@ -228,15 +228,19 @@ def _from_afar(
 ) -> list[tuple[float, TimingLaw, Psi]]:
     """Gain and parameters of every timing that is promising from afar, or of all; one a name.
 
+    The gain is over the fit as it is, with the lag that it has found.
     A lag may be before or behind the opening curve: from so far that cannot be told.
     """
     banks = {timing: coarse.bank(timing, hints.get(key_of(timing), 0.0)) for timing in timings}
-    bar = PROMISING * max([other, *(max(bank.values()) for bank in banks.values())])
+    ahead = 0.0 if anywhere else coarse.ahead
+    bar = PROMISING * max([other, *(max(bank.values()) - ahead for bank in banks.values())])
     best: dict[tuple[Key, bool], tuple[float, TimingLaw, Psi]] = {}
     for timing, bank in banks.items():
-        if not anywhere and (max(bank.values()) < bar or max(bank.values()) <= 0.0):
+        seen = max(bank.values()) - ahead
+        if not anywhere and (seen < bar or seen <= 0.0):
             continue
         psi, gain = coarse.closed_in(timing, bank)
+        gain -= ahead
         form = key_of(timing), DEAD_BAND in timing.parameters
         if form not in best or gain > best[form][0]:
             best[form] = gain, timing, psi

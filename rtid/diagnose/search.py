@@ -69,16 +69,17 @@ class Search:
         """Costs beside a fit."""
         return Beside(self, fit)
 
-    def sent(self, timings: Timings) -> FloatArray:
+    def sent(self, timings: Timings, lag_s: float) -> FloatArray:
         """The thinned record (n // m, 2 + signals), SI, of the split machine, its spools' lag in.
 
+        lag_s: of those whose lag no timing replaces.
         The commands of the split machine stand behind its columns.
         """
         record = self.record
         if any(timing.where != COMMAND for timing, _ in timings):
             whole = transformed(self.declared, self.chunk, timings)[:, : self.chunk.shape[1]]
             record = self.thinning.record(self.declared, whole)
-        lag_s = 0.0 if any(timing.replaces_lag for timing, _ in timings) else self.lag_s
+        lag_s = 0.0 if any(timing.replaces_lag for timing, _ in timings) else lag_s
         sent = [self._thinned(through(u, d, self.step_s, timings), lag_s) for d, u in self._given]
         return np.column_stack([record, *sent])
 
@@ -88,7 +89,13 @@ class Search:
 
 
 class Beside:
-    """The search beside one fit: what a timing more would lower the cost by."""
+    """The search beside one fit: what a timing more would lower the cost by.
+
+    Timings are looked for beside the declared lag, and not beside that of the fit, which stands for
+    a part of what is missing.  What it has gained by that a timing must gain first, to be any
+    better: of a leak beside a lag of 0 that was declared each timing explained 240,000 of chi2, and
+    at its end 18,000 less than nothing.
+    """
 
     def __init__(self, search: Search, fit: Fit) -> None:
         self.search, self.timings = search, fit.revision.timings
@@ -99,6 +106,7 @@ class Beside:
         ]
         self.most_rows = 0
         self.before = self.cost(())
+        self.ahead = max(0.0, self.before - self._solved((), fit.weights.lag_s)[0])
 
     def cost(self, more: Timings) -> float:
         """Residual sum of squares with more timings; inf where they lose rows."""
@@ -118,10 +126,14 @@ class Beside:
         compliance = theta[:n_c] * self.search.weights.compliance
         return replace(like, compliance=np.clip(compliance, low, high))
 
-    def _solved(self, more: Timings) -> tuple[float, FloatArray]:
-        """The cost with more timings, and the coefficients of compliances and effects."""
+    def _solved(self, more: Timings, lag_s: float | None = None) -> tuple[float, FloatArray]:
+        """The cost with more timings, and the coefficients of compliances and effects.
+
+        lag_s: of the spools, s, where it is not the declared one.
+        """
         search, timings = self.search, (*self.timings, *more)
-        weights, sent = search.weights, search.sent(timings)
+        weights = search.weights
+        sent = search.sent(timings, search.lag_s if lag_s is None else lag_s)
         soft = softened(search.split, sent, weights, Revision((), timings))
         rows = rows_of(search.split, sent, weights, ROW_S, soft, search.thinning.m)
         self.most_rows = max(self.most_rows, rows.n)
