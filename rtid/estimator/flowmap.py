@@ -47,18 +47,34 @@ class EdgeMap:
 
     def flow(self, w_v: ArrayLike, dp_pa: ArrayLike) -> FloatArray:
         """Q in m3/s at broadcast points (...); 0 at or below the safe band, NaN off the grid."""
-        return self._blended(w_v, dp_pa)[0]
+        w, dp, open_, inside, shape = self._points(w_v, dp_pa)
+        q = np.zeros(len(w))
+        for cells, weight, *_ in self.corners(w, dp):
+            q += weight * (self._phi(cells, w, dp) * self.theta[cells]).sum(axis=1)
+        risen = foot(self.grid.u_v, self.safe_band_v, w)[0]
+        return self._finish(risen * q, open_, inside, shape)
 
     def gradient(self, w_v: ArrayLike, dp_pa: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """dQ/dw in m3/s/V and dQ/ddp in m3/s/Pa of the same map, shape (...) as its points."""
-        return self._blended(w_v, dp_pa)[1:]
+        w, dp, open_, inside, shape = self._points(w_v, dp_pa)
+        q, q_w, q_p = np.zeros((3, len(w)))
+        for cells, g, g_w, g_p in self.corners(w, dp):
+            theta = self.theta[cells]
+            value, by_w, by_p = ((t * theta).sum(axis=1) for t in self.terms(cells, w, dp))
+            q += g * value
+            q_w += g * by_w + g_w * value
+            q_p += g * by_p + g_p * value
+        f, f_w = foot(self.grid.u_v, self.safe_band_v, w)  # product rule over windows and foot
+        parts = f * q_w + f_w * q, f * q_p
+        along_w, along_dp = (self._finish(part, open_, inside, shape) for part in parts)
+        return along_w, along_dp
 
     def sd(self, w_v: ArrayLike, dp_pa: ArrayLike) -> FloatArray:
         """Standard deviation (...) of Q in m3/s; neighbours' errors count as wholly correlated."""
         w, dp, open_, inside, shape = self._points(w_v, dp_pa)
         total = np.zeros(len(w))
         for cells, weight, *_ in self.corners(w, dp):
-            phi = self.terms(cells, w, dp)[0]
+            phi = self._phi(cells, w, dp)
             variance = np.einsum("ki,kij,kj->k", phi, self.cov[cells], phi)
             total += weight * np.sqrt(np.maximum(variance, 0.0))
         return self._finish(
@@ -116,31 +132,23 @@ class EdgeMap:
         self, cells: Cells, w: FloatArray, dp: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """phi (k, 6) at points w in V, dp in Pa (k,) in their cells, and its derivatives."""
-        (i, j), u, p = cells, self.grid.u_v, self.grid.dp_pa
-        hu, hp = 2.0 / (u[i + 1] - u[i]), 2.0 / (p[j + 1] - p[j])
-        xi, eta = (w - u[i]) * hu - 1.0, (dp - p[j]) * hp - 1.0
+        xi, eta, hu, hp = self._local(cells, w, dp)
         ones, zero = np.ones_like(xi), np.zeros_like(xi)
-        phi = np.stack([ones, xi, eta, xi * xi, eta * eta, xi * eta], axis=1)
         by_w = np.stack([zero, ones, zero, 2 * xi, zero, eta], axis=1) * hu[:, None]
         by_dp = np.stack([zero, zero, ones, zero, 2 * eta, xi], axis=1) * hp[:, None]
-        return phi, by_w, by_dp
+        return self._phi(cells, w, dp), by_w, by_dp
 
-    def _blended(
-        self, w_v: ArrayLike, dp_pa: ArrayLike
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Q and its two slopes: product rule over terms, windows and foot."""
-        w, dp, open_, inside, shape = self._points(w_v, dp_pa)
-        q, q_w, q_p = np.zeros((3, len(w)))
-        for cells, g, g_w, g_p in self.corners(w, dp):
-            theta = self.theta[cells]
-            value, by_w, by_p = ((t * theta).sum(axis=1) for t in self.terms(cells, w, dp))
-            q += g * value
-            q_w += g * by_w + g_w * value
-            q_p += g * by_p + g_p * value
-        f, f_w = foot(self.grid.u_v, self.safe_band_v, w)
-        parts = (f * q, f * q_w + f_w * q, f * q_p)
-        a, b, c = (self._finish(part, open_, inside, shape) for part in parts)
-        return a, b, c
+    def _phi(self, cells: Cells, w: FloatArray, dp: FloatArray) -> FloatArray:
+        xi, eta, _, _ = self._local(cells, w, dp)
+        return np.stack([np.ones_like(xi), xi, eta, xi * xi, eta * eta, xi * eta], axis=1)
+
+    def _local(
+        self, cells: Cells, w: FloatArray, dp: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Points (k,) from -1 to 1 across their cells, and how fast they move in w and dp."""
+        (i, j), u, p = cells, self.grid.u_v, self.grid.dp_pa
+        hu, hp = 2.0 / (u[i + 1] - u[i]), 2.0 / (p[j + 1] - p[j])
+        return (w - u[i]) * hu - 1.0, (dp - p[j]) * hp - 1.0, hu, hp
 
     @staticmethod
     def _finish(

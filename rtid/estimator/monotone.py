@@ -89,18 +89,27 @@ def looked_at(edge: EdgeMap, known: Mask) -> Slopes:
     )
     used = (w > edge.safe_band_v) & (dp != 0)
     w, dp = w[used], dp[used]
+    cells, parts = _met(edge, w, dp)
+    near = known[parts].any(axis=1)  # a record visits a part of a map alone
+    w, dp = w[near], dp[near]
     risen, by_w = foot(edge.grid.u_v, edge.safe_band_v, w)
-    at, by_term, weight = [], [], []
-    for (i, j), g, g_w, _ in edge.corners(w, dp):
-        phi, phi_w, _ = edge.terms((i, j), w, dp)
+    by_term = []
+    for at, g, g_w, _ in edge.corners(w, dp):
+        phi, phi_w, _ = edge.terms(at, w, dp)
         by_term.append((risen * g)[:, None] * phi_w + (risen * g_w + by_w * g)[:, None] * phi)
+    signed = np.stack(by_term, axis=1) * np.sign(dp)[:, None, None]
+    return Slopes(w, dp, cells[near], parts[near], signed)
+
+
+def _met(edge: EdgeMap, w: FloatArray, dp: FloatArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """The cells that blend at points (k,), V and Pa, and their parts: each (k, 4), see `Slopes`."""
+    at, weight = [], []
+    for (i, j), g, *_ in edge.corners(w, dp):
         at.append(i * edge.grid.shape[1] + j)
         weight.append(g)
     cells, weights = np.stack(at, axis=1), np.stack(weight, axis=1)
     main = np.take_along_axis(cells, weights.argmax(axis=1)[:, None], axis=1)
-    parts = np.where(weights > 0, cells, main)
-    signed = np.stack(by_term, axis=1) * np.sign(dp)[:, None, None]
-    return Slopes(w, dp, cells, parts, signed)[known[parts].any(axis=1)]
+    return cells, np.where(weights > 0, cells, main)
 
 
 def _around(border: FloatArray, count: int) -> FloatArray:

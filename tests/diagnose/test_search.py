@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.signal import savgol_filter
 
-from rtid.diagnose.fit import one_pass, prepare, tried
+from rtid.diagnose.fit import fit, one_pass, prepare, tried
 from rtid.diagnose.moving import SIZED
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.search import Search
@@ -120,3 +120,16 @@ def test_smooth_is_savitzky_and_golay_s(derivative: int) -> None:
     expected = savgol_filter(p, 2 * half + 1, 2, deriv=derivative, delta=view.step_s)
     scale = np.abs(expected).max()
     assert view.smooth(p, derivative) / scale == pytest.approx(expected / scale, abs=1e-9)
+
+
+def test_a_timing_must_gain_what_the_lag_of_the_fit_has_gained_already() -> None:
+    """Of a machine whose lag nobody has declared every timing explains the lag first."""
+    model, chunk, _ = record("external_leakage_laminar", 3e-12)
+    blind = replace(model, lag=Lag(0.0, 1e-3))
+    present = fit(blind, chunk, prepare(blind, chunk), Revision(), bank=False)
+    assert present.weights.lag_s > 0.5e-3
+    beside = Search(blind, chunk).beside(present)
+    late = max(beside.bank(timing("input_delay")).values())
+    assert 0.0 < late < 1.2 * beside.ahead
+    known = replace(present, weights=replace(present.weights, lag_s=beside.search.lag_s))
+    assert Search(blind, chunk).beside(known).ahead == 0.0
