@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 
 from rtid.diagnose.diagnosis import search
+from rtid.diagnose.fit import Fit, fit, one_pass, prepare
 from rtid.diagnose.report import diagnosis
-from rtid.diagnose.spread import spread
+from rtid.diagnose.revision import Revision
+from rtid.diagnose.spread import spread, with_spreads
+from rtid.diagnose.trials import best_by_key, scored, with_effect
+from rtid.sim.extra_flows import gap_flow
 from rtid.sim.hidden import hide
 from rtid.sim.random_plants import draw
 from rtid.sim.run import simulate
@@ -26,6 +30,32 @@ def test_the_spread_is_what_sizes_differ_by_beyond_their_noise() -> None:
     assert np.sqrt(np.mean(squares)) == pytest.approx(t, rel=0.1)
     alike = [spread(3.0 + mix @ rng.standard_normal(4), mix @ mix.T) for _ in range(500)]
     assert np.median(alike) < 0.1 * t
+
+
+def leaking(effect: str, strength: float, where: str, seed: int = 3) -> tuple[Fit, int]:
+    """A machine that leaks, fitted with the leak, and the column of that."""
+    model, chunk, _ = record(effect, strength, seed)
+    weights = prepare(model, chunk)
+    plain = one_pass(model, chunk, weights, Revision(), None, bank=True)
+    leak = best_by_key(plain, scored(plain))[effect, where][0]
+    found = fit(model, chunk, weights, with_effect(plain, leak), plain, bank=False)
+    return found, found.column(leak)
+
+
+@pytest.mark.parametrize(("seed", "is_far"), [(3, True), (4, True), (5, False)])
+def test_a_size_is_as_far_from_that_over_the_record_as_it_says(seed: int, is_far: bool) -> None:
+    """The gap widens with the mean pressure, and what tells the leak is not all of its flow."""
+    found, column = leaking(LEAK, 2e-12, "a-b", seed)
+    size, (a, b) = found.held.value(column), (found.view.pressure(c) for c in (0, 1))
+    true = float(gap_flow.py_func(2e-12, a, b) @ (a - b) / ((a - b) @ (a - b)))
+    assert abs(size - true) < Z95 * with_spreads(found).sd_of(column) < 0.12 * size
+    assert not is_far or abs(size - true) > 5.0 * found.sd_of(column)
+
+
+def test_of_a_law_that_holds_the_pressures_tell_nothing_more() -> None:
+    """A turbulent leak has no size that goes with the pressures."""
+    found, column = leaking("external_leakage_turbulent", 2e-9, "a")
+    assert with_spreads(found).sd_of(column) < 1.2 * found.sd_of(column)
 
 
 @pytest.mark.slow
