@@ -74,9 +74,7 @@ class Regression:
     def fit(self, used: tuple[int, ...]) -> Estimate:
         """Least squares on some columns, errors in variables taken out."""
         at = list(used)
-        plain = self.s[np.ix_(at, at)] + np.diag(self.prior[at])
-        np.fill_diagonal(plain, np.where(plain.diagonal() > FAINTEST, plain.diagonal(), 1.0))
-        scale = 1.0 / np.sqrt(plain.diagonal())
+        plain, scale = self._plain(at)
         outer = np.outer(scale, scale)
         noise = self._bounded(at, plain, outer) * outer
         inverse = np.linalg.inv(plain * outer - noise)
@@ -86,6 +84,20 @@ class Regression:
         theta, cov = theta * scale, cov * outer
         sse = self.chi2(at, theta) + float(self.prior[at] @ (theta - self.mean[at]) ** 2)
         return Estimate(used, theta, cov, sse)
+
+    def noise_of(self, at: list[int]) -> FloatArray:
+        """What sensor noise adds to the products (k, k) of the columns `at`, as far as it is known.
+
+        In the units of the columns' products; see `_bounded`.
+        """
+        plain, scale = self._plain(at)
+        return self._bounded(at, plain, np.outer(scale, scale))
+
+    def _plain(self, at: list[int]) -> tuple[FloatArray, FloatArray]:
+        """Products with priors (k, k), and what makes their diagonal 1 (k,)."""
+        plain = self.s[np.ix_(at, at)] + np.diag(self.prior[at])
+        np.fill_diagonal(plain, np.where(plain.diagonal() > FAINTEST, plain.diagonal(), 1.0))
+        return plain, 1.0 / np.sqrt(plain.diagonal())
 
     def chi2(self, at: list[int], theta: FloatArray) -> float:
         """What theta (columns,), SI, of the columns `at` leaves of the rows, maps being free."""

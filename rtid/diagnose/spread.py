@@ -41,6 +41,7 @@ from rtid.plain import FloatArray
 from rtid.units import UNIFORM
 
 PARTS = 4
+CLEARLY = 2.0  # standard deviations by which a size over the record differs from what is fitted
 
 
 def with_spreads(fitted: Fit) -> Fit:
@@ -85,8 +86,8 @@ def _spreads(fitted: Fit, rows: Rows) -> Iterator[tuple[int, float]]:
 class _Sizes:
     """What the sizes of more columns are beside those of a fit.
 
-    s: products of y, the fit's columns and those more, the maps taken out; at: place of each of the
-    fit's columns there; prior, mean: by that place.
+    s: products of y, the fit's columns and those more, the maps and the sensors' noise taken out;
+    at: place of each of the fit's columns there; prior, mean: by that place.
     """
 
     s: FloatArray
@@ -99,8 +100,8 @@ class _Sizes:
     def of(cls, fitted: Fit, rows: Rows, given: dict[int, Volumes], more: list[Volumes]) -> _Sizes:
         known = [0, *range(1, fitted.first_given), *given]
         condensed = [rows.on_rows(column) for column in (*given.values(), *more)]
-        s, free = project(rows, condensed).schur, np.zeros(len(more))
-        regression = fitted.regression
+        s, free, regression = project(rows, condensed).schur, np.zeros(len(more)), fitted.regression
+        s[1 : len(known), 1 : len(known)] -= regression.noise_of(known[1:])
         prior, mean = (np.append(of[known], free) for of in (regression.prior, regression.mean))
         at = {column: place for place, column in enumerate(known)}
         return cls(s, at, prior, mean, max(1.0, fitted.rho))
@@ -114,19 +115,22 @@ class _Sizes:
         sizes, cov = self._solved(column, [self.at[column], *(len(self.at) + k for k in more)])
         return float(sizes[0]), float(cov[0, 0])
 
-    def _solved(self, column: int, own: list[int]) -> tuple[FloatArray, FloatArray]:
-        """Of the places `own`, which are free, beside the fit's columns without one of them."""
-        places = [place for c, place in self.at.items() if c not in (0, column)] + own
+    def _solved(self, column: int, free: list[int]) -> tuple[FloatArray, FloatArray]:
+        """Of the places `free`, without a prior, beside the fit's columns without one of them."""
+        places = [place for c, place in self.at.items() if c not in (0, column)] + free
         prior, mean = self.prior[places], self.mean[places]
-        prior[-len(own) :] = 0.0
+        prior[-len(free) :] = 0.0
         right = self.s[places, 0] + prior * mean
         sizes, cov = _solved(self.s[np.ix_(places, places)] + np.diag(prior), right)
-        return sizes[-len(own) :], self.rho * cov[-len(own) :, -len(own) :]
+        return sizes[-len(free) :], self.rho * cov[-len(free) :, -len(free) :]
 
 
 def _beyond(off: float, var: float) -> float:
-    """Standard deviation that a difference has beyond its own variance, in its unit."""
-    return float(np.sqrt(max(0.0, off**2 - max(0.0, var))))
+    """Standard deviation that a difference has beyond its own variance; 0 where it is not clear.
+
+    A record in which the pressures hardly move does not tell the size at others.
+    """
+    return float(np.sqrt(off**2 - max(0.0, var))) if off**2 > CLEARLY**2 * var else 0.0
 
 
 def _of_wholes(fitted: Fit) -> Iterator[tuple[int, float]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from rtid.diagnose import spread as spreading
 from rtid.diagnose.diagnosis import search
 from rtid.diagnose.fit import Fit, fit, one_pass, prepare
 from rtid.diagnose.report import diagnosis
@@ -50,6 +51,12 @@ def test_a_size_is_as_far_from_that_over_the_record_as_it_says(seed: int, is_far
     true = float(gap_flow.py_func(2e-12, a, b) @ (a - b) / ((a - b) @ (a - b)))
     assert abs(size - true) < Z95 * with_spreads(found).sd_of(column) < 0.12 * size
     assert not is_far or abs(size - true) > 5.0 * found.sd_of(column)
+
+
+def test_what_is_no_clear_difference_widens_no_interval() -> None:
+    assert spreading._beyond(1.9, 1.0) == 0.0 == spreading._beyond(0.0, 0.0)
+    assert spreading._beyond(-5.0, 16.0) == 0.0 and spreading._beyond(-5.0, 4.0) > 4.0
+    assert spreading._beyond(3.0, -1e-9) == 3.0  # rounding of two variances that are equal
 
 
 def test_of_a_law_that_holds_the_pressures_tell_nothing_more() -> None:
