@@ -173,7 +173,7 @@ def _is_out_of_reach(state: TrialState, present: Fit, now: Fit, trial: Trial) ->
     """True of a cause that is told apart as it stands, were it to gain as much as it ever might.
 
     now: the fit with the best one.  Its derivatives promise what moving the lag and shapes gains,
-    two thirds of what that came to where it was far off; what weighs the rows may be a quarter.
+    three quarters of what that came to where it was far off; what weighs the rows may be a quarter.
     Six rivals of a leak, each twenty times as bad, took 28 s of 63 to be fitted to their end.
     """
     there = trial.fit or one_pass(

@@ -106,7 +106,9 @@ class Beside:
         ]
         self.most_rows = 0
         self.before = self.cost(())
-        self.ahead = max(0.0, self.before - self._solved((), fit.weights.lag_s)[0])
+        self.ahead = 0.0
+        if fit.weights.lag_s != search.lag_s:
+            self.ahead = max(0.0, self.before - self._solved((), fit.weights.lag_s)[0])
 
     def cost(self, more: Timings) -> float:
         """Residual sum of squares with more timings; inf where they lose rows."""

@@ -12,11 +12,11 @@ m being their weighted mean: t is the standard deviation of the size from one pa
 
 What tells a flow is seldom all of it: the maps follow the rest.  So a size may go with the mean p
 of the pressures as well, c + c1 (p - p0) / sd p, where p0 is the mean over all of the effect's own
-flow.  With it c becomes c0, the size over the whole record, and
+flow.  With it c becomes c0, the size over the whole record; and where that is clearly another one,
 
-    t^2 = max(0, (c0 - c)^2 - (var c0 - var c)),
+    t^2 = (c0 - c)^2 - (var c0 - var c).
 
-of which the larger one counts.  A leak whose gap widens by 5 % per MPa was told to 1.5 %, 7 % from
+The larger t counts.  A leak whose gap widens by 5 % per MPa was told to 1.5 %, 7 % from
 what it let through in the same minute.
 """
 
@@ -75,8 +75,10 @@ def _spreads(fitted: Fit, rows: Rows) -> Iterator[tuple[int, float]]:
     for k, column in enumerate((*timed, *flows)):
         yield column, spread(*sizes.in_place_of(column, range(PARTS * k, PARTS * (k + 1))))
     level = _level(fitted)
+    if not flows or np.ptp(level) == 0.0:
+        return
     sizes = _Sizes.of(fitted, rows, given, [_risen(given[column], level) for column in flows])
-    for k, column in enumerate(flows if np.ptp(level) > 0.0 else ()):
+    for k, column in enumerate(flows):
         c, known = sizes.beside(column)
         c0, less_known = sizes.beside(column, k)
         yield column, _beyond(c0 - c, less_known - known)
@@ -108,14 +110,14 @@ class _Sizes:
 
     def in_place_of(self, column: int, more: Iterable[int]) -> tuple[FloatArray, FloatArray]:
         """Sizes (k,) of k of those more, by number, and their covariance (k, k), in their units."""
-        return self._solved(column, [len(self.at) + k for k in more])
+        return self._free(column, [len(self.at) + k for k in more])
 
     def beside(self, column: int, *more: int) -> tuple[float, float]:
         """Size of one of the fit's columns beside those more, and its variance, in its unit."""
-        sizes, cov = self._solved(column, [self.at[column], *(len(self.at) + k for k in more)])
+        sizes, cov = self._free(column, [self.at[column], *(len(self.at) + k for k in more)])
         return float(sizes[0]), float(cov[0, 0])
 
-    def _solved(self, column: int, free: list[int]) -> tuple[FloatArray, FloatArray]:
+    def _free(self, column: int, free: list[int]) -> tuple[FloatArray, FloatArray]:
         """Of the places `free`, without a prior, beside the fit's columns without one of them."""
         places = [place for c, place in self.at.items() if c not in (0, column)] + free
         prior, mean = self.prior[places], self.mean[places]
