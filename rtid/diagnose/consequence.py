@@ -15,6 +15,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rtid.diagnose.commands import behind
+from rtid.diagnose.evidence import rows_of
 from rtid.diagnose.excuse import counted
 from rtid.diagnose.fit import Fit, one_pass
 from rtid.diagnose.halves import between_halves
@@ -24,6 +26,7 @@ from rtid.diagnose.trials import Trial
 from rtid.effects.record_view import RecordView
 from rtid.estimator.misfit import can_be_explained
 from rtid.estimator.state import Weights
+from rtid.kernels.layout import TERMS
 from rtid.model import PROPORTIONAL, Grid, Machine
 from rtid.plain import FloatArray
 from rtid.units import Z95
@@ -145,8 +148,11 @@ def _on_finer(now: Fit) -> Fit | None:
     slopes, missed = (
         _spread(now.declared, machine, each) for each in (weights.slopes, weights.missed)
     )
-    on_finer = _again(now, machine, now.chunk, replace(weights, slopes=slopes, missed=missed))
-    return on_finer if on_finer.regression.dof > 0.0 else None
+    weights = replace(weights, slopes=slopes, missed=missed)
+    rows = rows_of(behind(machine, now.revision.timings), now.sent, weights)
+    if rows.n <= TERMS * len(rows.cells):  # asked first: factors of 13,500 unknowns took 20 s
+        return None
+    return _again(now, machine, now.chunk, weights)
 
 
 def _again(now: Fit, machine: Machine, chunk: FloatArray, weights: Weights) -> Fit:

@@ -141,7 +141,7 @@ def searched(standing: Standing, progress: Progress = silent) -> Result:
         doubted = told_doubts(first) if state.found else doubted
         present, last, state.found = first, before, []
     elif not state.found and (soft or matches_as_it_stands(first, present)):
-        present, last, doubted = with_bank(first, state.suspects), before, told_doubts(first)
+        present, last, doubted = standing.fit, before, told_doubts(first)
     present = with_spreads(present)
     result, negligible, scores = tuple(state.found), state.negligible, scored(present)
     joined = tuple(joint for part in record for joint in joints(present, part, scores))

@@ -14,14 +14,14 @@ from dataclasses import replace
 import numpy as np
 
 from rtid.diagnose.commands import split
-from rtid.diagnose.fit import Fit, columns_of_effects, fit, one_pass
+from rtid.diagnose.fit import Fit, columns_of_effects, fit, one_pass, with_covariances
 from rtid.diagnose.residual import effect_values
 from rtid.effects.extra import with_extra_flow
 from rtid.estimator.limits import most_open
-from rtid.estimator.misfit import Misfit, can_be_explained, count_misfit, residual_of
+from rtid.estimator.misfit import Misfit, can_be_explained, residual_of, widened
 from rtid.estimator.missed import excusing, misses
 from rtid.estimator.record import summed
-from rtid.estimator.solution import sketch, solve
+from rtid.estimator.solution import sketch
 from rtid.model import Machine
 from rtid.plain import FloatArray
 
@@ -46,7 +46,8 @@ def rho_of_all(present: Fit) -> float:
         return present.rho
     weights = replace(present.weights, missed=np.zeros_like(present.weights.missed))
     record = present.declared, present.chunk, weights, present.revision
-    return one_pass(*record, present, bank=False).rho
+    alike = one_pass(*record, present, bank=False, thorough=False)
+    return with_covariances(alike, like=present).rho  # a few blocks free no more and no less
 
 
 def _excused(present: Fit, most: float) -> Fit:
@@ -68,16 +69,21 @@ def left_over(present: Fit) -> Misfit:
     """What the maps of a fit leave of its record beside its effects."""
     if present.rest is not None:
         return present.rest
-    model, chunk = _machine(present)
-    weights = present.weights
-    return residual_of(model, chunk, weights, sketch(model, summed(model, chunk, weights)))
+    record = *_machine(present), present.weights
+    return residual_of(*record, sketch(record[0], summed(*record)))
 
 
 def counted(present: Fit) -> FloatArray:
-    """Covariance of the compliances (chambers, chambers), 1/Pa2, what the blocks miss counted."""
-    model, chunk = _machine(present)
-    solution = solve(model, summed(model, chunk, present.weights))
-    return count_misfit(model, chunk, present.weights, solution).compliance_cov
+    """Covariance of the compliances (chambers, chambers), 1/Pa2, what the blocks miss counted.
+
+    Of a record that can be explained.
+    """
+    record = *_machine(present), present.weights
+    known = present.rest.estimate if present.rest is not None else None
+    estimate = known or sketch(record[0], summed(*record))
+    covariance = estimate.influence[:, : len(estimate.scale_pa)]
+    covariance = covariance * np.outer(estimate.scale_pa, estimate.scale_pa)
+    return np.asarray(covariance * widened(*record, estimate))
 
 
 def _with_room(present: Fit) -> Machine:

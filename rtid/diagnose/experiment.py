@@ -9,14 +9,14 @@ made anew, and the standard deviations follow without simulating a machine.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 
 import numpy as np
 
 from rtid.diagnose.fit import Fit, one_pass
 from rtid.diagnose.regression import LIMIT_SD
 from rtid.effects.column import Candidate
-from rtid.plain import FloatArray
+from rtid.plain import FloatArray, Key
 
 SWING, RATES_HZ = 0.2, (0.03, 0.11)  # of the supply
 STEEP = 0.05  # of the largest dQ/du: a command that hardly opens its valve is left alone
@@ -55,8 +55,11 @@ def varied_supply(fit: Fit) -> FloatArray | None:
     return chunk
 
 
-def limits(fit: Fit) -> Limits:
-    """Detection limits as recorded, and with a wandering supply, for every candidate."""
+def limits(fit: Fit, keys: Collection[Key]) -> Limits:
+    """Detection limits as recorded, and with a wandering supply, of the candidates of some causes.
+
+    keys: those of the causes.
+    """
     chunk = varied_supply(fit)
     if chunk is None or not fit.columns.candidates:
         return {}
@@ -66,7 +69,8 @@ def limits(fit: Fit) -> Limits:
     )  # fmt: skip
     limits_of: Limits = {}
     for k, candidate in enumerate(fit.columns.candidates):
-        if candidate in fit.revision.effects or candidate not in other.columns.candidates:
+        is_free = candidate.key in keys and candidate not in fit.revision.effects
+        if not is_free or candidate not in other.columns.candidates:
             continue
         before = fit.regression.score(fit.estimate.used, fit.first + k).sd
         column = other.first + other.columns.candidates.index(candidate)

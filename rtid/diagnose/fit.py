@@ -147,7 +147,8 @@ class Fit:
         theta = dict(zip(self.held.used, self.held.theta, strict=True))
         theta |= {1 + c: share for c, share in enumerate(self.compliance / found)}
         at = {self.column(e): now.column(e) for e in old.effects}
-        return now.regression.chi2([at.get(c, c) for c in theta], np.array(list(theta.values())))
+        columns = np.array([at.get(c, c) for c in theta])
+        return now.regression.chi2(columns, np.array(list(theta.values())))
 
     @property
     def compliance(self) -> FloatArray:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import eigh
 
-from rtid.plain import FloatArray
+from rtid.plain import FloatArray, IntArray
 
 CLEARLY = 3.0  # standard deviations of the noise's own products by which a column must exceed it
 FAINTEST = 1e-200  # square of a column: what is fainter never acts
@@ -73,7 +73,7 @@ class Regression:
 
     def fit(self, used: tuple[int, ...]) -> Estimate:
         """Least squares on some columns, errors in variables taken out."""
-        at = list(used)
+        at = np.array(used, int)
         plain, scale = self._plain(at)
         outer = np.outer(scale, scale)
         noise = self._bounded(at, plain, outer) * outer
@@ -90,29 +90,32 @@ class Regression:
 
         In the units of the columns' products; see `_bounded`.
         """
-        plain, scale = self._plain(at)
-        return self._bounded(at, plain, np.outer(scale, scale))
+        columns = np.array(at, int)
+        plain, scale = self._plain(columns)
+        return self._bounded(columns, plain, np.outer(scale, scale))
 
-    def _plain(self, at: list[int]) -> tuple[FloatArray, FloatArray]:
+    def _plain(self, at: IntArray) -> tuple[FloatArray, FloatArray]:
         """Products with priors (k, k), and what makes their diagonal 1 (k,)."""
-        plain = self.s[np.ix_(at, at)] + np.diag(self.prior[at])
+        plain = self.s[at[:, None], at] + np.diag(self.prior[at])
         np.fill_diagonal(plain, np.where(plain.diagonal() > FAINTEST, plain.diagonal(), 1.0))
         return plain, 1.0 / np.sqrt(plain.diagonal())
 
-    def chi2(self, at: list[int], theta: FloatArray) -> float:
-        """What theta (columns,), SI, of the columns `at` leaves of the rows, maps being free."""
+    def chi2(self, at: IntArray, theta: FloatArray) -> float:
+        """What theta, SI, of the columns `at` (columns,) leaves of the rows, maps being free."""
         s = self.s
-        return float(s[0, 0] - 2.0 * s[0, at] @ theta + theta @ s[np.ix_(at, at)] @ theta)
+        return float(s[0, 0] - 2.0 * s[0, at] @ theta + theta @ s[at[:, None], at] @ theta)
 
-    def _bounded(self, at: list[int], plain: FloatArray, outer: FloatArray) -> FloatArray:
+    def _bounded(self, at: IntArray, plain: FloatArray, outer: FloatArray) -> FloatArray:
         """The noise's products, less where they leave too little: then nothing can be told.
 
         outer (columns, columns): what makes the products of the columns 1, finite for any column.
         """
-        noise = self.noise[np.ix_(at, at)]
+        noise = self.noise[at[:, None], at]
         if not noise.any():
             return noise
         most = 1.0 - CLEARLY * np.sqrt(2.0 / max(1, self.rows))
+        if _is_positive((most * plain - noise) * outer):  # quicker than to know the share
+            return noise
         # the largest share that noise has of any combination of the columns
         share = float(eigh(noise * outer, plain * outer, eigvals_only=True)[-1])
         return noise * min(1.0, most / share) if share > 0.0 else noise
@@ -133,10 +136,19 @@ class Regression:
         return Score(column, value, sd, gain, visible)
 
     def _left(self, used: tuple[int, ...], column: int) -> float:
-        at = list(used)
+        at = np.array(used, int)
         square = self.s[column, column]
-        if not at:
+        if not used:
             return float(square)
         cross = self.s[at, column]
-        gram = self.s[np.ix_(at, at)] + np.diag(self.prior[at] + 1e-300)
+        gram = self.s[at[:, None], at] + np.diag(self.prior[at] + 1e-300)
         return float(square - cross @ np.linalg.solve(gram, cross))
+
+
+def _is_positive(matrix: FloatArray) -> bool:
+    """True for a symmetric matrix (n, n) whose eigenvalues are all positive."""
+    try:
+        np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        return False
+    return True

@@ -446,8 +446,8 @@ def _experiment(result: Result, unseen: tuple[Unseen, ...]) -> list[str]:
     closed |= {key for f in result.found for key in (f.key, *f.alike) if f.alike}
     closed &= {candidate.key for candidate in result.last.columns.candidates}
     best: dict[Key, tuple[float, float]] = {}
-    for candidate, (before, after) in (limits(result.last) if closed else {}).items():
-        if candidate.key in closed and np.isfinite(after) and after > 0:
+    for candidate, (before, after) in (limits(result.last, closed) if closed else {}).items():
+        if np.isfinite(after) and after > 0:
             scale = physical(result.last, candidate, 1.0)
             known = best.get(candidate.key)
             if known is None or scale * after < known[1]:

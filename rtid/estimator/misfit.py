@@ -13,7 +13,7 @@ clusters: Cameron, Gelbach and Miller 2011).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
@@ -38,13 +38,24 @@ def count_misfit(
     """
     if not can_be_explained(chunk):
         return solution
-    scores, cells = _scores(model, chunk, weights, solution)
-    if not len(scores):
-        return solution
     cov = solution.compliance_cov / np.outer(solution.scale_pa, solution.scale_pa)
-    variance = crossed(scores, [_of_chamber(model, cells, c) for c in range(len(cov))])
-    ratio = np.sqrt(np.maximum(1.0, variance / np.diag(cov)))
-    return widen(solution, cov * np.outer(ratio, ratio) - cov)
+    return widen(solution, cov * (widened(model, chunk, weights, solution) - 1.0))
+
+
+def widened(
+    model: Machine, chunk: FloatArray, weights: Weights, estimate: Solution | Sketch
+) -> FloatArray:
+    """By what the misfit multiplies the covariance of the compliances, (chambers, chambers).
+
+    chunk (n, 2 + signals): the record that it was learned from, SI, which can be explained.
+    """
+    scores, cells = _scores(model, chunk, weights, estimate)
+    chambers = range(len(model.chambers))
+    if not len(scores):
+        return np.ones((len(chambers), len(chambers)))
+    variance = crossed(scores, [_of_chamber(model, cells, c) for c in chambers])
+    ratio = np.sqrt(np.maximum(1.0, variance / estimate.influence.diagonal()))
+    return np.outer(ratio, ratio)
 
 
 def can_be_explained(chunk: FloatArray) -> bool:
@@ -61,12 +72,14 @@ class Misfit:
     """A fit held against its record, per interval (n - 1).
 
     missed (n - 1, chambers): measured flow less modelled, m3/s; innovation (n - 1, chambers):
-    whitened, NaN where no row; cells (n - 1, edges): grid cell, -1 shut, in half of an index.
+    whitened, NaN where no row; cells (n - 1, edges): grid cell, -1 shut, in half of an index;
+    estimate: what it was held beside, of `residual_of`.
     """
 
     missed: FloatArray
     innovation: FloatArray
     cells: Cells
+    estimate: Solution | Sketch | None = None
 
 
 def residual_of(
@@ -76,15 +89,17 @@ def residual_of(
     n_c = len(model.chambers)
     theta = _cells_of(model, estimate.cells, estimate.unknowns)
     terms = estimate.unknowns[n_c : n_c + len(model.terms)]
-    return _residual(model, chunk, weights, theta, estimate.compliance, terms)
+    misfit = _residual(model, chunk, weights, theta, estimate.compliance, terms)
+    return replace(misfit, estimate=estimate)
 
 
 def _scores(
-    model: Machine, chunk: FloatArray, weights: Weights, solution: Solution
+    model: Machine, chunk: FloatArray, weights: Weights, solution: Solution | Sketch
 ) -> tuple[FloatArray, Cells]:
     """w_k r_k (rows, chambers) about their mean, and the grid cells (rows, edges)."""
     theta, flows = _per_cell(model, solution)
-    n_c, terms = len(solution.scale_pa), solution.terms_theta
+    n_c = len(solution.scale_pa)
+    terms = solution.unknowns[n_c : n_c + len(model.terms)]
     misfit = _residual(model, chunk, weights, theta, solution.compliance, terms)
     residual, cells = misfit.innovation, misfit.cells
     scores = np.empty((len(residual), len(solution.scale_pa)))
@@ -98,7 +113,7 @@ def _scores(
     return scores - scores.sum(axis=0) / max(1, len(scores)), cells
 
 
-def _per_cell(model: Machine, solution: Solution) -> tuple[FloatArray, list[FloatArray]]:
+def _per_cell(model: Machine, solution: Solution | Sketch) -> tuple[FloatArray, list[FloatArray]]:
     """The fitted map (cells, 6) in m3/s, and the influence on each compliance as such maps."""
     rows = (solution.unknowns, *solution.influence)
     maps = [_cells_of(model, solution.cells, unknowns) for unknowns in rows]

@@ -84,7 +84,8 @@ class Sketch:
     """First estimate, no variances: compliance (chambers,), flow_m3s (blocks,), NaN: few rows.
 
     slope, gain (blocks,): root mean squares of dQ/ddp and dQ/dw over the data, m3/s/Pa and m3/s/V;
-    cells (blocks,): the grid cells of the blocks; unknowns (n,): as of `Solution`.
+    cells (blocks,): the grid cells of the blocks; unknowns, influence, scale_pa: as of `Solution`,
+    every term taken as learned.
     """
 
     compliance: FloatArray
@@ -94,6 +95,8 @@ class Sketch:
     cells: IntArray
     leverage: FloatArray
     unknowns: FloatArray
+    influence: FloatArray
+    scale_pa: FloatArray
 
 
 def sketch(model: Machine, sums: Sums) -> Sketch:
@@ -102,13 +105,19 @@ def sketch(model: Machine, sums: Sums) -> Sketch:
     with one_thread():
         factor = factor_of(sums)
         leverage = leverage_of(model, sums, np.ones(len(factor.prior)))
-        unknowns = theta = correct(sums, *plain(sums, factor), leverage).theta
+        first = plain(sums, factor)
+        corrected = correct(sums, *first, leverage)
+        unknowns = theta = corrected.theta
         if overlaps(model):
             theta = to_taylor(model, sums, factor.cov(), PRIOR_SD)[0] @ theta
     flow = mean_flows(model, sums, theta)
     flow[sums.blocks["rows"] < model.gates.min_rows] = np.nan
     slopes = rms_slopes(model, sums, theta)
-    return Sketch(theta[:n_c] * sums.compliance, flow, *slopes, sums.cells, leverage, unknowns)
+    influence = first[1].T + corrected.cov_change @ corrected.basis.T
+    return Sketch(
+        theta[:n_c] * sums.compliance, flow, *slopes, sums.cells, leverage, unknowns, influence,
+        sums.compliance,
+    )  # fmt: skip
 
 
 def solve(
