@@ -59,6 +59,7 @@ from rtid.diagnose.zeros import Zero, zeros
 from rtid.effects.column import Candidate
 from rtid.effects.laws.lines import is_sampled, lines_at, stores_at
 from rtid.effects.page import Effect
+from rtid.estimator.factor import on_one_thread
 from rtid.estimator.validity import Doubt
 from rtid.model import Machine
 from rtid.plain import FloatArray, Key, Progress, silent
@@ -114,6 +115,7 @@ def search(
     return searched(stand(model, chunk, held_out, parts, progress, suspects=suspects), progress)
 
 
+@on_one_thread
 def searched(standing: Standing, progress: Progress = silent) -> Result:
     """Diagnose a record, from the model as it stands on."""
     first, before, parts = standing.fit, standing.held_out, standing.state.given

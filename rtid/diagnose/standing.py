@@ -14,6 +14,7 @@ from rtid.diagnose.residual import Residual, residual
 from rtid.diagnose.spread import with_spreads
 from rtid.diagnose.trials import TrialState
 from rtid.effects.page import Effect
+from rtid.estimator.factor import on_one_thread
 from rtid.model import Machine
 from rtid.plain import FloatArray, Progress, silent
 
@@ -36,6 +37,7 @@ class Standing:
         return residual(self.fit, self.state.held_out)
 
 
+@on_one_thread
 def fitted(
     model: Machine,
     chunk: FloatArray,

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, wraps
+from typing import ParamSpec, TypeVar
 
 import numpy as np
 from scipy.linalg import cho_solve
@@ -14,6 +16,9 @@ from rtid.estimator import lapack
 from rtid.estimator.sums import Normal, Sums
 from rtid.kernels.normal import mirror, residual
 from rtid.plain import FloatArray
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 # One standard deviation of the prior on a flow term: ten times the rated flow, so that directions
 # without data stay finite and are seen as unknown by their variance.
@@ -112,3 +117,17 @@ def one_thread() -> AbstractContextManager[object]:
     and on the device they would take the controller's core.
     """
     return _linear_algebra().limit(limits=1, user_api="blas")
+
+
+def on_one_thread(function: Callable[P, R]) -> Callable[P, R]:
+    """The function with all its linear algebra on the calling thread (`one_thread`).
+
+    Commands have it so by the environment; a program that imports the package has not.
+    """
+
+    @wraps(function)
+    def alone(*args: P.args, **kwargs: P.kwargs) -> R:
+        with one_thread():
+            return function(*args, **kwargs)
+
+    return alone

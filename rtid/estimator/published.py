@@ -20,7 +20,7 @@ from rtid.errors import door
 from rtid.estimator.blocks import VALID as BLOCK_VALID
 from rtid.estimator.blocks import Block
 from rtid.estimator.cells import mean_square, projection, quadrature, terms
-from rtid.estimator.factor import PRIOR_SD
+from rtid.estimator.factor import PRIOR_SD, on_one_thread
 from rtid.estimator.flowmap import EXTRAPOLATED, LEARNING, PRIOR, SHUT, VALID, EdgeMap, FlowMap
 from rtid.estimator.monotone import monotone
 from rtid.estimator.orifice import GainData, OrificeLaw, fit_law, root
@@ -37,6 +37,7 @@ COLUMN_PRIOR = 0.05  # share of the rise of K over a column by which its shape m
 
 
 @door
+@on_one_thread
 def publish(
     solution: Solution, prior: FlowMap | None = None, prior_sd: float = PRIOR_SHARE
 ) -> FlowMap:
