@@ -85,7 +85,8 @@ class TrialState:
     """State of a diagnosis.
 
     judges_itself: the map is known over too little of either part, and all of the record that has
-    taught it judges: what is named there is, what is not is no match.
+    taught it judges: what is named there is, what is not is no match.  ruled_out: timings that had
+    stood in for something else.
     """
 
     model: Machine
@@ -98,13 +99,15 @@ class TrialState:
     given: tuple[AddedEffect, ...] = ()  # effects that the model has already
     suspects: tuple[Effect, ...] = ()  # effects of the user's, scored beside the catalogue
     judges_itself: bool = False
+    ruled_out: set[Key] = field(default_factory=set)
     _coarse: Search | None = None
 
     def anew(self, progress: Progress) -> TrialState:
         """The state of a search that has not begun."""
         return replace(
-            self, progress=progress, found=[], negligible={}, excess=0.0, judges_itself=False
-        )
+            self, progress=progress, found=[], negligible={}, excess=0.0, judges_itself=False,
+            ruled_out=set(),
+        )  # fmt: skip
 
     def left(self, fit_: Fit, leave_out: Candidate | None = None) -> Residual:
         """What a fit leaves of the part that judges; leave_out: an effect that is not counted."""

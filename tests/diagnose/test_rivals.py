@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rtid.diagnose import contest, diagnosis, rivals
-from rtid.diagnose.diagnosis import makes_impossible
+from rtid.diagnose.diagnosis import is_as_credible, makes_impossible
 from rtid.diagnose.fit import Fit, one_pass, prepare
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.rivals import CLEARLY, is_told_apart, loss
@@ -121,9 +121,32 @@ def test_a_cause_beside_which_no_oil_is_possible_is_refuted(
     refuted: bool,
 ) -> None:
     """A line beside a sag that was half explained left 19 GPa of oil."""
-
-    def told(fit: Any) -> tuple[Any, ...]:
-        return tuple(SimpleNamespace(is_invalid=invalid) for invalid in fit)
-
-    monkeypatch.setattr(diagnosis, "told_doubts", told)
+    monkeypatch.setattr(diagnosis, "told_doubts", doubts)
     assert makes_impossible(before, after) is refuted  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "credible"),
+    [
+        ((), (), True),
+        ((), (False,), False),
+        ((False,), (False,), True),  # they contradict each other either way
+        ((False,), (True,), False),  # which is no licence to make one impossible
+        ((True,), (True,), True),
+        ((True,), (), True),
+    ],
+)
+def test_what_the_residual_hardly_shows_leaves_moduli_as_credible(
+    monkeypatch: pytest.MonkeyPatch,
+    before: tuple[bool, ...],
+    after: tuple[bool, ...],
+    credible: bool,
+) -> None:
+    """On a sweep with a leak of 4 % of the flow a line was named that left 1326 and 1852 MPa."""
+    monkeypatch.setattr(diagnosis, "doubts_about", doubts)
+    assert is_as_credible(before, after) is credible  # type: ignore[arg-type]
+
+
+def doubts(fit: Any) -> tuple[Any, ...]:
+    """Of a fit that is no more than whether each of its doubts is of what cannot be."""
+    return tuple(SimpleNamespace(is_invalid=invalid) for invalid in fit)

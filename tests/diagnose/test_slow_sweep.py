@@ -31,6 +31,14 @@ def test_a_worn_place_is_as_wide_as_it_is() -> None:
     assert of("orifice", "position_dependent_leakage").judgement == RIGHT
 
 
+def test_a_timing_that_had_stood_in_for_a_leak_is_not_named() -> None:
+    """A hysteresis of 5 mV, the least of its page, beside which the leak was 37 % too small."""
+    found = answer(Case(6405, "mixed", SWEEP, "internal_leakage_laminar"))
+    assert found is not None
+    assert (found.judgement, found.named) == (RIGHT, "internal_leakage_laminar")
+    assert abs(found.size_z) < 3.0
+
+
 def test_a_pump_is_found_in_the_valley_of_its_own_lag() -> None:
     """A slower, weaker one left rho 18; a line was named beside it, with oil of 19 GPa."""
     found = answer(Case(6141, "jump", SWEEP, "supply_sag"))

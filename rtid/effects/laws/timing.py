@@ -87,6 +87,12 @@ class TimingLaw:
         """True where parameter k is not at a bound."""
         return AT_BOUND * self.low[k] < psi[k] < self.high[k] / AT_BOUND
 
+    def is_least(self, psi: Psi) -> bool:
+        """True where it does no more than any timing of its kind must."""
+        if self.is_rate:
+            return psi[0] >= self.high[0] / AT_BOUND
+        return psi[0] <= AT_BOUND * self.low[0]
+
     def strength(self, psi: Psi) -> float:
         """How much a command is changed, 0 for not at all."""
         return 1.0 / psi[0] if self.is_rate else psi[0]
