@@ -144,7 +144,8 @@ def searched(standing: Standing, progress: Progress = silent) -> Result:
         present, last, state.found = first, before, []
     elif not state.found and (soft or matches_as_it_stands(first, present)):
         present, last, doubted = standing.fit, before, told_doubts(first)
-    present = with_spreads(present)
+    named = {f.key for f in state.found} | {part.key for part in parts}
+    present = with_spreads(present, frozenset(e.key for e in present.revision.effects) - named)
     result, negligible, scores = tuple(state.found), state.negligible, scored(present)
     joined = tuple(joint for part in record for joint in joints(present, part, scores))
     apart = zeros(present, joined)

@@ -11,13 +11,15 @@ from rtid.diagnose.fit import Fit, fit, one_pass, prepare
 from rtid.diagnose.report import diagnosis
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.spread import spread, with_spreads
+from rtid.diagnose.standing import with_bank
 from rtid.diagnose.trials import best_by_key, scored, with_effect
+from rtid.plain import Key
 from rtid.sim.extra_flows import gap_flow
 from rtid.sim.hidden import hide
 from rtid.sim.random_plants import draw
 from rtid.sim.run import simulate
 from rtid.sim.sensing import P_A, P_B
-from rtid.units import Z95
+from rtid.units import UNIFORM, Z95
 from tests.diagnose.records import DURATION_S, record
 
 LEAK = "internal_leakage_laminar"
@@ -76,3 +78,21 @@ def test_the_interval_of_a_leak_knows_that_its_gap_widens() -> None:
     true = float(flow @ drop / (drop @ drop))
     print(f"{size.value:.4g} +- {Z95 * size.std:.2g}, true {true:.4g}")
     assert abs(size.value - true) < Z95 * size.std < 0.1 * true
+
+
+def test_what_nobody_is_told_of_widens_what_it_moves() -> None:
+    """A relief valve beside a leak whose gap widens: with it the leak is another one."""
+    model, chunk, _ = record(LEAK, 2e-12)
+    first = with_bank(fit(model, chunk, prepare(model, chunk), Revision(), bank=False))
+    best = best_by_key(first, scored(first))
+    leak, valve = (best[key][0] for key in ((LEAK, "a-b"), ("relief_valve", "a")))
+    alone, both = (
+        fit(model, chunk, first.weights, Revision(effects), bank=False)
+        for effects in ((leak,), (leak, valve))
+    )
+    known, told = (
+        dict(with_spreads(both, unnamed).spreads)[both.column(leak)]
+        for unnamed in (frozenset[Key](), frozenset({valve.key}))
+    )
+    moved = both.held.value(both.column(leak)) - alone.held.value(alone.column(leak))
+    assert told == pytest.approx(np.hypot(known, moved / UNIFORM), rel=0.1) and told > known
