@@ -229,8 +229,11 @@ def answer(case: Case) -> Answer | None:
     """The answer to one case; None where it could not be simulated."""
     began = time.process_time()
     found = judged(case)
-    if found is None:
-        return None
+    return None if found is None else answer_of(case, found, began)
+
+
+def answer_of(case: Case, found: Judged, began: float = 0.0) -> Answer:
+    """The answer to a case that was judged; began: processor time before that, s."""
     said, z, half = found.said, float("nan"), float("nan")
     judgement = judge(diagnoses.Case(case.seed, case.hidden), said)
     first = said.found[0] if said.found else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,11 @@ pytestmark = pytest.mark.hidden_effect
 
 
 def diagnosed(effect: str = "", strength: float = 0.0, seed: int = 3) -> Diagnosis:
+    return once(effect, strength, seed)
+
+
+@cache
+def once(effect: str, strength: float, seed: int) -> Diagnosis:
     return diagnosis(search(*record(effect, strength, seed)))
 
 

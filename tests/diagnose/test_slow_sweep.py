@@ -13,17 +13,17 @@ from rtid.diagnose.standing import stand
 from rtid.tell.diagnosed import seen_and_not_named
 from tests.campaign.diagnoses import IN_SET, RIGHT, judge
 from tests.campaign.diagnoses import Case as Hidden
-from tests.campaign.laws import Answer, Case, answer, declared, judged, of_run
+from tests.campaign.laws import Answer, Case, answer, answer_of, declared, judged, of_run
 
 SWEEP = "sweep_record"
 once = cache(judged)
 
 
-@cache
 def of(law: str, effect: str) -> Answer:
-    found = answer(Case(6101, law, SWEEP, effect))
+    case = Case(6101, law, SWEEP, effect)
+    found = once(case)
     assert found is not None
-    return found
+    return answer_of(case, found)
 
 
 def test_a_worn_place_is_as_wide_as_it_is() -> None:
