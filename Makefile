@@ -10,7 +10,7 @@ READY = .venv/.ready
 demo: $(READY)
 	.venv/bin/rtid demo
 
-# Three on two cores: what waits for a browser or a process leaves one idle, 35 minutes in place of 38.
+# Three on two cores: what waits for a browser or a process leaves one idle: 35 minutes, 37 to 43 with two.
 # Bytecode is kept whatever the environment says: the tests start hundreds of interpreters.
 test: export PYTHONDONTWRITEBYTECODE =
 test: $(READY)

@@ -232,7 +232,7 @@ def answer(case: Case) -> Answer | None:
     return None if found is None else answer_of(case, found, began)
 
 
-def answer_of(case: Case, found: Judged, began: float = 0.0) -> Answer:
+def answer_of(case: Case, found: Judged, began: float = float("nan")) -> Answer:
     """The answer to a case that was judged; began: processor time before that, s."""
     said, z, half = found.said, float("nan"), float("nan")
     judgement = judge(diagnoses.Case(case.seed, case.hidden), said)
