@@ -6,21 +6,29 @@ significant, possible and material; when nothing more is, the verdict follows fr
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
+from rtid.diagnose.admission import (
+    WORSE,
+    clearest_gain,
+    explains_enough,
+    is_as_credible,
+    is_form_of_another,
+    is_noticed,
+    is_refuted,
+    is_within_a_form,
+    taken_in,
+)
 from rtid.diagnose.consequence import (
     ALIKE,
     BENT,
     HIDDEN_GAIN,
-    Consequence,
-    consequence,
-    is_stable,
 )
 from rtid.diagnose.contest import as_nearly_right, contest, ended, hardly_worse, trials_of
 from rtid.diagnose.exact import carried_on
 from rtid.diagnose.excuse import few_excused
-from rtid.diagnose.fit import MATCH_RHO, Fit, fit, with_covariances
+from rtid.diagnose.fit import Fit, fit, with_covariances
 from rtid.diagnose.joined import joints
 from rtid.diagnose.nameable import Reach, reaches
 from rtid.diagnose.parts import AddedEffect
@@ -35,7 +43,6 @@ from rtid.diagnose.trials import (
     AcceptedEffect,
     Trial,
     TrialState,
-    is_at_a_bound,
     material_share,
     own_share,
     physical,
@@ -50,14 +57,13 @@ from rtid.diagnose.verdict import (
     NAMED,
     UNKNOWN,
     can_judge,
-    doubts_about,
     explained,
     told_doubts,
     verdict,
 )
 from rtid.diagnose.zeros import Zero, zeros
 from rtid.effects.column import Candidate
-from rtid.effects.laws.lines import is_sampled, lines_at, stores_at
+from rtid.effects.laws.lines import lines_at, stores_at
 from rtid.effects.page import Effect
 from rtid.estimator.factor import on_one_thread
 from rtid.estimator.validity import Doubt
@@ -66,14 +72,7 @@ from rtid.plain import FloatArray, Key, Progress, silent
 
 LATER_GAIN = 25.0  # chi2 of every effect behind the first
 MOST = 6  # effects that are added at most
-WORSE = 1.02  # held-out residual, as a share, that an immaterial effect may not raise
-CLEAR = 1.5  # times the variance of the sensors' noise, from which unseen data show a misfit ...
-LEFT = 0.4  # ... of which what explains it may leave so much
-FEIGNED = 0.25  # share by which the variance of the sensors' noise may be wrong
 MOST_NEGLIGIBLE = 4  # that are looked at
-NOTICED = 0.01  # of the degrees of freedom: chi2 from which an immaterial effect stays in the model
-SHARE = 0.4  # of the misfit left that a cause must explain, once most of the first is explained,
-LEAST_SHARE = 0.1  # ... and before
 
 
 @dataclass(frozen=True)
@@ -283,7 +282,7 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
     for best in sorted(trials, key=lambda t: -t.gain):
         if best.key in state.negligible or len(state.negligible) == MOST_NEGLIGIBLE:
             continue
-        if not _explains(state, present, best):
+        if not explains_enough(state, present, best):
             return None
         trial, alike = contest(state, present, best, trials, finished)
         if trial.key in passed_over:
@@ -314,7 +313,7 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
         state.negligible[trial.key] = share
         is_good = after.rms_m3s <= WORSE * last.rms_m3s and is_as_credible(present, now)
         is_needless = is_form and present.rho < present.most_rho
-        if is_good and _is_noticed(present, trial) and not is_needless:
+        if is_good and is_noticed(present, trial) and not is_needless:
             kept, after = _with_bank(state, now)
             if _is_shown_now(trial.key, min(material_share(last, after), BENT * own), state):
                 what = trial.key, alike, trial.gain, trial.n_parameters
@@ -324,111 +323,6 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
             return kept, after
         del now  # its rows are large
     return None
-
-
-def taken_in(
-    present: Fit, now: Fit, trial: Trial, own_flow: float, last: Residual, after: Residual
-) -> Consequence | None:
-    """What leaving out an effect that the residual hardly shows does; None where that is nothing.
-
-    own_flow: of the rms flow; last, after: residuals without and with it.  One that
-    explains most of a misfit beyond the noise's is no matter of taste: where it does so in data
-    that have not taught it, no halves are asked, in which a pump's numbers would only trade off.
-    One that takes moduli out of what they can be is nothing that the maps have hidden: on a clean
-    sweep a line took both from 1030 MPa to 1660 and 1860, stable, and 3 % off the residual.
-    """
-    if trial.gain < HIDDEN_GAIN * trial.n_parameters or after.rms_m3s > WORSE * last.rms_m3s:
-        return None
-    if not is_as_credible(present, now):
-        return None
-    does = consequence(present, now, own_flow)
-    misfit = present.held.sse - present.regression.dof
-    is_needed = present.rho >= present.most_rho and trial.gain > SHARE * misfit
-    if is_needed and is_seen_again(now, last, after):
-        return does
-    is_wanted = does.is_material or is_needed
-    return does if is_wanted and is_stable(now, trial, is_needed) else None
-
-
-def is_of_another_form(now: Fit) -> bool:
-    """True where a form of the last effect ended at a bound of its page, and misfit is left."""
-    return now.rho >= now.most_rho and is_at_a_bound(now)
-
-
-def is_spread_alone(present: Fit, now: Fit, least: float) -> bool:
-    """True where an effect only lets the rows be noisier, and explains less than it must.
-
-    chi2 falls with the weights as well, and where ln det of the noise rises by more the rows are
-    settled; of that rise chi2 feigns as much as the noise's variance is wrong by.  At 200 Hz a true
-    leak took 1421 off chi2, beside an oil of 928 MPa for 1106 that had stood in for it: the noise
-    of that rose by 1484, and settled it took 1213.
-    """
-    fallen, wins = present.held.sse - now.held.sse, now.wins_over(present)
-    if fallen < least or wins >= least:
-        return fallen < least
-    return present.settled_chi2 - now.settled_chi2 < least + FEIGNED * (fallen - wins)
-
-
-def is_refuted(present: Fit, now: Fit, trial: Trial, least: float) -> bool:
-    """True for a cause of another form, that explains noise alone, or makes an oil impossible."""
-    if not trial.is_timing and (is_of_another_form(now) or is_unsampled(now, trial)):
-        return True
-    return makes_impossible(present, now) or is_spread_alone(present, now, least)
-
-
-def is_unsampled(now: Fit, trial: Trial) -> bool:
-    """True for a line that rings faster than the samples of the record could show.
-
-    Healthy machines of 50 samples a second had lines of 450 to 825 rad/s: 157 is half of that.
-    """
-    is_line = trial.key in lines_at(trial.key[1])
-    own = [e for e in now.revision.effects if is_line and e.key == trial.key]
-    return any(not is_sampled(e.shape[0], now.view) for e in own)
-
-
-def makes_impossible(present: Fit, now: Fit) -> bool:
-    """True for a cause beside which an oil cannot be, by all that is told of it, that could before.
-
-    It takes what another law misses: of a sag that was half explained, a line before a chamber took
-    half of the rest, and left 19 GPa of oil there.
-    """
-    after = any(doubt.is_invalid for doubt in told_doubts(now))
-    return after and not any(doubt.is_invalid for doubt in told_doubts(present))
-
-
-def is_seen_again(now: Fit, last: Residual, after: Residual) -> bool:
-    """True where an effect takes most of what unseen data clearly show beyond their noise.
-
-    now: the fit with it; last, after: what is left of the part that judges, without and with it.
-    """
-    if not len(after.t_s) or after.t_s[0] < now.chunk[-1, 0]:
-        return False
-    before, rest, floor = last.rms_m3s**2, after.rms_m3s**2, after.floor_m3s**2
-    return before > CLEAR * floor and rest - floor < LEFT * (before - floor)
-
-
-def is_form_of_another(state: TrialState, key: Key) -> bool:
-    """True for a cause that was not told from one that was found.
-
-    Beside it, what it takes is what the other's form misses: a gap that widens with pressure was
-    named a leak, and a relief valve too.
-    """
-    return any(key in f.alike for f in state.found)
-
-
-def is_within_a_form(state: TrialState, trial: Trial) -> bool:
-    """True for a cause that a law found before would leave if it were a tenth off.
-
-    chi2 goes with the square of what it explains.  No law of a page is known better than that: an
-    internal leak, whose gap widens with pressure, took 49,560 of chi2, and a relief valve that the
-    maps would have hidden took 291 beside it.
-    """
-    return trial.gain < ALIKE**2 * clearest_gain(state.found)
-
-
-def clearest_gain(effects: Iterable[AcceptedEffect]) -> float:
-    """chi2 that the clearest effect found has taken; 0 without any."""
-    return max((effect.gain for effect in effects), default=0.0)
 
 
 def _with_bank(state: TrialState, now: Fit) -> tuple[Fit, Residual]:
@@ -447,36 +341,6 @@ def _is_shown_now(key: Key, share: float, state: TrialState) -> bool:
     if is_shown:
         del state.negligible[key]
     return is_shown
-
-
-def _is_noticed(present: Fit, trial: Trial) -> bool:
-    """True for an immaterial cause that explains a fair part of the misfit all the same."""
-    dof = present.regression.dof
-    return trial.gain > max(NOTICED * dof, LEAST_SHARE * (present.held.sse - dof))
-
-
-def is_as_credible(present: Fit, now: Fit) -> bool:
-    """False where what the residual hardly shows makes moduli impossible, or contradict.
-
-    Those that contradict are no licence to make one impossible: on a sweep a leak had left 1112 and
-    1289 MPa, of 1075, and a line that took 436 of chi2 left 1326 and 1852.
-    """
-    before, after = doubts_about(present), doubts_about(now)
-    worse = any(doubt.is_invalid for doubt in after) and not any(d.is_invalid for d in before)
-    return not (worse or (after and not before))
-
-
-def _explains(state: TrialState, present: Fit, trial: Trial) -> bool:
-    """False where a cause is a small part of what is left behind an effect of the wrong form.
-
-    Once most of the first misfit is explained, the rest of a form that is nearly right would be
-    named as effects of their own.
-    """
-    rest = present.held.sse - present.regression.dof
-    excess = state.excess
-    if present.rho < MATCH_RHO or excess <= 0:
-        return True
-    return trial.gain > (SHARE if rest < (1 - NAMED) * excess else LEAST_SHARE) * rest
 
 
 def _look_back(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Residual]:

@@ -11,8 +11,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from rtid.diagnose.admission import LEAST_SHARE, taken_in
 from rtid.diagnose.contest import alike_ones
-from rtid.diagnose.diagnosis import LEAST_SHARE, Result, taken_in
+from rtid.diagnose.diagnosis import Result
 from rtid.diagnose.exact import carried_on, exact_trials, is_inside, key_of, with_pump
 from rtid.diagnose.excuse import few_excused
 from rtid.diagnose.fit import MATCH_RHO

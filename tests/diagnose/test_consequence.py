@@ -7,16 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rtid.diagnose import admission
 from rtid.diagnose import consequence as evidence
-from rtid.diagnose import diagnosis as search_module
+from rtid.diagnose.admission import is_form_of_another, is_seen_again
 from rtid.diagnose.consequence import Consequence, finer, is_stable
-from rtid.diagnose.diagnosis import (
-    Result,
-    beside_its_line,
-    is_form_of_another,
-    is_seen_again,
-    search,
-)
+from rtid.diagnose.diagnosis import Result, beside_its_line, search
 from rtid.diagnose.experiment import FLOW, would_separate
 from rtid.diagnose.report import Diagnosis, diagnosis
 from rtid.diagnose.residual import Residual, is_known
@@ -138,12 +133,12 @@ def test_each_number_of_what_is_hidden_must_stand_out(
     result: Result, monkeypatch: pytest.MonkeyPatch, shape: tuple[float, ...], is_believed: bool
 ) -> None:
     """A line of three numbers took 115 of chi2 where a dead volume was hidden, and was named."""
-    monkeypatch.setattr(search_module, "is_stable", lambda *_: True)
+    monkeypatch.setattr(admission, "is_stable", lambda *_: True)
     (accepted,) = result.found
     (leak,) = result.last.revision.effects
     trial = Trial(accepted.key, 250.0, Revision((replace(leak, shape=shape),)))
     residuals = result.before, result.after
-    does = search_module.taken_in(result.first, result.last, trial, 0.1, *residuals)
+    does = admission.taken_in(result.first, result.last, trial, 0.1, *residuals)
     assert (does is not None) == is_believed
 
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtid.diagnose import contest, diagnosis, rivals
-from rtid.diagnose.diagnosis import is_as_credible, makes_impossible
+from rtid.diagnose import admission, contest, rivals
+from rtid.diagnose.admission import is_as_credible, makes_impossible
 from rtid.diagnose.fit import Fit, one_pass, prepare
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.rivals import CLEARLY, is_told_apart, loss
@@ -121,7 +121,7 @@ def test_a_cause_beside_which_no_oil_is_possible_is_refuted(
     refuted: bool,
 ) -> None:
     """A line beside a sag that was half explained left 19 GPa of oil."""
-    monkeypatch.setattr(diagnosis, "told_doubts", doubts)
+    monkeypatch.setattr(admission, "told_doubts", doubts)
     assert makes_impossible(before, after) is refuted  # type: ignore[arg-type]
 
 
@@ -143,7 +143,7 @@ def test_what_the_residual_hardly_shows_leaves_moduli_as_credible(
     credible: bool,
 ) -> None:
     """On a sweep with a leak of 4 % of the flow a line was named that left 1326 and 1852 MPa."""
-    monkeypatch.setattr(diagnosis, "doubts_about", doubts)
+    monkeypatch.setattr(admission, "doubts_about", doubts)
     assert is_as_credible(before, after) is credible  # type: ignore[arg-type]
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from rtid.diagnose.diagnosis import is_spread_alone
+from rtid.diagnose.admission import is_spread_alone
 from rtid.diagnose.fit import Fit, fit, one_pass, prepare
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.trials import best_by_key, scored, with_effect
