@@ -33,11 +33,16 @@ PICTURES = ("compare", "where", "add", "map")
 SAY = """(words) => { const place = document.querySelector("#work");
   place.innerHTML = `<span title="${words}">${words}</span>`; }"""
 LONG = "wrote /a/b/c " * 40
-SHOWN = """([name, line]) => { document.querySelector("#record").innerHTML = name;
-  document.querySelector("#work").innerHTML = line; }"""
-ENDS = """() => ["#work", "#work .acting button"]
-  .map(place => document.querySelector(place).getBoundingClientRect())
-  .map(box => [box.left, box.right])"""
+# Written and measured in one go: the page, which is told every state anew, would put its own back.
+MEASURED = """([name, line]) => {
+  document.querySelector("#record").innerHTML = name;
+  document.querySelector("#work").innerHTML = line;
+  const cut = [...document.querySelectorAll("#work .acting > *")]
+    .map(part => part.scrollWidth > part.clientWidth + 1);
+  const ends = ["#work", "#work .acting button"]
+    .map(place => document.querySelector(place).getBoundingClientRect())
+    .map(box => [box.left, box.right]);
+  return [cut, ends]; }"""
 BARS = "#add_bars .bar:not(.foretold)"
 
 
@@ -415,11 +420,7 @@ def test_stop_and_words_stand_beside_a_long_record_s_name(judged: Page, width: i
     working: Any = SimpleNamespace(
         trouble=("", ""), doing="learning", can_stop=True, share=0.5, note=""
     )
-    page.evaluate(SHOWN, [f'<span title="{LONG}">{LONG}</span>', work_line(working)])
-    cut = page.evaluate(
-        "() => [...document.querySelectorAll('#work .acting > *')]"
-        ".map(part => part.scrollWidth > part.clientWidth + 1)"
-    )
+    name = f'<span title="{LONG}">{LONG}</span>'
+    cut, ((least, most), (left, right)) = page.evaluate(MEASURED, [name, work_line(working)])
     assert cut == [False] * 3
-    (least, most), (left, right) = page.evaluate(ENDS)
     assert least <= left < right <= most + 1
