@@ -5,7 +5,7 @@ PYTHON ?= python3
 PIP = .venv/bin/python -m pip --disable-pip-version-check
 READY = .venv/.ready
 
-.PHONY: demo check test wheel bench speed benchmark-missing lint campaign faults fuzz soak mutants paper pictures screenshots lock clean
+.PHONY: demo check test long wheel bench speed benchmark-missing lint campaign faults fuzz soak mutants paper pictures screenshots lock clean
 
 demo: $(READY)
 	.venv/bin/rtid demo
@@ -15,6 +15,10 @@ demo: $(READY)
 test: export PYTHONDONTWRITEBYTECODE =
 test: $(READY)
 	.venv/bin/python -m pytest -q -n 3 --dist worksteal -p no:benchmark -p tools.spent
+
+# One more case, or a whole way, of what `make test` holds: whole records that are diagnosed for tens of seconds.
+long: $(READY)
+	.venv/bin/python -m pytest -q -n 3 --dist worksteal -p no:benchmark -p tools.spent -m long
 
 # After each edit, a minute: lint, types, layers, and the unit tests that the change touches, nearest
 # first; all unit tests: make check ALL=1.
@@ -63,7 +67,7 @@ screenshots: $(READY)
 faults: $(READY)
 	@mkdir -p out && rm -f out/faults.jsonl
 	RTID_FAULTS=$(CURDIR)/out/faults.jsonl .venv/bin/python -m pytest -q -p no:benchmark \
-	  -m 'not campaign and not soak' tests/faults $$(.venv/bin/python -m tests.faults.elsewhere); \
+	  -m 'not campaign and not soak and not long' tests/faults $$(.venv/bin/python -m tests.faults.elsewhere); \
 	  status=$$?; .venv/bin/python -m tests.faults.table out/faults.jsonl out/soak.jsonl --all > out/faults.md || status=1; \
 	  cat out/faults.md; exit $$status
 

@@ -344,7 +344,9 @@ def test_replay_learns_beside_and_keeps_the_boards_memory(folder: Path, tmp_path
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("suffix", [".json", ".npz", ".csv"])
+@pytest.mark.parametrize(
+    "suffix", [".json", *(pytest.param(k, marks=pytest.mark.long) for k in (".npz", ".csv"))]
+)
 def test_the_exported_map_names_its_effects(folder: Path, tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"map{suffix}"
     text = call("export", folder / "leak.parquet", path, "-p", folder / "leak.toml")

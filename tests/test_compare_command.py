@@ -111,6 +111,7 @@ def later(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_two_projects_on_one_trace(trace: Path, coarse: Path, tmp_path: Path) -> None:
     arguments = ("compare", trace, "-p", trace.with_suffix(".toml"), "--against", coarse)

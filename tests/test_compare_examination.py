@@ -179,6 +179,7 @@ def test_the_smoother_finds_its_bandwidth() -> None:
     assert np.sqrt(np.mean((found - x)[50:-50] ** 2)) < 4e-6
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_bands_hold_95_percent_of_the_lags_of_clean_records(
     clean: list[tuple[Machine, Comparison]],

@@ -29,7 +29,7 @@ from tests.test_rate import said
 
 STRANGERS = Path(__file__).parents[2] / "shared/data/strangers"
 FULL, HZ, GRAVITY = 65535.0, 500.0, 9.80665
-SEEDS = 0, pytest.param(1, marks=pytest.mark.campaign)
+SEEDS = 0, pytest.param(1, marks=pytest.mark.long)
 
 
 @pytest.fixture(autouse=True)
@@ -131,7 +131,7 @@ def test_a_lag_behind_the_map_is_found_whatever_the_noise(tmp_path: Path, seed: 
     assert [c.name for c in quick.pair.commands] == [f"motor_{k}" for k in (1, 2, 3, 4)]
 
 
-@pytest.mark.parametrize("drift", [pytest.param(-0.004, marks=pytest.mark.campaign), 0.003])
+@pytest.mark.parametrize("drift", [pytest.param(-0.004, marks=pytest.mark.long), 0.003])
 def test_a_battery_that_empties_is_a_drift_of_the_gain(tmp_path: Path, drift: float) -> None:
     """Beside the lag, from the first half of a flight; none is named where there is none."""
     rng = np.random.default_rng([22, round(1e4 * abs(drift))])

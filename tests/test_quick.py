@@ -98,9 +98,7 @@ def as_csv(path: Path, **values: np.ndarray) -> Path:
     return path
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param("leak.blf", marks=pytest.mark.campaign), "leak.parquet"]
-)
+@pytest.mark.parametrize("name", [pytest.param("leak.blf", marks=pytest.mark.long), "leak.parquet"])
 def test_a_leak_is_named_from_the_file_alone(folder: Path, name: str) -> None:
     found = told(folder / name)
     assert set(found["roles"]) == {"p_supply", "p_tank", "p_a", "p_b", "x", "v", "u"}
@@ -126,6 +124,7 @@ def test_a_clean_machine_misses_nothing_in_plain_sentences(folder: Path) -> None
     assert [float(volumes[0]), float(volumes[5])] == pytest.approx([0.6, 0.6], rel=0.1)
 
 
+@pytest.mark.long
 def test_an_area_only_scales(folder: Path) -> None:
     """Twice the bore: four times the leak, the same verdict."""
     one, two = told(folder / "leak.parquet"), told(folder / "leak.parquet", *TWICE)
@@ -190,7 +189,7 @@ def test_a_volume_that_is_none_is_refused(folder: Path, volume: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "what", [pytest.param("x", marks=pytest.mark.campaign), "u", "chambers", "units"]
+    "what", ["chambers", *(pytest.param(k, marks=pytest.mark.long) for k in ("x", "u", "units"))]
 )
 def test_signs_and_units_are_found(folder: Path, tmp_path: Path, what: str) -> None:
     c = columns(folder / "leak.parquet")
@@ -314,7 +313,7 @@ def test_data_that_cannot_bear_a_verdict_end_with_4(
     assert "No verdict" in done.stdout
 
 
-@pytest.mark.parametrize("is_noisy", [False, pytest.param(True, marks=pytest.mark.campaign)])
+@pytest.mark.parametrize("is_noisy", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_a_machine_that_rests_at_the_end_is_judged_by_the_end_of_its_motion(
     folder: Path, tmp_path: Path, is_noisy: bool
 ) -> None:

@@ -114,6 +114,7 @@ def test_diagnose_add_matches_undo_and_named_again(
     assert told[1]["errors"]["heldout_pct"]["after"] == errors.heldout_pct.before
 
 
+@pytest.mark.long
 def test_two_adds_then_two_undos(project: Path, trace: Path) -> None:
     texts = [project.read_bytes()]
     add(project, trace, LEAK, "a-b", reason="the seal is old")

@@ -64,7 +64,8 @@ def tested(modules: list[Path], most_s: float) -> int:
             *(sys.executable, "-m", "pytest", "-q", "-n", "2", "--dist", "loadfile"),
             *("--no-loadscope-reorder", "-p", "no:benchmark", "-p", "tools.unit_tests"),
             *("--most", str(most_s)),
-            *("-m", "not campaign and not soak and not faults and not slow", *map(str, modules)),
+            *("-m", "not campaign and not soak and not faults and not long and not slow"),
+            *map(str, modules),
         ],
         cwd=ROOT, check=False,
     )  # fmt: skip

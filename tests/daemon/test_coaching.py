@@ -85,6 +85,7 @@ def test_the_coach_is_asked_once_there_is_a_snapshot_and_now_and_then(
     assert made[1].is_stopped and not coach.is_running, "it has taken too long"
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_coach_says_what_excite_after_the_same_snapshot_says(
     project: Project,

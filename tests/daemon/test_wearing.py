@@ -96,6 +96,7 @@ def test_an_estimate_that_was_taken_back_is_compared_with_nothing(
     assert trend.push(*known, 96) is None, "it knows less: it is no later one"
 
 
+@pytest.mark.long
 def test_the_daemon_follows(tmp_path: Path) -> None:
     """Learner, baseline and what is published go with the machine; the history tells of it."""
     rate = rated_m3s(machine().project.model) / 3e6

@@ -49,7 +49,7 @@ def size(effect: FoundEffect) -> float:
     return float(value / kappa.value * (2.2e6 / 101325.0) ** (1 - 1 / kappa.value))
 
 
-@pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.campaign), 5])
+@pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.long), 5])
 def test_a_clean_record_matches(seed: int) -> None:
     found = diagnosed(seed=seed)
     assert found.verdict == "matches"
@@ -58,9 +58,7 @@ def test_a_clean_record_matches(seed: int) -> None:
     assert found.heldout_residual_before_m3s < 1.3 * found.noise_floor_m3s
 
 
-@pytest.mark.parametrize(
-    "seed", [3, *(pytest.param(k, marks=pytest.mark.campaign) for k in (4, 5))]
-)
+@pytest.mark.parametrize("seed", [3, *(pytest.param(k, marks=pytest.mark.long) for k in (4, 5))])
 def test_a_lag_that_is_declared_as_anything_is_learned(seed: int) -> None:
     """0 +- 5 ms, as `rtid init` writes it: the spools' 1.3 ms are no missing effect."""
     model, chunk, held_out = record(seed=seed)
@@ -77,7 +75,7 @@ def test_a_lag_that_is_declared_as_anything_is_learned(seed: int) -> None:
     ("effect", "strength", "expected", "seed"),
     [
         ("internal_leakage_laminar", 4e-12, 4e-12, 3),
-        pytest.param(*("internal_leakage_laminar", 4e-12, 4e-12, 6), marks=pytest.mark.campaign),
+        pytest.param(*("internal_leakage_laminar", 4e-12, 4e-12, 6), marks=pytest.mark.long),
         # warms up with 1.5 records: so much of it in the 30 of 40 s that the fit sees
         ("valve_gain_drift", 0.06, 0.06 * (1 - np.exp(-0.5)) / (1 - np.exp(-1 / 1.5)), 3),
         ("entrained_air", 0.05, 0.05, 3),
@@ -96,6 +94,7 @@ def test_an_effect_is_named_and_sized(
     assert found.heldout_residual_after_m3s < 0.3 * found.heldout_residual_before_m3s
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_gas_that_comes_out_below_some_pressure_is_not_called_air() -> None:
     """It comes out at the pressure of the gas beside which the oil has stood, not at the tank's."""

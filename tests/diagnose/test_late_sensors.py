@@ -75,7 +75,7 @@ def test_a_slow_signal_is_put_right_up_to_the_window() -> None:
 @pytest.mark.parametrize(
     ("effect", "strength"),
     [
-        pytest.param("position_sensor_delay", 1.5e-3, marks=pytest.mark.campaign),
+        pytest.param("position_sensor_delay", 1.5e-3, marks=pytest.mark.long),
         ("pressure_sensor_lag", 2e-3),
     ],
 )

@@ -18,7 +18,7 @@ from tests.diagnose.records import record
 INERTANCE, SEED = 2.4e7, 3  # 3.7 m of hose
 ENDS = [
     ("line_dynamics", AT_CYLINDER),
-    pytest.param("line_dynamics_seen_at_valve", AT_VALVE, marks=pytest.mark.campaign),
+    pytest.param("line_dynamics_seen_at_valve", AT_VALVE, marks=pytest.mark.long),
 ]
 
 

@@ -30,6 +30,7 @@ def test_what_was_let_go_is_read_again() -> None:
     assert all(a is not b and (a == b).all() for a, b in zip(after, before, strict=True))
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_long_record_is_judged_as_a_short_one(monkeypatch: pytest.MonkeyPatch) -> None:
     model, chunk, held_out = record(*DELAY)

@@ -23,7 +23,7 @@ SHARES = st.floats(1e-3, 1e3)
     [
         (6201, "laminar", "external_leakage_laminar", "a"),
         pytest.param(
-            *(6202, "asymmetric", "internal_leakage_laminar", "a-b"), marks=pytest.mark.campaign
+            *(6202, "asymmetric", "internal_leakage_laminar", "a-b"), marks=pytest.mark.long
         ),
     ],
 )

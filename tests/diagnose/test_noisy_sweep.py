@@ -11,9 +11,9 @@ from tests.campaign.laws import Case, judged
 @pytest.mark.parametrize(
     ("seed", "law"),
     [
-        pytest.param(5043, "compensated", marks=pytest.mark.campaign),
+        pytest.param(5043, "compensated", marks=pytest.mark.long),
         (5043, "choking"),
-        (5051, "jump"),
+        pytest.param(5051, "jump", marks=pytest.mark.long),
     ],
 )
 def test_a_clean_sweep_with_noisy_pressures_matches(seed: int, law: str) -> None:

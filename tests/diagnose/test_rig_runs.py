@@ -33,7 +33,7 @@ HIDDEN = {
     13: ("relief_valve", "opening_pressure", 3.6e6),
     14: ("supply_sag", "", 0.0),
 }
-IN_FULL = (8, 11, 13, 14)  # by `make campaign` alone: a diagnosis of each takes its time
+IN_FULL = (8, 10, 11, 13, 14)  # by `make long`: a diagnosis of each takes its time
 ONE_COLUMN = {11: ("hose_compliance",)}  # a dead volume is what a hose that does not stiffen is
 
 
@@ -54,7 +54,7 @@ def diagnosis_of(
 def runs(missed: dict[int, str]) -> list[Any]:
     """The runs with something hidden; missed: of some, what is reached of a figure that is not."""
     marks = {k: [pytest.mark.xfail(strict=True, reason=v)] for k, v in missed.items()}
-    in_full = {key: [pytest.mark.campaign] for key in IN_FULL}
+    in_full = {key: [pytest.mark.long] for key in IN_FULL}
     return [pytest.param(k, marks=[*marks.get(k, []), *in_full.get(k, [])]) for k in HIDDEN]
 
 
@@ -103,7 +103,7 @@ def test_the_error_falls_to_that_of_the_rig_as_it_was_built(
     assert left <= 1.15 * clean.heldout_residual_before_m3s / clean.rms_flow_m3s
 
 
-@pytest.mark.campaign
+@pytest.mark.long
 def test_an_undeclared_lag_is_found(shared: Path, tmp_path: Path) -> None:
     """1.3 +- 0.2 ms; that it is not a delay of as much cannot be told from this motion."""
     text = rig.PROJECT.read_text()
@@ -117,7 +117,7 @@ def test_an_undeclared_lag_is_found(shared: Path, tmp_path: Path) -> None:
     assert own.parameters["time_constant"].value == pytest.approx(1.3e-3, abs=0.2e-3)
 
 
-@pytest.mark.campaign
+@pytest.mark.long
 def test_a_leak_that_the_maps_hide_is_confirmed_by_a_finer_grid(
     diagnosis_of: Callable[[int], Diagnosis],
 ) -> None:
@@ -129,7 +129,7 @@ def test_a_leak_that_the_maps_hide_is_confirmed_by_a_finer_grid(
     assert abs(size.value - 2e-12) < Z95 * size.std < 0.5e-12
 
 
-@pytest.mark.campaign
+@pytest.mark.long
 def test_a_sag_is_named_on_a_grid_that_follows_most_of_it(shared: Path, tmp_path: Path) -> None:
     """On the grid of `rtid quick` its first order is a supply that rises: it was `unknown`."""
     u_v = ", ".join(f"{v:.3f}" for v in np.linspace(1.06, 8.09, 25))
@@ -143,11 +143,9 @@ def test_a_sag_is_named_on_a_grid_that_follows_most_of_it(shared: Path, tmp_path
     assert named.effect == "supply_sag"
 
 
+@pytest.mark.long
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("run", "effect"),
-    [pytest.param(1, "", marks=pytest.mark.campaign), (5, "internal_leakage_laminar")],
-)
+@pytest.mark.parametrize(("run", "effect"), [(1, ""), (5, "internal_leakage_laminar")])
 def test_a_real_bus_of_unknown_ages_tells_the_same(
     shared: Path, tmp_path: Path, run: int, effect: str
 ) -> None:

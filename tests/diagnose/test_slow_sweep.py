@@ -26,6 +26,7 @@ def of(law: str, effect: str) -> Answer:
     return answer_of(case, found)
 
 
+@pytest.mark.long
 def test_a_worn_place_is_as_wide_as_it_is() -> None:
     """Held at 30 mm, it left rho 36 where 6.5 are left now, and a leak was named beside it."""
     assert of("orifice", "position_dependent_leakage").judgement == RIGHT
@@ -39,6 +40,7 @@ def test_a_timing_that_had_stood_in_for_a_leak_is_not_named() -> None:
     assert abs(found.size_z) < 3.0
 
 
+@pytest.mark.long
 def test_a_pump_is_found_in_the_valley_of_its_own_lag() -> None:
     """A slower, weaker one left rho 18; a line was named beside it, with oil of 19 GPa."""
     found = answer(Case(6141, "jump", SWEEP, "supply_sag"))
@@ -47,11 +49,12 @@ def test_a_pump_is_found_in_the_valley_of_its_own_lag() -> None:
     assert abs(found.beta_z).max() < 3.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("law", "effect", "remains"),
     [
         ("jump", "cavitation", True),
-        pytest.param("notch", "spool_lag_first_order", False, marks=pytest.mark.campaign),
+        ("notch", "spool_lag_first_order", False),
     ],
 )
 def test_laws_that_are_both_nearly_right_are_a_set(law: str, effect: str, remains: bool) -> None:
@@ -70,7 +73,7 @@ def test_laws_that_are_both_nearly_right_are_a_set(law: str, effect: str, remain
     [
         ("compensated", "external_leakage_laminar"),
         ("overlap", "input_delay"),
-        pytest.param("choking", "valve_seat_leakage", marks=pytest.mark.campaign),
+        pytest.param("choking", "valve_seat_leakage", marks=pytest.mark.long),
     ],
 )
 def test_what_is_not_named_is_below_the_limit_that_is_stated(law: str, effect: str) -> None:
@@ -81,13 +84,12 @@ def test_what_is_not_named_is_below_the_limit_that_is_stated(law: str, effect: s
     assert missed.of_limit < 1.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("law", "effect", "volume_m3"),
     [
         ("asymmetric", "extra_dead_volume", 4.76e-4),
-        pytest.param(
-            *("laminar", "line_dynamics_seen_at_valve", 5.83e-4), marks=pytest.mark.campaign
-        ),  # of 4.4 m of hose
+        ("laminar", "line_dynamics_seen_at_valve", 5.83e-4),  # of 4.4 m of hose
     ],
 )
 def test_what_one_chamber_stores_more_is_told_by_the_other(
@@ -123,6 +125,7 @@ def test_what_a_modulus_tells_is_declared() -> None:
     assert softer(again.present) is None and again.said.verdict == "matches"
 
 
+@pytest.mark.long
 def test_the_moduli_of_a_clean_sweep_are_alike() -> None:
     """By the noise alone 1070 and 1170 MPa were 2.5 deviations apart."""
     found = once(Case(5051, "compensated", SWEEP))
@@ -130,6 +133,7 @@ def test_the_moduli_of_a_clean_sweep_are_alike() -> None:
     assert softer(found.present) is None and found.said.verdict == "matches"
 
 
+@pytest.mark.long
 def test_what_nothing_confirms_is_not_called_too_small() -> None:
     """A leak of twice the flow, forty times the one that is there: it is what the maps miss."""
     found = once(Case(6101, "compensated", SWEEP, "external_leakage_laminar"))

@@ -25,6 +25,7 @@ from tests.campaign.laws import RECORD_S, Case, declared, judged, of_run
 from tests.diagnose.records import record
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_strong_turbulent_leak_is_diagnosed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -71,9 +72,7 @@ def test_what_is_slight_and_more_than_noise_is_no_match(unexplained: Diagnosis) 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "law", ["choking", pytest.param("compensated", marks=pytest.mark.campaign)]
-)
+@pytest.mark.parametrize("law", ["choking", pytest.param("compensated", marks=pytest.mark.long)])
 def test_a_curve_that_all_blocks_miss_by_a_little_is_no_alarm(law: str) -> None:
     """On somebody's grid rho was 1.11 and 1.13: half the width along one axis explains it."""
     case = Case(5101, law, "rich_record")
@@ -101,6 +100,7 @@ def test_a_weak_leak_is_no_curve_of_the_maps() -> None:
     assert found.present.declared.n_cells < 1.2 * declared(case, found.run).n_cells
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_what_the_law_of_a_leak_misses_is_no_effect_of_its_own() -> None:
     """Its gap widens with pressure: a relief valve was named beside it, hidden in the maps."""
@@ -109,6 +109,7 @@ def test_what_the_law_of_a_leak_misses_is_no_effect_of_its_own() -> None:
     assert [effect.effect for effect in found.said.found] == ["internal_leakage_laminar"]
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_an_area_too_wide_makes_moduli_contradict_and_that_is_counted_once(
     monkeypatch: pytest.MonkeyPatch,

@@ -42,6 +42,7 @@ def test_standstill_breaks_a_covariance_that_forgets(name: str) -> None:
     assert loss.wrong is not None
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_corner_of_the_dead_band() -> None:
     """Within 5 % and within the stated interval, which chance alone breaks in 5 % of the cases."""

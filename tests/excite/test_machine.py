@@ -80,6 +80,7 @@ def test_the_nominal_machine_moves_as_the_simulated_one(tmp_path: Path) -> None:
     assert not found[shut, U].any()
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.usefixtures("eighty")
 def test_a_design_from_the_file_to_the_true_machine(

@@ -240,6 +240,7 @@ def test_row_17_kill_9_while_it_runs(tmp_path: Path, figure: Figure) -> None:
            drift(heard(running.folder).solution(), learned.solution()), 0.01)  # fmt: skip
 
 
+@pytest.mark.faults
 def test_row_33_a_disk_that_is_really_full(tmp_path: Path, figure: Figure) -> None:
     """The status, on that very disk, says so at once; the end says it by its exit code."""
     settings = "publish_s = 60\nstore_s = 30\n"  # the next save is half a minute away

@@ -7,22 +7,22 @@ import subprocess
 import sys
 from pathlib import Path
 
-SIZES = (
+SIZES = [
     "--projects",
-    "16",
-    "--dbcs",
-    "12",
-    "--nodes",
     "8",
+    "--dbcs",
+    "6",
+    "--nodes",
+    "4",
     "--logs",
-    "30",
+    "15",
     "--tables",
-    "24",
+    "12",
     "--plants",
-    "10",
+    "5",
     "--bombs",
     "0",
-)
+]
 
 
 def test_a_sample_of_the_fuzz_finds_nothing(tmp_path: Path) -> None:

@@ -100,6 +100,7 @@ def test_the_data_sheet_is_wrong_within_its_bounds(plant: SimulatedPlant) -> Non
         assert abs(opens_v - valve.deadband_v) < DEADBAND_ERROR_V + valve.corner_v
 
 
+@pytest.mark.long
 def test_all_five_valves_are_identified_in_normal_operation(
     plant: SimulatedPlant, done: Commissioned
 ) -> None:
