@@ -16,6 +16,7 @@ import numpy as np
 from scipy.linalg.blas import dtrsm
 from scipy.linalg.lapack import dpotrf, dtrtri, dtrtrs
 
+from rtid.diagnose.directions import Directions
 from rtid.effects.law import Volumes
 from rtid.estimator.factor import PRIOR_SD, one_thread
 from rtid.estimator.state import Weights, build
@@ -75,13 +76,21 @@ class Rows:
         kernel.condense(np.ascontiguousarray(series), self.row_of, self.share, self.fresh, out)
         return out
 
+    @cached_property
+    def told(self) -> tuple[Directions, FloatArray]:
+        """The directions of the blocks' terms that the rows tell of, and the entries along them."""
+        weight = float(np.max(self.whiten[:, ::2], initial=0.0)) ** 2
+        return Directions.of(self.block, self.terms, len(self.cells), weight)
+
     def maps(self) -> FloatArray:
-        """Products of the maps' columns: the lower triangle of an array (6 V, 6 V)."""
-        gram = half_used(TERMS * len(self.cells))
+        """Products of the told directions: the lower triangle of an array (n, n)."""
+        (directions, along), n_v = self.told, len(self.cells)
+        pairs, gram = np.zeros((n_v * (n_v + 1) // 2, TERMS**2)), half_used(directions.n)
         ringing.map_products(
-            self.sign, self.start, self.block, self.terms, self.fresh, self.whiten, self.keep,
-            SPAN, QUIET, gram,
+            self.sign, self.start, self.block, along, self.fresh, self.whiten, self.keep,
+            SPAN, QUIET, pairs,
         )  # fmt: skip
+        ringing.laid_out(pairs, directions.first, gram)
         return gram
 
     def on_rows(self, volumes: Volumes) -> Volumes:
@@ -94,10 +103,11 @@ class Rows:
         return columns
 
     def cross(self, columns: FloatArray) -> FloatArray:
-        """Products of the maps' columns with whitened (rows, chambers, m), used up: (6 V, m)."""
+        """Products of the told directions with whitened (rows, chambers, m), used up: (n, m)."""
         products.adjoint(columns, self.fresh, self.whiten, self.keep)
-        cross = np.zeros((TERMS * len(self.cells), columns.shape[2]))
-        products.cross(columns, self.sign, self.start, self.block, self.terms, cross)
+        directions, along = self.told
+        cross = np.zeros((directions.n, columns.shape[2]))
+        products.cross(columns, self.sign, self.start, self.block, along, directions.first, cross)
         return cross
 
     def columns(self, given: list[Volumes]) -> FloatArray:
@@ -115,7 +125,7 @@ class Rows:
     @cached_property
     def factor(self) -> EvidenceFactor:
         """Cholesky factor of the maps' products and their prior."""
-        return EvidenceFactor.of(self.maps())
+        return EvidenceFactor.of(self.maps(), self.told[0])
 
     @cached_property
     def covariances(self) -> FloatArray:
@@ -124,28 +134,32 @@ class Rows:
 
     def forget(self) -> None:
         """Let the factor go where it is large: who asks for it again makes it anew."""
-        if TERMS * len(self.cells) > MANY:
+        if self.told[0].n > MANY:
             vars(self).pop("factor", None)
 
 
 @dataclass(frozen=True)
 class EvidenceFactor:
-    """U' U = products and prior, scaled: upper (6 V, 6 V) in Fortran order, scale (6 V,)."""
+    """U' U = products and prior, scaled: upper (n, n) in Fortran order, scale (n,).
+
+    directions: of the blocks' terms, which has n told directions.
+    """
 
     upper: FloatArray
     scale: FloatArray
+    directions: Directions
 
     @classmethod
-    def of(cls, gram: FloatArray) -> EvidenceFactor:
-        """Factor of the lower triangle of gram (6 V, 6 V), scaled here; gram is used up."""
+    def of(cls, gram: FloatArray, directions: Directions) -> EvidenceFactor:
+        """Factor of the lower triangle of gram (n, n), scaled here; gram is used up."""
         scale = np.empty(len(gram))
         products.scaled(gram, PRIOR_SD**-2, scale)
         with one_thread():
             upper = dpotrf(gram.T, lower=0, clean=0, overwrite_a=1)[0] if len(gram) else gram
-        return cls(upper, scale)
+        return cls(upper, scale, directions)
 
     def half(self, right: FloatArray) -> FloatArray:
-        """L^-1 scale right' for right (6 V, m), which is used up: (m, 6 V)."""
+        """L^-1 scale right' for right (n, m), which is used up: (m, n)."""
         right *= self.scale[:, None]
         if not len(right):
             return right.T
@@ -153,20 +167,20 @@ class EvidenceFactor:
             return np.asarray(dtrsm(1.0, self.upper, right.T, side=1, overwrite_b=1))
 
     def whole(self, half: FloatArray) -> FloatArray:
-        """Solutions (..., 6 V) for what `half` gave of one right-hand side, or of several."""
+        """Terms (..., V, 6) for what `half` gave of one right-hand side, or of several."""
         if not half.size:
-            return half
+            return self.directions.terms(half)
         with one_thread():
-            return np.asarray(dtrtrs(self.upper, half.T)[0].T * self.scale)
+            return self.directions.terms(dtrtrs(self.upper, half.T)[0].T * self.scale)
 
     def covariances(self) -> FloatArray:
         """Diagonal blocks (V, 6, 6) of the inverse: covariance of each block's terms."""
-        cov = np.zeros((len(self.scale) // TERMS, TERMS, TERMS))
-        if len(cov):
+        cov = np.zeros_like(self.directions.basis)
+        if len(self.scale):
             with one_thread():
                 inverse = dtrtri(_triangle(self.upper), lower=0, overwrite_c=1)[0]
-            products.covariances(inverse.T, self.scale, cov)
-        return cov
+            products.covariances(inverse.T, self.directions.first, self.scale, cov)
+        return self.directions.covariances(cov)
 
 
 def _triangle(upper: FloatArray) -> FloatArray:
@@ -262,7 +276,7 @@ def _measured(chunk: FloatArray) -> BoolArray:
 class Projected:
     """What is left of y and the head columns once every map is free to follow them.
 
-    schur (h, h): products after the projection; own (h,): squares before it; half (h, 6 V): what
+    schur (h, h): products after the projection; own (h,): squares before it; half (h, n): what
     the maps take of each, see `EvidenceFactor.half`.
     """
 
@@ -277,7 +291,7 @@ class Projected:
         column: the one that all of them follow, y unless named; or several, each with its own.
         """
         rest = self.half[column] - theta @ self.half[used]
-        return self.factor.whole(rest).reshape(*rest.shape[:-1], -1, TERMS)
+        return self.factor.whole(rest)
 
 
 class Heading:
@@ -326,7 +340,7 @@ class Heading:
         self._cross.append(self._rows.cross(columns))
 
     def products(self) -> tuple[FloatArray, FloatArray]:
-        """Among the columns (h, h), and of the maps with them (6 V, h)."""
+        """Among the columns (h, h), and of the told directions with them (n, h)."""
         self._flush()
         gram = np.full((self._h, self._h), np.nan)
         for a, b, met in self._met:

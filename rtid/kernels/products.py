@@ -14,7 +14,6 @@ from __future__ import annotations
 import numpy as np
 
 from rtid.kernels.jit import inlined, kernel
-from rtid.kernels.layout import TERMS
 from rtid.plain import BoolArray, FloatArray, IntArray
 
 
@@ -78,24 +77,26 @@ def cross(
     start: IntArray,
     block: IntArray,
     terms: FloatArray,
+    first: IntArray,
     out: FloatArray,
 ) -> None:
     """Products of the columns of the maps with those of which `adjoints` (rows, chambers, m) are.
 
     sign (V, 2) of the blocks' edges; start (rows + 1,), block (entries,), terms (entries, 6): see
-    `evidence.integrate`; out (6 V, m) is changed in place.
+    `evidence.integrate`; first (V + 1,): place of each block's first term in out (n, m), which is
+    changed in place.
     """
     rows, n_c, m = adjoints.shape
     felt = np.empty(m)
     for r in range(rows):
         for n in range(start[r], start[r + 1]):
-            v, at = block[n], TERMS * block[n]
+            v, at = block[n], first[block[n]]
             for j in range(m):
                 felt[j] = sign[v, 0] * adjoints[r, 0, j]
             if n_c == 2 and sign[v, 1] != 0.0:
                 for j in range(m):
                     felt[j] += sign[v, 1] * adjoints[r, 1, j]
-            for p in range(TERMS):
+            for p in range(first[v + 1] - at):
                 t, row = terms[n, p], out[at + p]
                 for j in range(m):
                     row[j] += t * felt[j]
@@ -113,16 +114,23 @@ def scaled(gram: FloatArray, prior: float, scale: FloatArray) -> None:
 
 
 @kernel
-def covariances(inverse: FloatArray, scale: FloatArray, cov: FloatArray) -> None:
-    """Diagonal blocks cov (V, 6, 6) of X' X scaled, X (n, n) lower; cov is changed in place."""
+def covariances(inverse: FloatArray, first: IntArray, scale: FloatArray, cov: FloatArray) -> None:
+    """Diagonal blocks cov (V, 6, 6) of X' X scaled, X (n, n) lower; cov is changed in place.
+
+    first (V + 1,): place of each block's first term; what is behind its last one is left as it is.
+    """
     for i in range(len(inverse)):
         row = inverse[i]
-        for b in range(i // TERMS + 1):
-            for p in range(min(TERMS, i + 1 - TERMS * b)):
+        for b in range(len(cov)):
+            at = first[b]
+            if at > i:
+                break
+            for p in range(min(first[b + 1], i + 1) - at):
                 for q in range(p + 1):
-                    cov[b, p, q] += row[TERMS * b + p] * row[TERMS * b + q]
+                    cov[b, p, q] += row[at + p] * row[at + q]
     for b in range(len(cov)):
-        for p in range(TERMS):
+        at = first[b]
+        for p in range(first[b + 1] - at):
             for q in range(p + 1):
-                cov[b, p, q] *= scale[TERMS * b + p] * scale[TERMS * b + q]
+                cov[b, p, q] *= scale[at + p] * scale[at + q]
                 cov[b, q, p] = cov[b, p, q]

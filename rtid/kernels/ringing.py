@@ -29,10 +29,12 @@ def map_products(
     A: FloatArray,
     span: int,
     quiet: float,
-    gram: FloatArray,
+    pairs: FloatArray,
 ) -> None:
-    """Add the products of all columns of the maps to the lower triangle of gram (6 V, 6 V).
+    """Add the products of all columns of the maps to those of pairs of blocks.
 
+    pairs (V (V + 1) / 2, 36): of blocks v >= w at v (v + 1) / 2 + w, six terms of v by six of w.
+    What is met together lies together: the rows of a matrix are pages of memory apart.
     sign (V, 2) of the blocks' edges; start (rows + 1,), block (entries,), terms (entries, 6),
     fresh, whiten, A: see `evidence.integrate`.  Rows are taken `span` at a time; a block whose
     whitened state is below `quiet` is forgotten.
@@ -65,10 +67,10 @@ def map_products(
                     moves[v] = True
                     moving[n_moving] = v
                     n_moving += 1
-                _meet(v, terms[n], sign[v], M[r], way, moving[:n_moving], new, felt, gram, both)
+                _meet(v, terms[n], sign[v], M[r], way, moving[:n_moving], new, felt, pairs, both)
             r += 1
         for a in range(n_moving):
-            _ring(moving[a], felt[moving[a]], live[:n_live], d, gram)
+            _ring(moving[a], felt[moving[a]], live[:n_live], d, pairs)
         if r < rows:
             _carry(A[r - 1], way)
             for n in range(n_live):
@@ -133,17 +135,23 @@ def _leave(a: FloatArray, new: FloatArray, felt: FloatArray, d: FloatArray) -> N
 
 
 @inlined
-def _outer(gram: FloatArray, i: int, j: int, a: FloatArray, b: FloatArray) -> None:
-    """gram[i : i + 6, j : j + 6] += a b'."""
+def _of(v: int, w: int) -> int:
+    """Number of the pair of block v and one that is not behind it."""
+    return v * (v + 1) // 2 + w
+
+
+@inlined
+def _outer(pair: FloatArray, a: FloatArray, b: FloatArray) -> None:
+    """pair (36,) += a b' of six terms each."""
     b0, b1, b2, b3, b4, b5 = b[0], b[1], b[2], b[3], b[4], b[5]
     for p in range(TERMS):
-        row, f = gram[i + p], a[p]
-        row[j] += f * b0
-        row[j + 1] += f * b1
-        row[j + 2] += f * b2
-        row[j + 3] += f * b3
-        row[j + 4] += f * b4
-        row[j + 5] += f * b5
+        f, j = a[p], TERMS * p
+        pair[j] += f * b0
+        pair[j + 1] += f * b1
+        pair[j + 2] += f * b2
+        pair[j + 3] += f * b3
+        pair[j + 4] += f * b4
+        pair[j + 5] += f * b5
 
 
 @part
@@ -156,7 +164,7 @@ def _meet(
     moving: IntArray,
     new: FloatArray,
     felt: FloatArray,
-    gram: FloatArray,
+    pairs: FloatArray,
     both: FloatArray,
 ) -> None:
     """Products of one entry with what blocks have added since the span began, and with itself.
@@ -169,15 +177,15 @@ def _meet(
         for p in range(TERMS):
             both[p] = m0 * new[w, p] + m1 * new[w, TERMS + p]
         if w < v:
-            _outer(gram, TERMS * v, TERMS * w, t, both)
+            _outer(pairs[_of(v, w)], t, both)
         elif w > v:
-            _outer(gram, TERMS * w, TERMS * v, both, t)
+            _outer(pairs[_of(w, v)], both, t)
         else:
             half = 0.5 * (m0 * s[0] + m1 * s[1])
             for p in range(TERMS):
                 both[p] += half * t[p]
-            _outer(gram, TERMS * v, TERMS * v, t, both)
-            _outer(gram, TERMS * v, TERMS * v, both, t)
+            _outer(pairs[_of(v, v)], t, both)
+            _outer(pairs[_of(v, v)], both, t)
     f0, f1 = way[0, 0] * m0 + way[1, 0] * m1, way[0, 1] * m0 + way[1, 1] * m1
     for p in range(TERMS):
         felt[v, p] += f0 * t[p]
@@ -187,30 +195,30 @@ def _meet(
 
 
 @part
-def _ring(v: int, f: FloatArray, live: IntArray, d: FloatArray, gram: FloatArray) -> None:
+def _ring(v: int, f: FloatArray, live: IntArray, d: FloatArray, pairs: FloatArray) -> None:
     """Products of what block v added in a span with what others had left behind before it."""
     for n in range(len(live)):
         w = live[n]
         d_w = d[w]
         if w <= v:
-            _twice(gram, TERMS * v, TERMS * w, f, d_w)
+            _twice(pairs[_of(v, w)], f, d_w)
         if w >= v:
-            _twice(gram, TERMS * w, TERMS * v, d_w, f)
+            _twice(pairs[_of(w, v)], d_w, f)
 
 
 @inlined
-def _twice(gram: FloatArray, i: int, j: int, a: FloatArray, b: FloatArray) -> None:
-    """gram[i : i + 6, j : j + 6] += a' b of two states (12,)."""
+def _twice(pair: FloatArray, a: FloatArray, b: FloatArray) -> None:
+    """pair (36,) += a' b of two states (12,)."""
     b0, b1, b2, b3, b4, b5 = b[0], b[1], b[2], b[3], b[4], b[5]
     c0, c1, c2, c3, c4, c5 = b[6], b[7], b[8], b[9], b[10], b[11]
     for p in range(TERMS):
-        row, f, g = gram[i + p], a[p], a[TERMS + p]
-        row[j] += f * b0 + g * c0
-        row[j + 1] += f * b1 + g * c1
-        row[j + 2] += f * b2 + g * c2
-        row[j + 3] += f * b3 + g * c3
-        row[j + 4] += f * b4 + g * c4
-        row[j + 5] += f * b5 + g * c5
+        f, g, j = a[p], a[TERMS + p], TERMS * p
+        pair[j] += f * b0 + g * c0
+        pair[j + 1] += f * b1 + g * c1
+        pair[j + 2] += f * b2 + g * c2
+        pair[j + 3] += f * b3 + g * c3
+        pair[j + 4] += f * b4 + g * c4
+        pair[j + 5] += f * b5 + g * c5
 
 
 @part
@@ -239,3 +247,19 @@ def _loud(
             is_live[v] = False
             d[v] = 0.0
     return kept
+
+
+@kernel
+def laid_out(pairs: FloatArray, first: IntArray, gram: FloatArray) -> None:
+    """Products of pairs as of `map_products` become the lower triangle of gram (n, n).
+
+    first (V + 1,): place of each block's first term; those behind its last one are left out.
+    """
+    for v in range(len(first) - 1):
+        of_v = _of(v, 0)
+        for p in range(first[v + 1] - first[v]):
+            row = gram[first[v] + p]
+            for w in range(v + 1):
+                pair, at = pairs[of_v + w], first[w]
+                for q in range(first[w + 1] - at):
+                    row[at + q] = pair[TERMS * p + q]

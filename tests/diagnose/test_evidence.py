@@ -37,9 +37,20 @@ def head(rows: Rows, given: list[Volumes]) -> tuple[np.ndarray, np.ndarray]:
 def gram_of(rows: Rows, given: list[Volumes] | None = None) -> np.ndarray:
     """Products of all columns: head, then maps."""
     own, cross = head(rows, given or [])
-    maps = rows.maps()
-    maps = np.tril(maps) + np.tril(maps, -1).T
-    return np.block([[own, cross.T], [cross, maps]])
+    cross = along_terms(rows) @ cross
+    return np.block([[own, cross.T], [cross, whole_maps(rows)]])
+
+
+def along_terms(rows: Rows) -> np.ndarray:
+    """The told directions in the blocks' terms (6 V, n)."""
+    span, _ = rows.told
+    return np.asarray(span.terms(np.eye(span.n)).reshape(span.n, -1).T)
+
+
+def whole_maps(rows: Rows) -> np.ndarray:
+    """Products of the maps' terms (6 V, 6 V)."""
+    maps, along = rows.maps(), along_terms(rows)
+    return np.asarray(along @ (np.tril(maps) + np.tril(maps, -1).T) @ along.T)
 
 
 @pytest.mark.parametrize(("quiet", "within"), [(1e-9, 1e-8), (evidence.QUIET, 1e-4)])
@@ -89,21 +100,21 @@ def test_products_are_those_of_whole_rows(row_s: float) -> None:
     chunk = chunk[:6000].copy()
     chunk[2500, 1] = 3  # and behind a gap
     rows = rows_of(model, chunk, nominal_weights(model), row_s=row_s)
-    whole, maps = dense(rows), rows.maps()
+    whole, maps = dense(rows), whole_maps(rows)
     expected = whole.T @ whole
     size = np.sqrt(np.outer(np.diag(expected), np.diag(expected))) + 1e-300
-    assert np.abs(np.tril(maps - expected) / size).max() < 1e-9
+    assert np.abs((maps - expected) / size).max() < 1e-9
     flat = rows.whitened(rows.own.copy()).reshape(rows.n, -1)
     _, cross = head(rows, [])
     scale = np.sqrt(np.outer(np.diag(expected), (flat**2).sum(axis=0))) + 1e-300
-    assert np.abs((cross - whole.T @ flat) / scale).max() < 1e-9
+    assert np.abs((along_terms(rows) @ cross - whole.T @ flat) / scale).max() < 1e-9
 
 
 def test_covariances_are_blocks_of_the_inverse() -> None:
     model, chunk, _ = record()
     rows = rows_of(model, chunk[:3000], nominal_weights(model))
-    maps = rows.maps()
-    full = np.tril(maps) + np.tril(maps, -1).T + np.eye(len(maps)) * PRIOR_SD**-2
+    full = whole_maps(rows) + np.eye(TERMS * len(rows.cells)) * PRIOR_SD**-2
+    assert rows.told[0].n < len(full)
     inverse = np.linalg.inv(full)
     for v, cov in enumerate(rows.covariances):
         at = slice(TERMS * v, TERMS * (v + 1))
