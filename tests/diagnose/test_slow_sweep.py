@@ -15,6 +15,7 @@ from tests.campaign.diagnoses import IN_SET, RIGHT, judge
 from tests.campaign.diagnoses import Case as Hidden
 from tests.campaign.laws import Answer, Case, answer, answer_of, declared, judged, of_run
 
+BESIDE_NO_OIL = "unknown: the line that explains it leaves 7.9 GPa, which refutes it"
 SWEEP = "sweep_record"
 once = cache(judged)
 
@@ -89,13 +90,16 @@ def test_what_is_not_named_is_below_the_limit_that_is_stated(law: str, effect: s
     ("law", "effect", "volume_m3"),
     [
         ("asymmetric", "extra_dead_volume", 4.76e-4),
-        ("laminar", "line_dynamics_seen_at_valve", 5.83e-4),  # of 4.4 m of hose
+        pytest.param(
+            *("laminar", "line_dynamics_seen_at_valve", 5.83e-4),  # of 4.4 m of hose
+            marks=pytest.mark.xfail(strict=True, reason=BESIDE_NO_OIL),
+        ),
     ],
 )
 def test_what_one_chamber_stores_more_is_told_by_the_other(
     law: str, effect: str, volume_m3: float
 ) -> None:
-    """The first "matched" with a line before both chambers, and 1487 MPa; the other was unknown."""
+    """The first "matched" with a line before both chambers, and 1487 MPa; the other is unknown."""
     case = Case(6101, law, SWEEP, effect)
     found = once(case)
     assert found is not None
