@@ -78,12 +78,12 @@ class Rows:
 
     @cached_property
     def told(self) -> tuple[Directions, FloatArray]:
-        """The directions of the blocks' terms that the rows tell of, and the entries along them."""
+        """What directions of the blocks' terms the rows tell of; the entries (n, 6) along them, m3."""
         weight = float(np.max(self.whiten[:, ::2], initial=0.0)) ** 2
         return Directions.of(self.block, self.terms, len(self.cells), weight)
 
     def maps(self) -> FloatArray:
-        """Products of the told directions: the lower triangle of an array (n, n)."""
+        """Products of the told directions, whitened: the lower triangle of an array (n, n)."""
         (directions, along), n_v = self.told, len(self.cells)
         pairs, gram = np.zeros((n_v * (n_v + 1) // 2, TERMS**2)), half_used(directions.n)
         ringing.map_products(
@@ -340,7 +340,7 @@ class Heading:
         self._cross.append(self._rows.cross(columns))
 
     def products(self) -> tuple[FloatArray, FloatArray]:
-        """Among the columns (h, h), and of the told directions with them (n, h)."""
+        """Among the columns (h, h), and of the told directions with them (n, h): whitened."""
         self._flush()
         gram = np.full((self._h, self._h), np.nan)
         for a, b, met in self._met:
