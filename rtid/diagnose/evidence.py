@@ -78,7 +78,7 @@ class Rows:
 
     @cached_property
     def told(self) -> tuple[Directions, FloatArray]:
-        """What directions of the blocks' terms the rows tell of; the entries (n, 6) along them, m3."""
+        """Directions of the blocks' terms that the rows tell of; entries (n, 6) along them, m3."""
         weight = float(np.max(self.whiten[:, ::2], initial=0.0)) ** 2
         return Directions.of(self.block, self.terms, len(self.cells), weight)
 
