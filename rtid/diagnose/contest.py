@@ -91,6 +91,29 @@ def contest(
     return chosen, tuple(t.key for t in equals if t.key != chosen.key)
 
 
+def its_turn(
+    state: TrialState,
+    present: Fit,
+    best: Trial,
+    trials: list[Trial],
+    finished: dict[Key, Trial],
+    refuted: dict[Key, bool],
+) -> tuple[Trial, tuple[Key, ...]]:
+    """The contest; where a refuted cause wins that is not told from the best one, without such.
+
+    refuted: of each whether by its form alone: the right form of that law may fit as well, so that
+    it stays beside the other one.  Gas that comes out of oil was told as well by air with an
+    exponent at its bound, 330 better of 10,600: that was refuted, and nothing was named.
+    """
+    chosen, alike = contest(state, present, best, trials, finished)
+    if chosen.key not in refuted or best.key not in alike:
+        return chosen, alike
+    better = (chosen.key,) if refuted[chosen.key] else ()
+    rest = [t for t in trials if t.key not in refuted]
+    chosen, alike = contest(state, present, best, rest, finished)
+    return chosen, (*alike, *better)
+
+
 def _as_late(state: TrialState, present: Fit, trials: list[Trial]) -> list[Trial]:
     """The best of the times that were refitted, and those that are not told from it, by chi2 alone.
 

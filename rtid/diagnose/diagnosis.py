@@ -16,6 +16,7 @@ from rtid.diagnose.admission import (
     is_as_credible,
     is_form_of_another,
     is_noticed,
+    is_of_another_form,
     is_refuted,
     is_within_a_form,
     taken_in,
@@ -25,7 +26,7 @@ from rtid.diagnose.consequence import (
     BENT,
     HIDDEN_GAIN,
 )
-from rtid.diagnose.contest import as_nearly_right, contest, ended, hardly_worse, trials_of
+from rtid.diagnose.contest import as_nearly_right, ended, hardly_worse, its_turn, trials_of
 from rtid.diagnose.exact import carried_on
 from rtid.diagnose.excuse import few_excused
 from rtid.diagnose.fit import Fit, fit, with_covariances
@@ -278,18 +279,18 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
         t for t in trials_of(state, present) if t.gain > least and t.key not in state.ruled_out
     ]
     finished: dict[Key, Trial] = {}
-    passed_over: set[Key] = set()
+    refuted: dict[Key, bool] = {}  # whether by its form alone
     for best in sorted(trials, key=lambda t: -t.gain):
         if best.key in state.negligible or len(state.negligible) == MOST_NEGLIGIBLE:
             continue
         if not explains_enough(state, present, best):
             return None
-        trial, alike = contest(state, present, best, trials, finished)
-        if trial.key in passed_over:
+        trial, alike = its_turn(state, present, best, trials, finished, refuted)
+        if trial.key in refuted:
             continue
         now = with_covariances(carried_on(state, present, trial, must_win=True), like=present)
         if is_refuted(present, now, trial, least):
-            passed_over.add(trial.key)
+            refuted[trial.key] = not trial.is_timing and is_of_another_form(now)
             continue
         finished.setdefault(trial.key, ended(present, trial, now))
         after = state.left(now)

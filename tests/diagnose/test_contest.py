@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from rtid.diagnose import contest as module
-from rtid.diagnose.contest import REFUTED, alike_ones, contest
+from rtid.diagnose.contest import REFUTED, alike_ones, contest, its_turn
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.trials import TIE, TIE_SHARE, Trial
 from rtid.effects.column import Candidate
@@ -144,3 +144,15 @@ def test_times_are_compared_by_what_they_explain(monkeypatch: pytest.MonkeyPatch
     chosen, alike_to_it = contest(state(), present(4000), position, trials, {})
     assert chosen.key[0] == "command", "it leaves least"
     assert [name for name, _ in alike_to_it] == ["position"]
+
+
+@pytest.mark.parametrize(("by_form", "beside"), [(True, {("air", "a")}), (False, set())])
+@pytest.mark.usefixtures("refits")
+def test_what_is_not_told_from_a_refuted_one_has_its_turn(by_form: bool, beside: set[Key]) -> None:
+    """The right form of the refuted law may fit as well; beside an impossible oil it does not."""
+    air, gas, far = trial("air", 1000, 1.0), trial("gas", 985, 1.0), trial("hose", 900, 1.0)
+    refuted = {air.key: by_form}
+    chosen, alike = its_turn(state(), present(5000), gas, [air, gas, far], {}, refuted)
+    assert chosen.key == gas.key and set(alike) == beside
+    chosen, _ = its_turn(state(), present(5000), far, [air, gas, far], {}, refuted)
+    assert chosen.key == air.key, "one that is told from it has none"

@@ -21,7 +21,8 @@ from rtid.sim.random_plants import draw
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from rtid.tell.diagnosed import sentences
-from tests.campaign.laws import RECORD_S, Case, declared, judged, of_run
+from tests.campaign.diagnoses import IN_SET
+from tests.campaign.laws import RECORD_S, Case, answer, declared, judged, of_run
 from tests.diagnose.records import record
 
 
@@ -130,3 +131,13 @@ def test_an_area_too_wide_makes_moduli_contradict_and_that_is_counted_once(
     said = of_run(case.plant, run, wide).said
     assert said.verdict == "unknown" and "contradict" in said.doubts[0].reason
     assert len(counts) == 1
+
+
+@pytest.mark.long
+@pytest.mark.slow
+def test_gas_that_air_of_an_impossible_exponent_tells_as_well_is_in_a_set() -> None:
+    """That was refuted, and what is not told from it was never asked: `unknown` at rho 4.7."""
+    found = answer(Case(6613, "compensated", hidden="cavitation"))
+    assert found is not None
+    assert (found.judgement, found.named) == (IN_SET, "cavitation")
+    assert abs(found.beta_z).max() < 3.0
