@@ -140,6 +140,8 @@ def _direction(low: float) -> str:
 def _when(time: Dependence, c: int) -> str:
     """The span of time in which most is left, where it stands out."""
     size = time.rms_m3s[:, c]
+    if not len(size):  # too few rows for any
+        return ""
     k = int(np.argmax(size))
     usual = np.sqrt(np.average(size**2, weights=time.rows))
     if not size[k] > BURST * usual:

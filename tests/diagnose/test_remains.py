@@ -7,8 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rtid.compare.dependence import Dependence
+from rtid.compare.comparison import Comparison, Intervals
+from rtid.compare.dependence import Dependence, against_signals, by_direction, over_time
 from rtid.diagnose.remains import BANDS_HZ, Remainder, _how_fast, _way, _when, bands
+from rtid.sim.declare import declared_model
+from rtid.sim.simulated_plant import SimulatedPlant
 from rtid.tell.charts.evidence import left_over
 from rtid.tell.stills import draw
 
@@ -71,3 +74,28 @@ def test_the_picture_has_a_place_for_each_of_them() -> None:
     assert panels[3].ticks[0] == "below 0.25" and panels[3].ticks[3] == "1 to 2"
     assert chart.caption == "said"
     assert draw(chart).axes
+
+
+def test_rows_too_few_for_any_bin_have_words_and_a_picture() -> None:
+    """A record of which the map was known over nine rows ended in a traceback."""
+    model, part = declared_model(SimulatedPlant()), few_rows()
+    time, ways = over_time(part), by_direction(model, part)
+    assert not len(time.low)
+    assert _when(time, 0) == ""
+    signals = tuple(against_signals(model, part))
+    assert all(np.isfinite(of.explained).all() for of in (*signals, time, ways))
+    sizes = np.ones((len(BANDS_HZ) - 1, 2))
+    assert draw(left_over(Remainder("", ("a", "b"), signals, time, ways, sizes, sizes))).axes
+
+
+def few_rows() -> Comparison:
+    """Fewer rows than a bin over time needs, of a machine with two chambers."""
+    model, rng = declared_model(SimulatedPlant()), np.random.default_rng(1)
+    n, values = 7, rng.standard_normal((7, 4))
+    none = np.empty((0, 2))
+    empty = Intervals(np.empty(0), np.empty((0, 4), np.int64), none, none, none)
+    return Comparison(
+        name="", t_s=np.linspace(7.0, 12.0, n), measured_m3s=values[:, :2],
+        modelled_m3s=values[:, 2:], cell=np.zeros((n, 4), np.int64), shares={}, rho=np.ones(2),
+        signals=rng.standard_normal((n, len(model.signals))), intervals=empty,
+    )  # fmt: skip
