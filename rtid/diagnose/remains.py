@@ -22,6 +22,7 @@ from rtid.compare.dependence import (
 )
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.residual import Residual, residual
+from rtid.diagnose.verdict import can_judge
 from rtid.model import Machine
 from rtid.plain import FloatArray
 
@@ -83,8 +84,14 @@ class Remainder:
 
 
 def remainder(fit: Fit) -> Remainder | None:
-    """What the residual of a fit is like in its own record; None where nothing can be judged."""
+    """What the residual of a fit is like in its own record; None where nothing can be judged.
+
+    Where the map is known over next to nothing of it, it is that of all of the record that is on
+    its grid: nine rows, of a choking valve, said nothing of flow in bursts.
+    """
     part, model = residual(fit, fit.chunk), fit.declared
+    if not can_judge(part):
+        part = residual(fit, fit.chunk, everywhere=True)
     if not len(part.t_s):
         return None
     beside = filtered(model, part, fit.chunk)
