@@ -10,7 +10,7 @@ READY = .venv/.ready
 demo: $(READY)
 	.venv/bin/rtid demo
 
-# Three on two cores: what waits for a browser or a process leaves one idle: 35 minutes, 37 to 43 with two.
+# Three on two cores: what waits for a browser or a process leaves one idle: 19 minutes.
 # Bytecode is kept whatever the environment says: the tests start hundreds of interpreters.
 test: export PYTHONDONTWRITEBYTECODE =
 test: $(READY)
