@@ -19,6 +19,9 @@ from tests.rig import figures
 
 PROJECT = Path(__file__).parents[1] / "rtid" / "project" / "examples" / "cylinder.toml"
 
+# It was -72 % with moduli of 570 and 562 MPa beside the delay; they are 557 and 442 now, for 700.
+NO_WORSE = pytest.mark.xfail(strict=True, reason="53 and 66 % beside a delay of 30 ms")
+
 
 @pytest.fixture(scope="module")
 def calibrated(shared: Path) -> ReferenceMap:
@@ -81,7 +84,7 @@ def test_with_the_missing_effect_added_maps_and_free_run_are_those_of_a_sound_ma
 ) -> None:
     """A leak (05) and a delay (08): maps 0.02 to 0.06 % off, 1 to 5 % without; beta of 700 MPa.
 
-    The free run on unseen motion fits to 97 %; without the effect to -202 % and to 53 % at worst.
+    The free run on unseen motion fits to 97 %.
     """
     project, run = (
         tmp_path / "rig.toml",
@@ -99,4 +102,13 @@ def test_with_the_missing_effect_added_maps_and_free_run_are_those_of_a_sound_ma
     assert (new.equation.residual_share < 0.005).all()
     assert (old.equation.residual_share > 0.02).all()
     assert (new.simulations[FREE_RUN].fit_percent > 95.0).all()
-    assert old.simulations[FREE_RUN].fit_percent.min() < 60.0
+
+
+@pytest.mark.long
+@pytest.mark.slow
+@pytest.mark.parametrize("number", ["05", pytest.param("08", marks=NO_WORSE)])
+def test_without_the_effect_a_free_run_is_worse_than_a_constant(shared: Path, number: str) -> None:
+    """-202 % at worst beside a leak that nobody has told the model of."""
+    run = shared / "data" / "rig" / "measured" / f"rig_{number}.parquet"
+    examined = study(replay(load(PROJECT), run)).held[0].examinations["validation"]
+    assert examined.simulations[FREE_RUN].fit_percent.min() < 0.0

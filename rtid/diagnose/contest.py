@@ -108,10 +108,10 @@ def its_turn(
     chosen, alike = contest(state, present, best, trials, finished)
     if chosen.key not in refuted or best.key not in alike:
         return chosen, alike
-    better = (chosen.key,) if refuted[chosen.key] else ()
+    beside = tuple(key for key in (chosen.key, *alike) if refuted.get(key))
     rest = [t for t in trials if t.key not in refuted]
     chosen, alike = contest(state, present, best, rest, finished)
-    return chosen, (*alike, *better)
+    return chosen, (*alike, *beside)
 
 
 def _as_late(state: TrialState, present: Fit, trials: list[Trial]) -> list[Trial]:

@@ -135,8 +135,8 @@ def _leave(a: FloatArray, new: FloatArray, felt: FloatArray, d: FloatArray) -> N
 
 
 @inlined
-def _of(v: int, w: int) -> int:
-    """Number of the pair of block v and one that is not behind it."""
+def _place(v: int, w: int) -> int:
+    """Where the pair of a block v and one w <= v lies."""
     return v * (v + 1) // 2 + w
 
 
@@ -177,15 +177,15 @@ def _meet(
         for p in range(TERMS):
             both[p] = m0 * new[w, p] + m1 * new[w, TERMS + p]
         if w < v:
-            _outer(pairs[_of(v, w)], t, both)
+            _outer(pairs[_place(v, w)], t, both)
         elif w > v:
-            _outer(pairs[_of(w, v)], both, t)
+            _outer(pairs[_place(w, v)], both, t)
         else:
             half = 0.5 * (m0 * s[0] + m1 * s[1])
             for p in range(TERMS):
                 both[p] += half * t[p]
-            _outer(pairs[_of(v, v)], t, both)
-            _outer(pairs[_of(v, v)], both, t)
+            _outer(pairs[_place(v, v)], t, both)
+            _outer(pairs[_place(v, v)], both, t)
     f0, f1 = way[0, 0] * m0 + way[1, 0] * m1, way[0, 1] * m0 + way[1, 1] * m1
     for p in range(TERMS):
         felt[v, p] += f0 * t[p]
@@ -201,9 +201,9 @@ def _ring(v: int, f: FloatArray, live: IntArray, d: FloatArray, pairs: FloatArra
         w = live[n]
         d_w = d[w]
         if w <= v:
-            _twice(pairs[_of(v, w)], f, d_w)
+            _twice(pairs[_place(v, w)], f, d_w)
         if w >= v:
-            _twice(pairs[_of(w, v)], d_w, f)
+            _twice(pairs[_place(w, v)], d_w, f)
 
 
 @inlined
@@ -256,7 +256,7 @@ def laid_out(pairs: FloatArray, first: IntArray, gram: FloatArray) -> None:
     first (V + 1,): place of each block's first term; those behind its last one are left out.
     """
     for v in range(len(first) - 1):
-        of_v = _of(v, 0)
+        of_v = _place(v, 0)
         for p in range(first[v + 1] - first[v]):
             row = gram[first[v] + p]
             for w in range(v + 1):

@@ -33,7 +33,7 @@ FLAGS = [
 SIZE = {"width": 1366, "height": 768}
 SEED, DURATION_S = 3, 40.0
 UNTOUCHED = "untouched.toml"  # a copy of the project, to which the workbench's tests save
-PATIENCE_MS = 240_000  # cold kernels on a loaded machine: 120 s were too few beside a whole run
+PATIENCE_MS = 120_000  # cold kernels on a loaded machine
 COOKIES: dict[str, list[Any]] = {}  # of the browser that has opened an address
 
 

@@ -154,5 +154,9 @@ def test_what_is_not_told_from_a_refuted_one_has_its_turn(by_form: bool, beside:
     refuted = {air.key: by_form}
     chosen, alike = its_turn(state(), present(5000), gas, [air, gas, far], {}, refuted)
     assert chosen.key == gas.key and set(alike) == beside
+    line = trial("line", 990, 1.0)
+    both = [air, line, gas, far]
+    _, alike = its_turn(state(), present(5000), gas, both, {}, refuted | {line.key: True})
+    assert set(alike) == beside | {line.key}, "each of them that its own form alone refutes"
     chosen, _ = its_turn(state(), present(5000), far, [air, gas, far], {}, refuted)
     assert chosen.key == air.key, "one that is told from it has none"

@@ -122,6 +122,22 @@ def test_covariances_are_blocks_of_the_inverse() -> None:
         assert np.abs((cov - inverse[at, at]) / size).max() < 1e-5
 
 
+@pytest.mark.parametrize("motion", ["rich", "sweep"])
+def test_what_is_left_out_tells_next_to_nothing_beside_the_prior(motion: str) -> None:
+    """With all that rings on: products of the directions without a say, of whole maps."""
+    model, chunk, _ = record(motion=motion)
+    rows = rows_of(model, chunk[:8000], nominal_weights(model))
+    directions, _ = rows.told
+    whole = dense(rows)
+    maps = whole.T @ whole
+    count, most = np.diff(directions.first), []
+    for v in np.flatnonzero(count < TERMS):
+        at = slice(TERMS * v, TERMS * (v + 1))
+        rest = directions.basis[v][:, count[v] :]
+        most.append(np.linalg.eigvalsh(rest.T @ maps[at, at] @ rest)[-1] * PRIOR_SD**2)
+    assert most and max(most) < 1e-5
+
+
 def test_a_factor_that_was_let_go_is_made_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     """A large one; of a small one nobody's memory is short."""
     model, chunk, _ = record()

@@ -9,11 +9,14 @@ import pytest
 
 from rtid.compare.comparison import Comparison, Intervals
 from rtid.compare.dependence import Dependence, against_signals, by_direction, over_time
-from rtid.diagnose.remains import BANDS_HZ, Remainder, _how_fast, _way, _when, bands
+from rtid.diagnose import remains
+from rtid.diagnose.remains import BANDS_HZ, Remainder, _how_fast, _way, _when, bands, remainder
+from rtid.diagnose.standing import fitted
 from rtid.sim.declare import declared_model
 from rtid.sim.simulated_plant import SimulatedPlant
 from rtid.tell.charts.evidence import left_over
 from rtid.tell.stills import draw
+from tests.diagnose.records import record
 
 RATE_HZ = 50.0
 
@@ -99,3 +102,16 @@ def few_rows() -> Comparison:
         modelled_m3s=values[:, 2:], cell=np.zeros((n, 4), np.int64), shares={}, rho=np.ones(2),
         signals=rng.standard_normal((n, len(model.signals))), intervals=empty,
     )  # fmt: skip
+
+
+def test_a_record_whose_map_is_hardly_known_is_described_by_all_of_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Whole seconds of it instead of nine rows."""
+    present = fitted(*record("", 0.0, 3, "sweep")[:2])
+    monkeypatch.setattr(remains, "can_judge", lambda _: True)
+    known = remainder(present)
+    monkeypatch.setattr(remains, "can_judge", lambda _: False)
+    whole = remainder(present)
+    assert known is not None and whole is not None
+    assert whole.time.rows.sum() > known.time.rows.sum()

@@ -7,22 +7,22 @@ import subprocess
 import sys
 from pathlib import Path
 
-SIZES = [
+SIZES = (
     "--projects",
-    "8",
+    "16",
     "--dbcs",
-    "6",
-    "--nodes",
-    "4",
-    "--logs",
-    "15",
-    "--tables",
     "12",
+    "--nodes",
+    "8",
+    "--logs",
+    "30",
+    "--tables",
+    "24",
     "--plants",
-    "5",
+    "10",
     "--bombs",
     "0",
-]
+)
 
 
 def test_a_sample_of_the_fuzz_finds_nothing(tmp_path: Path) -> None:
