@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 import numpy as np
 
 from rtid.diagnose.commands import change_of, half_of
+from rtid.diagnose.regression import Estimate
 from rtid.diagnose.revision import Revision
 from rtid.effects.column import Candidate, Cause, Columns
 from rtid.effects.law import Shape, Volumes
@@ -84,15 +85,42 @@ def _slower(view: RecordView, lag_s: float) -> dict[str, FloatArray]:
 
 
 def add_shapes(view: RecordView, columns: Columns, revision: Revision) -> Iterator[tuple[int, int]]:
-    """Derivative columns of the nonlinear parameters of effects, but for those at a bound."""
+    """Derivative columns of the nonlinear parameters of effects, but for those that are none, 0.
+
+    At an end of its range one may still point back (`pointing_out`): air that was scored beside an
+    oil as it was bent stood at the end of its exponents, and had no way to the 1.2 of the truth.
+    """
     for e, effect in enumerate(revision.effects):
         cause = cause_of(view, effect)
         for k, value in enumerate(effect.shape):
             low, high = cause.bounds(k)
-            slope = cause.slope(effect.shape, k) if low < value < high else {}
+            slope = cause.slope(effect.shape, k) if value != 0.0 or low < value < high else {}
             if any(np.any(series != 0.0) for series in slope.values()):
                 columns.add(slope)
                 yield e, k
+
+
+def pointing_out(
+    view: RecordView,
+    revision: Revision,
+    shapes: tuple[tuple[int, int], ...],
+    first: int,
+    sizes: list[int],
+    estimate: Estimate,
+) -> set[int]:
+    """Columns of nonlinear parameters at an end of their range that an estimate takes beyond it.
+
+    shapes: as of a fit, in columns from first on; sizes: the columns of the effects.
+    """
+    out = set()
+    for column, (e, k) in enumerate(shapes, first):
+        effect = revision.effects[e]
+        low, high = cause_of(view, effect).bounds(k)
+        ways = [way for end, way in ((low, -1.0), (high, 1.0)) if effect.shape[k] == end]
+        if ways and column in estimate.used:
+            moved = estimate.value(column) * estimate.value(sizes[e])
+            out |= {column for way in ways if moved * way >= 0.0}
+    return out
 
 
 def _at_spools(view: RecordView) -> dict[str, tuple[int, FloatArray]]:

@@ -168,13 +168,13 @@ def exact_trials(
     timings, coarse = [*_behind_openings(present, timings)], state.coarse.beside(present)
     present.unfactored().at_rest()
     gains = _from_afar(coarse, timings, other, hints, anywhere)
-    most = max([other, *(gain for gain, _, _ in gains)])
+    most = max([other, *(gain for gain, *_ in gains)])
     trials: dict[Key, Trial] = {}
-    for gain, timing, psi in gains:
+    for gain, timing, psi, lag_s in gains:
         if gain < CLOSE * most:
             continue
         revision = replace(present.revision, timings=(*present.revision.timings, (timing, psi)))
-        weights = coarse.weights(((timing, psi),), present.weights)
+        weights = coarse.weights(((timing, psi),), present.weights, lag_s)
         now = tried(state.model, state.chunk, weights, revision)
         if not (anywhere or is_inside(now)):
             continue
@@ -225,26 +225,32 @@ def _from_afar(
     other: float,
     hints: Mapping[Key, float],
     anywhere: bool,
-) -> list[tuple[float, TimingLaw, Psi]]:
-    """Gain and parameters of every timing that is promising from afar, or of all; one a name.
+) -> list[tuple[float, TimingLaw, Psi, float]]:
+    """Gain, parameters and the lag beside every timing that is promising from afar; one a name.
 
-    The gain is over the fit as it is, with the lag that it has found.
+    anywhere: of all.  The gain is over the fit as it is, with the lag that it has found.
     A lag may be before or behind the opening curve: from so far that cannot be told.
     """
     banks = {timing: coarse.bank(timing, hints.get(key_of(timing), 0.0)) for timing in timings}
     ahead = 0.0 if anywhere else coarse.ahead
-    bar = PROMISING * max([other, *(max(bank.values()) - ahead for bank in banks.values())])
-    best: dict[tuple[Key, bool], tuple[float, TimingLaw, Psi]] = {}
+    seen = {timing: _best_of(coarse, timing, bank) - ahead for timing, bank in banks.items()}
+    bar = PROMISING * max([other, *seen.values()])
+    best: dict[tuple[Key, bool], tuple[float, TimingLaw, Psi, float]] = {}
     for timing, bank in banks.items():
-        seen = max(bank.values()) - ahead
-        if not anywhere and (seen < bar or seen <= 0.0):
+        if not anywhere and (seen[timing] < bar or seen[timing] <= 0.0):
             continue
-        psi, gain = coarse.closed_in(timing, bank)
+        psi, lag_s, gain = coarse.shared(timing, *coarse.closed_in(timing, bank))
         gain -= ahead
         form = key_of(timing), DEAD_BAND in timing.parameters
         if form not in best or gain > best[form][0]:
-            best[form] = gain, timing, psi
+            best[form] = gain, timing, psi, lag_s
     return list(best.values())
+
+
+def _best_of(coarse: Beside, timing: TimingLaw, bank: Mapping[float, float]) -> float:
+    """The largest gain of a bank of strengths from 0 on, alone or with the lag of the fit."""
+    strength = max(list(bank)[1:], key=lambda x: bank[x])
+    return coarse.shared(timing, timing.at(strength), bank[strength])[2]
 
 
 def is_inside(now: Fit) -> bool:

@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from rtid.diagnose.bank import columns_of
+from rtid.diagnose.bank import columns_of, pointing_out
 from rtid.diagnose.commands import behind, commands, transformed
 from rtid.diagnose.equations import regression_of, softened
 from rtid.diagnose.evidence import Heading, Rows, project, rows_of
@@ -230,8 +230,8 @@ class Fit:
     def shape_columns(self, effect: Candidate) -> dict[int, int]:
         """Columns of an effect's nonlinear parameters that are free, by their number."""
         at = self.revision.effects.index(effect)
-        first = self.first - len(self.shapes)
-        return {k: first + j for j, (e, k) in enumerate(self.shapes) if e == at}
+        columns = enumerate(self.shapes, self.first - len(self.shapes))
+        return {k: j for j, (e, k) in columns if e == at and j in self.estimate.used}
 
 
 def prepare(model: Machine, chunk: FloatArray) -> Weights:
@@ -319,7 +319,9 @@ def one_pass(
     regression.prior[at] += regression.own[at] == 0.0  # what never acts here is held at nothing
     whole = [column for column, e in zip(at, revision.effects, strict=True) if e.is_whole]
     regression.prior[whole], regression.mean[whole] = WHOLLY, 1.0
-    estimate = regression.fit((*range(1, first), *at))
+    estimate, open_ = regression.fit((*range(1, first), *at)), (first - len(shapes), at)
+    while out := pointing_out(view, revision, shapes, *open_, estimate):
+        estimate = regression.fit(tuple(k for k in estimate.used if k not in out))
     fixed = regression.fit((*range(1, 1 + len(model.chambers)), *at))
     flowmap = MapTerms(rows.cells, projected.terms(list(fixed.used), fixed.theta), NO_COV)
     parts = chunk, weights, revision, before, columns, regression, estimate, fixed

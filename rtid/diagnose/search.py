@@ -30,6 +30,8 @@ KEPT = 0.995  # of the rows that must stay on the grids: what is left out cannot
 CLOSING = 3  # refits between the neighbours of the best of the bank
 FOUND = 0.02  # share of a parameter within which it is found well enough from afar
 OFF = 0.05  # share of a bracket that a trial stays off its ends
+# of what the lag of a fit and a timing beside the declared one have taken: each beside the other's
+SHARED = ((0.25, 0.75), (0.5, 0.5), (0.75, 0.25), (1.0, 1.0))
 
 
 def coarse(model: Machine) -> Machine:
@@ -106,22 +108,42 @@ class Beside:
         ]
         self.most_rows = 0
         self.before = self.cost(())
-        self.ahead = 0.0
-        if fit.weights.lag_s != search.lag_s:
-            self.ahead = max(0.0, self.before - self._solved((), fit.weights.lag_s)[0])
+        self.ahead, self.fitted_s = 0.0, fit.weights.lag_s
+        if self.fitted_s != search.lag_s:
+            self.ahead = max(0.0, self.before - self.cost((), self.fitted_s))
 
-    def cost(self, more: Timings) -> float:
-        """Residual sum of squares with more timings; inf where they lose rows."""
-        return self._solved(more)[0]
+    def cost(self, more: Timings, lag_s: float | None = None) -> float:
+        """Residual sum of squares with more timings; inf where they lose rows.
 
-    def weights(self, more: Timings, like: Weights) -> Weights:
+        lag_s: of the spools, s, where it is not the declared one.
+        """
+        return self._solved(more, lag_s)[0]
+
+    def shared(self, timing: TimingLaw, psi: Psi, gain: float) -> tuple[Psi, float, float]:
+        """A timing that is found beside the declared lag, a lag in s, and the gain with both.
+
+        The best of those in which the timing and the lag of the fit share what each takes alone.
+        """
+        declared_s, strength = self.search.lag_s, timing.strength(psi)
+        best = psi, declared_s, gain
+        if not self.ahead or timing.replaces_lag:
+            return best
+        for of_lag, of_timing in SHARED:
+            part = timing.at(of_timing * strength)
+            lag_s = declared_s + of_lag * (self.fitted_s - declared_s)
+            gain = self.before - self.cost(((timing, part),), lag_s)
+            if gain > best[2]:
+                best = part, lag_s, gain
+        return best
+
+    def weights(self, more: Timings, like: Weights, lag_s: float) -> Weights:
         """Those like others, with the lag and the compliances beside which more timings were found.
 
         A delay that is missing bends the modulus by more than rows may be weighed apart, and had
         the lag stand for a part of it: both at once left 447,893 of chi2 where nothing left 97,557.
         """
-        theta, n_c = self._solved(more)[1], len(self.search.model.chambers)
-        like = replace(like, lag_s=self.search.lag_s)
+        theta, n_c = self._solved(more, lag_s)[1], len(self.search.model.chambers)
+        like = replace(like, lag_s=lag_s)
         if not self.search.model.has_pressures or len(theta) < n_c:
             return like
         low, high = sorted(1.0 / bound for bound in self.search.model.beta_bounds_pa)
@@ -129,10 +151,7 @@ class Beside:
         return replace(like, compliance=np.clip(compliance, low, high))
 
     def _solved(self, more: Timings, lag_s: float | None = None) -> tuple[float, FloatArray]:
-        """The cost with more timings, and the coefficients of compliances and effects.
-
-        lag_s: of the spools, s, where it is not the declared one.
-        """
+        """The cost with more timings, and the coefficients of compliances and effects."""
         search, timings = self.search, (*self.timings, *more)
         weights = search.weights
         sent = search.sent(timings, search.lag_s if lag_s is None else lag_s)
@@ -153,6 +172,8 @@ class Beside:
         """Gains by strength, from the slightest value of the bank on, or from a hint below it.
 
         They rise towards the truth and fall behind it: two falls in a row, or a deep one, end it.
+        What stands in the place of a declared lag begins where there is none, which is far below
+        it: neither that is a fall, nor how deep the others are.
         """
         costs, falls = {0.0: 0.0}, 0
         strengths = sorted(timing.strength(psi) for psi in timing.bank)
@@ -161,8 +182,9 @@ class Beside:
         for strength in strengths:
             costs[strength] = self.gain(timing, timing.at(strength))
             *_, second, third = costs.values()
-            falls = falls + 1 if third < second else 0
-            if falls == 2 or third < -max(costs.values()):
+            is_first = timing.replaces_lag and len(costs) == 2
+            falls = falls + 1 if third < second and not is_first else 0
+            if falls == 2 or (not timing.replaces_lag and third < -max(costs.values())):
                 break
         return costs
 

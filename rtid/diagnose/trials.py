@@ -109,6 +109,11 @@ class TrialState:
             ruled_out=set(),
         )  # fmt: skip
 
+    def begin(self, model: Machine) -> None:
+        """Begin anew on other grids."""
+        self.model, self._coarse = model, None
+        self.found, self.negligible, self.ruled_out = [], {}, set()
+
     def left(self, fit_: Fit, leave_out: Candidate | None = None) -> Residual:
         """What a fit leaves of the part that judges; leave_out: an effect that is not counted."""
         return residual(fit_, self.held_out, leave_out, self.judges_itself)

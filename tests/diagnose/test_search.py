@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 from scipy.signal import savgol_filter
 
+from rtid.diagnose.exact import exact_trials
 from rtid.diagnose.fit import fit, one_pass, prepare, tried
 from rtid.diagnose.moving import SIZED
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.search import Search
+from rtid.diagnose.standing import stand
 from rtid.diagnose.thinned import Thinning
+from rtid.effects.laws.sensors import sensor_timings
 from rtid.effects.laws.timing import TIMINGS, TimingLaw
 from rtid.effects.record_view import RecordView
 from rtid.kernels.engine import GAP_FLAG
@@ -67,7 +70,7 @@ def test_a_late_command_is_closed_in_on() -> None:
     assert psi[0] == pytest.approx(12e-3, rel=0.03)
     assert gain > 1.2 * max(beside.bank(play).values())
     alone = tried(model, chunk, fit.weights, Revision((), ((delay, psi),)))
-    weights = beside.weights(((delay, psi),), fit.weights)
+    weights = beside.weights(((delay, psi),), fit.weights, beside.search.lag_s)
     assert weights.compliance == pytest.approx(alone.compliance, rel=SIZED)  # no second pass
     assert not np.allclose(fit.weights.compliance, alone.compliance, rtol=SIZED, atol=0.0)
 
@@ -82,7 +85,7 @@ def test_a_lag_that_has_stood_for_the_delay_is_not_counted_beside_it() -> None:
     fit = one_pass(model, chunk, bent, Revision(), None, False, thorough=False)
     delay = timing("input_delay")
     late = ((delay, (12e-3,)),)
-    begun = Search(model, chunk).beside(fit).weights(late, bent)
+    begun = Search(model, chunk).beside(fit).weights(late, bent, weights.lag_s)
     assert begun.lag_s == weights.lag_s
     found, double = (tried(model, chunk, w, Revision((), late)) for w in (begun, bent))
     assert found.rho < 1.5 and double.rho > 5.0 * found.rho
@@ -133,3 +136,42 @@ def test_a_timing_must_gain_what_the_lag_of_the_fit_has_gained_already() -> None
     assert 0.0 < late < 1.2 * beside.ahead
     known = replace(present, weights=replace(present.weights, lag_s=beside.search.lag_s))
     assert Search(blind, chunk).beside(known).ahead == 0.0
+
+
+def test_a_late_position_and_a_lag_that_nobody_has_declared_are_told_apart() -> None:
+    """The lag of the fit is the sum of both, which gains more than the position alone: it was not
+    refitted, and named a dead volume.  Shared by both it gains what neither does.
+    """
+    late_s = 2e-3
+    model, chunk, held_out = record("position_sensor_delay", late_s)
+    nobody = replace(model, lag=Lag(0.0, 5e-3))
+    standing = stand(nobody, chunk, held_out)
+    law = next(t for t in sensor_timings(nobody) if t.effect == "position_sensor_delay")
+    beside = standing.state.coarse.beside(standing.fit)
+    psi, gain = beside.closed_in(law, beside.bank(law))
+    part, lag_s, more = beside.shared(law, psi, gain)
+    assert more - beside.ahead > 1.2 * (gain - beside.ahead)
+    assert 0.0 < part[0] < psi[0] and 0.0 < lag_s < beside.fitted_s
+    (trial,) = exact_trials(standing.state, standing.fit, [law])
+    ((_, found),) = trial.revision.timings
+    assert trial.fit is not None
+    assert found[0] + trial.fit.estimate.value(trial.fit.timing_columns(0)[0]) == pytest.approx(
+        late_s, rel=0.1
+    )
+
+
+def test_a_spool_of_second_order_is_looked_for_in_the_place_of_a_slow_declared_lag() -> None:
+    """The bank began at 800 rad/s, which gains less than a declared lag of 5 ms, and ended there:
+    a spool of 157 rad/s was named a delay, or a lag of first order.
+    """
+    radps = 157.0
+    model, chunk, _ = record("spool_lag_second_order", radps)
+    slow = replace(model, lag=Lag(8e-3, 1e-3))
+    present = fit(slow, chunk, prepare(slow, chunk), Revision(), bank=False)
+    beside = Search(slow, chunk).beside(present)
+    law = timing("spool_lag_second_order")
+    bank = beside.bank(law)
+    assert list(bank.values())[1] < 0.0
+    psi, gain = beside.closed_in(law, bank)
+    assert psi[0] == pytest.approx(radps, rel=0.1)
+    assert gain > 0.0
