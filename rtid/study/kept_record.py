@@ -6,8 +6,10 @@ the one fit of the part that teaches, with the maps of the record beside it.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,7 +20,7 @@ from rtid.errors import RtidError
 from rtid.estimator.chunk import to_chunk
 from rtid.estimator.estimator import Estimator
 from rtid.estimator.flowmap import FlowMap
-from rtid.estimator.noise import estimate_noise
+from rtid.estimator.noise import NoiseEstimate, estimate_noise
 from rtid.estimator.record import RecordFit, fit_record
 from rtid.maps.prior_map import find_prior, published
 from rtid.model import Machine, Signal
@@ -31,6 +33,9 @@ from rtid.trace.reading import AT_ONCE, NoSamplesError, Trace, assemble, whole
 
 if TYPE_CHECKING:
     from rtid.study.known_effects import KnownEffect
+
+
+NOTHING: Mapping[str, NoiseEstimate] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -101,21 +106,29 @@ def through_bus(
     return learner.estimator
 
 
-def model_for(project: Project, samples: Samples) -> Machine:
-    """The declared model, with the sensor noise that the file leaves to be estimated."""
+def model_for(
+    project: Project, samples: Samples, own: Mapping[str, NoiseEstimate] = NOTHING
+) -> Machine:
+    """The declared model, with the sensor noise that the file leaves to be estimated.
+
+    own: the noise at the instants at which signals were measured, where those are known.
+    """
     if not project.noise_unknown:
         return project.model
-    signals = project.model.signals
-    noise = {s.name: _white_noise(samples, s) for s in signals if s.name in project.noise_unknown}
-    return project.model_with(noise)
+    signals = [s for s in project.model.signals if s.name in project.noise_unknown]
+    return project.model_with({s.name: _white_noise(samples, s, own.get(s.name)) for s in signals})
 
 
-def _white_noise(samples: Samples, signal: Signal) -> float:
-    """Noise of one signal beside its quantisation, which the model counts separately."""
+def _white_noise(samples: Samples, signal: Signal, own: NoiseEstimate | None) -> float:
+    """Noise of one signal beside its quantisation, which the model counts separately.
+
+    By the samples alone one that is read off a line between two messages has none: healthy logs
+    of messages at their own instants left rho 50.
+    """
     values = samples.column(signal.name)
     if signal.resolution and len(values) and np.ptp(values) < signal.resolution:
         return 0.0  # it stays within one step
-    result = estimate_noise(1e-6 * samples.t_us, values)
+    result = own or estimate_noise(1e-6 * samples.t_us, values)
     if not np.isfinite(result.relative_sd):
         raise NoSamplesError(
             f"{len(samples)} samples do not tell the noise of {signal.name}",

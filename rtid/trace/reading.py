@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -18,12 +19,15 @@ from firmware_bridge.sources import open_file, open_log
 from firmware_bridge.sources.table import Table, to_samples
 from rtid.errors import RtidError, door
 from rtid.estimator.chunk import to_chunk
+from rtid.estimator.noise import NoiseEstimate, estimate_noise
 from rtid.model import Machine
 from rtid.plain import FloatArray
 from rtid.project import Project
 from rtid.trace.described import catalog_of
 from rtid.trace.measured import with_sums
 from rtid.trace.neutral import about_neutral
+from rtid.trace.own_instants import of_log, of_table, wanted
+from rtid.trace.series import Series
 from rtid.trace.spikes import without_spikes
 from rtid.trace.table import declared
 
@@ -52,12 +56,16 @@ class Log:
 
 @dataclass(frozen=True)
 class Trace:
-    """What a trace yields: complete samples, refusals by reason, and its log (None: a table)."""
+    """What a trace yields: complete samples, refusals by reason, and its log (None: a table).
+
+    noise: of signals that have none declared, at the instants at which they were measured.
+    """
 
     path: Path
     samples: Samples
     counters: dict[str, int]
     log: Log | None
+    noise: Mapping[str, NoiseEstimate] = field(default_factory=dict)
 
     @property
     def frames(self) -> Frames | None:
@@ -90,13 +98,25 @@ def read_trace(project: Project, path: str | Path) -> Trace:
     path = Path(path)
     content = open_file(path)
     if isinstance(content, Table):
-        samples, counters = whole(project, *to_samples(*declared(project, content)))
+        table, assembly = declared(project, content)
+        samples, counters = whole(project, *to_samples(table, assembly))
         samples = with_sums(project, about_neutral(project, samples))
-        return _not_empty(Trace(path, samples, counters, None), project)
-    samples, counters = whole(project, *assemble(catalog_of(project), project.assembly, content))
+        noise = _noise(project, of_table(table, assembly))
+        return _not_empty(Trace(path, samples, counters, None, noise), project)
+    catalog, assembly = catalog_of(project), project.assembly
+    samples, counters = whole(project, *assemble(catalog, assembly, content))
     samples = with_sums(project, samples)
-    trace = _not_empty(Trace(path, samples, counters, Log(path, content)), project)
+    noise = _noise(project, of_log(wanted(content, assembly, catalog), assembly, catalog))
+    trace = _not_empty(Trace(path, samples, counters, Log(path, content), noise), project)
     return _within_chunk(trace, project.model)
+
+
+def _noise(project: Project, series: Iterable[Series]) -> dict[str, NoiseEstimate]:
+    """The noise of signals that have none declared."""
+    if not project.noise_unknown:
+        return {}
+    asked = (s for s in series if s.name in project.noise_unknown)
+    return {s.name: estimate_noise(1e-6 * s.t_us, s.value) for s in asked}
 
 
 def whole(

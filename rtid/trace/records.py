@@ -87,7 +87,7 @@ def read_records(project: Project, paths: Sequence[Path]) -> tuple[Trace, tuple[
         spans.append(RecordSpan(trace.path, 1e-6 * start_us, 1e-6 * float(t_us[-1]), is_judging))
         start_us = int(t_us[-1]) + round(1e6 * BETWEEN_S)
         add_counts(counters, trace.counters)
-    return Trace(traces[0].path, join(parts), counters, None), tuple(spans)
+    return Trace(traces[0].path, join(parts), counters, None, traces[0].noise), tuple(spans)
 
 
 def with_spans(project: Project, spans: Sequence[RecordSpan]) -> Project:
