@@ -107,19 +107,21 @@ def through_bus(
 
 
 def model_for(
-    project: Project, samples: Samples, own: Mapping[str, NoiseEstimate] = NOTHING
+    project: Project, samples: Samples, measured: Mapping[str, NoiseEstimate] = NOTHING
 ) -> Machine:
     """The declared model, with the sensor noise that the file leaves to be estimated.
 
-    own: the noise at the instants at which signals were measured, where those are known.
+    measured: the noise at the instants at which signals were measured, where those are known.
     """
     if not project.noise_unknown:
         return project.model
     signals = [s for s in project.model.signals if s.name in project.noise_unknown]
-    return project.model_with({s.name: _white_noise(samples, s, own.get(s.name)) for s in signals})
+    return project.model_with(
+        {s.name: _white_noise(samples, s, measured.get(s.name)) for s in signals}
+    )
 
 
-def _white_noise(samples: Samples, signal: Signal, own: NoiseEstimate | None) -> float:
+def _white_noise(samples: Samples, signal: Signal, measured: NoiseEstimate | None) -> float:
     """Noise of one signal beside its quantisation, which the model counts separately.
 
     By the samples alone one that is read off a line between two messages has none: healthy logs
@@ -128,7 +130,7 @@ def _white_noise(samples: Samples, signal: Signal, own: NoiseEstimate | None) ->
     values = samples.column(signal.name)
     if signal.resolution and len(values) and np.ptp(values) < signal.resolution:
         return 0.0  # it stays within one step
-    result = own or estimate_noise(1e-6 * samples.t_us, values)
+    result = measured or estimate_noise(1e-6 * samples.t_us, values)
     if not np.isfinite(result.relative_sd):
         raise NoSamplesError(
             f"{len(samples)} samples do not tell the noise of {signal.name}",
