@@ -6,6 +6,7 @@ orifice  q = K dp / sqrt(|dp| + dp_t)                       sharp edge, laminar 
 relief   q = k (d + sqrt(d^2 + w^2)) / 2, d = P - P_open    a poppet with a soft knee
 mixture  1 / beta_c = (V_gas / (kappa P) + V_oil / beta) / (V_gas + V_oil),
          V_gas = share (p0 / P)^(1/kappa), V_oil = (1 - share) exp(-(P - p0) / beta)
+oil      beta (1 + s P) in place of beta
 hose     pi section: (V_h / 2 beta) dP_port/dt = valves - q,  I dq/dt = P_port - P_c - R q - r q|q|
 pump     P_s = P_set - D,  C(P_s) dD/dt = flow drawn - Q_p tanh(D / (R Q_p)), C of an accumulator
 """
@@ -164,7 +165,7 @@ def extra_valve_flows(
 @compiled
 def compressibility(c: Constants, e: Any, r: Any, p_pa: float) -> float:
     """1 / beta_c of oil with free and released gas at the absolute pressure, 1/Pa."""
-    oil = 1.0 / c.beta_pa
+    oil = 1.0 / (c.beta_pa * (1.0 + e.whole.stiffening * p_pa))
     if e.whole.air_share > 0.0:
         gas = e.whole.air_share * (ATMOSPHERE_PA / p_pa) ** (1.0 / POLYTROPIC)
         liquid = (1.0 - e.whole.air_share) * math.exp(-(p_pa - ATMOSPHERE_PA) * oil)

@@ -39,6 +39,7 @@ class Extra(NamedTuple):
     gain_swing: float = 0.0  # relative amplitude
     # storage
     air_share: float = 0.0  # of the volume at atmospheric pressure
+    stiffening: float = 0.0  # of the oil's modulus, as a share of it per Pa
     released: Pair = NO_PAIR  # share of the volume that boils out of the oil below `release_pa`
     release_pa: Pair = NO_PAIR
     dead_volume_m3: Pair = NO_PAIR

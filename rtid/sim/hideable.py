@@ -204,6 +204,8 @@ _CATALOGUE = (
      (2e-12, 6e-12, 18e-12), ANYWHERE, _number("groove")),
     ("load_compensated_valve", "the flow's share that saturates above 0.2 MPa, as at 2 MPa",
      (0.1, 0.3, 0.9), (*VALVES, ""), _at("compensated", EDGES)),
+    ("oil_stiffening", "modulus that rises in a straight line with the absolute pressure",
+     (3e-9, 9e-9, 27e-9), ANYWHERE, _number("stiffening")),
 )
 _VARIANTS = (
     ("line_dynamics_seen_at_valve", "as line_dynamics; sensors at the valves' end",
