@@ -88,7 +88,9 @@ def verdict(
         return MATCHES if last.rho < last.most_rho and not doubted else UNKNOWN
     # a rate without pressures is disturbed by whatever moves the machine: unseen data have judged
     doubtful = last.declared.has_pressures and last.rho >= last.most_rho
-    if doubtful and explained(state, last) < NAMED:
+    # nor is a cause told that leaves a misfit and an oil that cannot be: hum was named a line
+    is_impossible = any(doubt.is_invalid for doubt in doubted)
+    if doubtful and (is_impossible or explained(state, last) < NAMED):
         return INSUFFICIENT if state.judges_itself else UNKNOWN
     return AMBIGUOUS if any(f.alike for f in state.found[:1]) else MISSING
 

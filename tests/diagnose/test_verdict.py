@@ -15,6 +15,10 @@ from rtid.diagnose.diagnosis import search
 from rtid.diagnose.excuse import counted
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.report import Diagnosis, diagnosis
+from rtid.diagnose.residual import Residual
+from rtid.diagnose.standing import Standing, stand
+from rtid.diagnose.trials import AcceptedEffect
+from rtid.estimator.validity import Doubt
 from rtid.plain import FloatArray
 from rtid.sim.hidden import hide
 from rtid.sim.random_plants import draw
@@ -153,3 +157,27 @@ def test_the_grid_is_looked_at_again_beside_what_was_found() -> None:
     assert found.verdict == "missing"
     assert found.named == "valve_gain_drift"
     assert abs(found.size_z) < 3.0
+
+
+def test_a_cause_beside_an_oil_that_cannot_be_and_a_misfit_is_not_named() -> None:
+    """A hum of 50 Hz was named a line, beside -5600 MPa of oil and rho 11."""
+    standing, after, leak = _leaking()
+    state, present = standing.state, standing.fit
+    state.found, state.excess = [leak], 10.0 * (present.held.sse - present.regression.dof)
+    assert present.rho >= present.most_rho
+    impossible = Doubt("beta_b", True, "negative for certain", "look at the sensors")
+    contradicts = replace(impossible, is_invalid=False)
+    said = [
+        verdicts.verdict(state, present, present, after, doubts)
+        for doubts in ((), (contradicts,), (impossible,))
+    ]
+    assert said == [verdicts.MISSING, verdicts.MISSING, verdicts.UNKNOWN]
+
+
+def _leaking() -> tuple[Standing, Residual, AcceptedEffect]:
+    """A machine that leaks, as it stands, what it leaves, and a cause that took most of more."""
+    model, chunk, held_out = record("internal_leakage_laminar", 2e-12)
+    standing = stand(model, chunk, held_out)
+    left = standing.identification
+    key = "internal_leakage_laminar", "a-b"
+    return standing, left, AcceptedEffect(key, (), 1e4, 1, left, left)
