@@ -47,7 +47,9 @@ from rtid.study.kept_record import MessageAges, Replay, taught_s, within
 from rtid.trace.reading import Trace
 
 ALL = (-math.inf, math.inf)
-ALONE = 1e-4  # share by which the terms of one effect may differ from each other
+# share by which the terms of one effect may differ from each other; a hundredth of a per cent,
+# beside a compliance that nothing tells, was more than a factor has digits for (air on a sweep)
+ALONE = 1e-3
 
 
 class TooManyEffectsError(RtidError):

@@ -181,3 +181,12 @@ def _leaking() -> tuple[Standing, Residual, AcceptedEffect]:
     left = standing.identification
     key = "internal_leakage_laminar", "a-b"
     return standing, left, AcceptedEffect(key, (), 1e4, 1, left, left)
+
+
+@pytest.mark.long
+@pytest.mark.slow
+def test_air_beside_an_oil_that_nothing_tells_is_learned_beside() -> None:
+    """The terms that air has on board were tied so closely that no factor was definite."""
+    found = answer(Case(6910, "choking", "sweep_record", "entrained_air"))
+    assert found is not None
+    assert found.named == "entrained_air"
