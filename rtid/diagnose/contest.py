@@ -168,6 +168,19 @@ def hardly_worse(
     )
 
 
+def passed_over(state: TrialState, best: Trial, finished: dict[Key, Trial]) -> tuple[Key, ...]:
+    """Causes that explain more than one that the maps had hidden, and were too little to matter.
+
+    A record that cannot size them tells no lesser one from them: a hose, not stable, had taken 541
+    of chi2, and a cavitation that took 297 was named alone.
+    """
+    return tuple(
+        t.key
+        for t in finished.values()
+        if t.key in state.negligible and t.gain > best.gain + TIE and t.has_ended
+    )
+
+
 def as_nearly_right(
     state: TrialState, present: Fit, now: Fit, trials: list[Trial], finished: dict[Key, Trial]
 ) -> tuple[Key, ...]:

@@ -26,7 +26,14 @@ from rtid.diagnose.consequence import (
     BENT,
     HIDDEN_GAIN,
 )
-from rtid.diagnose.contest import as_nearly_right, ended, hardly_worse, its_turn, trials_of
+from rtid.diagnose.contest import (
+    as_nearly_right,
+    ended,
+    hardly_worse,
+    its_turn,
+    passed_over,
+    trials_of,
+)
 from rtid.diagnose.exact import carried_on
 from rtid.diagnose.excuse import few_excused
 from rtid.diagnose.finer import finer_beside
@@ -330,7 +337,11 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
         if is_shown or does is not None:
             present.unread()  # what is read beside the next one is as large
             kept, after = _with_bank(state, now)
-            more = () if does is None else hardly_worse(state, trial, finished, HIDDEN_GAIN)
+            more: tuple[Key, ...] = ()
+            if does is not None:
+                as_ended = finished[trial.key]
+                more = hardly_worse(state, as_ended, finished, HIDDEN_GAIN)
+                more += passed_over(state, as_ended, finished)
             if kept.rho >= kept.most_rho:
                 more += as_nearly_right(state, present, now, trials, finished)
             alike = tuple(dict.fromkeys((*alike, *more)))

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from rtid.diagnose import contest as module
-from rtid.diagnose.contest import REFUTED, alike_ones, contest, its_turn
+from rtid.diagnose.contest import REFUTED, alike_ones, contest, its_turn, passed_over
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.trials import TIE, TIE_SHARE, Trial
 from rtid.effects.column import Candidate
@@ -160,3 +160,12 @@ def test_what_is_not_told_from_a_refuted_one_has_its_turn(by_form: bool, beside:
     assert set(alike) == beside | {line.key}, "each of them that its own form alone refutes"
     chosen, _ = its_turn(state(), present(5000), far, [air, gas, far], {}, refuted)
     assert chosen.key == air.key, "one that is told from it has none"
+
+
+def test_what_explains_more_and_was_passed_over_stays_beside_what_is_named() -> None:
+    """A hose of 541 was not stable and so too little to matter: the cavitation of 297 was alone."""
+    ended = [replace(trial(f"cause {k}", g), has_ended=True) for k, g in enumerate((541, 297, 305))]
+    finished = {t.key: t for t in ended}
+    found = passed_over(state("cause 0", "cause 2"), ended[1], finished)
+    assert found == (ended[0].key,)
+    assert passed_over(state(), ended[1], finished) == ()
