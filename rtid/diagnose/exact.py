@@ -35,6 +35,12 @@ PROMISING = 0.3  # share of the best gain that a timing must reach from afar to 
 # a slower, weaker pump was found, that left rho 18 for 4.4
 DROOPS, PUMP_LIMITS = (0.1, 0.7, 1.5), (0.8, 0.93, 0.98)
 STIFFNESSES = (3e8, 1e9, 3e9, 1e10, 1e11, 1e12)
+# of one that never reaches its limit: the first order sees a third of a droop, and one that is a
+# fifth off, or half as fast, explains less than none
+WHOLE_DROOPS, SETTLING_S = (
+    (0.35, 0.6, 1.0, 1.4, 1.9, 2.5, 3.3),
+    (0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6),
+)
 
 
 def with_pump(state: TrialState, present: Fit, trials: list[Trial]) -> list[Trial]:
@@ -48,12 +54,16 @@ def with_pump(state: TrialState, present: Fit, trials: list[Trial]) -> list[Tria
     bar = PROMISING * max((t.gain for t in rest), default=0.0)
     if not any(t.gain >= bar for t in first) and not _sags(state, present, key, bar):
         return rest
-    psi = state.coarse.beside(present).polished(PUMP, _pumps(present))
-    timings = (*present.revision.timings, (PUMP, psi))
-    revision = replace(present.revision, timings=timings)
-    now = fit(state.model, state.chunk, present.weights, revision, bank=False)
+    beside = state.coarse.beside(present)
+    pumped = [_with_pump(state, present, beside.polished(PUMP, p)) for p in _pumps(present)]
+    now = min(pumped, key=lambda fitted: fitted.held.sse)
     gain = present.held.sse - now.held.sse
-    return [*rest, Trial(key, gain, now.revision, now.light(), True)]
+    return [*rest, Trial(key, gain, now.revision, now, True)]
+
+
+def _with_pump(state: TrialState, present: Fit, psi: Psi) -> Fit:
+    revision = replace(present.revision, timings=(*present.revision.timings, (PUMP, psi)))
+    return fit(state.model, state.chunk, present.weights, revision, bank=False).light()
 
 
 def _sags(state: TrialState, present: Fit, key: Key, bar: float) -> bool:
@@ -66,20 +76,26 @@ def _sags(state: TrialState, present: Fit, key: Key, bar: float) -> bool:
     if not is_open or present.rho < LARGE or np.ptp(present.view.signal(key[1])) > 0.0:
         return False
     beside = state.coarse.beside(present)
-    return max(beside.gain(PUMP, psi) for psi in _pumps(present)) >= bar
+    return max(beside.gain(PUMP, psi) for bank in _pumps(present) for psi in bank) >= bar
 
 
-def _pumps(present: Fit) -> list[Psi]:
-    """Pumps to begin with: droops about the one that is seen, limits within what is drawn."""
+def _pumps(present: Fit) -> tuple[list[Psi], ...]:
+    """Pumps to begin with, about the droop that is seen: limited within what is drawn, or never."""
     drawn = demand(present.view)
     resistances = [
         score.value
         for candidate, score in scored(present)
         if candidate.effect == PUMP.effect and candidate.parameter == "resistance"
     ]
-    r = max([*resistances, PUMP.low[0]])
-    limits = [*np.quantile(drawn[drawn > 0], PUMP_LIMITS), 2.0 * drawn.max()]
-    return [(float(r * part), float(q), s) for part in DROOPS for q in limits for s in STIFFNESSES]
+    r = float(max([*resistances, PUMP.low[0]]))
+    limits, most = np.quantile(drawn[drawn > 0], PUMP_LIMITS), 2.0 * float(drawn.max())
+    limited: list[Psi] = [
+        (r * part, float(q), s) for part in DROOPS for q in limits for s in STIFFNESSES
+    ]
+    whole: list[Psi] = [
+        (r * part, most, r * part / tau) for part in WHOLE_DROOPS for tau in SETTLING_S
+    ]
+    return limited, whole
 
 
 def timing_trials(

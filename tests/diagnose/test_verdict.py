@@ -190,3 +190,17 @@ def test_air_beside_an_oil_that_nothing_tells_is_learned_beside() -> None:
     found = answer(Case(6910, "choking", "sweep_record", "entrained_air"))
     assert found is not None
     assert found.named == "entrained_air"
+
+
+@pytest.mark.long
+@pytest.mark.slow
+def test_a_supply_that_never_reaches_its_pumps_limit_is_found_on_a_sweep() -> None:
+    """The first order sees half of its droop: it was a slower, limited pump, rho 6, `unknown`."""
+    case = Case(6700, "laminar", "sweep_record", "supply_sag")
+    found = judged(case)
+    assert found is not None
+    (sag,) = found.said.found
+    assert sag.effect == "supply_sag"
+    resistance = sag.parameters["resistance"]
+    assert resistance.value == pytest.approx(case.plant.hidden[0].strength, rel=0.1)
+    assert found.last.rho < 1.5
