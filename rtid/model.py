@@ -142,6 +142,19 @@ class Edge:
         return (self.sink == chamber.pressure) - int(self.source == chamber.pressure)
 
 
+@dataclass(frozen=True)
+class Axes:
+    """What the map of an edge is over, and the units in which the model has these quantities.
+
+    over: the second quantity of a plant without pressures, NONE of a map of the command alone; None
+    of a pressure drop.  second: its unit, "1" where there is none.
+    """
+
+    command: str = "V"
+    second: str = "Pa"
+    over: str | None = None
+
+
 SHAPES = ("linear", "root", "hinge", "inverse")
 
 
@@ -305,6 +318,14 @@ class Machine:
             return unit
         whole = rate.removesuffix("/s") if rate.endswith("/s") else f"{rate} s"
         return whole + unit.removeprefix(VOLUME)
+
+    def axes(self, edge: Edge) -> Axes:
+        """What an edge's map is over: the only place that says in which units."""
+        command = self.signals[self.column(edge.command)].unit
+        if self.has_pressures:
+            return Axes(command)
+        over = edge.source or edge.sink
+        return Axes(command, self.signals[self.column(over)].unit if over else "1", over)
 
     @property
     def with_taylor_maps(self) -> Machine:

@@ -79,6 +79,14 @@ def test_csv_is_the_map_at_nodes_and_centres(flowmap: FlowMap, tmp_path: Path) -
         assert float(row["Q_m3/s"]) == pytest.approx(float(q), rel=1e-6, abs=1e-15)
 
 
+def test_a_csv_over_a_second_quantity_serves_as_reference_map(tmp_path: Path) -> None:
+    """A rate may be over a speed that changes its sign, and is no gain times a root of it."""
+    lines = [f"f,{u},{v},{u + 10 * v}" for u in (-2, 0, 2) for v in (-1, 0, 1)]
+    (tmp_path / "rate.csv").write_text("\n".join(["edge,u_%,over_m/s,Q_m/s2", *lines]))
+    flow = read_reference(tmp_path / "rate.csv").flow("f", [-1, 1.5, 0, 3], [-0.5, 0.25, 2, 0])
+    np.testing.assert_allclose(flow, [-6, 4, 10, np.nan])
+
+
 def test_exported_csv_serves_as_reference_map(flowmap: FlowMap, tmp_path: Path) -> None:
     write_map(tmp_path / "map.csv", flowmap, {})
     sheet = read_reference(tmp_path / "map.csv")

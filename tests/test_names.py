@@ -19,6 +19,7 @@ from firmware_bridge import catalog
 from firmware_bridge.sources import read_table
 from rtid.cli.exits import Exit
 from rtid.cli.main import run
+from rtid.compare.reference import GainTable
 from rtid.errors import RtidError
 from rtid.maps.datasheet import read_reference
 from rtid.plain import FloatArray
@@ -298,6 +299,7 @@ def test_a_data_sheet_may_name_its_units_in_either_way(tmp_path: Path) -> None:
     for header in ("dp_MPa,u_V,Q_l_min", "dp [MPa],u [V],Q [L/min]", "dp / MPa,u / V,Q_lpm"):
         (path := tmp_path / "sheet.csv").write_text(f"{header}\n{rows}\n")
         (table,) = read_reference(path).tables.values()
+        assert isinstance(table, GainTable)
         found.append(table.gain.tolist())
     assert found[0] == found[1] == found[2]
 

@@ -18,6 +18,10 @@ from rtid.cli.main import run
 from rtid.compare.dead_band import dead_band
 from rtid.diagnose.disturbance import with_disturbance
 from rtid.estimator.chunk import to_chunk
+from rtid.fleet.archive import Archive
+from rtid.fleet.merging import FleetMachine, typical, write
+from rtid.maps.datasheet import read_reference
+from rtid.maps.files import read_map
 from rtid.plain import FloatArray
 from rtid.project import ProjectError, load
 from rtid.study.study import Study
@@ -134,10 +138,32 @@ def test_every_command_takes_it(crane: tuple[Crane, Path, Path], folder: Path) -
     assert found["heldout_residual_after_m3s"] < 0.5 * found["heldout_residual_before_m3s"]
     said("undo", "-p", project)
     said("export", table, folder / "jib_map.csv", "-p", project)
-    assert '"flow_unit": "m/s"' in (folder / "jib_map.csv").read_text()
+    origin, heads, *_ = (folder / "jib_map.csv").read_text().splitlines()
+    assert '"flow_unit": "m/s"' in origin
+    assert heads == "edge,u_%,over,Q_m/s,sd_m/s,status"
+    said("export", table, folder / "jib_map.json", "-p", project)
+    units = json.loads((folder / "jib_map.json").read_text())["units"]
+    assert units == {"u_v": "%", "dp_pa": "1", "theta_m3s": "m/s", "cov_m6s2": "(m/s)^2"}
+    flowmap, sheet = read_map(folder / "jib_map.json")[0], read_reference(folder / "jib_map.csv")
+    w = np.linspace(-4, 4, 41)
+    flow = flowmap.flow("f", w, np.zeros(41))
+    np.testing.assert_allclose(sheet.flow("f", w, np.zeros(41)), flow, atol=0.05 * flow.max())
     said("export", table, folder / "jib_map.fmu", "-p", project, "--map")
     with ZipFile(folder / "jib_map.fmu") as archive:
         assert 'unit="m/s"' in archive.read("modelDescription.xml").decode()
+
+
+def test_a_typical_map_of_rates_says_its_units(
+    crane: tuple[Crane, Path, Path], folder: Path
+) -> None:
+    _, table, project = crane
+    study = Study(project, table)
+    alike = [FleetMachine(name, "0" * 16, (), study.fit.solution, study.map) for name in "abc"]
+    archive = Archive(folder / "fleet")
+    write(archive, [], typical(alike))
+    _, heads, *_ = (archive.folder / "typical-00000000.csv").read_text().splitlines()
+    assert heads == "edge,u_%,over,Q_m/s,sd_m/s,status"
+    assert read_map(archive.folder / "typical-00000000.npz")[1]["command_unit"] == "%"
 
 
 def test_neutral_is_found_anew_in_each_record(

@@ -8,7 +8,7 @@ drops, K = Q / sqrt(dp) may depend on dp too.  Outside the table's commands the 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -46,6 +46,10 @@ class GainTable:
         known = (w_v >= self.w_v[0]) & (w_v <= self.w_v[-1])
         return np.where(known, low + share * (high - low), np.nan)
 
+    def flow(self, w_v: FloatArray, dp_pa: FloatArray) -> FloatArray:
+        """Q (n,) in m3/s at points (n,) in V, Pa."""
+        return self.at(w_v, dp_pa) * root(dp_pa)
+
     def _along_dp(self, row: FloatArray, dp_pa: FloatArray) -> FloatArray:
         known = np.isfinite(row)
         if not known.any():
@@ -54,13 +58,32 @@ class GainTable:
 
 
 @dataclass(frozen=True)
+class RateTable:
+    """Rates (n, m) of a plant without pressures, SI, at commands w (n,) and over (m,), rising."""
+
+    w: FloatArray
+    over: FloatArray
+    rate: FloatArray
+
+    def flow(self, w: FloatArray, over: FloatArray) -> FloatArray:
+        """Rates (k,), SI, at points (k,) in the table's units; linear, NaN beyond the commands."""
+        columns = np.stack([np.interp(w, self.w, c, np.nan, np.nan) for c in self.rate.T], axis=1)
+        if len(self.over) == 1:
+            return columns[:, 0]
+        at = np.clip(np.searchsorted(self.over, over) - 1, 0, len(self.over) - 2)
+        low, high = np.take_along_axis(columns, np.stack([at, at + 1], axis=1), axis=1).T
+        share = (over - self.over[at]) / (self.over[at + 1] - self.over[at])
+        return np.asarray(low + np.clip(share, 0.0, 1.0) * (high - low))
+
+
+@dataclass(frozen=True)
 class ReferenceMap:
-    """Gain tables by edge name, or one for all edges under "*"."""
+    """Tables by edge name, or one for all edges under "*"."""
 
     name: str
-    tables: dict[str, GainTable]
+    tables: Mapping[str, GainTable | RateTable]
 
-    def table(self, edge: str) -> GainTable:
+    def table(self, edge: str) -> GainTable | RateTable:
         """The table of an edge.  Raises MissingEdgeError naming what there is."""
         for key in (edge.casefold(), ANY_EDGE):
             if key in self.tables:
@@ -74,8 +97,7 @@ class ReferenceMap:
     def flow(self, edge: str, w_v: ArrayLike, dp_pa: ArrayLike) -> FloatArray:
         """Q in m3/s at broadcast points (...); NaN where the table has nothing."""
         w, dp = np.broadcast_arrays(np.asarray(w_v, float), np.asarray(dp_pa, float))
-        gain = self.table(edge).at(w.ravel(), dp.ravel())
-        return (gain * root(dp.ravel())).reshape(w.shape)
+        return self.table(edge).flow(w.ravel(), dp.ravel()).reshape(w.shape)
 
     def theta_cells(self, model: Machine) -> FloatArray:
         """Its Taylor terms (cells, 6), m3/s, in all cells of the model's grids, for `explain`."""

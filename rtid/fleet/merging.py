@@ -24,7 +24,7 @@ from rtid.estimator.flowmap import PRIOR, SHUT, VALID, FlowMap
 from rtid.estimator.published import publish
 from rtid.estimator.solution import Solution, solve
 from rtid.fleet.archive import Archive
-from rtid.maps.files import provenance, write_map
+from rtid.maps.files import columns, provenance, unusual_units, write_map
 from rtid.model import Machine
 from rtid.plain import FloatArray
 
@@ -70,6 +70,7 @@ class Typical:
     spread_m3s: FloatArray
     machines: int
     flowmap: FlowMap  # the same as a prior for the next machine, see `_middle`
+    units: dict[str, str]  # see `rtid.maps.files.unusual_units`
 
 
 def machines(
@@ -116,7 +117,8 @@ def _typical(digest: str, alike: Sequence[FleetMachine]) -> Typical:
     names = [name for name, is_known in zip(edge, enough, strict=True) if is_known]
     spread = np.maximum(spread, least)
     flowmap = _middle([machine.flowmap for machine in alike])
-    return Typical(digest, names, u[enough], dp[enough], middle, spread, len(alike), flowmap)
+    units = unusual_units(alike[0].solution.model)
+    return Typical(digest, names, u[enough], dp[enough], middle, spread, len(alike), flowmap, units)
 
 
 def _middle(maps: Sequence[FlowMap]) -> FlowMap:
@@ -191,7 +193,8 @@ def write(
     for item in types:
         path = archive.folder / f"typical-{item.digest[:8]}.npz"
         _write_typical(path.with_suffix(".csv"), item)
-        write_map(path, item.flowmap, {"digest": item.digest, "machines": item.machines})
+        origin = {"digest": item.digest, "machines": item.machines, **item.units}
+        write_map(path, item.flowmap, origin)
     archive.keep_machines(ranked(fleet_machines, types))
 
 
@@ -228,7 +231,7 @@ def _write_typical(path: Path, item: Typical) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         file.write(f"# typical of {item.machines} machines; sd: spread over them\n")
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["edge", "u_V", "dp_Pa", "Q_m3/s", "sd_m3/s", "status"])
-        columns = item.edge, item.u_v, item.dp_pa, item.flow_m3s, item.spread_m3s
-        for name, u, dp, q, sd in zip(*columns, strict=True):
+        writer.writerow(columns(item.units))
+        values = item.edge, item.u_v, item.dp_pa, item.flow_m3s, item.spread_m3s
+        for name, u, dp, q, sd in zip(*values, strict=True):
             writer.writerow([name, f"{u:.9g}", f"{dp:.9g}", f"{q:.9g}", f"{sd:.3g}", "prior"])

@@ -3,20 +3,22 @@
 abs_u_V,K                          one gain for all edges, Q = K sqrt(dp)
 abs_u_V,K_PA,K_AT,K_PB,K_BT        one gain per edge, m3/s/sqrt(Pa)
 dp_MPa,u_V,Q_l_min                 long form, optionally with a column `edge`
+edge,u_%,over,Q_m/s                of a plant without pressures, as `rtid export` writes it
 """
 
 from __future__ import annotations
 
 import csv
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from firmware_bridge.names import split_brackets
-from rtid.compare.reference import ANY_EDGE, GainTable, ReferenceMap
+from rtid.compare.reference import ANY_EDGE, GainTable, RateTable, ReferenceMap
 from rtid.errors import RtidError, door
 from rtid.estimator.orifice import root
-from rtid.plain import FloatArray
+from rtid.plain import BoolArray, FloatArray
 from rtid.units import COMMAND_DIMENSIONS, Unit, find_unit, split_name
 
 
@@ -31,6 +33,8 @@ def read_reference(path: str | Path) -> ReferenceMap:
     header, lines = _read_csv(path)
     plain = [name.casefold() for name in header]
     gains = [k for k, name in enumerate(plain) if name == "k" or name.startswith("k_")]
+    if any(_is(name, "over") for name in header):
+        return ReferenceMap(path.stem, _rates(path, header, lines))
     tables = _gain_columns(path, header, lines, gains) if gains else _long(path, header, lines)
     return ReferenceMap(path.stem, tables)
 
@@ -75,15 +79,49 @@ def _long(path: Path, header: list[str], lines: list[list[str]]) -> dict[str, Ga
     w_v = _numbers(path, header, lines, u) * u_unit.factor
     dp_pa = _numbers(path, header, lines, p) * p_unit.factor
     q_m3s = _numbers(path, header, lines, q) * q_unit.factor
+    tables = {}
+    for edge, rows in _by_edge(header, lines):
+        of = rows & (dp_pa != 0)
+        tables[edge] = _gains(path, w_v[of], dp_pa[of], q_m3s[of])
+    return tables
+
+
+def _by_edge(header: list[str], lines: list[list[str]]) -> Iterator[tuple[str, BoolArray]]:
+    """Every edge of a long table, and which lines are its own."""
     plain = [name.casefold() for name in header]
     edges = [ANY_EDGE] * len(lines)
     if "edge" in plain:
         edges = [row[plain.index("edge")].strip().casefold() for row in lines]
-    tables = {}
     for edge in dict.fromkeys(edges):
-        of = np.array([name == edge for name in edges]) & (dp_pa != 0)
-        tables[edge] = _gains(path, w_v[of], dp_pa[of], q_m3s[of])
-    return tables
+        yield edge, np.array([name == edge for name in edges])
+
+
+def _rates(path: Path, header: list[str], lines: list[list[str]]) -> dict[str, RateTable]:
+    """The long form of a plant without pressures, over a second quantity of any unit."""
+    w, over, q = (_scaled(path, header, lines, stem) for stem in ("u", "over", "Q"))
+    return {edge: _rate_table(path, w[of], over[of], q[of]) for edge, of in _by_edge(header, lines)}
+
+
+def _scaled(path: Path, header: list[str], lines: list[list[str]], stem: str) -> FloatArray:
+    """A column in SI; as it stands where its unit is not known, or none."""
+    columns = [k for k, name in enumerate(header) if _is(name, stem)]
+    if len(columns) != 1:
+        raise DataSheetError(
+            f"{path}: no single column {stem} among {', '.join(header)}", "as `rtid export` has it"
+        )
+    unit = find_unit(split_name(header[columns[0]])[1])
+    values = _numbers(path, header, lines, columns[0])
+    return values * unit.factor + unit.offset if unit else values
+
+
+def _rate_table(path: Path, w: FloatArray, over: FloatArray, q: FloatArray) -> RateTable:
+    us, i = np.unique(w, return_inverse=True)
+    ends, j = np.unique(over, return_inverse=True)
+    if len(us) < 2:
+        raise DataSheetError(f"{path}: rates at one command only", "give two commands or more")
+    rate = np.full((len(us), len(ends)), np.nan)
+    rate[i, j] = q
+    return RateTable(us, ends, rate)
 
 
 def _gains(path: Path, w_v: FloatArray, dp_pa: FloatArray, q_m3s: FloatArray) -> GainTable:

@@ -30,15 +30,14 @@ from rtid.maps.matlab import write_m, write_mat
 from rtid.maps.modelica import write_mo
 from rtid.maps.pedals import ACCEL, BRAKE, write_pedals
 from rtid.maps.plc import write_st
-from rtid.model import Grid
+from rtid.model import NONE, Grid, Machine
 from rtid.plain import FloatArray, plain
 from rtid.trace.state_files import read_bytes
 
 SCHEMA = "rtid-flowmap/1"
 PLUGINS = "rtid.export"  # entry points of other packages: suffix = function, as in WRITERS
-FLOW_UNIT = "m3/s"
+FLOW_UNIT, COMMAND_UNIT, DROP_UNIT = "m3/s", "V", "Pa"  # where the provenance says no others
 MAP_FILES = (".json", ".npz")  # what comes back with `read_map`
-UNITS = {"u_v": "V", "dp_pa": "Pa", "theta_m3s": "m3/s", "cov_m6s2": "m6/s2"}
 BASIS = "Taylor: 1, xi, eta, xi^2, eta^2, xi eta; xi and eta run from -1 to 1 over each block"
 
 Writer = Callable[[Path, FlowMap, Mapping[str, Any]], None]
@@ -133,27 +132,53 @@ def provenance(
     effects: those beside which it was fitted, whose flow is not in the map; None: not known.
     """
     known: dict[str, Any] = {} if effects is None else {"effects": list(effects)}
-    units = {chamber.unit for chamber in solution.model.chambers}
-    if units != {FLOW_UNIT}:  # what stands in the columns of flows
-        known["flow_unit"] = "+".join(sorted(units))
-    return known | {
-        "program": f"rtid {rtid.__version__}",
-        "project": project,
-        "digest": digest,
-        "source": source,
-        "rows": solution.counters.get("rows", 0),
-        "rho": solution.rho,
-        "beta_pa": plain(solution.beta_pa),
-        "beta_sd_pa": plain(solution.beta_sd_pa),
+    return (
+        known
+        | unusual_units(solution.model)
+        | {
+            "program": f"rtid {rtid.__version__}",
+            "project": project,
+            "digest": digest,
+            "source": source,
+            "rows": solution.counters.get("rows", 0),
+            "rho": solution.rho,
+            "beta_pa": plain(solution.beta_pa),
+            "beta_sd_pa": plain(solution.beta_sd_pa),
+        }
+    )
+
+
+def unusual_units(model: Machine) -> dict[str, str]:
+    """Units of commands, second arguments and flows that are not V, Pa and m3/s: for a provenance.
+
+    over_unit: of a plant without pressures, "1" where its maps are of the command alone.
+    """
+    axes = [model.axes(edge) for edge in model.maps]
+    units = {
+        "command_unit": {a.command for a in axes},
+        "over_unit": {a.second for a in axes if a.over != NONE} or {"1"},
+        "flow_unit": {chamber.unit for chamber in model.chambers},
     }
+    usual = {"command_unit": COMMAND_UNIT, "flow_unit": FLOW_UNIT}
+    usual |= {"over_unit": DROP_UNIT} if model.has_pressures else {}
+    known = {key: "+".join(sorted(names)) for key, names in units.items()}
+    return {key: names for key, names in known.items() if names != usual.get(key)}
+
+
+def columns(provenance: Mapping[str, Any]) -> tuple[str, ...]:
+    """Heads of the long table, with the units that a provenance says."""
+    command = provenance.get("command_unit", COMMAND_UNIT)
+    flow, over = provenance.get("flow_unit", FLOW_UNIT), provenance.get("over_unit")
+    second = f"dp_{DROP_UNIT}" if over is None else "over" if over == "1" else f"over_{over}"
+    return "edge", f"u_{command}", second, f"Q_{flow}", f"sd_{flow}", "status"
 
 
 def table_rows(flowmap: FlowMap) -> Iterator[tuple[str, float, float, float, float, str]]:
-    """edge, u in V, dp in Pa, q and sd in m3/s, status; at all nodes and centres of the grids."""
+    """Of `columns`: edge, u, dp, q and sd in SI, status; at all nodes and centres of the grids."""
     for edge in flowmap.edges:
         w, dp = np.meshgrid(_halves(edge.grid.u_v), _halves(edge.grid.dp_pa), indexing="ij")
-        columns = (w, dp, edge.flow(w, dp), edge.sd(w, dp), edge.status_at(w, dp))
-        for row in zip(*(c.ravel().tolist() for c in columns), strict=True):
+        values = (w, dp, edge.flow(w, dp), edge.sd(w, dp), edge.status_at(w, dp))
+        for row in zip(*(v.ravel().tolist() for v in values), strict=True):
             yield edge.name, *row
 
 
@@ -165,7 +190,7 @@ def _write_csv(path: Path, flowmap: FlowMap, provenance: Mapping[str, Any]) -> N
     with path.open("w", newline="", encoding="utf-8") as file:
         file.write(f"# {SCHEMA} {json.dumps(provenance, sort_keys=True)}\n")
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["edge", "u_V", "dp_Pa", "Q_m3/s", "sd_m3/s", "status"])
+        writer.writerow(columns(provenance))
         for edge, u, dp, q, sd, status in table_rows(flowmap):
             writer.writerow([edge, f"{u:.9g}", f"{dp:.9g}", f"{q:.9g}", f"{sd:.3g}", status])
 
@@ -182,9 +207,20 @@ def as_dict(flowmap: FlowMap, provenance: Mapping[str, Any]) -> dict[str, Any]:
 def _header(provenance: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "schema": SCHEMA,
-        "units": UNITS,
+        "units": _units(provenance),
         "basis": BASIS,
         "provenance": dict(provenance),
+    }
+
+
+def _units(provenance: Mapping[str, Any]) -> dict[str, str]:
+    """By array, whose names are those of a hydraulic machine on every plant."""
+    flow = provenance.get("flow_unit", FLOW_UNIT)
+    return {
+        "u_v": provenance.get("command_unit", COMMAND_UNIT),
+        "dp_pa": provenance.get("over_unit", DROP_UNIT),
+        "theta_m3s": flow,
+        "cov_m6s2": "m6/s2" if flow == FLOW_UNIT else f"({flow})^2",
     }
 
 

@@ -16,6 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rtid.compare.comparison import Comparison
 from rtid.estimator.flowmap import LEARNING, VALID, EdgeMap
 from rtid.estimator.validity import Doubt, doubts_of
+from rtid.model import NONE
 from rtid.plain import plain
 from rtid.study.compared import TraceComparison
 from rtid.study.compared import as_json as compared_json
@@ -210,12 +211,12 @@ class LearnedStory:
         beside = "" if self.compared.reference is None else " | reference"
         title = f"{edge.name}: flow ±{beside} in {scale.name}   (~ not known well enough yet)"
         declared = next(e for e in self.result.model.edges if e.name == edge.name)
-        unit = self.result.model.signals[self.result.model.column(declared.command)].unit
+        axes = self.result.model.axes(declared)
         heads = ("u \\ dp|", *(f"{drop.number(p, 2)} {drop.name}|" for p in dp))
-        if not (declared.source or declared.sink):
+        if axes.over == NONE:
             heads = ("u|", f"{scale.name}|")
-        elif not self.result.model.has_pressures:
-            heads = (f"u \\ {declared.source}|", *(f"{p:.4g}|" for p in dp))
+        elif axes.over is not None:
+            heads = (f"u \\ {axes.over}|", *(f"{p:.4g}|" for p in dp))
         flows = None
         if self.compared.reference is not None:
             points = np.meshgrid(u, dp, indexing="ij")
@@ -224,7 +225,7 @@ class LearnedStory:
         for a, w in enumerate(u):
             row = None if flows is None else flows[a]
             cells = _map_cells(scale, edge, np.full(len(dp), w), dp, row)
-            rows.append((f"{w:.2f} {unit}", *cells))
+            rows.append((f"{w:.2f} {axes.command}", *cells))
         return Table(title, heads, rows)
 
 
