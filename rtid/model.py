@@ -321,7 +321,7 @@ class Machine:
 
     def axes(self, edge: Edge) -> Axes:
         """What an edge's map is over: the only place that says in which units."""
-        command = self.signals[self.column(edge.command)].unit
+        command = self.signals[self.column(edge.command)].unit or "V"
         if self.has_pressures:
             return Axes(command)
         over = edge.source or edge.sink

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 from zipfile import ZipFile
 
 import numpy as np
@@ -25,7 +27,13 @@ from rtid.maps.files import read_map
 from rtid.plain import FloatArray
 from rtid.project import ProjectError, load
 from rtid.study.study import Study
+from rtid.tell.charts.blocks import quantities
 from rtid.trace.neutral import neutral_of
+from rtid.ui.desk import Desk
+from rtid.ui.desk_views import Bench
+from rtid.ui.map_view import MapView
+from rtid.ui.shared import Session, ShownRevision
+from rtid.ui.where_view import WhereView
 from rtid.units import flow_name, show_flow_as
 from tests.replays import shared_replays  # noqa: F401
 
@@ -164,6 +172,44 @@ def test_a_typical_map_of_rates_says_its_units(
     _, heads, *_ = (archive.folder / "typical-00000000.csv").read_text().splitlines()
     assert heads == "edge,u_%,over,Q_m/s,sd_m/s,status"
     assert read_map(archive.folder / "typical-00000000.npz")[1]["command_unit"] == "%"
+
+
+def texts(root: Any) -> str:
+    """All words of a drawn view: titles, labels of axes, and what a pointer tells."""
+    figures = [model for model in root.references() if model.__class__.__name__ == "figure"]
+    axes = [axis.axis_label or "" for f in figures for axis in (*f.xaxis, *f.yaxis) if axis.visible]
+    return " | ".join([*axes, *(f.title.text for f in figures)])
+
+
+def test_the_page_says_the_units_of_a_rate(crane: tuple[Crane, Path, Path]) -> None:
+    """It said V, MPa and mL/min of a command in per cent and a speed, and "f:  →" of the map."""
+    _, table, project = crane
+    opened = Desk(lambda _text, _share: None).open(project, table, None)
+    seen = [ShownRevision(opened.look, ())]
+    session = SimpleNamespace(
+        seen=seen, revisions=seen, opened=opened, released=None, trace=table, last=seen[0]
+    )
+    bench = Bench(cast("Session", session), lambda _key: None, lambda *_span: None)
+    where, shown_map = WhereView(bench), MapView(bench)
+    for view in (where, shown_map):
+        view.refresh()
+        said_of = " ".join([*view.fragments().values(), *map(texts, view.roots.values())])
+        assert not re.findall(r"MPa|\bV\b|L/min|orifice|→|pressure drop", said_of), said_of
+        assert "command in %" in said_of and "mm/s" in said_of
+    assert "f of u" in texts(where.roots["maps"])
+    assert re.search(r"The block <b>f, \S+ to \S+ %</b> holds", where.fragments()["says"])
+    assert set(quantities(1.0)) >= {"residual"} and quantities(1.0)["residual"].unit == "mm/s rms"
+    hints = next(iter(where.planes._sources.values())).data
+    assert all(re.fullmatch(r"\S+ to \S+ %", words) for words in hints["place"])
+
+
+def test_the_report_says_the_units_of_a_rate(crane: tuple[Crane, Path, Path], folder: Path) -> None:
+    _, table, project = crane
+    said("report", table, "-p", project, "-o", folder / "jib.html")
+    words = (folder / "jib.html").read_text()
+    for wrong in ("opening command in V", "pressure drop", "L/min", " V and "):
+        assert wrong not in words
+    assert "command in %" in words and "flow in mm/s" in words
 
 
 def test_neutral_is_found_anew_in_each_record(

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rtid.study.compared import IDENTIFICATION, Held, TraceComparison
+from rtid.tell.axes import axes_of
 from rtid.tell.charts.correlation import correlogram, cusum
 from rtid.tell.charts.dependence import dependences
 from rtid.tell.charts.maps import maps, slices
@@ -45,9 +46,9 @@ def _of_study(comparison: TraceComparison, ending: str) -> dict[str, Figure]:
     drawn: dict[str, Figure] = {}
     for title, rows in comparison.blocks_of.items():
         drawn[f"where_{title}{ending}"] = residual_map(model, rows)
-    drawn[f"maps{ending}"] = stills.draw(maps(comparison.flowmap))
+    drawn[f"maps{ending}"] = stills.draw(maps(comparison.flowmap, axes=axes_of(model)))
     name = comparison.reference.name if comparison.reference else ""
-    cut = slices(comparison.flowmap, comparison.reference, reference_name=name)
+    cut = slices(comparison.flowmap, comparison.reference, None, name, axes_of(model))
     drawn[f"slices{ending}"] = stills.draw(cut)
     return drawn
 

@@ -182,8 +182,10 @@ class PlanePlot:
         self.root.add_layout(bar, "right")
         self.show(plane)
 
-    def show(self, plane: Plane) -> None:
-        """Draw a plane."""
+    def show(self, plane: Plane, labels: tuple[str, str] | None = None) -> None:
+        """Draw a plane; labels: of its axes, where it is over other quantities than before."""
+        if labels is not None:
+            self.root.xaxis.axis_label, self.root.yaxis.axis_label = labels
         (x, x_end), (y, y_end) = plane.x, plane.y
         self._mapper.update(palette=PALETTES[plane.palette], low=plane.low, high=plane.high)
         place = {"x": [x], "y": [y], "dw": [x_end - x], "dh": [y_end - y]}

@@ -22,6 +22,7 @@ from rtid.study.compared import TraceComparison
 from rtid.study.compared import as_json as compared_json
 from rtid.study.kept_record import Replay
 from rtid.tell import compared_tables as tables
+from rtid.tell.axes import axes_of
 from rtid.tell.charts.maps import maps, slices
 from rtid.tell.charts.over_time import residual
 from rtid.tell.story import FAINT, Story, Table
@@ -109,11 +110,12 @@ class LearnedStory:
         folder.mkdir(parents=True, exist_ok=True)
         chunk = self.result.part(self.result.identification_s)
         flowmap, reference = self.compared.flowmap, self.compared.reference
+        axes = axes_of(self.result.model)
         name = reference.name if reference else ""
         figures = {
             "coverage": coverage(self.result.model, flowmap, chunk),
-            "maps": stills.draw(maps(flowmap)),
-            "slices": stills.draw(slices(flowmap, reference, reference_name=name)),
+            "maps": stills.draw(maps(flowmap, axes=axes)),
+            "slices": stills.draw(slices(flowmap, reference, None, name, axes)),
             "residual": stills.draw(residual(self.result.model, self.compared.held[0].parts)),
         }
         return [stills.save(f, folder / f"{name}.{suffix}") for name, f in figures.items()]

@@ -15,6 +15,7 @@ from rtid.diagnose.verdict import MATERIAL
 from rtid.effects.page import title
 from rtid.project.history import Change, standing
 from rtid.tell import stills as still_pictures
+from rtid.tell.axes import axes_of
 from rtid.tell.charts.dependence import before_and_after
 from rtid.tell.charts.maps import maps, slices
 from rtid.tell.charts.over_time import flows
@@ -62,7 +63,7 @@ def stills(report_story: ReportStory) -> dict[str, Figure]:
 
 def sections(story: ReportStory) -> tuple[Story, ...]:
     """Everything below the verdict."""
-    result = story.diagnosed.diagnosis
+    result, axes = story.diagnosed.diagnosis, axes_of(story.diagnosed.model)
     return (
         _errors(story),
         *(Story(chart.title, (chart,)) for chart in story.evidence),
@@ -70,7 +71,11 @@ def sections(story: ReportStory) -> tuple[Story, ...]:
         _dependences(story),
         Story(
             "Flow maps",
-            (maps(story.flowmap, story.points), slices(story.flowmap), coverage(story)),
+            (
+                maps(story.flowmap, story.points, axes),
+                slices(story.flowmap, axes=axes),
+                coverage(story),
+            ),
         ),
         Story("", (parameters(story),)),
         *([Story("Tracking", (story.tracking,))] if story.tracking else []),

@@ -11,10 +11,11 @@ from rtid.diagnose.report import FittedEffect, FoundEffect, Value
 from rtid.effects.page import title
 from rtid.estimator.flowmap import VALID, EdgeMap
 from rtid.model import Machine
+from rtid.tell.axes import place
 from rtid.tell.report_story import ReportStory
 from rtid.tell.story import Table
 from rtid.tell.words import quantity
-from rtid.units import MPA, flow_name, lpm
+from rtid.units import flow_name, lpm
 
 
 def coverage(story: ReportStory) -> Table:
@@ -86,8 +87,8 @@ def settings(story: ReportStory) -> list[tuple[str, str]]:
 
 def _ends(model: Machine) -> str:
     """The ranges of the grids, where all have the same."""
-    ends = {(*e.grid.u_v[[0, -1]].tolist(), *e.grid.dp_pa[[0, -1]].tolist()) for e in model.maps}
-    if len(ends) != 1:
-        return ""
-    u0, u1, p0, p1 = ends.pop()
-    return f", {u0:g} to {u1:g} V and {MPA * p0:.3g} to {MPA * p1:.3g} MPa"
+    ends = {
+        place(model.axes(e), e.grid.u_v[[0, -1]].tolist(), e.grid.dp_pa[[0, -1]].tolist())
+        for e in model.maps
+    }
+    return f", {ends.pop()}" if len(ends) == 1 else ""

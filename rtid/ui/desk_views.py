@@ -9,12 +9,12 @@ from bokeh.models import Column
 from rtid.compare import NoSuchBlockError
 from rtid.compare.places import blocks_in_span, spans_of_block
 from rtid.study.look import Look
+from rtid.tell.axes import place
 from rtid.tell.charts.blocks import Key
 from rtid.tell.charts.time_plots import TimePlots, spans_of
 from rtid.tell.html import text
 from rtid.ui.shared import Session
 from rtid.ui.views import Action, PageView, ViewRow, made
-from rtid.units import MPA
 
 Put = Callable[[dict[str, str]], None]
 
@@ -126,10 +126,9 @@ class DeskViews:
             return
         self._bench.time.light(spans)
         total = sum(b - a for a, b in spans)
-        grid = next(e.grid for e in look.model.edges if e.name == edge)
-        where = f"{edge}, {grid.u_v[i]:g} to {grid.u_v[i + 1]:g} V, " + (
-            f"{grid.dp_pa[j] * MPA:.3g} to {grid.dp_pa[j + 1] * MPA:.3g} MPa"
-        )
+        of = next(e for e in look.model.edges if e.name == edge)
+        u, dp = of.grid.u_v[[i, i + 1]].tolist(), of.grid.dp_pa[[j, j + 1]].tolist()
+        where = f"{edge}, {place(look.model.axes(of), u, dp)}"
         words = (
             f"Block <b>{text(where)}</b>: the valve was there {len(spans)} times, {total:.1f} s in "
             "all; these spans are marked in every plot over time."

@@ -12,10 +12,10 @@ import numpy as np
 from rtid.compare import PAPER_DP_PA, PAPER_U_V, LearnedReference, Reference, deviations
 from rtid.estimator.flowmap import VALID, EdgeMap, FlowMap
 from rtid.maps.files import formats
+from rtid.model import Axes
 from rtid.plain import FloatArray
+from rtid.tell.axes import axes_of, labels
 from rtid.tell.charts.maps import (
-    COMMAND,
-    DROP,
     change_plane,
     flow_plane,
     interval_plane,
@@ -31,7 +31,6 @@ from rtid.ui.views import PageView
 from rtid.units import MPA, Z95, flow_name, lpm
 
 NOTHING = "nothing"
-ALONG = {"over the pressure drop": "dp", "over the command": "u"}
 CHOICES = ("edge", "beside", "along", "second")
 SECOND = ("95 % interval", "difference")
 
@@ -57,11 +56,12 @@ class MapView(PageView):
         opened = bench.session.opened
         self._reference = reference = opened.reference if opened else None
         self.edge = self.flowmap.edges[0].name
-        self.along, self.second = next(iter(ALONG)), SECOND[0]
+        self.along, self.second = next(iter(self._alongs)), SECOND[0]
         self.beside = reference.name if reference else NOTHING
         edge = self.flowmap[self.edge]
         self._flow, self._second = (
-            PlanePlot(plane, COMMAND, DROP) for plane in (flow_plane(edge), interval_plane(edge))
+            PlanePlot(plane, *labels(self._axes))
+            for plane in (flow_plane(edge, self._axes), interval_plane(edge, self._axes))
         )
         self._slices = PanelPlot(self._cut(edge, None))
         self.roots = {"plot": beside(self._flow.root, self._second.root, self._slices.root)}
@@ -74,6 +74,17 @@ class MapView(PageView):
     def flowmap(self) -> FlowMap:
         """The map of the newest revision."""
         return self.look.flowmap
+
+    @property
+    def _axes(self) -> Axes:
+        """What the valve's map is over."""
+        return axes_of(self.look.model)[self.edge]
+
+    @property
+    def _alongs(self) -> dict[str, str]:
+        """What the slices may be over."""
+        over = "the pressure drop" if self._axes.over is None else self._axes.over
+        return ({f"over {over}": "dp"} if over else {}) | {"over the command": "u"}
 
     @property
     def others(self) -> dict[str, Reference]:
@@ -94,7 +105,7 @@ class MapView(PageView):
             self.edge = name
         elif what == "beside":
             self.beside = name
-        elif what == "along" and name in ALONG:
+        elif what == "along" and name in self._alongs:
             self.along = name
         elif what == "second" and name in SECOND:
             self.second = name
@@ -108,19 +119,23 @@ class MapView(PageView):
         """Draw what is chosen."""
         if self.beside not in self.others:
             self.beside = NOTHING
+        if self.along not in self._alongs:
+            self.along = next(iter(self._alongs))
         edge, other = self.flowmap[self.edge], self.others.get(self.beside)
-        self._flow.show(flow_plane(edge))
+        self._flow.show(flow_plane(edge, self._axes), labels(self._axes))
         if self.second == SECOND[1] and other is not None:
-            self._second.show(change_plane(edge, other, self.beside))
+            second = change_plane(edge, other, self.beside, self._axes)
         else:
-            self._second.show(interval_plane(edge))
+            second = interval_plane(edge, self._axes)
+        self._second.show(second, labels(self._axes))
         self._slices.show(self._cut(edge, other))
 
     def _cut(self, edge: EdgeMap, other: Reference | None) -> Panel:
         """Slices, beside a reference; without one its points are none."""
         dots = f", dots: {other.name}" if other else ""
         title = f"{edge.name}: slices with 95 % band{dots}"
-        return slice_panel(edge, title, ALONG[self.along], None, other, self.beside)
+        along = self._alongs[self.along]
+        return slice_panel(edge, title, along, None, other, self.beside, self._axes)
 
     def fragments(self) -> Mapping[str, str]:
         """Tools, and what the pictures say."""
@@ -128,13 +143,14 @@ class MapView(PageView):
             choice("edge", [e.name for e in self.flowmap.edges], self.edge)
             + select("beside", [NOTHING, *self.others], self.beside, "beside")
             + select("second", list(SECOND), self.second, "second plane")
-            + select("along", list(ALONG), self.along, "slices")
+            + select("along", list(self._alongs), self.along, "slices")
         )
         valid = float(np.mean(self.flowmap[self.edge].status == VALID))
+        kind, law = ("Valve", "the orifice law") if self._axes.over is None else ("Map", "a law")
         says = (
-            f"Valve <b>{text(self.edge)}</b>: outlined blocks ({100 * valid:.0f} % of the grid) "
+            f"{kind} <b>{text(self.edge)}</b>: outlined blocks ({100 * valid:.0f} % of the grid) "
             "stand on their own data; the others (dashed in the slices, in brackets in the table) "
-            "follow the orifice law from these, and their interval says how far to trust them. "
+            f"follow {law} from these, and their interval says how far to trust them. "
             "Next: hold it beside a reference or another valve, or release it."
         )
         released = self.bench.session.released
@@ -173,5 +189,5 @@ class MapView(PageView):
             for j, d in enumerate(ps)
         ]
         head = (f"flow in {flow_name()} ± 95 %" + (f" | {self.beside}" if other else ""),
-                *(f"{w:g} V" for w in us))  # fmt: skip
+                *(f"{w:g} {self._axes.command}" for w in us))  # fmt: skip
         return table(head, rows, "figures")

@@ -13,10 +13,10 @@ from bokeh.plotting import figure
 from rtid.compare import BlockRow, Dependence
 from rtid.compare.tables import CAUSES, cause_of
 from rtid.study.look import Look
+from rtid.tell.axes import axes_of, place, small_flow
 from rtid.tell.charts.blocks import (
     HATCHES,
     LARGEST,
-    ML_PER_MIN,
     BlockPlots,
     Key,
     quantities,
@@ -33,7 +33,7 @@ from rtid.ui.add_view import name_of
 from rtid.ui.desk_views import Bench
 from rtid.ui.shared import ShownRevision
 from rtid.ui.views import PageView
-from rtid.units import MPA, flow_name
+from rtid.units import flow_name
 
 CHOICES = ("quantity", "part", "signal", "revision")
 
@@ -48,8 +48,9 @@ class WhereView(PageView):
         self.quantity = "residual"
         self._time = bench.time
         every = [b for part in look.parts.values() for b in part.blocks]
-        values = [b.residual_rms_m3s * ML_PER_MIN for b in every if np.isfinite(b.residual_rms_m3s)]
-        top = round_up(float(np.quantile(values, LARGEST))) if values else 1.0
+        values = [b.residual_rms_m3s for b in every if np.isfinite(b.residual_rms_m3s)]
+        most = float(np.quantile(values, LARGEST)) if values else 0.0
+        top = round_up(small_flow().factor * most)
         self._quantities = quantities(top)
         self.planes = BlockPlots(look.model, every, bench.mark_block)
         self._asked = ""  # the signal that the user wants to see
@@ -160,6 +161,9 @@ class WhereView(PageView):
         )
         return {"tools": tools, "says": self._sentence()}
 
+    def _place(self, block: BlockRow) -> str:
+        return place(axes_of(self.look.model)[block.edge], block.u_v, block.dp_pa)
+
     def _scale(self) -> str:
         q = self._quantities[self.quantity]
         if q.name == "status":
@@ -187,8 +191,7 @@ class WhereView(PageView):
                 "choose the other part above, or record a motion that opens the valves."
             )
         return (
-            f"The block <b>{text(worst.edge)}, {worst.u_v[0]:g} to {worst.u_v[1]:g} V, "
-            f"{worst.dp_pa[0] * MPA:.3g} to {worst.dp_pa[1] * MPA:.3g} MPa</b> holds "
+            f"The block <b>{text(worst.edge)}, {text(self._place(worst))}</b> holds "
             f"{100 * worst.residual_share:.0f} % of the residual of its chambers. Click a block: "
             "its time spans light up here and in Compare; drag a span: its blocks are outlined. "
             f"A map that fails everywhere alike lacks an effect, not data: see <b>Why</b>.{hatched}"

@@ -25,20 +25,20 @@ from bokeh.plotting import figure
 
 from rtid.compare import BlockRow
 from rtid.compare.tables import CAUSES, cause_of
-from rtid.model import Edge, Machine
+from rtid.model import NONE, Axes, Edge, Machine
+from rtid.tell.axes import axes_of, heading, labels, place, second, small_flow
 from rtid.tell.charts.theme import FIGURES_TAG, LIT, NARROWEST_PX, beside, plot
 from rtid.tell.colours import GREY
 from rtid.tell.live import YELLOWS
-from rtid.units import LPM, MPA, Z95, lpm
+from rtid.units import Z95, flow_name, lpm
 
 Key = tuple[str, int, int]
 HATCHES = dict(zip(CAUSES, (" ", ".", "/", "\\", "x", "+"), strict=True))
 STATUS_COLOURS = {
     "valid": "#9ecae1", "learning": "#f6e3b4", "stale": "#d9d9d9", "invalid": "#e6a98c",
 }  # fmt: skip
-ML_PER_MIN = 1e3 * LPM  # per m3/s
 LARGEST = 0.98  # quantile of the blocks' residuals at which their scale ends
-NONE, OTHER = "rgba(128, 128, 128, 0.10)", "rgba(128, 128, 128, 0.25)"
+EMPTY, OTHER = "rgba(128, 128, 128, 0.10)", "rgba(128, 128, 128, 0.25)"
 DARK_FROM = 0.55  # of a scale: figures are white from here on
 MOST_TICKS = 9
 
@@ -72,7 +72,7 @@ class Quantity:
     def colour(self, row: BlockRow) -> str:
         """Of its place on the scale."""
         at = self.place(row)
-        return self.palette[int(at * (len(self.palette) - 1))] if np.isfinite(at) else NONE
+        return self.palette[int(at * (len(self.palette) - 1))] if np.isfinite(at) else EMPTY
 
     def text(self, row: BlockRow) -> str:
         """The figure in the block."""
@@ -88,12 +88,14 @@ BLUES = list(interp_palette(tuple(reversed(Blues9)), 256))[8:220]
 
 
 def quantities(largest: float) -> dict[str, Quantity]:
-    """Everything that the plane can show; largest: of the residual's scale, mL/min."""
+    """Everything that the plane can show; largest: of the residual's scale, in `small_flow`."""
+    small = small_flow()
+    digits = ".0f" if small.name == "mL/min" else ".2g"
     return {
         q.name: q
         for q in (
-            Quantity("residual", "mL/min rms", lambda b: b.residual_rms_m3s * ML_PER_MIN, 0.0,
-                     largest, YELLOWS, digits=".0f"),
+            Quantity("residual", f"{small.name} rms", lambda b: b.residual_rms_m3s * small.factor,
+                     0.0, largest, YELLOWS, digits=digits),
             Quantity("share of the residual", "%", lambda b: 100 * b.residual_share, 0.0, 20.0,
                      YELLOWS, digits=".1f"),
             Quantity("samples", "rows", lambda b: float(b.rows), 1.0, 1e4, BLUES, True, ".0f"),
@@ -126,6 +128,7 @@ class BlockPlots:
         self._sources: dict[str, ColumnDataSource] = {}
         self._lit: dict[str, ColumnDataSource] = {}
         self._shown: dict[str, list[BlockRow]] = {}
+        self._axes = axes_of(model)
         plots = [self._plot(e, [b for b in blocks if b.edge == e.name]) for e in model.maps]
         pairs = [plots[k : k + 2] for k in range(0, len(plots), 2)]
         rows = [beside(*pair, stacked_below_px=NARROWEST_PX) for pair in pairs]
@@ -136,7 +139,7 @@ class BlockPlots:
         for edge, source in self._sources.items():
             rows = [b for b in blocks if b.edge == edge]
             self._shown[edge] = rows
-            source.data = _columns(rows, quantity)
+            source.data = _columns(rows, quantity, self._axes[edge])
 
     def light(self, keys: Mapping[Key, float] | Sequence[Key]) -> None:
         """Outline blocks."""
@@ -149,14 +152,17 @@ class BlockPlots:
     def _plot(self, edge: Edge, blocks: Sequence[BlockRow]) -> figure:
         used = [(b.i, b.j) for b in blocks] or [(0, 0)]
         (i0, j0), (i1, j1) = np.min(used, axis=0), np.max(used, axis=0)
-        source = ColumnDataSource(_columns([], next(iter(quantities(1.0).values()))))
+        axes = self._axes[edge.name]
+        source = ColumnDataSource(_columns([], next(iter(quantities(1.0).values())), axes))
         made = plot(
             x_range=Range1d(i0 - 0.1, i1 + 1.1), y_range=Range1d(j0 - 0.1, j1 + 1.1),
-            title=f"{edge.name}: {edge.source} → {edge.sink}{'' if blocks else ', never open'}",
+            title=f"{heading(edge, axes)}{'' if blocks else ', never open'}",
         )  # fmt: skip
         _ticks(made.xaxis[0], edge.grid.u_v, int(i0), int(i1) + 1)
-        _ticks(made.yaxis[0], edge.grid.dp_pa * MPA, int(j0), int(j1) + 1)
-        made.xaxis.axis_label, made.yaxis.axis_label = "opening command in V", "drop in MPa"
+        _ticks(made.yaxis[0], edge.grid.dp_pa * second(axes).factor, int(j0), int(j1) + 1)
+        made.yaxis.visible = axes.over != NONE
+        command, over = labels(axes)
+        made.xaxis.axis_label, made.yaxis.axis_label = command, over.removeprefix("pressure ")
         made.grid.visible = False
         made.min_border_left = 46
         box: dict[str, Any] = {"width": 0.96, "height": 0.94, "source": source}
@@ -189,12 +195,12 @@ class BlockPlots:
             self._on_block((edge, block.i, block.j))
 
 
-TIP = """<div><b>@u V, @dp MPa</b><br>
-residual @residual L/min rms, @share % of all<br>@rows rows in @dwell s<br>
-flow @flow ± @sd L/min (95 %), condition @condition<br>@status @reason</div>"""
+TIP = """<div><b>@place</b><br>
+residual @residual rms, @share % of all<br>@rows rows in @dwell s<br>
+flow @flow ± @sd (95 %), condition @condition<br>@status @reason</div>"""
 
 
-def _columns(blocks: Sequence[BlockRow], quantity: Quantity) -> dict[str, list[Any]]:
+def _columns(blocks: Sequence[BlockRow], quantity: Quantity, axes: Axes) -> dict[str, list[Any]]:
     by_status = quantity.name == "status"
     fill = [
         STATUS_COLOURS.get(b.status, OTHER) if by_status else quantity.colour(b) for b in blocks
@@ -207,14 +213,13 @@ def _columns(blocks: Sequence[BlockRow], quantity: Quantity) -> dict[str, list[A
         "hatch": [HATCHES[cause_of(b)] for b in blocks],
         "text": [b.status[:4] if by_status else quantity.text(b) for b in blocks],
         "ink": ["#ffffff" if d else "#22272b" for d in dark],
-        "u": [f"{b.u_v[0]:g} to {b.u_v[1]:g}" for b in blocks],
-        "dp": [f"{b.dp_pa[0] * MPA:.3g} to {b.dp_pa[1] * MPA:.3g}" for b in blocks],
-        "residual": [_told(b.residual_rms_m3s * lpm(), ".3g") for b in blocks],
+        "place": [place(axes, b.u_v, b.dp_pa) for b in blocks],
+        "residual": [f"{_told(b.residual_rms_m3s * lpm(), '.3g')} {flow_name()}" for b in blocks],
         "share": [_told(100 * b.residual_share, ".2g") for b in blocks],
         "rows": [f"{b.rows}" for b in blocks],
         "dwell": [f"{b.dwell_s:.2f}" for b in blocks],
         "flow": [_told(b.flow_m3s * lpm(), ".3g") for b in blocks],
-        "sd": [_told(Z95 * b.sd_m3s * lpm(), ".2g") for b in blocks],
+        "sd": [f"{_told(Z95 * b.sd_m3s * lpm(), '.2g')} {flow_name()}" for b in blocks],
         "condition": [_told(b.condition, ".1e") for b in blocks],
         "status": [b.status for b in blocks],
         "reason": [f"- {b.reason}" if b.reason else "" for b in blocks],

@@ -11,10 +11,10 @@ from matplotlib.patches import Patch
 from rtid.estimator.flowmap import EdgeMap, FlowMap
 from rtid.model import Machine
 from rtid.plain import FloatArray
+from rtid.tell.axes import common_labels, heading, second
 from rtid.tell.charts.points import spread_points
 from rtid.tell.colours import GREY, INK, LINE
 from rtid.tell.stills import FILL, LABELS, STYLE, label_outer, panels
-from rtid.units import MPA
 
 DOTS = 6000  # samples drawn per edge
 
@@ -24,17 +24,17 @@ def coverage(model: Machine, flowmap: FlowMap, chunk: FloatArray) -> Figure:
     with mpl.rc_context(STYLE):
         figure, axes = panels(len(model.maps))
         for axis, edge, learned in zip(axes, model.maps, flowmap.edges, strict=True):
-            _blocks(axis, learned)
+            _blocks(axis, learned, second(model.axes(edge)).factor)
             w_v, dp_pa = spread_points(model, edge, chunk, DOTS).T
             axis.plot(w_v, dp_pa, ".", color=INK, ms=1.8, alpha=0.45, mew=0)
-            axis.set_title(f"{edge.name}: {edge.source} → {edge.sink}")
-        label_outer(axes, "opening command w in V", "pressure drop in MPa")
+            axis.set_title(heading(edge, model.axes(edge)))
+        label_outer(axes, *common_labels(model))
         _legend(figure, flowmap)
     return figure
 
 
-def _blocks(axis: Axes, edge: EdgeMap) -> None:
-    u, p = edge.grid.u_v, edge.grid.dp_pa * MPA
+def _blocks(axis: Axes, edge: EdgeMap, factor: float) -> None:
+    u, p = edge.grid.u_v, edge.grid.dp_pa * factor
     words = list(FILL)
     code = np.searchsorted(sorted(words), edge.status)
     fills = mpl.colors.ListedColormap([FILL[word] for word in sorted(words)])

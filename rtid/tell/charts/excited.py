@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from rtid.excite.prediction import Prediction
 from rtid.model import Edge, Machine
+from rtid.tell.axes import common_labels
 from rtid.tell.colours import GREY, INK
 from rtid.tell.stills import STYLE, label_outer, panels
 from rtid.units import MPA
@@ -25,7 +26,7 @@ def predicted(model: Machine, motions: tuple[Prediction, ...]) -> Figure:
             edge, motion = k // 2, motions[k % 2]
             mesh = _sds(axis, model.edges[edge], edge, motion)
             axis.set_title(f"{model.edges[edge].name}: {motion.name}")
-        label_outer(axes, "opening command w in V", "pressure drop in MPa")
+        label_outer(axes, *common_labels(model))
         bar = figure.colorbar(mesh, ax=axes, shrink=0.6, aspect=40)
         bar.set_label("predicted standard error of the map, % of the largest flow; dot: valid")
     return figure

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 
 from rtid.compare.tables import AnyMap
 from rtid.estimator.flowmap import VALID, EdgeMap, FlowMap
+from rtid.model import NONE, Axes
 from rtid.plain import BoolArray, FloatArray
+from rtid.tell.axes import HYDRAULIC, joined, labels, second
 from rtid.tell.colours import BLUE, INK
 from rtid.tell.story import Chart, Dots, Line, Palette, Panel, Plane, Planes, Remark, Strip
-from rtid.units import MPA, Z95, flow_name, lpm
+from rtid.units import Z95, Scale, flow_name, lpm
 
 FIELDS = 96, 120  # of a plane: over the pressure drop, over the command
 SLICES, ROW = 5, 4  # of a map, and pictures beside each other
@@ -20,55 +23,69 @@ POINTS, DOTS = 200, 25  # of a slice, and of a reference beside it
 LEAST_FLOW = 0.02  # of the largest: what a row of blocks passes that is worth a slice
 SURE = 0.98  # quantile of what two maps differ by at which its scale ends
 DOUBT = 0.05  # of the largest flow: end of the scale of its interval
-COMMAND, DROP = "opening command in V", "pressure drop in MPa"
+_OF_DROPS = (
+    "Learned flow over opening command and pressure drop. Outlined blocks stand on their own "
+    "data, the others follow the valve's law from these."
+)
+_OF_RATES = "Learned rate. Outlined blocks stand on their own data."
 
 
 def _flow() -> str:
     return f"flow in {flow_name()}"
 
 
-def maps(flowmap: FlowMap, points: Mapping[str, FloatArray] | None = None) -> Planes:
+def maps(
+    flowmap: FlowMap,
+    points: Mapping[str, FloatArray] | None = None,
+    axes: Mapping[str, Axes] = MappingProxyType({}),
+) -> Planes:
     """Q in L/min, one scale for all valves; veiled where a block is not valid.
 
-    points: of the data by valve, (n, 2) in V and MPa.
+    points: of the data by valve, (n, 2) in V and MPa.  axes: by valve, see `rtid.tell.axes`.
     """
     largest = max((np.nan_to_num(edge.q_max_m3s) for edge in flowmap.edges), default=0.0) * lpm()
     top = 1.25 * max(largest, 1e-3)
     planes = tuple(
         replace(
-            _plane(edge, edge.name, _flow_on(edge), (0.0, top), "flow"),
+            _plane(edge, over, edge.name, _flow_on(edge), (0.0, top), "flow"),
             points=(points or {}).get(edge.name),
         )
-        for edge in flowmap.edges
+        for edge, over in _with_axes(flowmap, axes)
     )
-    caption = (
-        "Learned flow over opening command and pressure drop. Outlined blocks stand on their own "
-        "data, the others follow the valve's law from these."
-    ) + (" Dots: where the record was." if points else "")
-    words = "valid", "not valid: from the orifice law"
-    return Planes("maps", "Flow maps", planes, COMMAND, DROP, _flow(), caption, *words)
+    named = [labels(over) for _, over in _with_axes(flowmap, axes)]
+    x, y = (joined([pair[k] for pair in named]) for k in (0, 1))
+    is_rate = any(over.over is not None for over in axes.values())
+    caption = _OF_RATES if is_rate else _OF_DROPS
+    caption += " Dots: where the record was." if points else ""
+    words = "valid", "not valid" if is_rate else "not valid: from the orifice law"
+    return Planes("maps", "Flow maps", planes, x, y, _flow(), caption, *words)
 
 
-def flow_plane(edge: EdgeMap) -> Plane:
+def _with_axes(flowmap: FlowMap, axes: Mapping[str, Axes]) -> list[tuple[EdgeMap, Axes]]:
+    return [(edge, axes.get(edge.name, HYDRAULIC)) for edge in flowmap.edges]
+
+
+def flow_plane(edge: EdgeMap, axes: Axes = HYDRAULIC) -> Plane:
     """The flow of a valve on its own scale."""
-    return _plane(edge, f"{edge.name}: {_flow()}", _flow_on(edge), (0.0, _top(edge)), "flow")
+    title, scale = f"{edge.name}: {_flow()}", (0.0, _top(edge))
+    return _plane(edge, axes, title, _flow_on(edge), scale, "flow")
 
 
-def interval_plane(edge: EdgeMap) -> Plane:
+def interval_plane(edge: EdgeMap, axes: Axes = HYDRAULIC) -> Plane:
     """Half the 95 % interval of a valve's flow."""
     sd = Z95 * edge.sd(*_lattice(edge)) * lpm()
     title = f"{edge.name}: ± 95 % interval in {flow_name()}"
-    return _plane(edge, title, sd, (0.0, DOUBT * _top(edge)), "doubt")
+    return _plane(edge, axes, title, sd, (0.0, DOUBT * _top(edge)), "doubt")
 
 
-def change_plane(edge: EdgeMap, other: AnyMap, name: str) -> Plane:
+def change_plane(edge: EdgeMap, other: AnyMap, name: str, axes: Axes = HYDRAULIC) -> Plane:
     """The flow of a valve less that of another map, `name`."""
     w, dp = np.broadcast_arrays(*_lattice(edge))
     change = _flow_on(edge) - other.flow(edge.name, w, dp) * lpm()
     known = np.abs(change[np.isfinite(change)])
     most = float(np.quantile(known, SURE)) if len(known) else 1.0
     title = f"{edge.name}: flow less {name}, {flow_name()}"
-    return _plane(edge, title, change, (-most, most), "change")
+    return _plane(edge, axes, title, change, (-most, most), "change")
 
 
 def _flow_on(edge: EdgeMap) -> FloatArray:
@@ -93,9 +110,10 @@ def _middles(borders: FloatArray, count: int) -> FloatArray:
 
 
 def _plane(
-    edge: EdgeMap, title: str, values: FloatArray, scale: tuple[float, float], palette: Palette
-) -> Plane:
-    u, p, valid = edge.grid.u_v, edge.grid.dp_pa * MPA, edge.status == VALID
+    edge: EdgeMap, axes: Axes, title: str, values: FloatArray, scale: tuple[float, float],
+    palette: Palette,
+) -> Plane:  # fmt: skip
+    u, p, valid = edge.grid.u_v, edge.grid.dp_pa * second(axes).factor, edge.status == VALID
     ends = (float(u[0]), float(u[-1])), (float(p[0]), float(p[-1]))
     return Plane(
         title, *ends, values, *scale, palette, _outline(u, p, valid), _fields(u, p, ~valid)
@@ -123,13 +141,16 @@ def slices(
     reference: AnyMap | None = None,
     u_v: Sequence[float] | None = None,
     reference_name: str = "reference",
+    axes: Mapping[str, Axes] = MappingProxyType({}),
 ) -> Chart:
     """Q(dp) at fixed commands, V, with the 95 % band, beside a reference; dashed where not valid.
 
-    u_v: the commands; evenly spread over the valid range of each valve if not given.
+    u_v: the commands; evenly spread over the valid range of each valve if not given.  axes: by
+    valve, see `rtid.tell.axes`; a map of the command alone is shown over the command.
     """
     panels = [
-        slice_panel(edge, edge.name, "dp", u_v, reference, reference_name) for edge in flowmap.edges
+        slice_panel(edge, edge.name, "dp", u_v, reference, reference_name, over)
+        for edge, over in _with_axes(flowmap, axes)
     ]
     rows = tuple(tuple(panels[k : k + ROW]) for k in range(0, len(panels), ROW))
     caption = (
@@ -146,27 +167,42 @@ def slice_panel(
     at: Sequence[float] | None = None,
     reference: AnyMap | None = None,
     reference_name: str = "",
+    axes: Axes = HYDRAULIC,
 ) -> Panel:
-    """Flow over the pressure drop ("dp") at fixed commands `at`, V, or over "u" at drops, Pa."""
-    over_drop = along == "dp"
+    """Flow over the pressure drop ("dp") at fixed commands `at`, V, or over "u" at drops, Pa.
+
+    axes: of a rate's map, the second quantity in place of the drop; without one always over "u".
+    """
+    over_drop = along == "dp" and axes.over != NONE
     fixed, free = (edge.grid.u_v, edge.grid.dp_pa)[:: 1 if over_drop else -1]
-    fixed_at = _spread(edge, fixed, over_drop) if at is None else np.asarray(at, np.float64)
-    unit, scale = ("V", MPA) if over_drop else ("MPa", 1.0)
-    cut = _Cut(edge, over_drop, scale, fixed_at, max(float(free[0]), 0.0), float(free[-1]))
+    by_itself = at is None or axes.over == NONE
+    fixed_at = _spread(edge, fixed, over_drop) if by_itself else np.asarray(at, np.float64)
+    scales = Scale(axes.command, 1.0), second(axes)
+    of_fixed, of_free = scales[:: 1 if over_drop else -1]
+    low = max(float(free[0]), 0.0) if axes.over is None else float(free[0])
+    cut = _Cut(edge, over_drop, of_free.factor, fixed_at, low, float(free[-1]))
     x, q, sd, valid = cut.flow()
-    ends = [
-        Remark(float(x[k, -1]), f"{value if over_drop else value * MPA:.3g} {unit}", INK,
-               y=float(q[k, -1]))
-        for k, value in enumerate(fixed_at)
-    ]  # fmt: skip
+    least = 0.0 if axes.over is None else -np.inf  # a rate has two directions
+    ends = () if axes.over == NONE else _ends(x, q, fixed_at, of_fixed)
     lines = (
         Line("extrapolated", _joined(x), _joined(q), BLUE, 0.9, is_dashed=True),
         Line("learned, valid", _joined(x), _joined(np.where(valid, q, np.nan)), BLUE, 2.0),
     )
-    strip = Strip("95 % band", _joined(x), _joined(np.maximum(q - sd, 0.0)), _joined(q + sd), BLUE)
+    strip = Strip(
+        "95 % band", _joined(x), _joined(np.maximum(q - sd, least)), _joined(q + sd), BLUE
+    )
     dots = cut.dots(reference, reference_name)
-    x_label = DROP if over_drop else COMMAND
-    return Panel(title, x_label, _flow(), lines, (dots,), (), tuple(ends), (strip,), has_zero=False)
+    x_label = labels(axes)[int(over_drop)]
+    return Panel(title, x_label, _flow(), lines, (dots,), (), ends, (strip,), has_zero=False)
+
+
+def _ends(x: FloatArray, q: FloatArray, fixed: FloatArray, scale: Scale) -> tuple[Remark, ...]:
+    """What each slice is at, behind its end."""
+    unit = "" if scale.name == "1" else f" {scale.name}"
+    return tuple(
+        Remark(float(x[k, -1]), f"{value * scale.factor:.3g}{unit}", INK, y=float(q[k, -1]))
+        for k, value in enumerate(fixed)
+    )
 
 
 class _Cut:

@@ -7,7 +7,7 @@ import numpy as np
 from rtid.estimator.track import pressure_drop
 from rtid.model import Edge, Machine
 from rtid.plain import FloatArray
-from rtid.units import MPA
+from rtid.tell.axes import second
 
 
 def working_points(model: Machine, edge: Edge, chunk: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -22,7 +22,7 @@ def working_points(model: Machine, edge: Edge, chunk: FloatArray) -> tuple[Float
 
 
 def spread_points(model: Machine, edge: Edge, chunk: FloatArray, most: int) -> FloatArray:
-    """Some of them, spread over the record: (n, 2), V and MPa."""
+    """Some of them, spread over the record: (n, 2), V and MPa, or as a rate's map has them."""
     w_v, dp_pa = working_points(model, edge, chunk)
     step = max(1, len(w_v) // most)
-    return np.stack([w_v[::step], dp_pa[::step] * MPA], axis=1)
+    return np.stack([w_v[::step], dp_pa[::step] * second(model.axes(edge)).factor], axis=1)

@@ -15,9 +15,10 @@ from matplotlib.patches import Patch, Rectangle
 from rtid.compare import BlockRow
 from rtid.compare.tables import CAUSES, cause_of
 from rtid.model import Edge, Machine
+from rtid.tell.axes import common_labels, heading, second
 from rtid.tell.colours import GREY, INK, LINE
 from rtid.tell.stills import STYLE, label_outer, panels
-from rtid.units import MPA, flow_name, lpm
+from rtid.units import flow_name, lpm
 
 HATCHES = dict(zip(CAUSES, ("", "....", "////", "\\\\\\\\", "xxxx", "++++"), strict=True))
 EMPTY = "#f4f4f2"
@@ -36,9 +37,9 @@ def residual_map(model: Machine, rows: Sequence[BlockRow]) -> Figure:
         norm, colours = mpl.colors.Normalize(0.0, max(top, 1e-9)), mpl.colormaps["YlOrBr"]
         for axis, edge in zip(axes, model.maps, strict=True):
             of_edge = [row for row in rows if row.edge == edge.name]
-            _blocks(axis, edge, of_edge, norm, colours)
-            axis.set_title(f"{edge.name}: {edge.source} → {edge.sink}")
-        label_outer(axes, "opening command w in V", "pressure drop in MPa")
+            _blocks(axis, edge, of_edge, norm, colours, second(model.axes(edge)).factor)
+            axis.set_title(heading(edge, model.axes(edge)))
+        label_outer(axes, *common_labels(model))
         scale = mpl.cm.ScalarMappable(norm, colours)
         bar = figure.colorbar(
             scale,
@@ -59,24 +60,25 @@ def _blocks(
     rows: Sequence[BlockRow],
     norm: mpl.colors.Normalize,
     colours: mpl.colors.Colormap,
+    factor: float,
 ) -> None:
-    u, p = edge.grid.u_v, edge.grid.dp_pa * MPA
+    u, p = edge.grid.u_v, edge.grid.dp_pa * factor
     axis.set_xlim(u[0], u[-1])
     axis.set_ylim(p[0], p[-1])
     axis.set_facecolor("white")
     for row in rows:
         known = np.isfinite(row.residual_rms_m3s)
         face = colours(norm(row.residual_rms_m3s * lpm())) if known else EMPTY
-        axis.add_patch(Rectangle(*_box(row), facecolor=face, edgecolor=LINE, linewidth=0.4))
+        axis.add_patch(Rectangle(*_box(row, factor), facecolor=face, edgecolor=LINE, linewidth=0.4))
     for cause, hatch in HATCHES.items():
-        boxes = [Rectangle(*_box(row)) for row in rows if cause_of(row) == cause]
+        boxes = [Rectangle(*_box(row, factor)) for row in rows if cause_of(row) == cause]
         if boxes and hatch:
             style = PatchCollection(boxes, facecolor="none", edgecolor=GREY, linewidth=0.0)
             style.set_hatch(hatch)
             axis.add_collection(style)
     worst = max(rows, key=lambda row: row.residual_share, default=None)
     if worst is not None and worst.residual_share > 0:
-        (x, y), width, height = _box(worst)
+        (x, y), width, height = _box(worst, factor)
         frame = Rectangle((x, y), width, height, facecolor="none", edgecolor=INK, linewidth=1.4)
         axis.add_patch(frame)
         text, at = f"{100 * worst.residual_share:.0f} %", (x + width, y + height)
@@ -84,9 +86,9 @@ def _blocks(
         axis.annotate(text, at, fontsize=8, color=INK, **shift)
 
 
-def _box(row: BlockRow) -> tuple[tuple[float, float], float, float]:
-    low = row.dp_pa[0] * MPA
-    return (row.u_v[0], low), row.u_v[1] - row.u_v[0], row.dp_pa[1] * MPA - low
+def _box(row: BlockRow, factor: float) -> tuple[tuple[float, float], float, float]:
+    low = row.dp_pa[0] * factor
+    return (row.u_v[0], low), row.u_v[1] - row.u_v[0], row.dp_pa[1] * factor - low
 
 
 def _legend(figure: Figure, rows: Sequence[BlockRow]) -> None:
