@@ -187,7 +187,7 @@ def test_the_page_says_the_units_of_a_rate(crane: tuple[Crane, Path, Path]) -> N
     opened = Desk(lambda _text, _share: None).open(project, table, None)
     seen = [ShownRevision(opened.look, ())]
     session = SimpleNamespace(
-        seen=seen, revisions=seen, opened=opened, released=None, trace=table, last=seen[0]
+        seen=seen, revisions=seen, opened=opened, offered=None, trace=table, last=seen[0]
     )
     bench = Bench(cast("Session", session), lambda _key: None, lambda *_span: None)
     where, shown_map = WhereView(bench), MapView(bench)

@@ -153,7 +153,7 @@ class MapView(PageView):
             f"follow {law} from these, and their interval says how far to trust them. "
             "Next: hold it beside a reference or another valve, or release it."
         )
-        released = self.bench.session.released
+        released = self.bench.session.offered
         below = shown(released) if released else self._table()
         asked = controls(self.wish, formats(), self._there())
         return {"tools": tools, "release": asked, "says": says + below}

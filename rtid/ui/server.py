@@ -114,7 +114,7 @@ class Download(RequestHandler):
 
     def get(self) -> None:
         """One file, to be saved."""
-        released, name = self._session.released, self.get_query_argument("name", "")
+        released, name = self._session.offered, self.get_query_argument("name", "")
         path = next((p for p in released.files if p.name == name), None) if released else None
         if path is None or not path.is_file():
             self.set_status(404)

@@ -75,12 +75,13 @@ class Session:
     pages: Counter[int] = field(default_factory=Counter)  # open ones by browser
     writer: int | None = None  # the browser that works on the record
     arrival: Arrival | None = None  # before there is a project
-    released: Released | None = None  # that can be taken from the page
+    released: Released | None = None  # the last that was written, see `offered`
     folder: Path | None = None  # in which a daemon keeps its state
     test_bus: bool = False  # maps may be sent over a bus that anybody may write to
     sending: Sending | None = None  # waits for a yes
     is_stopped: bool = False  # what was being done, by the user
     _is_adding: bool = False
+    _released_of: ShownRevision | None = None
 
     def open(self) -> None:
         """Read the record."""
@@ -223,11 +224,20 @@ class Session:
         """Write a report beside the record."""
         self.ask("export", what, then=self.say)
 
+    @property
+    def offered(self) -> Released | None:
+        """What can be taken from the page: released of the model that it shows, not of one before.
+
+        The files stay where they were written; whoever signs the sheet shall sign the page's maps.
+        """
+        return self.released if self._released_of is self.last else None
+
     def release(self, wish: ReleaseWish) -> None:
         """Write the maps as a controller or a tool takes them, to be taken from the page."""
+        revision = self.last
 
         def done(released: Released) -> None:
-            self.released = released
+            self.released, self._released_of = released, revision
             self.tell("looks")
             self.say(f"wrote {released.files[0]}")
 

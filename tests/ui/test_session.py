@@ -16,6 +16,7 @@ from rtid.tell.story import Story
 from rtid.trace.glance import Curve
 from rtid.ui.add_view import sentence
 from rtid.ui.headline import strip
+from rtid.ui.release_form import Released, ReleaseWish
 from rtid.ui.sending import Sending, Way
 from rtid.ui.shared import FAILED, LOADING, READY, ROLE, Session
 from tests.replays import shared_replays  # noqa: F401
@@ -91,6 +92,10 @@ def waiting(session: Session) -> Sending | None:
     return session.sending
 
 
+def offered(session: Session) -> Released | None:
+    return session.offered
+
+
 def looks(session: Session) -> list[Any]:
     return [revision.look for revision in session.revisions]
 
@@ -125,6 +130,26 @@ def test_a_record_that_cannot_be_read_says_why() -> None:
     worker.refuse("run.blf: no complete sample")
     assert session.state == FAILED
     assert session.trouble == ("run.blf: no complete sample", "do something else")
+
+
+def test_a_release_is_offered_of_the_model_that_is_shown_alone() -> None:
+    session, worker, _ = begun()
+    diagnosed(worker)
+    released = Released((Path("run.map.dcm"),), (), ())
+    session.release(ReleaseWish())
+    assert worker.answer(released) == "release"
+    assert offered(session) is released
+    session.add(*KEY)
+    worker.answer(addition())
+    assert offered(session) is None  # its maps are of the model before
+    worker.answer("second look")
+    assert offered(session) is None
+    worker.jobs.clear()
+    session.release(ReleaseWish())
+    worker.answer(released)
+    assert offered(session) is released
+    session.undo()
+    assert offered(session) is None
 
 
 def test_add_and_undo_leave_the_file_alone() -> None:
