@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -129,6 +130,26 @@ def test_the_sheet_tells_what_is_signed(flowmap: FlowMap, tmp_path: Path) -> Non
     nodes = f"{len(tables[0].u_v)} x {len(tables[0].dp_pa)}"
     for words in ("&lt;new&gt;.dcm", "p &amp; q", "abc", nodes, "released, date", "Against what"):
         assert words in page
+    found = {"value": 2e-12, "std": 7.3e-14, "unit": "m3/s/Pa"}
+    leak = {
+        "effect": "internal_leakage_laminar",
+        "where": "a-b",
+        "parameters": {"coefficient": found},
+    }
+    origin = {
+        "effects": [leak],
+        "beta_pa": [608115697.1, None],
+        "beta_sd_pa": [2e5, None],
+        "rho": 1.01234,
+    }
+    page = sheet("new.dcm", tables, changes, origin)
+    for words in (
+        "608.1 ± 0.39 MPa</dd>",
+        "Internal leakage, laminar (a-b): coefficient 0.12 ± 0.0086 L/min/MPa",
+        "1.01 times the noise",
+    ):
+        assert words in page
+    assert not re.search(r"[{\[]['\d]|_pa|e-14", page.partition("</style>")[2])
     lines = "\n".join(said(tables, changes))
     assert nodes in lines and f"together {sum(g.n_bytes for g in tables)} bytes" in lines
     assert "e1 against what is there" in lines

@@ -5,6 +5,7 @@ In lines for the terminal, and as a sheet to be signed.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -12,7 +13,8 @@ from firmware_bridge.lookup import STATUS
 from rtid.maps.flashed import FlashedDifference
 from rtid.maps.gridded import Gridded, Tables
 from rtid.tell.html import table, text
-from rtid.units import LPM, MPA
+from rtid.tell.words import named
+from rtid.units import LPM, MPA, with_unit
 
 HEADS = ("map", "nodes|", "bytes|", "largest flow|", "off by|", "on data|", "ranges")
 CHANGED = ("map", "largest difference|", "of the largest flow|", "at", "rms|")
@@ -76,7 +78,7 @@ def sheet(
 ) -> str:
     """The sheet as one HTML page; output: the file that it is about."""
     facts = "".join(
-        f"<dt>{text(key)}</dt><dd>{text(str(value))}</dd>" for key, value in provenance.items()
+        f"<dt>{text(name)}</dt><dd>{text(words)}</dd>" for name, words in _facts(provenance)
     )
     parts = [_table(HEADS, rows(tables))]
     if differences:
@@ -89,6 +91,40 @@ def sheet(
         "learned; the others are the orifice law or the prior.</p>"
         '<div class="sign"><p>made, date</p><p>released, date</p></div></html>\n'
     )
+
+
+def _facts(provenance: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """What the maps come from, in the words and units of the report."""
+    for key, value in provenance.items():
+        if key == "beta_pa":
+            sds = provenance.get("beta_sd_pa") or [None] * len(value)
+            if moduli := [_modulus(b, sd) for b, sd in zip(value, sds, strict=True) if b]:
+                yield "bulk modulus", ", ".join(moduli)
+        elif key == "effects":
+            yield "learned beside", "; ".join(map(_effect, value)) or "no effect"
+        elif key == "rho":
+            yield "residual variance", f"{value:.3g} times the noise's"
+        elif key != "beta_sd_pa":
+            yield key.replace("_", " "), str(value)
+
+
+def _modulus(beta_pa: float, sd_pa: float | None) -> str:
+    return with_unit(beta_pa, "Pa", math.nan if sd_pa is None else sd_pa)
+
+
+def _effect(effect: Mapping[str, Any]) -> str:
+    """With its sizes; an older file has effects without their place or parameters."""
+    sizes = [
+        f"{name.replace('_', ' ')} {with_unit(v['value'], v['unit'], _sd(v))}"
+        for name, v in effect.get("parameters", {}).items()
+    ]
+    name = named((effect["effect"], effect.get("where", "")))
+    return f"{name}: {', '.join(sizes)}" if sizes else name
+
+
+def _sd(value: Mapping[str, Any]) -> float:
+    """None stands for a number that JSON does not know."""
+    return math.nan if value.get("std") is None else float(value["std"])
 
 
 def _table(heads: Sequence[str], lines: Iterator[tuple[str, ...]]) -> str:
