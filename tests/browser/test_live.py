@@ -41,6 +41,11 @@ END_S = 60.0
 UPDATES = "() => Number(document.querySelector('#seen').textContent)"
 # what a page shows that gets no answer any more, without the line of the console about it
 GONE = """() => { window.fetch = () => Promise.reject(); }"""
+REFUSED = """() => {
+  window.asked = 0;
+  const refusal = new Response("", { status: 401 });
+  window.fetch = () => { window.asked += 1; return Promise.resolve(refusal); };
+}"""
 SLID_S = 2.0
 PLACES = f"""() => new Promise((done) => {{
   const seen = new Set(), end = performance.now() + {1e3 * SLID_S};
@@ -196,6 +201,19 @@ def test_the_page_of_a_machine_without_a_daemon_says_what_to_do(
             opened.page.evaluate(GONE)
             opened.page.wait_for_selector("#lost >> text=The server has gone")
             assert_clear(opened.page, "#lost", "#cover h2")
+
+
+def test_a_page_that_another_server_refuses_says_where_to_go_and_asks_no_more(
+    browser: Browser, project: Path, tmp_path: Path
+) -> None:
+    """A server that was started anew has another token: the page waited for it for ever."""
+    with served(project=project, state=tmp_path) as bench:
+        for opened in open_page(browser, bench):
+            opened.go()
+            opened.page.evaluate(REFUSED)
+            opened.page.wait_for_selector("#lost >> text=open the address that it prints")
+            opened.page.wait_for_timeout(1e3 * 4.0)  # longer than from one question to the next
+            assert opened.page.evaluate("() => window.asked") == 1
 
 
 # The daemon and its machine run on to the end of this module: what needs them comes last.

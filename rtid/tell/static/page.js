@@ -149,10 +149,16 @@
   plots.keepFitting();
   document.addEventListener("DOMContentLoaded", attach);
 
-  // -- a page whose server has gone says so, and comes back by itself
-  document.addEventListener("DOMContentLoaded", () => setInterval(() => {
-    fetch("alive", { cache: "no-store" }).then(
-      (r) => { if (!$("lost").hidden && r.ok) location.reload(); },
-      () => { $("lost").hidden = false; });
-  }, 3000));
+  // -- a page whose server has gone says so; it comes back once that one answers again, and asks no
+  // more where another has taken its place: that has another token, which is in the address it prints
+  document.addEventListener("DOMContentLoaded", () => {
+    const asking = setInterval(() => {
+      fetch("alive", { cache: "no-store" }).then(
+        (r) => {
+          if (r.status === 401) { clearInterval(asking); $("lost").hidden = false; }
+          else if (!$("lost").hidden && r.ok) location.reload();
+        },
+        () => { $("lost").hidden = false; });
+    }, 3000);
+  });
 })();
