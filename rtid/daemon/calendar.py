@@ -2,6 +2,12 @@
 
 A mean of n estimates has the scatter of their values as its deviation: they are published from one
 growing estimate and are not independent, so that it is not divided by sqrt(n).
+
+An estimate counts where it is known: a bulk modulus by three deviations of itself, since it is
+never zero.  Other quantities may come back to zero (a leak that was mended, a sensor's offset) and
+are known there too: theirs count by a deviation within a third of the largest value that was surely
+seen in the span.  All that counts weighs the same: weights by the deviation would show only how the
+span ended.
 """
 
 from __future__ import annotations
@@ -21,7 +27,17 @@ from rtid.units import scale_of
 
 NOTES = "CREATE TABLE IF NOT EXISTS note (from_s REAL, until_s REAL, who TEXT, text TEXT)"
 KNOWN = "1e100"  # what is not known yet is infinite
+SURE = "0.333"  # of a value, its deviation at most: that of an estimate without data is beyond it
+END_S = 1e100  # of a span that is open
 MOST_POINTS = 400  # of a trend
+# what counts of two tables between two times
+MODULI = f"""FROM estimate WHERE unix_s >= ? AND unix_s < ?
+  AND beta_sd_pa <= {SURE} * beta_pa AND beta_pa < {KNOWN}"""
+QUANTITIES = f"""FROM (
+  SELECT *, max(CASE WHEN sd <= {SURE} * abs(value) THEN abs(value) END)
+    OVER (PARTITION BY name, unit) AS seen
+  FROM quantity WHERE unix_s >= ? AND unix_s < ? AND abs(value) < {KNOWN}
+) WHERE sd <= {SURE} * seen"""
 
 
 @dataclass(frozen=True)
@@ -101,21 +117,20 @@ def _values(base: sqlite3.Connection, span: Span) -> dict[tuple[str, str], tuple
     ends = (span.from_s, span.until_s)
     mean = "avg({0}), sqrt(max(0, avg({0} * {0}) - avg({0}) * avg({0})))"
     found: dict[tuple[str, str], tuple[float, float]] = {}
-    for table, key, column, name, unit in (
-        ("estimate", "chamber", "beta_pa", "bulk modulus {}", "Pa"),
-        ("map", "edge", "valid * 1.0", "blocks known, valve {}", ""),
+    for chamber, v, sd in base.execute(
+        f"SELECT chamber, {mean.format('beta_pa')} {MODULI} GROUP BY chamber", ends
     ):
-        rows = base.execute(
-            f"SELECT {key}, {mean.format(column)} FROM {table} "
-            f"WHERE unix_s >= ? AND unix_s < ? AND abs({column}) < {KNOWN} GROUP BY {key}", ends,
-        )  # fmt: skip
-        found |= {(name.format(k), unit): (v, sd) for k, v, sd in rows if None not in (v, sd)}
+        found[f"bulk modulus {chamber}", "Pa"] = (v, sd)
+    for edge, v, sd in base.execute(
+        f"SELECT edge, {mean.format('valid * 1.0')} FROM map WHERE unix_s >= ? AND unix_s < ? "
+        "GROUP BY edge", ends,
+    ):  # fmt: skip
+        found[f"blocks known, valve {edge}", ""] = (v, sd)
     if _has(base, "quantity"):
         rows = base.execute(
-            f"SELECT name, unit, {mean.format('value')} FROM quantity WHERE unix_s >= ? "
-            f"AND unix_s < ? AND abs(value) < {KNOWN} GROUP BY name, unit", ends,
-        )  # fmt: skip
-        found |= {(name, unit): (v, sd) for name, unit, v, sd in rows if None not in (v, sd)}
+            f"SELECT name, unit, {mean.format('value')} {QUANTITIES} GROUP BY name, unit", ends
+        )
+        found |= {(name, unit): (v, sd) for name, unit, v, sd in rows}
     for v, sd in base.execute(
         f"SELECT {mean.format('rho')} FROM map WHERE unix_s >= ? AND unix_s < ?", ends
     ):
@@ -132,27 +147,27 @@ def _values(base: sqlite3.Connection, span: Span) -> dict[tuple[str, str], tuple
 def trend(folder: Path, since_s: float) -> list[TrendLine]:
     """What was learned since a time, thinned to means: bulk moduli, then lag and sizes by name."""
     with _opened(folder) as base:
-        found = list(_thinned(base, "estimate", "chamber", "beta_pa", "beta_sd_pa", since_s))
+        found = list(_thinned(base, MODULI, "chamber", "beta_pa", "beta_sd_pa", since_s))
         trends = [TrendLine(f"bulk modulus {name}", "Pa", points) for (name,), points in found]
         if _has(base, "quantity"):
-            found = list(_thinned(base, "quantity", "name, unit", "value", "sd", since_s))
+            found = list(_thinned(base, QUANTITIES, "name, unit", "value", "sd", since_s))
             trends += [TrendLine(name, unit, points) for (name, unit), points in found]
     return trends
 
 
 def _thinned(
-    base: sqlite3.Connection, table: str, key: str, value: str, sd: str, since_s: float
+    base: sqlite3.Connection, known: str, key: str, value: str, sd: str, since_s: float
 ) -> Iterator[tuple[tuple[str, ...], tuple[TrendPoint, ...]]]:
     """Means over the MOST_POINTS part of the time that there is something of, by key."""
-    known = f"FROM {table} WHERE unix_s >= ? AND abs({value}) < {KNOWN} AND abs({sd}) < {KNOWN}"
-    first, last = base.execute(f"SELECT min(unix_s), max(unix_s) {known}", (since_s,)).fetchone()
+    span = (since_s, END_S)
+    first, last = base.execute(f"SELECT min(unix_s), max(unix_s) {known}", span).fetchone()
     if first is None:
         return
     step_s = max((last - first) / (MOST_POINTS - 1), 1e-3)
     rows = base.execute(
         f"SELECT {key}, avg(unix_s), avg({value}), avg({sd}) {known} "
         f"GROUP BY {key}, CAST((unix_s - ?) / ? AS INTEGER) ORDER BY {key}, avg(unix_s)",
-        (since_s, first, step_s),
+        (*span, first, step_s),
     ).fetchall()
     for name, group in groupby(rows, lambda row: tuple(row[:-3])):
         yield name, tuple((t, v, deviation) for *_, t, v, deviation in group)

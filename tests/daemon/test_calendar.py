@@ -97,6 +97,29 @@ def test_sizes_and_the_lag_are_kept_with_their_intervals(tmp_path: Path) -> None
     assert rows["spool lag"].now == pytest.approx((5e-3, 0.0), abs=1e-9)
 
 
+def test_an_estimate_counts_where_it_is_known(tmp_path: Path) -> None:
+    """Not the first of a modulus, from hardly any data; what came back to zero is known there."""
+    Chronicle(tmp_path).close()
+    moduli = [(-1.4e10, 1.7e11), (2e9, 1.5e9), (1e9, 1e7), (1.1e9, 1e7)]
+    leaks = [(-9e-10, 8e-9), (2e-12, 1e-13), (0.0, 1e-13), (1e-12, 1e-13)]
+    with closing(sqlite3.connect(tmp_path / FILE)) as base:
+        for k, (modulus, leak) in enumerate(zip(moduli, leaks, strict=True)):
+            at_s = NOW_S - 90.0 + 10.0 * k
+            base.execute("INSERT INTO estimate VALUES (?, 'a', ?, ?)", (at_s, *modulus))
+            base.execute("INSERT INTO estimate VALUES (?, 'b', ?, ?)", (at_s, *moduli[0]))
+            row = (at_s, "leak", "m3/s/Pa", *leak)
+            base.execute("INSERT INTO quantity VALUES (?, ?, ?, ?, ?)", row)
+            base.execute("INSERT INTO quantity VALUES (?, 'wear of pa', '', 0, 0)", (at_s,))
+        base.commit()
+    rows = {row.name: row for row in side_by_side(tmp_path, *two_spans(1.0, NOW_S))}
+    assert rows["bulk modulus a"].now == pytest.approx((1.05e9, 5e7))
+    assert rows["leak"].now == pytest.approx((1e-12, 1e-12 * (2 / 3) ** 0.5))
+    assert rows["wear of pa"].now == (0.0, 0.0) and "bulk modulus b" not in rows
+    lines = {line.name: [v for _, v, _ in line.points] for line in trend(tmp_path, 0.0)}
+    assert lines["bulk modulus a"] == [1e9, 1.1e9]
+    assert lines["leak"] == [2e-12, 0.0, 1e-12] and "bulk modulus b" not in lines
+
+
 def test_a_history_of_an_older_daemon_has_no_sizes(history: Path) -> None:
     with closing(sqlite3.connect(history / FILE)) as base:
         base.execute("DROP TABLE quantity")
