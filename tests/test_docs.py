@@ -217,3 +217,39 @@ def test_what_is_next_goes_by_the_verdict(outcome: str) -> None:
     commands = re.findall(r"rtid (\w+)", step)
     assert commands
     assert set(commands) <= set(EXAMPLES)
+
+
+@pytest.mark.parametrize("given", [
+    ("drive.csv", "--example", "electric_drive"), ("room.csv", "--example", "heated_room"),
+    ("run.parquet", "--duration", "2"),
+])  # fmt: skip
+def test_what_is_next_behind_a_simulation_can_be_typed(
+    given: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main.run(["simulate", str(tmp_path / given[0]), *given[1:]])
+    next_line = capsys.readouterr().out.splitlines()[-1]
+    typed = shlex.split(next_line.removeprefix("Next: rtid "))
+    with pytest.raises(SystemExit) as end:
+        main.run(typed)
+    said = capsys.readouterr()
+    assert end.value.code in (Exit.OK, Exit.NEGATIVE), said.err  # two seconds are too little
+
+
+def test_nothing_is_next_where_nothing_was_written(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["simulate", "--bus", "virtual", "--channel", "x", "--duration", "0.1", "--speed", "0"]
+    with pytest.raises(SystemExit):
+        main.run(words)
+    assert "sent" in (said := capsys.readouterr().out) and "Next" not in said
+
+
+def test_only_a_change_that_stands_can_be_taken_back(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    project = tmp_path / "machine.toml"
+    project.write_text("")
+    with pytest.raises(SystemExit):
+        main.run(["history", "-p", str(project)])
+    assert "no change yet" in (said := capsys.readouterr().out)
+    assert "Next: rtid diagnose" in said and "undo" not in said
+    assert "rtid undo" in next_step("history", {"project": project}, "changed")

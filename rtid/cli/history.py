@@ -37,7 +37,7 @@ def history(
     ] = None,
     note: Annotated[str, typer.Option(help="Write this about these days, for whoever looks.")] = "",
     as_json: AsJson = False,
-) -> None:
+) -> str | None:
     """List the changes of the model, and the points in time that `rtid restore` goes back to.
 
     Of a change: date, effect, errors before and after, noise floor, reason.  Of a point: when and
@@ -45,14 +45,15 @@ def history(
     beside the last one, from the daemon's history, with what was noted about them.
     """
     from rtid.project.history import history as changes_of
-    from rtid.project.history import state_beside
+    from rtid.project.history import standing, state_beside
     from rtid.tell.history import SCHEMA, plain, show_history, show_points
     from rtid.trace.points import points_of
 
     changes, folder = changes_of(project), state_beside(project)
+    outcome = "changed" if standing(changes) else None
     if days is not None:
         _calendar(folder, days, until, note, as_json)
-        return
+        return outcome
     if note or until:
         raise typer.BadParameter("--note and --until say something of --days")
     points = [(key.name, p) for key in sorted(folder.glob("*/")) for p in points_of(key)]
@@ -67,6 +68,7 @@ def history(
     else:
         show_history(changes)
         show_points([(p.path.stem, p.unix_s, p.reason, key) for key, p in points])
+    return outcome
 
 
 def _calendar(folder: Path, days: float, until: str | None, note: str, as_json: bool) -> None:

@@ -76,7 +76,7 @@ def simulate(
         float, typer.Option(help="On the bus: times real time; 0: as fast as possible.")
     ] = 1.0,
     as_json: AsJson = False,
-) -> None:
+) -> str | None:
     """Record a simulated machine: the trace, the truth (.truth.json), a project file (.toml).
 
     The trace then replays with `rtid replay TRACE --project TRACE.toml`.  With --bus the machine
@@ -91,10 +91,10 @@ def simulate(
     """
     if example == PROGRAMMABLE:
         _programmable(trace, 0 if plant is None else plant, hide, as_json)
-        return
+        return None
     if example is not None:
         _example(example, trace, seed, hide, as_json)
-        return
+        return "equations"
     _check_arguments(trace, bus, motion, plant, cross_port)
     _check_hidden(hide, hide_at_s)
     from rtid.tell.replay import progress_bar
@@ -112,6 +112,7 @@ def simulate(
         print(json.dumps(_plain(machine, run) | _files(written) | {"frames_sent": sent}))
     else:
         _tell(machine, run, written, f"sent {sent} frames on {bus} {channel}" if sent else "")
+    return None if written else "live"
 
 
 def _plain(machine: SimulatedPlant, run: Run) -> dict[str, Any]:

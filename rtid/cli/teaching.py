@@ -49,6 +49,8 @@ EXAMPLES = {
 NEXT = {
     "check": "rtid diagnose {trace} -p {project}",
     "simulate": "rtid diagnose {trace} -p {project}",
+    "simulate equations": "rtid refit {project} {trace} --diagnose",
+    "simulate live": "",  # nothing is written that a command could read
     "replay": "rtid diagnose {trace} -p {project}",
     "compare": "rtid diagnose {trace} -p {project}",
     "diagnose": "rtid ui {trace} -p {project}",
@@ -64,7 +66,9 @@ NEXT = {
     "add": "rtid report {trace} -p {project}; rtid export {trace} maps.csv -p {project}",
     "drop": "rtid diagnose {trace} -p {project}",
     "undo": "rtid history -p {project}",
-    "history": "rtid diagnose TRACE -p {project}; rtid undo -p {project} takes a change back",
+    "history": "rtid diagnose TRACE -p {project}",
+    "history changed": "rtid diagnose TRACE -p {project}; rtid undo -p {project} takes a change "
+    "back",
     "report": "open it and print it; rtid export {trace} maps.csv -p {project}",
     "excite": "drive it, record it, and rtid check RECORD -p {project}",
     "status": "rtid ui {project} shows it in the browser",
@@ -101,4 +105,5 @@ def next_step(command: str, given: Mapping[str, Any], outcome: str | None = None
         project = str(Path(trace).with_suffix(".toml"))
     beside = str(given.get("where") or "PROJECT")  # a state folder
     step = NEXT.get(f"{command} {outcome}", NEXT[command])
-    return f"Next: {step.format(trace=quote(trace), project=quote(project or beside))}"
+    step = step.format(trace=quote(trace), project=quote(project or beside))
+    return f"Next: {step}" if step else ""
