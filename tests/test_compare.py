@@ -170,6 +170,26 @@ def test_long_form_per_edge(tmp_path: Path) -> None:
     assert sheet.flow("b", 2.0, 2e6) * 6e4 == pytest.approx(6.0)
 
 
+@pytest.mark.parametrize("text", [
+    "u_V;dp_MPa;Q_l_min\n0,5;1,0;4,5\n1,5;1,0;NA\n1,5;2,0;12,5\n",
+    "\ufeff# gemessen\nu;dp;Q\nV;MPa;l/min\n0,5;1;4,5\n\n1,5;2;12,5\n",
+    "Prüfblatt\n\nu_V\tdp_MPa\tQ_l_min\n0.5\t1\t4.5\n# Mitte\n1.5\t2\t12.5\n",
+])  # fmt: skip
+@pytest.mark.parametrize("code", ["utf-8", "cp1252", "utf-16"])
+def test_a_sheet_of_a_german_spreadsheet(tmp_path: Path, text: str, code: str) -> None:
+    path = tmp_path / "m.csv"
+    path.write_bytes(text.removeprefix("\ufeff" if code == "cp1252" else "").encode(code))
+    sheet = read_reference(path)
+    assert sheet.flow("x", 0.5, 1e6) * 6e4 == pytest.approx(4.5)
+    assert sheet.flow("x", 1.5, 2e6) * 6e4 == pytest.approx(12.5)
+
+
+def test_a_first_row_of_numbers_that_are_missing_is_no_row_of_units(tmp_path: Path) -> None:
+    text = "abs_u_V,K_PA,K_AT\n0,NA,NA\n2,2e-7,1e-7\n3,2e-7,1e-7\n"
+    sheet = read_reference(write(tmp_path / "m.csv", text))
+    assert np.isnan(sheet.flow("pa", 1.0, 1e6)) and sheet.flow("at", 2.5, 1e6) > 0.0
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

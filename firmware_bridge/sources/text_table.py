@@ -25,6 +25,7 @@ from firmware_bridge.sources.errors import LogError
 
 LOOKED_AT, LONGEST = 200, 1 << 20  # lines in which the names are looked for, characters of each
 DELIMITERS = ";\t,"
+NULLS = ("NA", "N/A", "n/a", "NULL", "null", "#N/A")  # pyarrow knows them by itself
 MISSING = ("---", "--", "-", "?", "OL", "Overload", "#NV", "#DIV/0!", "#VALUE!")
 UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 STAMP = re.compile(
@@ -66,6 +67,24 @@ def read(path: Path) -> list[tuple[str, Any, str]]:
         ),
     )
     return list(zip(layout.names, content.columns, layout.units, strict=True))
+
+
+def rows_of(path: Path) -> tuple[Layout, list[list[str]]]:
+    """A small table as it is written, row by row, decimal points in its numbers; LogError.
+
+    Rows (n,) of fields, as many as each row has; blank ones and comments are left out.
+    """
+    layout = layout_of(path)
+    code = "utf-16" if layout.encoding == "utf-16" else "utf-8-sig"
+    lines = path.read_text(code, errors="surrogateescape").splitlines()[layout.first :]
+    rows = [_fields(_decoded(line), layout.delimiter) for line in lines if line.strip()]
+    if layout.decimal == ",":
+        rows = [[_with_point(field) for field in row] for row in rows]
+    return layout, [row for row in rows if any(row) and not row[0].startswith("#")]
+
+
+def _with_point(field: str) -> str:
+    return field.replace(",", ".") if _is_value(field) else field
 
 
 def layout_of(path: Path) -> Layout:
@@ -146,7 +165,7 @@ def _is_value(field: str) -> bool:
     try:
         float(field.replace(",", "."))
     except ValueError:
-        return STAMP.fullmatch(field) is not None or field in MISSING
+        return STAMP.fullmatch(field) is not None or field in (*MISSING, *NULLS)
     return True
 
 

@@ -1,5 +1,7 @@
 """Reference maps from CSV data sheets, units in the header; lines with # are comments.
 
+Semicolons, tabulators, decimal commas and a row of units are read as in a table of samples.
+
 abs_u_V,K                          one gain for all edges, Q = K sqrt(dp)
 abs_u_V,K_PA,K_AT,K_PB,K_BT        one gain per edge, m3/s/sqrt(Pa)
 dp_MPa,u_V,Q_l_min                 long form, optionally with a column `edge`
@@ -15,6 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from firmware_bridge.names import split_brackets
+from firmware_bridge.sources.errors import LogError
+from firmware_bridge.sources.text_table import rows_of
 from rtid.compare.reference import ANY_EDGE, GainTable, RateTable, ReferenceMap
 from rtid.errors import RtidError, door
 from rtid.estimator.orifice import root
@@ -40,18 +44,19 @@ def read_reference(path: str | Path) -> ReferenceMap:
 
 
 def _read_csv(path: Path) -> tuple[list[str], list[list[str]]]:
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        try:
-            rows = [row for row in csv.reader(file) if any(row) and not row[0].startswith("#")]
-        except (csv.Error, UnicodeDecodeError) as error:
-            raise DataSheetError(f"{path}: not a CSV table ({error})") from error
-    if len(rows) < 2:
+    """Names, with the unit that a row below them gives, and the fields of each line of numbers."""
+    try:
+        layout, rows = rows_of(path)
+    except (csv.Error, UnicodeError, LogError) as error:
+        raise DataSheetError(f"{path}: no data in a CSV table ({error})") from error
+    if not rows:
         raise DataSheetError(f"{path}: no data", "a header line and at least one line of numbers")
-    header = [name.strip() for name in rows[0]]
-    for k, row in enumerate(rows[1:], start=2):
+    named = zip(layout.names, layout.units, strict=True)
+    header = [f"{name} [{unit}]" if unit else name for name, unit in named]
+    for k, row in enumerate(rows, start=2):
         if len(row) != len(header):
             raise DataSheetError(f"{path}: data line {k} has {len(row)} of {len(header)} columns")
-    return header, rows[1:]
+    return header, rows
 
 
 def _gain_columns(

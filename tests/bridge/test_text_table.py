@@ -39,6 +39,12 @@ def test_a_row_of_units(tmp_path: Path, text: str) -> None:
     assert columns(table) == {"Zeit": [0, 0.002], "Druck": [1.5, 2.5], "Weg": [2, 3]}
 
 
+@pytest.mark.parametrize("null", ["NA", "#N/A", "null"])
+def test_a_first_row_without_values_is_no_row_of_units(tmp_path: Path, null: str) -> None:
+    table = read(tmp_path, f"t,p,q\n0,{null},{null}\n1,2,3\n2,4,5\n")
+    assert columns(table)["t"] == [0, 1, 2] and table.units["t"] == ""
+
+
 @pytest.mark.parametrize("comment", ["\tComment", ""])
 @pytest.mark.parametrize("end", ["\t", ""])
 def test_a_preamble_and_a_title_without_values(tmp_path: Path, comment: str, end: str) -> None:
