@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import tomlkit
 
@@ -79,6 +81,17 @@ def test_clean_trace_passes(folder: Path) -> None:
     assert report.samples.rate_hz == pytest.approx(1000)
     assert min(one.enough for one in report.coverage) > 10
     assert report.motion.v_slope == pytest.approx(1, abs=0.02)
+
+
+def test_gaps_are_told_by_what_they_take(folder: Path, tmp_path: Path) -> None:
+    """However few: of a record that misses a fifth in two gaps nothing was said."""
+    table = pq.read_table(folder / "trace.parquet")
+    kept = [table.slice(0, 5000), table.slice(6000, 4000), table.slice(13_000)]
+    pq.write_table(pa.concat_tables(kept), tmp_path / "trace.parquet")
+    (tmp_path / "trace.toml").write_text((folder / "trace.toml").read_text())
+    found = {f.subject: f for f in judged(tmp_path, lambda raw: None).findings}["trace.parquet"]
+    assert found.level == "warning"
+    assert "2 of 16000 steps" in found.text and "at worst 3001 ms: 20 % of" in found.text
 
 
 def unit(name: str, written: str) -> Edit:
@@ -215,6 +228,9 @@ def test_timing_counts_gaps_and_backward_stamps() -> None:
     found = timing(t_us)
     assert (found.count, found.gaps, found.backward) == (1000, 1, 0)
     assert [found.median_s, found.worst_s] == pytest.approx([0.01, 0.1])
+    assert found.missing == pytest.approx(0.09 / 10.08)
+    late = t_us[:500] + 6000 * (np.arange(500) % 3 == 1)  # and the next one comes in time
+    assert timing(late).gaps > 100 and timing(late).missing < 2e-3
     assert timing(t_us[::-1]).backward == 999
     assert np.isnan(timing(t_us[:1]).median_s)
 

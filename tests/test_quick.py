@@ -124,6 +124,21 @@ def test_a_clean_machine_misses_nothing_in_plain_sentences(folder: Path) -> None
     assert [float(volumes[0]), float(volumes[5])] == pytest.approx([0.6, 0.6], rel=0.1)
 
 
+def test_what_a_record_misses_is_a_reservation(folder: Path, tmp_path: Path) -> None:
+    names = ("t", "u", "x", "p_a", "p_b", "p_supply")
+    every = {name: columns(folder / "clean.parquet")[name] for name in names}
+    at = np.arange(len(every["t"]))
+    kept = ((at < 9000) | (at >= 13_500)) & ((at < 20_000) | (at >= 24_500))
+    path = as_csv(tmp_path / "t.csv", **{name: column[kept] for name, column in every.items()})
+    told_of = [
+        line for line in quick(path).stdout.splitlines() if "gap" in line or "steps ex" in line
+    ]
+    assert told_of == [
+        "  ~ t.csv: 2 of 36000 steps exceed 1.5 periods, at worst 4501 ms: 20 % of the record is "
+        "missing"
+    ]
+
+
 @pytest.mark.long
 def test_an_area_only_scales(folder: Path) -> None:
     """Twice the bore: four times the leak, the same verdict."""

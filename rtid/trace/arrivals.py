@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from firmware_bridge.frames import EXTENDED, Frames
-from rtid.plain import IntArray
+from rtid.plain import FloatArray, IntArray
 
 BURST = 4  # frames of one channel with one stamp
 GAP_PERIODS = 1.5  # a step longer than this many median periods is a gap
@@ -17,7 +17,8 @@ GAP_PERIODS = 1.5  # a step longer than this many median periods is a gap
 class Timing:
     """Steps between n arrivals, seconds: 1 %, median and 99 % quantile, the longest, the gaps.
 
-    A single arrival has no step: all steps are NaN then.  `backward` counts stamps that go back.
+    A single arrival has no step: all steps are NaN then.  `backward` counts stamps that go back;
+    `missing` is the share of the time in which arrivals are missing.
     """
 
     count: int
@@ -27,6 +28,7 @@ class Timing:
     worst_s: float
     gaps: int
     backward: int
+    missing: float = 0.0
 
     @property
     def rate_hz(self) -> float:
@@ -57,8 +59,18 @@ def timing(t_us: IntArray) -> Timing:
         return Timing(len(t_us), nan, nan, nan, nan, 0, 0)
     p01, median, p99 = (float(q) for q in np.percentile(step_s, [1, 50, 99]))
     gaps = int((step_s > GAP_PERIODS * median).sum()) if median > 0 else 0
-    backward = int((step_s < 0).sum())
-    return Timing(len(t_us), median, p01, p99, float(step_s.max()), gaps, backward)
+    backward, missing = int((step_s < 0).sum()), _missing(step_s, median)
+    return Timing(len(t_us), median, p01, p99, float(step_s.max()), gaps, backward, missing)
+
+
+def _missing(step_s: FloatArray, median_s: float) -> float:
+    """Share of the time that is beyond the usual step in gaps, and not made up for by others.
+
+    step_s (n,).  An arrival that is late is no loss: the next one comes sooner.
+    """
+    whole_s = float(step_s.sum())
+    lost_s = float((step_s - median_s)[step_s > GAP_PERIODS * median_s].sum())
+    return min(lost_s, max(0.0, whole_s - len(step_s) * median_s)) / whole_s if whole_s > 0 else 0.0
 
 
 def bus(frames: Frames) -> tuple[IdTiming, ...]:

@@ -21,7 +21,8 @@ from rtid.units import limit, units_of, with_unit
 
 PERIOD_TOLERANCE = 0.1
 NOISE_FACTOR = 1.5
-GAP_SHARE = 1e-3
+GAP_SHARE = 1e-3  # of the steps
+MISSING_SHARE = 0.01  # of the time, however few the gaps are
 OUT_OF_RANGE_SHARE = 1e-3
 OUTSIDE_GRID_SHARE = 0.02
 MIN_T = 8.0  # of the rough bulk modulus, before its sign is believed
@@ -150,10 +151,11 @@ def _timing(
             yield _error(
                 name, text, f"set messages.{name}.period_ms = {1e3 * arrivals.median_s:.4g}"
             )
-        if arrivals.gaps > GAP_SHARE * arrivals.count:
+        if arrivals.gaps > GAP_SHARE * arrivals.count or arrivals.missing > MISSING_SHARE:
             text = f"{arrivals.gaps} of {arrivals.count} steps exceed {GAP_PERIODS} periods"
             text += f", at worst {_ms(arrivals.worst_s)}"
-            yield _warning(name, text, "look for lost frames: bus load, logger, wiring")
+            text += f": {100 * arrivals.missing:.2g} % of the record is missing"
+            yield _warning(name, text, "look for lost frames or rows: bus load, logger, wiring")
         if arrivals.backward:
             text = f"{arrivals.backward} time stamps go back"
             yield _warning(name, text, "sort the log, or record with one clock")
