@@ -48,6 +48,7 @@ class Saving:
     needed: int = LEAST_FREE  # bytes of a snapshot
     started_s: float = field(default_factory=time.monotonic)
     saved_s: float | None = None
+    idle_s: float | None = None  # when nothing was learned last, and so nothing was to be saved
     refused: dict[str, str] = field(default_factory=dict)
 
     def hear(self, answer: SavedSnapshot | NotSaved | SavedAgain) -> None:
@@ -67,8 +68,10 @@ class Saving:
             return "NOT SAVED: " + "; ".join(f"{w}: {r}" for w, r in self.refused.items())
         if is_learning and (short := short_of_room(self.folder, self.needed)):
             return f"NOT SAVED: {short}"
-        since_s = self.started_s if self.saved_s is None else self.saved_s
-        age_s = time.monotonic() - since_s
+        now_s = time.monotonic()
+        if not is_learning:
+            self.idle_s = now_s
+        age_s = now_s - max(self.started_s, self.saved_s or 0.0, self.idle_s or 0.0)
         if is_learning and age_s > self.interval_s + GRACE_S:
             return f"NOT SAVED: no snapshot for {age_s:.0f} s"
         return ""

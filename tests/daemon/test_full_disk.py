@@ -112,6 +112,23 @@ def test_a_disk_without_room_is_told_before_a_save_fails(disk: Path) -> None:
     assert "is read-only" in saving.why_not(True)
 
 
+def test_what_was_not_to_be_saved_is_not_missed_when_learning_begins_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A changed machine is accepted after a minute in which nothing was stored on purpose."""
+    clock = {"now_s": 1000.0}
+    monkeypatch.setattr(time, "monotonic", lambda: clock["now_s"])
+    saving = Saving(30.0, tmp_path, started_s=1000.0)
+
+    def said(now_s: float, is_learning: bool) -> str:
+        clock["now_s"] = now_s
+        return saving.why_not(is_learning)
+
+    assert not any(said(now_s, False) for now_s in (1020.0, 1050.0, 1080.0))
+    assert not any(said(now_s, True) for now_s in (1081.0, 1120.0))
+    assert said(1126.0, True) == "NOT SAVED: no snapshot for 46 s"
+
+
 def test_the_recorder_makes_no_files_on_a_full_disk(disk: Path) -> None:
     """Five batches a second for a minute: it tries again now and then, and leaves nothing."""
     clock = Clock()
