@@ -19,6 +19,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from difflib import get_close_matches
 from enum import StrEnum
+from unicodedata import normalize
 
 from firmware_bridge.names import split_unit
 
@@ -177,7 +178,9 @@ _OF_DIMENSION = {
     "temperature": {"temp", "temperature"},
     "volume": {"vol", "volume"},
 }
-_WORD = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
+_UPPER, _LOWER = "[A-ZÄÖÜ]", "[a-zäöüß]"
+_WORD = re.compile(rf"{_UPPER}+(?={_UPPER}{_LOWER})|{_UPPER}?{_LOWER}+|{_UPPER}+|\d+")
+_SPELT = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss"})
 
 
 FLOW = "m3/s"  # of what the equations of a machine with pressures are in
@@ -306,8 +309,9 @@ def said(text: str) -> str:
 
 
 def words_of(name: str) -> set[str]:
-    """Words of a name: "PSupply" -> p, supply."""
-    return {word.lower() for word in _WORD.findall(name)}
+    """Words of a name: "PSupply" -> p, supply; "Rücklauf" -> ruecklauf, as it is often spelt."""
+    composed = normalize("NFC", name)  # some systems write an umlaut as two letters
+    return {word.lower().translate(_SPELT) for word in _WORD.findall(composed)}
 
 
 def _suffix(text: str, stem: str, dimensions: Collection[str]) -> Unit | None:

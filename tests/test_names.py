@@ -304,16 +304,21 @@ def test_a_data_sheet_may_name_its_units_in_either_way(tmp_path: Path) -> None:
     assert found[0] == found[1] == found[2]
 
 
-def test_a_machine_with_german_names(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("supply", "tank"), [
+    ("Pumpendruck", "Tankdruck"), ("Versorgungsdruck", "Rücklaufdruck"),
+    ("Druck Zulauf", "Druck Rücklauf"), ("p_Versorgung", "p_RUECKLAUF"),
+    ("Zulaufdruck", "Ru\u0308cklaufdruck"), ("ZULAUF_DRUCK", "RÜCKLAUF_DRUCK"),
+])  # fmt: skip
+def test_a_machine_with_german_names(tmp_path: Path, supply: str, tank: str) -> None:
     columns = machine()
     names = {
         "t": "Zeit", "u": "Ventilstrom [mA]", "x": "Kolbenweg [mm]", "p_a": "Druck A [bar]",
-        "p_b": "Druck B [bar]", "p_s": "Pumpendruck [bar]", "p_t": "Tankdruck [bar]",
+        "p_b": "Druck B [bar]", "p_s": f"{supply} [bar]", "p_t": f"{tank} [bar]",
     }  # fmt: skip
     path = written(tmp_path / "m.csv", {name: columns[key] for key, name in names.items()})
     roles = roles_of(path, open_source(path, None))
     assert {role: one.name for role, one in roles.items()} == {
-        "p_supply": "Pumpendruck", "p_tank": "Tankdruck", "p_a": "Druck A", "p_b": "Druck B",
+        "p_supply": supply, "p_tank": tank, "p_a": "Druck A", "p_b": "Druck B",
         "x": "Kolbenweg", "u": "Ventilstrom",
     }  # fmt: skip
 

@@ -73,10 +73,16 @@ ROLES = (
     _role(
         "p_supply",
         "pressure",
-        "supply pump pmp system main line sup outlet pumpe pumpendruck systemdruck speisedruck",
+        "supply pump pmp system main line sup outlet pumpe pumpendruck systemdruck speisedruck "
+        "versorgung versorgungsdruck zulauf zulaufdruck",
         "ps p0 pp psys pressp presp pressurep druckp",
     ),
-    _role("p_tank", "pressure", "tank return reservoir drain tankdruck", "pt pr pret"),
+    _role(
+        "p_tank",
+        "pressure",
+        "tank return reservoir drain tankdruck ruecklauf ruecklaufdruck ablauf ablaufdruck",
+        "pt pr pret",
+    ),
     _role(
         "p_a", "pressure", "a cap bore head piston 1 bottom base extend kolbendruck", "pa p1 pcap"
     ),
