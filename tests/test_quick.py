@@ -348,6 +348,22 @@ def test_a_machine_that_rests_at_the_end_is_judged_by_the_end_of_its_motion(
     assert 15.0 < split < c["t"][begin] < end
 
 
+def test_a_safe_band_is_in_the_unit_of_the_command() -> None:
+    ends = {"x": ("m", 0.0, 0.5), "p_a": ("Pa", 0.0, 7e6), "p_b": ("Pa", 0.0, 7e6)}
+    ends["u"] = ("mA", -400.0, 400.0)
+    roles = {role: RoleCandidate(role, "", *known) for role, known in ends.items()}
+    assert first_machine(roles, Given(safe_band=50.0)).safe_band == pytest.approx(0.05)
+    assert first_machine(roles, Given()).safe_band is None
+    t = np.linspace(0.0, 60.0, 6001)
+    u, x = 0.4 * np.sin(t), 0.25 - 0.2 * np.cos(t)
+    values = np.column_stack([u, x, 3e6 + 1e5 * u, 3e6 - 1e5 * u, 0 * t + 7e6, 0 * t + 1e5])
+    names = ("u", "x", "p_a", "p_b", "p_supply", "p_tank")
+    samples = Samples(names, (t * 1e6).astype(np.int64), values, np.full(len(t), ROW, np.uint8))
+    machine = fitted_machine(first_machine(roles, Given()), samples)
+    (said,) = (a.what for a in machine.assumptions if "--safe-band" in a.what)
+    assert f"|u| = {1e3 * (machine.safe_band or 0.0):.3g} mA," in said
+
+
 def test_a_foreign_bus_needs_its_dbc(folder: Path, tmp_path: Path) -> None:
     log = tmp_path / "other.log"
     log.write_text("".join(f"({k}.0) can0 6AB#0011223344556677\n" for k in range(50)))

@@ -63,7 +63,10 @@ def quick(
     ] = None,
     safe_band: Annotated[
         float | None,
-        typer.Option(min=0.0, help="Command up to which the valves are shut for sure."),
+        typer.Option(
+            min=0.0,
+            help="Command up to which the valves are shut for sure, in the unit of its column.",
+        ),
     ] = None,
     lag_ms: Annotated[
         float | None, typer.Option("--lag", min=0.0, help="Lag of the spools, data sheet, ms.")
@@ -113,7 +116,7 @@ def _given(
     rod_mm: float | None,
     stroke_mm: float | None,
     dead_volume_l: str | None,
-    safe_band_v: float | None,
+    safe_band: float | None,
     lag_ms: float | None,
 ) -> Given:
     """What the user says of the machine, in SI."""
@@ -125,7 +128,7 @@ def _given(
         None if value is None else 1e-3 * value for value in (bore_mm, rod_mm, stroke_mm, lag_ms)
     )
     volumes_m3 = _both(dead_volume_l) if dead_volume_l else None
-    return Given(bore_m, rod_m, stroke_m, volumes_m3, safe_band_v, lag_s)
+    return Given(bore_m, rod_m, stroke_m, volumes_m3, safe_band, lag_s)
 
 
 class _Answer(NamedTuple):

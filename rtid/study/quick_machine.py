@@ -18,6 +18,7 @@ from rtid.project.template import EDGES, nice
 from rtid.study.spans import HELD_OUT_SHARE
 from rtid.trace.neutral import last_part_from
 from rtid.trace.quick_source import is_motor, unit_of
+from rtid.units import Unit
 
 BORE_M, ROD_SHARE, DEAD_SHARE = 0.05, 0.7, 0.2  # a usual cylinder
 TURN_M3, DEAD_TURNS = 50e-6, 10.0  # a usual motor's displacement; its sides and lines, in turns
@@ -61,8 +62,9 @@ class MachineSizes:
 
     spans_s: the part of the record that teaches, and the one that judges; empty: not looked at yet.
     goes_round: a motor, whose x is an angle.  command_hold, command_noise: how the command runs
-    between its samples, and what is unknown of it there, in its unit; command_step_s: from one to
+    between its samples, and what is unknown of it there, in SI; command_step_s: from one to
     the next of a sample of a faster one, which may act up to half of it later than on the line.
+    command_unit: that of its column.
     """
 
     bore_m: float
@@ -76,6 +78,7 @@ class MachineSizes:
     safe_band: float | None
     lag_s: float | None
     rated_flow_m3s: float
+    command_unit: Unit
     spans_s: tuple[tuple[float, float], ...] = ()
     reversed: frozenset[str] = frozenset()
     assumptions: tuple[Assumption, ...] = field(default=())
@@ -158,9 +161,10 @@ def _first_cylinder(roles: dict[str, RoleCandidate], given: Given) -> MachineSiz
         zero,
         np.linspace(0.0, u_max, U_STEPS + 1),
         top * np.linspace(-1.0, 1.0, DP_STEPS + 1),
-        given.safe_band,
+        None if given.safe_band is None else unit_of(u).factor * given.safe_band,
         given.lag_s,
         LEAST_FLOW,
+        unit_of(u),
         assumptions=tuple(_of_geometry(given, bore, rod, stroke, zero)),
     )
 
@@ -230,8 +234,8 @@ def _of_samples(
     assumptions = []
     if machine.safe_band is None:
         assumptions.append(Assumption(
-            f"the valves are shut up to |u| = {band:.3g}, half of what it takes to move "
-            "(--safe-band)",
+            f"the valves are shut up to |u| = {band / machine.command_unit.factor:.3g} "
+            f"{machine.command_unit.name}, half of what it takes to move (--safe-band)",
             "a valve that opens earlier passes for a leak",
         ))  # fmt: skip
     if machine.lag_s is None:
