@@ -364,6 +364,15 @@ def test_a_safe_band_is_in_the_unit_of_the_command() -> None:
     assert f"|u| = {1e3 * (machine.safe_band or 0.0):.3g} mA," in said
 
 
+def test_a_log_without_data_frames_says_what_it_holds(tmp_path: Path) -> None:
+    log = tmp_path / "remote.log"
+    log.write_text("".join(f"({k}.0) can0 123#R\n" for k in range(50)))
+    done = quick(log)
+    assert done.returncode == Exit.INPUT
+    assert "holds no data frames; refused: remote_frame 50" in done.stderr
+    assert "DBC" not in done.stderr and "--bus-only" in done.stderr
+
+
 def test_a_foreign_bus_needs_its_dbc(folder: Path, tmp_path: Path) -> None:
     log = tmp_path / "other.log"
     log.write_text("".join(f"({k}.0) can0 6AB#0011223344556677\n" for k in range(50)))

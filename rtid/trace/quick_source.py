@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import NoReturn
 
 import numpy as np
 
@@ -100,6 +101,8 @@ def _take_turns(table: Table, first: RoleCandidate, second: RoleCandidate) -> bo
 
 def log_source(path: Path, frames: Frames, dbc: Path | None) -> Source:
     """What a log offers by a DBC, rtid's own if none is named.  RtidError if it describes none."""
+    if not len(frames):
+        _refuse_empty(path, frames)
     places = catalogs.places(dbc) if dbc else catalogs.places()
     catalog = catalogs.load(places)
     every = {n: f for n, f in by_message(frames, catalog).items() if len(f) > 1}
@@ -119,6 +122,15 @@ def log_source(path: Path, frames: Frames, dbc: Path | None) -> Source:
     name = ", ".join(place.named(str(place.file.resolve())) for place in places)
     keys = {"dbc": name if dbc else f"{catalogs.BUILTIN}controller.dbc"}
     return Source(keys, signals, periods, {}, channels=several)
+
+
+def _refuse_empty(path: Path, frames: Frames) -> NoReturn:
+    """No DBC helps where a log holds remote frames, errors, or nothing; it says what it holds."""
+    counts = ", ".join(f"{reason} {n}" for reason, n in frames.refused.items() if n)
+    raise RtidError(
+        f"{path}: it holds no data frames; refused: {counts or 'nothing'}",
+        "record the bus while the machine moves; `rtid check FILE --bus-only` looks at a capture",
+    )
 
 
 def _signals(frames: Frames, name: str, catalog: Catalog) -> list[RoleCandidate]:
