@@ -117,6 +117,7 @@ def test_what_was_found_leads_the_ranking(leaking: Reported) -> None:
     assert first.before > 100
     fell = [r for r in others if r.before and r.after is not None and r.after < 0.5 * r.before]
     assert len(fell) > len(others) / 2  # the imitators fall once the cause is part of the model
+    assert "Each coefficient is what is left of it once what was found" in read(leaking.path)[1]
 
 
 def test_every_picture_has_a_sentence_below(leaking: Reported) -> None:

@@ -23,7 +23,7 @@ from rtid.tell.diagnosed import LIMITS, LIMITS_SAY, heading, limits, remark, sen
 from rtid.tell.history import history_table
 from rtid.tell.html import rendered
 from rtid.tell.report_page import embedded, key_figures, page_of
-from rtid.tell.report_story import Ranked, ReportStory
+from rtid.tell.report_story import Ranked, ReportStory, sizes_say
 from rtid.tell.report_tables import coverage, parameters, settings
 from rtid.tell.story import Bar, Bars, Chart, Planes, Story, StoryPart, Table
 from rtid.tell.words import is_floor, named, quantity
@@ -219,6 +219,7 @@ def _ranking(story: ReportStory) -> Story:
         if story.after
         else f"Nothing beyond {np.sqrt(GAIN):g} counts unless it is also possible and material."
     )
+    caption += f" {sizes_say(story.ranking, 'coefficient')}"
     ranked = story.ranking[:RANKED]
     bars = tuple(
         Bar(named(r.key), r.before or 0.0, "found" if r.after is None else "rival", r.after)

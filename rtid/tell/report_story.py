@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -59,6 +60,16 @@ class Ranked:
     is_possible: bool = True
     per_shape: tuple[float, str] | None = None
     unseen: Unseen | None = None
+
+
+def sizes_say(ranking: Sequence[Ranked], noun: str) -> str:
+    """Beside what the sizes of a ranking are fitted; noun: what its column is called."""
+    if any(candidate.after is None for candidate in ranking):
+        return (
+            f"Each {noun} is what is left of it once what was found is in the model, not that "
+            "alone; what was found has its own."
+        )
+    return f"Each {noun} is that of the effect added alone."
 
 
 @dataclass(frozen=True)

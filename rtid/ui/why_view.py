@@ -29,7 +29,7 @@ from rtid.tell.diagnosed import (
 )
 from rtid.tell.html import button, clearness, table, text
 from rtid.tell.live import PanelPlot
-from rtid.tell.report_story import Ranked
+from rtid.tell.report_story import Ranked, sizes_say
 from rtid.tell.story import Chart
 from rtid.tell.words import named, quantity
 from rtid.ui.desk import RankedDiagnosis
@@ -188,6 +188,7 @@ def _ranking(ranked: RankedDiagnosis, may_add: bool) -> str:
         says += "An effect's name opens its page."
     else:
         says += "None of them explains the error. An effect's name opens its page."
+    says += f" {sizes_say(ranked.ranking, 'size')}"
     return f'<h3>All candidates</h3><p class="says">{text(says)}</p>{table(head, rows, "ranking")}'
 
 

@@ -9,7 +9,10 @@ import pytest
 from rtid.diagnose.report import Value
 from rtid.tell.diagnosed import said
 from rtid.tell.html import clearness, error_bars
+from rtid.tell.report_story import Ranked, sizes_say
 from rtid.tell.words import is_floor, quantity
+from rtid.ui.desk import RankedDiagnosis
+from rtid.ui.why_view import _ranking
 from rtid.units import limit
 from tests.ui.test_session import KEY, told
 
@@ -76,6 +79,19 @@ def test_errors_of_the_part_that_taught_the_model_are_called_so() -> None:
     found = replace(told(KEY).diagnosis, held_out_judged=False)
     assert "held-out" not in said(found)
     assert "the error on the motion it was taught by from 2.00 % to 0.20 %" in said(found)
+
+
+def test_the_ranking_says_beside_what_its_sizes_are_fitted() -> None:
+    """It said "added alone" above sizes that were fitted with what was found in the model."""
+    leak = Ranked(KEY, 1216.0, None, 2e-12, 1e-14, "m3/s/Pa")
+    rival = Ranked(("hose_compliance", "b"), 900.0, 2.0, 1e-15, 5e-16, "m3/Pa")
+    beside, alone = (
+        _ranking(RankedDiagnosis(told(*found).diagnosis, ranks), may_add=False)
+        for found, ranks in (((KEY,), (leak, rival)), ((), (replace(rival, after=900.0),)))
+    )
+    assert "Each size is what is left of it once what was found is in the model" in beside
+    assert "Each size is that of the effect added alone." in alone
+    assert "Each coefficient is what is left" in sizes_say((leak, rival), "coefficient")
 
 
 def test_bars_are_as_long_as_their_errors() -> None:
