@@ -28,6 +28,7 @@ from rtid.plain import FloatArray
 
 FOLLOWS = 0.05  # of the residual's variance that a signal must explain to be named
 MOST_NAMED = 3
+FOLLOWS_NONE = "It follows none of the signals"
 LARGER = 1.5  # times its size the other way: then the direction is named
 BURST = 2.0  # times the size over the record: then the span of time is named
 BANDS_HZ = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, np.inf)
@@ -183,7 +184,7 @@ def _what(dependences: list[Dependence]) -> str:
     if named:
         return f"It follows {', '.join(named)} of its variance."
     return (
-        "It follows none of the signals at the same instant: look for something quick (a delay, a "
+        f"{FOLLOWS_NONE} at the same instant: look for something quick (a delay, a "
         "line), or for a quantity that is not measured."
     )
 

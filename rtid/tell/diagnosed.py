@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from rtid.diagnose.clean import Cut
 from rtid.diagnose.fit import MATCH_RHO
 from rtid.diagnose.regression import LIMIT_SD
+from rtid.diagnose.remains import FOLLOWS_NONE
 from rtid.diagnose.report import NOT_CONFIRMED, Diagnosis, FoundEffect, Unseen, Value
 from rtid.diagnose.verdict import INSUFFICIENT, MATCHES, MATERIAL, UNKNOWN
 from rtid.effects.page import title
@@ -298,10 +299,17 @@ def said(diagnosis: Diagnosis) -> str:
         case "unknown":
             return (
                 f"No known effect explains the {judged(diagnosis)} of {rest}{floored(diagnosis)}. "
-                "Next: Where shows which signals it follows; an effect of your own goes into the "
+                f"Next: Where shows {_where(diagnosis)}; an effect of your own goes into the "
                 "project file as a formula."
             )
     return _first(diagnosis, diagnosis.found[0])
+
+
+def _where(diagnosis: Diagnosis) -> str:
+    """What the view Where has to show: no signals where the advice says that it follows none."""
+    if any(FOLLOWS_NONE in line for line in diagnosis.advice):
+        return "in which blocks and when it is largest"
+    return "which signals it follows"
 
 
 def _first(diagnosis: Diagnosis, first: FoundEffect) -> str:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from rtid.diagnose.remains import _what
 from rtid.diagnose.report import Value
 from rtid.tell.diagnosed import said
 from rtid.tell.html import clearness, error_bars
@@ -73,6 +74,14 @@ def test_a_set_leaves_the_choice_to_the_user() -> None:
 )
 def test_every_verdict_says_what_it_stands_on_or_what_to_do(verdict: str, part: str) -> None:
     assert part in said(replace(told().diagnosis, verdict=verdict))
+
+
+def test_no_signals_are_promised_where_it_follows_none() -> None:
+    """The promise stood beside the advice that it follows none of them."""
+    alone = replace(told().diagnosis, verdict="unknown", advice=(_what([]),))
+    assert "follows none of the signals" in alone.advice[0]
+    assert "Next: Where shows in which blocks and when it is largest" in said(alone)
+    assert "which signals it follows" not in said(alone)
 
 
 def test_errors_of_the_part_that_taught_the_model_are_called_so() -> None:
