@@ -9,6 +9,7 @@ import shutil
 import subprocess
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +20,17 @@ import pytest
 import tomlkit
 
 from firmware_bridge.frames import EXTENDED, empty
+from firmware_bridge.samples import Samples
 from rtid.cli.main import run
+from rtid.daemon.first import wrong_signs
 from rtid.estimator.noise import estimate_noise
 from rtid.project import load
+from rtid.sim.declare import declared_model
+from rtid.sim.run import simulate
+from rtid.sim.simulated_plant import SimulatedPlant
 from rtid.trace.arrivals import bus, timing
 from rtid.trace.check import Finding, Report, against_signs, judge
-from rtid.trace.plausible import Motion, Spring
+from rtid.trace.plausible import Motion, Spring, motion
 from rtid.trace.series import Series, describe, longest_frozen
 from rtid.trace.signals import read_recording
 from tests.replays import shared_replays  # noqa: F401
@@ -37,15 +43,12 @@ Edit = Callable[[dict[str, Any]], None]
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """20 s of the simulated machine as trace.parquet and trace.toml."""
     found = tmp_path_factory.mktemp("check")
-    from rtid.sim.declare import declared_model
     from rtid.sim.project_file import project_text
-    from rtid.sim.run import simulate
     from rtid.sim.run_files import write_table
-    from rtid.sim.simulated_plant import SimulatedPlant
 
-    run = simulate(SimulatedPlant(), "rich", 1, 20.0)
-    write_table(found / "trace.parquet", run)
-    text = project_text(declared_model(run.plant, sensors=run.sensors), 0.5, "simulated")
+    recorded = simulate(SimulatedPlant(), "rich", 1, 20.0)
+    write_table(found / "trace.parquet", recorded)
+    text = project_text(declared_model(recorded.plant, sensors=recorded.sensors), 0.5, "simulated")
     (found / "trace.toml").write_text(text)
     return found
 
@@ -155,6 +158,41 @@ def test_a_spring_that_is_no_oil_speaks_against_no_sign(folder: Path) -> None:
     assert finding.subject == "chambers.b"
     (finding,) = against_signs(model, Motion(0.96, {"a": slow, "b": reverse}, nothing))
     assert "swapped" in finding.text
+
+
+def test_a_record_whose_oil_settles_between_samples_tells_no_sign() -> None:
+    """20 samples a second: the pressure that fell was right, and turning it round made it wrong."""
+    recorded = simulate(SimulatedPlant(), "sweep", 1, 60.0)
+    model = declared_model(recorded.plant, sensors=recorded.sensors)
+    model = replace(model, gates=replace(model.gates, max_gap_s=0.15))
+    slow = motion(model, every(recorded.samples, 50))
+    assert slow.springs["b"].t < -8.0
+    (finding,) = against_signs(model, slow)
+    assert (finding.level, finding.subject) == ("warning", "chambers")
+    assert "over 100 ms: the rate cannot tell" in finding.text
+    assert 0.02 < slow.springs["b"].settles_s < 0.1
+    told = every(recorded.samples, 50)
+    chunk = np.column_stack([1e-6 * told.t_us, told.flags, told.values])
+    assert wrong_signs(model, chunk) == ()
+
+
+@pytest.mark.parametrize("step", [1, 5, 10, 20])
+def test_swapped_pressures_are_named_down_to_the_rate_that_tells(step: int) -> None:
+    """50 samples a second are enough for the chamber that settles within 60 ms."""
+    recorded = simulate(SimulatedPlant(), "rich", 1, 40.0)
+    model = declared_model(recorded.plant, sensors=recorded.sensors)
+    model = replace(model, gates=replace(model.gates, max_gap_s=0.06))
+    names = {"p_a": "p_b", "p_b": "p_a"}
+    turned = [recorded.samples.names.index(names.get(n, n)) for n in recorded.samples.names]
+    samples = replace(recorded.samples, values=recorded.samples.values[:, turned])
+    found = list(against_signs(model, motion(model, every(samples, step))))
+    assert [f.level for f in found] == ["error"] and "swapped" in found[0].text
+
+
+def every(samples: Samples, step: int) -> Samples:
+    """Each sample of so many."""
+    values, flags = samples.values[::step], samples.flags[::step]
+    return Samples(samples.names, samples.t_us[::step], values, flags)
 
 
 def test_wrong_noise_is_a_warning_with_the_right_figure(folder: Path) -> None:

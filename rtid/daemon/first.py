@@ -30,7 +30,8 @@ def against_first(model: Machine, chunk: FloatArray, solution: Solution) -> tupl
 
 def wrong_signs(model: Machine, chunk: FloatArray) -> tuple[str, ...]:
     """Signs that samples (n, 2 + signals), SI, without a gap speak against, whatever the map."""
-    return tuple(f"{f.subject}: {f.text}" for f in against_signs(model, _motion(model, chunk)))
+    findings = against_signs(model, _motion(model, chunk))
+    return tuple(f"{f.subject}: {f.text}" for f in findings if f.level == "error")
 
 
 def follows_command(model: Machine, chunk: FloatArray) -> bool:

@@ -262,8 +262,11 @@ def against_motion(model: Machine, result: Motion) -> Iterator[Finding]:
 def against_signs(model: Machine, result: Motion) -> Iterator[Finding]:
     """Signs and swapped pressures that cannot be as declared."""
     stiffest_pa = STIFFEST * model.beta_bounds_pa[1]
-    known = [s for s in result.springs.values() if abs(s.t) > MIN_T and -s.beta_pa < stiffest_pa]
+    clear = [s for s in result.springs.values() if abs(s.t) > MIN_T and -s.beta_pa < stiffest_pa]
+    known = [s for s in clear if not result.is_too_slow(s)]
     soft = [s for s in known if s.t < 0]
+    if any(s.t < 0 for s in clear if result.is_too_slow(s)):
+        yield _too_slow(result)
     against = result.u_to_v < -MIN_CORRELATION
     x = model.position
     if known and len(soft) == len(known):
@@ -284,6 +287,15 @@ def against_signs(model: Machine, result: Motion) -> Iterator[Finding]:
         names = [name for name, s in result.springs.items() if s in soft]
         text = "pressure falls where the oil is compressed"
         yield _error(f"chambers.{names[0]}", text, "check its sign and its pressure signal")
+
+
+def _too_slow(result: Motion) -> Finding:
+    """Of a record whose oil settles between two samples: its pressures go either way."""
+    settles_s = min(s.settles_s for s in result.springs.values() if result.is_too_slow(s))
+    text = f"the oil settles within {_ms(settles_s)}, changes are seen over {_ms(result.window_s)}"
+    text += ": the rate cannot tell the signs of the pressures"
+    remedy = "record faster to have them judged; do not turn a sensor round for this"
+    return _warning("chambers", text, remedy)
 
 
 def _stiffness(model: Machine, moves: Motion) -> Iterator[Finding]:

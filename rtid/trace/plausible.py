@@ -8,10 +8,17 @@ command
 
 A reversed command turns the first sign alone, a reversed position both, swapped chamber pressures
 the second alone; a wrong unit makes 1 / theta_c no bulk modulus.
+
+Compression is seen while it lasts.  A chamber settles by its valve's flow within
+
+    V_c / (beta dQ/dP) = 2 V_c dP / (beta Q),   Q = A_c |v|,
+
+and over longer windows its pressure follows the load and the flow, either way round.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,14 +32,19 @@ from rtid.units import Unit, units_of
 WINDOW_S = 0.02
 MIN_WINDOWS = 100
 COMMAND_BINS = 40
+LONGEST = 1.25  # of WINDOW_S: a window of whole samples that is still as short as meant
 
 
 @dataclass(frozen=True)
 class Spring:
-    """Rough bulk modulus of one chamber, Pa, and its t value; NaN where too little moved."""
+    """Rough bulk modulus of one chamber, Pa, and its t value; NaN where too little moved.
+
+    settles_s: time in which its pressure settles at the speeds of the record.
+    """
 
     beta_pa: float
     t: float
+    settles_s: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -40,21 +52,28 @@ class Motion:
     """How the machine moves, each NaN where nothing can be told.
 
     u_to_v: correlation of push and motion, positive as declared; v_slope: measured velocity over
-    the derivative of the position, 1 where both agree.
+    the derivative of the position, 1 where both agree; window_s: over which changes are taken, as
+    long as the rate demands.
     """
 
     u_to_v: float
     springs: dict[str, Spring]
     v_slope: float
+    window_s: float = 0.0
+
+    def is_too_slow(self, spring: Spring) -> bool:
+        """Whether a chamber settles between samples, so that its compression is not seen."""
+        return self.window_s > max(spring.settles_s, LONGEST * WINDOW_S)
 
 
 @dataclass(frozen=True)
 class Windows:
-    """Of windows without a gap: means of all signals, first values and changes (n, m)."""
+    """Of windows without a gap: means of all signals, first values and changes (n, m); length."""
 
     mean: FloatArray
     start: FloatArray
     change: FloatArray
+    length_s: float
 
 
 def motion(model: Machine, samples: Samples) -> Motion:
@@ -64,20 +83,24 @@ def motion(model: Machine, samples: Samples) -> Motion:
         nothing = Spring(float("nan"), float("nan"))
         return Motion(float("nan"), {c.name: nothing for c in model.chambers}, float("nan"))
     springs = {c.name: _spring(model, c, windows) for c in model.chambers if c.pressure}
-    return Motion(_u_to_v(model, windows), springs, _v_slope(model, samples))
+    v_slope = _v_slope(model, samples)
+    return Motion(_u_to_v(model, windows), springs, v_slope, windows.length_s)
 
 
 def _windows(model: Machine, samples: Samples) -> Windows:
     """Windows of 20 ms, but of two rows at least; each border lies on a row."""
     rows = np.flatnonzero(samples.flags & ROW)
     if len(rows) < 3:
-        return Windows(*(np.empty((0, len(samples.names))) for _ in range(3)))
+        nothing = np.empty((0, len(samples.names)))
+        return Windows(nothing, nothing, nothing, 0.0)
     period_s = float(np.median(np.diff(samples.t_us[rows]))) * 1e-6
-    border = rows[:: max(2, round(WINDOW_S / period_s))]
+    steps = max(2, round(WINDOW_S / period_s))
+    border = rows[::steps]
     total = np.concatenate([np.zeros((1, len(samples.names))), np.cumsum(samples.values, axis=0)])
     mean = np.diff(total[border], axis=0) / np.diff(border)[:, None]
     whole, values = _unbroken(model, samples, border), samples.values[border]
-    return Windows(mean[whole], values[:-1][whole], np.diff(values, axis=0)[whole])
+    change = np.diff(values, axis=0)[whole]
+    return Windows(mean[whole], values[:-1][whole], change, steps * period_s)
 
 
 def _unbroken(model: Machine, samples: Samples, border: NDArray[np.intp]) -> BoolArray:
@@ -115,9 +138,33 @@ def _spring(model: Machine, chamber: Chamber, windows: Windows) -> Spring:
     gram = (phi / scale).T @ (phi / scale)
     residual = y - phi / scale @ theta
     sd = float(np.sqrt(np.dot(residual, residual) / len(y) * np.linalg.pinv(gram)[0, 0]))
-    known = theta[0] != 0 and sd > 0
-    nan = float("nan")
-    return Spring(float(scale[0] / theta[0]), float(theta[0]) / sd) if known else Spring(nan, nan)
+    if theta[0] == 0 or not sd > 0:
+        return Spring(float("nan"), float("nan"))
+    settles_s = _settles_s(model, chamber, windows)
+    return Spring(float(scale[0] / theta[0]), float(theta[0]) / sd, settles_s)
+
+
+def _settles_s(model: Machine, chamber: Chamber, windows: Windows) -> float:
+    """Time in which a chamber settles, at the speed that weighs in its law, with oil of the middle.
+
+    Of the two drops at its valves the smaller counts: by it the pressure settles sooner.
+    """
+    drop_pa = _smallest_drop_pa(model, chamber, windows)
+    beta_pa = math.sqrt(model.beta_bounds_pa[0] * model.beta_bounds_pa[1])
+    x = model.column(model.position)
+    speed = float(np.sqrt(np.mean(windows.change[:, x] ** 2))) / windows.length_s
+    volume = float(np.median(chamber.volume(windows.start[:, x])))
+    flow = chamber.area_m2 * speed
+    return 2.0 * volume * drop_pa / (beta_pa * flow) if flow > 0 else math.inf
+
+
+def _smallest_drop_pa(model: Machine, chamber: Chamber, windows: Windows) -> float:
+    """The smallest drop between a chamber and what its valves lead to, median of the windows."""
+    ends = [(e.source, e.sink) for e in model.edges if chamber.pressure in (e.source, e.sink)]
+    drops = [
+        np.abs(windows.mean[:, model.column(a)] - windows.mean[:, model.column(b)]) for a, b in ends
+    ]
+    return float(np.median(np.min(drops, axis=0))) if drops else math.inf
 
 
 def _command_bin(model: Machine, windows: Windows) -> NDArray[np.intp]:
