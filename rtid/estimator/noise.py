@@ -8,6 +8,7 @@ within the chi-square scatter of their own floor.  A signal in steps of q has at
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import comb
 
@@ -74,6 +75,16 @@ def estimate_noise(
     if sd < least:
         return NoiseEstimate(least, step, max(relative_sd, 1.0 - sd / least), samples)
     return NoiseEstimate(sd, step, relative_sd, samples)
+
+
+def pooled(estimates: Sequence[NoiseEstimate]) -> NoiseEstimate:
+    """One sensor's noise by several records: the mean square by the measurements of each."""
+    known = [e for e in estimates if np.isfinite(e.relative_sd)] or list(estimates)
+    samples = np.array([max(1, e.samples) for e in known], np.float64)
+    share = samples / samples.sum()
+    sd = float(np.sqrt(share @ np.array([e.sd for e in known]) ** 2))
+    relative = float(np.sqrt(share**2 @ np.array([e.relative_sd for e in known]) ** 2))
+    return NoiseEstimate(sd, max(e.resolution for e in known), relative, int(samples.sum()))
 
 
 def resolution_of(values: FloatArray) -> float:

@@ -18,6 +18,7 @@ from pathlib import Path
 from firmware_bridge.frames import add_counts
 from firmware_bridge.samples import GAP, join
 from rtid.errors import RtidError
+from rtid.estimator.noise import NoiseEstimate, pooled
 from rtid.plain import BoolArray, FloatArray
 from rtid.project import Project
 from rtid.trace.reading import Trace, read_trace
@@ -87,7 +88,16 @@ def read_records(project: Project, paths: Sequence[Path]) -> tuple[Trace, tuple[
         spans.append(RecordSpan(trace.path, 1e-6 * start_us, 1e-6 * float(t_us[-1]), is_judging))
         start_us = int(t_us[-1]) + round(1e6 * BETWEEN_S)
         add_counts(counters, trace.counters)
-    return Trace(traces[0].path, join(parts), counters, None, traces[0].noise), tuple(spans)
+    return Trace(traces[0].path, join(parts), counters, None, _noise(traces)), tuple(spans)
+
+
+def _noise(traces: Sequence[Trace]) -> dict[str, NoiseEstimate]:
+    """The noise of the sensors over all records, which have the same ones."""
+    return {
+        name: pooled([trace.noise[name] for trace in traces])
+        for name in traces[0].noise
+        if all(name in trace.noise for trace in traces)
+    }
 
 
 def with_spans(project: Project, spans: Sequence[RecordSpan]) -> Project:

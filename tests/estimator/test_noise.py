@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtid.estimator.noise import estimate_noise, measurements, resolution_of
+from rtid.estimator.noise import estimate_noise, measurements, pooled, resolution_of
 from rtid.plain import FloatArray
 from rtid.sim.random_plants import draw
 from rtid.sim.run import NAMES, Run, Sensors, simulate
@@ -165,3 +165,18 @@ def test_where_nothing_is_known_it_says_so() -> None:
     assert estimate_noise(T_S[:20], white(1.0, n=20)).relative_sd == np.inf
     assert estimate_noise(T_S, np.zeros(len(T_S))).relative_sd == np.inf
     assert estimate_noise(T_S[:0], T_S[:0]).samples == 0
+
+
+def test_records_of_one_sensor_are_pooled_by_what_they_measured() -> None:
+    """Three records as one: the noise of all of it; one that tells nothing does not count."""
+    t, y = T_S[:6000], 100 * motion(T_S[:6000]) + white(2.0, 4, 6000)
+    parts = [
+        estimate_noise(t[k], y[k]) for k in (slice(0, 1000), slice(1000, 3000), slice(3000, None))
+    ]
+    silent = estimate_noise(t[:3], y[:3])
+    assert not np.isfinite(silent.relative_sd)
+    found = pooled([*parts, silent])
+    assert found.sd == pytest.approx(2.0, rel=3 * found.relative_sd)
+    assert found.relative_sd < min(part.relative_sd for part in parts)
+    assert found.samples == sum(part.samples for part in parts)
+    assert pooled([parts[0]]) == parts[0]
