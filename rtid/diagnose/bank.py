@@ -94,7 +94,8 @@ def add_shapes(view: RecordView, columns: Columns, revision: Revision) -> Iterat
         cause = cause_of(view, effect)
         for k, value in enumerate(effect.shape):
             low, high = cause.bounds(k)
-            slope = cause.slope(effect.shape, k) if value != 0.0 or low < value < high else {}
+            is_open = low < value < high or (value != 0.0 and low < high)
+            slope = cause.slope(effect.shape, k) if is_open else {}
             if any(np.any(series != 0.0) for series in slope.values()):
                 columns.add(slope)
                 yield e, k

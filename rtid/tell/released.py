@@ -102,6 +102,8 @@ def _facts(provenance: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
                 yield "bulk modulus", ", ".join(moduli)
         elif key == "effects":
             yield "learned beside", "; ".join(map(_effect, value)) or "no effect"
+            if value:
+                yield "in the project file", ", ".join(effect["effect"] for effect in value)
         elif key == "rho":
             yield "residual variance", f"{value:.3g} times the noise's"
         elif key != "beta_sd_pa":

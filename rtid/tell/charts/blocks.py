@@ -196,8 +196,8 @@ class BlockPlots:
 
 
 TIP = """<div><b>@place</b><br>
-residual @residual rms, @share % of all<br>@rows rows in @dwell s<br>
-flow @flow ± @sd (95 %), condition @condition<br>@status @reason</div>"""
+residual @residual @unit rms, @share % of all<br>@rows rows in @dwell s<br>
+flow @flow ± @sd @unit (95 %), condition @condition<br>@status @reason</div>"""
 
 
 def _columns(blocks: Sequence[BlockRow], quantity: Quantity, axes: Axes) -> dict[str, list[Any]]:
@@ -214,12 +214,13 @@ def _columns(blocks: Sequence[BlockRow], quantity: Quantity, axes: Axes) -> dict
         "text": [b.status[:4] if by_status else quantity.text(b) for b in blocks],
         "ink": ["#ffffff" if d else "#22272b" for d in dark],
         "place": [place(axes, b.u_v, b.dp_pa) for b in blocks],
-        "residual": [f"{_told(b.residual_rms_m3s * lpm(), '.3g')} {flow_name()}" for b in blocks],
+        "residual": [_told(b.residual_rms_m3s * lpm(), ".3g") for b in blocks],
+        "unit": [flow_name()] * len(blocks),
         "share": [_told(100 * b.residual_share, ".2g") for b in blocks],
         "rows": [f"{b.rows}" for b in blocks],
         "dwell": [f"{b.dwell_s:.2f}" for b in blocks],
         "flow": [_told(b.flow_m3s * lpm(), ".3g") for b in blocks],
-        "sd": [f"{_told(Z95 * b.sd_m3s * lpm(), '.2g')} {flow_name()}" for b in blocks],
+        "sd": [_told(Z95 * b.sd_m3s * lpm(), ".2g") for b in blocks],
         "condition": [_told(b.condition, ".1e") for b in blocks],
         "status": [b.status for b in blocks],
         "reason": [f"- {b.reason}" if b.reason else "" for b in blocks],
