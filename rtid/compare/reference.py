@@ -39,12 +39,8 @@ class GainTable:
 
     def at(self, w_v: FloatArray, dp_pa: FloatArray) -> FloatArray:
         """K (n,) at points (n,) in V, Pa: linear between commands, along |dp| constant beyond."""
-        columns = np.stack([self._along_dp(row, np.abs(dp_pa)) for row in self.gain])
-        at = np.clip(np.searchsorted(self.w_v, w_v) - 1, 0, max(len(self.w_v) - 2, 0))
-        low, high = columns[at, np.arange(len(at))], columns[at + 1, np.arange(len(at))]
-        share = (w_v - self.w_v[at]) / (self.w_v[at + 1] - self.w_v[at])
-        known = (w_v >= self.w_v[0]) & (w_v <= self.w_v[-1])
-        return np.where(known, low + share * (high - low), np.nan)
+        rows = np.stack([self._along_dp(row, np.abs(dp_pa)) for row in self.gain])
+        return _between(self.w_v, rows, w_v)
 
     def flow(self, w_v: FloatArray, dp_pa: FloatArray) -> FloatArray:
         """Q (n,) in m3/s at points (n,) in V, Pa."""
@@ -67,13 +63,19 @@ class RateTable:
 
     def flow(self, w: FloatArray, over: FloatArray) -> FloatArray:
         """Rates (k,), SI, at points (k,) in the table's units; linear, NaN beyond the commands."""
-        columns = np.stack([np.interp(w, self.w, c, np.nan, np.nan) for c in self.rate.T], axis=1)
-        if len(self.over) == 1:
-            return columns[:, 0]
-        at = np.clip(np.searchsorted(self.over, over) - 1, 0, len(self.over) - 2)
-        low, high = np.take_along_axis(columns, np.stack([at, at + 1], axis=1), axis=1).T
-        share = (over - self.over[at]) / (self.over[at + 1] - self.over[at])
-        return np.asarray(low + np.clip(share, 0.0, 1.0) * (high - low))
+        rows = np.stack([np.interp(over, self.over, row) for row in self.rate])
+        return _between(self.w, rows, w)
+
+
+def _between(known: FloatArray, rows: FloatArray, at: FloatArray) -> FloatArray:
+    """Linear between commands (n,) of the rows (n, k) that belong to each of k points, NaN beyond.
+
+    rows: each point's value at every command, in any unit; at: the points' commands (k,).
+    """
+    k = np.clip(np.searchsorted(known, at) - 1, 0, max(len(known) - 2, 0))
+    low, high = rows[k, np.arange(len(k))], rows[k + 1, np.arange(len(k))]
+    share = (at - known[k]) / (known[k + 1] - known[k])
+    return np.where((at >= known[0]) & (at <= known[-1]), low + share * (high - low), np.nan)
 
 
 @dataclass(frozen=True)

@@ -141,8 +141,7 @@ def searched(standing: Standing, progress: Progress = silent) -> Result:
     if can_judge(before):
         present, last = _extended(state, present, before)
         if (finer := _on_finer_grid(state, present)) is not None:
-            first, before = finer, state.left(finer)
-            present, last = _extended(state, first, before)
+            present, last = _extended(state, finer, state.left(finer))
     state.found = [beside_its_line(state, told_apart(state, effect)) for effect in state.found]
     doubted = told_doubts(present)
     said = verdict(state, first, present, last, doubted, judged)
@@ -177,7 +176,8 @@ def _on_finer_grid(state: TrialState, present: Fit) -> Fit | None:
 
     What is missing hides what the grid misses: a valve that opens with a jump had no border there,
     as it would have had without the line before its cylinder, which took 79 % of the misfit and so
-    was not named.  None where nothing was found, or where the grid does.
+    was not named.  None where nothing was found, where the grid does, or where too little of the
+    part that judges lies in blocks that a finer one knows.
     """
     if not state.found or present.rho < present.most_rho:
         return None
@@ -189,6 +189,8 @@ def _on_finer_grid(state: TrialState, present: Fit) -> Fit | None:
     again = stand(
         machine, state.chunk, state.held_out, state.given, state.progress, suspects=state.suspects
     )
+    if not can_judge(state.left(again.fit)):
+        return None
     state.begin(again.state.model)
     state.excess = _excess(state, again.fit)
     return again.fit

@@ -319,8 +319,8 @@ def one_pass(
     regression.prior[at] += regression.own[at] == 0.0  # what never acts here is held at nothing
     whole = [column for column, e in zip(at, revision.effects, strict=True) if e.is_whole]
     regression.prior[whole], regression.mean[whole] = WHOLLY, 1.0
-    estimate, open_ = regression.fit((*range(1, first), *at)), (first - len(shapes), at)
-    while out := pointing_out(view, revision, shapes, *open_, estimate):
+    estimate = regression.fit((*range(1, first), *at))
+    while out := pointing_out(view, revision, shapes, first - len(shapes), at, estimate):
         estimate = regression.fit(tuple(k for k in estimate.used if k not in out))
     fixed = regression.fit((*range(1, 1 + len(model.chambers)), *at))
     flowmap = MapTerms(rows.cells, projected.terms(list(fixed.used), fixed.theta), NO_COV)

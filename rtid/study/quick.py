@@ -41,7 +41,7 @@ from rtid.study.study import Study
 from rtid.trace.check import Report, judge
 from rtid.trace.quick_data import BAD, Point, level_of, points
 from rtid.trace.quick_source import Source, open_source, roles_of
-from rtid.trace.reading import NoSamplesError
+from rtid.trace.reading import NoSamplesError, noise_of
 from rtid.trace.signals import Recording, read_recording
 
 if TYPE_CHECKING:
@@ -266,7 +266,7 @@ def _diagnosed(study: Study) -> Diagnosis:
 def _noise(project: Project, trace: Recording) -> list[Point]:
     """Whether the sensors' noise can be told from the record: without it nothing can be judged."""
     try:
-        model_for(project, trace.samples)
+        model_for(project, trace.samples, noise_of(project, trace.series))
     except NoSamplesError as error:
         remedy = "record a minute or two at even steps, without values that are missing"
         return [Point(BAD, str(error), remedy)]

@@ -27,7 +27,14 @@ def of_table(table: Table, assembly: Assembly) -> Iterator[Series]:
             yield _of_column(source, t_us, table.column(source.signal))
 
 
-def of_log(chosen: Mapping[str, Frames], assembly: Assembly, catalog: Catalog) -> Iterator[Series]:
+def of_log(frames: Frames, assembly: Assembly, catalog: Catalog) -> Iterator[Series]:
+    """Those of the frames of a log."""
+    yield from of_messages(wanted(frames, assembly, catalog), assembly, catalog)
+
+
+def of_messages(
+    chosen: Mapping[str, Frames], assembly: Assembly, catalog: Catalog
+) -> Iterator[Series]:
     """Those of the frames of each message, as from `wanted`."""
     for message in assembly.messages:
         yield from _of_message(chosen[message.name], message, assembly, catalog)

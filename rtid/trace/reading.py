@@ -26,7 +26,7 @@ from rtid.project import Project
 from rtid.trace.described import catalog_of
 from rtid.trace.measured import with_sums
 from rtid.trace.neutral import about_neutral
-from rtid.trace.own_instants import of_log, of_table, wanted
+from rtid.trace.own_instants import of_log, of_table
 from rtid.trace.series import Series
 from rtid.trace.spikes import without_spikes
 from rtid.trace.table import declared
@@ -101,19 +101,19 @@ def read_trace(project: Project, path: str | Path) -> Trace:
         table, assembly = declared(project, content)
         samples, counters = whole(project, *to_samples(table, assembly))
         samples = with_sums(project, about_neutral(project, samples))
-        noise = _noise(project, of_table(table, assembly))
+        noise = noise_of(project, of_table(table, assembly))
         return _not_empty(Trace(path, samples, counters, None, noise), project)
     catalog, assembly = catalog_of(project), project.assembly
     samples, counters = whole(project, *assemble(catalog, assembly, content))
     samples = with_sums(project, samples)
-    noise = _noise(project, of_log(wanted(content, assembly, catalog), assembly, catalog))
+    noise = noise_of(project, of_log(content, assembly, catalog))
     trace = _not_empty(Trace(path, samples, counters, Log(path, content), noise), project)
     return _within_chunk(trace, project.model)
 
 
-def _noise(project: Project, series: Iterable[Series]) -> dict[str, NoiseEstimate]:
-    """The noise of signals that have none declared."""
-    if not project.noise_unknown:
+def noise_of(project: Project, series: Iterable[Series]) -> dict[str, NoiseEstimate]:
+    """The noise of signals that have none declared, by name, in SI."""
+    if not project.noise_unknown:  # then nothing need be decoded
         return {}
     asked = (s for s in series if s.name in project.noise_unknown)
     return {s.name: estimate_noise(1e-6 * s.t_us, s.value) for s in asked}

@@ -20,7 +20,7 @@ from rtid.trace.arrivals import Timing, timing
 from rtid.trace.described import catalog_of
 from rtid.trace.measured import with_sums
 from rtid.trace.neutral import about_neutral
-from rtid.trace.own_instants import of_log, of_table, wanted
+from rtid.trace.own_instants import of_messages, of_table, wanted
 from rtid.trace.reading import assemble, whole
 from rtid.trace.series import Series
 from rtid.trace.table import declared
@@ -72,7 +72,7 @@ def _from_log(project: Project, path: Path, frames: Frames) -> Recording:
     chosen = wanted(frames, assembly, catalog)
     if not any(len(frames) for frames in chosen.values()):
         raise RtidError(*_nothing_wanted(path, frames, assembly, catalog))
-    series = of_log(chosen, assembly, catalog)
+    series = of_messages(chosen, assembly, catalog)
     samples, refused = whole(project, *assemble(catalog, assembly, frames))
     samples = with_sums(project, samples)
     timings = {name: timing(frames.t_us) for name, frames in chosen.items()}
