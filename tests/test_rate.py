@@ -28,6 +28,7 @@ from rtid.plain import FloatArray
 from rtid.project import ProjectError, load
 from rtid.study.study import Study
 from rtid.tell.charts.blocks import quantities
+from rtid.tell.charts.maps import flow_plane
 from rtid.trace.neutral import neutral_of
 from rtid.ui.desk import Desk
 from rtid.ui.desk_views import Bench
@@ -201,6 +202,23 @@ def test_the_page_says_the_units_of_a_rate(crane: tuple[Crane, Path, Path]) -> N
     assert set(quantities(1.0)) >= {"residual"} and quantities(1.0)["residual"].unit == "mm/s rms"
     hints = next(iter(where.planes._sources.values())).data
     assert all(re.fullmatch(r"\S+ to \S+ %", words) for words in hints["place"])
+
+
+def test_the_server_says_the_units_that_its_worker_has_read(
+    crane: tuple[Crane, Path, Path],
+) -> None:
+    """The project is read in another process: charts of the page said L/min all the same."""
+    _, table, project = crane
+    opened = Desk(lambda _text, _share: None).open(project, table, None)
+    show_flow_as("m3/s")
+    worker = SimpleNamespace(submit=lambda *_a, **_k: None)
+    session = Session(project, table, cast("Any", worker))
+    session.ask = lambda *_a, **_k: None  # type: ignore[method-assign]
+    session._opened(opened)
+    assert quantities(1.0)["residual"].unit == "mm/s rms"
+    (edge,), (learned,) = opened.look.model.maps, opened.look.flowmap.edges
+    plane = flow_plane(learned, opened.look.model.axes(edge))
+    assert plane.low == -plane.high and plane.low <= plane.values.min() < 0  # down and up
 
 
 def test_the_report_says_the_units_of_a_rate(crane: tuple[Crane, Path, Path], folder: Path) -> None:

@@ -45,7 +45,7 @@ def _named(axes: Axes) -> str:
 
 def place(axes: Axes, u: tuple[float, float], dp: tuple[float, float]) -> str:
     """A block in words; u, dp: its borders in the units of the model."""
-    words = f"{u[0]:g} to {u[1]:g} {axes.command}"
+    words = f"{u[0]:.4g} to {u[1]:.4g} {axes.command}"
     if axes.over == NONE:
         return words
     scale = second(axes)
@@ -58,7 +58,8 @@ def heading(edge: Edge, axes: Axes) -> str:
     """What flows where, or of which signals a rate is the function."""
     if axes.over is None:
         return f"{edge.name}: {edge.source} → {edge.sink}"
-    return f"{edge.name} of {edge.command}" + (f" and {axes.over}" if axes.over else "")
+    command = edge.command.rstrip("+-")  # of a machine that is split by direction
+    return f"{edge.name} of {command}" + (f" and {axes.over}" if axes.over else "")
 
 
 def small_flow() -> Scale:

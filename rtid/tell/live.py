@@ -165,6 +165,7 @@ class PlanePlot:
         self._x, self._y = Range1d(0, 1), Range1d(0, 1)
         self.root: figure = plot(y_label, x_label, self._x, y_range=self._y)
         self.root.grid.visible = False
+        self.root.yaxis.visible = bool(y_label)  # of a map of the command alone there is none
         self._mapper = LinearColorMapper(palette=PALETTES["flow"], nan_color="#dddddd")
         self._image = ColumnDataSource({"image": [], "x": [], "y": [], "dw": [], "dh": []})
         self.root.image(
@@ -186,6 +187,7 @@ class PlanePlot:
         """Draw a plane; labels: of its axes, where it is over other quantities than before."""
         if labels is not None:
             self.root.xaxis.axis_label, self.root.yaxis.axis_label = labels
+            self.root.yaxis.visible = bool(labels[1])
         (x, x_end), (y, y_end) = plane.x, plane.y
         self._mapper.update(palette=PALETTES[plane.palette], low=plane.low, high=plane.high)
         place = {"x": [x], "y": [y], "dw": [x_end - x], "dh": [y_end - y]}

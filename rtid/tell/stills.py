@@ -130,6 +130,8 @@ def _planes(chart: Planes) -> Figure:
     figure, axes = panels(len(chart.planes))
     for axis, plane in zip(axes, chart.planes, strict=True):
         drawn = _plane(axis, plane)
+        if not chart.y_label:  # over the command alone
+            axis.set_yticks([])
     label_outer(axes, chart.x_label, chart.y_label)
     bar = figure.colorbar(drawn, ax=axes, label=chart.value_label, pad=0.015, aspect=40)
     bar.outline.set_visible(False)

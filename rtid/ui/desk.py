@@ -40,7 +40,7 @@ from rtid.ui.upload import free_name
 
 @dataclass(frozen=True)
 class Opened:
-    """A record that was read and learned from."""
+    """A record that was read and learned from; flow_unit: SI unit of what its maps give."""
 
     project: str
     trace: str
@@ -50,6 +50,7 @@ class Opened:
     look: Look
     added: tuple[AddedSection, ...]
     reference: Reference | None
+    flow_unit: str = "m3/s"
 
 
 @dataclass(frozen=True)
@@ -173,6 +174,7 @@ class Desk(Reader):
             seen,
             first.sections,
             find_reference(study.project, sheet),
+            study.project.model.chambers[0].unit,
         )
 
     def diagnose(self) -> RankedDiagnosis:

@@ -146,11 +146,13 @@ class MapView(PageView):
             + select("along", list(self._alongs), self.along, "slices")
         )
         valid = float(np.mean(self.flowmap[self.edge].status == VALID))
-        kind, law = ("Valve", "the orifice law") if self._axes.over is None else ("Map", "a law")
+        kind, rest = "Valve", "follow the orifice law from these"
+        if self._axes.over is not None:
+            kind, rest = "Map", "go on as these bend"
         says = (
             f"{kind} <b>{text(self.edge)}</b>: outlined blocks ({100 * valid:.0f} % of the grid) "
             "stand on their own data; the others (dashed in the slices, in brackets in the table) "
-            f"follow {law} from these, and their interval says how far to trust them. "
+            f"{rest}, and their interval says how far to trust them. "
             "Next: hold it beside a reference or another valve, or release it."
         )
         released = self.bench.session.offered

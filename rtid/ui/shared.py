@@ -20,6 +20,7 @@ from rtid.ui.arrival import Arrival, choose
 from rtid.ui.release_form import Released, ReleaseWish
 from rtid.ui.sending import Sending, Way
 from rtid.ui.worker import Worker, ignore
+from rtid.units import show_flow_as
 
 if TYPE_CHECKING:
     from rtid.study.look import Look
@@ -323,6 +324,8 @@ class Session:
 
     def _opened(self, opened: Opened) -> None:
         self.state, self.opened, self.curves = READY, opened, ()
+        # the project was read in the worker, another process: charts and words are made here
+        show_flow_as(opened.flow_unit)
         self.revisions = [ShownRevision(opened.look, opened.added, is_saved=True)]
         self.tell("looks")
         self._diagnose()

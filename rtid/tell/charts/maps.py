@@ -47,7 +47,7 @@ def maps(
     top = 1.25 * max(largest, 1e-3)
     planes = tuple(
         replace(
-            _plane(edge, over, edge.name, _flow_on(edge), (0.0, top), "flow"),
+            _plane(edge, over, edge.name, _flow_on(edge), *_scale(over, top)),
             points=(points or {}).get(edge.name),
         )
         for edge, over in _with_axes(flowmap, axes)
@@ -67,8 +67,8 @@ def _with_axes(flowmap: FlowMap, axes: Mapping[str, Axes]) -> list[tuple[EdgeMap
 
 def flow_plane(edge: EdgeMap, axes: Axes = HYDRAULIC) -> Plane:
     """The flow of a valve on its own scale."""
-    title, scale = f"{edge.name}: {_flow()}", (0.0, _top(edge))
-    return _plane(edge, axes, title, _flow_on(edge), scale, "flow")
+    scale = _scale(axes, _top(edge))
+    return _plane(edge, axes, f"{edge.name}: {_flow()}", _flow_on(edge), *scale)
 
 
 def interval_plane(edge: EdgeMap, axes: Axes = HYDRAULIC) -> Plane:
@@ -93,8 +93,13 @@ def _flow_on(edge: EdgeMap) -> FloatArray:
     return np.asarray(edge.flow(*_lattice(edge)) * lpm())
 
 
+def _scale(axes: Axes, top: float) -> tuple[tuple[float, float], Palette]:
+    """Colours up to a largest flow; a rate has two directions."""
+    return ((0.0, top), "flow") if axes.over is None else ((-top, top), "change")
+
+
 def _top(edge: EdgeMap) -> float:
-    q = _flow_on(edge)
+    q = np.abs(_flow_on(edge))
     return max(float(np.nanmax(q)) if np.isfinite(q).any() else 1.0, 1e-9)
 
 
