@@ -65,10 +65,7 @@ class Ranked:
 def sizes_say(ranking: Sequence[Ranked], noun: str) -> str:
     """Beside what the sizes of a ranking are fitted; noun: what its column is called."""
     if any(candidate.after is None for candidate in ranking):
-        return (
-            f"Each {noun} is what is left of it once what was found is in the model, not that "
-            "alone; what was found has its own."
-        )
+        return f"Each {noun} is what is left of it once what was found is in the model."
     return f"Each {noun} is that of the effect added alone."
 
 

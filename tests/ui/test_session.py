@@ -73,7 +73,9 @@ def told(*named: tuple[str, str], alike: tuple[str, ...] = ()) -> Any:
 
 
 def opened() -> Any:
-    return SimpleNamespace(flow_unit="m3/s", look="first look", added=(), project="machine", trace="run.blf")
+    return SimpleNamespace(
+        flow_unit="m3/s", look="first look", added=(), project="machine", trace="run.blf"
+    )
 
 
 def state(session: Session) -> str:
