@@ -1,6 +1,7 @@
 """The campaign of ten valve laws, case by case: each is kept, so that it can stop and go on.
 
 python -m tests.campaign.laws_at_size rich|sweep|clean|limit FIRST LAST    (machines per law)
+python -m tests.campaign.laws_at_size rich|sweep SEED LAW [EFFECT]        (one machine, in words)
 
 limit: effects at twice the size from which on the records of the clean machines, of those that are
 kept, say that they are named.
@@ -23,7 +24,7 @@ from rtid.plain import FloatArray
 from rtid.sim.hideable import KNOWN
 from rtid.sim.valve_laws import LAWS
 from tests.campaign.diagnoses import IN_SET, RIGHT, WRONG, wilson
-from tests.campaign.laws import Answer, Case, Outcome, answer, outcome
+from tests.campaign.laws import Answer, Case, Outcome, answer, answer_of, judged, outcome
 from tests.campaign.report import FOLDER, leave
 
 FIRST, HIDING, CLEAN, LIMIT = 5000, 1000, "clean", "limit"
@@ -170,6 +171,22 @@ def of_clean(found: list[Outcome]) -> str:
     return "; ".join(parts)
 
 
+def say(case: Case) -> None:
+    """Judge one machine, and print what is said of it beside the truth."""
+    found = judged(case)
+    if found is None:
+        print("it leaves its stroke or cavitates: not simulated")
+        return
+    said, true = found.said, ", ".join(f"{h.name} {h.strength:.4g}" for h in case.plant.hidden)
+    judgement = answer_of(case, found).judgement if case.hidden else said.verdict
+    print(
+        f"{judgement}; rho {found.present.rho:.3f} -> {found.last.rho:.3f}; true: {true or 'none'}"
+    )
+    for effect in said.found:
+        sizes = ", ".join(f"{k} {v.value:.4g} +- {v.std:.2g}" for k, v in effect.parameters.items())
+        print(f"{effect.effect} at {effect.where}: {sizes}; or {effect.cannot_be_told_from}")
+
+
 def main(kind: str, first: str, last: str) -> None:
     """Judge, and leave the lines of all that is kept."""
     judge_all(kind, int(first), int(last))
@@ -207,4 +224,8 @@ def main(kind: str, first: str, last: str) -> None:
 
 if __name__ == "__main__":
     Path(FOLDER).mkdir(parents=True, exist_ok=True)
-    main(*sys.argv[1:4])
+    if sys.argv[3] in LAWS:
+        hidden = "".join(sys.argv[4:5])
+        say(Case(int(sys.argv[2]), sys.argv[3], MOTIONS[sys.argv[1]], hidden))
+    else:
+        main(*sys.argv[1:4])
