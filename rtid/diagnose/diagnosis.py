@@ -126,22 +126,19 @@ def search(
 @on_one_thread
 def searched(standing: Standing, progress: Progress = silent) -> Result:
     """Diagnose a record, from the model as it stands on."""
-    first, before, parts = standing.fit, standing.held_out, standing.state.given
+    first, parts = standing.fit, standing.state.given
     state = standing.state.anew(progress)
     record = state.chunk, state.held_out
-    judged = can_judge(before)
-    if not judged:
-        state.held_out = state.chunk
-        before = state.left(first)
-        if not can_judge(before):
-            state.judges_itself = True
-            before = state.left(first)
+    before, judged = _judging(state, first, standing.held_out)
     state.excess = _excess(state, first)
     present, first, last = first, first.light(), before
     if can_judge(before):
         present, last = _extended(state, present, before)
         if (finer := _on_finer_grid(state, present)) is not None:
-            present, last = _extended(state, finer, state.left(finer))
+            left, is_judged = _judging(state, finer, state.left(finer))
+            if is_judged < judged:
+                before, judged = state.left(first), False
+            present, last = _extended(state, finer, left)
     state.found = [beside_its_line(state, told_apart(state, effect)) for effect in state.found]
     doubted = told_doubts(present)
     said = verdict(state, first, present, last, doubted, judged)
@@ -171,13 +168,28 @@ def searched(standing: Standing, progress: Progress = silent) -> Result:
     )  # fmt: skip
 
 
+def _judging(state: TrialState, first: Fit, left: Residual) -> tuple[Residual, bool]:
+    """What a fit leaves of the part that judges, and whether that is the held-out one.
+
+    left: what it leaves of that.  Where its map is known over next to nothing there, the record
+    judges, and where over next to nothing of that, all of it.
+    """
+    if can_judge(left):
+        return left, True
+    state.held_out = state.chunk
+    left = state.left(first)
+    if not can_judge(left):
+        state.judges_itself = True
+        left = state.left(first)
+    return left, False
+
+
 def _on_finer_grid(state: TrialState, present: Fit) -> Fit | None:
     """The fit that a search begins with, on the grid that the record needs beside what was found.
 
     What is missing hides what the grid misses: a valve that opens with a jump had no border there,
     as it would have had without the line before its cylinder, which took 79 % of the misfit and so
-    was not named.  None where nothing was found, where the grid does, or where too little of the
-    part that judges lies in blocks that a finer one knows.
+    was not named.  None where nothing was found, or where the grid does.
     """
     if not state.found or present.rho < present.most_rho:
         return None
@@ -189,8 +201,6 @@ def _on_finer_grid(state: TrialState, present: Fit) -> Fit | None:
     again = stand(
         machine, state.chunk, state.held_out, state.given, state.progress, suspects=state.suspects
     )
-    if not can_judge(state.left(again.fit)):
-        return None
     state.begin(again.state.model)
     state.excess = _excess(state, again.fit)
     return again.fit
