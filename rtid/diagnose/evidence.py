@@ -33,6 +33,7 @@ QUIET = 1e-9  # a block whose whitened state is smaller adds nothing to an innov
 COLUMNS_AT_ONCE = 256  # of a triangle that is copied
 AT_ONCE = 16  # given columns that are put beside one another
 ENTRIES = 4  # per row, for which there is room at first
+LITTLE = 1e-6  # of a row
 MANY = 2_000  # unknowns of a factor of 32 MB
 
 
@@ -209,6 +210,7 @@ def rows_of(
     e = build(model, weights)
     e.engine[0]["x_var_m2"] /= group * means
     e.engine[0]["p_var_pa2"] /= group * means
+    e.engine[0]["settle_s"] = _whole_rows(chunk, group, float(e.engine[0]["settle_s"]))
     n, most = len(chunk), _measured(chunk).sum() // group + 1
     counts, noise = np.zeros(4, np.int64), np.zeros((4, 2, 2))
     row_of, share = np.full(max(0, n - 1), kernel.NO_ROW), np.zeros(max(0, n - 1))
@@ -264,8 +266,20 @@ def _signs(model: Machine) -> FloatArray:
 
 def rows_per_group(chunk: FloatArray, row_s: float) -> int:
     """Measured positions per row: as many as come within row_s; chunk (n, 2 + signals), SI."""
+    period_s = _period_s(chunk)
+    return max(1, round(row_s / period_s)) if period_s else 1
+
+
+def _whole_rows(chunk: FloatArray, group: int, time_s: float) -> float:
+    """A time, s, made whole rows: those behind it are what they would have been without it."""
+    row_s = group * _period_s(chunk)
+    return float(np.ceil(time_s / row_s - LITTLE)) * row_s if row_s else time_s
+
+
+def _period_s(chunk: FloatArray) -> float:
+    """Median time between measured positions, s; 0 where there is at most one."""
     measured = chunk[_measured(chunk), 0]
-    return max(1, round(row_s / float(np.median(np.diff(measured)))) if len(measured) > 1 else 1)
+    return float(np.median(np.diff(measured))) if len(measured) > 1 else 0.0
 
 
 def _measured(chunk: FloatArray) -> BoolArray:

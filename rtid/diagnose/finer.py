@@ -34,7 +34,7 @@ WORTH = 2.0  # chi2 per unknown more, by which a finer grid predicts better
 BY_CHANCE = 4.0  # standard deviations of what unknowns more explain by chance
 LEFT = 0.35  # of the misfit in the halved intervals, at most: 1/8 at a corner, 1/64 of a cubic
 LITTLE = 1.5  # rho from which on a misfit is no matter of the grid's detail alone
-MOST_BLOCKS = 500  # that are all halved: a solution's time grows with their cube
+MOST_BLOCKS = 600  # that are all halved: a solution's time grows with their cube
 LEFT_OF_A_JUMP = 0.7  # of all that is missed, at most: nearly all of what is missing would be
 
 

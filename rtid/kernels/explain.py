@@ -17,7 +17,7 @@ from rtid.kernels.increments import flow_noise, mean_terms, mean_windowed, term_
 from rtid.kernels.jit import inlined, kernel, part
 from rtid.kernels.layout import TAYLOR, TERMS
 from rtid.kernels.rows import fade, innovations
-from rtid.kernels.taking import begin, take
+from rtid.kernels.taking import resume, take
 from rtid.plain import FloatArray
 
 MEASURED, MODELLED = 0, 1
@@ -58,10 +58,8 @@ def explain(
             if (flags & ROW_FLAG) != 0:
                 _innovate(e, gap, work, innovation[k - 1])
         else:
-            e.running = 0
             gap[:] = 0.0
-            if whole and (flags & ROW_FLAG) != 0:
-                begin(e, sample)
+            resume(e, sample, whole)
 
 
 @inlined

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from rtid.kernels.engine import ROW_FLAG, SHUT, home_of, remember
+from rtid.kernels.engine import SHUT, home_of, remember
 from rtid.kernels.increments import mean_terms
 from rtid.kernels.jit import kernel, part
 from rtid.kernels.layout import PROPORTIONAL, TERMS
-from rtid.kernels.taking import begin, take
+from rtid.kernels.taking import resume, take
 from rtid.plain import FloatArray, IntArray
 
 
@@ -38,16 +38,13 @@ def follow_map(
     e = engine[0]
     for k in range(first, first + len(along)):
         whole, joined, _ = take(e, chunk, k)
-        sample, flags = e.sample, int(e.sample[1])
         if joined:
             _map_at(e, theta, cov, along[k - first], cell[k - first])
-            remember(e, sample)
+            remember(e, e.sample)
             continue
         along[k - first] = np.nan
         cell[k - first] = SHUT
-        e.running = 0
-        if whole and (flags & ROW_FLAG) != 0:
-            begin(e, sample)
+        resume(e, e.sample, whole)
 
 
 @part

@@ -110,6 +110,7 @@ ENGINE = np.dtype(
         ("hysteresis", _F),
         ("max_gap_s", _F),
         ("recovery_s", _F),
+        ("settle_s", _F),  # until spools that were somewhere are where they are sent
         ("max_open", _I),  # blocks that can be open at once
         ("gate_sd", _F),  # innovations beyond are refused, in standard deviations; 0: none is
         ("gate_rows", _I),  # so many refused in a row: the plant has changed

@@ -22,7 +22,7 @@ from rtid.kernels.increments import flow_noise, mean_terms
 from rtid.kernels.jit import inlined, kernel, part
 from rtid.kernels.layout import TERMS
 from rtid.kernels.rows import over, position_noise
-from rtid.kernels.taking import begin, take
+from rtid.kernels.taking import resume, take
 from rtid.plain import BoolArray, FloatArray, IntArray
 
 IN_GROUP, N_ROWS, N_ENTRIES, GROUP_AT = range(4)  # entries of `counts`
@@ -84,13 +84,10 @@ def integrate(
                     counts[IN_GROUP], counts[GROUP_AT] = 0, k
                     counts[N_ROWS] += 1
                     _hand_on(counts, start, r, cell, terms, later)
-        else:
-            e.running = 0
-            if whole and (flags & ROW_FLAG) != 0:
-                begin(e, sample)
-                row_of[counts[GROUP_AT] : k] = NO_ROW
-                _begin_rows(e, soft[k], group, counts, noise, b, fresh, start)
-                counts[GROUP_AT] = k
+        elif resume(e, sample, whole):
+            row_of[counts[GROUP_AT] : k] = NO_ROW
+            _begin_rows(e, soft[k], group, counts, noise, b, fresh, start)
+            counts[GROUP_AT] = k
     return len(chunk)
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 from rtid.kernels.engine import (
     GAP_FLAG,
+    ROW_FLAG,
     SHUT,
     acceptable,
     commanded,
@@ -18,6 +19,8 @@ from rtid.kernels.jit import inlined
 from rtid.kernels.rows import start_whitener
 from rtid.plain import FloatArray
 
+AWAY, RUNNING, FOLLOWED = 0, 1, 2  # FOLLOWED: the spools are, and no row has begun
+
 
 @inlined
 def take(e: Any, chunk: FloatArray, k: int) -> tuple[bool, bool, float]:
@@ -26,20 +29,36 @@ def take(e: Any, chunk: FloatArray, k: int) -> tuple[bool, bool, float]:
         e.sample[j] = chunk[k, j]
     sample, flags, dt = e.sample, int(e.sample[1]), step_s(e, e.sample[0])
     whole = acceptable(e, sample)
-    joined = whole and e.running and 0.0 < dt <= e.max_gap_s and (flags & GAP_FLAG) == 0
-    if joined:
+    goes_on = whole and e.running != AWAY and 0.0 < dt <= e.max_gap_s and (flags & GAP_FLAG) == 0
+    joined = False
+    if goes_on:
         if dt != e.dt_s:
             set_step(e, dt)
-        joined = working_points(e, sample, dt)[0]
+        inside = working_points(e, sample, dt)[0]
+        joined = inside and e.running == RUNNING and e.t_s > e.ready_s - 0.5 * dt
+    if not joined:
+        e.running = FOLLOWED if goes_on else AWAY
     return whole, joined, dt
 
 
 @inlined
-def begin(e: Any, sample: FloatArray) -> None:
-    """Start at one measured position, sample (2 + signals,) in SI, spools at rest."""
+def resume(e: Any, sample: FloatArray, whole: bool) -> bool:
+    """Behind a sample (2 + signals,), SI, that joins nothing: True where rows begin at it.
+
+    That is at a measured position.  Where spools stood before the first sample, or behind a gap,
+    nobody knows: they are taken to be where they are sent, and believed once that has faded.
+    """
+    row = whole and (int(sample[1]) & ROW_FLAG) != 0
+    if not whole:
+        return False
+    if e.running == AWAY:
+        e.ready_s = sample[0] + e.settle_s
     remember(e, sample)
-    e.running = 1
     for i in range(e.n_edges):
-        e.w_v[i] = commanded(e, i)
+        if e.running == AWAY:
+            e.w_v[i] = commanded(e, i)
         e.cell[i, 0] = SHUT
-    start_whitener(e)
+    e.running = RUNNING if row else FOLLOWED
+    if row:
+        start_whitener(e)
+    return row
