@@ -34,7 +34,7 @@ RING_FLOOR = {layout.INTEGRAL: 1e-11, layout.CARRY: 1e-13, layout.RESTART: 1e-13
 FORMS = {"integral": layout.INTEGRAL, "carry": layout.CARRY, "restart": layout.RESTART}
 # Where no pressure noise bounds it, the whitener forgets within this time.
 MEMORY_S = 2.0
-SETTLES = 5.0  # lags after which nothing is left of where a spool stood
+SETTLES = 4.0  # lags, with half their tolerance: 2 % are left of where a spool stood
 FLOW_NOISE_FLOOR = 0.01  # least flow noise, share of the variance that the rated slope gives
 FIRST_BLOCKS, FIRST_PAIRS = 64, 1024
 MAX_CLOSED = layout.MAX_RECENT
@@ -243,7 +243,7 @@ def _configure(e: np.void, model: Machine) -> None:
     e["mode_column"], e["max_open"] = _column(model, model.mode), most_open(model)
     e["hysteresis"], e["max_gap_s"] = model.gates.hysteresis, model.gates.max_gap_s
     e["recovery_s"] = model.gates.recovery_s
-    e["settle_s"] = SETTLES * (model.lag.nominal_s + model.lag.tolerance_s)
+    e["settle_s"] = SETTLES * (model.lag.nominal_s + 0.5 * model.lag.tolerance_s)
     e["ring_floor"] = RING_FLOOR[int(e["form"])]
     e["wn_rad_s"], e["zeta"] = model.filter.wn_rad_s, model.filter.zeta
     e["row_period_s"] = 1.0 / model.filter.rows_per_s
