@@ -19,6 +19,7 @@ from firmware_bridge.samples import ROW, Samples
 from firmware_bridge.sources import read_table
 from rtid.cli.exits import Exit
 from rtid.cli.main import run
+from rtid.daemon.daemon import Bus, Daemon
 from rtid.maps.flashed import read_flashed
 from rtid.project import load
 from rtid.project.guess import RoleCandidate
@@ -439,3 +440,14 @@ def test_a_position_below_zero_is_moved(tmp_path: Path) -> None:
     assert machine.x_zero_m == pytest.approx(-0.25)
     assert machine.stroke_m == pytest.approx(0.5)
     assert any("fully retracted at x = -250 mm" in a.what for a in machine.assumptions)
+
+
+def test_a_saved_project_runs_on_board_as_it_is(folder: Path, tmp_path: Path) -> None:
+    """Whoever follows `Next:` from a log to the machine edits no file by hand."""
+    project = tmp_path / "p.toml"
+    assert quick(folder / "leak.parquet", "--save", project).returncode == Exit.OK
+    loaded = load(project)
+    noise = {signal.name: signal.noise for signal in loaded.model.signals}
+    assert loaded.noise_unknown and not loaded.noise_unseen
+    assert noise["p_a"] == pytest.approx(5e3, rel=0.05), "of the simulated sensor, Pa"
+    Daemon(loaded, Bus("virtual", "x", lambda: pytest.fail("opened")), tmp_path)

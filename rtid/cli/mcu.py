@@ -95,8 +95,8 @@ def _refuse_estimated(project: Project) -> None:
     """The controller has no trace to take the sensors' noise from."""
     from rtid.mcu.errors import ValveError
 
-    if project.noise_unknown:
-        names = ", ".join(f"signals.{name}.noise" for name in project.noise_unknown)
+    if project.noise_unseen:
+        names = ", ".join(f"signals.{name}.noise" for name in project.noise_unseen)
         raise ValveError(f"{project.path}: {names} is to be estimated", "give its value, 1 sigma")
 
 

@@ -73,11 +73,11 @@ class Daemon:
         log_every_s: float = 1.0,
         is_fresh: bool = False,
     ) -> None:
-        if project.noise_unknown:
-            names = ", ".join(project.noise_unknown)
+        if project.noise_unseen:
+            names = ", ".join(project.noise_unseen)
             raise DaemonError(
                 f"{project.path}: the noise of {names} is to be estimated; on board it is needed",
-                "record a trace, let `rtid check` tell the noise, and write it into the file",
+                "`rtid quick TRACE --save` writes what a record tells as `noise_seen`; `rtid check` tells it",
             )
         self._project, self._bus, self._folder = project, bus, folder
         self._board = on_board(project, logger.warning)  # with the added effects that can run live

@@ -213,7 +213,7 @@ def _signal(name: str, signal: SignalSection, catalog: Catalog | None) -> Signal
         name=name,
         kind=kind,
         unit=_si_unit(kind, unit, signal) or _command_unit(unit),
-        noise=slope * (signal.noise or 0.0),
+        noise=slope * (signal.noise or signal.noise_seen or 0.0),
         resolution=slope * resolution,
         minimum=low,
         maximum=high,

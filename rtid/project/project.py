@@ -134,6 +134,12 @@ class Project:
         return self.model.with_noise(noise)
 
     @property
+    def noise_unseen(self) -> tuple[str, ...]:
+        """The signals whose noise no record has told yet: without one it is needed."""
+        signals = self.sections.signals
+        return tuple(name for name in self.noise_unknown if signals[name].noise_seen is None)
+
+    @property
     def name(self) -> str:
         """What the machine is called."""
         return self.sections.project.name

@@ -167,7 +167,10 @@ class AngleTable(Section):
 
 
 class SignalSection(Section):
-    """[signals.ROLE]: one column of the samples.  Numbers are in `unit`."""
+    """[signals.ROLE]: one column of the samples.  Numbers are in `unit`.
+
+    noise_seen: what a record told of `noise = "estimate"`; on board, without a record, it is taken.
+    """
 
     message: str | None = None
     signal: str | None = None
@@ -178,6 +181,7 @@ class SignalSection(Section):
     scale: float | None = None
     offset: Estimable = 0.0
     noise: Estimable = Field(default=None, ge=0)
+    noise_seen: float | None = Field(default=None, ge=0)
     resolution: float | None = Field(default=None, ge=0)
     range: Interval | None = None
     constant: float | None = None

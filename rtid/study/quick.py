@@ -210,7 +210,8 @@ def _of_cylinder(
         arranged = _arranged(file, path, source, roles, given)
         progress("judging the data", 0.1)
         judged = points(arranged.project.model, arranged.trace, arranged.report)
-        judged += _noise(arranged.project, arranged.trace)
+        noise, doubts = _noise(arranged.project, arranged.trace)
+        judged += doubts
         level, diagnosis, machine = level_of(judged), None, arranged.machine
         if level != BAD:
             diagnosis, machine = _likeliest(file, path, source, arranged, progress)
@@ -218,7 +219,7 @@ def _of_cylinder(
         path,
         source,
         arranged.roles,
-        machine,
+        replace(machine, noise_seen=noise),
         tuple(judged),
         level,
         diagnosis,
@@ -263,14 +264,14 @@ def _diagnosed(study: Study) -> Diagnosis:
         ) from error
 
 
-def _noise(project: Project, trace: Recording) -> list[Point]:
-    """Whether the sensors' noise can be told from the record: without it nothing can be judged."""
+def _noise(project: Project, trace: Recording) -> tuple[dict[str, float], list[Point]]:
+    """The sensors' noise in the record, 1 sigma in SI by signal: else nothing can be judged."""
     try:
-        model_for(project, trace.samples, noise_of(project, trace.series))
+        model = model_for(project, trace.samples, noise_of(project, trace.series))
     except NoSamplesError as error:
         remedy = "record a minute or two at even steps, without values that are missing"
-        return [Point(BAD, str(error), remedy)]
-    return []
+        return {}, [Point(BAD, str(error), remedy)]
+    return {s.name: s.noise for s in model.signals if s.name in project.noise_unknown}, []
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ What nobody has said is assumed, and every assumption is kept with what would ch
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -64,7 +64,7 @@ class MachineSizes:
     goes_round: a motor, whose x is an angle.  command_hold, command_noise: how the command runs
     between its samples, and what is unknown of it there, in SI; command_step_s: from one to
     the next of a sample of a faster one, which may act up to half of it later than on the line.
-    command_unit: that of its column.
+    command_unit: that of its column.  noise_seen: 1 sigma by role, as the record tells it.
     """
 
     bore_m: float
@@ -86,6 +86,7 @@ class MachineSizes:
     command_hold: str = "zero"
     command_noise: float = 0.0
     command_step_s: float = 0.0
+    noise_seen: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def displacement_m3(self) -> float:

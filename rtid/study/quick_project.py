@@ -111,6 +111,8 @@ def _signals(
         }
         if role != "u":
             section["noise"] = "estimate" if candidate.high > candidate.low else _least(candidate)
+            if role in machine.noise_seen:
+                section["noise_seen"] = _neat(machine.noise_seen[role] / unit_of(candidate).factor)
             if candidate.name in source.steps:
                 section["resolution"] = source.steps[candidate.name]
         elif machine.command_noise or machine.command_hold != HELD:
