@@ -77,7 +77,7 @@ class Daemon:
             names = ", ".join(project.noise_unseen)
             raise DaemonError(
                 f"{project.path}: the noise of {names} is to be estimated; on board it is needed",
-                "`rtid quick TRACE --save` writes noise_seen; or let `rtid check` tell it, and write it",
+                "`rtid quick TRACE --save` writes it; or write what `rtid check` tells of it",
             )
         self._project, self._bus, self._folder = project, bus, folder
         self._board = on_board(project, logger.warning)  # with the added effects that can run live

@@ -51,7 +51,7 @@ class SpanLook:
     blocks: list[BlockRow]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # what is learned anew is another one
 class Look:
     """A revision held against every part of the record, and its published map."""
 

@@ -24,6 +24,7 @@ from rtid.tell.colours import BLUE, ORANGE
 from rtid.tell.html import button, error_bars, table, text
 from rtid.tell.words import is_floor, quantity
 from rtid.ui.desk_views import Bench
+from rtid.ui.headline import undo_button
 from rtid.ui.shared import Session, ShownRevision
 from rtid.ui.views import PageView
 from rtid.units import flow_name
@@ -173,7 +174,6 @@ def _plane(blocks: list[BlockRow], scale: Quantity) -> str:
 
 
 def _actions(session: Session) -> str:
-    last = session.last
     unsaved = sum(not r.is_saved for r in session.revisions)
     made = ""
     if session.named is not None:
@@ -181,7 +181,7 @@ def _actions(session: Session) -> str:
         made += button(
             f"Add {title(effect).lower()}", "add", kind="main", effect=effect, where=where
         )
-    made += " " + button("Undo", "undo", off=last is None or last.is_saved)
+    made += " " + undo_button(session.last if len(session.revisions) > 1 else None)
     label = f"Save {unsaved} to the project" if unsaved else "Nothing to save"
     made += " " + button(label, "save", off=not unsaved or session.seen != session.revisions)
     made += " " + button("Write the report", "export", what="report")

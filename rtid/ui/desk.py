@@ -22,7 +22,7 @@ from rtid.study.quick import quick
 from rtid.study.quick_machine import Given
 from rtid.study.quick_plant import QuickPlant
 from rtid.study.quick_rate import QuickRate
-from rtid.study.revisions import change_of, undo_command, with_effect, without
+from rtid.study.revisions import change_of, undo, undo_command, with_effect, without
 from rtid.study.study import Study
 from rtid.tell.charts.evidence import charts_of
 from rtid.tell.diagnosed import heading
@@ -117,6 +117,12 @@ class _Revision:
 def _addition(made: _Revision) -> Addition:
     assert made.section is not None
     return Addition(made.section, made.sections, made.note)
+
+
+def _refuse_changed(path: Path, known: _Revision) -> None:
+    """Where the file has other effects than a revision, somebody else has worked on it."""
+    if [s.key for s in load(path).sections.added] != [s.key for s in known.sections]:
+        raise RtidError(f"{path} has other effects than the page", "start `rtid ui` again")
 
 
 class Desk(Reader):
@@ -245,10 +251,7 @@ class Desk(Reader):
         changes = [r for r in self._stack if not r.is_saved]
         before = self._stack[self._stack.index(changes[0]) - 1] if changes else self._stack[-1]
         text = text_of(path)
-        if [s.key for s in load(path).sections.added] != [s.key for s in before.sections]:
-            raise RtidError(
-                f"{path} has other effects than when it was opened", "start `rtid ui` again"
-            )
+        _refuse_changed(path, before)
         steps = []
         for r in changes:
             old, text = text, text_with(text, r.sections)
@@ -259,6 +262,14 @@ class Desk(Reader):
         for r in changes:
             r.is_saved = True
         return Saved(f"wrote {path}; `{undo_command(path)}` takes the last change back")
+
+    def take_back(self) -> str:
+        """Take the newest revision, which is saved, out of the project file again."""
+        path, last = self._stack[0].study.project.path, self._stack[-1]
+        _refuse_changed(path, last)
+        undo(path)
+        self._stack.pop().is_saved = False  # it is ready to be added again
+        return f"wrote {path}: as before the last change"
 
     def export(self, what: str) -> str:
         """Write a report beside the record."""

@@ -99,11 +99,20 @@ def _decided(session: Session, last: ShownRevision, diagnosis: Diagnosis) -> str
     elif diagnosis.found and diagnosis.found[0].cannot_be_told_from:
         offer = button("Choose", "go", name="why")
     elif len(session.revisions) > 1 and not last.is_saved:
-        offer = button("Save to project", "save", kind="main") + button("Undo", "undo")
+        offer = button("Save to project", "save", kind="main") + undo_button(last)
         words += " Next: save it, or undo." if diagnosis.verdict == "matches" else ""
+    elif len(session.revisions) > 1:
+        offer = button("Take the maps along", "go", kind="main", name="map") + undo_button(last)
     elif diagnosis.verdict == "matches":
         words += " Next: Map, to take the valves' maps along."
     return f'<h1 class="{kind}">{text(heading)}</h1><p>{text(words)}</p>{offer}'
+
+
+def undo_button(last: ShownRevision | None, kind: str = "") -> str:
+    """What takes a change back, out of the project file too where that has it; None: nothing."""
+    is_in_file = last is not None and last.is_saved
+    label = "Undo, in the project too" if is_in_file else "Undo"
+    return button(label, "undo", kind=kind, off=last is None)
 
 
 def _changed(session: Session, last: ShownRevision) -> str:
@@ -118,11 +127,11 @@ def _changed(session: Session, last: ShownRevision) -> str:
     if isfinite(errors[-2]) and isfinite(errors[-1]):
         words += f"The error went from {errors[-2]:.2f} % to {errors[-1]:.2f} %. "
     if last.note:
-        undo = "" if last.is_saved else button("Undo", "undo", kind="main")
+        undo = undo_button(last, "main")
         return (
             f'<h1 class="open">{heading}, against the evidence</h1><p>{text(last.note)}</p>{undo}'
         )
-    offer = button("Undo", "undo")
+    offer = undo_button(last)
     if session.is_stopped:
         offer = button("Look for what is missing", "diagnose", kind="main") + offer
     else:

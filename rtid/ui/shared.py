@@ -174,16 +174,28 @@ class Session:
         self.ask("drop", effect, where, then=self._added("drop"))
 
     def undo(self) -> None:
-        """Take the last change of this session back; the page shows so before the worker knows."""
+        """Take the last change of this session back; the page shows so before the worker knows.
+
+        One that is saved goes out of the project file too, as with `rtid undo`.
+        """
         if self._is_adding:
             self.stop()
-        elif len(self.revisions) > 1 and not self.revisions[-1].is_saved:
+        elif len(self.revisions) > 1:
             self._forget()
-            self.revisions.pop()
-            self._step_back()
+            gone = self.revisions.pop()
+            if gone.is_saved:
+                failed = partial(self._not_taken_back, len(self.revisions), gone)
+                self.ask("take_back", then=self.say, failed=failed)
+            else:
+                self._step_back()
             self.tell("state")  # words first: pictures take longer
             self.tell("looks")
             self._diagnose()
+
+    def _not_taken_back(self, at: int, gone: ShownRevision, error: RtidError) -> None:
+        self.revisions.insert(at, gone)
+        self._failed(error)
+        self.tell("looks")
 
     def stop(self) -> None:
         """Wait no longer for what is being done; what there was before stays."""

@@ -96,6 +96,11 @@ def test_the_whole_way_of_an_effect(worn: tuple[Path, Path]) -> None:
     ]
     assert [a.key for a in load(project).sections.added] == [LEAK]
     assert [change.change for change in read(project)] == [ADD]
+    desk.take_back()
+    assert project.read_bytes() == untouched
+    desk.add(*LEAK, "for good")
+    assert desk.look() != again, "Where compares what it shows, and raised on the arrays in it"
+    desk.save()
     desk.release(ReleaseWish(".npz"))
     flowmap, _ = read_map(trace.with_suffix(".map.npz"))
     assert np.array_equal(flowmap.edges[0].theta, again.flowmap.edges[0].theta)

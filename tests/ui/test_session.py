@@ -171,6 +171,27 @@ def test_add_and_undo_leave_the_file_alone() -> None:
     assert not worker.is_busy  # there is nothing more to take back
 
 
+def test_undo_after_save_takes_it_out_of_the_project_file() -> None:
+    """It did nothing, and the page did not say so."""
+    session, worker, _ = begun()
+    diagnosed(worker)
+    session.add(*KEY)
+    for result in (addition(), "second look", told()):
+        worker.answer(result)
+    session.save()
+    assert worker.answer(SimpleNamespace(note="wrote m.toml")) == "save"
+    assert "Undo, in the project too" in strip(session)
+    for _ in range(2):
+        session.undo()  # clicked twice: there is one change to take back
+        assert looks(session) == ["first look"]
+    assert [method for method, *_ in worker.jobs] == ["take_back"]
+    worker.refuse("m.toml has other effects than the page")
+    assert looks(session) == ["first look", "second look"] and "other effects" in session.trouble[0]
+    session.undo()
+    worker.answer("wrote m.toml: as before the last change")
+    assert (looks(session), session.note[:12]) == (["first look"], "wrote m.toml")
+
+
 def addition(note: str = "") -> Any:
     return SimpleNamespace(sections=(section(),), section=section(), note=note)
 
@@ -278,20 +299,6 @@ def test_what_is_written_cannot_be_stopped() -> None:
     session.save()
     session.stop()
     assert worker.answer(SimpleNamespace(note="wrote m.toml")) == "save"
-
-
-def test_what_was_saved_is_not_taken_back_here() -> None:
-    session, worker, _ = begun()
-    diagnosed(worker)
-    session.add(*KEY)
-    worker.answer(addition())
-    worker.answer("l")
-    worker.answer(told())
-    session.save()
-    assert worker.answer(SimpleNamespace(note="wrote m.toml")) == "save"
-    assert session.note == "wrote m.toml"
-    session.undo()
-    assert not worker.is_busy
 
 
 def test_a_refusal_is_shown_and_the_work_goes_on() -> None:

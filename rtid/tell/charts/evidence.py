@@ -14,11 +14,11 @@ import numpy as np
 
 from rtid.compare import Dependence
 from rtid.diagnose.partial import AddedVariable, Exhibit, Rise
-from rtid.diagnose.remains import Remainder, band_name
+from rtid.diagnose.remains import BANDS_HZ, Remainder
 from rtid.effects import catalogue
 from rtid.effects.page import readable, title
 from rtid.plain import FloatArray
-from rtid.tell.charts.dependence import over_signal
+from rtid.tell.charts.dependence import SHAPES, over_signal
 from rtid.tell.colours import BLUE, CHAMBERS, GREY, MARKERS, ORANGE
 from rtid.tell.story import Chart, Dots, Line, Panel
 from rtid.tell.words import named
@@ -37,12 +37,14 @@ def charts_of(shown: Sequence[Exhibit], rest: Remainder | None = None) -> tuple[
 
 def left_over(rest: Remainder) -> Chart:
     """What no effect explains: over the signal that it follows most, time, direction, frequency."""
-    names = rest.chambers
+    names, looks = rest.chambers, zip(rest.chambers, MARKERS, strict=False)
+    marks = ", ".join(f"{SHAPES[marker]}: chamber {name}" for name, marker in looks)
     shown = (*rest.signals[:1], rest.time, rest.direction)
     panels = (*(replace(over_signal(names, d), title=_says(d)) for d in shown), _spectrum(rest))
     rows = tuple(panels[k : k + 2] for k in range(0, len(panels), 2))
     heading = "What is left, and no known effect explains"
-    return Chart(REMAINDER, heading, rows, rest.text, "none", size_in=(5.2, 2.4))
+    caption = f"{rest.text} {marks.capitalize()}." if len(names) > 1 else rest.text
+    return Chart(REMAINDER, heading, rows, caption, "none", size_in=(5.2, 2.4))
 
 
 def _says(depends: Dependence) -> str:
@@ -62,10 +64,11 @@ def _spectrum(rest: Remainder) -> Panel:
         for c, name in enumerate(rest.chambers)
     ]
     noise = points("noise", rest.noise_m3s.max(axis=1), GREY, "c")
-    ticks = tuple(band_name(k, k + 1).replace("at ", "").replace(" Hz", "") for k in known.tolist())
+    ends = (BANDS_HZ[k + 1] for k in known.tolist())  # words of both ends stood in each other
+    ticks = tuple(f"{end:g}" if end < inf else "more" for end in ends)
     title = "size by frequency; circles: noise"
     label = f"rms in {flow_name()}"
-    return Panel(title, "frequency in Hz", label, points=(*series, noise), ticks=ticks)
+    return Panel(title, "frequency up to, Hz", label, points=(*series, noise), ticks=ticks)
 
 
 def evidence(exhibit: Exhibit) -> Chart:

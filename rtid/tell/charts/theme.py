@@ -9,11 +9,12 @@ from __future__ import annotations
 from typing import Any
 
 from bokeh.layouts import row
-from bokeh.models import DataRange1d, GlyphRenderer, Row, Title, UIElement
+from bokeh.models import DataRange1d, GlyphRenderer, NoOverlap, Row, Title, UIElement
 from bokeh.plotting import figure
 
 NARROW_PX, NARROWEST_PX = 900, 560  # widths of the page below which less stands side by side
 FIGURES_TAG = "figures"  # text that the browser turns or leaves out where its block is too small
+APART_PX = 2  # between the words of two ticks
 LIT = "#cc79a7"  # Okabe and Ito's purple: what the user has pointed at
 INK_TAG = "ink"
 NOTE_TAG = "note"  # a title that keeps its colour
@@ -48,6 +49,7 @@ def plot(
         axis.minor_tick_line_color = None
         axis.major_tick_in, axis.major_tick_out = 0, 4
         axis.axis_line_width = 0.7
+        axis.major_label_policy = NoOverlap(min_distance=APART_PX)
     made.title = styled(Title(text=title))
     return made
 
