@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import shutil
 import subprocess
 import sys
+from inspect import signature
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import numpy as np
 import pytest
 from rich.console import Console
 
 from rtid.cli import demo
 from rtid.cli.main import COMMANDS
+from rtid.sim.random_plants import draw
+from rtid.study.demo import prepare
 
 FOLDER = Path("my machines")  # with a space, as folders have
 MACHINE = cast(
@@ -72,3 +77,15 @@ def test_as_a_module(
 ) -> None:
     monkeypatch.setattr(sys, "argv", [str(shell / "rtid" / "__main__.py"), "demo"])
     assert all(line.startswith(f"{sys.executable} -m rtid ") for line in commands(capsys))
+
+
+def test_the_sizes_of_readme_s_quick_are_those_of_the_demo() -> None:
+    """Typed as it stood, it made a relief valve of the demo's worn machine."""
+    readme = (Path(__file__).parents[1] / "README.md").read_text("utf-8")
+    line = re.search(r"`rtid quick rtid-demo/worn.blf (--bore .*?) --save", readme)
+    assert line
+    bore, rod, stroke = (float(word) for word in line[1].split()[1::2])
+    sizes = draw(signature(prepare).parameters["seed"].default).constants
+    area = [np.pi / 400 * square for square in (bore**2, bore**2 - rod**2)]
+    assert area == pytest.approx([1e4 * sizes.area_a_m2, 1e4 * sizes.area_b_m2], rel=5e-3)
+    assert stroke == pytest.approx(1e3 * sizes.stroke_m, rel=1e-3)

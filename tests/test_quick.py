@@ -451,3 +451,23 @@ def test_a_saved_project_runs_on_board_as_it_is(folder: Path, tmp_path: Path) ->
     assert loaded.noise_unknown and not loaded.noise_unseen
     assert noise["p_a"] == pytest.approx(5e3, rel=0.05), "of the simulated sensor, Pa"
     Daemon(loaded, Bus("virtual", "x", lambda: pytest.fail("opened")), tmp_path)
+
+
+def test_a_supply_that_nobody_measures_is_asked_for_first(folder: Path, tmp_path: Path) -> None:
+    """A record without one was `unknown`, and the safe band the first to be looked at."""
+    values = {name: v for name, v in columns(folder / "leak.parquet").items() if name != "p_supply"}
+    table = as_csv(tmp_path / "no_supply.csv", **values)
+    silent = told(table)
+    assert silent["assumptions"][0]["what"].endswith("MPa (--supply)")
+    assert "the supply's pressure" in silent["cautions"][0]
+    points = [point["text"] for point in silent["data"]["points"]]
+    assert not any("stays within" in text for text in points), "of a figure that was assumed"
+    project = tmp_path / "said.toml"
+    said = told(table, "--supply", 7, "--save", project)
+    assert not any("supply" in a["what"] for a in said["assumptions"])
+    assert load(project).sections.signals["p_supply"].constant == 7e6
+
+
+def test_a_supply_is_measured_or_said(folder: Path) -> None:
+    refused = quick(folder / "leak.parquet", "--supply", 7)
+    assert refused.returncode == Exit.USAGE and "p_supply measures the supply" in refused.stderr

@@ -71,6 +71,10 @@ def quick(
     lag_ms: Annotated[
         float | None, typer.Option("--lag", min=0.0, help="Lag of the spools, data sheet, ms.")
     ] = None,
+    supply_mpa: Annotated[
+        float | None,
+        typer.Option("--supply", min=0.01, help="Supply pressure, MPa, where it is not measured."),
+    ] = None,
     role: RoleOption = None,
     held_out: Annotated[
         list[str] | None,
@@ -98,7 +102,7 @@ def quick(
 
     if save is not None and save.exists() and not force:
         raise RtidError(f"{save} exists", "give another --save, or --force", Exit.USAGE)
-    given = _given(bore_mm, rod_mm, stroke_mm, dead_volume_l, safe_band, lag_ms)
+    given = _given(bore_mm, rod_mm, stroke_mm, dead_volume_l, safe_band, lag_ms, supply_mpa)
     file, *more = files
     with progress_bar() as progress:
         looked = look(file, dbc, given, progress, by_role(role or []), more, held_out or ())
@@ -118,6 +122,7 @@ def _given(
     dead_volume_l: str | None,
     safe_band: float | None,
     lag_ms: float | None,
+    supply_mpa: float | None,
 ) -> Given:
     """What the user says of the machine, in SI."""
     from rtid.study.quick_machine import Given
@@ -128,7 +133,8 @@ def _given(
         None if value is None else 1e-3 * value for value in (bore_mm, rod_mm, stroke_mm, lag_ms)
     )
     volumes_m3 = _both(dead_volume_l) if dead_volume_l else None
-    return Given(bore_m, rod_m, stroke_m, volumes_m3, safe_band, lag_s)
+    supply_pa = None if supply_mpa is None else 1e6 * supply_mpa
+    return Given(bore_m, rod_m, stroke_m, volumes_m3, safe_band, lag_s, supply_pa)
 
 
 class _Answer(NamedTuple):

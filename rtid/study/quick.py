@@ -86,7 +86,8 @@ class Quick:
     @property
     def assumptions(self) -> tuple[Assumption, ...]:
         """Whatever nobody has said."""
-        missing, channels = of_missing(self.roles), of_channels(self.source, self.roles)
+        missing = of_missing(self.roles, self.machine.supply_pa)
+        channels = of_channels(self.source, self.roles)
         return (*missing, *channels, *self.machine.assumptions)
 
     def text_for(self, file: Path) -> str:
@@ -167,7 +168,11 @@ def quick(
             f"rtid quick {path} --save machine.toml, its [record] taken out, and `rtid diagnose`"
         )
         raise RtidError(f"{path}: of a cylinder with valves quick takes one record", remedy, 2)
-    looked = _of_cylinder(path, source, roles_of(path, source, named), given, progress)
+    played = roles_of(path, source, named)
+    if given.supply_pa is not None and "p_supply" in played:
+        measured = played["p_supply"].full_name
+        raise RtidError(f"{path}: {measured} measures the supply", "leave its pressure out", 2)
+    looked = _of_cylinder(path, source, played, given, progress)
     return replace(looked, options=_options(dbc, given, roles))
 
 
@@ -194,6 +199,8 @@ def _options(dbc: Path | None, given: Given, roles: Mapping[str, str]) -> str:
         words.append(("safe-band", f"{given.safe_band:g}"))
     if given.lag_s is not None:
         words.append(("lag", f"{1e3 * given.lag_s:g}"))
+    if given.supply_pa is not None:
+        words.append(("supply", f"{1e-6 * given.supply_pa:g}"))
     words += [("role", f"{role}={name}") for role, name in roles.items()]
     return "".join(f" --{name} {shlex.quote(value)}" for name, value in words)
 
@@ -223,7 +230,7 @@ def _of_cylinder(
         tuple(judged),
         level,
         diagnosis,
-        tuple(_cautions(diagnosis, given)),
+        tuple(_cautions(diagnosis, given, arranged.roles)),
         bool(arranged.trace.refused.get("truncated")),
     )
 
@@ -347,7 +354,9 @@ def _turn(report: Report) -> str:
     return ""
 
 
-def _cautions(diagnosis: Diagnosis | None, given: Given) -> list[str]:
+def _cautions(
+    diagnosis: Diagnosis | None, given: Given, roles: Mapping[str, RoleCandidate]
+) -> list[str]:
     """What the verdict must not be taken for, where it stands on assumptions."""
     if diagnosis is None:
         return []
@@ -360,11 +369,15 @@ def _cautions(diagnosis: Diagnosis | None, given: Given) -> list[str]:
             "Air and dead volume share what a chamber takes up: with --dead-volume (and the bore) "
             "the share of air is known, without it it may be twice too large."
         )
+    is_assumed = "p_supply" not in roles and given.supply_pa is None
     if diagnosis.verdict == UNKNOWN:
+        first = "the supply's pressure first: one that varies does; log it, or say it (--supply)"
+        usual = "safe band and diameters first: a project file has them right"
         cautions.append(
-            "What is assumed above may leave that by itself, safe band and diameters first: "
-            "a project file has them right."
+            f"What is assumed above may leave that by itself, {first if is_assumed else usual}."
         )
+    elif is_assumed:
+        cautions.append("The maps stand on the supply's pressure, which is assumed (--supply).")
     if given.rod_m is None and "diameters" in stood_on:
         cautions.append(
             "The leak's size stands on the assumed diameters: --bore scales it, --rod moves it "

@@ -46,6 +46,7 @@ class Given:
     dead_volumes_m3: tuple[float, float] | None = None
     safe_band: float | None = None
     lag_s: float | None = None
+    supply_pa: float | None = None
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,7 @@ class MachineSizes:
     between its samples, and what is unknown of it there, in SI; command_step_s: from one to
     the next of a sample of a faster one, which may act up to half of it later than on the line.
     command_unit: that of its column.  noise_seen: 1 sigma by role, as the record tells it.
+    supply_pa: of a supply that is not measured, as it was said.
     """
 
     bore_m: float
@@ -87,6 +89,7 @@ class MachineSizes:
     command_noise: float = 0.0
     command_step_s: float = 0.0
     noise_seen: Mapping[str, float] = field(default_factory=dict)
+    supply_pa: float | None = None
 
     @property
     def displacement_m3(self) -> float:
@@ -167,6 +170,7 @@ def _first_cylinder(roles: dict[str, RoleCandidate], given: Given) -> MachineSiz
         LEAST_FLOW,
         unit_of(u),
         assumptions=tuple(_of_geometry(given, bore, rod, stroke, zero)),
+        supply_pa=given.supply_pa,
     )
 
 

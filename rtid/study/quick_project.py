@@ -125,23 +125,23 @@ def _signals(
             section["offset"] = end_m / unit_of(candidate).factor
         sections[role] = section
     if "p_supply" not in roles:
-        sections["p_supply"] = {"unit": "Pa", "constant": _supply_pa(roles)}
+        sections["p_supply"] = {"unit": "Pa", "constant": machine.supply_pa or _supply_pa(roles)}
     if "p_tank" not in roles:
         sections["p_tank"] = {"unit": "Pa", "constant": TANK_PA}
     return sections
 
 
-def of_missing(roles: dict[str, RoleCandidate]) -> list[Assumption]:
-    """What is assumed of pressures that nobody measures."""
+def of_missing(roles: dict[str, RoleCandidate], supply_pa: float | None) -> list[Assumption]:
+    """What is assumed of pressures that nobody measures; supply_pa: as it was said."""
     assumptions = []
-    if "p_supply" not in roles:
+    if "p_supply" not in roles and supply_pa is None:
         assumptions.append(Assumption(
-            f"the supply is not measured, and stays at {_supply_pa(roles) / 1e5:.0f} bar",
-            "maps of the supply's valves are off, and a supply that sags cannot be seen apart",
+            f"the supply is not measured, and stays at {1e-6 * _supply_pa(roles):g} MPa (--supply)",
+            "maps of the supply's valves are off, and where it varies the verdict too",
         ))  # fmt: skip
     if "p_tank" not in roles:
         assumptions.append(Assumption(
-            f"the tank is at {TANK_PA / 1e5:.0f} bar", "maps to the tank are off at small drops",
+            f"the tank is at {1e-6 * TANK_PA:g} MPa", "maps to the tank are off at small drops",
         ))  # fmt: skip
     return assumptions
 

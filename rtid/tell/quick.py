@@ -23,7 +23,7 @@ ANSWERS = {
     FAIR: "Is this data good enough?  With reservations.",
     BAD: "Is this data good enough?  No.",
 }
-SIZES = ("--bore", "--rod", "--stroke", "--dead-volume", "--safe-band", "--lag")
+SIZES = ("--bore", "--rod", "--stroke", "--dead-volume", "--safe-band", "--lag", "--supply")
 
 
 def lines(quick: Quick, saved: Path | None = None) -> Iterator[str]:

@@ -154,7 +154,10 @@ def _excitation(model: Machine, trace: Recording) -> Iterator[Point]:
         yield Point(GOOD, f"{steps} steps of the command")
     supply = samples.column("p_supply")
     swing = float(np.ptp(np.quantile(supply, [0.01, 0.99]))) / max(float(np.mean(supply)), 1.0)
-    if swing < VARIED:
+    if swing == 0.0:
+        text = "nothing tells what the supply does: a sag, and external leaks, may hide in the maps"
+        yield Point(FAIR, text, "log its pressure, or say it with --supply MPA")
+    elif swing < VARIED:
         text = f"the supply stays within {100 * swing:.1f} %: external leaks may hide in the maps"
         yield Point(FAIR, text, "record part of the motion at another supply pressure")
     else:

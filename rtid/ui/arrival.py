@@ -41,6 +41,7 @@ SIZES = {  # words, unit, SI per unit
     "dead_b": ("dead volume of B, with hoses", "L", 1e-3),
     "safe_band": ("valves shut up to", "as the command", 1.0),
     "lag": ("lag of the spools", "ms", 1e-3),
+    "supply": ("supply, if not measured", "MPa", 1e6),
 }
 SHELL = """<div class="arrival"><div><section><h2>File</h2><div id="arrival_files"></div></section>
 <section><h2>Signals</h2><div id="arrival_signals"></div></section></div>
@@ -102,7 +103,7 @@ class Arrival:
         volumes = (ends[0], ends[-1]) if ends else None
         return Given(
             known.get("bore"), known.get("rod"), known.get("stroke"), volumes,
-            known.get("safe_band"), known.get("lag"),
+            known.get("safe_band"), known.get("lag"), known.get("supply"),
         )  # fmt: skip
 
 
