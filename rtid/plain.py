@@ -8,6 +8,7 @@ import math
 import mmap
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,7 +29,7 @@ def silent(_what: str, _share: float) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Plain JSON types, all the way down: dataclasses as objects, arrays as lists, NaN as null."""
+    """Plain JSON types all the way: dataclasses as objects, arrays as lists, paths, NaN as null."""
     if dataclasses.is_dataclass(value):
         names = (field.name for field in dataclasses.fields(value))
         return {name: plain(getattr(value, name)) for name in names}
@@ -38,6 +39,8 @@ def plain(value: Any) -> Any:
         return plain(value.tolist())
     if isinstance(value, list | tuple):
         return [plain(entry) for entry in value]
+    if isinstance(value, Path):
+        return str(value)
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

@@ -8,7 +8,7 @@ the precision that they have.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -51,9 +51,20 @@ class SpanLook:
     blocks: list[BlockRow]
 
 
+class RecordShare(NamedTuple):
+    """What is left of one of several records, in per cent of its own flow."""
+
+    name: str
+    is_held_out: bool
+    percent: float
+
+
 @dataclass(frozen=True, eq=False)  # what is learned anew is another one
 class Look:
-    """A revision held against every part of the record, and its published map."""
+    """A revision held against every part of the record, and its published map.
+
+    records: what is left of each of several.
+    """
 
     model: Machine
     parts: dict[str, SpanLook]
@@ -61,6 +72,7 @@ class Look:
     beta_pa: FloatArray
     beta_sd_pa: FloatArray
     lag_s: float
+    records: tuple[RecordShare, ...] = ()
 
 
 def look(result: Replay) -> Look:

@@ -10,10 +10,11 @@ from bokeh.models import Title, UIElement
 from bokeh.plotting import figure
 
 from rtid.compare import FREE_RUN, HORIZONS_S, Comparison
+from rtid.study.look import RecordShare
 from rtid.tell.charts.flows import NAMES, flow_plots, flows_of, pressures_of
 from rtid.tell.charts.theme import INK_TAG, beside
 from rtid.tell.colours import BLUE, ORANGE
-from rtid.tell.html import button, choice
+from rtid.tell.html import button, choice, text
 from rtid.ui.desk_views import Bench
 from rtid.ui.views import PageView
 
@@ -98,15 +99,23 @@ class CompareView(PageView):
             for title, part in self.look.parts.items()
             if len(part.equation.t_s)
         )
-        text = (
+        words = (
             f"The learned map leaves <b>{rest}</b> of the flow unexplained (lower plots), blocks "
             "without data included, which the verdict leaves out. "
         )
+        if self.look.records:
+            words += f"Of each record: {', '.join(map(_of_record, self.look.records))}. "
         if self.has_runs and self.run == FREE_RUN:
-            text += "Above, the model runs on its own pressures: what it gets wrong adds up. "
+            words += "Above, the model runs on its own pressures: what it gets wrong adds up. "
         elif self.has_runs:
-            text += f"Above, the model starts from the measured pressures and runs {self.run}. "
-        return text + "Next: <b>Where</b> shows in which part of which valve's map the rest is."
+            words += f"Above, the model starts from the measured pressures and runs {self.run}. "
+        return words + "Next: <b>Where</b> shows in which part of which valve's map the rest is."
+
+
+def _of_record(record: RecordShare) -> str:
+    """What is left of one of several records, of its own flow."""
+    held_out = " (held out)" if record.is_held_out else ""
+    return f"{text(record.name)} {record.percent:.2g} %{held_out}"
 
 
 def _fit(percent: float) -> str:

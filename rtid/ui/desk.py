@@ -5,7 +5,7 @@ It holds the fits; what it returns is plain and small enough to be sent.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from rtid.compare import Reference
@@ -17,7 +17,7 @@ from rtid.project import load
 from rtid.project.added import AddedSection, text_with
 from rtid.project.history import ADD, DROP, text_of, write
 from rtid.study.compared import find_reference
-from rtid.study.look import Look, look
+from rtid.study.look import Look, RecordShare, look
 from rtid.study.quick import quick
 from rtid.study.quick_machine import Given
 from rtid.study.quick_plant import QuickPlant
@@ -119,6 +119,15 @@ def _addition(made: _Revision) -> Addition:
     return Addition(made.section, made.sections, made.note)
 
 
+def _looked(study: Study) -> Look:
+    """What a study shows, of each of several records too."""
+    shares = (
+        RecordShare(e.path.name, e.is_held_out, 100 * e.left / max(e.flow, 1e-300))
+        for e in study.record_errors
+    )
+    return replace(look(study.replay), records=tuple(shares))
+
+
 def _refuse_changed(path: Path, known: _Revision) -> None:
     """Where the file has other effects than a revision, somebody else has worked on it."""
     if [s.key for s in load(path).sections.added] != [s.key for s in known.sections]:
@@ -165,15 +174,15 @@ class Desk(Reader):
         """
         known, self._read = self._read, None
         study = Study(known[0] if known else project, trace, self._progress)
-        if known:
+        if known and not study.records:  # of several it was but one
             vars(study)["read"] = known[1]
-        learned, read = study.replay, study.trace
+        _, read = study.replay, study.trace
         self._progress("simulating the pressures", 0.8)
-        seen, first = look(learned), _Revision(study, is_saved=True)
+        seen, first = _looked(study), _Revision(study, is_saved=True)
         self._stack = [first]
         return Opened(
             study.project.name,
-            read.path.name,
+            ", ".join(path.name for path in study.paths),
             read.duration_s,
             len(read.samples),
             {name: n for name, n in read.counters.items() if n},
@@ -201,7 +210,7 @@ class Desk(Reader):
     def prepare(self, effect: str, where: str, reason: str) -> None:
         """Have ready what the page shows once an effect is added."""
         ready = self._with(effect, where, reason)
-        ready.seen = ready.seen or look(ready.study.replay)
+        ready.seen = ready.seen or _looked(ready.study)
 
     def add(self, effect: str, where: str, reason: str) -> Addition:
         """The newest revision with one effect more."""
@@ -212,7 +221,7 @@ class Desk(Reader):
         """What the newest revision shows, once."""
         last = self._stack[-1]
         self._progress("learning the maps again", 0.6)
-        seen, last.seen = last.seen or look(last.study.replay), None
+        seen, last.seen = last.seen or _looked(last.study), None
         return seen
 
     def _with(self, effect: str, where: str, reason: str) -> _Revision:
