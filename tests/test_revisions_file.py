@@ -142,8 +142,9 @@ def test_two_changes_then_two_undos_then_none_is_left(project: Path) -> None:
     assert project.read_bytes() == one.encode()
     assert undo(project).changes[0].undoes == 1
     assert project.read_bytes() == old
-    with pytest.raises(RtidError, match="no change to undo"):
+    with pytest.raises(RtidError, match="no change to undo") as refused:
         undo(project)
+    assert "rtid add" in refused.value.remedy
     assert [(c.number, c.change) for c in history(project)] == [
         (1, "add"), (2, "add"), (3, "undo"), (4, "undo"),
     ]  # fmt: skip

@@ -117,7 +117,7 @@ def _show(daemon_status: Status, age_s: float) -> None:
         console.print(f"coach   {daemon_status.advice.text}")
     for alarm in daemon_status.alarms:
         over = "" if alarm.until_unix_s is None else " (over)"
-        console.print(f"ALARM   {alarm.name}{over}: {alarm.text} {alarm.trace}")
+        console.print(f"ALARM   {alarm.name}{over}: {alarm.words} {alarm.trace}")
 
 
 def _maps(daemon_status: Status) -> str:

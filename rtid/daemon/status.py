@@ -23,6 +23,7 @@ from rtid.trace.state_files import create, exchange, read_bytes
 SCHEMA = 1
 STATUS_FILE = "status.json"
 ROOM_BYTES = 8192  # the file grows by so much, with half its length to spare
+TO_DECIDE = " If the machine is to stay as it is now: rtid accept"  # ends an alarm that is on
 OLD_S = 5.0  # a status of that age is that of a daemon that no longer runs
 
 SignalVerdict = Literal["ok", "silent", "frozen", "out_of_range", "not_available", "implausible"]
@@ -241,6 +242,11 @@ class Alarm:
     until_unix_s: float | None = None
     kind: Literal["bus", "sensor", "plant", "store", "loop"] = "bus"
     trace: str = ""  # recording of the seconds around it
+
+    @property
+    def words(self) -> str:
+        """What it says; once it is over there is nothing to be decided."""
+        return self.text if self.until_unix_s is None else self.text.removesuffix(TO_DECIDE)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from rtid.daemon.status import MessageHealth, SignalHealth, Verdict
+from rtid.daemon.status import TO_DECIDE, MessageHealth, SignalHealth, Verdict
 
 CAUSES = {
     "late": "woken too late",
@@ -97,10 +97,10 @@ def plant_changed(verdict: Verdict | None, cause: str = "") -> str:
     """
     text = "the machine no longer does what the map says; learning is suspended"
     if cause:
-        return f"{text}. {cause}. If the machine is to stay as it is now: rtid accept"
+        return f"{text}. {cause}.{TO_DECIDE}"
     if verdict is None:
         return f"{text}, a diagnosis follows"
-    return f"{text}. {verdict.text} If the machine is to stay as it is now: rtid accept"
+    return f"{text}. {verdict.text}{TO_DECIDE}"
 
 
 def overload(lost: int, ticks: int, causes: Mapping[str, int]) -> str:

@@ -168,7 +168,9 @@ def undo(project: str | Path) -> Revised:
     text = text_of(project)
     changes = standing(read(project))
     if not changes:
-        raise RtidError(f"{project}: there is no change to undo", "", 4)
+        drop = "`rtid drop EFFECT` takes out what the file came with"
+        remedy = drop if load(project).sections.added else "`rtid add` makes the first"
+        raise RtidError(f"{project}: there is no change to undo", remedy, 4)
     last, note = changes[-1], ""
     restored = last.before
     if digest(text) not in (digest(restored), last.after_sha256):

@@ -231,7 +231,7 @@ def _same_alarms(alarms: Sequence[Alarm], now_s: float) -> str:
         word += f"; {len(alarms)} times since {_clock(alarms[-1])}"
     dot = _dot("failed" if is_on else "ok")
     seconds = "".join(_seconds(alarm, alarm is newest) for alarm in alarms[:MOST_ALARMS])
-    return f"<li>{dot}<b>{text(newest.name)}</b> {text(newest.text)} ({word}){seconds}</li>"
+    return f"<li>{dot}<b>{text(newest.name)}</b> {text(newest.words)} ({word}){seconds}</li>"
 
 
 def _clock(alarm: Alarm) -> str:

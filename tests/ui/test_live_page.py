@@ -8,7 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from rtid.cli.main import build
 from rtid.daemon import calendar
 from rtid.daemon.chronicle import Chronicle
 from rtid.daemon.status import (
@@ -28,6 +30,7 @@ from rtid.daemon.status import (
     Verdict,
     write,
 )
+from rtid.daemon.wording import plant_changed
 from rtid.ui import live_page
 from rtid.ui.live_page import Live
 
@@ -82,6 +85,17 @@ def test_everything_that_the_daemon_says_is_there(tmp_path: Path) -> None:
         assert words in html, words
     assert "samples 60,000" not in html  # counted, not refused
     assert "stale:" not in html
+
+
+def test_an_alarm_that_is_over_leaves_nothing_to_be_decided(tmp_path: Path) -> None:
+    """It told to accept the machine, beside a button that could not be pressed."""
+    changed = plant_changed(Verdict(NOW - 5, "missing", "A leak."))
+    for until, is_asked in ((None, True), (NOW - 1, False)):
+        alarm = Alarm("plant_changed", changed, NOW - 9, until, "plant")
+        write(tmp_path, replace(status(), alarms=(alarm,)))
+        assert "A leak." in (html := shown(tmp_path)) and ("rtid accept" in html) is is_asked
+        said = CliRunner().invoke(build(["status"]), ["status", str(tmp_path)]).output
+        assert ("rtid accept" in " ".join(said.split())) is is_asked
 
 
 def test_a_status_that_is_not_renewed_is_stale(tmp_path: Path) -> None:
