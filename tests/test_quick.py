@@ -29,6 +29,7 @@ from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import SimulatedPlant
 from rtid.study import quick_machine
+from rtid.study.on_board import on_board
 from rtid.study.quick_command import is_taken
 from rtid.study.quick_machine import (
     MOST_S,
@@ -451,6 +452,13 @@ def test_a_saved_project_runs_on_board_as_it_is(folder: Path, tmp_path: Path) ->
     assert loaded.noise_unknown and not loaded.noise_unseen
     assert noise["p_a"] == pytest.approx(5e3, rel=0.05), "of the simulated sensor, Pa"
     Daemon(loaded, Bus("virtual", "x", lambda: pytest.fail("opened")), tmp_path)
+    board = on_board(loaded, lambda _: None)
+    assert len(board.model.terms) == 2 and all(term.scale > 0.0 for term in board.model.terms)
+    desk, first = Study(project, folder / "leak.parquet"), told(folder / "leak.parquet")
+    (named,) = desk.diagnosis().found
+    size = first["diagnosis"]["found"][0]["parameters"]["coefficient"]
+    assert named.parameters["coefficient"].value == pytest.approx(size["value"], rel=1e-6)
+    assert named.parameters["coefficient"].std == pytest.approx(size["std"], rel=1e-6)
 
 
 def test_a_supply_that_nobody_measures_is_asked_for_first(folder: Path, tmp_path: Path) -> None:

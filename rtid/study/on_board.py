@@ -171,6 +171,8 @@ def load_for(path: Path, project: Project) -> tuple[Estimator, tuple[AddedSectio
 
 def _live(project: Project, added: AddedSection) -> tuple[tuple[Term, ...], tuple[LiveFlow, ...]]:
     """What of an added effect runs live: its terms, and flows where the kernels lack its form."""
+    if _is_nothing(project, added):
+        return (), ()
     terms = _terms(project, added)
     flows = () if terms else _flows(project, added)
     if flows:
@@ -179,7 +181,16 @@ def _live(project: Project, added: AddedSection) -> tuple[tuple[Term, ...], tupl
     return terms, flows
 
 
+def _is_nothing(project: Project, added: AddedSection) -> bool:
+    """Whether its size in the file is zero: a term is a multiple of it."""
+    effect = _effect(project, added)
+    size = added.parameters.get(effect.size.name) if effect is not None else None
+    return size is not None and size.value == 0.0
+
+
 def _why_not(project: Project, added: AddedSection) -> str:
+    if _is_nothing(project, added):
+        return "because its size in the file is 0"
     if _column(project, added) is None:
         trusted = (
             "" if project.untrusted is None else f" unless {project.untrusted.name} is trusted"

@@ -226,13 +226,19 @@ def _of_cylinder(
         path,
         source,
         arranged.roles,
-        replace(machine, noise_seen=noise),
+        replace(machine, noise_seen=noise, extra_volumes=_fitted_volumes(diagnosis)),
         tuple(judged),
         level,
         diagnosis,
         tuple(_cautions(diagnosis, given, arranged.roles)),
         bool(arranged.trace.refused.get("truncated")),
     )
+
+
+def _fitted_volumes(diagnosis: Diagnosis | None) -> dict[str, tuple[float, float]]:
+    """Dead volume of each chamber beyond the assumed one, m3, with its standard deviation."""
+    volumes = {a.where: a.parameters["volume"] for a in (diagnosis.added if diagnosis else ())}
+    return {where: (volume.value, volume.std) for where, volume in volumes.items()}
 
 
 def _likeliest(

@@ -66,7 +66,8 @@ class MachineSizes:
     between its samples, and what is unknown of it there, in SI; command_step_s: from one to
     the next of a sample of a faster one, which may act up to half of it later than on the line.
     command_unit: that of its column.  noise_seen: 1 sigma by role, as the record tells it.
-    supply_pa: of a supply that is not measured, as it was said.
+    supply_pa: of a supply that is not measured, as it was said.  extra_volumes: dead volume of each
+    chamber beyond the assumed one, as fitted, m3, with its standard deviation.
     """
 
     bore_m: float
@@ -90,6 +91,7 @@ class MachineSizes:
     command_step_s: float = 0.0
     noise_seen: Mapping[str, float] = field(default_factory=dict)
     supply_pa: float | None = None
+    extra_volumes: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def displacement_m3(self) -> float:

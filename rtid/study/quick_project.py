@@ -53,9 +53,10 @@ def project_text(
     }
     if machine.dead_is_fitted:
         dead, *_ = correcting(DEAD_VOLUME)
-        volume = {dead.size.name: {"value": 0.0, "unit": dead.size.unit}}
         raw["added"] = [
-            {"effect": dead.name, "where": chamber, "parameters": volume} for chamber in "ab"
+            {"effect": dead.name, "where": chamber, "parameters": {dead.size.name: volume}}
+            for chamber in "ab"
+            for volume in [_extra(machine, chamber) | {"unit": dead.size.unit}]
         ]
     lag_ms, tolerance_ms = map(_neat, lag_of(machine))
     raw["dynamics"] = {"spool_lag": {"nominal_ms": lag_ms, "tolerance_ms": tolerance_ms}}
@@ -81,6 +82,14 @@ def _sizes(machine: MachineSizes) -> dict[str, Any]:
             "b": {"pressure": "p_b", "sign": -1, **bore, **rod, **room_b},
         },
     }
+
+
+def _extra(machine: MachineSizes, chamber: str) -> dict[str, float]:
+    """Dead volume of a chamber beyond the assumed one: as fitted; 0: nobody knows."""
+    if chamber not in machine.extra_volumes:
+        return {"value": 0.0}
+    value, sd = machine.extra_volumes[chamber]
+    return {"value": _neat(value), "sd": _neat(sd)}
 
 
 def _neat(value: float) -> float:

@@ -143,6 +143,13 @@ def test_a_snapshot_says_what_it_was_learned_beside(tmp_path: Path) -> None:
         load_for(path, machine().project)
 
 
+def test_an_effect_of_size_zero_is_no_column() -> None:
+    """Everything was divided by it: no status came, and the live page stood still."""
+    said: list[str] = []
+    board = on_board(with_added(added(LEAK, "a-b", coefficient=0.0)), said.append)
+    assert board.model.terms == () and "its size in the file is 0" in said[0]
+
+
 def test_noise_that_is_to_be_estimated_is_refused_at_the_start(tmp_path: Path) -> None:
     project = replace(machine().project, noise_unknown=("p_a", "x"))
     with pytest.raises(DaemonError, match="noise of p_a, x is to be estimated") as refused:
