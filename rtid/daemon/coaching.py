@@ -103,8 +103,8 @@ def by_valve(model: Machine, edges: Iterable[EdgeHealth]) -> Advice | None:
     sign = "positive" if edge.direction > 0 else "negative"
     missing = sum(poorest.blocks.values()) - poorest.blocks.get("valid", 0)
     text = (
-        f"Valve {edge.name} knows least. Move with {sign} {edge.command} between {low:g} and "
-        f"{high:g} V: hold each level for a second, then step to the next; repeat with another "
+        f"Valve {edge.name} knows least. Move with {sign} {edge.command} between {low:.3g} and "
+        f"{high:.3g} V: hold each level for a second, then step to the next; repeat with another "
         "load or supply pressure, so that its pressure drop changes."
     )
     if missing:

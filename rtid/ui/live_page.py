@@ -366,7 +366,8 @@ def _learning(status: Status) -> str:
         if c.beta_pa is not None
     )
     betas += "".join(
-        f"<dt>{text(e.name)}</dt><dd>{scale.known(e.size, e.sd, 4)} {text(scale.name)}</dd>"
+        f"<dt>{text(e.name.replace('_', ' '))}</dt>"
+        f"<dd>{scale.known(e.size, e.sd, 4)} {text(scale.name)}</dd>"
         for e in result.effects
         for scale in (scale_of(e.unit),)
     )

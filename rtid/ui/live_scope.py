@@ -111,7 +111,7 @@ class Recent:
             if u0 <= u <= u1 and p0 <= p <= p1
         )
         frame = '<rect width="180" height="120" fill="none" stroke="var(--line)"/>'
-        words = f"{u0:g} to {u1:g} V, {MPA * p0:.3g} to {MPA * p1:.3g} MPa"
+        words = f"{u0:.3g} to {u1:.3g} V, {MPA * p0:.3g} to {MPA * p1:.3g} MPa"
         return (
             f'<figure class="plane"><svg viewBox="0 0 180 120" role="img" aria-label="plane of '
             f'{text(edge.name)}">{blocks}{frame}{dots}</svg><figcaption class="key"><b>'
@@ -152,7 +152,8 @@ def _trend_plot(lines: Sequence[TrendLine], t0: float, t1: float) -> str:
             drawn += _band([(x, v - d, v + d) for x, v, d in at], low, high, colour, 0.3)
             drawn += _band([(x, v, v) for x, v, _ in at], low, high, colour)
         _, value, sd = line.points[-1]
-        said = f"{line.name} {scale.known(value, sd, DECIMALS.get(line.unit, 4))} {scale.name}"
+        name = line.name.replace("_", " ")
+        said = f"{name} {scale.known(value, sd, DECIMALS.get(line.unit, 4))} {scale.name}"
         keys.append(f'<span style="color:{colour}">■</span> {text(said.rstrip())}')
     words = f"{scale.factor * low:.4g} to {scale.factor * high:.4g}, {(t1 - t0) / 3600.0:.2g} h"
     return (

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from rtid.cli.main import build
 from rtid.daemon import calendar
+from rtid.daemon.calendar import TrendLine
 from rtid.daemon.chronicle import Chronicle
 from rtid.daemon.status import (
     Advice,
@@ -20,6 +21,7 @@ from rtid.daemon.status import (
     ChamberStatus,
     Distribution,
     EdgeHealth,
+    EffectStatus,
     EstimateStatus,
     LoopHealth,
     MessageHealth,
@@ -33,6 +35,7 @@ from rtid.daemon.status import (
 from rtid.daemon.wording import plant_changed
 from rtid.ui import live_page
 from rtid.ui.live_page import Live
+from rtid.ui.live_scope import trends
 
 NOW = 1_800_000_000.0
 
@@ -96,6 +99,15 @@ def test_an_alarm_that_is_over_leaves_nothing_to_be_decided(tmp_path: Path) -> N
         assert "A leak." in (html := shown(tmp_path)) and ("rtid accept" in html) is is_asked
         said = CliRunner().invoke(build(["status"]), ["status", str(tmp_path)]).output
         assert ("rtid accept" in " ".join(said.split())) is is_asked
+
+
+def test_effects_and_borders_are_in_words_of_the_workshop(tmp_path: Path) -> None:
+    effect = EffectStatus("extra_dead_volume a", 2.66e-4, 2e-6, "m3")
+    estimate = replace(status().estimate, effects=(effect,))
+    write(tmp_path, replace(status(), estimate=estimate))
+    assert "<dt>extra dead volume a</dt><dd>0.266" in shown(tmp_path)
+    points = ((NOW - 60.0, 2.6e-4, 2e-6), (NOW, 2.66e-4, 2e-6))
+    assert "extra dead volume a 0.266" in trends([TrendLine(effect.name, "m3", points)])
 
 
 def test_a_status_that_is_not_renewed_is_stale(tmp_path: Path) -> None:
