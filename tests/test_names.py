@@ -171,7 +171,7 @@ def test_a_supply_that_is_recorded_is_not_assumed(tmp_path: Path) -> None:
         "p_supply": "pP_bar", "p_tank": "pT_bar", "p_a": "pA_bar", "p_b": "pB_bar", "x": "x_mm",
         "u": "u",
     }  # fmt: skip
-    assert of_missing(roles) == []
+    assert of_missing(roles, None) == []
     assert source.keys == {"time_column": "t_ms", "time_unit": "ms"}
     assert source.step_ms == pytest.approx(1.0)
 
