@@ -479,3 +479,19 @@ def test_a_supply_that_nobody_measures_is_asked_for_first(folder: Path, tmp_path
 def test_a_supply_is_measured_or_said(folder: Path) -> None:
     refused = quick(folder / "leak.parquet", "--supply", 7)
     assert refused.returncode == Exit.USAGE and "p_supply measures the supply" in refused.stderr
+
+
+def test_several_records_of_a_cylinder_make_one_project(folder: Path, tmp_path: Path) -> None:
+    """One was taken, and a section of the file was to be deleted by hand for the others."""
+    other, project = tmp_path / "tuesday.parquet", tmp_path / "m.toml"
+    leaking = simulate(hide_wish(SimulatedPlant(), f"{LEAK}=middle"), "rich", 8, 30.0)
+    write_run(other, leaking, 8, "rich")
+    done = quick(folder / "leak.parquet", other, "--save", project)
+    assert done.returncode == Exit.OK, done.stderr
+    assert "learns from all 2 records" in done.stdout
+    assert f"Next: rtid diagnose {folder / 'leak.parquet'} -p {project}" in done.stdout
+    assert '"tuesday.parquet"' in project.read_text()
+    study = Study(project, other)
+    assert [span.path.name for span in study.records] == ["leak.parquet", "tuesday.parquet"]
+    assert [span.is_held_out for span in study.records] == [False, True]
+    assert [effect.effect for effect in study.diagnosis().found] == [LEAK]

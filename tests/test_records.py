@@ -147,14 +147,6 @@ def test_quick_takes_several_records(days: tuple[Crane, list[Path], Path], tmp_p
     assert f"the delay is {1e3 * delay:.0f} to " in said("diagnose", first, "-p", file) + words
 
 
-def test_a_cylinder_with_valves_is_looked_at_alone(
-    days: tuple[Crane, list[Path], Path], tmp_path: Path
-) -> None:
-    table = tmp_path / "cylinder.csv"
-    table.write_text("t_s,u_V,x_mm,pA_bar,pB_bar\n0,1,2,3,4\n1,2,3,4,5\n")
-    assert "takes one record" in said("quick", table, days[1][0], code=2)
-
-
 def rate_errors(study: Study) -> list[float]:
     """Of each record, the model's rate beside the measured one's Savitzky-Golay, 20 Hz, rms, m/s.
 

@@ -41,7 +41,7 @@ def _both(text: str) -> tuple[float, float]:
 def quick(
     files: Annotated[
         list[Path],
-        typer.Argument(help="Table (.csv .parquet .mat) or CAN log; tables of a rate: one fit."),
+        typer.Argument(help="Table (.csv .parquet .mat) or CAN log; of several, one project."),
     ],
     dbc: Annotated[
         Path | None, typer.Option(help="DBC of a CAN log; the built-in one without it.")

@@ -37,6 +37,7 @@ from rtid.study.quick_machine import (
 from rtid.study.quick_project import DEAD_VOLUME, head_of, of_channels, of_missing, project_text
 from rtid.study.quick_rate import QuickRate, quick_rate
 from rtid.study.rate_pairs import driven_pairs, pressed_pairs
+from rtid.study.rate_project import of_records, placed_near
 from rtid.study.study import Study
 from rtid.trace.check import Report, judge
 from rtid.trace.quick_data import BAD, Point, level_of, points
@@ -59,7 +60,8 @@ class Quick:
     """What a file tells without a project file.
 
     level: good, fair or bad; diagnosis: None where the data are too bad for one; options: of the
-    command line that said the rest.
+    command line that said the rest.  records: of the project, where they are several; what is told
+    is of the first; held_out: names of those that judge, else the last one.
     """
 
     path: Path
@@ -72,6 +74,8 @@ class Quick:
     cautions: tuple[str, ...]
     truncated: bool
     options: str = ""
+    records: tuple[Path, ...] = ()
+    held_out: tuple[str, ...] = ()
 
     @property
     def is_enough(self) -> bool:
@@ -98,17 +102,24 @@ class Quick:
                 place.named(proposal.relative(place.file, file.parent)) for place in places(dbc)
             )
             source = replace(source, keys=source.keys | {"dbc": ", ".join(near)})
-        return head_of(self.assumptions) + project_text(file.stem, source, self.roles, self.machine)
+        text = head_of(self.assumptions)
+        text += project_text(file.stem, source, self.roles, self.machine)
+        if not self.records:
+            return text
+        return placed_near(of_records(text, self.records, self.held_out), self.records, file)
 
     @property
     def next_command(self) -> str:
         """What writes the project."""
-        return f"rtid quick {self.path}{self.options} --save machine.toml"
+        files = " ".join(map(str, self.records or [self.path]))
+        return f"rtid quick {files}{self.options} --save machine.toml"
 
     def after(self, project: Path) -> str:
         """What to do with the project once it is written."""
         verdict = self.diagnosis.verdict if self.diagnosis else INSUFFICIENT
         trace = f"{self.path} -p {project}"
+        if self.records:
+            return f"rtid diagnose {trace}"
         if verdict == MISSING:
             return f"rtid add {trace}"
         if verdict == MATCHES:
@@ -148,9 +159,9 @@ def quick(
     """Judge a table or a CAN log; roles: names of signals by role, where guesses would fail.
 
     A table without pressures is one of a plant that is a rate, or one of its equations where it
-    empties or cools down by itself.  more: further records of such a
-    plant, of which those named held_out judge, or the last.  Raises RtidError where the file cannot
-    be read, or is of no kind of plant.
+    empties or cools down by itself.  more: further records of the plant, of which those named
+    held_out judge, or the last; of a cylinder the first is judged, and the project is of all.
+    Raises RtidError where the file cannot be read, or is of no kind of plant.
     """
     given = given or Given()
     progress("reading", 0.0)
@@ -163,17 +174,14 @@ def quick(
 
         by_equations = None if more else quick_plant(path, source, named, progress)
         return by_equations or quick_rate(path, source, named, progress, more, held_out)
-    if more:
-        remedy = (
-            f"rtid quick {path} --save machine.toml, its [record] taken out, and `rtid diagnose`"
-        )
-        raise RtidError(f"{path}: of a cylinder with valves quick takes one record", remedy, 2)
     played = roles_of(path, source, named)
     if given.supply_pa is not None and "p_supply" in played:
         measured = played["p_supply"].full_name
         raise RtidError(f"{path}: {measured} measures the supply", "leave its pressure out", 2)
     looked = _of_cylinder(path, source, played, given, progress)
-    return replace(looked, options=_options(dbc, given, roles))
+    options = _options(dbc, given, roles) + "".join(f" --held-out {name}" for name in held_out)
+    several = (path, *more) if more else ()
+    return replace(looked, options=options, records=several, held_out=tuple(held_out))
 
 
 def _is_rate(

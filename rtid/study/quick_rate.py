@@ -20,10 +20,10 @@ from rtid.estimator.flowmap import VALID, EdgeMap
 from rtid.estimator.published import publish
 from rtid.plain import Progress, plain, silent
 from rtid.project import Project
-from rtid.project.guess import RoleCandidate, relative
+from rtid.project.guess import RoleCandidate
 from rtid.study.in_turn import in_turn
 from rtid.study.rate_pairs import RatePair, pairs_of
-from rtid.study.rate_project import of_records, rate_text
+from rtid.study.rate_project import of_records, placed_near, rate_text
 from rtid.study.study import RecordError, Study
 from rtid.trace.neutral import neutrals
 from rtid.trace.quick_source import Source
@@ -93,10 +93,7 @@ class QuickRate:
 
     def text_for(self, file: Path) -> str:
         """The project as it is written to a file: its records relative to it where they can be."""
-        text = self.text
-        for path in self.records:
-            text = text.replace(f'"{path.resolve()}"', f'"{relative(path, file.parent)}"')
-        return text
+        return placed_near(self.text, self.records, file)
 
     def as_json(self) -> dict[str, Any]:
         """Plain JSON types."""

@@ -12,7 +12,7 @@ import tomlkit
 from firmware_bridge.sources import read_table
 from firmware_bridge.sources.table import held
 from rtid.plain import FloatArray
-from rtid.project.guess import RoleCandidate
+from rtid.project.guess import RoleCandidate, relative
 from rtid.study.quick_drive import drive_text
 from rtid.study.quick_pressed import pressed_text
 from rtid.study.rate_pairs import RatePair
@@ -160,6 +160,13 @@ def _joined(u: FloatArray, borders: list[float], least: int = LEAST_ROWS) -> lis
 
 def _three(value: float) -> float:
     return float(f"{value:.3g}")
+
+
+def placed_near(text: str, records: Sequence[Path], file: Path) -> str:
+    """The text of a project file with the places of its records relative to it, where they can."""
+    for path in records:
+        text = text.replace(f'"{path.resolve()}"', f'"{relative(path, file.parent)}"')
+    return text
 
 
 def of_records(text: str, records: Sequence[Path], held_out: Sequence[str]) -> str:

@@ -53,7 +53,10 @@ def lines(quick: Quick, saved: Path | None = None) -> Iterator[str]:
     yield from _verdict(quick)
     yield ""
     if saved is not None:
-        yield f"wrote {saved}: every other command takes it, and says the same."
+        says = "takes it, and says the same"
+        if quick.records:
+            says = f"learns from all {len(quick.records)} records; above stands what the first says"
+        yield f"wrote {saved}: every other command {says}."
         yield f"Next: {quick.after(saved)}"
         return
     yield f"Next: {quick.next_command}"
