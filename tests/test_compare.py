@@ -168,6 +168,10 @@ def test_long_form_per_edge(tmp_path: Path) -> None:
     sheet = read_reference(write(tmp_path / "m.csv", text))
     assert sheet.flow("a", 1.5, 1e6) * 6e4 == pytest.approx(9.0)
     assert sheet.flow("b", 2.0, 2e6) * 6e4 == pytest.approx(6.0)
+    titles = text.replace("edge,dp_bar,u_V,Q_l_min", "Valve,dp [bar],u [V],flow [L/min]")
+    other = read_reference(write(tmp_path / "stranger.csv", titles))
+    assert other.flow("a", 1.5, 1e6) == sheet.flow("a", 1.5, 1e6)
+    assert other.flow("b", 1.0, 1e6) * 6e4 == pytest.approx(3.0), "not those of a as well"
 
 
 @pytest.mark.parametrize("text", [

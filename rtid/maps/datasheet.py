@@ -4,7 +4,7 @@ Semicolons, tabulators, decimal commas and a row of units are read as in a table
 
 abs_u_V,K                          one gain for all edges, Q = K sqrt(dp)
 abs_u_V,K_PA,K_AT,K_PB,K_BT        one gain per edge, m3/s/sqrt(Pa)
-dp_MPa,u_V,Q_l_min                 long form, optionally with a column `edge`
+dp_MPa,u_V,Q_l_min                 long form (or flow_l_min), optionally with a column edge or valve
 edge,u_%,over,Q_m/s                of a plant without pressures, as `rtid export` writes it
 """
 
@@ -79,7 +79,7 @@ def _gain_columns(
 def _long(path: Path, header: list[str], lines: list[list[str]]) -> dict[str, GainTable]:
     u, u_unit = _column(path, header, COMMAND_DIMENSIONS, "u", "abs_u")
     p, p_unit = _column(path, header, ("pressure",), "dp")
-    q, q_unit = _column(path, header, ("flow",), "Q")
+    q, q_unit = _column(path, header, ("flow",), "Q", "flow")
     _require_command(path, header[u], u_unit)
     w_v = _numbers(path, header, lines, u) * u_unit.factor
     dp_pa = _numbers(path, header, lines, p) * p_unit.factor
@@ -95,8 +95,9 @@ def _by_edge(header: list[str], lines: list[list[str]]) -> Iterator[tuple[str, B
     """Every edge of a long table, and which lines are its own."""
     plain = [name.casefold() for name in header]
     edges = [ANY_EDGE] * len(lines)
-    if "edge" in plain:
-        edges = [row[plain.index("edge")].strip().casefold() for row in lines]
+    named = next((plain.index(word) for word in ("edge", "valve") if word in plain), None)
+    if named is not None:
+        edges = [row[named].strip().casefold() for row in lines]
     for edge in dict.fromkeys(edges):
         yield edge, np.array([name == edge for name in edges])
 
@@ -177,7 +178,7 @@ def _numbers(path: Path, header: list[str], lines: list[list[str]], column: int)
     out = np.empty(len(lines))
     for k, row in enumerate(lines):
         text = row[column].strip()
-        missing = text.casefold() in ("", "na", "nan") and header[column][0] in "QqK"
+        missing = text.casefold() in ("", "na", "nan") and header[column][0] in "QqKFf"
         try:
             out[k] = np.nan if missing else float(text)
         except ValueError:
