@@ -102,7 +102,7 @@ def _decided(session: Session, last: ShownRevision, diagnosis: Diagnosis) -> str
         offer = button("Save to project", "save", kind="main") + undo_button(last)
         words += " Next: save it, or undo." if diagnosis.verdict == "matches" else ""
     elif len(session.revisions) > 1:
-        offer = button("Take the maps along", "go", kind="main", name="map") + undo_button(last)
+        offer = button("To the maps", "go", kind="main", name="map") + undo_button(last)
     elif diagnosis.verdict == "matches":
         words += " Next: Map, to take the valves' maps along."
     return f'<h1 class="{kind}">{text(heading)}</h1><p>{text(words)}</p>{offer}'
@@ -111,7 +111,7 @@ def _decided(session: Session, last: ShownRevision, diagnosis: Diagnosis) -> str
 def undo_button(last: ShownRevision | None, kind: str = "") -> str:
     """What takes a change back, out of the project file too where that has it; None: nothing."""
     is_in_file = last is not None and last.is_saved
-    label = "Undo, in the project too" if is_in_file else "Undo"
+    label = "Undo in the project" if is_in_file else "Undo"
     return button(label, "undo", kind=kind, off=last is None)
 
 

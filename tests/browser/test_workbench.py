@@ -244,7 +244,7 @@ def test_from_the_verdict_to_the_falling_bar_and_back(
     page.click("#add_bars >> text=Save 1 to the project")
     page.wait_for_selector("#add_bars button[data-do=save]:disabled")
     assert [a.effect for a in load(project).sections.added] == ["internal_leakage_laminar"]
-    page.click("#verdict >> text=Undo, in the project too")
+    page.click("#verdict >> text=Undo in the project")
     wait_for_bars(page, 1)
     page.wait_for_selector("#work >> text=as before the last change")
     assert project.read_bytes() == untouched

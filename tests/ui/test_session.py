@@ -180,7 +180,7 @@ def test_undo_after_save_takes_it_out_of_the_project_file() -> None:
         worker.answer(result)
     session.save()
     assert worker.answer(SimpleNamespace(note="wrote m.toml")) == "save"
-    assert "Undo, in the project too" in strip(session)
+    assert "Undo in the project" in strip(session)
     for _ in range(2):
         session.undo()  # clicked twice: there is one change to take back
         assert looks(session) == ["first look"]
