@@ -95,7 +95,14 @@ def _judged(project: Project, path: Path, progress: Progress) -> Report:
     tables = project.table_assembly if read.is_table else None
     assembly = tables or project.assembly
     report = judge(
-        project.model, assembly, read.samples, read.series, read.messages, read.refused, stroke_m
+        project.model,
+        assembly,
+        read.samples,
+        read.series,
+        read.messages,
+        read.refused,
+        stroke_m,
+        read.jitter_s,
     )
     if not report.ok:
         return report

@@ -27,6 +27,7 @@ from rtid.model import Machine, Signal
 from rtid.plain import FloatArray, Progress
 from rtid.project import Project
 from rtid.trace.described import catalog_of
+from rtid.trace.late_stamps import frames_in_time
 from rtid.trace.learner import Learner, listen, virtual_bus
 from rtid.trace.measured import with_sums
 from rtid.trace.reading import AT_ONCE, NoSamplesError, Trace, assemble, whole
@@ -144,7 +145,8 @@ def aged(project: Project, model: Machine, trace: Trace) -> tuple[Trace, Message
     tolerance, nothing = project.offset_tolerance_s, np.zeros(0)
     if not tolerance or trace.log is None:
         return trace, MessageAges(nothing, nothing)
-    catalog, frames = catalog_of(project), trace.log.read()
+    catalog = catalog_of(project)
+    frames, _ = frames_in_time(trace.log.read(), project.assembly, catalog)
     span_s = taught_s(project)
 
     def shifted(offsets_s: FloatArray) -> Samples:

@@ -356,6 +356,7 @@ def _judged(project: Project, trace: Recording) -> Report:
         trace.messages,
         trace.refused,
         stroke_m,
+        trace.jitter_s,
     )
 
 

@@ -71,11 +71,16 @@ def judge(
     messages: dict[str, Timing],
     refused: dict[str, int],
     stroke_m: float,
+    jitter_s: float = 0.0,
 ) -> Report:
-    """Judge samples and raw series (each signal at its own instants) against the declaration."""
+    """Judge samples and raw series (each signal at its own instants) against the declaration.
+
+    jitter_s: of the stamps, where the samples have better ones.
+    """
     signals = tuple(describe(series) for series in series)
     moved, covered = motion(model, samples), coverage(model, samples)
     findings = list(_timing(assembly, messages, samples, refused))
+    findings += [_late(jitter_s)] if jitter_s else []
     timed = not any(finding.level == "error" for finding in findings)
     findings += _signals(model, series, signals)
     findings += _units(model, assembly, stroke_m, signals)
@@ -169,6 +174,13 @@ def _timing(
     if len(samples) == 0:
         remedy = "see the counters of refused frames; check counter, crc and data_id"
         yield _error("samples", "no complete sample could be made", remedy)
+
+
+def _late(jitter_s: float) -> Finding:
+    """Of stamps that a busy computer wrote: on board nothing is put back."""
+    text = f"the logger stamps late by turns, by {_ms(jitter_s)} rms beside the usual delay"
+    text += ": the sensors say that they were sampled evenly, and are taken so"
+    return _warning("samples", text, "let the interface's hardware stamp, or write when it sampled")
 
 
 def _signals(

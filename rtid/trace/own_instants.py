@@ -15,7 +15,7 @@ from firmware_bridge.config import Assembly, MessageSource, SignalSource
 from firmware_bridge.frames import Frames
 from firmware_bridge.j1939 import Network, known_as
 from firmware_bridge.sources.table import Table, in_turn
-from rtid.plain import FloatArray, IntArray
+from rtid.plain import BoolArray, FloatArray, IntArray
 from rtid.trace.series import Series
 
 
@@ -37,13 +37,13 @@ def of_messages(
 ) -> Iterator[Series]:
     """Those of the frames of each message, as from `wanted`."""
     for message in assembly.messages:
-        yield from _of_message(chosen[message.name], message, assembly, catalog)
+        yield from of_message(chosen[message.name], message, assembly, catalog)
 
 
 def wanted(frames: Frames, assembly: Assembly, catalog: Catalog) -> dict[str, Frames]:
     """The frames of each message that is asked for."""
     matched = Network(catalog, assembly.messages).push(frames)
-    return {m.name: _frames_of(matched, m, catalog) for m in assembly.messages}
+    return {m.name: matched[are_of(matched, m, catalog)] for m in assembly.messages}
 
 
 def _of_column(source: SignalSource, t_us: IntArray, column: FloatArray) -> Series:
@@ -53,16 +53,18 @@ def _of_column(source: SignalSource, t_us: IntArray, column: FloatArray) -> Seri
     return Series(source.name, t_us[at], _si(column[at], source))
 
 
-def _frames_of(frames: Frames, message: MessageSource, catalog: Catalog) -> Frames:
+def are_of(frames: Frames, message: MessageSource, catalog: Catalog) -> BoolArray:
+    """Which of the frames, (n,), are those of a message, matched where it is one of J1939."""
     mine = frames.can_id == known_as(catalog, message)
     if message.channel is not None:
         mine &= frames.channel == message.channel
-    return frames[mine & (frames.length == catalog.message(message.name).length)]
+    return np.asarray(mine & (frames.length == catalog.message(message.name).length))
 
 
-def _of_message(
+def of_message(
     frames: Frames, message: MessageSource, assembly: Assembly, catalog: Catalog
 ) -> list[Series]:
+    """The signals that are asked for in the frames of one message."""
     sources = [s for s in assembly.signals if s.message == message.name and s.constant is None]
     layouts = catalog.layouts(message.name, list(dict.fromkeys(s.signal for s in sources)))
     values = layouts.decode(frames.data)

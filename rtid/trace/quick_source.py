@@ -20,6 +20,7 @@ from rtid.errors import RtidError
 from rtid.project import guess as proposal
 from rtid.project.guess import RoleCandidate
 from rtid.trace.described import by_message
+from rtid.trace.steady import period_of
 from rtid.trace.table import time_of
 from rtid.units import Unit, find_unit
 
@@ -72,7 +73,7 @@ def _of_table(table: Table) -> Source:
         span = candidate.high - candidate.low
         steps[candidate.name] = max(smallest_step(values[np.isfinite(values)]), LEAST_STEP * span)
     t_us = table.t_us()
-    step_ms = 1e-3 * float(np.median(np.diff(t_us))) if len(t_us) > 1 else 0.0
+    step_ms = 1e-3 * period_of(t_us) if len(t_us) > 1 else 0.0
     return Source({"time_column": time, "time_unit": unit}, signals, {}, steps, step_ms)
 
 
@@ -118,7 +119,7 @@ def log_source(path: Path, frames: Frames, dbc: Path | None) -> Source:
             "name the DBC of this bus: --dbc FILE" if dbc is None else "is it the right DBC?",
         )
     signals = [c for name, mine in messages.items() for c in _signals(mine, name, catalog)]
-    periods = {name: 1e-3 * float(np.median(np.diff(f.t_us))) for name, f in messages.items()}
+    periods = {name: 1e-3 * period_of(f.t_us) for name, f in messages.items()}
     name = ", ".join(place.named(str(place.file.resolve())) for place in places)
     keys = {"dbc": name if dbc else f"{catalogs.BUILTIN}controller.dbc"}
     return Source(keys, signals, periods, {}, channels=several)

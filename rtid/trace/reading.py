@@ -24,6 +24,7 @@ from rtid.model import Machine
 from rtid.plain import FloatArray
 from rtid.project import Project
 from rtid.trace.described import catalog_of
+from rtid.trace.late_stamps import frames_in_time, rows_in_time
 from rtid.trace.measured import with_sums
 from rtid.trace.neutral import about_neutral
 from rtid.trace.own_instants import of_log, of_table
@@ -99,14 +100,16 @@ def read_trace(project: Project, path: str | Path) -> Trace:
     content = open_file(path)
     if isinstance(content, Table):
         table, assembly = declared(project, content)
+        table, _ = rows_in_time(table, assembly)
         samples, counters = whole(project, *to_samples(table, assembly))
         samples = with_sums(project, about_neutral(project, samples))
         noise = noise_of(project, of_table(table, assembly))
         return _not_empty(Trace(path, samples, counters, None, noise), project)
     catalog, assembly = catalog_of(project), project.assembly
-    samples, counters = whole(project, *assemble(catalog, assembly, content))
+    frames, _ = frames_in_time(content, assembly, catalog)
+    samples, counters = whole(project, *assemble(catalog, assembly, frames))
     samples = with_sums(project, samples)
-    noise = noise_of(project, of_log(content, assembly, catalog))
+    noise = noise_of(project, of_log(frames, assembly, catalog))
     trace = _not_empty(Trace(path, samples, counters, Log(path, content), noise), project)
     return _within_chunk(trace, project.model)
 

@@ -18,6 +18,7 @@ from rtid.errors import RtidError
 from rtid.project import Project
 from rtid.trace.arrivals import Timing, timing
 from rtid.trace.described import catalog_of
+from rtid.trace.late_stamps import frames_in_time, rows_in_time
 from rtid.trace.measured import with_sums
 from rtid.trace.neutral import about_neutral
 from rtid.trace.own_instants import of_messages, of_table, wanted
@@ -30,7 +31,8 @@ from rtid.trace.table import declared
 class Recording:
     """A trace as declared: raw series per signal, timing per message, complete samples.
 
-    A table has one "message", called after its file.  `refused` counts by reason.
+    A table has one "message", called after its file.  `refused` counts by reason.  jitter_s: of
+    stamps that were put back to the instants of a steady sender (`late_stamps`), rms; 0 of others.
     """
 
     path: Path
@@ -39,6 +41,7 @@ class Recording:
     samples: Samples
     refused: dict[str, int]
     is_table: bool
+    jitter_s: float = 0.0
 
 
 def read_recording(project: Project, path: Path) -> Recording:
@@ -61,10 +64,12 @@ def series_of(by_name: dict[str, Frames], catalog: Catalog) -> Iterator[tuple[st
 
 def _from_table(project: Project, content: Table) -> Recording:
     table, assembly = declared(project, content)
+    table, jitter_s = rows_in_time(table, assembly)
     samples, refused = whole(project, *to_samples(table, assembly))
     samples = with_sums(project, about_neutral(project, samples))
     messages = {table.path.name: timing(table.t_us())}
-    return Recording(table.path, tuple(of_table(table, assembly)), messages, samples, refused, True)
+    series = tuple(of_table(table, assembly))
+    return Recording(table.path, series, messages, samples, refused, True, jitter_s)
 
 
 def _from_log(project: Project, path: Path, frames: Frames) -> Recording:
@@ -72,11 +77,13 @@ def _from_log(project: Project, path: Path, frames: Frames) -> Recording:
     chosen = wanted(frames, assembly, catalog)
     if not any(len(frames) for frames in chosen.values()):
         raise RtidError(*_nothing_wanted(path, frames, assembly, catalog))
+    frames, jitter_s = frames_in_time(frames, assembly, catalog)
+    chosen = wanted(frames, assembly, catalog) if jitter_s else chosen
     series = of_messages(chosen, assembly, catalog)
     samples, refused = whole(project, *assemble(catalog, assembly, frames))
     samples = with_sums(project, samples)
     timings = {name: timing(frames.t_us) for name, frames in chosen.items()}
-    return Recording(path, tuple(series), timings, samples, refused, False)
+    return Recording(path, tuple(series), timings, samples, refused, False, jitter_s)
 
 
 def _nothing_wanted(
