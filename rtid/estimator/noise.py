@@ -196,17 +196,41 @@ def _windows(t_s: FloatArray, values: FloatArray, order: int) -> FloatArray:
 
 def _divided(t_s: FloatArray, values: FloatArray, order: int) -> FloatArray:
     """Divided differences at uneven instants, scaled to gain 1 on white noise."""
-    n, t = len(values) - order, t_s / _usual_step(t_s)
-    total, gain = np.zeros(n), np.zeros(n)
+    weights = _weights(t_s, order)
+    gain = np.sqrt((weights**2).sum(axis=0))
+    total = (weights * _neighbours(values, order)).sum(axis=0)
+    return np.divide(total, gain, out=np.zeros(len(total)), where=gain > 0)
+
+
+def divided_squares(
+    t_s: FloatArray, values: FloatArray, variance: FloatArray, order: int
+) -> tuple[FloatArray, FloatArray]:
+    """Squares (n - order,) of divided differences of values (n,), and what noise gives them.
+
+    t_s (n,), s; variance (n,): of independent noise, unit of the values squared.  Both scaled to
+    gain 1 on white noise.
+    """
+    weights2 = _weights(t_s, order) ** 2
+    gain2 = weights2.sum(axis=0)
+    known = (weights2 * _neighbours(variance, order)).sum(axis=0)
+    of_noise = np.divide(known, gain2, out=np.zeros(len(gain2)), where=gain2 > 0)
+    return _divided(t_s, values, order) ** 2, of_noise
+
+
+def _weights(t_s: FloatArray, order: int) -> FloatArray:
+    """Weights (order + 1, n - order) of the divided differences at t_s (n,), s."""
+    t = _neighbours(t_s / _usual_step(t_s), order)
+    weights = np.empty(t.shape)
     for i in range(order + 1):
-        product = np.ones(n)
-        for j in range(order + 1):
-            if j != i:
-                product *= t[i : i + n] - t[j : j + n]
-        weight = np.divide(1.0, product, out=np.zeros(n), where=product != 0)
-        total += weight * values[i : i + n]
-        gain += weight**2
-    return np.divide(total, np.sqrt(gain), out=np.zeros(n), where=gain > 0)
+        product = np.prod(t[i] - np.delete(t, i, axis=0), axis=0)
+        weights[i] = np.divide(1.0, product, out=np.zeros(len(product)), where=product != 0)
+    return weights
+
+
+def _neighbours(values: FloatArray, order: int) -> FloatArray:
+    """Each of order + 1 neighbours (order + 1, n - order) of values (n,)."""
+    n = len(values) - order
+    return np.stack([values[i : i + n] for i in range(order + 1)])
 
 
 def _usual_step(t_s: FloatArray) -> float:

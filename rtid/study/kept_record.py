@@ -6,7 +6,7 @@ the one fit of the part that teaches, with the maps of the record beside it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -26,6 +26,7 @@ from rtid.maps.prior_map import find_prior, published
 from rtid.model import Machine, Signal
 from rtid.plain import FloatArray, Progress
 from rtid.project import Project
+from rtid.trace.coarse import at_crossings
 from rtid.trace.described import catalog_of
 from rtid.trace.late_stamps import frames_in_time
 from rtid.trace.learner import Learner, listen, virtual_bus
@@ -108,17 +109,26 @@ def through_bus(
 
 
 def model_for(
-    project: Project, samples: Samples, measured: Mapping[str, NoiseEstimate] = NOTHING
+    project: Project,
+    samples: Samples,
+    measured: Mapping[str, NoiseEstimate] = NOTHING,
+    crossed: Collection[str] = (),
 ) -> Machine:
     """The declared model, with the sensor noise that the file leaves to be estimated.
 
     measured: the noise at the instants at which signals were measured, where those are known.
+    crossed: signals whose steps are known by where they cross them, see `Trace`.
     """
-    if not project.noise_unknown:
-        return project.model
-    signals = [s for s in project.model.signals if s.name in project.noise_unknown]
-    return project.model_with(
-        {s.name: _white_noise(samples, s, measured.get(s.name)) for s in signals}
+    model = project.model
+    if crossed:
+        left = {name: measured[name].resolution for name in crossed}
+        signals = (replace(s, resolution=left.get(s.name, s.resolution)) for s in model.signals)
+        model = replace(model, signals=tuple(signals))
+    unknown = [s for s in model.signals if s.name in project.noise_unknown]
+    if not unknown:
+        return model
+    return model.with_noise(
+        {s.name: _white_noise(samples, s, measured.get(s.name)) for s in unknown}
     )
 
 
@@ -152,7 +162,8 @@ def aged(project: Project, model: Machine, trace: Trace) -> tuple[Trace, Message
     def shifted(offsets_s: FloatArray) -> Samples:
         changes = dict(zip(tolerance, offsets_s, strict=True))
         moved = with_offsets(project.assembly, changes)
-        return with_sums(project, whole(project, *assemble(catalog, moved, frames))[0])
+        samples = with_sums(project, whole(project, *assemble(catalog, moved, frames))[0])
+        return at_crossings(model, samples)[0] if trace.crossed else samples
 
     def chunk_of(offsets_s: FloatArray) -> FloatArray:
         return _chunk(model, shifted(offsets_s), span_s)

@@ -40,6 +40,7 @@ from rtid.study.rate_pairs import driven_pairs, pressed_pairs
 from rtid.study.rate_project import of_records, placed_near
 from rtid.study.study import Study
 from rtid.trace.check import Report, judge
+from rtid.trace.coarse import at_crossings
 from rtid.trace.quick_data import BAD, Point, level_of, points
 from rtid.trace.quick_source import Source, open_source, roles_of
 from rtid.trace.reading import NoSamplesError, noise_of
@@ -313,12 +314,15 @@ def _arranged(
     notes, turned = tuple[Assumption, ...](), frozenset[str]()
     while True:
         first = replace(first_machine(roles, given), reversed=turned)
-        trace = read_recording(_project(file, path, source, roles, first), path)
+        project = _project(file, path, source, roles, first)
+        trace = read_recording(project, path)
         if len(trace.samples) < 2:
             raise RtidError(
                 f"{path}: no two complete samples", "`rtid check` counts what is refused"
             )
-        machine = fitted_machine(first, trace.samples)
+        # over 20 ms a position in steps of 0.5 mm stands still up to 25 mm/s
+        lines = at_crossings(project.model, trace.samples)[0].values
+        machine = fitted_machine(first, replace(trace.samples, values=lines))
         project = _project(file, path, source, roles, machine)
         report, turn = _judged(project, trace), ""
         if len(notes) < TURNS:

@@ -147,7 +147,7 @@ class Study:
     @cached_property
     def machine(self) -> Machine:
         """The declared machine, with the sensors' noise, and what disturbs its rate if unknown."""
-        model = model_for(self.project, self.read.samples, self.read.noise)
+        model = model_for(self.project, self.read.samples, self.read.noise, self.read.crossed)
         model = replace(model, joined=len(self.records) > 1)
         if model.has_pressures:
             return model

@@ -23,6 +23,7 @@ from rtid.estimator.noise import NoiseEstimate, estimate_noise
 from rtid.model import Machine
 from rtid.plain import FloatArray
 from rtid.project import Project
+from rtid.trace.coarse import at_crossings
 from rtid.trace.described import catalog_of
 from rtid.trace.late_stamps import frames_in_time, rows_in_time
 from rtid.trace.measured import with_sums
@@ -60,6 +61,8 @@ class Trace:
     """What a trace yields: complete samples, refusals by reason, and its log (None: a table).
 
     noise: of signals that have none declared, at the instants at which they were measured.
+    crossed: signals whose rows are where they cross their steps (`coarse`); the `resolution` of
+    their noise, which is known in any case, is what is left of the steps.
     """
 
     path: Path
@@ -67,6 +70,7 @@ class Trace:
     counters: dict[str, int]
     log: Log | None
     noise: Mapping[str, NoiseEstimate] = field(default_factory=dict)
+    crossed: frozenset[str] = frozenset()
 
     @property
     def frames(self) -> Frames | None:
@@ -104,14 +108,25 @@ def read_trace(project: Project, path: str | Path) -> Trace:
         samples, counters = whole(project, *to_samples(table, assembly))
         samples = with_sums(project, about_neutral(project, samples))
         noise = noise_of(project, of_table(table, assembly))
-        return _not_empty(Trace(path, samples, counters, None, noise), project)
+        trace = _by_crossings(Trace(path, samples, counters, None, noise), project.model)
+        return _not_empty(trace, project)
     catalog, assembly = catalog_of(project), project.assembly
     frames, _ = frames_in_time(content, assembly, catalog)
     samples, counters = whole(project, *assemble(catalog, assembly, frames))
     samples = with_sums(project, samples)
     noise = noise_of(project, of_log(frames, assembly, catalog))
-    trace = _not_empty(Trace(path, samples, counters, Log(path, content), noise), project)
+    trace = Trace(path, samples, counters, Log(path, content), noise)
+    trace = _not_empty(_by_crossings(trace, project.model), project)
     return _within_chunk(trace, project.model)
+
+
+def _by_crossings(trace: Trace, model: Machine) -> Trace:
+    """The trace with its rows where a coarse position crosses its steps."""
+    samples, noise = at_crossings(model, trace.samples)
+    if noise is None:
+        return trace
+    known = {**trace.noise, model.position: noise}
+    return replace(trace, samples=samples, noise=known, crossed=frozenset({model.position}))
 
 
 def noise_of(project: Project, series: Iterable[Series]) -> dict[str, NoiseEstimate]:

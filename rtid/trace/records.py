@@ -88,7 +88,9 @@ def read_records(project: Project, paths: Sequence[Path]) -> tuple[Trace, tuple[
         spans.append(RecordSpan(trace.path, 1e-6 * start_us, 1e-6 * float(t_us[-1]), is_judging))
         start_us = int(t_us[-1]) + round(1e6 * BETWEEN_S)
         add_counts(counters, trace.counters)
-    return Trace(traces[0].path, join(parts), counters, None, _noise(traces)), tuple(spans)
+    noise, every = _noise(traces), [trace.crossed for trace in traces]
+    crossed = frozenset().union(*every) & noise.keys()
+    return Trace(traces[0].path, join(parts), counters, None, noise, crossed), tuple(spans)
 
 
 def _noise(traces: Sequence[Trace]) -> dict[str, NoiseEstimate]:
