@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
+from firmware_bridge.samples import GAP, ROW, Samples
 from firmware_bridge.sources.table import jumps
 from rtid.plain import FloatArray
-from rtid.trace.between import unknown_between
+from rtid.project import load
+from rtid.sim.recording import write_run
+from rtid.sim.run import simulate
+from rtid.sim.simulated_plant import SimulatedPlant
+from rtid.trace.between import unknown_between, until_settled
+from rtid.trace.check import BETWEEN_ROWS, judge
+from rtid.trace.signals import read_recording
 
 N, EACH, DT_S = 100_000, 20, 1e-3  # samples of the controller, of which each so many-th is logged
 T_S = np.linspace(0.0, DT_S * (N - 1), N)
@@ -50,3 +60,43 @@ def test_what_trembles_has_no_jumps_and_what_rests_tells_of_nothing() -> None:
     assert not jumps(np.zeros(9)).any()
     assert not jumps(np.zeros(2)).any()
     assert unknown_between(T_S[:200], np.zeros(200))[0] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("step_us", "lag_s", "begins"), [(1000, 2e-3, 6), (5000, 3.25e-3, 2), (20000, 2e-3, 1)]
+)
+def test_nothing_is_integrated_until_the_spools_have_settled(
+    step_us: int, lag_s: float, begins: int
+) -> None:
+    """Behind a jump (here at 50) they are anywhere between where they were and where they go."""
+    flags = np.full(100, ROW, np.uint8)
+    flags[50] |= GAP
+    t_us = step_us * np.arange(100, dtype=np.int64)
+    samples = Samples(("u",), t_us, np.zeros((100, 1)), flags)
+    waits = until_settled(samples, lag_s)
+    assert np.flatnonzero(waits.flags & GAP).tolist() == list(range(50, 50 + begins + 1))
+    assert (waits.flags & ROW).all()
+    assert until_settled(samples, 0.0) is samples
+
+
+@pytest.mark.parametrize(("each", "says"), [(1, False), (5, True)])
+def test_check_says_which_noise_a_held_command_may_have(
+    each: int, says: bool, tmp_path: Path
+) -> None:
+    trace = tmp_path / "run.parquet"
+    write_run(trace, simulate(SimulatedPlant(), "rich", 0, 12.0), 0, "rich")
+    table = pq.read_table(trace)
+    pq.write_table(table.take(np.arange(0, len(table), each)), trace)
+    file = trace.with_suffix(".toml")
+    for is_held in (True, False):
+        if not is_held:
+            file.write_text(file.read_text().replace('hold = "zero"', 'hold = "linear"'))
+        project = load(file)
+        read, by = read_recording(project, trace), project.table_assembly
+        assert by is not None
+        report = judge(
+            project.model, by, read.samples, read.series, read.messages, read.refused, 0.5
+        )
+        told = [f for f in report.findings if BETWEEN_ROWS in f.text]
+        assert [f.subject for f in told] == ["u"] * (says and is_held)
+        assert all('hold = "linear"' in f.remedy for f in told)

@@ -19,9 +19,8 @@ from rtid.diagnose.report import Diagnosis
 from rtid.diagnose.verdict import AMBIGUOUS, MATCHES, MISSING
 from rtid.study.quick_machine import Assumption, MachineSizes
 from rtid.study.study import Study
-from rtid.trace.between import unknown_between
+from rtid.trace.between import FASTEST_S, unknown_between
 
-FASTEST_S = 1.5e-3  # between two samples of a command: up to it a log is no slower than controllers
 SHARES = 0.0, 0.5, 1.0  # of what is unknown between its samples, that are tried as its noise
 
 

@@ -13,6 +13,7 @@ from firmware_bridge.samples import Samples
 from firmware_bridge.sources.table import APART
 from rtid.model import Machine, Signal
 from rtid.trace.arrivals import GAP_PERIODS, Timing, timing
+from rtid.trace.between import FASTEST_S, unknown_between
 from rtid.trace.coverage import Coverage, coverage
 from rtid.trace.plausible import Motion, looks_like, motion
 from rtid.trace.series import Series, SignalReport, describe
@@ -29,6 +30,7 @@ MIN_T = 8.0  # of the rough bulk modulus, before its sign is believed
 STIFFEST = 2.0  # of the upper bound: what is stiffer the other way is no oil, but the slow motion
 MIN_CORRELATION = 0.2
 BETA_DECADE = 30.0  # a rough bulk modulus this far outside the bounds is a wrong unit
+BETWEEN_ROWS = "a quicker controller may have changed it meanwhile"
 TOO_COARSE = "the grid is too coarse for the valve"
 FEWEST_BLOCKS = 4  # of a map that is worth its name
 
@@ -81,6 +83,8 @@ def judge(
     moved, covered = motion(model, samples), coverage(model, samples)
     findings = list(_timing(assembly, messages, samples, refused))
     findings += [_late(jitter_s)] if jitter_s else []
+    if not assembly.messages:  # of a bus a command is what was sent
+        findings += _commands(assembly, model, samples)
     timed = not any(finding.level == "error" for finding in findings)
     findings += _signals(model, series, signals)
     findings += _units(model, assembly, stroke_m, signals)
@@ -181,6 +185,20 @@ def _late(jitter_s: float) -> Finding:
     text = f"the logger stamps late by turns, by {_ms(jitter_s)} rms beside the usual delay"
     text += ": the sensors say that they were sampled evenly, and are taken so"
     return _warning("samples", text, "let the interface's hardware stamp, or write when it sampled")
+
+
+def _commands(assembly: Assembly, model: Machine, samples: Samples) -> Iterator[Finding]:
+    """Commands of a table that the controller may have changed between its rows."""
+    for source in assembly.signals:
+        if not source.command or source.hold != "zero" or source.constant is not None:
+            continue
+        signal = model.signals[model.column(source.name)]
+        t_s = np.multiply(1e-6, samples.t_us)
+        sd, step_s = unknown_between(t_s, samples.column(source.name))
+        if sd > 0.0 and step_s >= FASTEST_S:
+            text = f"is held for {_ms(step_s)} from row to row: {BETWEEN_ROWS}"
+            remedy = f'if it has, set signals.{source.name}.hold = "linear" and its noise to up to '
+            yield _warning(source.name, text, remedy + _shown(sd, signal))
 
 
 def _signals(

@@ -103,10 +103,10 @@ def crossings(x_m: FloatArray, step_m: float, fresh: BoolArray) -> Crossings:
 
 
 def _with_rows(
-    model: Machine, samples: Samples, rows: IntArray, found: Crossings, fresh: BoolArray
+    model: Machine, samples: Samples, rows: IntArray, by: Crossings, fresh: BoolArray
 ) -> Samples:
     """Samples with a row where a crossing is, and the position on a line between those of a run."""
-    at, column = rows[found.at], samples.names.index(model.position)
+    at, column = rows[by.at], samples.names.index(model.position)
     flags, values = samples.flags & ~np.uint8(ROW), samples.values.copy()
     flags[at] |= ROW
     runs = np.append(rows[fresh], len(samples))
@@ -114,7 +114,7 @@ def _with_rows(
         mine = slice(*np.searchsorted(at, (begin, end)))
         if len(at[mine]):
             inside, t_us = slice(begin, end), samples.t_us
-            values[inside, column] = np.interp(t_us[inside], t_us[at[mine]], found.x_m[mine])
+            values[inside, column] = np.interp(t_us[inside], t_us[at[mine]], by.x_m[mine])
     return replace(samples, values=values, flags=flags)
 
 

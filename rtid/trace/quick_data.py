@@ -14,7 +14,7 @@ import numpy as np
 from firmware_bridge.samples import ROW
 from rtid.model import Machine
 from rtid.plain import FloatArray
-from rtid.trace.check import Report
+from rtid.trace.check import BETWEEN_ROWS, Report
 from rtid.trace.quick_source import NEEDED
 from rtid.trace.series import SignalReport
 from rtid.trace.signals import Recording
@@ -90,7 +90,8 @@ def _objections(trace: Recording, report: Report) -> Iterator[Point]:
     still, as the machine does.
     """
     resting = {s.name for s in report.signals if _is_commanded_to_rest(trace, s)}
-    apart = ("outside the grid", "never changes", "of about nan")
+    # of a command between rows the fit tells itself
+    apart = ("outside the grid", "never changes", "of about nan", BETWEEN_ROWS)
     for finding in report.findings:
         if not any(known in finding.text for known in apart):
             is_rest = FROZEN in finding.text and finding.subject in resting
