@@ -8,14 +8,13 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from firmware_bridge.samples import GAP, ROW, Samples
 from firmware_bridge.sources.table import jumps
 from rtid.plain import FloatArray
 from rtid.project import load
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import SimulatedPlant
-from rtid.trace.between import unknown_between, until_settled
+from rtid.trace.between import unknown_between
 from rtid.trace.check import BETWEEN_ROWS, judge
 from rtid.trace.signals import read_recording
 
@@ -60,23 +59,6 @@ def test_what_trembles_has_no_jumps_and_what_rests_tells_of_nothing() -> None:
     assert not jumps(np.zeros(9)).any()
     assert not jumps(np.zeros(2)).any()
     assert unknown_between(T_S[:200], np.zeros(200))[0] == 0.0
-
-
-@pytest.mark.parametrize(
-    ("step_us", "lag_s", "begins"), [(1000, 2e-3, 6), (5000, 3.25e-3, 2), (20000, 2e-3, 1)]
-)
-def test_nothing_is_integrated_until_the_spools_have_settled(
-    step_us: int, lag_s: float, begins: int
-) -> None:
-    """Behind a jump (here at 50) they are anywhere between where they were and where they go."""
-    flags = np.full(100, ROW, np.uint8)
-    flags[50] |= GAP
-    t_us = step_us * np.arange(100, dtype=np.int64)
-    samples = Samples(("u",), t_us, np.zeros((100, 1)), flags)
-    waits = until_settled(samples, lag_s)
-    assert np.flatnonzero(waits.flags & GAP).tolist() == list(range(50, 50 + begins + 1))
-    assert (waits.flags & ROW).all()
-    assert until_settled(samples, 0.0) is samples
 
 
 @pytest.mark.parametrize(("each", "says"), [(1, False), (5, True)])

@@ -6,25 +6,19 @@ that trembles by W leaves the sum of many steps W for each.  Both are in its dif
 
     E (d2 u)^2 = 6 W + 2 B,    E (d3 u)^2 = 20 W + 6 B,
 
-of which a line, a ramp and a slow swing have none.  Across what jumps nothing is integrated, nor
-until the spool has followed: when in the step it jumped, and so where the spool is, nobody knows.
+of which a line, a ramp and a slow swing have none.  Across what jumps nothing is integrated.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.config import Assembly
-from firmware_bridge.samples import GAP, Samples
 from firmware_bridge.sources.table import jumps
 from rtid.plain import FloatArray
 
 FASTEST_S = 1.5e-3  # between two samples of a command: up to it a log is no slower than controllers
 FEWEST = 100  # differences that tell of it
-SETTLES = 3.0  # lags, behind which 5 % of a jump are left of what a spool has to go
 GAP_STEPS = 1.5  # of the usual step: no difference is taken across a longer one
 
 
@@ -50,27 +44,3 @@ def unknown_between(t_s: FloatArray, u: FloatArray) -> tuple[float, float]:
 def _three(values: NDArray[np.bool_]) -> FloatArray:
     """Sums (n - 2,) of three neighbours of values (n,)."""
     return np.convolve(values, np.ones(3), "valid")
-
-
-def until_settled(samples: Samples, lag_s: float) -> Samples:
-    """Samples of which nothing is integrated from a GAP on until spools with that lag have settled.
-
-    The first that is at least so much later begins anew.  Taken for settled at once, jumps of 1 to
-    5 V at 200 samples a second left 1.6 times the noise, and made a lag of 2.5 ms one of 3.2.
-    """
-    gap = (samples.flags & GAP) != 0
-    if not gap.any() or lag_s <= 0.0:
-        return samples
-    t_us, at = samples.t_us, np.flatnonzero(gap)
-    settled = np.searchsorted(t_us, t_us[at] + SETTLES * 1e6 * lag_s)
-    last = np.minimum(settled, len(t_us) - 1)
-    change = np.zeros(len(t_us) + 1, np.int64)
-    np.add.at(change, at, 1)
-    np.add.at(change, last + 1, -1)
-    waits = np.cumsum(change[:-1]) > 0
-    return replace(samples, flags=np.where(waits, samples.flags | GAP, samples.flags))
-
-
-def is_sampled(assembly: Assembly) -> bool:
-    """Whether a command of it is a sample of a faster one."""
-    return any(s.command and s.hold != "zero" for s in assembly.signals)

@@ -23,7 +23,6 @@ from rtid.estimator.noise import NoiseEstimate, estimate_noise
 from rtid.model import Machine
 from rtid.plain import FloatArray
 from rtid.project import Project
-from rtid.trace.between import is_sampled, until_settled
 from rtid.trace.coarse import at_crossings
 from rtid.trace.described import catalog_of
 from rtid.trace.late_stamps import frames_in_time, rows_in_time
@@ -106,7 +105,7 @@ def read_trace(project: Project, path: str | Path) -> Trace:
     if isinstance(content, Table):
         table, assembly = declared(project, content)
         table, _ = rows_in_time(table, assembly)
-        samples, counters = rows_of(project, table, assembly)
+        samples, counters = whole(project, *to_samples(table, assembly))
         samples = with_sums(project, about_neutral(project, samples))
         noise = noise_of(project, of_table(table, assembly))
         trace = _by_crossings(Trace(path, samples, counters, None, noise), project.model)
@@ -119,14 +118,6 @@ def read_trace(project: Project, path: str | Path) -> Trace:
     trace = Trace(path, samples, counters, Log(path, content), noise)
     trace = _not_empty(_by_crossings(trace, project.model), project)
     return _within_chunk(trace, project.model)
-
-
-def rows_of(project: Project, table: Table, assembly: Assembly) -> tuple[Samples, dict[str, int]]:
-    """The samples of a table that is declared, as a whole, and the refusals by reason."""
-    samples, counters = whole(project, *to_samples(table, assembly))
-    if is_sampled(assembly):
-        samples = until_settled(samples, project.model.lag.nominal_s)
-    return samples, counters
 
 
 def _by_crossings(trace: Trace, model: Machine) -> Trace:

@@ -13,7 +13,7 @@ from firmware_bridge.config import Assembly
 from firmware_bridge.frames import Frames
 from firmware_bridge.samples import Samples
 from firmware_bridge.sources import open_file
-from firmware_bridge.sources.table import Table
+from firmware_bridge.sources.table import Table, to_samples
 from rtid.errors import RtidError
 from rtid.project import Project
 from rtid.trace.arrivals import Timing, timing
@@ -22,7 +22,7 @@ from rtid.trace.late_stamps import frames_in_time, rows_in_time
 from rtid.trace.measured import with_sums
 from rtid.trace.neutral import about_neutral
 from rtid.trace.own_instants import of_messages, of_table, wanted
-from rtid.trace.reading import assemble, rows_of, whole
+from rtid.trace.reading import assemble, whole
 from rtid.trace.series import Series
 from rtid.trace.table import declared
 
@@ -65,7 +65,7 @@ def series_of(by_name: dict[str, Frames], catalog: Catalog) -> Iterator[tuple[st
 def _from_table(project: Project, content: Table) -> Recording:
     table, assembly = declared(project, content)
     table, jitter_s = rows_in_time(table, assembly)
-    samples, refused = rows_of(project, table, assembly)
+    samples, refused = whole(project, *to_samples(table, assembly))
     samples = with_sums(project, about_neutral(project, samples))
     messages = {table.path.name: timing(table.t_us())}
     series = tuple(of_table(table, assembly))
