@@ -135,10 +135,10 @@ def searched(standing: Standing, progress: Progress = silent) -> Result:
     if can_judge(before):
         present, last = _extended(state, present, before)
         if (finer := _on_finer_grid(state, present)) is not None:
-            left, is_judged = _judging(state, finer, state.left(finer))
+            rest, is_judged = _judging(state, finer, state.left(finer))
             if is_judged < judged:
                 before, judged = state.left(first), False
-            present, last = _extended(state, finer, left)
+            present, last = _extended(state, finer, rest)
     state.found = [beside_its_line(state, told_apart(state, effect)) for effect in state.found]
     doubted = told_doubts(present)
     said = verdict(state, first, present, last, doubted, judged)
@@ -168,20 +168,20 @@ def searched(standing: Standing, progress: Progress = silent) -> Result:
     )  # fmt: skip
 
 
-def _judging(state: TrialState, first: Fit, left: Residual) -> tuple[Residual, bool]:
+def _judging(state: TrialState, first: Fit, unseen: Residual) -> tuple[Residual, bool]:
     """What a fit leaves of the part that judges, and whether that is the held-out one.
 
-    left: what it leaves of that.  Where its map is known over next to nothing there, the record
+    unseen: what it leaves of that.  Where its map is known over next to nothing there, the record
     judges, and where over next to nothing of that, all of it.
     """
-    if can_judge(left):
-        return left, True
+    if can_judge(unseen):
+        return unseen, True
     state.held_out = state.chunk
-    left = state.left(first)
-    if not can_judge(left):
+    rest = state.left(first)
+    if not can_judge(rest):
         state.judges_itself = True
-        left = state.left(first)
-    return left, False
+        rest = state.left(first)
+    return rest, False
 
 
 def _on_finer_grid(state: TrialState, present: Fit) -> Fit | None:
