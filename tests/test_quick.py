@@ -188,6 +188,16 @@ def run_ok(*words: object) -> None:
     assert not ended.value.code
 
 
+def test_what_is_written_is_right_on_board(folder: Path, tmp_path: Path) -> None:
+    """The lag is the record's, not the assumed one, and changes nothing on the desk."""
+    trace, project = folder / "clean.parquet", tmp_path / "machine.toml"
+    found = told(trace, *SIZES, "--save", project)
+    lag = load(project).sections.dynamics.spool_lag
+    assert lag.nominal_s == 2e-3 and lag.seen_s == pytest.approx(1.3e-3, abs=3e-4)
+    assert Study(project, trace).diagnosis().as_json() == found["diagnosis"]
+    assert on_board(load(project), lambda _: None).model.lag.nominal_s == lag.seen_s
+
+
 def test_a_project_beside_its_database_names_it_as_it_lies_there(
     folder: Path, tmp_path: Path
 ) -> None:
@@ -453,7 +463,8 @@ def test_a_saved_project_runs_on_board_as_it_is(folder: Path, tmp_path: Path) ->
     assert noise["p_a"] == pytest.approx(5e3, rel=0.05), "of the simulated sensor, Pa"
     Daemon(loaded, Bus("virtual", "x", lambda: pytest.fail("opened")), tmp_path)
     board = on_board(loaded, lambda _: None)
-    assert len(board.model.terms) == 2 and all(term.scale > 0.0 for term in board.model.terms)
+    chambers = zip(board.model.chambers, loaded.model.chambers, strict=True)
+    assert all(fitted.v0_m3 > assumed.v0_m3 for fitted, assumed in chambers)
     desk, first = Study(project, folder / "leak.parquet"), told(folder / "leak.parquet")
     (named,) = desk.diagnosis().found
     size = first["diagnosis"]["found"][0]["parameters"]["coefficient"]

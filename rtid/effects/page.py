@@ -218,6 +218,7 @@ def correcting(size: str) -> tuple[Effect, ...]:
     return tuple(sorted(pages, key=lambda page: page.size.name not in size))
 
 
+DEAD_VOLUME = "dead volume"  # as the pages call the declared size
 ZERO = "zero of a pressure sensor"  # what is taken out of the samples, and no part of a fit
 
 

@@ -339,10 +339,14 @@ class UpkeepSection(Section):
 
 
 class LagSection(Section):
-    """[dynamics.spool_lag]: first-order lag behind the command, with its tolerance."""
+    """[dynamics.spool_lag]: first-order lag behind the command, with its tolerance.
+
+    seen: what a record told of it; on board, without a record, it is taken.
+    """
 
     nominal_s: Annotated[float, TIME] = Field(default=0.0, ge=0)
     tolerance_s: Annotated[float, TIME] = Field(default=0.0, ge=0)
+    seen_s: Annotated[float | None, TIME] = Field(default=None, ge=0)
 
 
 class DynamicsSection(Section):

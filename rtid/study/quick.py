@@ -20,6 +20,7 @@ from firmware_bridge.catalog import BUILTIN, places
 from rtid.diagnose.report import Diagnosis
 from rtid.diagnose.verdict import INSUFFICIENT, MATCHES, MISSING, UNKNOWN
 from rtid.effects import catalogue
+from rtid.effects.page import DEAD_VOLUME
 from rtid.errors import RtidError
 from rtid.plain import Progress, silent
 from rtid.project import Project, load
@@ -34,7 +35,7 @@ from rtid.study.quick_machine import (
     first_machine,
     fitted_machine,
 )
-from rtid.study.quick_project import DEAD_VOLUME, head_of, of_channels, of_missing, project_text
+from rtid.study.quick_project import head_of, of_channels, of_missing, project_text
 from rtid.study.quick_rate import QuickRate, quick_rate
 from rtid.study.rate_pairs import driven_pairs, pressed_pairs
 from rtid.study.rate_project import of_records, placed_near
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
 
 SCHEMA = 1
 TURNS = 2  # signs that may have to be turned round
+LAG_KNOWN_S = 3e-4  # deviation up to which a record tells the lag of the spools
 SWAPPED = "chambers"
 CHAMBERS = {"p_a", "p_b"}
 NOBODY: Mapping[str, str] = MappingProxyType({})
@@ -235,7 +237,12 @@ def _of_cylinder(
         path,
         source,
         arranged.roles,
-        replace(machine, noise_seen=noise, extra_volumes=_fitted_volumes(diagnosis)),
+        replace(
+            machine,
+            noise_seen=noise,
+            extra_volumes=_fitted_volumes(diagnosis),
+            lag_seen_s=_lag_seen_s(diagnosis),
+        ),
         tuple(judged),
         level,
         diagnosis,
@@ -248,6 +255,13 @@ def _fitted_volumes(diagnosis: Diagnosis | None) -> dict[str, tuple[float, float
     """Dead volume of each chamber beyond the assumed one, m3, with its standard deviation."""
     volumes = {a.where: a.parameters["volume"] for a in (diagnosis.added if diagnosis else ())}
     return {where: (volume.value, volume.std) for where, volume in volumes.items()}
+
+
+def _lag_seen_s(diagnosis: Diagnosis | None) -> float | None:
+    """The spools' lag where the record tells it to `LAG_KNOWN_S`."""
+    if diagnosis is None or not diagnosis.lag_sd_s < LAG_KNOWN_S:  # nan: it does not
+        return None
+    return diagnosis.lag_s
 
 
 def _likeliest(

@@ -67,7 +67,8 @@ class MachineSizes:
     the next of a sample of a faster one, which may act up to half of it later than on the line.
     command_unit: that of its column.  noise_seen: 1 sigma by role, as the record tells it.
     supply_pa: of a supply that is not measured, as it was said.  extra_volumes: dead volume of each
-    chamber beyond the assumed one, as fitted, m3, with its standard deviation.
+    chamber beyond the assumed one, as fitted, m3, with its standard deviation.  lag_seen_s: as the
+    record tells it, None where it does not.
     """
 
     bore_m: float
@@ -92,6 +93,7 @@ class MachineSizes:
     noise_seen: Mapping[str, float] = field(default_factory=dict)
     supply_pa: float | None = None
     extra_volumes: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    lag_seen_s: float | None = None
 
     @property
     def displacement_m3(self) -> float:

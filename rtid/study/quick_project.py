@@ -12,13 +12,13 @@ from typing import Any
 import tomlkit
 
 from rtid.effects import correcting
+from rtid.effects.page import DEAD_VOLUME
 from rtid.project.guess import RoleCandidate
 from rtid.project.template import EDGES, nice
 from rtid.study.quick_machine import RATED_DP_PA, SUPPLY_PA, Assumption, MachineSizes, lag_of
 from rtid.trace.quick_source import Source, unit_of
 from rtid.units import LPM, units_of
 
-DEAD_VOLUME = "dead volume"  # as the pages call the declared size
 TANK_PA = 1e5
 HELD = "zero"  # how a command runs to its next sample, unless it is said
 DIGITS = 6  # of what is written
@@ -59,7 +59,9 @@ def project_text(
             for volume in [_extra(machine, chamber) | {"unit": dead.size.unit}]
         ]
     lag_ms, tolerance_ms = map(_neat, lag_of(machine))
-    raw["dynamics"] = {"spool_lag": {"nominal_ms": lag_ms, "tolerance_ms": tolerance_ms}}
+    lag = {"nominal_ms": lag_ms, "tolerance_ms": tolerance_ms}
+    seen = {} if machine.lag_seen_s is None else {"seen_ms": _neat(1e3 * machine.lag_seen_s)}
+    raw["dynamics"] = {"spool_lag": lag | seen}
     raw["gates"] = {"max_gap_ms": GAP_STEPS * source.step_ms} if source.step_ms > SLOW_MS else {}
     if machine.spans_s:
         teaches, judges = machine.spans_s

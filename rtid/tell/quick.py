@@ -9,8 +9,8 @@ from pathlib import Path
 
 from rtid.compare.dead_band import DeadBand
 from rtid.effects import correcting
+from rtid.effects.page import DEAD_VOLUME
 from rtid.study.quick import Quick
-from rtid.study.quick_project import DEAD_VOLUME
 from rtid.study.quick_rate import QuickRate
 from rtid.tell.diagnosed import sentences
 from rtid.tell.records import record_lines
