@@ -159,6 +159,7 @@ class Answer:
     (chambers,) as of an outcome; left: of the held-out part, in units of the sensors' noise;
     of_limit: the size that is hidden over the one from which the record says that it is named, 0
     where it says that no possible one would be; NaN where the record names it, or cannot be asked.
+    clean_left: what the same machine leaves without the effect, where it is named.
     """
 
     case: Case
@@ -173,6 +174,7 @@ class Answer:
     left: float
     seconds: float
     of_limit: float = float("nan")
+    clean_left: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -229,7 +231,27 @@ def answer(case: Case) -> Answer | None:
     """The answer to one case; None where it could not be simulated."""
     began = time.process_time()
     found = judged(case)
-    return None if found is None else answer_of(case, found, began)
+    if found is None:
+        return None
+    said = answer_of(case, found, began)
+    if said.judgement not in (diagnoses.RIGHT, diagnoses.IN_SET):
+        return said
+    return replace(said, clean_left=left_without(case))
+
+
+def left_without(case: Case) -> float:
+    """What a machine leaves of the held-out part, in units of the noise, without the effect."""
+    bare = replace(case, hidden="", size=0.0)
+    try:
+        run = simulate(bare.plant, bare.motion, bare.seed, RECORD_S, bare.sensors)
+    except SimulationError:
+        return float("nan")
+    model = declared(bare, run)
+    chunk = to_chunk(model, run.samples, 0)
+    t_s = chunk[:, 0]
+    taught, judging = chunk[t_s < IDENTIFICATION * RECORD_S], chunk[t_s >= VALIDATION * RECORD_S]
+    residual = stand(model, taught, judging).held_out
+    return residual.rms_m3s / residual.floor_m3s
 
 
 def answer_of(case: Case, found: Judged, began: float = float("nan")) -> Answer:
