@@ -472,6 +472,7 @@ def test_a_saved_project_runs_on_board_as_it_is(folder: Path, tmp_path: Path) ->
     assert named.parameters["coefficient"].std == pytest.approx(size["std"], rel=1e-6)
 
 
+@pytest.mark.long
 def test_a_supply_that_nobody_measures_is_asked_for_first(folder: Path, tmp_path: Path) -> None:
     """A record without one was `unknown`, and the safe band the first to be looked at."""
     values = {name: v for name, v in columns(folder / "leak.parquet").items() if name != "p_supply"}
@@ -492,6 +493,7 @@ def test_a_supply_is_measured_or_said(folder: Path) -> None:
     assert refused.returncode == Exit.USAGE and "p_supply measures the supply" in refused.stderr
 
 
+@pytest.mark.long
 def test_several_records_of_a_cylinder_make_one_project(folder: Path, tmp_path: Path) -> None:
     """One was taken, and a section of the file was to be deleted by hand for the others."""
     other, project = tmp_path / "tuesday.parquet", tmp_path / "m.toml"

@@ -67,6 +67,7 @@ from rtid.diagnose.verdict import (
     UNKNOWN,
     can_judge,
     explained,
+    is_slight,
     told_doubts,
     verdict,
 )
@@ -134,7 +135,7 @@ def searched(standing: Standing, progress: Progress = silent) -> Result:
     present, first, last = first, first.light(), before
     if can_judge(before):
         present, last = _extended(state, present, before)
-        if (finer := _on_finer_grid(state, present)) is not None:
+        if (finer := _on_finer_grid(state, present, last)) is not None:
             rest, is_judged = _judging(state, finer, state.left(finer))
             if is_judged < judged:
                 before, judged = state.left(first), False
@@ -184,14 +185,17 @@ def _judging(state: TrialState, first: Fit, unseen: Residual) -> tuple[Residual,
     return rest, False
 
 
-def _on_finer_grid(state: TrialState, present: Fit) -> Fit | None:
+def _on_finer_grid(state: TrialState, present: Fit, last: Residual) -> Fit | None:
     """The fit that a search begins with, on the grid that the record needs beside what was found.
 
     What is missing hides what the grid misses: a valve that opens with a jump had no border there,
     as it would have had without the line before its cylinder, which took 79 % of the misfit and so
-    was not named.  None where nothing was found, or where the grid does.
+    was not named.  None where nothing was found, where the grid does, or where what explains most
+    has a name and leaves what is immaterial: a finer map is known over less of the record.
     """
     if not state.found or present.rho < present.most_rho:
+        return None
+    if is_slight(last) and explained(state, present) >= NAMED:
         return None
     finer = finer_beside(present.light())
     if finer.declared is present.declared:

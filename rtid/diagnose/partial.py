@@ -114,8 +114,9 @@ class _Bench:
         soft = softened(fit.model, fit.sent, fit.weights, fit.revision)
         rows = rows_of(fit.model, fit.sent, fit.weights, soft=soft)
         effects = {e.key: (e, cause_of(fit.view, e).column(e.shape)) for e in fit.revision.effects}
-        for k, outcome_of in enumerate(fit.revision.timings):
-            key = outcome_of[0].effect, outcome_of[0].where
+        for k, (timing, _) in enumerate(fit.revision.timings):
+            where = fit.view.supply_name if timing.where == SUPPLY else timing.where
+            key = timing.effect, where
             effects[key] = Candidate(*key, SHARE, "1", 1.0), _changed(fit, k)
         return cls(fit, rows, effects)
 

@@ -29,6 +29,8 @@ def unknown_between(t_s: FloatArray, u: FloatArray) -> tuple[float, float]:
     """
     step_s = np.diff(t_s)
     usual_s = float(np.median(step_s)) if len(step_s) else 0.0
+    if len(step_s) < FEWEST:
+        return 0.0, usual_s
     moves = np.diff(u) != 0.0
     whole = _three((step_s <= GAP_STEPS * usual_s) & ~jumps(u)) == 3
     here = whole & (_three(moves) > 0)

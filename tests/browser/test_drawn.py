@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 from pyarrow import array
 from pyarrow.parquet import read_table, write_table
@@ -17,7 +18,8 @@ from tests.ui.served import served
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.long]
+TAU, HUM_HZ = 2.0 * np.pi, 11.0
 # Every word that is written on a canvas since it was cleared, with its box in pixels of the window.
 LISTEN = """() => {
   const paper = CanvasRenderingContext2D.prototype, { fillText, clearRect } = paper;
@@ -47,13 +49,13 @@ CLASHES = """() => { const said = [];
 def unexplained(
     browser: Browser, recorded: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Page]:
-    """The page of a record that no known effect explains: its supply is said to be constant."""
+    """The page of a record that no known effect explains: a pressure hums."""
     trace, project = recorded
     table = read_table(trace)
-    at = table.column_names.index("p_supply")
-    constant = array([1e7] * len(table))
-    other = tmp_path_factory.mktemp("unexplained") / "supply.parquet"
-    write_table(table.set_column(at, "p_supply", constant), other)
+    at, t_s = table.column_names.index("p_a"), 1e-3 * np.arange(len(table))
+    hums = array(table["p_a"].to_numpy() + 2e5 * np.sin(TAU * HUM_HZ * t_s))
+    other = tmp_path_factory.mktemp("unexplained") / "hum.parquet"
+    write_table(table.set_column(at, "p_a", hums), other)
     with served(project=project.with_name("untouched.toml"), trace=other) as bench:
         for opened in open_page(browser, bench):
             opened.page.add_init_script(f"({LISTEN})()")

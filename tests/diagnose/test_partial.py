@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -83,3 +84,15 @@ def test_the_picture_its_numbers_and_its_sentence_are_the_same(exhibit: Exhibit)
 
 def test_nothing_named_nothing_shown(result: Result) -> None:
     assert exhibits(replace(result, found=())) == ()
+
+
+@pytest.mark.long
+@pytest.mark.slow
+def test_a_supply_that_sags_has_its_evidence(tmp_path: Path) -> None:
+    """The pump is at the supply's signal in what is found: a KeyError for whoever was told of it."""
+    trace = tmp_path / "sag.parquet"
+    plant = hide_wish(SimulatedPlant(), "supply_sag=middle")
+    write_run(trace, simulate(plant, "rich_record", 0, 40.0), 0, "rich_record")
+    result = Study(load(trace.with_suffix(".toml")), trace).diagnosed.result
+    assert ("supply_sag", "p_supply") in [f.key for f in result.found]
+    assert [e.named.key[0] for e in exhibits(result)] == [f.key[0] for f in result.found]

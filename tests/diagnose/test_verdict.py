@@ -164,6 +164,8 @@ def test_the_grid_is_looked_at_again_beside_what_was_found() -> None:
     assert abs(found.size_z) < 3.0
 
 
+@pytest.mark.long
+@pytest.mark.slow
 def test_what_begins_behind_a_step_needs_no_finer_grid() -> None:
     """Rows of the first ms, of spools that stood elsewhere, left rho 1.11; all maps were halved."""
     case = Case(5101, "choking", "rich_record")
