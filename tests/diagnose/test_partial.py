@@ -86,10 +86,9 @@ def test_nothing_named_nothing_shown(result: Result) -> None:
     assert exhibits(replace(result, found=())) == ()
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_a_supply_that_sags_has_its_evidence(tmp_path: Path) -> None:
-    """The pump is at the supply's signal in what is found: a KeyError for whoever was told of it."""
+    """What is found is at the supply's signal: a KeyError for whoever was told of it."""
     trace = tmp_path / "sag.parquet"
     plant = hide_wish(SimulatedPlant(), "supply_sag=middle")
     write_run(trace, simulate(plant, "rich_record", 0, 40.0), 0, "rich_record")
