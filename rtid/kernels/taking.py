@@ -19,7 +19,8 @@ from rtid.kernels.jit import inlined
 from rtid.kernels.rows import start_whitener
 from rtid.plain import FloatArray
 
-AWAY, RUNNING, FOLLOWED = 0, 1, 2  # FOLLOWED: the spools are, and no row has begun
+# FOLLOWED: the spools are, and no row has begun; OUTSIDE: the point is off a grid
+AWAY, RUNNING, FOLLOWED, OUTSIDE = 0, 1, 2, 3
 
 
 @inlined
@@ -30,14 +31,15 @@ def take(e: Any, chunk: FloatArray, k: int) -> tuple[bool, bool, float]:
     sample, flags, dt = e.sample, int(e.sample[1]), step_s(e, e.sample[0])
     whole = acceptable(e, sample)
     goes_on = whole and e.running != AWAY and 0.0 < dt <= e.max_gap_s and (flags & GAP_FLAG) == 0
-    joined = False
-    if goes_on:
-        if dt != e.dt_s:
-            set_step(e, dt)
-        inside = working_points(e, sample, dt)[0]
-        joined = inside and e.running == RUNNING and e.t_s > e.ready_s - 0.5 * dt
+    if not goes_on:
+        e.running = AWAY
+        return whole, False, dt
+    if dt != e.dt_s:
+        set_step(e, dt)
+    inside = working_points(e, sample, dt)[0]
+    joined = inside and e.running == RUNNING and e.t_s > e.ready_s - 0.5 * dt
     if not joined:
-        e.running = FOLLOWED if goes_on else AWAY
+        e.running = FOLLOWED if inside else OUTSIDE
     return whole, joined, dt
 
 
@@ -46,7 +48,8 @@ def resume(e: Any, sample: FloatArray, whole: bool) -> bool:
     """Behind a sample (2 + signals,), SI, that joins nothing: True where rows begin at it.
 
     That is at a measured position.  Where spools stood before the first sample, or behind a gap,
-    nobody knows: they are taken to be where they are sent, and believed once that has faded.
+    nobody knows: they are taken to be where they are sent, and believed once that has faded.  Off
+    the grids they are so too, as in the sums that maps are learned by: they meet the same blocks.
     """
     row = whole and (int(sample[1]) & ROW_FLAG) != 0
     if not whole:
@@ -55,7 +58,7 @@ def resume(e: Any, sample: FloatArray, whole: bool) -> bool:
         e.ready_s = sample[0] + e.settle_s
     remember(e, sample)
     for i in range(e.n_edges):
-        if e.running == AWAY:
+        if e.running in (AWAY, OUTSIDE):
             e.w_v[i] = commanded(e, i)
         e.cell[i, 0] = SHUT
     e.running = RUNNING if row else FOLLOWED
