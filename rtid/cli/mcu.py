@@ -50,10 +50,11 @@ def mcu(
     from rtid.mcu.valve import one_valve
     from rtid.mcu.write import write_sources
     from rtid.project import load
+    from rtid.study.on_board import as_found, is_volume
 
     loaded = load(project)
     _refuse_estimated(loaded)
-    model = one_valve(loaded.model, chamber or loaded.model.chambers[0].name, edge or ())
+    model = one_valve(as_found(loaded), chamber or loaded.model.chambers[0].name, edge or ())
     title = f" of project {loaded.digest}"
     limited = _limited(loaded, model, blocks, budget, trace) if budget else None
     tiles = limited.chosen.tiles if limited else None
@@ -64,7 +65,7 @@ def mcu(
         name: [Layout(sizes, single).estimator.itemsize, Layout(sizes, single).work.itemsize]
         for name, single in (("float64", False), ("float32", True))
     }
-    added = [f"{a.effect} at {a.where}" for a in loaded.sections.added]
+    added = [f"{a.effect} at {a.where}" for a in loaded.sections.added if not is_volume(a)]
     if as_json:
         document = {"schema": 1, "written": [str(path) for path in written], "ram_bytes": ram}
         document |= {"chamber": model.chambers[0].name, "blocks": sizes.blocks, "without": added}

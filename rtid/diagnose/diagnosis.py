@@ -137,7 +137,7 @@ def searched(standing: Standing, progress: Progress = silent) -> Result:
         present, last = _extended(state, present, before)
         if (finer := _on_finer_grid(state, present, last)) is not None:
             rest, is_judged = _judging(state, finer, state.left(finer))
-            if is_judged < judged:
+            if judged and not is_judged:
                 before, judged = state.left(first), False
             present, last = _extended(state, finer, rest)
     state.found = [beside_its_line(state, told_apart(state, effect)) for effect in state.found]
@@ -367,7 +367,7 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
         state.negligible[trial.key] = share
         is_good = after.rms_m3s <= WORSE * last.rms_m3s and is_as_credible(present, now)
         is_needless = is_form and present.rho < present.most_rho
-        if is_good and is_noticed(present, trial) and not is_needless:
+        if is_good and is_noticed(present, finished[trial.key]) and not is_needless:
             kept, after = _with_bank(state, now)
             if _is_shown_now(trial.key, min(material_share(last, after), BENT * own), state):
                 what = trial.key, alike, trial.gain, trial.n_parameters

@@ -52,7 +52,7 @@ def on_board(project: Project, tell: Callable[[str], None]) -> Project:
     tell: hears one sentence per effect.  Another model has another digest: what was learned without
     an effect is not gone on with.  Raises NoRoomOnBoardError.
     """
-    model, flows = _with_lag_seen(project), project.flows
+    model, flows = as_found(project), project.flows
     for added in project.sections.parts:
         if model.measured and _is_behind(added):
             model, flows = _behind(project, model, flows, added)
@@ -66,8 +66,7 @@ def on_board(project: Project, tell: Callable[[str], None]) -> Project:
             )
             continue
         name = f"{title(added.effect)} at {added.where}"
-        if _is_volume(added):
-            model = _with_volume(model, added)
+        if is_volume(added):
             tell(f"{name} is part of the chamber's volume")
             continue
         terms, more = _live(project, added)
@@ -98,15 +97,17 @@ def on_board(project: Project, tell: Callable[[str], None]) -> Project:
     return replace(project, model=model, digest=key, machine_digest=alone, flows=flows)
 
 
-def _with_lag_seen(project: Project) -> Machine:
-    """The machine with the lag that a record told: on board none is found beside the maps."""
-    seen_s = project.sections.dynamics.spool_lag.seen_s
-    if seen_s is None:
-        return project.model
-    return replace(project.model, lag=replace(project.model.lag, nominal_s=seen_s))
+def as_found(project: Project) -> Machine:
+    """The machine with the lag and the dead volumes that a record told: none is found on board."""
+    model, seen_s = project.model, project.sections.dynamics.spool_lag.seen_s
+    if seen_s is not None:
+        model = replace(model, lag=replace(model.lag, nominal_s=seen_s))
+    for added in filter(is_volume, project.sections.parts):
+        model = _with_volume(model, added)
+    return model
 
 
-def _is_volume(added: AddedSection) -> bool:
+def is_volume(added: AddedSection) -> bool:
     """Whether it is a volume that the file has not declared."""
     return added.effect == correcting(DEAD_VOLUME)[0].name
 
@@ -132,7 +133,7 @@ def _is_behind(added: AddedSection) -> bool:
 
 def _is_in_model(added: AddedSection) -> bool:
     """Whether it is a part of the model itself, and no term beside its maps."""
-    return _is_volume(added) or _is_behind(added) or _walks(added)
+    return is_volume(added) or _is_behind(added) or _walks(added)
 
 
 def _walks(added: AddedSection) -> bool:

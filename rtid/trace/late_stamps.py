@@ -54,9 +54,7 @@ def frames_in_time(frames: Frames, assembly: Assembly, catalog: Catalog) -> tupl
     t_us = frames.t_us.copy()
     for name, grid in grids.items():
         t_us[places[name]] = np.rint(grid.t_us)
-    moved = Frames(t_us, frames.channel, frames.can_id, frames.length, frames.data)
-    moved.refused.update(frames.refused)
-    return by_time(moved), max(grid.jitter_s for grid in grids.values())
+    return by_time(replace(frames, t_us=t_us)), max(grid.jitter_s for grid in grids.values())
 
 
 def _told(

@@ -142,7 +142,6 @@ def test_an_area_too_wide_makes_moduli_contradict_and_that_is_counted_once(
     assert len(counts) == 1
 
 
-@pytest.mark.xfail(reason="`unknown` at rho 4.7 again since slopes go over steps of the command")
 @pytest.mark.long
 @pytest.mark.slow
 def test_gas_that_air_of_an_impossible_exponent_tells_as_well_is_in_a_set() -> None:

@@ -99,6 +99,25 @@ def test_noise_that_is_to_be_estimated_is_refused(
     assert "signals.x.noise" in capsys.readouterr().err
 
 
+def test_what_a_record_told_of_the_machine_is_in_the_tables(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As on board: a dead volume that was found is the chamber's own, and its lag the spools'."""
+    project, model = tmp_path / "p.toml", load(PROJECT).model
+    text = PROJECT.read_text().replace("[dynamics.spool_lag]", "[dynamics.spool_lag]\nseen_ms = 0.9")
+    volume = 'parameters = { volume = { value = 2e-4, unit = "m3" } }'
+    project.write_text(
+        f'{text}\n[[added]]\neffect = "extra_dead_volume"\nwhere = "a"\n{volume}\n'
+    )
+    folder = tmp_path / "c"
+    assert command(str(folder), "-p", str(project), "-c", "a", "-e", "pa", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["without"] == []
+    written = "".join(path.read_text() for path in folder.glob("*.h"))
+    numbers = dict(re.findall(r"#define RTID_EST_(V0|LAG)\s+\(?([0-9.e+-]+)", written))
+    assert float(numbers["V0"]) == pytest.approx(model.chambers[0].v0_m3 + 2e-4)
+    assert float(numbers["LAG"]) == pytest.approx(0.9e-3)
+
+
 def test_everything_that_it_does_not_do_is_named() -> None:
     model = load(PROJECT).model
     term = Term("air", (("p_a", 1.0),), (("a", 1),), 1.0, 1e5, "linear", rate=True, volume="b")
