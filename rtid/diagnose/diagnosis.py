@@ -329,7 +329,9 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
     ]
     finished: dict[Key, Trial] = {}
     refuted: dict[Key, bool] = {}  # whether by its form alone
-    for best in sorted(trials, key=lambda t: -t.gain):
+    turns = sorted(trials, key=lambda t: t.gain)
+    while turns:
+        best = turns.pop()
         if best.key in state.negligible or len(state.negligible) == MOST_NEGLIGIBLE:
             continue
         if not explains_enough(state, present, best):
@@ -340,6 +342,8 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
         now = with_covariances(carried_on(state, present, trial, must_win=True), like=present)
         if is_refuted(present, now, trial, least):
             refuted[trial.key] = not trial.is_timing and is_of_another_form(now)
+            if trial.key != best.key:
+                turns.append(best)  # whose turn it is still
             continue
         finished.setdefault(trial.key, ended(present, trial, now))
         after = state.left(now)

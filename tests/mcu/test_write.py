@@ -104,11 +104,11 @@ def test_what_a_record_told_of_the_machine_is_in_the_tables(
 ) -> None:
     """As on board: a dead volume that was found is the chamber's own, and its lag the spools'."""
     project, model = tmp_path / "p.toml", load(PROJECT).model
-    text = PROJECT.read_text().replace("[dynamics.spool_lag]", "[dynamics.spool_lag]\nseen_ms = 0.9")
-    volume = 'parameters = { volume = { value = 2e-4, unit = "m3" } }'
-    project.write_text(
-        f'{text}\n[[added]]\neffect = "extra_dead_volume"\nwhere = "a"\n{volume}\n'
+    text = PROJECT.read_text().replace(
+        "[dynamics.spool_lag]", "[dynamics.spool_lag]\nseen_ms = 0.9"
     )
+    volume = 'parameters = { volume = { value = 2e-4, unit = "m3" } }'
+    project.write_text(f'{text}\n[[added]]\neffect = "extra_dead_volume"\nwhere = "a"\n{volume}\n')
     folder = tmp_path / "c"
     assert command(str(folder), "-p", str(project), "-c", "a", "-e", "pa", "--json") == 0
     assert json.loads(capsys.readouterr().out)["without"] == []
