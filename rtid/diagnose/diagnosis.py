@@ -357,14 +357,13 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
         if is_shown or does is not None:
             present.unread()  # what is read beside the next one is as large
             kept, after = _with_bank(state, now)
-            more: tuple[Key, ...] = ()
             if does is not None:
                 as_ended = finished[trial.key]
-                more = hardly_worse(state, as_ended, finished, HIDDEN_GAIN)
-                more += passed_over(state, as_ended, finished)
+                alike += hardly_worse(state, as_ended, finished, HIDDEN_GAIN)
+                alike += passed_over(state, as_ended, finished)
             if kept.rho >= kept.most_rho:
-                more += as_nearly_right(state, present, now, trials, finished)
-            alike = tuple(dict.fromkeys((*alike, *more)))
+                alike += as_nearly_right(state, present, now, trials, finished)
+            alike = tuple(dict.fromkeys(alike))
             what = trial.key, alike, trial.gain, trial.n_parameters
             state.found.append(AcceptedEffect(*what, last, after, does))
             return kept, after
@@ -372,15 +371,25 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
         is_good = after.rms_m3s <= WORSE * last.rms_m3s and is_as_credible(present, now)
         is_needless = is_form and present.rho < present.most_rho
         if is_good and is_noticed(present, finished[trial.key]) and not is_needless:
-            kept, after = _with_bank(state, now)
-            if _is_shown_now(trial.key, min(material_share(last, after), BENT * own), state):
-                what = trial.key, alike, trial.gain, trial.n_parameters
-                state.found.append(AcceptedEffect(*what, last, after, None))
-            else:
-                state.negligible |= dict.fromkeys(alike, share)
-            return kept, after
+            return _kept_aside(state, now, trial, alike, own, last)
         del now  # its rows are large
     return None
+
+
+def _kept_aside(
+    state: TrialState, now: Fit, trial: Trial, alike: tuple[Key, ...], own: float, last: Residual
+) -> tuple[Fit, Residual]:
+    """The model with what is listed only, unless it is shown beside all that the blocks hold.
+
+    own: its flow, of the rms flow; last: what the model without it leaves.
+    """
+    kept, after = _with_bank(state, now)
+    if _is_shown_now(trial.key, min(material_share(last, after), BENT * own), state):
+        what = trial.key, alike, trial.gain, trial.n_parameters
+        state.found.append(AcceptedEffect(*what, last, after, None))
+    else:
+        state.negligible |= dict.fromkeys(alike, state.negligible[trial.key])
+    return kept, after
 
 
 def _with_bank(state: TrialState, now: Fit) -> tuple[Fit, Residual]:

@@ -20,7 +20,6 @@ from rtid.model import PRESSURE, Edge, Machine
 from rtid.plain import BoolArray, FloatArray, IntArray, give_back
 
 TURNS = 0.05  # share of changes that reverse the one before: 2/3 for noise, next to 0 for motion
-MUCH = 1.0  # of a block: a command that moves further between two samples leaves it
 UNKNOWN = 10.0  # standard deviation of the flow in a block that was never visited, rated flows
 NONE = np.zeros(0)
 SMOOTH_S = 0.02  # half width of the window for derivatives of pressures, without delay
@@ -191,7 +190,7 @@ class RecordView:
         return self._along(FLOW)[i]
 
     def slope_u(self, i: int) -> FloatArray:
-        """dQ/dw of edge i (n - 1,), m3/s/V; over all of a step (`_over_steps`)."""
+        """dQ/dw of edge i (n - 1,), m3/s/V; out of a block by what the whole map rises."""
         return self._along(SLOPE_U)[i]
 
     def slope_dp(self, i: int) -> FloatArray:
@@ -248,12 +247,11 @@ class RecordView:
         theta, cov = _of_all_cells(model, self.beside.map, FLOW_SD in asked)
         out = {k: np.zeros((n_edges, n)) for k in asked}
         inside, room = np.zeros(n, bool), np.empty((5, n_edges, AT_ONCE)).transpose(2, 1, 0)
-        cell, before = np.empty(room.shape[:2], np.int64), np.full((1, n_edges, 5), np.nan)
+        cell, was = np.empty(room.shape[:2], np.int64), np.full((n_edges, 2), np.nan)
         for first in range(0, n, AT_ONCE):
             part = room[: n - first]
             here = slice(first, first + len(part))
-            follow_map(state.engine, state.cells, theta, cov, self.chunk, first, part, cell)
-            before = _over_steps(model, before, part)
+            follow_map(state.engine, state.cells, theta, cov, self.chunk, first, part, cell, was)
             inside[here] = np.isfinite(part[:, 0, 0])
             for k, series in out.items():
                 np.copyto(series[:, here], part[:, :, k].T, where=inside[here])
@@ -285,24 +283,6 @@ class RecordView:
         """True where the pressure of every chamber that has one is measured."""
         kinds = {s.name: s.kind for s in self.model.signals} | {"": PRESSURE}
         return all(kinds.get(c.pressure) == PRESSURE for c in self.model.chambers)
-
-
-def _over_steps(model: Machine, before: FloatArray, part: FloatArray) -> FloatArray:
-    """dQ/dw along a part of a record, in place, over steps out of a block; its last interval.
-
-    part (m, edges, 5): as of `follow_map`, SI; before (1, edges, 5): the interval before it.  What
-    a lag of tau takes from a step is (Q after - Q before) tau, and both are visited.  The slope in
-    the block that is stepped to is not, where it was met once: on the grid of `rtid init` such
-    slopes were 400 times the others, and a lag of 1.2 ms was 0.01 ms by them.  Within a block its
-    terms know better: over less than one delays of strangers' excavators cost up to 18 of chi2.
-    """
-    whole = np.concatenate([before, part])
-    w, q = whole[:, :, OPENING], whole[:, :, FLOW]
-    step, width = np.diff(w, axis=0), [float(np.median(np.diff(e.grid.u_v))) for e in model.edges]
-    is_far = np.abs(step) > MUCH * np.array(width)
-    rise = np.diff(q, axis=0) / np.where(is_far, step, 1.0)
-    np.copyto(part[:, :, SLOPE_U], rise, where=is_far & np.isfinite(rise))
-    return whole[-1:]
 
 
 def _of_all_cells(

@@ -252,7 +252,8 @@ def test_the_map_is_followed_with_its_slopes() -> None:
         along = np.empty((len(samples), len(model.edges), 5))
         cell = np.empty(along.shape[:2], np.int64)
         cov = np.zeros((model.n_cells, TERMS, TERMS))
-        follow_map(state.engine, state.cells, theta, cov, samples, 0, along, cell)
+        was = np.full((len(model.edges), 2), np.nan)
+        follow_map(state.engine, state.cells, theta, cov, samples, 0, along, cell, was)
         return along[1:], cell[1:]
 
     along, cell = flows(chunk)
