@@ -13,6 +13,12 @@ from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, NoReturn
 
+# Two test workers fill two cores already, and OpenBLAS' idle threads spin: a diagnosis of the tanks
+# took 94 s of processor time instead of 28.  Before the first import of numba and of numpy.
+os.environ.setdefault("NUMBA_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("RTID_CACHE", "off")  # each test learns for itself
+
 import can
 import pyarrow.csv
 import pytest
@@ -22,12 +28,6 @@ from hypothesis import settings
 
 from rtid.units import FLOW, show_flow_as
 from tests.left import Here, left_since, of_this_run
-
-# Two test workers fill two cores already, and OpenBLAS' idle threads spin: a diagnosis of the tanks
-# took 94 s of processor time instead of 28.  Read at the first import of numba and of numpy.
-os.environ.setdefault("NUMBA_NUM_THREADS", "1")
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-os.environ.setdefault("RTID_CACHE", "off")  # each test learns for itself
 
 # What a machine with other work does in 200 ms says nothing of the code.
 settings.register_profile("untimed", settings.default, deadline=None)
