@@ -14,7 +14,7 @@ demo: $(READY)
 # Bytecode is kept whatever the environment says: the tests start hundreds of interpreters.
 test: export PYTHONDONTWRITEBYTECODE =
 test: $(READY)
-	.venv/bin/python -m pytest -q -n 3 --dist worksteal -p no:benchmark -p tools.spent
+	.venv/bin/python -m pytest -q -n 3 --dist loadfile --no-loadscope-reorder -p no:benchmark -p tools.spent
 
 # One more case, or a whole way, of what `make test` holds: whole records that are diagnosed for tens of seconds.
 long: $(READY)

@@ -13,6 +13,12 @@ from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, NoReturn
 
+# Two test workers fill two cores already, and OpenBLAS' idle threads spin: a diagnosis of the tanks
+# took 94 s of processor time instead of 28.  Before the first import of numba and of numpy.
+os.environ.setdefault("NUMBA_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("RTID_CACHE", "off")  # each test learns for itself
+
 import can
 import pyarrow.csv
 import pytest
@@ -23,18 +29,13 @@ from hypothesis import settings
 from rtid.units import FLOW, show_flow_as
 from tests.left import Here, left_since, of_this_run
 
-# Two test workers fill two cores already, and OpenBLAS' idle threads spin: a diagnosis of the tanks
-# took 94 s of processor time instead of 28.  Read at the first import of numba and of numpy.
-os.environ.setdefault("NUMBA_NUM_THREADS", "1")
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-os.environ.setdefault("RTID_CACHE", "off")  # each test learns for itself
-
 # What a machine with other work does in 200 ms says nothing of the code.
 settings.register_profile("untimed", settings.default, deadline=None)
 settings.load_profile("untimed")
 
 LONG_S = 8 * 3600.0  # the limit of what is meant to take hours
 AGAIN_S = 5.0  # after its limit a test is ended as often as it begins anew, as hypothesis does
+PAGES = "tests/browser/"
 ROOT = Path(__file__).parents[1]
 SHARED = ROOT.parent / "shared"
 
@@ -46,15 +47,29 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(trylast=True)  # of those that are chosen
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Modules with slow tests come first, so that no worker is left with a long one at the end.
+    """Pages come first, which wait most, then modules with slow tests: none is left for the end.
 
     Every test has a time limit, `timeout` in pyproject.toml; the long ones have a longer one.
     """
     slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in slow)
+    items.sort(key=lambda item: (not item.nodeid.startswith(PAGES), item.path not in slow))
     for item in items:
         if item.get_closest_marker("campaign") or item.get_closest_marker("soak"):
             item.add_marker(pytest.mark.timeout(LONG_S))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """With `--dist loadfile` all tests of a module run in one worker, which makes once what they
+    share; so do those of the page, with one browser and one learned record."""
+    if config.getvalue("dist") != "loadfile":
+        return None
+    from xdist.scheduler import LoadFileScheduling
+
+    scheduler = LoadFileScheduling(config, log)
+    of_module = scheduler._split_scope
+    scheduler._split_scope = lambda test: PAGES if test.startswith(PAGES) else of_module(test)
+    return scheduler
 
 
 @pytest.hookimpl(trylast=True)

@@ -79,9 +79,12 @@ def _once(
             key = _digest(_apart(tests), arguments, sorted(named.items()))
         except UNFIT:
             return function(*arguments, **named)
-        if folder is not None:
+        if folder is not None and key not in own:
             path = folder / f"{function.__qualname__}-{key}"
-            return _kept(path, lambda: function(*arguments, **named))
+            made, is_kept = _kept(path, lambda: function(*arguments, **named))
+            if is_kept:
+                return made
+            own[key] = made  # no pickle takes it
         if key not in own:
             own[key] = function(*arguments, **named)
         return own[key]
@@ -89,15 +92,15 @@ def _once(
     return remembered
 
 
-def _kept(path: Path, make: Callable[[], Any]) -> Any:
-    """A copy of what lies in the file; where there is none yet, one process makes it."""
+def _kept(path: Path, make: Callable[[], Any]) -> tuple[Any, bool]:
+    """A copy of what lies in the file, and whether it does; one process makes what is not there."""
     with alone(path.with_name(f"{path.name}.lock")):
         if path.exists():
-            return pickle.loads(path.read_bytes())
+            return pickle.loads(path.read_bytes()), True
         made = make()
         with suppress(*UNFIT):
             path.write_bytes(pickle.dumps(made, pickle.HIGHEST_PROTOCOL))
-    return made
+    return made, path.exists()
 
 
 def _digest(apart: str, arguments: tuple[Any, ...], named: list[tuple[str, Any]]) -> str:

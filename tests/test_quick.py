@@ -71,7 +71,7 @@ def told(*arguments: object, code: int = Exit.OK) -> dict[str, Any]:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A leaking machine on the bus and as a table, and a clean one."""
     path = tmp_path_factory.mktemp("quick")
-    leaking = simulate(hide_wish(SimulatedPlant(), f"{LEAK}=middle"), "rich", 5, 45.0)
+    leaking = simulate(hide_wish(SimulatedPlant(), f"{LEAK}=middle"), "rich", 5, 24.0)
     write_run(path / "leak.blf", leaking, 5, "rich")
     write_run(path / "leak.parquet", leaking, 5, "rich")
     write_run(path / "clean.parquet", simulate(SimulatedPlant(), "rich", 6, 45.0), 6, "rich")

@@ -72,6 +72,18 @@ def test_it_is_made_once_and_each_gets_a_copy(tmp_path: Path) -> None:
     assert other(2.0) == [2.0] and made == [1.0, 2.0]
 
 
+def test_what_no_pickle_takes_is_made_once_in_each_process(tmp_path: Path) -> None:
+    made = list[float]()
+
+    def law(number: float) -> Callable[[], float]:
+        made.append(number)
+        return lambda: number
+
+    first = _once(law, {}, tmp_path)
+    assert first(1.0)() == first(1.0)() == 1.0 and made == [1.0]
+    assert first(2.0)() == 2.0 and made == [1.0, 2.0]
+
+
 def test_who_changes_the_program_does_not_share(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -182,6 +182,10 @@ def _axis(view: RecordView, p: Parameter) -> Shape:
     return tuple(float(v) for v in spread(p.low, p.high, SPREAD + 2)[1:-1])
 
 
+def _taken_no_more(_volumes: Volumes, _is_aside: bool) -> None:
+    """In the place of what took a column: a function of the module, which a pickle takes."""
+
+
 @dataclass
 class Columns:
     """Candidates and columns, in the order in which they were added.
@@ -210,4 +214,4 @@ class Columns:
 
     def ended(self) -> Columns:
         """The same, let go of what took them, which holds the rows."""
-        return replace(self, take=lambda volumes, is_aside: None)
+        return replace(self, take=_taken_no_more)

@@ -15,7 +15,7 @@ from math import comb
 import numpy as np
 from numpy.typing import NDArray
 
-from rtid.plain import FloatArray
+from rtid.plain import BoolArray, FloatArray
 
 ORDERS = range(2, 9)
 WINDOW = 32  # differences per window: shorter than the time between two steps of a command
@@ -61,14 +61,16 @@ def estimate_noise(
     t_s = np.asarray(t_s, np.float64)
     known = np.isfinite(t_s) & np.isfinite(values)
     t, y = t_s[known], values[known]
-    step, levels = resolution_of(y), len(np.unique(y))
+    every = np.unique(y)
+    step, levels = _resolution(every), len(every)
     if held_command and levels < FEW_LEVELS:
         step = 0.0  # the levels of a switched command
     least = float(step / np.sqrt(12.0))
     if held_command:
         return NoiseEstimate(least, step, 0.0, len(y))
     t, y = measurements(t, y)
-    floors = [f for m in ORDERS if (f := _floor(t, y, m)) is not None]
+    spacing = _Spacing.of(t)
+    floors = [f for m in ORDERS if (f := _floor(spacing, y, m)) is not None]
     if not floors or levels < 2:
         return NoiseEstimate(least, step, np.inf, 0)
     sd, relative_sd, samples = _settled(floors)
@@ -94,7 +96,10 @@ def resolution_of(values: FloatArray) -> float:
 
     With few levels they must be neighbours: what a signal jumps between is not its resolution.
     """
-    levels = np.unique(values)
+    return _resolution(np.unique(values))
+
+
+def _resolution(levels: FloatArray) -> float:
     if len(levels) < 2:
         return 0.0
     rounding = ROUNDING * float(np.abs(levels).max())
@@ -136,15 +141,34 @@ def measurements(t_s: FloatArray, values: FloatArray) -> tuple[FloatArray, Float
 
 
 @dataclass(frozen=True)
+class _Spacing:
+    """Instants t_s (n,), and the steps between them (n - 1,) that differ, or that are gaps."""
+
+    t_s: FloatArray
+    is_even: bool
+    apart: tuple[BoolArray, BoolArray]
+
+    @classmethod
+    def of(cls, t_s: FloatArray) -> _Spacing:
+        step = np.diff(t_s)
+        if not len(step):
+            return cls(t_s, True, (step > 0.0, step > 0.0))
+        usual = np.median(step)
+        uneven = np.abs(step - usual) > 0.5 * usual
+        broken = (step > GAP * np.quantile(step, OFTEN)) | (step <= 0.0)
+        return cls(t_s, bool(np.ptp(step) < EVEN * usual), (uneven, broken))
+
+
+@dataclass(frozen=True)
 class _Floor:
     sd: float
     relative_sd: float
     samples: int
 
 
-def _floor(t_s: FloatArray, values: FloatArray, order: int) -> _Floor | None:
+def _floor(spacing: _Spacing, values: FloatArray, order: int) -> _Floor | None:
     """Noise from the order-th differences in quiet windows; None where there are too few."""
-    squares = _windows(t_s, values, order)
+    squares = _windows(spacing, values, order)
     if len(squares) < FEWEST:
         return None
     squares = _of_a_sensor(squares, values)
@@ -171,27 +195,30 @@ def _of_a_sensor(squares: FloatArray, values: FloatArray) -> FloatArray:
     return shown if len(shown) > max(4, QUIET * len(squares)) else squares
 
 
-def _windows(t_s: FloatArray, values: FloatArray, order: int) -> FloatArray:
+def _windows(spacing: _Spacing, values: FloatArray, order: int) -> FloatArray:
     """Mean square of the scaled differences per window (windows,); none reaches over a gap."""
     if len(values) < order + WINDOW:
         return np.zeros(0)
-    spacing = np.diff(t_s)
-    even = np.ptp(spacing) < EVEN * np.median(spacing)
     difference = (
         np.diff(values, order) / np.sqrt(comb(2 * order, order))
-        if even
-        else _divided(t_s, values, order)
+        if spacing.is_even
+        else _divided(spacing.t_s, values, order)
     )
     n = len(difference) // WINDOW * WINDOW
     squares = np.mean(difference[:n].reshape(-1, WINDOW) ** 2, axis=1)
-    uneven = np.abs(spacing - np.median(spacing)) > 0.5 * np.median(spacing)
-    broken = (spacing > GAP * np.quantile(spacing, OFTEN)) | (spacing <= 0.0)
-    for apart in (uneven, broken):  # the latter where no two steps are alike
-        across = np.convolve(apart, np.ones(order), "valid") > 0
-        whole = ~across[:n].reshape(-1, WINDOW).any(axis=1)
+    for apart in spacing.apart:  # the latter where no two steps are alike
+        whole = ~_over(apart, order)[:n].reshape(-1, WINDOW).any(axis=1)
         if np.count_nonzero(whole) >= FEWEST:
             break
     return np.asarray(squares[whole])
+
+
+def _over(apart: BoolArray, order: int) -> BoolArray:
+    """Differences (n - order,) that reach over one of the steps (n - 1,)."""
+    across = np.zeros(len(apart) + 1 - order, bool)
+    for k in range(order if apart.any() else 0):
+        across |= apart[k : k + len(across)]
+    return across
 
 
 def _divided(t_s: FloatArray, values: FloatArray, order: int) -> FloatArray:

@@ -76,30 +76,44 @@ def residual(
     """
     n, total, lost = len(right), right.copy(), np.zeros(len(right))
     own, own_lost = np.zeros(LANES), np.zeros(LANES)
+    high, low = np.empty(n), np.empty(n)
     for j in range(n):
-        row, b = matrix[j], theta[j]
-        _take(total, lost, j, diagonal[j], b)
-        for i in range(j + 1, n):
-            _take(total, lost, i, row[i], b)
-        whole = j + 1 + (n - j - 1) // LANES * LANES
-        for i in range(j + 1, whole, LANES):
+        high[j] = _high(theta[j])
+        low[j] = theta[j] - high[j]
+    for j in range(n):
+        b, b_high, b_low = theta[j], high[j], low[j]
+        _take(total, lost, j, diagonal[j], _high(diagonal[j]), b, b_high, b_low)
+        row, rest, rest_lost = matrix[j, j + 1 :], total[j + 1 :], lost[j + 1 :]
+        x, x_high, x_low = theta[j + 1 :], high[j + 1 :], low[j + 1 :]
+        for i in range(len(row)):
+            _take(rest, rest_lost, i, row[i], _high(row[i]), b, b_high, b_low)
+        whole = len(row) // LANES * LANES
+        for i in range(0, whole, LANES):
             for k in range(LANES):
-                _take(own, own_lost, k, row[i + k], theta[i + k])
-        for i in range(whole, n):
-            _take(total, lost, j, row[i], theta[i])
+                a = row[i + k]
+                _take(own, own_lost, k, a, _high(a), x[i + k], x_high[i + k], x_low[i + k])
+        for i in range(whole, len(row)):
+            _take(total, lost, j, row[i], _high(row[i]), x[i], x_high[i], x_low[i])
         for k in range(LANES):
-            _take(total, lost, j, -1.0, own[k])
+            _take(total, lost, j, -1.0, -1.0, own[k], _high(own[k]), own[k] - _high(own[k]))
             lost[j] += own_lost[k]
             own[k] = own_lost[k] = 0.0
     return total + lost
 
 
 @inlined
-def _take(total: FloatArray, lost: FloatArray, i: int, a: float, b: float) -> None:
+def _high(a: float) -> float:
+    """The upper 26 bits of a double."""
+    return SPLIT * a - (SPLIT * a - a)
+
+
+@inlined
+def _take(
+    total: FloatArray, lost: FloatArray, i: int,
+    a: float, a_high: float, b: float, b_high: float, b_low: float,
+) -> None:  # fmt: skip
     """total[i] -= a b; what rounding loses of product and sum goes to lost[i]."""
-    a_high = SPLIT * a - (SPLIT * a - a)
-    b_high = SPLIT * b - (SPLIT * b - b)
-    a_low, b_low, p = a - a_high, b - b_high, a * b
+    a_low, p = a - a_high, a * b
     p_lost = ((a_high * b_high - p) + a_high * b_low + a_low * b_high) + a_low * b_low
     before = total[i]
     after = before - p
