@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import subprocess
 from contextlib import redirect_stderr, redirect_stdout
 from functools import cache
@@ -37,6 +38,7 @@ from rtid.study.quick_machine import (
     dp_grid,
     first_machine,
     fitted_machine,
+    rated_flow,
     shut_band,
 )
 from rtid.study.quick_project import project_text
@@ -401,6 +403,21 @@ def test_a_stamp_years_ahead_costs_no_memory() -> None:
     samples = Samples(("x",), t_us, x[:, None], np.full(len(x), ROW, np.uint8))
     span = quick_machine._span(samples, x)
     assert span is not None and span[1] - span[0] == quick_machine.MOST_S
+
+
+@pytest.mark.parametrize("power", [0.5, 1.0, 1.6])
+def test_the_rated_flow_is_that_of_a_valve_that_opens_on_as_it_did(power: float) -> None:
+    """A straight line from neutral took a valve of 16.5 L/min for one of 11.2."""
+    u = np.linspace(-7.0, 7.0, 1401)
+    supply, tank, chamber = np.full(1401, 7e6), np.full(1401, 1e5), np.full(1401, 3.55e6)
+    dp = np.where(u > 0.0, supply - chamber, chamber - tank)
+    area = math.pi / 4 * 0.05**2
+    speed = 1e-7 * np.maximum(np.abs(u) - 1.0, 0.0) ** power * np.sqrt(dp) / area
+    columns = {"u": u, "p_supply": supply, "p_tank": tank, "p_a": chamber, "p_b": chamber}
+    machine: Any = SimpleNamespace(u_grid=np.array([0.0, 10.0]), bore_m=0.05, rod_m=0.0)
+    samples: Any = SimpleNamespace(column=columns.__getitem__)
+    wanted = 1e-7 * 9.0**power * np.sqrt(5e5)
+    assert rated_flow(machine, samples, speed, 1.0) == pytest.approx(wanted, rel=0.02)
 
 
 def test_the_dead_band_is_half_of_where_motion_begins() -> None:

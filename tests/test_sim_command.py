@@ -145,9 +145,11 @@ def test_a_record_declares_its_parts(tmp_path: Path) -> None:
     assert record["validation_s"] == pytest.approx([8.3, 11])
 
 
-def test_live_on_a_bus() -> None:
+@pytest.mark.parametrize("bus", [["virtual", "--channel", "sim-live"], ["virtual:sim-live"]])
+def test_live_on_a_bus(bus: list[str]) -> None:
+    """Named as by `rtid run`, too."""
     with can.Bus("sim-live", interface="virtual") as receiver:
-        output = call("--bus", "virtual", "--channel", "sim-live", "--duration", 0.05, "--speed", 0)
+        output = call("--bus", *bus, "--duration", 0.05, "--speed", 0)
         assert "sent 150 frames" in output
         first = receiver.recv(0.0)
         assert first is not None and first.timestamp == START_US * 1e-6

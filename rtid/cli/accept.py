@@ -40,7 +40,9 @@ def accept(
     end_s = time.monotonic() + WAIT_S
     while read(folder).has("plant_changed"):
         if time.monotonic() > end_s:
-            acceptance.withdraw(folder)
+            if not acceptance.withdraw(folder):
+                print(f"{status.name}: the daemon has heard it, and is learning anew")
+                return
             raise RtidError(
                 f"{folder}: the daemon has not answered within {WAIT_S:g} s", "see its log"
             )

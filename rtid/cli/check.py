@@ -57,7 +57,8 @@ def check(
         return
     from rtid.project import load
 
-    trace, project = told_apart(files, project, "check")
+    traces, project = told_apart(files, project, "check")
+    trace = next(iter(traces), None)
     if project is None:
         remedy = (
             f"rtid check {trace} -p PROJECT; `rtid quick {trace} --save machine.toml` writes one"

@@ -69,15 +69,16 @@ TracesArgument = Annotated[
 
 
 def told_apart(
-    files: list[Path], project: Path | None, command: str
-) -> tuple[Path | None, Path | None]:
-    """Trace and project of a command, whichever comes first: a project is a .toml."""
+    files: list[Path], project: Path | None, command: str, most: int | None = 1
+) -> tuple[list[Path], Path | None]:
+    """Traces, at most so many, and project of a command, in any order: a project is a .toml."""
     projects = [f for f in files if f.suffix.lower() == ".toml"] + ([project] if project else [])
     traces = [f for f in files if f.suffix.lower() != ".toml"]
-    if len(projects) > 1 or len(traces) > 1:
+    if len(projects) > 1 or (most is not None and len(traces) > most):
+        what = "more than one project" if len(projects) > 1 else f"more than {most} trace"
         remedy = f"rtid {command} TRACE -p PROJECT, the project a .toml"
-        raise RtidError("more than one trace or project", remedy, Exit.USAGE)
-    return next(iter(traces), None), next(iter(projects), None)
+        raise RtidError(what, remedy, Exit.USAGE)
+    return traces, next(iter(projects), None)
 
 
 ProjectOption = Annotated[Path, typer.Option("--project", "-p", help="Project file.")]

@@ -69,9 +69,15 @@ def simulate(
         ),
     ] = None,
     bus: Annotated[
-        str | None, typer.Option(help="Send live: udp_multicast, virtual, or socketcan with vcan.")
+        str | None,
+        typer.Option(
+            help="Send live on INTERFACE or INTERFACE:CHANNEL, as `rtid run` takes it: "
+            "udp_multicast, virtual, or socketcan with vcan."
+        ),
     ] = None,
-    channel: Annotated[str, typer.Option(help="Channel of the bus.")] = "239.74.163.2",
+    channel: Annotated[
+        str, typer.Option(help="Channel of the bus, where --bus names none.")
+    ] = "239.74.163.2",
     speed: Annotated[
         float, typer.Option(help="On the bus: times real time; 0: as fast as possible.")
     ] = 1.0,
@@ -107,11 +113,13 @@ def simulate(
         run = run_machine(healthy if later else machine, motion, seed, duration_s, change=later)
         progress("writing the trace", 0.7)
         written = write_run(trace, run, seed, motion) if trace else []
-    sent = _send(run, bus, channel, speed or AS_FAST_AS_POSSIBLE) if bus else 0
+    interface, _, named = (bus or "").partition(":")
+    channel = named or channel
+    sent = _send(run, interface, channel, speed or AS_FAST_AS_POSSIBLE) if bus else 0
     if as_json:
         print(json.dumps(_plain(machine, run) | _files(written) | {"frames_sent": sent}))
     else:
-        _tell(machine, run, written, f"sent {sent} frames on {bus} {channel}" if sent else "")
+        _tell(machine, run, written, f"sent {sent} frames on {interface}:{channel}" if sent else "")
     return None if written else "live"
 
 

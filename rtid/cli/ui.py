@@ -17,9 +17,9 @@ def ui(
     files: Annotated[
         list[Path] | None,
         typer.Argument(
-            metavar="[TRACE] [PROJECT]",
-            help="CAN log or table, and project file.  Without a project the page makes one, "
-            "without a trace it is the live page.",
+            metavar="[TRACE...] [PROJECT]",
+            help="CAN log or table, and project file; of several records, one fit.  Without a "
+            "project the page makes one, without a trace it is the live page.",
         ),
     ] = None,
     project: Annotated[Path | None, typer.Option("--project", "-p", help="Project file.")] = None,
@@ -47,8 +47,8 @@ def ui(
     and loads nothing from anywhere else.  Of several browsers one works, the others follow.  From
     another machine: ssh -L 5006:127.0.0.1:5006 DEVICE.  Ctrl-C, SIGTERM and SIGHUP end it.
     """
-    trace, project = told_apart(files or [], project, "ui")
-    for path in (project, trace):
+    traces, project = told_apart(files or [], project, "ui", most=None)
+    for path in (project, *traces):
         if path is not None and not path.exists():
             raise RtidError(f"{path}: no such file", "rtid ui TRACE -p PROJECT")
     refuse_without_bokeh()
@@ -57,7 +57,7 @@ def ui(
 
     do_without()  # the worker computes, the server shows
 
-    is_record = trace is not None and project is not None
+    is_record = bool(traces) and project is not None
     # the worker imports beside the server
     with TemporaryDirectory(prefix="rtid-ui-") as scrap, started(ahead=is_record) as worker:
         from rtid.project import load
@@ -73,7 +73,8 @@ def ui(
         serve(
             ready,
             project=project,
-            trace=trace,
+            trace=traces[0] if traces else None,
+            more=traces[1:],
             state=folder,
             host=host,
             port=port,

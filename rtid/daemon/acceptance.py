@@ -31,9 +31,13 @@ def ask(folder: Path, request: Acceptance) -> None:
     os.replace(temporary, folder / FILE)
 
 
-def withdraw(folder: Path) -> None:
-    """Take a request back that nobody has heard."""
-    (folder / FILE).unlink(missing_ok=True)
+def withdraw(folder: Path) -> bool:
+    """Take a request back that nobody has heard; False where somebody has."""
+    try:
+        (folder / FILE).unlink()
+    except FileNotFoundError:
+        return False
+    return True
 
 
 def taken(folder: Path) -> Acceptance | None:

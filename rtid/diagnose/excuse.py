@@ -17,6 +17,7 @@ from rtid.diagnose.commands import split
 from rtid.diagnose.fit import Fit, columns_of_effects, fit, one_pass, with_covariances
 from rtid.diagnose.residual import effect_values
 from rtid.effects.extra import with_extra_flow
+from rtid.effects.laws import total_softness
 from rtid.estimator.limits import most_open
 from rtid.estimator.misfit import Misfit, can_be_explained, residual_of, widened
 from rtid.estimator.missed import excusing, misses
@@ -27,6 +28,7 @@ from rtid.plain import FloatArray
 
 # of the visited blocks: 1 in 100 on clean records, 4 in 10 with a leak of 2 % of the flow
 FEW = 0.1
+LEAST = -0.9  # of a chamber's volume, that a fitted one may take off it
 KNOWN = 1e-4  # share by which the flow of an effect may differ from what is fitted
 
 
@@ -102,7 +104,7 @@ def _machine(present: Fit) -> tuple[Machine, FloatArray]:
     machine = _with_room(present)
     if not present.revision.effects:
         return machine, present.sent
-    flow = np.zeros((present.view.n - 1, len(present.model.chambers)))
+    machine, flow = _storing(present, machine)
     volumes = zip(columns_of_effects(present), effect_values(present), strict=True)
     for columns, (_, value) in volumes:
         for c, volume in columns.items():
@@ -110,3 +112,23 @@ def _machine(present: Fit) -> tuple[Machine, FloatArray]:
     present.view.rest()
     model, _, chunk = with_extra_flow(machine, np.zeros(0), present.sent, flow)
     return replace(model, terms=tuple(replace(term, sd=KNOWN) for term in model.terms)), chunk
+
+
+def _storing(present: Fit, machine: Machine) -> tuple[Machine, FloatArray]:
+    """The machine whose volumes take up what its effects do, and flows that take that back.
+
+    Flows (n - 1, chambers), m3/s.  A pressure's noise moves all that is stored: where most of a
+    dead volume is fitted, 3 times the variance was left, as if all blocks missed the flow.
+    """
+    flow = np.zeros((present.view.n - 1, len(machine.chambers)))
+    if not machine.has_pressures:
+        return machine, flow
+    taken = total_softness(present.view, effect_values(present)).mean(axis=0)
+    chambers = list(machine.chambers)
+    for c, chamber in enumerate(chambers):
+        if taken[c] != 0.0 and chamber.pressure:
+            volume = max(float(taken[c] / present.weights.compliance[c]), LEAST * chamber.v0_m3)
+            chambers[c] = replace(chamber, v0_m3=chamber.v0_m3 + volume)
+            rise = np.diff(present.sent[:, 2 + machine.column(chamber.pressure)])
+            flow[:, c] = volume * present.compliance[c] * rise / present.view.dt_s
+    return replace(machine, chambers=tuple(chambers)), flow

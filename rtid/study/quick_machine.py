@@ -25,6 +25,7 @@ TURN_M3, DEAD_TURNS = 50e-6, 10.0  # a usual motor's displacement; its sides and
 SUPPLY_PA = 7e6
 U_STEPS, DP_STEPS = 24, 12  # with 16 along u a healthy machine left 1.2 times its noise
 RATED_DP_PA = 5e5  # as data sheets have it
+MOST_POWER = 2.0  # of the opening, that a valve's gain is taken to follow beyond the record
 WIDE = 0.5  # of the largest command beyond the dead band: from there on a valve is wide open
 LEAST_FLOW = 1e-7  # m3/s
 WINDOW_S = 0.02  # over which the speed is taken
@@ -266,17 +267,31 @@ def rated_flow(machine: MachineSizes, samples: Samples, speed: FloatArray, band:
     """Flow of the largest valve, fully open at RATED_DP_PA, m3/s: what a data sheet would say.
 
     speed (n,) in m/s; machine: its grid still ends at the largest command that the signal can have.
+    A valve that was not opened so far opens on as it did: Q / sqrt(dp) as a power of the opening.
     """
     u, full, flows = samples.column("u"), float(machine.u_grid[-1]), [LEAST_FLOW]
     for name, (source, sink, way) in EDGES.items():
         w, dp = way * u, samples.column(source) - samples.column(sink)
         wide = (w > band + WIDE * (w.max() - band)) & (w > band) & (dp > 0.0)
         if wide.any():
-            gain = speed[wide] / np.sqrt(dp[wide]) / (w[wide] - band)
+            gain = _at_full(w[wide] - band, speed[wide] / np.sqrt(dp[wide]), full - band)
             rod = machine.rod_m if "b" in name else 0.0
             area = math.pi / 4 * (machine.bore_m**2 - rod**2)
-            flows.append(area * float(np.median(gain)) * (full - band) * math.sqrt(RATED_DP_PA))
+            flows.append(area * gain * math.sqrt(RATED_DP_PA))
     return max(flows)
+
+
+def _at_full(opening: FloatArray, gain: FloatArray, full: float) -> float:
+    """A gain (n,) that is a power of the opening (n,), at the full one: from medians of halves."""
+    is_far = opening >= np.median(opening)
+    near, far = (
+        (float(np.median(opening[half])), float(np.median(gain[half])))
+        for half in (~is_far if not is_far.all() else is_far, is_far)
+    )
+    power = 1.0
+    if far[0] > near[0] and min(near[1], far[1]) > 0.0:
+        power = math.log(far[1] / near[1]) / math.log(far[0] / near[0])
+    return far[1] * (full / far[0]) ** min(max(power, 0.0), MOST_POWER)
 
 
 def _speed(samples: Samples) -> FloatArray:

@@ -55,6 +55,7 @@ class Arrival:
 
     folder: Path
     file: Path | None = None
+    more: tuple[Path, ...] = ()  # further records of the same project
     dbc: Path | None = None
     seen: Glance | None = None
     roles: dict[str, str] = field(default_factory=dict)
@@ -72,6 +73,7 @@ class Arrival:
         if path.suffix.lower() in DATABASES:
             self.dbc = None if path == self.dbc else path
         else:
+            self.more = self.more if path == self.file else ()
             self.file = path
         self.seen, self.judged, self.roles = None, None, {}
 
@@ -143,7 +145,8 @@ def judge(session: Session, arrival: Arrival) -> None:
         arrival.judged = result
         session.tell("state")
 
-    session.ask("judge", arrival.file, arrival.dbc, arrival.given(), chosen, then=judged)
+    known = arrival.file, arrival.dbc, arrival.given(), chosen, arrival.more
+    session.ask("judge", *known, then=judged)
 
 
 def asked(session: Session, arrival: Arrival, asked: dict[str, str]) -> None:
@@ -185,7 +188,7 @@ def fragments(session: Session, arrival: Arrival) -> dict[str, str]:
 
 
 def _files(arrival: Arrival) -> str:
-    chosen = (arrival.file, arrival.dbc)
+    chosen = (arrival.file, arrival.dbc, *arrival.more)
     rows = "".join(
         f'<button data-do="file" data-name="{text(p.name)}" '
         f'aria-pressed="{str(p in chosen).lower()}">{text(p.name)}</button> '

@@ -5,6 +5,7 @@ It holds the fits; what it returns is plain and small enough to be sent.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -153,27 +154,39 @@ class Desk(Reader):
         self._progress(f"looking at {file.name}", 0.0)
         return glance(file, dbc)
 
-    def judge(self, file: Path, dbc: Path | None, given: Given, roles: dict[str, str]) -> Judged:
-        """The verdict of a file without a project, and the project that would be saved."""
-        looked = quick(file, dbc, given, self._progress, roles)
+    def judge(
+        self,
+        file: Path,
+        dbc: Path | None,
+        given: Given,
+        roles: dict[str, str],
+        more: Sequence[Path] = (),
+    ) -> Judged:
+        """The verdict of a file without a project, and the project that would be saved.
+
+        more: further records that the project is of.
+        """
+        looked = quick(file, dbc, given, self._progress, roles, more)
         project = free_name(file.with_suffix(".toml"))
         if isinstance(looked, QuickPlant):
             kind, words = VERDICTS[looked.diagnosis.verdict]
             return Judged(kind, words, tuple(plant_lines(looked)), None, looked.found.text)
         if isinstance(looked, QuickRate):
-            told, project_text = rate_lines(looked, project), looked.text
+            told, project_text = rate_lines(looked, project), looked.text_for(project)
         else:
             told, project_text = lines(looked, project), looked.text_for(project)
         kind, words = ("bad", "No verdict") if not looked.diagnosis else heading(looked.diagnosis)
         return Judged(kind, words, tuple(told)[:-2], project, project_text)
 
-    def open(self, project: Path, trace: Path, sheet: Path | None) -> Opened:
+    def open(
+        self, project: Path, trace: Path, sheet: Path | None, more: Sequence[Path] = ()
+    ) -> Opened:
         """Read and learn; the model has the effects that the project file has.
 
-        sheet: data sheet or exported map to hold beside the learned one.
+        sheet: data sheet or exported map to hold beside the learned one; more: further records.
         """
         known, self._read = self._read, None
-        study = Study(known[0] if known else project, trace, self._progress)
+        study = Study(known[0] if known else project, [trace, *more], self._progress)
         if known and not study.records:  # of several it was but one
             vars(study)["read"] = known[1]
         _, read = study.replay, study.trace

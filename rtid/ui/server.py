@@ -11,7 +11,7 @@ import signal
 import threading
 import time
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
@@ -305,18 +305,19 @@ def start(
     sheet: Path | None = None,
     test_bus: bool = False,
     worker: Worker | None = None,
+    more: Sequence[Path] = (),
 ) -> Workbench:
     """Begin to serve on the current event loop; port 0: any that is free.
 
     project: None where there is none yet; state: folder in which a daemon keeps its state, for the
     live page; test_bus: maps may be sent over a bus that anybody may write to; worker: one that was
-    started ahead.  Raises RtidError where the port is taken.
+    started ahead; more: further records of the same fit.  Raises RtidError where the port is taken.
     """
     worker = worker or Worker()
     logging.getLogger("bokeh.server.views.ws").setLevel(logging.ERROR)  # a tab may be closed
     loop, sockets = IOLoop.current(), _bound(host, port)
     worker.on_loop = loop.add_callback
-    session = _session(project, trace, worker, sheet, state, test_bus)
+    session = _session(project, trace, worker, sheet, state, test_bus, more)
     turns = Turns(loop.call_later)
     door = Door(host, port=sockets[0].getsockname()[1])
     guarded = _guarded(door, session, Live(state), turns)
@@ -365,12 +366,16 @@ def _session(
     sheet: Path | None,
     state: Path | None,
     test_bus: bool,
+    more: Sequence[Path],
 ) -> Session:
     """Of a project and its trace; without a project, of a file that is made one of."""
     if project is not None:
-        return Session(project, trace, worker, sheet, folder=state, test_bus=test_bus)
+        return Session(project, trace, worker, sheet, tuple(more), folder=state, test_bus=test_bus)
     folder = trace.resolve().parent if trace else Path.cwd()
-    return Session(folder, None, worker, arrival=Arrival(folder, trace and trace.resolve()))
+    others = tuple(path.resolve() for path in more)
+    return Session(
+        folder, None, worker, arrival=Arrival(folder, trace and trace.resolve(), more=others)
+    )
 
 
 def _guarded(door: Door, session: Session, live: Live, turns: Turns) -> Guarded:

@@ -64,6 +64,7 @@ class Session:
     trace: Path | None
     worker: Worker
     sheet: Path | None = None
+    more: tuple[Path, ...] = ()  # further records of the same fit
     state: str = LOADING
     doing: str = "starting"
     share: float = 0.0
@@ -331,7 +332,7 @@ class Session:
         self._failed(error)
 
     def _read(self, curves: tuple[Curve, ...]) -> None:
-        self.curves, known = curves, (self.project, self.trace, self.sheet)
+        self.curves, known = curves, (self.project, self.trace, self.sheet, self.more)
         self.ask("open", *known, then=self._opened, failed=self._not_opened)
 
     def _opened(self, opened: Opened) -> None:

@@ -18,13 +18,11 @@ from rtid.tell.diagnosed import (
     LIMITS,
     LIMITS_SAY,
     floored,
-    heading,
     hidden,
     judged,
     limits,
     percent,
     remark,
-    said,
     seen_and_not_named,
 )
 from rtid.tell.html import button, clearness, table, text
@@ -104,12 +102,8 @@ def fragments(ranked: RankedDiagnosis | None, page: str, may_add: bool) -> dict[
     if diagnosis.verdict != "insufficient_data":
         parts.append(_ranking(ranked, may_add))
     parts += _unseen(diagnosis)
-    if not diagnosis.found:
-        kind, head = heading(diagnosis)
-        words = " ".join([said(diagnosis), *seen_and_not_named(diagnosis)])
-        parts.insert(
-            0, f'<div class="card"><h2 class="{kind}">{text(head)}</h2>{text(words)}</div>'
-        )
+    if words := "" if diagnosis.found else " ".join(seen_and_not_named(diagnosis)):
+        parts.insert(0, f'<div class="card">{text(words)}</div>')
     chosen = page or next((e.effect for e in diagnosis.found), "")
     return {"ranking": "".join(parts), "page": effect_page(chosen)}
 
@@ -129,13 +123,14 @@ def _found(diagnosis: Diagnosis, effect: FoundEffect) -> str:
     told_apart = (
         f"cannot be told from {alike} in this record" if alike else "no other known effect does"
     )
+    bends = hidden(effect) if effect is not diagnosis.found[0] else ""  # that one: above the view
     return (
         f'<div class="card"><h2 class="found">{_link(effect.effect, title(effect.effect))} '
         f"at {text(effect.where)}</h2><dl>{sizes}<dt>{judged(diagnosis)}</dt><dd>"
         f"{percent(diagnosis, before)} → <b>{percent(diagnosis, after)}</b> of the rms flow"
         f"{floored(diagnosis)}</dd><dt>explains as much</dt>"
         f"<dd>{text(told_apart)}</dd><dt>by chance</dt><dd>"
-        f"{_chance(effect.p_value)}</dd></dl>{text(hidden(effect))}{_choices(effect)}</div>"
+        f"{_chance(effect.p_value)}</dd></dl>{text(bends)}{_choices(effect)}</div>"
     )
 
 

@@ -47,3 +47,20 @@ def test_the_page_shows_all_records_of_a_project(browser: Browser, tmp_path: Pat
                 page.wait_for_selector("#verdict h1 >> text=/model|missing/")
     finally:
         show_flow_as("m3/s")
+
+
+def test_several_records_without_a_project_make_one(browser: Browser, tmp_path: Path) -> None:
+    """`rtid ui A B` said "more than one trace or project"; `rtid quick A B` took both."""
+    rng = np.random.default_rng(31)
+    crane = Crane.drawn(rng)
+    days = [crane.recorded(tmp_path / f"day{k}.csv", rng, seconds=110.0) for k in range(2)]
+    try:
+        with served(project=None, trace=days[0], more=days[1:]) as bench:
+            for opened in open_page(browser, bench):
+                opened.go()
+                page = opened.page
+                page.click("#arrival_told [data-do=keep]")
+                page.wait_for_selector("#compare_says >> text=Of each record")
+                assert "day0.csv, day1.csv" in page.locator("#record").inner_text()
+    finally:
+        show_flow_as("m3/s")

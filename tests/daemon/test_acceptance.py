@@ -22,7 +22,8 @@ def test_a_request_is_heard_once(tmp_path: Path) -> None:
     ask(tmp_path, REQUEST)
     assert taken(tmp_path) == REQUEST and taken(tmp_path) is None
     ask(tmp_path, REQUEST)
-    withdraw(tmp_path)
+    assert withdraw(tmp_path)
+    assert not withdraw(tmp_path), "somebody has heard it"
     assert taken(tmp_path) is None
 
 

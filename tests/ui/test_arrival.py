@@ -59,6 +59,22 @@ def test_a_file_is_looked_at_judged_and_kept(tmp_path: Path) -> None:
     assert worker.jobs[0][1][:2] == (tmp_path / "day.toml", tmp_path / "day.csv")
 
 
+def test_several_records_are_judged_as_one_until_another_is_taken(tmp_path: Path) -> None:
+    """`rtid ui A B` was refused."""
+    session, arrival, worker = begun(tmp_path)
+    first, second = tmp_path / "day.csv", tmp_path / "next.csv"
+    second.write_text(first.read_text())
+    arrival.file, arrival.more = first, (second,)
+    session.open()
+    worker.answer(SEEN)
+    assert worker.jobs[0][0] == "judge" and worker.jobs[0][1][4] == (second,)
+    worker.answer(Judged("good", "The model matches", (), tmp_path / "day.toml", "text\n"))
+    pressed = fragments(session, arrival)["arrival_files"].count('aria-pressed="true"')
+    assert pressed == 2
+    asked(session, arrival, {"do": "file", "name": "next.csv"})
+    assert not arrival.more
+
+
 @pytest.mark.parametrize(
     ("roles", "is_judged"),
     [({"u": "cmd", "v": "y"}, True), ({"u": "cmd", "p_a": "P1"}, False), ({"v": "y"}, False)],
@@ -107,7 +123,8 @@ def test_roles_and_sizes_are_what_was_clicked_and_typed(tmp_path: Path) -> None:
         asked(session, arrival, {"do": "size", "size": name, "name": typed})
     assert "stroke" in session.trouble[0]
     asked(session, arrival, {"do": "judge"})
-    _, (file, dbc, given, chosen), _ = worker.jobs[0]
+    _, (file, dbc, given, chosen, more), _ = worker.jobs[0]
+    assert more == ()
     assert (file, dbc, chosen) == (tmp_path / "day.csv", None, {"x": "P1", "p_b": "P2"})
     assert (given.bore_m, given.rod_m, given.stroke_m) == (0.063, 0.0365, None)
     assert given.dead_volumes_m3 == (0.4e-3, 0.4e-3)

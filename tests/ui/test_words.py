@@ -8,12 +8,12 @@ import pytest
 
 from rtid.diagnose.remains import _what
 from rtid.diagnose.report import Value
-from rtid.tell.diagnosed import said
+from rtid.tell.diagnosed import heading, said
 from rtid.tell.html import clearness, error_bars
 from rtid.tell.report_story import Ranked, sizes_say
 from rtid.tell.words import is_floor, quantity
 from rtid.ui.desk import RankedDiagnosis
-from rtid.ui.why_view import _ranking
+from rtid.ui.why_view import _ranking, fragments
 from rtid.units import limit
 from tests.ui.test_session import KEY, told
 
@@ -115,3 +115,11 @@ def test_clearness_tells_what_is_left_once_the_cause_is_in_the_model() -> None:
     assert clearness(1216.0, 13.4, 1293.0)[0] == "1216 → 13"
     assert clearness(22.4, 22.0, 1293.0)[0] == "22.4"
     assert 'class="clear own" style="width:150px"' in clearness(1293.0, None, 1293.0)[1]
+
+
+def test_why_does_not_say_again_what_stands_above_every_view() -> None:
+    """A model that matches, was told in the same sentences twice."""
+    for ranked in (told(), told(KEY)):
+        shown = fragments(ranked, "", may_add=True)["ranking"]
+        assert said(ranked.diagnosis) not in shown
+        assert heading(ranked.diagnosis)[1] not in shown
