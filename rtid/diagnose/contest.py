@@ -134,8 +134,8 @@ def _as_late(state: TrialState, present: Fit, trials: list[Trial]) -> list[Trial
     those let into the rows: that is as good as the noise that is declared.  A command that came
     5 ms late on a sweep was named a position, late by 6 ms, beside an oil of 1440 MPa for 926.
     """
-    sse = present.held.sse
-    times = [replace(t, gain=sse - t.fit.held.sse) for t in trials if t.is_timing and t.fit]
+    beyond = present.excess
+    times = [replace(t, gain=beyond - t.fit.excess) for t in trials if t.is_timing and t.fit]
     best = max(times, key=lambda t: t.gain)
     alike = {best.key, *alike_ones(state, present, best, times)}
     return [t for t in times if t.key in alike]

@@ -61,5 +61,13 @@ def regression_of(
         prior[1 + n_c] = tolerance**-2 if tolerance > 0 else HELD
         mean[1 + n_c] = model.lag.nominal_s - weights.lag_s
     return Regression(
-        projected.schur, noise, prior, mean, projected.own, dof, rows.n, rows.log_noise
+        projected.schur,
+        noise,
+        prior,
+        mean,
+        projected.own,
+        dof,
+        rows.n,
+        rows.log_noise,
+        float(rows.n - rows.told[0].n),
     )

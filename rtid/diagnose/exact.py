@@ -56,8 +56,8 @@ def with_pump(state: TrialState, present: Fit, trials: list[Trial]) -> list[Tria
         return rest
     beside = state.coarse.beside(present)
     pumped = [_with_pump(state, present, beside.polished(PUMP, p)) for p in _pumps(present)]
-    now = min(pumped, key=lambda fitted: fitted.held.sse)
-    gain = present.held.sse - now.held.sse
+    now = min(pumped, key=lambda fitted: fitted.excess)
+    gain = present.excess - now.excess
     return [*rest, Trial(key, gain, now.revision, now, True)]
 
 
@@ -195,7 +195,8 @@ def exact_trials(
         now = tried(state.model, state.chunk, weights, revision)
         if not (anywhere or is_inside(now)):
             continue
-        exact, key = present.held.sse - now.estimate.sse, key_of(timing)
+        exact = present.excess - (now.estimate.sse - now.regression.due)
+        key = key_of(timing)
         if key not in trials or exact > trials[key].gain:
             trials[key] = Trial(key, exact, now.revision, now, True)
     return list(trials.values())
@@ -229,7 +230,7 @@ def _split_anew(state: TrialState, now: Fit) -> Fit:
         revision = replace(now.revision, timings=(*others, (timing, (both - lag_s,))))
         record = state.model, state.chunk, replace(now.weights, lag_s=lag_s), revision
         trial = one_pass(*record, now.light(), bank=False, thorough=False)
-        if trial.held.sse < best.held.sse - UNEVEN * now.regression.dof:
+        if trial.excess < best.excess - UNEVEN * now.regression.dof:
             best = trial
     if best is now:
         return now

@@ -111,7 +111,7 @@ def halfway(best: Fit, step: Step) -> Step:
 def is_as_good(fit: Fit, best: Fit) -> bool:
     """True where a step changed the misfit by next to nothing."""
     misfit = best.held.sse - best.regression.dof
-    return abs(best.held.sse - fit.held.sse) < max(NOISE, ENOUGH * misfit)
+    return abs(best.excess - fit.excess) < max(NOISE, ENOUGH * misfit)
 
 
 def is_worse(fit: Fit, best: Fit) -> bool:
@@ -120,7 +120,7 @@ def is_worse(fit: Fit, best: Fit) -> bool:
         return True
     alike = np.array_equal(fit.weights.compliance, best.weights.compliance)
     alike = alike and _weigh_alike(fit.revision.sizes, best.revision.sizes)
-    return alike and fit.held.sse > best.held.sse and not is_as_good(fit, best)
+    return alike and fit.excess > best.excess and not is_as_good(fit, best)
 
 
 def _mean(a: Psi, b: Psi) -> Psi:

@@ -59,7 +59,8 @@ class Regression:
 
     s, noise (columns, columns); prior, mean (columns,): information and value of the priors;
     own (columns,): squares of the columns before the maps were taken out; rows: of all segments;
-    dof: what the maps leave of them; log_noise: logarithm of the determinant of their noise.
+    dof: what the maps leave of them; log_noise: logarithm of the determinant of their noise; due:
+    what noise alone leaves, on average: the rows less the directions of the maps that they tell.
     """
 
     s: FloatArray
@@ -70,6 +71,7 @@ class Regression:
     dof: float
     rows: int
     log_noise: float = 0.0
+    due: float = 0.0
 
     def fit(self, used: tuple[int, ...]) -> Estimate:
         """Least squares on some columns, errors in variables taken out."""

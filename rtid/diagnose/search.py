@@ -113,7 +113,7 @@ class Beside:
             self.ahead = max(0.0, self.before - self.cost((), self.fitted_s))
 
     def cost(self, more: Timings, lag_s: float | None = None) -> float:
-        """Residual sum of squares with more timings; inf where they lose rows.
+        """chi2 with more timings beyond what is due (`Regression`); inf where they lose rows.
 
         lag_s: of the spools, s, where it is not the declared one.
         """
@@ -162,7 +162,8 @@ class Beside:
             return float("inf"), np.zeros(0)
         s = project(rows, [rows.on_rows(volumes) for volumes in self.volumes]).schur
         theta = np.linalg.lstsq(s[1:, 1:], s[1:, 0], rcond=1e-12)[0]
-        return float(s[0, 0] - s[0, 1:] @ theta), np.asarray(theta)
+        due = float(rows.n - rows.told[0].n)
+        return float(s[0, 0] - s[0, 1:] @ theta) - due, np.asarray(theta)
 
     def gain(self, timing: TimingLaw, psi: Psi) -> float:
         """What a timing lowers the cost by."""
