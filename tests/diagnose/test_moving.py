@@ -57,7 +57,7 @@ def test_a_step_goes_towards_the_truth_and_no_farther_than_its_reach() -> None:
 
 def test_parameters_are_shortened_together() -> None:
     """The direction stays: what one may not go, the other does not go alone."""
-    start = np.array([3e-3, 3e-3])
+    start = np.array([1e-3, 1e-3])
     present = at(*start)
     columns = [present.timing_columns(k)[0] for k in (0, 1)]
     lagging = present.first_given  # the declared lag would leave its range, and is held
@@ -65,12 +65,12 @@ def test_parameters_are_shortened_together() -> None:
     held = present.regression.fit(used)
     whole = np.array([held.value(k) for k in columns])
     step = psi(moved(present)) - start
-    assert np.abs(whole).max() > REACH * 3e-3, "too long a step for the test to see anything"
+    assert np.abs(whole).max() > REACH * 1e-3, "too long a step for the test to see anything"
     moving = step != 0
     assert moving.any()
     shares = step[moving] / whole[moving]
     assert shares == pytest.approx(shares[0]) and shares[0] < 1.0
-    assert np.abs(step).max() <= REACH * 3e-3 * (1 + 1e-9)
+    assert np.abs(step).max() <= REACH * 1e-3 * (1 + 1e-9)
 
 
 def test_halfway_is_the_middle_of_all_that_moves() -> None:
