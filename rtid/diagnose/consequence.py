@@ -25,9 +25,10 @@ from rtid.diagnose.residual import is_known
 from rtid.diagnose.trials import Trial
 from rtid.effects.record_view import RecordView
 from rtid.estimator.misfit import can_be_explained
+from rtid.estimator.refine import halved_along
 from rtid.estimator.state import Weights
 from rtid.kernels.layout import TERMS
-from rtid.model import PROPORTIONAL, Grid, Machine
+from rtid.model import Machine
 from rtid.plain import FloatArray
 from rtid.units import Z95
 
@@ -144,7 +145,7 @@ def _of_either(now: Fit, trial: Trial) -> tuple[float, float]:
 
 def _on_finer(now: Fit) -> Fit | None:
     """The same revision on a grid of half the spacing; None where no freedom is left."""
-    machine, weights = finer(now.declared), now.weights
+    machine, weights = halved_along(halved_along(now.declared, 0), 1), now.weights
     slopes, missed = (
         _spread(now.declared, machine, each) for each in (weights.slopes, weights.missed)
     )
@@ -184,22 +185,6 @@ def _size(fit: Fit, trial: Trial) -> tuple[int, float, float]:
 def _is_alike(value: float, apart: float, sd: float) -> bool:
     """True for a difference of sizes that their deviation explains, or that is a tenth of them."""
     return abs(apart) <= max(Z95 * sd, ALIKE * abs(value))
-
-
-def finer(machine: Machine) -> Machine:
-    """The same machine with every block cut into four.
-
-    Of proportional maps none: they have one gain in each block on purpose.
-    """
-    edges = []
-    for edge in machine.edges:
-        u, dp = (_halved(border) for border in (edge.grid.u_v, edge.grid.dp_pa))
-        edges.append(edge if edge.basis == PROPORTIONAL else replace(edge, grid=Grid(u, dp)))
-    return replace(machine, edges=tuple(edges))
-
-
-def _halved(border: FloatArray) -> FloatArray:
-    return np.sort(np.concatenate([border, 0.5 * (border[1:] + border[:-1])]))
 
 
 def _spread(machine: Machine, finer_one: Machine, of_cells: FloatArray) -> FloatArray:

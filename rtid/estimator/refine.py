@@ -58,14 +58,16 @@ def missing_commands(model: Machine, misfit: Misfit) -> list[list[int]]:
 
 
 def cut(model: Machine, at_v: list[list[float]]) -> Machine:
-    """The machine with more borders along the command, those of each edge in volts."""
-    return _on(
-        model,
-        [
-            Grid(np.unique(np.append(edge.grid.u_v, more)), edge.grid.dp_pa)
-            for edge, more in zip(model.edges, at_v, strict=True)
-        ],
-    )
+    """The machine with more borders along the command, those of each edge in volts.
+
+    As it is where there is no room for so many.
+    """
+    grids = [
+        Grid(np.unique(np.append(edge.grid.u_v, more)), edge.grid.dp_pa)
+        for edge, more in zip(model.edges, at_v, strict=True)
+    ]
+    has_room = all(len(grid.u_v) <= MAX_BORDERS for grid in grids)
+    return _on(model, grids) if has_room else model
 
 
 def in_halved(model: Machine, finer: Machine, misfit: Misfit) -> BoolArray:

@@ -10,7 +10,7 @@ import pytest
 from rtid.diagnose import admission
 from rtid.diagnose import consequence as evidence
 from rtid.diagnose.admission import is_form_of_another, is_seen_again
-from rtid.diagnose.consequence import Consequence, finer, is_stable
+from rtid.diagnose.consequence import Consequence, is_stable
 from rtid.diagnose.diagnosis import Result, beside_its_line, search
 from rtid.diagnose.experiment import FLOW, would_separate
 from rtid.diagnose.report import Diagnosis, diagnosis
@@ -190,8 +190,3 @@ def test_each_limb_alone_is_material() -> None:
     assert Consequence(float("nan"), (("pa", 0.02),), ()).is_material
     assert Consequence(0.0, (), (("a", -0.02),)).is_material
     assert not Consequence(0.009, (("pa", 0.009),), (("a", 0.009),)).is_material
-
-
-def test_every_block_is_cut_into_four() -> None:
-    model, _, _ = record()
-    assert finer(model).n_cells == 4 * model.n_cells
