@@ -486,6 +486,8 @@ def test_a_supply_that_nobody_measures_is_asked_for_first(folder: Path, tmp_path
     said = told(table, "--supply", 7, "--save", project)
     assert not any("supply" in a["what"] for a in said["assumptions"])
     assert load(project).sections.signals["p_supply"].constant == 7e6
+    remedies = ["".join(point["remedy"] for point in d["data"]["points"]) for d in (silent, said)]
+    assert ["--supply" in text for text in remedies] == [True, False], "once is enough"
 
 
 def test_a_supply_is_measured_or_said(folder: Path) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 from rtid.diagnose.clean import Cut, cuts
 from rtid.diagnose.consequence import Consequence
 from rtid.diagnose.diagnosis import Result
+from rtid.diagnose.exact import LARGE, is_refitted
 from rtid.diagnose.excuse import steady
 from rtid.diagnose.experiment import limits, would_separate
 from rtid.diagnose.fit import Fit
@@ -40,6 +41,7 @@ TOGETHER = "delay and lag together are"
 CALLED = {"delay": "the delay is", "time_constant": "the lag is"}
 WORTH = 2.0  # times better that an experiment must be to be proposed
 NOBODY_LOOKED = "Not examined: the diagnosis has no column for it here."
+MISLED = "not told: what else is missing bends the maps that would tell it"
 NOT_CONFIRMED = "not confirmed: what the maps' blocks miss may look like it in this record"
 HYDRAULIC = ("flow", "storage", "timing", "supply", "map")
 
@@ -328,6 +330,8 @@ def _not_found(result: Result) -> tuple[Unseen, ...]:
 
 
 def _limit(result: Result, candidate: Candidate, score: Score) -> Unseen:
+    if _is_misled(result, candidate):
+        return Unseen(*candidate.key, None, "", True, MISLED)
     by, known = result.reach.get(candidate.key, (candidate, None))
     doubtful = known.not_believed(score) if known and by == candidate else 0.0
     least = max(detection_limit(score, result.last.rho), doubtful)
@@ -351,6 +355,16 @@ def _limit(result: Result, candidate: Candidate, score: Score) -> Unseen:
     key = candidate.effect, candidate.where
     at = _form(candidate)
     return Unseen(*key, largest, unit, bool(visible), reason, named_from=named, form=at)
+
+
+def _is_misled(result: Result, candidate: Candidate) -> bool:
+    """Whether a limit by derivatives is untrue: what is missing has bent the maps of the column.
+
+    A sag a thousand times its limit stood beside it: only refits tell what transforms a command, a
+    sensor or the supply, where so much is left.
+    """
+    is_bent = result.verdict == UNKNOWN and result.last.rho >= LARGE
+    return is_bent and is_refitted(result.last, candidate.key)
 
 
 def _taken_for_lag(fit: Fit, candidate: Candidate, unit: str) -> float:

@@ -258,7 +258,13 @@ def _unseen_table(diagnosis: Diagnosis) -> Table:
         if u.examined
     ]
     heads = ("effect", "where", *LIMITS, "remark~")
-    return Table(f"not found. {LIMITS_SAY}", heads, rows[: 3 * SHOWN], keys=2)
+    return Table(f"not found. {limits_say(diagnosis)}", heads, rows[: 3 * SHOWN], keys=2)
+
+
+def limits_say(diagnosis: Diagnosis) -> str:
+    """What the sizes of what was not found mean; beside what is unknown they are of less."""
+    only = " They hold if nothing else were missing." if diagnosis.verdict == UNKNOWN else ""
+    return f"{LIMITS_SAY}{only}"
 
 
 def limits(unseen: Unseen) -> tuple[str, str]:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,9 +13,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
+from rtid.diagnose import exact, report
 from rtid.diagnose.experiment import varied_supply
-from rtid.diagnose.fit import one_pass, prepare
+from rtid.diagnose.fit import Fit, fit, one_pass, prepare
 from rtid.diagnose.revision import Revision
+from rtid.diagnose.search import Search
+from rtid.diagnose.trials import scored
+from rtid.diagnose.verdict import UNKNOWN
 from rtid.effects.laws import pump
 from rtid.effects.laws.pump import PUMP, demand, drawn_down
 from rtid.effects.record_view import RecordView
@@ -104,3 +111,37 @@ def test_a_record_with_a_sag_is_varied_as_it_was_recorded() -> None:
     varied = [varied_supply(f) for f in (plain, sagged)]
     assert varied[0] is not None and varied[1] is not None
     assert varied[1][:, supply] == pytest.approx(varied[0][:, supply])
+
+
+@cache
+def sagging() -> tuple[Fit, tuple[float, float, float]]:
+    """A machine whose pump gives way at its limit, by exactly its law, fitted without one.
+
+    With the pump: what the declared supply is too high by is D.
+    """
+    model, chunk, _ = record(seed=5)
+    drawn = demand(RecordView.without_map(model, chunk))
+    psi = 1.5e9, float(np.quantile(drawn[drawn > 0], 0.8)), 3e10
+    supply, dt = 2 + model.column("p_supply"), float(np.median(np.diff(chunk[:, 0])))
+    declared = chunk.copy()
+    declared[:, supply] = np.median(chunk[:, supply]) + drawn_down(drawn, dt, psi)
+    return fit(model, declared, prepare(model, declared), Revision()), psi
+
+
+def test_a_pump_is_looked_for_where_its_limit_is_seen() -> None:
+    """About a droop alone the search began in a valley that explains nothing of it."""
+    present, truth = sagging()
+    beside = Search(present.declared, present.chunk).beside(present)
+    best = max(beside.gain(PUMP, psi) for bank in exact._pumps(present) for psi in bank)
+    assert best > 0.3 * beside.gain(PUMP, truth) > 0.0
+
+
+def test_no_limit_is_told_of_a_sag_beside_what_is_unknown() -> None:
+    present, _ = sagging()
+    pumps = [(c, score) for c, score in scored(present) if c.effect == PUMP.effect]
+    result: Any = SimpleNamespace(last=present, verdict=UNKNOWN, reach={}, negligible={})
+    assert present.rho > exact.LARGE and pumps
+    for candidate, score in pumps:
+        unseen = report._limit(result, candidate, score)
+        assert (unseen.detection_limit, unseen.named_from) == (None, None)
+        assert unseen.reason == report.MISLED
