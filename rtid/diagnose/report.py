@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,7 @@ from rtid.effects import catalogue
 from rtid.effects.column import Candidate
 from rtid.effects.law import is_of_rates
 from rtid.effects.laws.lines import LINE, inertance
+from rtid.effects.laws.pump import FLOW, PUMP, delivered, demand
 from rtid.effects.laws.timing import COMMAND, RATE
 from rtid.effects.page import ZERO, correcting
 from rtid.estimator.validity import Doubt
@@ -74,7 +75,8 @@ class HiddenInMap:
 class FoundEffect:
     """An effect that was found, in the order of addition.
 
-    hidden_in_map: None where the residual shows it.
+    hidden_in_map: None where the residual shows it; not_reached: what parameters are above that
+    the record never came to, as a pump's flow.
     """
 
     effect: str
@@ -86,6 +88,7 @@ class FoundEffect:
     heldout_residual_before_m3s: float
     heldout_residual_after_m3s: float
     hidden_in_map: HiddenInMap | None = None
+    not_reached: Mapping[str, Value] = field(default_factory=dict)
 
     @property
     def alike(self) -> tuple[Key, ...]:
@@ -211,17 +214,34 @@ def diagnosis(result: Result) -> Diagnosis:
 def _effect(result: Result, accepted: AcceptedEffect) -> FoundEffect:
     before, after = accepted.before.rms_m3s, accepted.after.rms_m3s
     tests = max(1, len(result.scores) + len(result.last.revision.effects))
+    sizes, not_reached = _told(result.last, accepted.key)
     return FoundEffect(
         effect=accepted.key[0],
         where=accepted.key[1],
         cannot_be_told_from=tuple(_named(result, accepted.key, key) for key in accepted.alike),
-        parameters=parameters(result.last, accepted.key),
+        parameters=sizes,
         p_value=min(1.0, tests * by_chance(accepted.n_parameters, accepted.gain)),
         heldout_gain_pct=100.0 * (1.0 - after / before),
         heldout_residual_before_m3s=before,
         heldout_residual_after_m3s=after,
         hidden_in_map=_hidden(result.last, accepted.key[0], accepted.hidden),
+        not_reached=not_reached,
     )
+
+
+def _told(fit: Fit, key: Key) -> tuple[dict[str, Value], dict[str, Value]]:
+    """The parameters of a cause that are known, and what a pump's flow is above, never reached.
+
+    One of 83 L/min that never gave more than 30 was told as 35 +- 180,000.
+    """
+    sizes = parameters(fit, key)
+    known = {name: size for name, size in sizes.items() if not size.std > abs(size.value)}
+    if key[0] != PUMP.effect or not known or len(known) == len(sizes):
+        return sizes, {}
+    (psi,) = (psi for timing, psi in fit.revision.timings if timing.effect == PUMP.effect)
+    most = delivered(demand(fit.view), fit.view.step_s, psi)
+    beyond = {FLOW: replace(sizes[FLOW], value=most, std=float("nan"))}
+    return known, {} if FLOW in known else beyond
 
 
 def _shown_too_much(result: Result, zero: Zero) -> FoundEffect:

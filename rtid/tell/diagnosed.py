@@ -182,9 +182,12 @@ def _left(diagnosis: Diagnosis) -> str:
 
 
 def _one(diagnosis: Diagnosis, effect: FoundEffect) -> str:
-    sizes = ", ".join(
-        f"{name.replace('_', ' ')} {quantity(v)}" for name, v in effect.parameters.items()
-    )
+    known = [f"{name.replace('_', ' ')} {quantity(v)}" for name, v in effect.parameters.items()]
+    known += [
+        f"{name.replace('_', ' ')} not reached: above {limit(v.value, v.unit)}"
+        for name, v in effect.not_reached.items()
+    ]
+    sizes = ", ".join(known)
     before = percent(diagnosis, effect.heldout_residual_before_m3s)
     after = percent(diagnosis, effect.heldout_residual_after_m3s)
     does = hidden(effect) or (

@@ -145,3 +145,16 @@ def test_no_limit_is_told_of_a_sag_beside_what_is_unknown() -> None:
         unseen = report._limit(result, candidate, score)
         assert (unseen.detection_limit, unseen.named_from) == (None, None)
         assert unseen.reason == report.MISLED
+
+
+def test_a_pump_s_flow_that_was_never_reached_is_above_what_it_gave() -> None:
+    """It was told as a number that was 5,000 times less than its interval."""
+    model, chunk, _ = record(seed=5)
+    psi = 1e9, 0.05, 1e10
+    drooping = Revision(timings=((PUMP, psi),))
+    weak = one_pass(model, chunk, prepare(model, chunk), drooping, None, True)
+    known, not_reached = report._told(weak, (PUMP.effect, "p_supply"))
+    assert set(known) == {"resistance", "stiffness"} and set(not_reached) == {"pump_flow"}
+    most = not_reached["pump_flow"].value
+    assert 0.3 < most / demand(weak.view).max() <= 1.0
+    assert "pump_flow" in report.parameters(weak, (PUMP.effect, "p_supply")), "the file has it"

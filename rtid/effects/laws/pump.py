@@ -39,6 +39,12 @@ def drawn_down(drawn: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
     return droop
 
 
+def delivered(drawn: FloatArray, dt_s: float, psi: Psi) -> float:
+    """The most that the pump gives in a record, m3/s; drawn (n,) in m3/s, psi = (R, Q_p, s)."""
+    r, q_p, _ = psi
+    return min(q_p, float(drawn_down(drawn, dt_s, psi).max()) / r)
+
+
 @kernel
 def _draw_down(
     drawn: FloatArray, dt_s: float, r: float, q_p: float, s: float, droop: FloatArray
@@ -71,4 +77,5 @@ def _step(d: float, q: float, dt_s: float, r: float, q_p: float, s: float) -> fl
     return corner + over_s * s * (q - q_p)
 
 
-PUMP = of_law("pump", drawn_down, ("resistance", "pump_flow", "stiffness"), where=SUPPLY)
+FLOW = "pump_flow"
+PUMP = of_law("pump", drawn_down, ("resistance", FLOW, "stiffness"), where=SUPPLY)
