@@ -15,7 +15,7 @@ from rtid.diagnose.search import Beside
 from rtid.diagnose.trials import GAIN, Trial, TrialState, scored
 from rtid.effects.column import Candidate
 from rtid.effects.law import Shape
-from rtid.effects.laws.pump import PUMP, demand
+from rtid.effects.laws.pump import PUMP, usual_demand
 from rtid.effects.laws.sensors import sensor_timings
 from rtid.effects.laws.timing import COMMAND, DEAD_BAND, Psi, TimingLaw, delayed, timings_of
 from rtid.effects.record_view import RecordView
@@ -85,7 +85,7 @@ def _pumps(present: Fit) -> tuple[list[Psi], ...]:
 
     And where the first order sees one that only gives way at its limit, about that one.
     """
-    drawn, seen = demand(present.view), _seen_pumps(present)
+    drawn, seen = usual_demand(present.view), _seen_pumps(present)
     r = float(max([*(value for _, value in seen["resistance"]), PUMP.low[0]]))
     limits, most = np.quantile(drawn[drawn > 0], PUMP_LIMITS), 2.0 * float(drawn.max())
     limited: list[Psi] = [

@@ -21,7 +21,7 @@ from rtid.diagnose.search import Search
 from rtid.diagnose.trials import scored
 from rtid.diagnose.verdict import UNKNOWN
 from rtid.effects.laws import pump
-from rtid.effects.laws.pump import PUMP, demand, drawn_down
+from rtid.effects.laws.pump import PUMP, demand, drawn_down, usual_demand
 from rtid.effects.record_view import RecordView
 from rtid.model import MODE, Machine, Signal
 from rtid.plain import FloatArray
@@ -99,6 +99,23 @@ def test_edges_that_the_mode_keeps_shut_draw_nothing() -> None:
     assert held == pytest.approx(np.where(mode == 1, free, 0.0))
 
 
+def test_a_pump_compresses_the_oil_of_what_it_feeds() -> None:
+    """The stiffness of a foreign accumulator was 1.6 % off without it, at 32 deviations."""
+    model, chunk, _ = record()
+    still, by_name = chunk[:2000].copy(), {s.name: k for k, s in enumerate(model.signals, 2)}
+    fed = model.chambers[0]
+    still[:, by_name[model.position]] = 0.2
+    still[:, by_name[fed.pressure]] = 3e6 + 2e8 * (still[:, 0] - still[0, 0])
+    for edge in model.edges:
+        still[:, by_name[edge.command]] = 5.0 * next(
+            e.direction for e in model.edges if e.source == "p_supply" and e.sign(fed) > 0
+        )
+    oil = RecordView.without_map(model, still, np.full(2, 1e-9))
+    taken = float(fed.volume(np.array([0.2]))[0]) * 1e-9 * 2e8
+    assert demand(oil)[:-1] == pytest.approx(np.full(1999, taken), rel=1e-3)
+    assert not demand(RecordView.without_map(model, still)).any(), "of nobody's compliance none"
+
+
 def test_a_record_with_a_sag_is_varied_as_it_was_recorded() -> None:
     """Each fit applies the sag of its revision: the record of an experiment must not have it."""
     model, chunk, _ = record()
@@ -120,7 +137,7 @@ def sagging() -> tuple[Fit, tuple[float, float, float]]:
     With the pump: what the declared supply is too high by is D.
     """
     model, chunk, _ = record(seed=5)
-    drawn = demand(RecordView.without_map(model, chunk))
+    drawn = usual_demand(RecordView.without_map(model, chunk))
     psi = 1.5e9, float(np.quantile(drawn[drawn > 0], 0.8)), 3e10
     supply, dt = 2 + model.column("p_supply"), float(np.median(np.diff(chunk[:, 0])))
     declared = chunk.copy()
@@ -156,5 +173,5 @@ def test_a_pump_s_flow_that_was_never_reached_is_above_what_it_gave() -> None:
     known, not_reached = report._told(weak, (PUMP.effect, "p_supply"))
     assert set(known) == {"resistance", "stiffness"} and set(not_reached) == {"pump_flow"}
     most = not_reached["pump_flow"].value
-    assert 0.3 < most / demand(weak.view).max() <= 1.0
+    assert 0.3 < most / usual_demand(weak.view).max() <= 1.0
     assert "pump_flow" in report.parameters(weak, (PUMP.effect, "p_supply")), "the file has it"
