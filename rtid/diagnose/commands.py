@@ -15,7 +15,7 @@ from rtid.effects.laws.pump import demand
 from rtid.effects.laws.response import behind_s
 from rtid.effects.laws.sensors import sensors_of
 from rtid.effects.laws.timing import COMMAND, SUPPLY, Psi, TimingLaw
-from rtid.effects.record_view import RecordView
+from rtid.effects.record_view import NONE, RecordView
 from rtid.model import Edge, Machine
 from rtid.plain import FloatArray, IntArray
 
@@ -69,20 +69,25 @@ def commands(model: Machine, chunk: FloatArray) -> dict[str, tuple[int, FloatArr
     return by_edge
 
 
-def transformed(model: Machine, chunk: FloatArray, timings: Timings) -> FloatArray:
+def transformed(
+    model: Machine, chunk: FloatArray, timings: Timings, compliance: FloatArray = NONE
+) -> FloatArray:
     """The record of the machine `behind` timings: commands as these let them reach the spools.
 
-    chunk (n, 2 + signals), SI; the commands of the split machine stand behind its columns.  Without
+    chunk (n, 2 + signals), SI; the commands of the split machine stand behind its columns.
+    compliance (chambers,), 1/Pa: of the oil that a supply must compress.  Without
     timings it is the record as it is: a copy would be as large.
     """
     if not timings:
         return chunk
     dt_s = float(np.median(np.diff(chunk[:, 0])))
     sent = [through(u, d, dt_s, timings) for d, u in commands(model, chunk).values()]
-    return _put_right(split(model), np.column_stack([chunk, *sent]), timings)
+    return _put_right(split(model), np.column_stack([chunk, *sent]), timings, compliance)
 
 
-def _put_right(model: Machine, chunk: FloatArray, timings: Timings) -> FloatArray:
+def _put_right(
+    model: Machine, chunk: FloatArray, timings: Timings, compliance: FloatArray
+) -> FloatArray:
     """The record of the split machine, its sensors and its supply as the timings have them.
 
     chunk (n, 2 + signals), SI: changed in place.
@@ -99,7 +104,7 @@ def _put_right(model: Machine, chunk: FloatArray, timings: Timings) -> FloatArra
                 chunk[:, column] = np.concatenate([timing.apply(r, dt_s, psi) for r in runs])
     for timing, psi in timings:
         if timing.where == SUPPLY:
-            view = RecordView.without_map(model, chunk)
+            view = RecordView.without_map(model, chunk, compliance)
             chunk[:, 2 + model.column(view.supply_name)] -= timing.apply(
                 demand(view), view.step_s, psi
             )

@@ -14,9 +14,10 @@ from rtid.diagnose.regression import Score
 from rtid.diagnose.search import Beside
 from rtid.diagnose.trials import GAIN, Trial, TrialState, scored
 from rtid.effects.column import Candidate
-from rtid.effects.laws.pump import PUMP, demand
+from rtid.effects.law import Shape
+from rtid.effects.laws.pump import PUMP, usual_demand
 from rtid.effects.laws.sensors import sensor_timings
-from rtid.effects.laws.timing import DEAD_BAND, Psi, TimingLaw, delayed, timings_of
+from rtid.effects.laws.timing import COMMAND, DEAD_BAND, Psi, TimingLaw, delayed, timings_of
 from rtid.effects.record_view import RecordView
 from rtid.estimator.orifice import root
 from rtid.estimator.track import pressure_drop
@@ -80,14 +81,12 @@ def _sags(state: TrialState, present: Fit, key: Key, bar: float) -> bool:
 
 
 def _pumps(present: Fit) -> tuple[list[Psi], ...]:
-    """Pumps to begin with, about the droop that is seen: limited within what is drawn, or never."""
-    drawn = demand(present.view)
-    resistances = [
-        score.value
-        for candidate, score in scored(present)
-        if candidate.effect == PUMP.effect and candidate.parameter == "resistance"
-    ]
-    r = float(max([*resistances, PUMP.low[0]]))
+    """Pumps to begin with, about the droop that is seen: limited within what is drawn, or never.
+
+    And where the first order sees one that only gives way at its limit, about that one.
+    """
+    drawn, seen = usual_demand(present.view), _seen_pumps(present)
+    r = float(max([*(value for _, value in seen["resistance"]), PUMP.low[0]]))
     limits, most = np.quantile(drawn[drawn > 0], PUMP_LIMITS), 2.0 * float(drawn.max())
     limited: list[Psi] = [
         (r * part, float(q), s) for part in DROOPS for q in limits for s in STIFFNESSES
@@ -95,7 +94,19 @@ def _pumps(present: Fit) -> tuple[list[Psi], ...]:
     whole: list[Psi] = [
         (r * part, most, r * part / tau) for part in WHOLE_DROOPS for tau in SETTLING_S
     ]
-    return limited, whole
+    at_limit: list[Psi] = [
+        (s * tau, *shape, s) for shape, s in seen["stiffness"] if s > 0.0 for tau in SETTLING_S
+    ]
+    return (limited, whole, at_limit) if at_limit else (limited, whole)
+
+
+def _seen_pumps(present: Fit) -> dict[str, list[tuple[Shape, float]]]:
+    """Shapes and sizes of both first-order forms of a pump, by the parameter that is a size."""
+    seen: dict[str, list[tuple[Shape, float]]] = {"resistance": [], "stiffness": []}
+    for candidate, score in scored(present):
+        if candidate.effect == PUMP.effect:
+            seen[candidate.parameter].append((candidate.shape, score.value))
+    return seen
 
 
 def timing_trials(
@@ -160,6 +171,12 @@ def _foot(w: FloatArray, gain: FloatArray) -> float:
 def _strength(timing: TimingLaw, candidate: Candidate, score: Score) -> float:
     """How strong the first order takes a timing to be: so many times that of its column."""
     return score.value * (timing.strength(candidate.shape) if candidate.shape else 1.0)
+
+
+def is_refitted(fit_: Fit, key: Key) -> bool:
+    """Whether a cause is told by exact refits where much is left, and not by its column."""
+    sensors = {key_of(timing) for timing in sensor_timings(fit_.declared)}
+    return key[1] == COMMAND or key[0] == PUMP.effect or key in sensors
 
 
 def key_of(timing: TimingLaw) -> Key:

@@ -24,6 +24,7 @@ from rtid.effects.column import Candidate, Cause, Columns
 from rtid.effects.law import Shape, Volumes
 from rtid.effects.laws import cause_of
 from rtid.effects.laws.response import behind_s
+from rtid.effects.laws.timing import SUPPLY
 from rtid.effects.page import Effect
 from rtid.effects.record_view import LONG, MapTerms, RecordView
 from rtid.estimator.factor import PRIOR_SD, SHARED_PRIOR
@@ -87,7 +88,9 @@ class Fit:
     @cached_property
     def sent(self) -> FloatArray:
         """The record (n, 2 + signals), SI, with the commands as they reach the spools."""
-        return transformed(self.declared, self.chunk, self.revision.timings)
+        return transformed(
+            self.declared, self.chunk, self.revision.timings, self.weights.compliance
+        )
 
     @cached_property
     def view(self) -> RecordView:
@@ -305,7 +308,7 @@ def one_pass(
     """
     if revision.replaces_lag:
         weights = replace(weights, lag_s=0.0)
-    declared, sent = model, _sent(start, model, chunk, revision) if sent is None else sent
+    declared, sent = model, _sent(start, model, chunk, revision, weights) if sent is None else sent
     model = behind(declared, revision.timings)
     soft = softened(model, sent, weights, revision)
     known = _same_rows(start, sent, weights, soft)
@@ -408,13 +411,23 @@ def _same_rows(
 
 
 def _sent(
-    start: Fit | None, declared: Machine, chunk: FloatArray, revision: Revision
+    start: Fit | None,
+    declared: Machine,
+    chunk: FloatArray,
+    revision: Revision,
+    weights: Weights,
 ) -> FloatArray:
-    """The record with the commands as they reach the spools; a fit's with the same timings."""
+    """The record with the commands as they reach the spools; a fit's with the same timings.
+
+    And with the same oil, where a supply must compress it.
+    """
     is_same = start is not None and start.chunk is chunk and start.declared is declared
     if start is not None and is_same and start.revision.timings == revision.timings:
-        return start.sent
-    return transformed(declared, chunk, revision.timings)
+        compresses = any(timing.where == SUPPLY for timing, _ in revision.timings)
+        known = start.weights.compliance
+        if not compresses or np.array_equal(known, weights.compliance):
+            return start.sent
+    return transformed(declared, chunk, revision.timings, weights.compliance)
 
 
 def with_rows_of(known: Fit, fitted: Fit) -> Fit:

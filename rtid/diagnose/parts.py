@@ -63,7 +63,8 @@ def recall(
     fixed = [part for part, timing in told if timing is None]
     if not fixed:
         return Revision((), timings)
-    sent, whole = transformed(model, chunk, timings), behind(model, timings)
+    sent = transformed(model, chunk, timings, weights.compliance)
+    whole = behind(model, timings)
     view = RecordView.of(whole, sent, weights, first_map(whole, sent, weights))
     offered = causes(view, suspects)
     return Revision(tuple(_candidate(p, offered) for p in fixed), timings)

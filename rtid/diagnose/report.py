@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy as np
 from rtid.diagnose.clean import Cut, cuts
 from rtid.diagnose.consequence import Consequence
 from rtid.diagnose.diagnosis import Result
+from rtid.diagnose.exact import LARGE, is_refitted
 from rtid.diagnose.excuse import steady
 from rtid.diagnose.experiment import limits, would_separate
 from rtid.diagnose.fit import Fit
@@ -28,6 +29,7 @@ from rtid.effects import catalogue
 from rtid.effects.column import Candidate
 from rtid.effects.law import is_of_rates
 from rtid.effects.laws.lines import LINE, inertance
+from rtid.effects.laws.pump import FLOW, PUMP, delivered, demand
 from rtid.effects.laws.timing import COMMAND, RATE
 from rtid.effects.page import ZERO, correcting
 from rtid.estimator.validity import Doubt
@@ -40,6 +42,7 @@ TOGETHER = "delay and lag together are"
 CALLED = {"delay": "the delay is", "time_constant": "the lag is"}
 WORTH = 2.0  # times better that an experiment must be to be proposed
 NOBODY_LOOKED = "Not examined: the diagnosis has no column for it here."
+MISLED = "not told: what else is missing bends the maps that would tell it"
 NOT_CONFIRMED = "not confirmed: what the maps' blocks miss may look like it in this record"
 HYDRAULIC = ("flow", "storage", "timing", "supply", "map")
 
@@ -72,7 +75,8 @@ class HiddenInMap:
 class FoundEffect:
     """An effect that was found, in the order of addition.
 
-    hidden_in_map: None where the residual shows it.
+    hidden_in_map: None where the residual shows it; not_reached: what parameters are above that
+    the record never came to, as a pump's flow.
     """
 
     effect: str
@@ -84,6 +88,7 @@ class FoundEffect:
     heldout_residual_before_m3s: float
     heldout_residual_after_m3s: float
     hidden_in_map: HiddenInMap | None = None
+    not_reached: Mapping[str, Value] = field(default_factory=dict)
 
     @property
     def alike(self) -> tuple[Key, ...]:
@@ -209,17 +214,34 @@ def diagnosis(result: Result) -> Diagnosis:
 def _effect(result: Result, accepted: AcceptedEffect) -> FoundEffect:
     before, after = accepted.before.rms_m3s, accepted.after.rms_m3s
     tests = max(1, len(result.scores) + len(result.last.revision.effects))
+    sizes, not_reached = _told(result.last, accepted.key)
     return FoundEffect(
         effect=accepted.key[0],
         where=accepted.key[1],
         cannot_be_told_from=tuple(_named(result, accepted.key, key) for key in accepted.alike),
-        parameters=parameters(result.last, accepted.key),
+        parameters=sizes,
         p_value=min(1.0, tests * by_chance(accepted.n_parameters, accepted.gain)),
         heldout_gain_pct=100.0 * (1.0 - after / before),
         heldout_residual_before_m3s=before,
         heldout_residual_after_m3s=after,
         hidden_in_map=_hidden(result.last, accepted.key[0], accepted.hidden),
+        not_reached=not_reached,
     )
+
+
+def _told(fit: Fit, key: Key) -> tuple[dict[str, Value], dict[str, Value]]:
+    """The parameters of a cause that are known, and what a pump's flow is above, never reached.
+
+    One of 83 L/min that never gave more than 30 was told as 35 +- 180,000.
+    """
+    sizes = parameters(fit, key)
+    known = {name: size for name, size in sizes.items() if not size.std > abs(size.value)}
+    if key[0] != PUMP.effect or not known or len(known) == len(sizes):
+        return sizes, {}
+    (psi,) = (psi for timing, psi in fit.revision.timings if timing.effect == PUMP.effect)
+    most = delivered(demand(fit.view), fit.view.step_s, psi)
+    beyond = {FLOW: replace(sizes[FLOW], value=most, std=float("nan"))}
+    return known, {} if FLOW in known else beyond
 
 
 def _shown_too_much(result: Result, zero: Zero) -> FoundEffect:
@@ -328,6 +350,8 @@ def _not_found(result: Result) -> tuple[Unseen, ...]:
 
 
 def _limit(result: Result, candidate: Candidate, score: Score) -> Unseen:
+    if _is_misled(result, candidate):
+        return Unseen(*candidate.key, None, "", True, MISLED)
     by, known = result.reach.get(candidate.key, (candidate, None))
     doubtful = known.not_believed(score) if known and by == candidate else 0.0
     least = max(detection_limit(score, result.last.rho), doubtful)
@@ -351,6 +375,16 @@ def _limit(result: Result, candidate: Candidate, score: Score) -> Unseen:
     key = candidate.effect, candidate.where
     at = _form(candidate)
     return Unseen(*key, largest, unit, bool(visible), reason, named_from=named, form=at)
+
+
+def _is_misled(result: Result, candidate: Candidate) -> bool:
+    """Whether a limit by derivatives is untrue: what is missing has bent the maps of the column.
+
+    A sag a thousand times its limit stood beside it: only refits tell what transforms a command, a
+    sensor or the supply, where so much is left.
+    """
+    is_bent = result.verdict == UNKNOWN and result.last.rho >= LARGE
+    return is_bent and is_refitted(result.last, candidate.key)
 
 
 def _taken_for_lag(fit: Fit, candidate: Candidate, unit: str) -> float:

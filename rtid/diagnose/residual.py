@@ -158,7 +158,7 @@ def transformed_like(fit: Fit, chunk: FloatArray) -> FloatArray:
 
     chunk (n, 2 + signals), SI, as declared; result: of the split machine (see `transformed`).
     """
-    return transformed(fit.declared, chunk, fit.revision.timings)
+    return transformed(fit.declared, chunk, fit.revision.timings, fit.weights.compliance)
 
 
 def _noise(fit: Fit, view: RecordView) -> FloatArray:

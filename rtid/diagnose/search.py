@@ -79,7 +79,8 @@ class Search:
         """
         record = self.record
         if any(timing.where != COMMAND for timing, _ in timings):
-            whole = transformed(self.declared, self.chunk, timings)[:, : self.chunk.shape[1]]
+            whole = transformed(self.declared, self.chunk, timings, self.weights.compliance)
+            whole = whole[:, : self.chunk.shape[1]]
             record = self.thinning.record(self.declared, whole)
         lag_s = 0.0 if any(timing.replaces_lag for timing, _ in timings) else lag_s
         sent = [self._thinned(through(u, d, self.step_s, timings), lag_s) for d, u in self._given]

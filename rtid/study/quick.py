@@ -227,7 +227,8 @@ def _of_cylinder(
         file = Path(folder) / "machine.toml"
         arranged = _arranged(file, path, source, roles, given)
         progress("judging the data", 0.1)
-        judged = points(arranged.project.model, arranged.trace, arranged.report)
+        record = arranged.trace, arranged.report, given.supply_pa is not None
+        judged = points(arranged.project.model, *record)
         noise, doubts = _noise(arranged.project, arranged.trace)
         judged += doubts
         level, diagnosis, machine = level_of(judged), None, arranged.machine

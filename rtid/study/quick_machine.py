@@ -15,6 +15,7 @@ from firmware_bridge.samples import ROW, Samples
 from rtid.plain import FloatArray
 from rtid.project.guess import RoleCandidate
 from rtid.project.template import EDGES, nice
+from rtid.study.quick_band import MOVES, creep, settled, shut_band
 from rtid.study.spans import HELD_OUT_SHARE
 from rtid.trace.neutral import last_part_from
 from rtid.trace.quick_source import is_motor, unit_of
@@ -29,8 +30,6 @@ MOST_POWER = 2.0  # of the opening, that a valve's gain is taken to follow beyon
 WIDE = 0.5  # of the largest command beyond the dead band: from there on a valve is wide open
 LEAST_FLOW = 1e-7  # m3/s
 WINDOW_S = 0.02  # over which the speed is taken
-MOVES = 0.02  # of the top speed: below, the machine stands
-SPEED_BINS = 80
 LAG_MS, LAG_TOLERANCE_MS = 2.0, 5.0  # of a spool: every real one has some lag
 LAG_SHARE = 0.2  # by which a data sheet's lag may be off
 LONGEST_S = 1e6  # of a record, seconds: behind a damaged stamp nothing is looked for
@@ -216,9 +215,11 @@ def _of_geometry(
 def fitted_machine(machine: MachineSizes, samples: Samples) -> MachineSizes:
     """The machine with grids, dead band, flow and span from the samples, as its signs are."""
     u, x = samples.column("u"), samples.column("x")
-    speed = _speed(samples)
-    span = _span(samples, x)
-    band = shut_band(u, speed) if machine.safe_band is None else machine.safe_band
+    speed, is_settled = _speed(samples), settled(u, np.asarray(samples.t_us * 1e-6, np.float64))
+    span, at_rest_mps = _span(samples, x), creep(u, speed, is_settled)
+    band = machine.safe_band
+    if band is None:
+        band = shut_band(u, speed, is_settled)
     top = float(np.abs(u).max())
     drops = [
         samples.column(source)[w > band] - samples.column(sink)[w > band]
@@ -232,9 +233,13 @@ def fitted_machine(machine: MachineSizes, samples: Samples) -> MachineSizes:
         u_grid=np.linspace(band, max(top, band + 1e-6) * 1.001, U_STEPS + 1),
         dp_grid_pa=dp_grid(low, high),
         safe_band=band,
-        rated_flow_m3s=rated_flow(machine, samples, speed, band),
+        rated_flow_m3s=rated_flow(machine, samples, np.abs(speed), band),
         spans_s=_teach_and_judge(samples, x, span),
-        assumptions=machine.assumptions + tuple(_of_samples(samples, machine, band, span)),
+        assumptions=(
+            *machine.assumptions,
+            *_of_samples(samples, machine, band, span),
+            *_of_creep(at_rest_mps, speed, machine.goes_round),
+        ),
     )
 
 
@@ -245,7 +250,7 @@ def _of_samples(
     if machine.safe_band is None:
         assumptions.append(Assumption(
             f"the valves are shut up to |u| = {band / machine.command_unit.factor:.3g} "
-            f"{machine.command_unit.name}, half of what it takes to move (--safe-band)",
+            f"{machine.command_unit.name}, half of what it takes to move or less (--safe-band)",
             "a valve that opens earlier passes for a leak",
         ))  # fmt: skip
     if machine.lag_s is None:
@@ -261,6 +266,20 @@ def _of_samples(
             "what happens elsewhere in the record is not seen",
         ))  # fmt: skip
     return assumptions
+
+
+def _of_creep(at_rest_mps: float, speed: FloatArray, goes_round: bool) -> Iterator[Assumption]:
+    """What moves the machine while nothing is commanded; speed (n,): dx/dt, m/s or rad/s."""
+    if abs(at_rest_mps) <= MOVES * float(np.quantile(np.abs(speed), 0.99)):
+        return
+    way = "falls" if at_rest_mps < 0.0 else "rises"
+    how_fast = (
+        f"{abs(at_rest_mps):.3g} rad/s" if goes_round else f"{1e3 * abs(at_rest_mps):.2g} mm/s"
+    )
+    yield Assumption(
+        f"x {way} by {how_fast} while nothing is commanded, as a load does that sinks by a leak",
+        "a valve is open at rest, and no band of the command is shut (--safe-band 0)",
+    )
 
 
 def rated_flow(machine: MachineSizes, samples: Samples, speed: FloatArray, band: float) -> float:
@@ -295,7 +314,7 @@ def _at_full(opening: FloatArray, gain: FloatArray, full: float) -> float:
 
 
 def _speed(samples: Samples) -> FloatArray:
-    """|dx/dt| at every sample (n,), over WINDOW_S."""
+    """dx/dt at every sample (n,), over WINDOW_S."""
     t, x = samples.t_us * 1e-6, samples.column("x")
     rows = np.flatnonzero(samples.flags & ROW)
     if len(rows) < 3:
@@ -304,26 +323,8 @@ def _speed(samples: Samples) -> FloatArray:
     at = rows[::step]
     if len(at) < 2:
         return np.zeros(len(t))
-    speed = np.abs(np.diff(x[at])) / np.maximum(np.diff(t[at]), 1e-9)
+    speed = np.diff(x[at]) / np.maximum(np.diff(t[at]), 1e-9)
     return np.asarray(speed[np.clip(np.searchsorted(at, np.arange(len(t))) - 1, 0, len(speed) - 1)])
-
-
-def shut_band(u: FloatArray, speed: FloatArray) -> float:
-    """Half of the |u| from which on the machine moves, for u > 0 and for u < 0 alike.
-
-    u (n,) in the unit that it was recorded in; speed (n,) in m/s.
-    """
-    top, fast = float(np.abs(u).max()), MOVES * float(np.quantile(speed, 0.99))
-    if top == 0.0 or fast == 0.0:
-        return 0.0
-    bands = []
-    for way in (1, -1):
-        mine = way * u > 0
-        place = np.minimum((way * u[mine] / top * SPEED_BINS).astype(int), SPEED_BINS - 1)
-        shut = speed[mine]
-        moving = [k for k in np.unique(place) if np.median(shut[place == k]) > fast]
-        bands.append(0.5 * top * moving[0] / SPEED_BINS if moving else 0.0)
-    return float(min(bands))
 
 
 def dp_grid(low: float, high: float) -> FloatArray:

@@ -182,9 +182,12 @@ def _left(diagnosis: Diagnosis) -> str:
 
 
 def _one(diagnosis: Diagnosis, effect: FoundEffect) -> str:
-    sizes = ", ".join(
-        f"{name.replace('_', ' ')} {quantity(v)}" for name, v in effect.parameters.items()
-    )
+    known = [f"{name.replace('_', ' ')} {quantity(v)}" for name, v in effect.parameters.items()]
+    known += [
+        f"{name.replace('_', ' ')} not reached: above {limit(v.value, v.unit)}"
+        for name, v in effect.not_reached.items()
+    ]
+    sizes = ", ".join(known)
     before = percent(diagnosis, effect.heldout_residual_before_m3s)
     after = percent(diagnosis, effect.heldout_residual_after_m3s)
     does = hidden(effect) or (
@@ -258,7 +261,13 @@ def _unseen_table(diagnosis: Diagnosis) -> Table:
         if u.examined
     ]
     heads = ("effect", "where", *LIMITS, "remark~")
-    return Table(f"not found. {LIMITS_SAY}", heads, rows[: 3 * SHOWN], keys=2)
+    return Table(f"not found. {limits_say(diagnosis)}", heads, rows[: 3 * SHOWN], keys=2)
+
+
+def limits_say(diagnosis: Diagnosis) -> str:
+    """What the sizes of what was not found mean; beside what is unknown they are of less."""
+    only = " They hold if nothing else were missing." if diagnosis.verdict == UNKNOWN else ""
+    return f"{LIMITS_SAY}{only}"
 
 
 def limits(unseen: Unseen) -> tuple[str, str]:

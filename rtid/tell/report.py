@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 import rtid
 from rtid.diagnose.regression import LIMIT_SD
-from rtid.diagnose.report import Unseen, Value
+from rtid.diagnose.report import Diagnosis, Value
 from rtid.diagnose.trials import GAIN
 from rtid.diagnose.verdict import MATERIAL
 from rtid.effects.page import title
@@ -19,7 +19,7 @@ from rtid.tell.axes import axes_of
 from rtid.tell.charts.dependence import before_and_after
 from rtid.tell.charts.maps import maps, slices
 from rtid.tell.charts.over_time import flows
-from rtid.tell.diagnosed import LIMITS, LIMITS_SAY, heading, limits, remark, sentences
+from rtid.tell.diagnosed import LIMITS, heading, limits, limits_say, remark, sentences
 from rtid.tell.history import history_table
 from rtid.tell.html import rendered
 from rtid.tell.report_page import embedded, key_figures, page_of
@@ -80,7 +80,7 @@ def sections(story: ReportStory) -> tuple[Story, ...]:
         Story("", (parameters(story),)),
         *([Story("Tracking", (story.tracking,))] if story.tracking else []),
         _ranking(story),
-        *_not_found(result.not_found, story.ranking),
+        *_not_found(result, story.ranking),
         *_negligible(story),
         *_history(story.history),
         _provenance(story),
@@ -244,11 +244,11 @@ def _candidate(ranked: Ranked) -> tuple[str, ...]:
     return title(ranked.key[0]), ranked.key[1], before, after, value, seen_from
 
 
-def _not_found(unseen: tuple[Unseen, ...], ranking: tuple[Ranked, ...]) -> tuple[Story, ...]:
+def _not_found(result: Diagnosis, ranking: tuple[Ranked, ...]) -> tuple[Story, ...]:
     """What was not found with its detection limits, and what the record cannot show."""
     clear = {r.key: r for r in ranking if r.after is not None and r.after > LIMIT_SD}
-    seen = [u for u in unseen if u.visible and u.detection_limit is not None]
-    hidden = [u for u in unseen if u not in seen]
+    seen = [u for u in result.not_found if u.visible and u.detection_limit is not None]
+    hidden = [u for u in result.not_found if u not in seen]
     rows = [
         (
             title(u.effect),
@@ -260,7 +260,7 @@ def _not_found(unseen: tuple[Unseen, ...], ranking: tuple[Ranked, ...]) -> tuple
     ]
     blind = [(title(u.effect), u.where, u.reason) for u in hidden]
     head = ("effect", "where", *LIMITS, "remark")
-    parts: list[StoryPart] = [LIMITS_SAY, Table("", head, rows)]
+    parts: list[StoryPart] = [limits_say(result), Table("", head, rows)]
     if hidden:
         parts.append(Table("What this record cannot show", ("effect", "where", "why"), blind))
     return (Story("Looked for and not found", tuple(parts)),)

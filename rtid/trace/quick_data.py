@@ -43,15 +43,20 @@ class Point:
     remedy: str = ""
 
 
-def points(model: Machine, trace: Recording, report: Report) -> list[Point]:
-    """Everything that speaks for or against a record, in the order of reading."""
+def points(
+    model: Machine, trace: Recording, report: Report, supply_is_given: bool = False
+) -> list[Point]:
+    """Everything that speaks for or against a record, in the order of reading.
+
+    supply_is_given: its pressure, which no sensor tells, by the user.
+    """
     return [
         *_size(trace, report),
         *_frozen(trace),
         *_objections(trace, report),
         *_ends(model, trace),
         *_coverage(report),
-        *_excitation(model, trace),
+        *_excitation(model, trace, supply_is_given),
     ]
 
 
@@ -137,7 +142,7 @@ def _coverage(report: Report) -> Iterator[Point]:
         yield Point(GOOD, f"blocks with enough data, by valve: {text}")
 
 
-def _excitation(model: Machine, trace: Recording) -> Iterator[Point]:
+def _excitation(model: Machine, trace: Recording, supply_is_given: bool) -> Iterator[Point]:
     samples = trace.samples
     u = samples.column("u")
     band = model.edges[0].safe_band_v
@@ -157,7 +162,8 @@ def _excitation(model: Machine, trace: Recording) -> Iterator[Point]:
     swing = float(np.ptp(np.quantile(supply, [0.01, 0.99]))) / max(float(np.mean(supply)), 1.0)
     if swing == 0.0:
         text = "nothing tells what the supply does: a sag, and external leaks, may hide in the maps"
-        yield Point(FAIR, text, "log its pressure, or say it with --supply MPA")
+        or_say = "" if supply_is_given else ", or say it with --supply MPA"
+        yield Point(FAIR, text, f"log its pressure{or_say}")
     elif swing < VARIED:
         text = f"the supply stays within {100 * swing:.1f} %: external leaks may hide in the maps"
         yield Point(FAIR, text, "record part of the motion at another supply pressure")

@@ -16,11 +16,11 @@ from rtid.effects.page import EffectError, readable, title
 from rtid.tell.charts.theme import NARROWEST_PX, beside
 from rtid.tell.diagnosed import (
     LIMITS,
-    LIMITS_SAY,
     floored,
     hidden,
     judged,
     limits,
+    limits_say,
     percent,
     remark,
     seen_and_not_named,
@@ -202,11 +202,11 @@ def _unseen(diagnosis: Diagnosis) -> list[str]:
     """Detection limits, and what the record cannot show."""
     listed = () if diagnosis.verdict == "insufficient_data" else diagnosis.not_found
     seen = [u for u in listed if u.visible and u.detection_limit is not None]
-    blind = [u for u in diagnosis.not_found if not u.visible]
+    blind = [u for u in diagnosis.not_found if not u.visible or u.detection_limit is None]
     head = ("effect", "where", *LIMITS, "remark")
     parts = []
     if seen:
-        says = f'<p class="says">{text(LIMITS_SAY)}</p>'
+        says = f'<p class="says">{text(limits_say(diagnosis))}</p>'
         rows = [(*_place(u), *map(text, limits(u)), text(remark(u))) for u in seen]
         parts.append(f"<h3>Looked for and not found</h3>{says}{table(head, rows)}")
     if blind:

@@ -10,7 +10,7 @@ import numpy as np
 from rtid.effects.column import Cause, of_page
 from rtid.effects.law import Shape, Volumes
 from rtid.effects.laws.common import supply_change
-from rtid.effects.laws.pump import demand, drawn_down
+from rtid.effects.laws.pump import demand, drawn_down, usual_demand
 from rtid.effects.page import Effect
 from rtid.effects.record_view import RecordView
 
@@ -27,7 +27,8 @@ def supply(view: RecordView, effect: Effect) -> Iterator[Cause]:
     if not view.supply_name:
         return
     drawn = demand(view)
-    flows = drawn[drawn > 0]
+    flows = usual_demand(view)
+    flows = flows[flows > 0]
     is_open = len(flows) > 0 and not view.supply_is_measured
 
     def droop(shape: Shape) -> Volumes:

@@ -1,0 +1,83 @@
+"""Up to which command valves are shut, and what moves a machine at rest, from motion alone.
+
+The valves are shut where the motion does not depend on the command: it is that at rest, which a
+leak under load makes a creep.  Where the command has just been larger the machine still runs on.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rtid.plain import BoolArray, FloatArray
+
+MOVES = 0.02  # of the top speed: below, the machine stands
+WELL = 4.0  # times as fast, and as fast again: how the speed rises beyond the opening
+STRAIGHT = 3.5  # times further to the next of them: 4 where it rises straight, 2 as a square
+BINS = 80  # of the command
+STILL_BINS = 2  # by which a command may have been larger just before
+SETTLES_S = 0.1  # of just before: a machine that runs on stops within
+HALF, LEAST = 0.5, 0.125  # of the command where motion begins; the least, of where it is seen
+
+
+def settled(u: FloatArray, t_s: FloatArray) -> BoolArray:
+    """Where the command (n,) has not been larger just before, by more than some bins; t_s (n,)."""
+    from scipy.ndimage import maximum_filter1d  # noqa: PLC0415 - takes long to import
+
+    size, long_s = np.abs(u), float(t_s[-1] - t_s[0]) if len(t_s) else 0.0
+    n = max(1, round(SETTLES_S * len(t_s) / long_s)) if long_s > 0.0 else 1
+    before = maximum_filter1d(size, min(n, len(u)), origin=(min(n, len(u)) - 1) // 2)
+    return np.asarray(before <= size + STILL_BINS * size.max(initial=0.0) / BINS)
+
+
+def creep(u: FloatArray, speed: FloatArray, is_settled: BoolArray | None = None) -> float:
+    """The speed at rest, m/s: of next to no command; 0 where there is no rest.
+
+    u (n,); speed (n,): dx/dt, m/s.
+    """
+    rests = np.abs(u) < float(np.abs(u).max(initial=0.0)) / BINS
+    rests &= True if is_settled is None else is_settled
+    return float(np.median(speed[rests])) if rests.any() else 0.0
+
+
+def shut_band(u: FloatArray, speed: FloatArray, is_settled: BoolArray | None = None) -> float:
+    """A |u| up to which the motion is surely that at rest, for u > 0 and for u < 0 alike.
+
+    u (n,) in the unit that it was recorded in; speed (n,): dx/dt, m/s, of either sign.
+    """
+    top = float(np.abs(u).max(initial=0.0))
+    fast = float(np.quantile(np.abs(speed), 0.99)) if len(u) else 0.0
+    if top == 0.0 or fast == 0.0:
+        return 0.0
+    beyond = (speed - creep(u, speed, is_settled)) / fast
+    usable = np.ones(len(u), bool) if is_settled is None else is_settled
+    return min(HALF * _begins(way * u / top, beyond, usable) for way in (1, -1)) * top
+
+
+def _begins(w: FloatArray, beyond: FloatArray, usable: BoolArray) -> float:
+    """The share of the largest command at which motion of one way begins, or one below it.
+
+    w (n,): command as such a share; beyond (n,): speed beyond that at rest, of the top speed.
+    Where the speed rises straight, motion is seen as it begins.  Where it rises as the square of
+    what is beyond the opening, two speeds tell that: a joystick's ramps left 2 % of the top speed
+    at 4 times the opening.  Bins that few samples pass are pooled with those beside them.
+    """
+    mine, forward = (w > 0.0) & usable, w > 0.0
+    if not mine.any():
+        return 0.0
+    way = np.sign(np.sum(w[forward] * beyond[forward]))
+    place = np.minimum((w[mine] * BINS).astype(int), BINS - 1)
+    bins, median = _rising(place, way * beyond[mine])
+    at = [bins[median > MOVES * WELL**k][:1] / BINS for k in range(3)]
+    seen, *more = [float(first[0]) for first in at if len(first)] or [0.0]
+    if not more or (len(more) == 2 and more[1] - more[0] >= STRAIGHT * (more[0] - seen)):
+        return seen
+    return max(2.0 * seen - more[0], LEAST / HALF * seen)
+
+
+def _rising(place: FloatArray, speed: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Bins (k,) that hold any of `place` (n,), and their speeds (k,), as they rise with the bin."""
+    from scipy.optimize import isotonic_regression  # noqa: PLC0415 - takes long to import
+
+    bins, count = np.unique(place, return_counts=True)
+    median = [np.median(speed[place == k]) for k in bins]
+    return bins, np.asarray(isotonic_regression(median, weights=count).x)
