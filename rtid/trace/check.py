@@ -16,6 +16,7 @@ from rtid.trace.arrivals import GAP_PERIODS, Timing, timing
 from rtid.trace.between import FASTEST_S, unknown_between
 from rtid.trace.coverage import Coverage, coverage
 from rtid.trace.plausible import Motion, looks_like, motion
+from rtid.trace.repeated import SENSORS, rows_per_value
 from rtid.trace.series import Series, SignalReport, describe
 from rtid.trace.spikes import SPIKE
 from rtid.units import limit, units_of, with_unit
@@ -210,6 +211,7 @@ def _signals(
             yield _error(item.name, "has no value at all", "check the signal's place in the DBC")
             continue
         yield from _values(signal, item, report)
+        yield from _repeats(signal, item)
         yield from _noise(signal, report)
 
 
@@ -231,6 +233,17 @@ def _values(signal: Signal, series: Series, report: SignalReport) -> Iterator[Fi
     elif signal.kind != "command" and report.frozen_s > 0 and report.noise > report.step:
         text = f"is frozen for {report.frozen_s:.3g} s from {report.frozen_from_s:.3g} s on"
         yield _error(signal.name, text, "leave this part out of [record]; check the sensor")
+
+
+def _repeats(signal: Signal, series: Series) -> Iterator[Finding]:
+    """A sensor that is slower than the rows in which it is written."""
+    known = np.isfinite(series.value)
+    rows = rows_per_value(series.value[known]) if signal.kind in SENSORS else 1.0
+    if rows > 1.0:
+        every_s = rows * 1e-6 * float(np.median(np.diff(series.t_us[known])))
+        text = f"is sent every {_ms(every_s)} and repeated: rows where it changes"
+        remedy = "log it at its own instants, or as often as the others"
+        yield _warning(signal.name, text, remedy)
 
 
 def _shown(value: float, signal: Signal) -> str:

@@ -29,6 +29,7 @@ from rtid.trace.late_stamps import frames_in_time, rows_in_time
 from rtid.trace.measured import with_sums
 from rtid.trace.neutral import about_neutral
 from rtid.trace.own_instants import of_log, of_table
+from rtid.trace.repeated import REPEATED, where_sent
 from rtid.trace.series import Series
 from rtid.trace.spikes import without_spikes
 from rtid.trace.table import declared
@@ -140,9 +141,14 @@ def noise_of(project: Project, series: Iterable[Series]) -> dict[str, NoiseEstim
 def whole(
     project: Project, samples: Samples, counters: dict[str, int]
 ) -> tuple[Samples, dict[str, int]]:
-    """The samples of a record that can be looked at as a whole: without those that spike."""
+    """The samples of a record that can be looked at as a whole: without those that spike.
+
+    With rows where sensors are sent that the others repeat.
+    """
     rest, spiked = without_spikes(project.model, samples)
     add_counts(counters, spiked)
+    rest, repeats = where_sent(project.model, rest)
+    add_counts(counters, {REPEATED: repeats})
     return rest, counters
 
 
