@@ -19,7 +19,8 @@ from firmware_bridge.sources import open_file, open_log
 from firmware_bridge.sources.table import Table, to_samples
 from rtid.errors import RtidError, door
 from rtid.estimator.chunk import to_chunk
-from rtid.estimator.noise import NoiseEstimate, estimate_noise
+from rtid.estimator.coloured import sensor_noise
+from rtid.estimator.noise import NoiseEstimate
 from rtid.model import Machine
 from rtid.plain import FloatArray
 from rtid.project import Project
@@ -135,7 +136,9 @@ def noise_of(project: Project, series: Iterable[Series]) -> dict[str, NoiseEstim
     if not project.noise_unknown:  # then nothing need be decoded
         return {}
     asked = (s for s in series if s.name in project.noise_unknown)
-    return {s.name: estimate_noise(1e-6 * s.t_us, s.value) for s in asked}
+    return {
+        s.name: sensor_noise(project.model, s.name, 1e-6 * s.t_us, s.value).noise for s in asked
+    }
 
 
 def whole(

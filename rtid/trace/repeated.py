@@ -17,11 +17,10 @@ import numpy as np
 
 from firmware_bridge.samples import GAP, ROW, Samples
 from rtid.estimator.noise import HELD_SHARE, SINGLE_RUNS, resolution_of
-from rtid.model import POSITION, PRESSURE, VELOCITY, Machine
+from rtid.model import SENSORS, Machine
 from rtid.plain import FloatArray, IntArray
 
 REPEATED = "repeated"  # counter of the samples that are rows no longer
-SENSORS = (POSITION, PRESSURE, VELOCITY)  # a command acts until the next one
 BY_STEPS = 3.0  # steps of the sensor that a value jumps by at least, where it tells of repeats
 FEWEST = 100  # runs between two such jumps, to learn by them
 ALIKE = 0.9  # share of these runs that are of one length, give or take a row
