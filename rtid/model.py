@@ -23,6 +23,7 @@ import numpy as np
 from rtid.plain import FloatArray
 
 COMMAND, PRESSURE, POSITION, VELOCITY = "command", "pressure", "position", "velocity"
+SENSORS = (POSITION, PRESSURE, VELOCITY)
 MODE = "mode"  # kind of the signal that carries the number of the working mode
 OTHER = "other"  # kind of a signal of any other quantity: a force, a temperature
 TAYLOR, LAPPED, BLENDED, PROPORTIONAL = BASES = "taylor", "lapped", "blended", "proportional"

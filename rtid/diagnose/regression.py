@@ -119,7 +119,7 @@ class Regression:
         if _is_positive((most * plain - noise) * outer):  # quicker than to know the share
             return noise
         # the largest share that noise has of any combination of the columns
-        share = float(eigh(noise * outer, plain * outer, eigvals_only=True)[-1])
+        share = _largest_share(noise * outer, plain * outer)
         return noise * min(1.0, most / share) if share > 0.0 else noise
 
     def rho(self, estimate: Estimate) -> float:
@@ -145,6 +145,17 @@ class Regression:
         cross = self.s[at, column]
         gram = self.s[at[:, None], at] + np.diag(self.prior[at] + 1e-300)
         return float(square - cross @ np.linalg.solve(gram, cross))
+
+
+def _largest_share(part: FloatArray, whole: FloatArray) -> float:
+    """The largest ratio of two quadratic forms (n, n), the second of diagonal 1.
+
+    Where that is none but for rounding, as of columns that nearly follow one another, it has a
+    floor.
+    """
+    squares, ways = eigh(whole)
+    ways /= np.sqrt(np.maximum(squares, VANISHED * max(1.0, float(squares[-1]))))
+    return float(eigh(ways.T @ part @ ways, eigvals_only=True)[-1])
 
 
 def _is_positive(matrix: FloatArray) -> bool:

@@ -172,8 +172,7 @@ def _floor(spacing: _Spacing, values: FloatArray, order: int) -> _Floor | None:
     if len(squares) < FEWEST:
         return None
     squares = _of_a_sensor(squares, values)
-    # A correlated sum of squares scatters like one of fewer, independent ones.
-    correlation = comb(4 * order, 2 * order) / comb(2 * order, order) ** 2
+    correlation = _correlation(order)
     dof = WINDOW / correlation
     floor = float(np.quantile(squares, QUIET)) * dof / _chi2(QUIET, dof)
     quiet = squares
@@ -184,6 +183,33 @@ def _floor(spacing: _Spacing, values: FloatArray, order: int) -> _Floor | None:
             break
     n = len(quiet) * WINDOW
     return _Floor(float(np.sqrt(floor)), float(np.sqrt(correlation / (2 * max(n, 1)))), n)
+
+
+def quantile_levels(
+    t_s: FloatArray,
+    values: FloatArray,
+    order: int,
+    stride: int,
+    shares: Sequence[float],
+    fewest: int,
+) -> FloatArray:
+    """Noise of values (n,) at t_s (n,), s, that quantiles of the windows tell, one by one.
+
+    By order-th differences of samples a stride apart, all of them; shares (m,) of the windows lie
+    below the quantiles.  NaN where there are not so many windows.
+    """
+    parts = (slice(begin, None, stride) for begin in range(stride))
+    squares = np.concatenate([_windows(_Spacing.of(t_s[p]), values[p], order) for p in parts])
+    if len(squares) < fewest * stride:
+        return np.full(len(shares), np.nan)
+    dof = WINDOW / _correlation(order)
+    told = [float(np.quantile(squares, share)) * dof / _chi2(share, dof) for share in shares]
+    return np.sqrt(told)
+
+
+def _correlation(order: int) -> float:
+    """Times fewer: independent squares that scatter like the correlated ones of a window."""
+    return comb(4 * order, 2 * order) / comb(2 * order, order) ** 2
 
 
 def _of_a_sensor(squares: FloatArray, values: FloatArray) -> FloatArray:

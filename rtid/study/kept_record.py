@@ -18,9 +18,10 @@ from firmware_bridge.config import Assembly
 from firmware_bridge.samples import Samples
 from rtid.errors import RtidError
 from rtid.estimator.chunk import to_chunk
+from rtid.estimator.coloured import sensor_noise
 from rtid.estimator.estimator import Estimator
 from rtid.estimator.flowmap import FlowMap
-from rtid.estimator.noise import NoiseEstimate, estimate_noise
+from rtid.estimator.noise import NoiseEstimate
 from rtid.estimator.record import RecordFit, fit_record
 from rtid.maps.prior_map import find_prior, published
 from rtid.model import Machine, Signal
@@ -128,11 +129,13 @@ def model_for(
     if not unknown:
         return model
     return model.with_noise(
-        {s.name: _white_noise(samples, s, measured.get(s.name)) for s in unknown}
+        {s.name: _white_noise(model, samples, s, measured.get(s.name)) for s in unknown}
     )
 
 
-def _white_noise(samples: Samples, signal: Signal, measured: NoiseEstimate | None) -> float:
+def _white_noise(
+    model: Machine, samples: Samples, signal: Signal, measured: NoiseEstimate | None
+) -> float:
     """Noise of one signal beside its quantisation, which the model counts separately.
 
     By the samples alone one that is read off a line between two messages has none: healthy logs
@@ -141,7 +144,7 @@ def _white_noise(samples: Samples, signal: Signal, measured: NoiseEstimate | Non
     values = samples.column(signal.name)
     if signal.resolution and len(values) and np.ptp(values) < signal.resolution:
         return 0.0  # it stays within one step
-    result = measured or estimate_noise(1e-6 * samples.t_us, values)
+    result = measured or sensor_noise(model, signal.name, 1e-6 * samples.t_us, values).noise
     if not np.isfinite(result.relative_sd):
         raise NoSamplesError(
             f"{len(samples)} samples do not tell the noise of {signal.name}",

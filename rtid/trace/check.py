@@ -11,11 +11,13 @@ import numpy as np
 from firmware_bridge.config import Assembly
 from firmware_bridge.samples import Samples
 from firmware_bridge.sources.table import APART
-from rtid.model import Machine, Signal
+from rtid.estimator.coloured import Coloured, sensor_noise
+from rtid.model import SENSORS, Machine, Signal
 from rtid.trace.arrivals import GAP_PERIODS, Timing, timing
 from rtid.trace.between import FASTEST_S, unknown_between
 from rtid.trace.coverage import Coverage, coverage
 from rtid.trace.plausible import Motion, looks_like, motion
+from rtid.trace.repeated import rows_per_value
 from rtid.trace.series import Series, SignalReport, describe
 from rtid.trace.spikes import SPIKE
 from rtid.units import limit, units_of, with_unit
@@ -210,7 +212,10 @@ def _signals(
             yield _error(item.name, "has no value at all", "check the signal's place in the DBC")
             continue
         yield from _values(signal, item, report)
-        yield from _noise(signal, report)
+        yield from _repeats(signal, item)
+        noise = sensor_noise(model, item.name, 1e-6 * item.t_us, item.value)
+        yield from _filtered(signal, noise)
+        yield from _noise(signal, replace(report, noise=noise.noise.sd))
 
 
 def _values(signal: Signal, series: Series, report: SignalReport) -> Iterator[Finding]:
@@ -231,6 +236,26 @@ def _values(signal: Signal, series: Series, report: SignalReport) -> Iterator[Fi
     elif signal.kind != "command" and report.frozen_s > 0 and report.noise > report.step:
         text = f"is frozen for {report.frozen_s:.3g} s from {report.frozen_from_s:.3g} s on"
         yield _error(signal.name, text, "leave this part out of [record]; check the sensor")
+
+
+def _filtered(signal: Signal, noise: Coloured) -> Iterator[Finding]:
+    """A sensor whose noise is that of a low-pass filter."""
+    if noise.is_filtered:
+        at = f" at about {noise.filtered_hz:.2g} Hz" if noise.filtered_hz else ""
+        text = f"was filtered{at}: its noise is taken for {_shown(noise.noise.sd, signal)}"
+        remedy = "log it unfiltered: what the filter delays is taken for a delay of the command"
+        yield _warning(signal.name, text, remedy)
+
+
+def _repeats(signal: Signal, series: Series) -> Iterator[Finding]:
+    """A sensor that is slower than the rows in which it is written."""
+    known = np.isfinite(series.value)
+    rows = rows_per_value(series.value[known]) if signal.kind in SENSORS else 1.0
+    if rows > 1.0:
+        every_s = rows * 1e-6 * float(np.median(np.diff(series.t_us[known])))
+        text = f"is sent every {_ms(every_s)} and repeated: rows where it changes"
+        remedy = "log it at its own instants, or as often as the others"
+        yield _warning(signal.name, text, remedy)
 
 
 def _shown(value: float, signal: Signal) -> str:

@@ -19,7 +19,8 @@ from firmware_bridge.sources import open_file, open_log
 from firmware_bridge.sources.table import Table, to_samples
 from rtid.errors import RtidError, door
 from rtid.estimator.chunk import to_chunk
-from rtid.estimator.noise import NoiseEstimate, estimate_noise
+from rtid.estimator.coloured import sensor_noise
+from rtid.estimator.noise import NoiseEstimate
 from rtid.model import Machine
 from rtid.plain import FloatArray
 from rtid.project import Project
@@ -29,6 +30,7 @@ from rtid.trace.late_stamps import frames_in_time, rows_in_time
 from rtid.trace.measured import with_sums
 from rtid.trace.neutral import about_neutral
 from rtid.trace.own_instants import of_log, of_table
+from rtid.trace.repeated import REPEATED, where_sent
 from rtid.trace.series import Series
 from rtid.trace.spikes import without_spikes
 from rtid.trace.table import declared
@@ -134,15 +136,22 @@ def noise_of(project: Project, series: Iterable[Series]) -> dict[str, NoiseEstim
     if not project.noise_unknown:  # then nothing need be decoded
         return {}
     asked = (s for s in series if s.name in project.noise_unknown)
-    return {s.name: estimate_noise(1e-6 * s.t_us, s.value) for s in asked}
+    return {
+        s.name: sensor_noise(project.model, s.name, 1e-6 * s.t_us, s.value).noise for s in asked
+    }
 
 
 def whole(
     project: Project, samples: Samples, counters: dict[str, int]
 ) -> tuple[Samples, dict[str, int]]:
-    """The samples of a record that can be looked at as a whole: without those that spike."""
+    """The samples of a record that can be looked at as a whole: without those that spike.
+
+    With rows where sensors are sent that the others repeat.
+    """
     rest, spiked = without_spikes(project.model, samples)
     add_counts(counters, spiked)
+    rest, repeats = where_sent(project.model, rest)
+    add_counts(counters, {REPEATED: repeats})
     return rest, counters
 
 

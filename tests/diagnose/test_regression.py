@@ -87,3 +87,14 @@ def test_columns_of_any_size_are_fitted(scale: float) -> None:
     estimate = r.fit((1, 2))
     assert estimate.value(1) == pytest.approx(1.0, abs=0.2)
     assert np.isfinite(estimate.sse)
+
+
+def test_noise_beside_columns_that_follow_one_another_is_bounded() -> None:
+    """Rows that were whitened by far too little noise ended in "B is not positive definite"."""
+    rng = np.random.default_rng(5)
+    a, y = rng.standard_normal((2, 1000))
+    r = regression(y, np.column_stack([a, a, a]), np.array([0.5, 0.5, 0.0]))
+    r.s[1, 2] = r.s[2, 1] = r.s[1, 1] * (1.0 + 1e-9)  # as rounding leaves them
+    estimate = r.fit((1, 2))
+    assert np.isfinite(estimate.theta).all() and np.isfinite(estimate.cov).all()
+    assert np.isfinite(r.noise_of([1, 2, 3])).all()
