@@ -28,7 +28,7 @@ from rtid.effects import catalogue
 from rtid.effects.column import Candidate
 from rtid.effects.law import is_of_rates
 from rtid.effects.laws.lines import LINE, inertance
-from rtid.effects.laws.timing import COMMAND, RATE
+from rtid.effects.laws.timing import COMMAND, OF_COMMAND, RATE, command_times
 from rtid.effects.page import ZERO, correcting
 from rtid.estimator.validity import Doubt
 from rtid.plain import Key, plain
@@ -389,7 +389,8 @@ def _sized(fit: Fit, candidate: Candidate, coefficient: float) -> tuple[float, s
         size, (unit,) = _of_timing(candidate, size), candidate.shape_units
         pages = catalogue()[candidate.effect].parameters
         (page,) = [p for p in pages if p.name in candidate.shape_names]
-        is_possible = page.low < size if page.unit == RATE else size < page.high
+        high = page.high * (command_times(fit.declared) if page.unit == OF_COMMAND else 1.0)
+        is_possible = page.low < size if page.unit == RATE else size < high
         return size, fit.declared.unit_here(unit), is_possible
     return size, fit.declared.unit_here(unit), size < candidate.largest
 
