@@ -26,7 +26,7 @@ from rtid.diagnose.verdict import MATERIAL, UNKNOWN
 from rtid.diagnose.zeros import Zero, by_chance
 from rtid.effects import catalogue
 from rtid.effects.column import Candidate
-from rtid.effects.law import is_of_rates
+from rtid.effects.law import LENGTH, fitted_names, is_of_rates
 from rtid.effects.laws.lines import LINE, inertance
 from rtid.effects.laws.timing import COMMAND, OF_COMMAND, RATE, command_times
 from rtid.effects.page import ZERO, correcting
@@ -42,6 +42,7 @@ WORTH = 2.0  # times better that an experiment must be to be proposed
 NOBODY_LOOKED = "Not examined: the diagnosis has no column for it here."
 NOT_CONFIRMED = "not confirmed: what the maps' blocks miss may look like it in this record"
 HYDRAULIC = ("flow", "storage", "timing", "supply", "map")
+OVER = "over"  # beside a change: the time in which it is so large
 
 
 @dataclass(frozen=True)
@@ -293,7 +294,16 @@ def parameters(fit: Fit, key: Key) -> dict[str, Value]:
                 values[name] = Value(effect.shape[k], sd, here(effect.shape_units[k]))
             if effect.law.law == LINE:
                 values |= _inertance(fit, effect, values)
+            values |= _over(fit, effect)
     return values
+
+
+def _over(fit: Fit, effect: Candidate) -> dict[str, Value]:
+    """The time over which a change is told, that of the record that has taught it."""
+    if LENGTH not in fitted_names(effect.law):
+        return {}
+    t_s = fit.view.t_s
+    return {OVER: Value(float(t_s[-1] - t_s[0]), float("nan"), "s")}
 
 
 def _inertance(fit: Fit, line: Candidate, values: dict[str, Value]) -> dict[str, Value]:
@@ -349,7 +359,7 @@ def _limit(result: Result, candidate: Candidate, score: Score) -> Unseen:
     largest = max(float(limit), taken) if is_possible else None
     named = max(float(named_from), taken) if may_be and known else None
     key = candidate.effect, candidate.where
-    at = _form(candidate)
+    at = _form(candidate) | _over(result.last, candidate)
     return Unseen(*key, largest, unit, bool(visible), reason, named_from=named, form=at)
 
 
