@@ -8,7 +8,7 @@ from rtid.diagnose.clean import Cut
 from rtid.diagnose.fit import MATCH_RHO
 from rtid.diagnose.regression import LIMIT_SD
 from rtid.diagnose.remains import FOLLOWS_NONE
-from rtid.diagnose.report import NOT_CONFIRMED, OVER, Diagnosis, FoundEffect, Unseen, Value
+from rtid.diagnose.report import NO_SIZE, NOT_CONFIRMED, OVER, Diagnosis, FoundEffect, Unseen, Value
 from rtid.diagnose.verdict import INSUFFICIENT, MATCHES, MATERIAL, UNKNOWN
 from rtid.effects.page import title
 from rtid.tell.story import Chart, Story, Table
@@ -67,7 +67,12 @@ def seen_and_not_named(diagnosis: Diagnosis) -> list[str]:
     how = "Too small to matter, if there at all"
     if diagnosis.verdict == INSUFFICIENT:
         how = "Seen, but too small on this motion to be sized"
-    lines = {how: small, "Seen, not confirmed, as what the maps miss may look like it": large}
+    sizeless = [named((u.effect, u.where)) for u in diagnosis.not_found if u.reason == NO_SIZE]
+    lines = {
+        how: small,
+        "Seen, not confirmed, as what the maps miss may look like it": large,
+        "Beside what was found, of a size that may as well be zero": ", ".join(sizeless),
+    }
     return [f"{words}: {which}." for words, which in lines.items() if which]
 
 
