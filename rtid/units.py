@@ -253,8 +253,11 @@ def scale_of(unit: str) -> Scale:
 
 
 def with_unit(value: float, unit: str, sd: float = math.nan) -> str:
-    """A value with its 95 % interval, where sd is known, and its unit; both are given in SI."""
-    scale = scale_of(unit)
+    """A value with its 95 % interval, where sd is known, and its unit; both are given in SI.
+
+    Long times stay in s.
+    """
+    scale = Scale(unit, 1.0) if unit == "s" and abs(value) >= 1.0 else scale_of(unit)
     spread = f" ± {_digits(Z95 * scale.factor * sd)}" if math.isfinite(sd) else ""
     name = "" if unit in ("", "1") else f" {scale.name}"
     return f"{scale.factor * value:.4g}{spread}{name}"

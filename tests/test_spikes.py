@@ -125,6 +125,22 @@ def test_a_peak_on_lines_between_slow_messages_is_kept(model: Machine) -> None:
     assert without_spikes(model, Samples(("p_a",), t_us, column[:, None], flags))[1] == {}
 
 
+@pytest.mark.parametrize("every", [1, 2])
+def test_a_peak_of_the_oil_is_kept_and_a_spike_on_it_is_not(model: Machine, every: int) -> None:
+    """A valve that shuts hard rings at 70 Hz in a record that is quiet else: 20 MPa for 12."""
+    t_s = 1e-3 * np.arange(0, 20_000, every)
+    since = t_s - 10.0
+    ring = 5e6 * np.exp(-since / 0.03) * (1.0 - np.cos(440.0 * since))
+    noise = 1e4 * np.random.default_rng(0).standard_normal(len(t_s))
+    column = 12e6 + 1e6 * np.sin(t_s) + np.where(since > 0.0, ring, 0.0) + noise
+    t_us, flags = np.round(1e6 * t_s).astype(np.int64), np.full(len(t_s), ROW, np.uint8)
+    assert without_spikes(model, Samples(("p_a",), t_us, column[:, None], flags))[1] == {}
+    top = int(np.argmax(column))
+    column[top] = 0.0
+    rest, counts = without_spikes(model, Samples(("p_a",), t_us, column[:, None], flags))
+    assert t_us[top] not in rest.t_us and counts[SPIKE] < 12, "and what is left of that peak"
+
+
 def test_what_has_ever_smaller_spikes_ends(model: Machine) -> None:
     """Each pass shows what is usual anew; a few of them are enough, whatever is left."""
     t_us = 1000 * np.arange(20_000)

@@ -16,11 +16,12 @@ import numpy as np
 from rtid.diagnose.fit import Fit, one_pass
 from rtid.diagnose.regression import LIMIT_SD
 from rtid.effects.column import Candidate
+from rtid.effects.laws.timing import command_times
 from rtid.plain import FloatArray, Key
 
 SWING, RATES_HZ = 0.2, (0.03, 0.11)  # of the supply
 STEEP = 0.05  # of the largest dQ/du: a command that hardly opens its valve is left alone
-MOST_V = 2.0  # that the command is moved by
+MOST = 2.0  # that a command of 10 V is moved by, and others by as much of theirs
 
 FLOW = "flow"  # kind of an effect
 AT_REST_S = 1.0  # with all valves shut: enough to tell a leak from a map
@@ -41,7 +42,7 @@ def varied_supply(fit: Fit) -> FloatArray | None:
     supply = 2 + declared.column(view.supply_name)
     t_s = chunk[:, 0] - chunk[0, 0]
     wander = sum(np.sin(2 * np.pi * rate * t_s) for rate in RATES_HZ) / len(RATES_HZ)
-    rise = SWING * np.median(chunk[:, supply]) * wander
+    most, rise = MOST * command_times(declared), SWING * np.median(chunk[:, supply]) * wander
     chunk[:, supply] += rise
     for i, edge in enumerate(declared.edges):
         if edge.source == view.supply_name:
@@ -51,7 +52,7 @@ def varied_supply(fit: Fit) -> FloatArray | None:
                 steep, slope, 1.0
             )
             command = 2 + declared.column(edge.command)
-            chunk[:-1, command] += edge.direction * np.clip(moved, -MOST_V, MOST_V)
+            chunk[:-1, command] += edge.direction * np.clip(moved, -most, most)
     return chunk
 
 

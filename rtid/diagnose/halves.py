@@ -30,7 +30,7 @@ FAIR = 0.1  # of a column's square, that half of a record must have of it to tel
 def between_halves(fitted: Fit, column: int) -> tuple[float, float]:
     """What a column's coefficient is more in its first half, and the deviation of that.
 
-    fitted: without a bank.  The deviation is inf where one row holds half of the column.
+    The deviation is inf where one row holds half of the column.
     """
     given = fitted.model, fitted.sent, fitted.weights
     rows = fitted.rows or rows_of(*given, soft=softened(*given, fitted.revision))
@@ -50,7 +50,7 @@ def between_halves(fitted: Fit, column: int) -> tuple[float, float]:
     beside = regression_of(
         fitted.model, fitted.weights, fitted.revision, projected, columns, rows, known.dof
     )
-    beside.prior[: len(known.prior)], beside.mean[: len(known.mean)] = known.prior, known.mean
+    beside.prior[:at], beside.mean[:at] = known.prior[:at], known.mean[:at]  # none is of a bank
     both = beside.fit((*fitted.estimate.used, at))
     return both.value(at), both.sd(at) * float(np.sqrt(max(1.0, fitted.rho)))
 

@@ -175,7 +175,9 @@ def _axis(view: RecordView, p: Parameter) -> Shape:
     """Values of a nonlinear parameter to begin with."""
     if p.over:
         seen = view.seen.value(p.over)
-        return tuple(float(v) for v in np.linspace(seen.min(), seen.max(), p.count))
+        low, high = float(seen.min()), float(seen.max())
+        shares = np.clip((high - low) * np.array(p.shares), p.low, p.high)
+        return tuple((shares if p.shares else np.linspace(low, high, p.count)).tolist())
     if p.start:
         return p.start
     spread = np.geomspace if p.low > 0 else np.linspace

@@ -58,7 +58,8 @@ class Parameter:
     """A parameter: SI unit, plausible range [low, high], sign of a possible value (0: either).
 
     start: where a search for a nonlinear one begins; it is held at a single value.  over: the start
-    is `count` values over the range that this signal has in the record, at least `least` wide.
+    is `count` values over the range that this signal has in the record, at least `least` wide, or
+    `shares` of its width, as far as they are plausible.
     size, plant_unit: what sets its size in a plant by equations, and its unit there.
     """
 
@@ -73,6 +74,7 @@ class Parameter:
     over: str = ""
     count: int = 0
     least: float = 0.0
+    shares: tuple[float, ...] = ()
     size: str = ""
     plant_unit: str = ""
 
@@ -267,11 +269,14 @@ def _read(name: str, page: dict[str, Any], common: dict[str, str]) -> Effect:
 
 
 def _parameter(entry: dict[str, Any]) -> Parameter:
-    """start: values; {from, to, count}, each a factor above the last; or {over, count, least}."""
+    """start: values; {from, to, count}, each a factor above the last; or {over, count, least}.
+
+    Or {over, shares}.
+    """
     entry = dict(entry)
     start = entry.pop("start", ())
     if isinstance(start, dict) and "over" in start:
-        return Parameter(**entry, **start)
+        return Parameter(**entry, **start | {"shares": tuple(start.get("shares", ()))})
     if isinstance(start, dict):
         factor = (start["to"] / start["from"]) ** (1 / (start["count"] - 1))
         start = [start["from"] * factor**k for k in range(start["count"])]

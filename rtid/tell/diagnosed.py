@@ -8,7 +8,7 @@ from rtid.diagnose.clean import Cut
 from rtid.diagnose.fit import MATCH_RHO
 from rtid.diagnose.regression import LIMIT_SD
 from rtid.diagnose.remains import FOLLOWS_NONE
-from rtid.diagnose.report import NOT_CONFIRMED, Diagnosis, FoundEffect, Unseen, Value
+from rtid.diagnose.report import NO_SIZE, NOT_CONFIRMED, OVER, Diagnosis, FoundEffect, Unseen, Value
 from rtid.diagnose.verdict import INSUFFICIENT, MATCHES, MATERIAL, UNKNOWN
 from rtid.effects.page import title
 from rtid.tell.story import Chart, Story, Table
@@ -67,7 +67,12 @@ def seen_and_not_named(diagnosis: Diagnosis) -> list[str]:
     how = "Too small to matter, if there at all"
     if diagnosis.verdict == INSUFFICIENT:
         how = "Seen, but too small on this motion to be sized"
-    lines = {how: small, "Seen, not confirmed, as what the maps miss may look like it": large}
+    sizeless = [named((u.effect, u.where)) for u in diagnosis.not_found if u.reason == NO_SIZE]
+    lines = {
+        how: small,
+        "Seen, not confirmed, as what the maps miss may look like it": large,
+        "Beside what was found, of a size that may as well be zero": ", ".join(sizeless),
+    }
     return [f"{words}: {which}." for words, which in lines.items() if which]
 
 
@@ -280,7 +285,8 @@ def limits(unseen: Unseen) -> tuple[str, str]:
 def remark(unseen: Unseen) -> str:
     """Why an effect was not found, or what its limits are of where they are of one form alone."""
     form = [f"{name.replace('_', ' ')} {quantity(v)}" for name, v in unseen.form.items()]
-    return unseen.reason or (f"with {', '.join(form)}" if form and unseen.visible else "")
+    words = ("with " if OVER not in unseen.form else "") + ", ".join(form)
+    return unseen.reason or (words if form and unseen.visible else "")
 
 
 def judged(diagnosis: Diagnosis) -> str:
@@ -322,8 +328,9 @@ def _where(diagnosis: Diagnosis) -> str:
 
 
 def _first(diagnosis: Diagnosis, first: FoundEffect) -> str:
-    sizes = list(first.parameters.values())
-    big = f", {quantity(sizes[0])} (95 %)" if len(sizes) == 1 else ""
+    sizes = {name: value for name, value in first.parameters.items() if name != OVER}
+    big = "".join(f", {quantity(v)} (95 %)" for v in sizes.values() if len(sizes) == 1)
+    big += f" over {quantity(first.parameters[OVER])}" if big and OVER in first.parameters else ""
     before = percent(diagnosis, first.heldout_residual_before_m3s)
     after = percent(diagnosis, first.heldout_residual_after_m3s)
     does = hidden(first) or (

@@ -4,7 +4,8 @@
 
 the grey opening and closing over more samples than such a jump lasts: what is narrower is left in
 s, steps and slopes are not, but for a slope's next sample.  A spike stands out from what s usually
-is, from the sensor's noise and from what the signal covers.
+is, from the sensor's noise and from what the signal covers.  It stands on what was before it: a
+peak of the oil, which more samples lead up to, is higher above the opening over more of them.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ OFTEN = 0.95  # quantile of the steps that a spike's samples may be apart: most 
 USUAL, TIMES = 0.98, 12.0  # quantile of s, and how far a spike stands above it
 LEAST_SD = 20.0  # of the sensor's noise
 LEAST_SHARE, SPANNED = 0.05, (0.01, 0.99)  # of what the signal covers between these quantiles
+WIDER, STEEP = 3, 0.5  # times as many samples, and the share that s is of that over them
 FEWEST, PASSES = 100, 5  # samples, to know what is usual; times that it is asked anew
 
 
@@ -60,21 +62,36 @@ def _any_spikes(model: Machine, samples: Samples) -> BoolArray:
 
 def _spikes(values: FloatArray, signal: Signal, longest: int) -> BoolArray:
     """Where values (n,) of a sensor, SI, belong to a spike of at most so many samples."""
-    width = longest + 1
-    s = np.maximum(values - _opening(values, width), -_opening(-values, width) - values)
-    s[:longest] = s[-longest:] = 0.0  # what begins or ends there has no other side
+    sides = values, -values
+    s = np.maximum(*(_above(side, longest) for side in sides))
     low, high = np.quantile(values, SPANNED)
     usual, sd = TIMES * np.quantile(s, USUAL), np.hypot(signal.noise, signal.resolution)
-    return np.asarray(s > max(usual, LEAST_SD * sd, LEAST_SHARE * (high - low)))
+    least = max(usual, LEAST_SD * sd, LEAST_SHARE * (high - low))
+    if not (s > least).any():
+        return np.zeros(len(s), bool)
+    leads_up = (STEEP * _above(side, WIDER * longest) for side in sides)
+    bars = (np.maximum(least, share) for share in leads_up)
+    steep = [_above(side, longest) > bar for side, bar in zip(sides, bars, strict=True)]
+    return np.asarray(steep[0] | steep[1])
+
+
+def _above(values: FloatArray, longest: int) -> FloatArray:
+    """By how much values (n,) stand above the opening over more samples than these."""
+    above = values - _opening(values, longest + 1)
+    above[:longest] = above[-longest:] = 0.0  # what begins or ends there has no other side
+    return above
 
 
 def _opening(values: FloatArray, width: int) -> FloatArray:
     """The grey opening of values (n,): the largest of the least of all runs of a width about it."""
-    least = np.minimum.reduce(_shifted(values, width))
-    return np.asarray(np.maximum.reduce(_shifted(np.pad(least, width - 1, "edge"), width)))
+    least = np.pad(_of_runs(np.minimum, values, width), width - 1, "edge")
+    return _of_runs(np.maximum, least, width)
 
 
-def _shifted(values: FloatArray, width: int) -> list[FloatArray]:
-    """The values of all runs of a width, by their place in it."""
+def _of_runs(extreme: np.ufunc, values: FloatArray, width: int) -> FloatArray:
+    """The extreme of every run of a width in values (n,): (n - width + 1,)."""
     n = len(values) - width + 1
-    return [values[k : k + n] for k in range(width)]
+    result = values[:n].copy()
+    for k in range(1, width):
+        extreme(result, values[k : k + n], out=result)
+    return result

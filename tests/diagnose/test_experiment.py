@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from rtid.diagnose.experiment import limits
+from rtid.diagnose.experiment import limits, varied_supply
 from rtid.diagnose.fit import Fit, fit, prepare
 from rtid.diagnose.regression import LIMIT_SD
 from rtid.diagnose.revision import Revision
+from rtid.model import Edge, Machine
+from rtid.plain import FloatArray
 from tests.diagnose.records import record
 
 pytestmark = pytest.mark.hidden_effect
@@ -31,3 +35,32 @@ def test_detection_limits_of_leaks_are_foretold() -> None:
         ratios.append(after / (LIMIT_SD * score.sd))
     assert len(ratios) == 5
     assert np.abs(np.log(ratios)).max() < np.log(1.5)
+
+
+def moved(model: Machine, chunk: FloatArray) -> FloatArray:
+    """By how much the command of the first edge moves with a wandering supply."""
+    swept = fit(model, chunk, prepare(model, chunk), Revision(), bank=False)
+    column, varied = 2 + model.column(model.edges[0].command), varied_supply(swept)
+    assert varied is not None
+    return np.asarray((varied - chunk)[:, column])
+
+
+def in_per_cent(edge: Edge) -> Edge:
+    """An edge of 10 V of which the command is in per cent."""
+    grid = replace(edge.grid, u_v=10.0 * edge.grid.u_v)
+    return replace(edge, grid=grid, safe_band_v=10.0 * edge.safe_band_v)
+
+
+def test_a_command_in_per_cent_is_moved_as_far_as_one_in_volts() -> None:
+    """It was moved by 2 % at most."""
+    model, chunk, _ = record(motion="sweep")
+    chunk = chunk[:8000]
+    signals = tuple(replace(s, maximum=1e9, minimum=-1e9) for s in model.signals)
+    model = replace(model, signals=signals)
+    by_edges = replace(model, edges=tuple(map(in_per_cent, model.edges)))
+    in_volts, scaled = moved(model, chunk), chunk.copy()
+    for name in {edge.command for edge in model.edges}:
+        scaled[:, 2 + model.column(name)] *= 10.0
+    parts = 0.5, 0.9, 0.99, 1.0
+    in_volts, here = (np.quantile(np.abs(u), parts) for u in (in_volts, moved(by_edges, scaled)))
+    assert in_volts[-1] > 0.2 and here == pytest.approx(10.0 * in_volts, rel=0.02)

@@ -10,6 +10,7 @@ from rtid.diagnose.consequence import HIDDEN_GAIN, is_stable
 from rtid.diagnose.fit import Fit, fit, one_pass, prepare
 from rtid.diagnose.halves import between_halves, first_half
 from rtid.diagnose.revision import Revision
+from rtid.diagnose.standing import with_bank
 from rtid.diagnose.trials import Trial, best_by_key, scored
 from rtid.estimator.chunk import to_chunk
 from rtid.kernels.engine import GAP_FLAG
@@ -48,6 +49,15 @@ def test_what_is_there_all_the_time_has_one_size(key: Key, strength: float, moti
     size, apart, sd = sizes(beside(model, chunk, key)[0])
     assert abs(apart) < max(3.0 * sd, 0.01 * size)
     assert sd < 0.1 * size
+
+
+def test_a_bank_beside_it_changes_nothing() -> None:
+    """`rtid add` asks the halves of a fit that has one, and ended in a ValueError."""
+    model, chunk, _ = record(LEAK[0], 1e-12, 4, where="a")
+    now = beside(model, chunk[:8000], LEAK)[0]
+    banked = with_bank(now, ())
+    assert len(banked.regression.prior) > len(now.regression.prior)
+    assert sizes(banked) == pytest.approx(sizes(now), rel=1e-3)
 
 
 def test_what_ends_half_way_has_two() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,9 +12,13 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from rtid.effects.laws import timing
-from rtid.effects.laws.timing import TIMINGS, delayed, lagged, played, second_order
+from rtid.effects.laws.timing import TIMINGS, delayed, lagged, played, second_order, timings_of
+from rtid.model import Machine
+from rtid.sim.declare import declared_model
+from rtid.sim.random_plants import draw
 
 DT = 1e-3
+INSTANTS_S = np.linspace(0.0, 8 * DT, 9)
 
 
 def steps(seed: int, n: int = 400) -> np.ndarray:
@@ -87,3 +92,30 @@ def test_derivatives_point_the_way(effect: timing.TimingLaw) -> None:
         change = effect.on(u, 1, DT, tuple(moved)) - effect.on(u, 1, DT, psi)
         slope = effect.change(u, 1, DT, psi, k) * 0.01 * value
         assert np.linalg.norm(change - slope) < 0.25 * np.linalg.norm(change) + 1e-9
+
+
+def commanded(largest: float) -> Machine:
+    """A machine whose commands go so far, in whatever unit."""
+    model = declared_model(draw(0))
+    by = largest / max(edge.grid.u_v[-1] for edge in model.edges)
+    grids = [replace(edge.grid, u_v=by * edge.grid.u_v) for edge in model.edges]
+    edges = [replace(e, grid=g) for e, g in zip(model.edges, grids, strict=True)]
+    return replace(model, edges=tuple(edges))
+
+
+@pytest.mark.parametrize("largest", [0.02, 0.7, 1.0, 100.0, 700.0])
+def test_what_is_in_the_command_s_unit_is_looked_for_in_shares_of_its_span(largest: float) -> None:
+    """A play of 3 % of +-100 % is 3: the bound was there, and the bank ended at 0.6."""
+    by = largest / 10.0
+    for usual, here in zip(TIMINGS, timings_of(commanded(largest), INSTANTS_S), strict=True):
+        for k, unit in enumerate(usual.units):
+            times = by if unit == "V" else 1.0
+            banks = [psi[k] for psi in usual.bank], [psi[k] for psi in here.bank]
+            assert banks[1] == pytest.approx([times * value for value in banks[0]])
+            assert here.low[k] == pytest.approx(times * usual.low[k])
+            assert here.high[k] == pytest.approx(times * usual.high[k])
+
+
+@pytest.mark.parametrize("largest", [6.0, 9.7, 10.0, 12.0])
+def test_of_some_ten_volts_the_banks_are_those_of_the_pages(largest: float) -> None:
+    assert timings_of(commanded(largest), INSTANTS_S) == TIMINGS

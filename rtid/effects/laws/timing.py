@@ -29,6 +29,8 @@ SHUT = 2e-3  # of the largest command, from which an opening counts for one
 LAG_S = "time_constant"
 DEAD_BAND = "dead_band"  # behind which a lag may sit
 USUAL_STEP_S = 0.01  # up to which the banks are those of the pages
+OF_COMMAND, USUAL_COMMAND = "V", 10.0  # unit on the pages of what is in a command's, its largest
+ALIKE = 2.0  # times the usual largest, up to which the banks are those of the pages
 AT_BOUND = 1.01  # times a bound, within which a parameter is at it
 
 
@@ -82,6 +84,18 @@ class TimingLaw:
         bank = tuple(longer(psi) for psi in self.bank)
         low, high = longer(self.low), longer(self.high)
         return replace(self, bank=bank, low=min(self.low, low), high=max(self.high, high))
+
+    def at_command(self, times: float) -> TimingLaw:
+        """The same for commands so many times as large as the pages': `command_times`."""
+        by = [times if unit == OF_COMMAND else 1.0 for unit in self.units]
+        if all(k == 1.0 for k in by):
+            return self
+
+        def wider(psi: Psi) -> Psi:
+            return tuple(k * value for k, value in zip(by, psi, strict=True))
+
+        bank = tuple(wider(psi) for psi in self.bank)
+        return replace(self, bank=bank, low=wider(self.low), high=wider(self.high))
 
     def is_free(self, psi: Psi, k: int) -> bool:
         """True where parameter k is not at a bound."""
@@ -223,8 +237,23 @@ def timings_of(model: Machine, t_s: FloatArray) -> tuple[TimingLaw, ...]:
     A plant without pressures has no spools of their own: its maps are over the signed command.
     Between what is measured, a pump's speed or a piston's, and what it does there is no spool.
     """
-    kinds = {s.name: s.kind for s in model.signals}
-    if not any(kinds[edge.command] == SENT for edge in model.edges):
+    times = command_times(model)
+    if not times:
         return ()
     step_s = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
-    return tuple(t.at_step(step_s) for t in TIMINGS if model.has_pressures or not t.own_spools)
+    can_be = [t for t in TIMINGS if model.has_pressures or not t.own_spools]
+    return tuple(t.at_step(step_s).at_command(times) for t in can_be)
+
+
+def command_times(model: Machine) -> float:
+    """The largest command of the maps, of the pages' 10 V; 0 of a machine that has no command.
+
+    Whatever its unit: %, mA, or a share of 1.  Banks are three times apart, so that one of 5 to
+    20 is as on the pages.
+    """
+    kinds = {s.name: s.kind for s in model.signals}
+    sent = [np.abs(e.grid.u_v).max() for e in model.edges if kinds[e.command] == SENT]
+    if not sent:
+        return 0.0
+    times = float(max(sent)) / USUAL_COMMAND
+    return 1.0 if 1.0 / ALIKE <= times <= ALIKE else times
