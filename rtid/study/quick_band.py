@@ -49,8 +49,15 @@ def shut_band(u: FloatArray, speed: FloatArray, is_settled: BoolArray | None = N
     if top == 0.0 or fast == 0.0:
         return 0.0
     beyond = (speed - creep(u, speed, is_settled)) / fast
-    usable = np.ones(len(u), bool) if is_settled is None else is_settled
-    return min(HALF * _begins(way * u / top, beyond, usable) for way in (1, -1)) * top
+    every = np.ones(len(u), bool)
+    usable = every if is_settled is None else is_settled
+
+    def surely(w: FloatArray) -> float:
+        """Where commands keep jumping, motion begins late and runs on: the earlier counts."""
+        begins = _begins(w, beyond, usable)
+        return min(HALF * begins, max(HALF * _begins(w, beyond, every), LEAST * begins))
+
+    return min(surely(way * u / top) for way in (1, -1)) * top
 
 
 def _begins(w: FloatArray, beyond: FloatArray, usable: BoolArray) -> float:
