@@ -114,3 +114,17 @@ def test_a_healthy_machine_leaves_its_noise(
     study = Study(file, trace)
     assert 0.9 < study.fitted.rho < most
     assert 1.0 / study.fitted.compliance == pytest.approx(run.plant.beta_pa, rel=0.02)
+
+
+def test_a_lost_message_is_no_value_that_came_again(run: Run, model: Machine) -> None:
+    """Its repeats as rows left 15 times the noise."""
+    every = np.arange(len(run.samples)) // 4 * 4
+    is_lost = np.random.default_rng(0).random(len(every)) < 0.03
+    every = np.where(is_lost[every] & (every >= 4), every - 4, every)
+    values, k = run.samples.values.copy(), run.samples.names.index("x")
+    values[:, k] = values[every, k]
+    by, _ = where_sent(model, replace(run.samples, values=values))
+    rows = np.flatnonzero(by.flags & ROW)
+    error = by.column("x")[rows] - run.samples.column("x")[rows]
+    sd = model.signals[model.column("x")].noise
+    assert len(rows) > 0.95 * len(every) / 4 and np.mean(np.abs(error) > 5.0 * sd) < 2e-3

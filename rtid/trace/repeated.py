@@ -18,13 +18,15 @@ import numpy as np
 from firmware_bridge.samples import GAP, ROW, Samples
 from rtid.estimator.noise import HELD_SHARE, SINGLE_RUNS, resolution_of
 from rtid.model import SENSORS, Machine
-from rtid.plain import FloatArray, IntArray
+from rtid.plain import BoolArray, FloatArray, IntArray
 
 REPEATED = "repeated"  # counter of the samples that are rows no longer
 BY_STEPS = 3.0  # steps of the sensor that a value jumps by at least, where it tells of repeats
 FEWEST = 100  # runs between two such jumps, to learn by them
 ALIKE = 0.9  # share of these runs that are of one length, give or take a row
-LONGEST = 2.0  # usual intervals that a line spans: behind more nothing is known
+BEYOND = 3.0  # times the usual second difference of what is sent: no noise goes so far
+RESTS = 6  # times that one value is sent, from which on a sensor rests
+LONGEST = 2.5  # usual intervals that a line spans: behind more nothing is known
 
 
 def rows_per_value(values: FloatArray) -> float:
@@ -33,7 +35,7 @@ def rows_per_value(values: FloatArray) -> float:
     if len(jump) < FEWEST or float(np.mean(jump == 0.0)) < HELD_SHARE:
         return 1.0
     at = np.flatnonzero(jump)
-    is_wide = np.abs(jump[at]) > (BY_STEPS - 0.5) * resolution_of(values)
+    is_wide = _is_wide(values, jump[at])
     runs = np.diff(at)[is_wide[:-1] & is_wide[1:]]
     if len(runs) < FEWEST or float(np.mean(runs == 1)) > SINGLE_RUNS:
         return 1.0
@@ -41,14 +43,25 @@ def rows_per_value(values: FloatArray) -> float:
     return float(runs[near].mean()) if near.mean() >= ALIKE else 1.0
 
 
+def _is_wide(values: FloatArray, jump: FloatArray) -> BoolArray:
+    """Jumps (m,) of a sensor (n,) by several of its steps."""
+    return np.asarray(np.abs(jump) > (BY_STEPS - 0.5) * resolution_of(values))
+
+
 def sent(values: FloatArray, rows: float) -> IntArray:
     """Rows (m,) of a sensor (n,) in which it is sent, each value standing for so many rows.
 
-    Where it comes to the same value again, it is sent in even steps from the last change on.
+    Where it comes to the same value again, or rests, it is sent in even steps from the last change
+    on.  A value that stands for some of them amid a quick motion was not followed: a message was
+    lost.
     """
-    first = np.flatnonzero(np.diff(values)) + 1
+    jump = np.diff(values)
+    first = np.flatnonzero(jump) + 1
     lasts = np.diff(np.append(first, len(values)))
     times = np.maximum(1, np.rint(lasts / rows)).astype(np.int64)
+    usual = float(np.median(np.abs(np.diff(values[first], 2)))) if len(first) > 2 else 0.0
+    is_far = _is_wide(values, jump[first - 1]) & (np.abs(jump[first - 1]) > BEYOND * usual)
+    times[is_far & np.append(is_far[1:], False) & (times < RESTS)] = 1
     nth = np.arange(times.sum()) - np.repeat(np.cumsum(times) - times, times)
     return np.asarray(np.repeat(first, times) + np.rint(nth * np.repeat(lasts / times, times)), int)
 
