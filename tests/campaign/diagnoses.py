@@ -9,7 +9,7 @@ from math import sqrt
 from multiprocessing import get_context
 
 from rtid.diagnose.diagnosis import search
-from rtid.diagnose.report import Diagnosis, diagnosis
+from rtid.diagnose.report import OVER, Diagnosis, FoundEffect, Value, diagnosis
 from rtid.diagnose.verdict import MATERIAL
 from rtid.estimator.chunk import to_chunk
 from rtid.sim.declare import declared_model
@@ -103,9 +103,14 @@ def _size(plant: SimulatedPlant, diagnosed: Diagnosis) -> float:
     if not diagnosed.found or not plant.hidden:
         return float("nan")
     own, true = diagnosed.found[0], plant.hidden[0]
-    value, *shape = own.parameters.values()
+    value, *shape = own_numbers(own)
     alike = not shape and own.effect == truth(true.name) and value.unit == HIDDEN[true.name].unit
     return abs(value.value / true.strength) if alike else float("nan")
+
+
+def own_numbers(effect: FoundEffect) -> tuple[Value, ...]:
+    """The numbers of an effect: the time that a change is told over is none of it."""
+    return tuple(value for name, value in effect.parameters.items() if name != OVER)
 
 
 def truth(effect: str) -> str:

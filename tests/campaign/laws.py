@@ -19,7 +19,7 @@ import numpy as np
 from rtid.diagnose.diagnosis import searched
 from rtid.diagnose.excuse import steady
 from rtid.diagnose.fit import Fit
-from rtid.diagnose.report import Diagnosis, Unseen, diagnosis
+from rtid.diagnose.report import OVER, Diagnosis, Unseen, diagnosis
 from rtid.diagnose.standing import fitted, stand
 from rtid.effects.laws import causes
 from rtid.effects.laws.timing import RATE
@@ -39,7 +39,7 @@ from rtid.sim.run import Run, Sensors, SimulationError, simulate
 from rtid.sim.simulated_plant import EDGES, SimulatedPlant
 from rtid.study.known_effects import learn_acting
 from tests.campaign import diagnoses
-from tests.campaign.diagnoses import judge, truth
+from tests.campaign.diagnoses import judge, own_numbers, truth
 
 WORKERS = int(os.environ.get("RTID_WORKERS", "2"))
 RECORD_S = 44.0  # of which 32 s teach
@@ -259,10 +259,11 @@ def answer_of(case: Case, found: Judged, began: float = float("nan")) -> Answer:
     said, z, half = found.said, float("nan"), float("nan")
     judgement = judge(diagnoses.Case(case.seed, case.hidden), said)
     first = said.found[0] if said.found else None
-    if first is not None and first.effect == truth(case.hidden) and len(first.parameters) == 1:
+    sizes = own_numbers(first) if first is not None else ()
+    if first is not None and first.effect == truth(case.hidden) and len(sizes) == 1:
         true = _over_the_record(found, (first.effect, first.where))
         true = true if np.isfinite(true) else case.plant.hidden[0].strength * _taught(case)
-        (size,) = first.parameters.values()
+        (size,) = sizes
         z, half = (abs(size.value) - abs(true)) / size.std, 1.96 * size.std / abs(true)
     is_hidden = first is not None and first.hidden_in_map is not None
     true, solution = case.plant.constants.beta_pa, told(found.last)
@@ -287,7 +288,7 @@ def of_limit(hidden: Planted, unseen: Iterable[Unseen]) -> float:
     at = limits.get(hidden.where or "both")
     if at is None and len(limits) == 1:
         (at,) = limits.values()
-    if at is None or at.form or HIDDEN[hidden.name].unit != at.unit:
+    if at is None or set(at.form) - {OVER} or HIDDEN[hidden.name].unit != at.unit:
         return float("nan")
     if at.named_from is None:
         return 0.0
