@@ -377,14 +377,14 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
 
 
 def _kept_aside(
-    state: TrialState, now: Fit, trial: Trial, alike: tuple[Key, ...], own: float, last: Residual
+    state: TrialState, now: Fit, trial: Trial, alike: tuple[Key, ...], flow: float, last: Residual
 ) -> tuple[Fit, Residual]:
     """The model with what is listed only, unless it is shown beside all that the blocks hold.
 
-    own: its flow, of the rms flow; last: what the model without it leaves.
+    flow: its own, of the rms flow; last: what the model without it leaves.
     """
     kept, after = _with_bank(state, now)
-    if _is_shown_now(trial.key, min(material_share(last, after), BENT * own), state):
+    if _is_shown_now(trial.key, min(material_share(last, after), BENT * flow), state):
         what = trial.key, alike, trial.gain, trial.n_parameters
         state.found.append(AcceptedEffect(*what, last, after, None))
     else:
