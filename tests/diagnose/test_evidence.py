@@ -266,3 +266,24 @@ def test_the_map_is_followed_with_its_slopes() -> None:
     slope = 0.5 * (moved[same, edge, 3] + along[same, edge, 3])
     assert same.sum() > 100
     assert rise == pytest.approx(slope, rel=1e-6, abs=1e-16)
+
+
+def test_slopes_along_a_ramp_add_up_to_what_the_map_rises() -> None:
+    """The steps from block to block are in them: a lag looked the other way without, on ramps."""
+    model, chunk, _ = record()
+    chunk = chunk[:60].copy()
+    chunk[:, 2:] = chunk[0, 2:]
+    ramp = np.linspace(0.0, 8.0, len(chunk))  # a block or less per sample, as narrow as they are
+    chunk[:, 2 + model.column(model.edges[0].command)] = ramp
+    theta = np.random.default_rng(2).standard_normal((model.n_cells, TERMS)) * 1e-4
+    theta[:, 3] = 0.0  # straight along the command: a slope is that of the way to a sample
+    engine, along = build(model), np.empty((len(chunk), len(model.edges), 5))
+    cell, was = np.empty(along.shape[:2], np.int64), np.full((len(model.edges), 2), np.nan)
+    none = np.zeros((0, TERMS, TERMS))
+    follow_map(engine.engine, engine.cells, theta, none, chunk, 0, along, cell, was)
+    edge = next(i for i, e in enumerate(model.edges) if e.direction > 0)
+    is_open = cell[:, edge] >= 0
+    assert len(np.unique(cell[is_open, edge])) > 5
+    w, q, slope = along[is_open, edge, :3].T
+    jumps = np.abs(np.diff(q)).sum()
+    assert (slope[1:] @ np.diff(w)) == pytest.approx(q[-1] - q[0], abs=1e-9 * jumps)
