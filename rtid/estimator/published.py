@@ -34,6 +34,7 @@ from rtid.plain import BoolArray, FloatArray
 
 SHAPE = np.arange(1, TERMS)  # all terms but the constant
 COLUMN_PRIOR = 0.05  # share of the rise of K over a column by which its shape may differ
+ROUNDED = 1e-13  # of a correlation: less is what rounding left of it
 
 
 @door
@@ -195,13 +196,22 @@ def cell_terms(grid: Grid, flow: Callable[[FloatArray, FloatArray], FloatArray])
     return np.concatenate([flow(w, dp) @ projection().T for w, dp in points])
 
 
+def information_of(cov: FloatArray, least: float) -> FloatArray:
+    """Inverse of a covariance (6, 6); least: of its correlations, that nothing is known below.
+
+    A block that one motion has crossed knows some directions 1e16 times better than others.
+    """
+    scale = np.sqrt(np.diag(cov))
+    outer = np.outer(scale, scale)
+    return np.asarray(np.linalg.inv(cov / outer + least * np.eye(len(cov))) / outer)
+
+
 def combined(
     m: FloatArray, S: FloatArray, block: Block, counted: bool
 ) -> tuple[FloatArray, FloatArray]:
     """Law (m, S) and block as two Gaussians; counted: the law contains the block's mean flow."""
-    scale = np.sqrt(np.diag(S))
-    law = np.linalg.inv(S / np.outer(scale, scale) + 1e-9 * np.eye(TERMS)) / np.outer(scale, scale)
-    information, phi = np.linalg.inv(block.cov), block.mean_phi
+    scale, phi = np.sqrt(np.diag(S)), block.mean_phi
+    law, information = information_of(S, 1e-9), information_of(block.cov, ROUNDED)
     if counted:
         information = information - np.outer(phi, phi) / block.mean_sd_m3s**2
     total = (law + information) * np.outer(scale, scale)

@@ -26,7 +26,7 @@ def trial(effect: str, gain: float, *shape: float) -> Trial:
 def present(misfit: float) -> Any:
     """A fit that leaves so much beyond its degrees of freedom."""
     return SimpleNamespace(
-        regression=SimpleNamespace(dof=DOF), held=SimpleNamespace(sse=DOF + misfit)
+        regression=SimpleNamespace(dof=DOF), held=SimpleNamespace(sse=DOF + misfit), excess=misfit
     )
 
 
@@ -130,7 +130,7 @@ def test_a_line_that_explains_less_than_what_it_stores_is_no_equal_of_it(
 
 def late(effect: str, sse: float) -> Trial:
     """A timing that wins by 1000 less what it leaves, and what its moduli let in of the noise."""
-    fit: Any = SimpleNamespace(held=SimpleNamespace(sse=sse))
+    fit: Any = SimpleNamespace(held=SimpleNamespace(sse=sse), excess=sse - DOF)
     revision: Any = SimpleNamespace(timings=[(effect, (1e-3,))])
     return Trial((effect, "a"), 1000.0, revision, fit=fit, is_timing=True)
 

@@ -31,6 +31,7 @@ def fitted(delay_s: float, lag_s: float, tolerance_s: float = 5e-3, sse: float =
         timing_columns=lambda k: range(3 + k, 4 + k),
         held=SimpleNamespace(sse=sse),
         regression=SimpleNamespace(dof=3000.0),
+        excess=sse - 3000.0,
         light=lambda: None,
     )
 
