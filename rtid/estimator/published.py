@@ -197,9 +197,10 @@ def cell_terms(grid: Grid, flow: Callable[[FloatArray, FloatArray], FloatArray])
 
 
 def information_of(cov: FloatArray, least: float) -> FloatArray:
-    """Inverse of a covariance (6, 6); least: of its correlations, that nothing is known below.
+    """Inverse (6, 6), s2/m6, of a covariance (6, 6), m6/s2.
 
-    A block that one motion has crossed knows some directions 1e16 times better than others.
+    least: of a correlation; nothing is known to less.  A block that one motion has crossed knows
+    some directions 1e16 times better than others.
     """
     scale = np.sqrt(np.diag(cov))
     outer = np.outer(scale, scale)
