@@ -405,7 +405,8 @@ def test_every_view_can_be_seen_at_every_width(opened: Opened) -> None:
     page.wait_for_selector("#verdict h1 >> text=/model|missing|motion/")
     for key, view in enumerate(VIEWS, 1):
         page.keyboard.press(str(key))
-        page.wait_for_selector(f"#{view} canvas" if view in PICTURES else f"#{view} .card")
+        drawn = f"#{view} canvas" if view in PICTURES else f"#{view} .card, #{view} table"
+        page.wait_for_selector(drawn)
         page.evaluate(SAY, LONG)
         assert_clear(page, f"#{view}", "#verdict h1", "#record", "#help")
         assert page.evaluate("() => document.documentElement.scrollHeight <= innerHeight")
