@@ -25,8 +25,8 @@ import pytest
 
 from firmware_bridge.kernel_cache import alone
 from rtid.diagnose.diagnosis import search, searched
-from rtid.diagnose.report import diagnosis
 from rtid.diagnose.standing import fitted
+from rtid.diagnose.summary import diagnosis
 from rtid.diagnose.trials import TrialState
 from rtid.estimator.published import publish
 from rtid.excite.design import candidates

@@ -23,9 +23,10 @@ from rtid.diagnose.fit import Fit
 from rtid.diagnose.partial import Exhibit, exhibits
 from rtid.diagnose.parts import AddedEffect
 from rtid.diagnose.remains import Remainder, remainder
-from rtid.diagnose.report import Diagnosis, diagnosis
+from rtid.diagnose.report import Diagnosis
 from rtid.diagnose.residual import Residual, residual
 from rtid.diagnose.standing import Standing, fitted, stand
+from rtid.diagnose.summary import diagnosis
 from rtid.diagnose.verdict import UNKNOWN
 from rtid.effects import Effect
 from rtid.effects.page import is_zero

@@ -9,7 +9,8 @@ from math import sqrt
 from multiprocessing import get_context
 
 from rtid.diagnose.diagnosis import search
-from rtid.diagnose.report import OVER, Diagnosis, FoundEffect, Value, diagnosis
+from rtid.diagnose.report import OVER, Diagnosis, FoundEffect, Value
+from rtid.diagnose.summary import diagnosis
 from rtid.diagnose.verdict import MATERIAL
 from rtid.estimator.chunk import to_chunk
 from rtid.sim.declare import declared_model

@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from rtid.diagnose.diagnosis import search
-from rtid.diagnose.report import diagnosis
+from rtid.diagnose.summary import diagnosis
 from rtid.estimator.chunk import to_chunk
 from rtid.excite.exciting import excite
 from rtid.excite.motion_limits import Limits

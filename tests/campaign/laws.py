@@ -19,8 +19,9 @@ import numpy as np
 from rtid.diagnose.diagnosis import searched
 from rtid.diagnose.excuse import steady
 from rtid.diagnose.fit import Fit
-from rtid.diagnose.report import OVER, Diagnosis, Unseen, diagnosis
+from rtid.diagnose.report import OVER, Diagnosis, Unseen
 from rtid.diagnose.standing import fitted, stand
+from rtid.diagnose.summary import diagnosis
 from rtid.effects.laws import causes
 from rtid.effects.laws.timing import RATE
 from rtid.estimator.chunk import to_chunk

@@ -13,9 +13,10 @@ from rtid.diagnose.admission import is_form_of_another, is_seen_again
 from rtid.diagnose.consequence import Consequence, is_stable
 from rtid.diagnose.diagnosis import Result, beside_its_line, search
 from rtid.diagnose.experiment import FLOW, would_separate
-from rtid.diagnose.report import Diagnosis, diagnosis
+from rtid.diagnose.report import Diagnosis
 from rtid.diagnose.residual import Residual, is_known
 from rtid.diagnose.revision import Revision
+from rtid.diagnose.summary import diagnosis
 from rtid.diagnose.trials import Trial, TrialState
 from rtid.diagnose.verdict import MATERIAL
 from rtid.effects.record_view import RecordView

@@ -9,7 +9,7 @@ import pytest
 
 from rtid.diagnose.clean import cuts, saturated
 from rtid.diagnose.diagnosis import search
-from rtid.diagnose.report import diagnosis
+from rtid.diagnose.summary import diagnosis
 from rtid.model import Machine
 from rtid.plain import FloatArray
 from rtid.tell.diagnosed import sentences

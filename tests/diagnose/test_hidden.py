@@ -11,7 +11,8 @@ import pytest
 
 from rtid.diagnose import report
 from rtid.diagnose.diagnosis import search
-from rtid.diagnose.report import Diagnosis, FoundEffect, diagnosis
+from rtid.diagnose.report import Diagnosis, FoundEffect
+from rtid.diagnose.summary import diagnosis
 from rtid.effects import from_expression, names_of_model
 from rtid.model import Lag
 from rtid.sim.random_plants import draw

@@ -9,8 +9,9 @@ from firmware_bridge.samples import GAP
 from rtid.diagnose.commands import transformed
 from rtid.diagnose.diagnosis import search
 from rtid.diagnose.parts import AddedEffect, recall
-from rtid.diagnose.report import Diagnosis, diagnosis
+from rtid.diagnose.report import Diagnosis
 from rtid.diagnose.standing import fitted
+from rtid.diagnose.summary import diagnosis
 from rtid.effects.law import BOTH
 from rtid.effects.laws.sensors import QUIET, ahead, quickened, sensor_timings
 from rtid.study.seed import Seed

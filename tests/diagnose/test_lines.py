@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from rtid.diagnose.diagnosis import search
-from rtid.diagnose.report import FoundEffect, diagnosis
+from rtid.diagnose.report import FoundEffect
+from rtid.diagnose.summary import diagnosis
 from rtid.effects.laws.lines import AT_CYLINDER, AT_VALVE, is_sampled
 from rtid.sim.extra_flows import HOSE_AREA_M2, INERTANCE_KGPM5
 from rtid.sim.random_plants import draw

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from rtid.diagnose.diagnosis import search
-from rtid.diagnose.report import Diagnosis, diagnosis
+from rtid.diagnose.report import Diagnosis
+from rtid.diagnose.summary import diagnosis
 from rtid.model import Machine
 from rtid.plain import FloatArray
 from rtid.tell.diagnosed import sentences

@@ -8,8 +8,8 @@ import pytest
 
 from rtid.diagnose import fit
 from rtid.diagnose.diagnosis import searched
-from rtid.diagnose.report import diagnosis
 from rtid.diagnose.standing import stand
+from rtid.diagnose.summary import diagnosis
 from rtid.effects import record_view
 from rtid.effects.record_view import RecordView
 from tests.diagnose.records import record

@@ -15,7 +15,7 @@ import pytest
 import rtid
 from rtid.cli import main
 from rtid.diagnose.fit import first_map, prepare
-from rtid.diagnose.report import HYDRAULIC
+from rtid.diagnose.unseen import HYDRAULIC
 from rtid.effects import Effect, EffectError, Parameter, catalogue
 from rtid.effects.column import Cause, fixed, of_page
 from rtid.effects.law import is_of_rates, lines_of, places_of

@@ -13,12 +13,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from rtid.diagnose import exact, report
+from rtid.diagnose import exact
 from rtid.diagnose.experiment import varied_supply
 from rtid.diagnose.fit import Fit, fit, one_pass, prepare
+from rtid.diagnose.report import MISLED
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.search import Search
+from rtid.diagnose.sizes import parameters
+from rtid.diagnose.summary import _told
 from rtid.diagnose.trials import scored
+from rtid.diagnose.unseen import _limit
 from rtid.diagnose.verdict import UNKNOWN
 from rtid.effects.laws import pump
 from rtid.effects.laws.pump import PUMP, demand, drawn_down, usual_demand
@@ -160,9 +164,9 @@ def test_no_limit_is_told_of_a_sag_beside_what_is_unknown() -> None:
     result: Any = SimpleNamespace(last=present, verdict=UNKNOWN, reach={}, negligible={})
     assert present.rho > exact.LARGE and pumps
     for candidate, score in pumps:
-        unseen = report._limit(result, candidate, score)
+        unseen = _limit(result, candidate, score)
         assert (unseen.detection_limit, unseen.named_from) == (None, None)
-        assert unseen.reason == report.MISLED
+        assert unseen.reason == MISLED
 
 
 def test_a_pump_s_flow_that_was_never_reached_is_above_what_it_gave() -> None:
@@ -171,8 +175,8 @@ def test_a_pump_s_flow_that_was_never_reached_is_above_what_it_gave() -> None:
     psi = 1e9, 0.05, 1e10
     drooping = Revision(timings=((PUMP, psi),))
     weak = one_pass(model, chunk, prepare(model, chunk), drooping, None, True)
-    known, not_reached = report._told(weak, (PUMP.effect, "p_supply"))
+    known, not_reached = _told(weak, (PUMP.effect, "p_supply"))
     assert set(known) == {"resistance", "stiffness"} and set(not_reached) == {"pump_flow"}
     most = not_reached["pump_flow"].value
     assert 0.3 < most / usual_demand(weak.view).max() <= 1.0
-    assert "pump_flow" in report.parameters(weak, (PUMP.effect, "p_supply")), "the file has it"
+    assert "pump_flow" in parameters(weak, (PUMP.effect, "p_supply")), "the file has it"

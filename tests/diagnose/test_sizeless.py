@@ -7,9 +7,10 @@ import pytest
 
 from rtid.diagnose.diagnosis import Result
 from rtid.diagnose.fit import one_pass, prepare
-from rtid.diagnose.report import NO_SIZE, Diagnosis, diagnosis
+from rtid.diagnose.report import NO_SIZE, Diagnosis
 from rtid.diagnose.residual import Residual
 from rtid.diagnose.revision import Revision
+from rtid.diagnose.summary import diagnosis
 from rtid.diagnose.trials import AcceptedEffect
 from rtid.effects.column import of_page
 from rtid.effects.page import effect

@@ -8,10 +8,10 @@ import pytest
 from rtid.diagnose import spread as spreading
 from rtid.diagnose.diagnosis import search
 from rtid.diagnose.fit import Fit, fit, one_pass, prepare
-from rtid.diagnose.report import diagnosis
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.spread import spread, with_spreads
 from rtid.diagnose.standing import with_bank
+from rtid.diagnose.summary import diagnosis
 from rtid.diagnose.trials import best_by_key, scored, with_effect
 from rtid.plain import Key
 from rtid.sim.extra_flows import gap_flow

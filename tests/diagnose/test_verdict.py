@@ -14,9 +14,10 @@ from rtid.diagnose import verdict as verdicts
 from rtid.diagnose.diagnosis import search
 from rtid.diagnose.excuse import counted
 from rtid.diagnose.fit import Fit
-from rtid.diagnose.report import Diagnosis, diagnosis
+from rtid.diagnose.report import Diagnosis
 from rtid.diagnose.residual import Residual
 from rtid.diagnose.standing import Standing, fitted, stand
+from rtid.diagnose.summary import diagnosis
 from rtid.diagnose.trials import AcceptedEffect
 from rtid.estimator.chunk import to_chunk
 from rtid.estimator.validity import Doubt

@@ -9,7 +9,7 @@ import pytest
 
 from rtid.diagnose.diagnosis import Result, search
 from rtid.diagnose.joined import joints, opening
-from rtid.diagnose.report import diagnosis
+from rtid.diagnose.summary import diagnosis
 from rtid.diagnose.trials import scored
 from rtid.diagnose.zeros import Zero, zeros
 from rtid.kernels.engine import GAP_FLAG

@@ -20,9 +20,10 @@ from rtid.diagnose.clean import usable
 from rtid.diagnose.diagnosis import searched
 from rtid.diagnose.excuse import steady
 from rtid.diagnose.fit import Fit
-from rtid.diagnose.report import Diagnosis, diagnosis
+from rtid.diagnose.report import Diagnosis
 from rtid.diagnose.residual import effect_values, transformed_like
 from rtid.diagnose.standing import fitted, stand
+from rtid.diagnose.summary import diagnosis
 from rtid.effects.laws import total_softness
 from rtid.effects.record_view import RecordView
 from rtid.estimator.flowmap import FlowMap

@@ -1,0 +1,228 @@
+"""The plain values of a search, and what to do next: a `Diagnosis` of its `Result`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from rtid.diagnose.clean import cuts
+from rtid.diagnose.consequence import Consequence
+from rtid.diagnose.diagnosis import Result
+from rtid.diagnose.excuse import steady
+from rtid.diagnose.experiment import limits, would_separate
+from rtid.diagnose.fit import Fit
+from rtid.diagnose.remains import described
+from rtid.diagnose.report import (
+    Diagnosis,
+    FittedEffect,
+    FoundEffect,
+    HiddenInMap,
+    Small,
+    Unseen,
+    Value,
+)
+from rtid.diagnose.sizes import parameters
+from rtid.diagnose.softer import Softer
+from rtid.diagnose.trials import AcceptedEffect, physical
+from rtid.diagnose.unseen import has_size, not_found
+from rtid.diagnose.verdict import UNKNOWN
+from rtid.diagnose.zeros import Zero, by_chance
+from rtid.effects import catalogue
+from rtid.effects.laws.pump import FLOW, PUMP, delivered, demand
+from rtid.effects.laws.timing import COMMAND
+from rtid.effects.page import ZERO, correcting
+from rtid.plain import Key
+from rtid.units import limit
+
+LONG_STEP = 0.2  # share of the delay: a shorter step changes little
+TOGETHER = "delay and lag together are"
+CALLED = {"delay": "the delay is", "time_constant": "the lag is"}
+WORTH = 2.0  # times better that an experiment must be to be proposed
+
+
+def diagnosis(result: Result) -> Diagnosis:
+    """The plain values of a search."""
+    sizeless = tuple(f.key for f in result.found[1:] if not has_size(result.last, f.key))
+    result = replace(result, found=tuple(f for f in result.found if f.key not in sizeless))
+    last, effects = result.last, tuple(_effect(result, f) for f in result.found)
+    if result.verdict != UNKNOWN:  # what explains a part of it only is not named
+        effects += tuple(_shown_too_much(result, z) for z in result.zeros if z.matters)
+        effects += (_stored(result, result.softer),) if result.softer else ()
+    words = steady(last)
+    unseen = not_found(result, sizeless)
+    return Diagnosis(
+        verdict=result.verdict,
+        added=tuple(FittedEffect(*p.key, parameters(last, p.key)) for p in result.given),
+        found=effects,
+        rho_before=result.first.rho,
+        rho_after=last.rho,
+        heldout_residual_before_m3s=result.before.rms_m3s,
+        heldout_residual_after_m3s=result.after.rms_m3s,
+        noise_floor_m3s=result.after.floor_m3s,
+        rms_flow_m3s=result.after.flow_m3s,
+        beta_pa=tuple(1.0 / float(c) if c else float("inf") for c in words.compliance),
+        lag_s=words.weights.lag_s,
+        lag_sd_s=words.lag_sd_s,
+        something_remains=last.rho >= last.most_rho or result.verdict == UNKNOWN,
+        held_out_judged=result.held_out_judged,
+        not_found=unseen,
+        negligible=tuple(
+            Small(effect, where, share) for (effect, where), share in result.negligible.items()
+        ),
+        advice=advice(result, unseen),
+        doubts=result.doubts,
+        cut=cuts(last.declared, last.chunk),
+        disturbance=max(chamber.disturbance for chamber in last.declared.chambers),
+        zeros=result.zeros,
+    )
+
+
+def _effect(result: Result, accepted: AcceptedEffect) -> FoundEffect:
+    before, after = accepted.before.rms_m3s, accepted.after.rms_m3s
+    tests = max(1, len(result.scores) + len(result.last.revision.effects))
+    sizes, not_reached = _told(result.last, accepted.key)
+    return FoundEffect(
+        effect=accepted.key[0],
+        where=accepted.key[1],
+        cannot_be_told_from=tuple(_named(result, accepted.key, key) for key in accepted.alike),
+        parameters=sizes,
+        p_value=min(1.0, tests * by_chance(accepted.n_parameters, accepted.gain)),
+        heldout_gain_pct=100.0 * (1.0 - after / before),
+        heldout_residual_before_m3s=before,
+        heldout_residual_after_m3s=after,
+        hidden_in_map=_hidden(result.last, accepted.key[0], accepted.hidden),
+        not_reached=not_reached,
+    )
+
+
+def _told(fit: Fit, key: Key) -> tuple[dict[str, Value], dict[str, Value]]:
+    """The parameters of a cause that are known, and what a pump's flow is above, never reached.
+
+    One of 83 L/min that never gave more than 30 was told as 35 +- 180,000.
+    """
+    sizes = parameters(fit, key)
+    known = {name: size for name, size in sizes.items() if not size.std > abs(size.value)}
+    if key[0] != PUMP.effect or not known or len(known) == len(sizes):
+        return sizes, {}
+    (psi,) = (psi for timing, psi in fit.revision.timings if timing.effect == PUMP.effect)
+    most = delivered(demand(fit.view), fit.view.step_s, psi)
+    beyond = {FLOW: replace(sizes[FLOW], value=most, std=float("nan"))}
+    return known, {} if FLOW in known else beyond
+
+
+def _shown_too_much(result: Result, zero: Zero) -> FoundEffect:
+    """A sensor whose zero is off: the maps have taken it in, whatever the residual."""
+    (page,) = correcting(ZERO)
+    left = result.after.rms_m3s
+    return FoundEffect(
+        effect=page.name,
+        where=zero.signal,
+        cannot_be_told_from=(),
+        parameters={page.size.name: Value(zero.apart_pa, zero.std_pa, page.size.unit)},
+        p_value=by_chance(1, (zero.apart_pa / zero.std_pa) ** 2),
+        heldout_gain_pct=0.0,
+        heldout_residual_before_m3s=left,
+        heldout_residual_after_m3s=left,
+        hidden_in_map=HiddenInMap(None, dict(zero.maps), {}, ()),
+    )
+
+
+def _stored(result: Result, soft: Softer) -> FoundEffect:
+    """What a chamber stores beyond its oil: its modulus has taken it in, whatever the residual."""
+    page, left = catalogue()[soft.causes[0][0]], result.after.rms_m3s
+    size = Value(soft.volume_m3, soft.volume_sd_m3, page.size.unit)
+    return FoundEffect(
+        effect=page.name,
+        where=soft.chamber,
+        cannot_be_told_from=tuple(name for name, _ in soft.causes[1:]),
+        parameters={page.size.name: size},
+        p_value=by_chance(1, (soft.share / soft.share_sd) ** 2),
+        heldout_gain_pct=0.0,
+        heldout_residual_before_m3s=left,
+        heldout_residual_after_m3s=left,
+        hidden_in_map=HiddenInMap(None, {}, {soft.chamber: soft.share}, ()),
+    )
+
+
+def _hidden(fit: Fit, effect: str, does: Consequence | None) -> HiddenInMap | None:
+    if does is None:
+        return None
+    pages = dict(catalogue()) | {s.name: s for s in fit.suspects}
+    own = does.own_share if np.isfinite(does.own_share) else None
+    separates = would_separate(fit, pages[effect].kind)
+    return HiddenInMap(own, dict(does.maps), dict(does.beta), tuple(separates))
+
+
+def _named(result: Result, best: Key, other: Key) -> str:
+    """The name alone, with its place where that differs."""
+    return other[0] if other[1] == best[1] else f"{other[0]} ({other[1]})"
+
+
+def advice(result: Result, unseen: tuple[Unseen, ...]) -> tuple[str, ...]:
+    """What an unknown residual follows; which motion would tell more of what is open."""
+    pages = catalogue()
+    lines = list(described(result.last)) if result.verdict == UNKNOWN else []
+    lines += _of_held_commands(result)
+    for f in result.found:
+        for key in f.alike:
+            page = pages.get(f.key[0])
+            if page is not None and key[0] in page.confounders:
+                lines.append(f"To tell {f.key[0]} from {key[0]}: {page.separates}")
+    if result.softer:
+        name = result.softer.causes[0][0]
+        lines.append(f"Where a drawing bears it out, {result.softer.remedy}.")
+        lines.append(f"To tell {name} in chamber {result.softer.chamber}: {pages[name].separates}")
+    hidden = sorted({u.effect for u in unseen if not u.visible and u.examined})
+    for name in hidden:
+        page = pages.get(name)
+        if page is not None and page.visible_when:
+            lines.append(f"{name} cannot be seen in this record: {page.visible_when}")
+    return tuple(dict.fromkeys(lines + _experiment(result, unseen)))
+
+
+def _of_held_commands(result: Result) -> list[str]:
+    """How much longer a delay is where a command may have changed long before its row.
+
+    A lag is to first order a delay as long as it: where they are not told apart, it is their sum,
+    and one in front of what integrates is as much too short.
+    """
+    fit = result.last
+    steps = np.diff(fit.chunk[:, 0])
+    steps = steps[steps <= fit.model.gates.max_gap_s]
+    step_s = float(np.mean(steps**2) / np.mean(steps))  # an event falls into long ones more often
+    timings = [(t, psi) for t, psi in fit.revision.timings if t.where == COMMAND]
+    known = (("delay",),) if fit.model.has_pressures else (("delay",), ("time_constant",))
+    delays = [(t.effect, t.parameters[0], psi[0]) for t, psi in timings if t.parameters in known]
+    tied = {f.key[0] for f in result.found if any(where == COMMAND for _, where in f.alike)}
+    return [
+        f"A row comes each {1e3 * step_s:.0f} ms, and the command may have changed up to that long "
+        f"before it: from the command itself {TOGETHER if name in tied else CALLED[kind]} "
+        f"{1e3 * delay:.0f} to {1e3 * (delay + step_s):.0f} ms, "
+        f"{1e3 * (delay + 0.5 * step_s):.0f} ms on average."
+        for name, kind, delay in delays
+        if step_s > LONG_STEP * delay
+    ]
+
+
+def _experiment(result: Result, unseen: tuple[Unseen, ...]) -> list[str]:
+    """What a wandering supply would show, computed from this record's own motion."""
+    closed = {(u.effect, u.where) for u in unseen if not u.visible}
+    closed |= {key for f in result.found for key in (f.key, *f.alike) if f.alike}
+    closed &= {candidate.key for candidate in result.last.columns.candidates}
+    best: dict[Key, tuple[float, float]] = {}
+    for candidate, (before, after) in (limits(result.last, closed) if closed else {}).items():
+        if np.isfinite(after) and after > 0:
+            scale = physical(result.last, candidate, 1.0)
+            known = best.get(candidate.key)
+            if known is None or scale * after < known[1]:
+                best[candidate.key] = scale * before, scale * after
+    here = result.last.declared.unit_here
+    units = {c.key: here(c.unit) for c, _ in result.scores}
+    return [
+        f"Supply varied by 20 % in the same motion: {effect} ({where}) would be seen from "
+        f"{limit(after, units.get((effect, where), '1'))} on, instead of "
+        f"{limit(before, units.get((effect, where), '1'))}."
+        for (effect, where), (before, after) in best.items()
+        if before > WORTH * after
+    ]
