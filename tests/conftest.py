@@ -66,10 +66,11 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
         return None
     from xdist.scheduler import LoadFileScheduling
 
-    scheduler = LoadFileScheduling(config, log)
-    of_module = scheduler._split_scope
-    scheduler._split_scope = lambda test: PAGES if test.startswith(PAGES) else of_module(test)
-    return scheduler
+    class ByPages(LoadFileScheduling):  # type: ignore[misc]  # xdist has no types
+        def _split_scope(self, nodeid: str) -> Any:
+            return PAGES if nodeid.startswith(PAGES) else super()._split_scope(nodeid)
+
+    return ByPages(config, log)
 
 
 @pytest.hookimpl(trylast=True)

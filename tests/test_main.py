@@ -103,7 +103,7 @@ def test_a_project_in_a_trace_s_place_is_recognised(words: str) -> None:
     assert " ".join(main.in_order(words.split())) == ORDERS[words]
 
 
-@pytest.mark.parametrize("words", ["check run.blf", "check a.toml b.toml"])
+@pytest.mark.parametrize("words", ["check run.blf", "check a.toml b.toml", "ui a.toml b.toml"])
 def test_what_is_no_trace_and_project_is_told_so(
     words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

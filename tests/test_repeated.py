@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,15 +11,11 @@ import pytest
 from firmware_bridge.samples import GAP, ROW, Samples
 from rtid.model import Machine
 from rtid.plain import FloatArray
-from rtid.project import load
 from rtid.sim.declare import declared_model
-from rtid.sim.recording import write_run
 from rtid.sim.run import Run, simulate
 from rtid.sim.simulated_plant import SimulatedPlant
-from rtid.study.study import Study
-from rtid.trace.check import judge
 from rtid.trace.repeated import REPEATED, rows_per_value, where_sent
-from rtid.trace.signals import read_recording
+from tests.checked import checked
 
 SECONDS = 20.0
 PRESSURES = ("p_a", "p_b", "p_supply")
@@ -97,21 +92,13 @@ def test_a_healthy_machine_leaves_its_noise(
     run: Run, tmp_path: Path, names: tuple[str, ...], rows: int, most: float
 ) -> None:
     """Repeats left 2.8 to 4.0 times the noise, and such machines were unknown."""
-    trace = tmp_path / "run.parquet"
     written = repeated(run.samples, dict.fromkeys(names, rows))
-    write_run(trace, replace(run, samples=written), 0, "sweep")
-    file = trace.with_suffix(".toml")
-    file.write_text(re.sub(r"(?m)^noise = .*$", 'noise = "estimate"', file.read_text()))
-    project = load(file)
-    read, stroke_m = read_recording(project, trace), project.sections.stroke_m
-    every = (read.samples, read.series, read.messages, read.refused)
-    report = judge(project.model, project.table_assembly or project.assembly, *every, stroke_m)
+    study, report = checked(run, written, tmp_path)
     said = {f.subject: f.text for f in report.findings if "repeated" in f.text}
     assert said == dict.fromkeys(
         names, f"is sent every {rows} ms and repeated: rows where it changes"
     )
     assert report.refused[REPEATED] > 0.7 * len(written)
-    study = Study(file, trace)
     assert 0.9 < study.fitted.rho < most
     assert 1.0 / study.fitted.compliance == pytest.approx(run.plant.beta_pa, rel=0.02)
 

@@ -63,15 +63,15 @@ def _any_spikes(model: Machine, samples: Samples) -> BoolArray:
 def _spikes(values: FloatArray, signal: Signal, longest: int) -> BoolArray:
     """Where values (n,) of a sensor, SI, belong to a spike of at most so many samples."""
     sides = values, -values
-    s = np.maximum(*(_above(side, longest) for side in sides))
+    above = [_above(side, longest) for side in sides]
+    s = np.maximum(*above)
     low, high = np.quantile(values, SPANNED)
     usual, sd = TIMES * np.quantile(s, USUAL), np.hypot(signal.noise, signal.resolution)
     least = max(usual, LEAST_SD * sd, LEAST_SHARE * (high - low))
     if not (s > least).any():
         return np.zeros(len(s), bool)
-    leads_up = (STEEP * _above(side, WIDER * longest) for side in sides)
-    bars = (np.maximum(least, share) for share in leads_up)
-    steep = [_above(side, longest) > bar for side, bar in zip(sides, bars, strict=True)]
+    leads_up = [STEEP * _above(side, WIDER * longest) for side in sides]
+    steep = [a > np.maximum(least, b) for a, b in zip(above, leads_up, strict=True)]
     return np.asarray(steep[0] | steep[1])
 
 

@@ -90,6 +90,14 @@ def test_a_border_is_put_where_a_valve_opens_with_a_jump() -> None:
     assert fit.rho < MATCH_RHO
 
 
+def test_a_jump_is_met_by_halves_where_these_are_worth_it() -> None:
+    """On the grid as it was declared rho was 2.9."""
+    plant = draw(5007, law="jump")
+    run = simulate(plant, "sweep_record", 5007, 44.0)
+    model = declared_model(plant, seed=5007)
+    assert fitted(model, to_chunk(model, run.samples, 0)[:32_000]).rho < MATCH_RHO
+
+
 def test_what_is_missing_is_no_jump() -> None:
     plant = draw_hidden(5007, "external_leakage_laminar")
     model = declared_model(plant, seed=5007)
