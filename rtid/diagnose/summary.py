@@ -12,6 +12,7 @@ from rtid.diagnose.diagnosis import Result
 from rtid.diagnose.excuse import steady
 from rtid.diagnose.experiment import limits, would_separate
 from rtid.diagnose.fit import Fit
+from rtid.diagnose.fitted_sizes import parameters
 from rtid.diagnose.remains import described
 from rtid.diagnose.report import (
     Diagnosis,
@@ -22,7 +23,6 @@ from rtid.diagnose.report import (
     Unseen,
     Value,
 )
-from rtid.diagnose.sizes import parameters
 from rtid.diagnose.softer import Softer
 from rtid.diagnose.trials import AcceptedEffect, physical
 from rtid.diagnose.unseen import has_size, not_found

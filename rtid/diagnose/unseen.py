@@ -10,10 +10,10 @@ import numpy as np
 from rtid.diagnose.diagnosis import Result
 from rtid.diagnose.exact import LARGE, is_refitted
 from rtid.diagnose.fit import Fit
+from rtid.diagnose.fitted_sizes import over, parameters
 from rtid.diagnose.nameable import VISIBLE, clearest
 from rtid.diagnose.regression import LIMIT_SD, Score
 from rtid.diagnose.report import MISLED, NO_SIZE, NOBODY_LOOKED, NOT_CONFIRMED, Unseen, Value
-from rtid.diagnose.sizes import over, parameters
 from rtid.diagnose.trials import detection_limit, physical
 from rtid.diagnose.verdict import UNKNOWN
 from rtid.diagnose.zeros import Zero

@@ -21,9 +21,9 @@ import numpy as np
 from rtid.diagnose.clean import usable
 from rtid.diagnose.excuse import steady
 from rtid.diagnose.fit import NO_COV, Fit
+from rtid.diagnose.fitted_sizes import parameters
 from rtid.diagnose.report import Value
 from rtid.diagnose.residual import effect_values, transformed_like
-from rtid.diagnose.sizes import parameters
 from rtid.diagnose.standing import fitted
 from rtid.effects.column import Candidate
 from rtid.effects.extra import with_extra_flow

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from rtid.diagnose.extend import Extension
+from rtid.diagnose.fitted_sizes import parameters
 from rtid.diagnose.report import Value
 from rtid.diagnose.residual import Residual
-from rtid.diagnose.sizes import parameters
 from rtid.diagnose.standing import Standing
 from rtid.effects.page import is_zero
 from rtid.project.added import AddedSection, ChangeSection, ErrorsSection, ParameterSection

@@ -19,11 +19,11 @@ from rtid.diagnose.clean import usable
 from rtid.diagnose.diagnosis import Result
 from rtid.diagnose.excuse import steady
 from rtid.diagnose.fit import Fit
+from rtid.diagnose.fitted_sizes import parameters
 from rtid.diagnose.regression import Score
 from rtid.diagnose.remains import filtered
 from rtid.diagnose.report import Diagnosis, Unseen
 from rtid.diagnose.residual import Residual, residual
-from rtid.diagnose.sizes import parameters
 from rtid.diagnose.trials import physical, scored
 from rtid.diagnose.verdict import LEAST_ROWS
 from rtid.effects.column import Candidate

@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 
 from rtid.diagnose.fit import one_pass, prepare
+from rtid.diagnose.fitted_sizes import parameters
 from rtid.diagnose.report import Diagnosis, FoundEffect, Unseen, Value
 from rtid.diagnose.revision import Revision
-from rtid.diagnose.sizes import parameters
 from rtid.effects.column import of_page
 from rtid.effects.page import effect
 from rtid.tell.diagnosed import remark, said

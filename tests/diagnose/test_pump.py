@@ -16,10 +16,10 @@ from scipy.integrate import solve_ivp
 from rtid.diagnose import exact
 from rtid.diagnose.experiment import varied_supply
 from rtid.diagnose.fit import Fit, fit, one_pass, prepare
+from rtid.diagnose.fitted_sizes import parameters
 from rtid.diagnose.report import MISLED
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.search import Search
-from rtid.diagnose.sizes import parameters
 from rtid.diagnose.summary import _told
 from rtid.diagnose.trials import scored
 from rtid.diagnose.unseen import _limit
