@@ -87,6 +87,7 @@ def test_nothing_named_nothing_shown(result: Result) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_supply_that_sags_has_its_evidence(tmp_path: Path) -> None:
     """What is found is at the supply's signal: a KeyError for whoever was told of it."""
     trace = tmp_path / "sag.parquet"

@@ -72,7 +72,7 @@ def test_laws_that_are_both_nearly_right_are_a_set(law: str, effect: str, remain
 @pytest.mark.parametrize(
     ("law", "effect"),
     [
-        ("compensated", "external_leakage_laminar"),
+        pytest.param("compensated", "external_leakage_laminar", marks=pytest.mark.long),
         ("overlap", "input_delay"),
         pytest.param("choking", "valve_seat_leakage", marks=pytest.mark.long),
     ],
@@ -110,6 +110,7 @@ def test_what_one_chamber_stores_more_is_told_by_the_other(
     assert abs(size.value - volume_m3) < 2.0 * size.std < 0.5 * volume_m3
 
 
+@pytest.mark.long
 def test_what_a_modulus_tells_is_declared() -> None:
     """Its rows size 0.14 L of it: added, it changes next to nothing; declared, nothing is left."""
     case = Case(6101, "asymmetric", SWEEP, "extra_dead_volume")
