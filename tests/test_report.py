@@ -141,7 +141,8 @@ def test_coverage_and_parameters_are_those_of_the_fit(leaking: Reported) -> None
             f"{edge.name} ", edge.name
         )
         assert len(told.points[edge.name]) > 20
-    beta, sd = told.diagnosed.diagnosis.beta_pa[0], told.beta_sd_pa[0]
+    said = told.diagnosed.diagnosis
+    beta, sd = said.beta_pa[0], said.beta_sd_pa[0]
     assert 0.0 < sd < 0.01 * beta
     assert f"bulk modulus, chamber a{1e-6 * beta:.0f} ± {1.96e-6 * sd:.1f} MPa" in words
 

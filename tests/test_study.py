@@ -91,7 +91,11 @@ def test_one_beta_and_one_rho_in_every_command(
     beta = list(replay["beta_pa"].values())
     assert beta == pytest.approx(diagnosis["beta_pa"], rel=1e-9)
     assert origin["beta_pa"] == beta
-    assert origin["beta_sd_pa"] == list(replay["beta_sd_pa"].values())
+    spread = list(replay["beta_sd_pa"].values())
+    assert origin["beta_sd_pa"] == spread
+    assert spread == pytest.approx(
+        diagnosis["beta_sd_pa"], rel=0.25
+    )  # clusters of blocks: each is one draw
     rhos = {diagnosis["rho_before"], replay["rho"], compare["rho_of_fit"], origin["rho"]}
     assert len(rhos) == 1 and 0.9 < rhos.pop() < 1.1
     held = [maps["beta_pa"] for maps in compare["maps"] if maps["name"] == "learned"]

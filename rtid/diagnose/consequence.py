@@ -24,7 +24,6 @@ from rtid.diagnose.regression import LIMIT_SD
 from rtid.diagnose.residual import is_known
 from rtid.diagnose.trials import Trial
 from rtid.effects.record_view import RecordView
-from rtid.estimator.misfit import can_be_explained
 from rtid.estimator.refine import halved_along
 from rtid.estimator.state import Weights
 from rtid.kernels.layout import TERMS
@@ -74,7 +73,7 @@ def consequence(present: Fit, now: Fit, own_share: float) -> Consequence:
     6.6 %, beyond what the noise alone gives, made the position sensor 2.3 ms late.
     """
     softer = tuple(_softer(present, now, present.compliance_cov))
-    if softer and can_be_explained(present.sent):
+    if softer:
         softer = tuple(_softer(present, now, counted(present)))
     own = own_share if np.isfinite(own_share) else float("nan")
     return Consequence(own, tuple(_bends(present, now)), softer)

@@ -78,8 +78,10 @@ def left_over(present: Fit) -> Misfit:
 def counted(present: Fit) -> FloatArray:
     """Covariance of the compliances (chambers, chambers), 1/Pa2, what the blocks miss counted.
 
-    Of a record that can be explained.
+    The noise's alone of a record that cannot be explained.
     """
+    if not can_be_explained(present.sent):
+        return present.compliance_cov
     record = *_machine(present), present.weights
     known = present.rest.estimate if present.rest is not None else None
     estimate = known or sketch(record[0], summed(*record))

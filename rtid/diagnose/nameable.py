@@ -27,7 +27,6 @@ from rtid.diagnose.verdict import MATERIAL
 from rtid.effects.column import Candidate, Columns
 from rtid.effects.law import Volumes
 from rtid.effects.laws.timing import COMMAND
-from rtid.estimator.misfit import can_be_explained
 from rtid.kernels.explain import filter_rows
 from rtid.plain import BoolArray, FloatArray, Key
 from rtid.units import Z95
@@ -226,8 +225,7 @@ def _narrowness(fit: Fit) -> FloatArray:
     have been named on a sweep, where one of 6 ms moved a modulus by half of what is known of it.
     """
     share = fit.weights.compliance / np.maximum(np.abs(fit.compliance), NOTHING)
-    cov = counted(fit) if can_be_explained(fit.sent) else fit.compliance_cov
-    half = Z95 * np.sqrt(np.maximum(np.diag(cov), 0.0))
+    half = Z95 * np.sqrt(np.maximum(np.diag(counted(fit)), 0.0))
     wide = half / np.maximum(np.abs(fit.compliance), NOTHING) / SOFTER
     return np.asarray(share / np.maximum(1.0, wide))
 

@@ -118,7 +118,8 @@ class Small:
 class Diagnosis:
     """Everything that `rtid diagnose` says; residuals are root mean squares behind H_f.
 
-    disturbance: what the rows were weighed for beside the sensors' noise, rate per sqrt(Hz).
+    disturbance: what the rows were weighed for beside the sensors' noise, rate per sqrt(Hz);
+    beta_sd_pa: what the blocks miss is counted; NaN where something unknown bends the moduli.
     """
 
     verdict: str
@@ -142,6 +143,7 @@ class Diagnosis:
     cut: tuple[Cut, ...] = ()
     disturbance: float = 0.0
     zeros: tuple[Zero, ...] = ()
+    beta_sd_pa: tuple[float, ...] = ()
 
     @property
     def is_slight(self) -> bool:

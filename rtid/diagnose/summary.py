@@ -9,7 +9,7 @@ import numpy as np
 from rtid.diagnose.clean import cuts
 from rtid.diagnose.consequence import Consequence
 from rtid.diagnose.diagnosis import Result
-from rtid.diagnose.excuse import steady
+from rtid.diagnose.excuse import counted, steady
 from rtid.diagnose.experiment import limits, would_separate
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.fitted_sizes import parameters
@@ -75,6 +75,20 @@ def diagnosis(result: Result) -> Diagnosis:
         cut=cuts(last.declared, last.chunk),
         disturbance=max(chamber.disturbance for chamber in last.declared.chambers),
         zeros=result.zeros,
+        beta_sd_pa=_sd_of_moduli(result, words),
+    )
+
+
+def _sd_of_moduli(result: Result, fit: Fit) -> tuple[float, ...]:
+    """Standard deviations of the bulk moduli, Pa; NaN where what is missing bends them.
+
+    Beside a line that nobody named they were 1.8 and 1.9 GPa, of 1.3: by the noise to 0.02.
+    """
+    if result.verdict == UNKNOWN:
+        return (float("nan"),) * len(fit.compliance)
+    sd = np.sqrt(np.maximum(np.diag(counted(fit)), 0.0))
+    return tuple(
+        float(s / c**2) if c else float("nan") for s, c in zip(sd, fit.compliance, strict=True)
     )
 
 

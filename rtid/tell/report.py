@@ -11,7 +11,7 @@ import rtid
 from rtid.diagnose.regression import LIMIT_SD
 from rtid.diagnose.report import Diagnosis, Value
 from rtid.diagnose.trials import GAIN
-from rtid.diagnose.verdict import MATERIAL
+from rtid.diagnose.verdict import MATERIAL, UNKNOWN
 from rtid.effects.page import title
 from rtid.project.history import Change, standing
 from rtid.tell import stills as still_pictures
@@ -24,7 +24,7 @@ from rtid.tell.history import history_table
 from rtid.tell.html import rendered
 from rtid.tell.report_page import embedded, key_figures, page_of
 from rtid.tell.report_story import Ranked, ReportStory, sizes_say
-from rtid.tell.report_tables import coverage, parameters, settings
+from rtid.tell.report_tables import BENT, coverage, parameters, settings
 from rtid.tell.story import Bar, Bars, Chart, Planes, Story, StoryPart, Table
 from rtid.tell.words import is_floor, named, quantity
 from rtid.units import CONVENTION, MPA, flow_name, limit, lpm
@@ -103,7 +103,9 @@ def _key_figures(story: ReportStory) -> dict[str, str]:
     before = _percent(story, diagnosis.heldout_residual_before_m3s)
     after = _percent(story, diagnosis.heldout_residual_after_m3s)
     rho = f"{diagnosis.rho_before:.3g}"
-    beta = " / ".join(f"{MPA * b:.0f}" for b in diagnosis.beta_pa)
+    beta = " / ".join(f"{MPA * b:.0f}" for b in diagnosis.beta_pa) + " MPa"
+    if diagnosis.verdict == UNKNOWN:
+        beta += BENT
     if diagnosis.found:
         before, rho = f"{before} → {after}", f"{rho} → {diagnosis.rho_after:.3g}"
     floor_m3s = diagnosis.noise_floor_m3s
@@ -112,7 +114,7 @@ def _key_figures(story: ReportStory) -> dict[str, str]:
         f"error on the {PARTS[story.judges]}, of the rms flow": before,
         "what the sensors alone leave": _percent(story, floor_m3s) if has_floor else "not known",
         "residual variance, of the noise": rho,
-        f"bulk modulus {' / '.join(story.chambers)}": f"{beta} MPa",
+        f"bulk modulus {' / '.join(story.chambers)}": beta,
     }
 
 

@@ -17,7 +17,6 @@ from rtid.apply.versions import Applied
 from rtid.compare import Dependence, against_signals, over_time
 from rtid.diagnose.clean import usable
 from rtid.diagnose.diagnosis import Result
-from rtid.diagnose.excuse import steady
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.fitted_sizes import parameters
 from rtid.diagnose.regression import Score
@@ -76,7 +75,7 @@ class ReportStory:
 
     after is None and depends_after is empty where nothing was found.  tracking: what the
     map will do to it, "" without a section [controller].  points: of the data that taught each map,
-    (n, 2) in V and MPa; beta_sd_pa: of the bulk moduli with everything that was found.
+    (n, 2) in V and MPa.
     """
 
     diagnosed: Diagnosed
@@ -93,7 +92,6 @@ class ReportStory:
     date: str
     tracking: str
     points: dict[str, FloatArray]
-    beta_sd_pa: tuple[float, ...]
 
     @property
     def judges(self) -> int:
@@ -128,15 +126,6 @@ def tell(project: Project, trace: Path, progress: Progress = silent) -> ReportSt
         datetime.now().astimezone().isoformat(" ", "seconds"),
         _tracking(study),
         {e.name: spread_points(study.machine, e, study.taught, POINTS) for e in study.machine.maps},
-        _beta_sd(steady(last)),
-    )
-
-
-def _beta_sd(fit: Fit) -> tuple[float, ...]:
-    """Standard deviations of the bulk moduli, Pa."""
-    sd = np.sqrt(np.diag(fit.compliance_cov))
-    return tuple(
-        float(s / c**2) if c else float("nan") for s, c in zip(sd, fit.compliance, strict=True)
     )
 
 

@@ -8,6 +8,7 @@ from math import isfinite
 
 from rtid.compare.tables import CAUSES, cause_of_block
 from rtid.diagnose.report import FittedEffect, FoundEffect, Value
+from rtid.diagnose.verdict import UNKNOWN
 from rtid.effects.page import title
 from rtid.estimator.flowmap import VALID, EdgeMap
 from rtid.model import Machine
@@ -16,6 +17,8 @@ from rtid.tell.report_story import ReportStory
 from rtid.tell.story import Table
 from rtid.tell.words import quantity
 from rtid.units import flow_name, lpm
+
+BENT = ", if nothing else were missing"  # a modulus that is told beside something unknown
 
 
 def coverage(story: ReportStory) -> Table:
@@ -43,8 +46,8 @@ def parameters(story: ReportStory) -> Table:
     """Bulk moduli, lag of the spools, and every effect, with their 95 % intervals."""
     result, model = story.diagnosed.diagnosis, story.diagnosed.project.model
     rows = [
-        (f"bulk modulus, chamber {chamber.name}", quantity(Value(beta, sd, "Pa")))
-        for chamber, beta, sd in zip(model.chambers, result.beta_pa, story.beta_sd_pa, strict=True)
+        (f"bulk modulus, chamber {chamber.name}", _modulus(beta, sd, result.verdict == UNKNOWN))
+        for chamber, beta, sd in zip(model.chambers, result.beta_pa, result.beta_sd_pa, strict=True)
         if chamber.pressure
     ]
     if result.lag_s > 0:
@@ -54,6 +57,11 @@ def parameters(story: ReportStory) -> Table:
     for found in result.found:
         rows += _effect(found, "found")
     return Table("Parameters, ± is the 95 % interval", ("", ""), rows)
+
+
+def _modulus(beta_pa: float, sd_pa: float, is_bent: bool) -> str:
+    """As a person reads it; beside something unknown nobody knows by how much it is off."""
+    return quantity(Value(beta_pa, sd_pa, "Pa")) + (BENT if is_bent else "")
 
 
 def _effect(effect: FittedEffect | FoundEffect, how: str) -> Iterator[tuple[str, str]]:

@@ -65,6 +65,7 @@ def unexplained() -> Diagnosis:
 def test_unknown_says_what_remains_and_what_to_do(unexplained: Diagnosis) -> None:
     assert unexplained.verdict == "unknown" and unexplained.found == ()
     assert unexplained.something_remains and unexplained.rho_after > 1.1
+    assert np.isnan(unexplained.beta_sd_pa).all()  # nobody knows how far they are bent
     assert any("Most is left in chamber" in text for text in unexplained.advice)
     assert any(text.startswith("Next: ") for text in unexplained.advice)
     assert any("Most is left in chamber" in text for text in sentences(unexplained))
