@@ -64,7 +64,7 @@ def is_spread_alone(present: Fit, now: Fit, least: float) -> bool:
     leak took 1421 off chi2, beside an oil of 928 MPa for 1106 that had stood in for it: the noise
     of that rose by 1484, and settled it took 1213.
     """
-    fallen, wins = present.held.sse - now.held.sse, now.wins_over(present)
+    fallen, wins = present.excess - now.excess, now.wins_over(present)
     if fallen < least or wins >= least:
         return fallen < least
     return present.settled_chi2 - now.settled_chi2 < least + FEIGNED * (fallen - wins)

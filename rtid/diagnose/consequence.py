@@ -50,19 +50,21 @@ class Consequence:
     """What leaving one effect out does.
 
     own_share: its own flow, of the rms flow, NaN for a timing; maps: edge and bend, of its largest
-    flow; beta: chamber and relative move of its modulus, where that is beyond its 95 % interval.
+    flow; beta: chamber and relative move of its modulus, where that is beyond its 95 % interval;
+    lag_s: move of the spools' lag, where a timing takes it beyond its own, 0 else.
     """
 
     own_share: float
     maps: tuple[tuple[str, float], ...]
     beta: tuple[tuple[str, float], ...]
+    lag_s: float = 0.0
 
     @property
     def is_material(self) -> bool:
         """True where at least one of them matters."""
         bent = max((bend for _, bend in self.maps), default=0.0)
         softer = max((abs(move) for _, move in self.beta), default=0.0)
-        return self.own_share >= OWN or bent >= BEND or softer >= SOFTER
+        return self.own_share >= OWN or bent >= BEND or softer >= SOFTER or self.lag_s != 0.0
 
 
 def consequence(present: Fit, now: Fit, own_share: float) -> Consequence:
@@ -76,7 +78,19 @@ def consequence(present: Fit, now: Fit, own_share: float) -> Consequence:
     if softer:
         softer = tuple(_softer(present, now, counted(present)))
     own = own_share if np.isfinite(own_share) else float("nan")
-    return Consequence(own, tuple(_bends(present, now)), softer)
+    return Consequence(own, tuple(_bends(present, now)), softer, _lag_moves(present, now))
+
+
+def _lag_moves(present: Fit, now: Fit) -> float:
+    """What one timing more takes of the spools' lag, s, beyond its interval; 0 where it stays.
+
+    Of a delay of 20 ms that a lag had stood in for, 9.6 ms of 1.1, the maps bent by 0.01 %.
+    """
+    is_timing = len(now.revision.timings) > len(present.revision.timings)
+    if not is_timing or now.revision.replaces_lag or not np.isfinite(present.lag_sd_s):
+        return 0.0
+    move = now.weights.lag_s - present.weights.lag_s
+    return move if abs(move) > Z95 * present.lag_sd_s else 0.0
 
 
 def _bends(present: Fit, now: Fit) -> Iterator[tuple[str, float]]:

@@ -140,6 +140,9 @@ def searched(standing: Standing, progress: Progress = silent) -> Result:
             if judged and not is_judged:
                 before, judged = state.left(first), False
             present, last = _extended(state, finer, rest)
+        if judged and not can_judge(last):  # as found, spools pass through blocks that it lacks
+            last, judged = _judging(state, present, last)
+            before = state.left(first)
     state.found = [beside_its_line(state, told_apart(state, effect)) for effect in state.found]
     doubted = told_doubts(present)
     said = verdict(state, first, present, last, doubted, judged)

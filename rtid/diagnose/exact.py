@@ -117,6 +117,8 @@ def timing_trials(
     Without pressures a disturbance as large as what is left hides how much that is: then a timing
     may matter whose first order is clear, though it may point the wrong way.  Maps of a state that
     a delay has bent hide the first order as well: there the first timing is looked for by refits.
+    A delay always is: where commands jump, its first order sees no further than a sample, and one
+    of 20 ms was a lag of 9.6 ms that matched.
     """
     timings = (*timings_of(state.model, state.chunk[:, 0]), *sensor_timings(state.model))
     open_ = [t for t in timings if not present.revision.has(key_of(t))]
@@ -124,7 +126,8 @@ def timing_trials(
         stirred = {c.key for c, score in scored(present) if score.gain > GAIN}
         open_ = [t for t in open_ if key_of(t) in stirred]
     elif state.model.has_pressures and present.rho < LARGE:
-        open_ = [t for t in open_ if key_of(t) in scores and scores[key_of(t)][1].gain > GAIN]
+        clear = {key for key, (_, score) in scores.items() if score.gain > GAIN}
+        open_ = [t for t in open_ if key_of(t) in clear or t.apply is delayed]
     if not open_ or not present.view.has_pressures:
         return []
     hints = {key_of(t): _strength(t, *scores[key_of(t)]) for t in open_ if key_of(t) in scores}
@@ -202,7 +205,7 @@ def exact_trials(
     present.unfactored().at_rest()
     gains = _from_afar(coarse, timings, other, hints, anywhere)
     # a gain from afar is that of the thinned record: 154,000 for 315,000 of chi2
-    least = max([PROMISING * other, *(CLOSE * gain for gain, *_ in gains)])
+    least = max([GAIN, PROMISING * other, *(CLOSE * gain for gain, *_ in gains)])
     trials: dict[Key, Trial] = {}
     for gain, timing, psi, lag_s in gains:
         if gain < least:
@@ -264,22 +267,46 @@ def _from_afar(
     """Gain, parameters and the lag beside every timing that is promising from afar; one a name.
 
     anywhere: of all.  The gain is over the fit as it is, with the lag that it has found.
-    A lag may be before or behind the opening curve: from so far that cannot be told.
+    A lag may be before or behind the opening curve, and spools of second order may be each
+    direction's own: from so far that cannot be told.
     """
-    banks = {timing: coarse.bank(timing, hints.get(key_of(timing), 0.0)) for timing in timings}
-    ahead = 0.0 if anywhere else coarse.ahead
+    beside = [timing for timing in timings if not timing.replaces_lag]
+    banks = {timing: coarse.bank(timing, hints.get(key_of(timing), 0.0)) for timing in beside}
+    ahead, instead = 0.0 if anywhere else coarse.ahead, _instead_of_the_lag(coarse, timings)
     seen = {timing: _best_of(coarse, timing, bank) - ahead for timing, bank in banks.items()}
+    seen |= {timing: gain - ahead for timing, (_, gain) in instead.items()}
     bar = PROMISING * max([other, *seen.values()])
-    best: dict[tuple[Key, bool], tuple[float, TimingLaw, Psi, float]] = {}
-    for timing, bank in banks.items():
+    best: dict[tuple[Key, bool, bool], tuple[float, TimingLaw, Psi, float]] = {}
+    for timing in seen:
         if not anywhere and (seen[timing] < bar or seen[timing] <= 0.0):
             continue
-        psi, lag_s, gain = coarse.shared(timing, *coarse.closed_in(timing, bank))
+        start = instead.get(timing) or coarse.closed_in(timing, banks[timing])
+        psi, lag_s, gain = coarse.shared(timing, *start)
         gain -= ahead
-        form = key_of(timing), DEAD_BAND in timing.parameters
+        own = timing.replaces_lag and timing.own_spools
+        form = key_of(timing), DEAD_BAND in timing.parameters, own
         if form not in best or gain > best[form][0]:
             best[form] = gain, timing, psi, lag_s
     return list(best.values())
+
+
+def _instead_of_the_lag(
+    coarse: Beside, timings: list[TimingLaw]
+) -> dict[TimingLaw, tuple[Psi, float]]:
+    """Where timings that replace the spools' lag do best from afar, and their gains.
+
+    Their bank is three times apart, the lag of the fit is far nearer to what both stand for: they
+    are closed in on before anything is held against it.  Spools of their own begin where others do.
+    """
+    found: dict[TimingLaw, tuple[Psi, float]] = {}
+    for timing in (timing for timing in timings if timing.replaces_lag):
+        known = [psi for other, (psi, _) in found.items() if other.effect == timing.effect]
+        if known:
+            found[timing] = known[0], coarse.gain(timing, known[0])
+        else:
+            start = coarse.closed_in(timing, coarse.bank(timing))
+            found[timing] = coarse.damped(timing, *start)
+    return found
 
 
 def _best_of(coarse: Beside, timing: TimingLaw, bank: Mapping[float, float]) -> float:

@@ -17,7 +17,16 @@ from rtid.diagnose.bank import columns_of, pointing_out
 from rtid.diagnose.commands import behind, commands, transformed
 from rtid.diagnose.equations import regression_of, softened
 from rtid.diagnose.evidence import Heading, Rows, project, rows_of
-from rtid.diagnose.moving import halfway, is_as_good, is_worse, moved, reweighed, steadied
+from rtid.diagnose.moving import (
+    CLEAR,
+    goes_on,
+    halfway,
+    is_as_good,
+    is_worse,
+    moved,
+    reweighed,
+    steadied,
+)
 from rtid.diagnose.regression import Estimate, Regression
 from rtid.diagnose.revision import Revision
 from rtid.effects.column import Candidate, Cause, Columns
@@ -187,12 +196,17 @@ class Fit:
         at = self.first_given
         if self.lag_tolerance_s == 0.0 or at not in self.estimate.used:
             return float("nan")
-        return self.estimate.sd(at) * float(np.sqrt(max(1.0, self.rho)))
+        return self.sd_on_its_way(at)
 
     def sd_of(self, column: int) -> float:
         """Of a size, by the misfit that is left and by how far it is from one number."""
         sd = self.estimate.sd(column) * float(np.sqrt(max(1.0, self.rho)))
         return float(np.hypot(sd, dict(self.spreads).get(column, 0.0)))
+
+    def sd_on_its_way(self, column: int) -> float:
+        """Of a lag or a timing, and how far it clearly points on from where it has ended."""
+        sd, ahead = self.sd_of(column), abs(self.estimate.value(column))
+        return float(np.hypot(sd, ahead)) if ahead > CLEAR * sd else sd
 
     @property
     def first_given(self) -> int:
@@ -268,16 +282,18 @@ def fit(
     beside those of the catalogue; other: the fit that it must win over, given up where it does not.
     """
     best = one_pass(model, chunk, weights, revision, start, False, thorough=False)
-    step, halvings, behind = moved(best), 0, 0
+    step, halvings, behind, stretch = moved(best), 0, 0, 1.0
     for _ in range(PASSES):
         if step is None or halvings > HALVINGS or behind == HOPELESS:
             break
         fitted = one_pass(model, chunk, step.weights, step.revision, best, False, thorough=False)
         if is_worse(fitted, best):
-            step, halvings = halfway(best, step), halvings + 1
+            step, halvings, stretch = halfway(best, step), halvings + 1, 1.0
         else:
-            halvings = 0
-            step = None if is_as_good(fitted, best) else steadied(moved(fitted), fitted, best)
+            halvings, on = 0, goes_on(fitted, best)
+            stretch = 2.0 * stretch if on else 1.0
+            is_at_end = is_as_good(fitted, best) and not on
+            step = None if is_at_end else steadied(moved(fitted, stretch), fitted, best)
             best = fitted
         behind = behind + 1 if other is not None and fitted.wins_over(other) < 0.0 else 0
         del fitted  # its rows are large

@@ -22,7 +22,7 @@ def parameters(fit: Fit, key: Key) -> dict[str, Value]:
             for name, unit, value, j in zip(
                 timing.parameters, timing.units, psi, fit.timing_columns(k), strict=True
             ):
-                values[name] = Value(value, fit.sd_of(j), here(unit))
+                values[name] = Value(value, fit.sd_on_its_way(j), here(unit))
     for effect in fit.revision.effects:
         if effect.key == key:
             column = fit.column(effect)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rtid.diagnose.commands import Timings
 from rtid.diagnose.regression import Estimate
 from rtid.diagnose.revision import Revision
 from rtid.effects.column import Candidate
@@ -24,16 +25,18 @@ from rtid.plain import FloatArray
 if TYPE_CHECKING:
     from rtid.diagnose.fit import Fit
 
+CLEAR = 2.0  # standard deviations of a way that is clear
 SETTLED = 0.2  # of a standard deviation: a step as short ends it
 REACH = 0.6  # of a timing parameter: the longest step
 SHAPE_REACH = 0.5  # the same of an effect's nonlinear parameter, in steps of its axis
 SIZED = 0.05  # share by which compliances and sizes of effects may still change: they weigh
-KEPT = 0.995  # of the rows that a step must leave on the grids: what is left out cannot misfit
+FEW_OUT, MOST_OUT = 0.005, 0.05  # of the rows that a step may take off the grids
+LEFT_OUT = 10.0  # times the usual that each of them is taken to leave
 LAG_REACH = 3.0  # tolerances of the declared lag
 FAR = 10.0  # rho above which what is missing would pass for a modulus, or for a lag far off
 NOISE = 4.0  # of chi2: two fits are as good as one another
 ENOUGH = 1e-3  # the same, of the misfit
-LEAST_LAG_S, LEAST_SHARE = 2e-5, 2e-3  # steps of a lag and of a timing that are not worth a pass
+LEAST_LAG_S, LEAST_SHARE = 5e-6, 2e-3  # steps of a lag and of a timing that are not worth a pass
 STEEPEST = -4.0  # of what a compliance finds over what weighs it: a straight line through two fits
 LEAST_SPACING = 1e-3  # the same of a shape, of its axis' spacing
 
@@ -46,9 +49,9 @@ class Step:
     weights: Weights
 
 
-def moved(fit: Fit) -> Step | None:
-    """Where the derivatives point; None where nothing is left to move."""
-    old, way = fit.revision, _Way.of(fit)
+def moved(fit: Fit, stretch: float = 1.0) -> Step | None:
+    """Where the derivatives point, so many times as far; None where nothing is left to move."""
+    old, way = fit.revision, _Way.of(fit, stretch)
     timings = tuple(
         (timing, way.timed(k, timing, psi)) for k, (timing, psi) in enumerate(old.timings)
     )
@@ -114,13 +117,48 @@ def is_as_good(fit: Fit, best: Fit) -> bool:
     return abs(best.excess - fit.excess) < max(NOISE, ENOUGH * misfit)
 
 
+def goes_on(fit: Fit, best: Fit) -> bool:
+    """True where lag and timings clearly point on from a fit, the way that led to it from `best`.
+
+    Steps of a command that leave their blocks bend the maps: the derivative was a fifth of the way
+    of a joystick's lag, which stood still on the first level stretch, at 8.6 +- 0.15 ms of 14.
+    """
+    steps = {fit.first_given: fit.weights.lag_s - best.weights.lag_s}
+    pairs = zip(fit.revision.timings, best.revision.timings, strict=True)
+    for k, ((_, psi), (_, was)) in enumerate(pairs):
+        steps |= zip(fit.timing_columns(k), np.subtract(psi, was).tolist(), strict=True)
+    least = CLEAR * float(np.sqrt(max(1.0, fit.rho)))
+    estimate = fit.estimate
+    clear = [
+        step * estimate.value(at)
+        for at, step in steps.items()
+        if step and at in estimate.used and abs(estimate.value(at)) > least * estimate.sd(at)
+    ]
+    return bool(clear) and min(clear) > 0.0
+
+
 def is_worse(fit: Fit, best: Fit) -> bool:
     """True where a step made the misfit larger, both being weighed alike, or lost rows."""
-    if fit.regression.rows < KEPT * best.regression.rows:
-        return True
+    left_out = 1.0 - fit.regression.rows / max(1.0, best.regression.rows)
+    more = counted_for(left_out, fit.revision.timings)
+    if more > 0.0:
+        return fit.excess + more * fit.held.sse > best.excess
     alike = np.array_equal(fit.weights.compliance, best.weights.compliance)
     alike = alike and _weigh_alike(fit.revision.sizes, best.revision.sizes)
     return alike and fit.excess > best.excess and not is_as_good(fit, best)
+
+
+def counted_for(left_out: float, timings: Timings) -> float:
+    """How much more a fit is taken to leave, as a share of it, that leaves out a share of the rows.
+
+    0 for few, inf for most: what is left out cannot misfit.  A spool of second order swings beyond
+    its largest command, where there is no map: of one at 113 rad/s and a damping of 0.6 each step
+    from 149 and 0.8 towards it was refused.
+    """
+    if left_out <= FEW_OUT:
+        return 0.0
+    swings = any(timing.replaces_lag for timing, _ in timings)
+    return LEFT_OUT * left_out if swings and left_out < MOST_OUT else float("inf")
 
 
 def _mean(a: Psi, b: Psi) -> Psi:
@@ -154,13 +192,13 @@ class _Way:
     share: float = 1.0
 
     @classmethod
-    def of(cls, fit: Fit) -> _Way:
+    def of(cls, fit: Fit, stretch: float = 1.0) -> _Way:
         """A declared lag that would leave its range stays, and the others go without it."""
         way = cls(fit, fit.estimate)
         if not fit.revision.replaces_lag and way._lag_leaves():
             used = tuple(k for k in fit.estimate.used if k != fit.first_given)
             way = cls(fit, fit.regression.fit(used))
-        return replace(way, share=min([1.0, *way._shares()]))
+        return replace(way, share=min([stretch, *way._shares()]))
 
     def lag_s(self, reach: float) -> float:
         """The declared lag to go on with, at most so many tolerances off."""

@@ -40,13 +40,14 @@ class HiddenInMap:
 
     own_flow: of the rms flow, None for a timing; maps: root mean square over the visits, of an
     edge's largest flow; beta: relative, of the chambers whose modulus leaves its interval;
-    separates: what would keep it out of the maps.
+    separates: what would keep it out of the maps; lag_s: by how much the spools' lag is off.
     """
 
     own_flow: float | None
     maps: dict[str, float]
     beta: dict[str, float]
     separates: tuple[str, ...]
+    lag_s: float = 0.0
 
 
 @dataclass(frozen=True)

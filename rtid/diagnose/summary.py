@@ -13,6 +13,7 @@ from rtid.diagnose.excuse import counted, steady
 from rtid.diagnose.experiment import limits, would_separate
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.fitted_sizes import parameters
+from rtid.diagnose.profile import lag_sd_s
 from rtid.diagnose.remains import described
 from rtid.diagnose.report import (
     Diagnosis,
@@ -63,7 +64,7 @@ def diagnosis(result: Result) -> Diagnosis:
         rms_flow_m3s=result.after.flow_m3s,
         beta_pa=tuple(1.0 / float(c) if c else float("inf") for c in words.compliance),
         lag_s=words.weights.lag_s,
-        lag_sd_s=words.lag_sd_s,
+        lag_sd_s=lag_sd_s(words),
         something_remains=last.rho >= last.most_rho or result.verdict == UNKNOWN,
         held_out_judged=result.held_out_judged,
         not_found=unseen,
@@ -165,7 +166,7 @@ def _hidden(fit: Fit, effect: str, does: Consequence | None) -> HiddenInMap | No
     pages = dict(catalogue()) | {s.name: s for s in fit.suspects}
     own = does.own_share if np.isfinite(does.own_share) else None
     separates = would_separate(fit, pages[effect].kind)
-    return HiddenInMap(own, dict(does.maps), dict(does.beta), tuple(separates))
+    return HiddenInMap(own, dict(does.maps), dict(does.beta), tuple(separates), does.lag_s)
 
 
 def _named(result: Result, best: Key, other: Key) -> str:

@@ -213,6 +213,8 @@ def hidden(effect: FoundEffect) -> str:
     bends = sorted(does.maps.items(), key=lambda bend: -bend[1])[:MOST_BENDS]
     parts = [f"the map {name} ({_share(bend)} of its largest flow)" for name, bend in bends]
     parts += [f"beta {name} ({_share(abs(move))})" for name, move in does.beta.items()]
+    if does.lag_s:
+        parts.append(f"the lag of the spools ({1e3 * abs(does.lag_s):.2g} ms)")
     own = f"; its own flow is {_share(does.own_flow)} of the rms flow" if does.own_flow else ""
     off = f"{_and(parts)} {'are' if len(parts) > 1 else 'is'} off"
     text = f"The maps hide it: the error hardly shows it, yet without it {off}{own}."

@@ -76,7 +76,7 @@ def test_it_is_said_with_what_it_bends(told: Diagnosis) -> None:
     assert "The maps hide it" in text and "of its largest flow" in text
     assert "vary the supply's pressure" in text
     json = told.as_json()["found"][0]["hidden_in_map"]
-    assert set(json) == {"own_flow", "maps", "beta", "separates"}
+    assert set(json) == {"own_flow", "maps", "beta", "separates", "lag_s"}
 
 
 def test_advice_never_asks_for_what_the_record_has(result: Result) -> None:
@@ -190,4 +190,5 @@ def test_each_limb_alone_is_material() -> None:
     assert Consequence(0.02, (), ()).is_material
     assert Consequence(float("nan"), (("pa", 0.02),), ()).is_material
     assert Consequence(0.0, (), (("a", -0.02),)).is_material
+    assert Consequence(float("nan"), (), (), 1e-3).is_material
     assert not Consequence(0.009, (("pa", 0.009),), (("a", 0.009),)).is_material

@@ -10,7 +10,21 @@ import pytest
 
 from rtid.diagnose import fit as fitting
 from rtid.diagnose.fit import Fit, fit, one_pass, prepare
-from rtid.diagnose.moving import REACH, SIZED, Step, halfway, is_as_good, is_worse, moved, steadied
+from rtid.diagnose.moving import (
+    FEW_OUT,
+    LEFT_OUT,
+    MOST_OUT,
+    REACH,
+    SIZED,
+    Step,
+    counted_for,
+    goes_on,
+    halfway,
+    is_as_good,
+    is_worse,
+    moved,
+    steadied,
+)
 from rtid.diagnose.revision import Revision
 from rtid.effects.laws.lines import AT_CYLINDER
 from rtid.effects.laws.timing import TIMINGS, TimingLaw
@@ -53,6 +67,30 @@ def test_a_step_goes_towards_the_truth_and_no_farther_than_its_reach() -> None:
     (found,) = psi(moved(at(8e-3)))
     assert 8e-3 < found <= 8e-3 * (1 + REACH) * (1 + 1e-9)
     assert abs(found - DELAY_S) < 4e-3
+
+
+def test_a_step_may_be_stretched() -> None:
+    near = at(11.5e-3)
+    (once,), (twice,) = psi(moved(near)), psi(moved(near, 2.0))
+    assert twice - 11.5e-3 == pytest.approx(2.0 * (once - 11.5e-3), rel=1e-6)
+
+
+def test_what_points_on_the_way_that_it_came_goes_on() -> None:
+    """A joystick's lag stood still on the first level stretch, at 8.6 +- 0.15 ms of 14."""
+    near, nearer = at(8e-3), at(9e-3)
+    assert goes_on(nearer, near) and not goes_on(near, nearer)
+    assert not goes_on(at(DELAY_S), nearer)  # nothing is left that is clear
+
+
+@pytest.mark.parametrize("effect", ["spool_lag_second_order", "input_delay"])
+def test_a_spool_that_swings_may_leave_rows_out(effect: str) -> None:
+    """Beyond its largest command there is no map: each step towards 113 rad/s was refused."""
+    parts = ((timing(effect), timing(effect).bank[0]),)
+    some = 0.5 * (FEW_OUT + MOST_OUT)
+    assert counted_for(0.5 * FEW_OUT, parts) == 0.0
+    assert counted_for(2.0 * MOST_OUT, parts) == np.inf
+    swings = effect == "spool_lag_second_order"
+    assert counted_for(some, parts) == (LEFT_OUT * some if swings else np.inf)
 
 
 def test_parameters_are_shortened_together() -> None:

@@ -62,8 +62,8 @@ def test_a_volume_that_is_none_explains_nothing_once_it_is_settled() -> None:
 def test_what_only_spreads_the_rows_explains_nothing(
     fallen: float, risen: float, settled: float, is_alone: bool
 ) -> None:
-    def of(sse: float, settled_chi2: float) -> Any:
-        of_record = {"held": SimpleNamespace(sse=sse), "settled_chi2": settled_chi2}
+    def of(excess: float, settled_chi2: float) -> Any:
+        of_record = {"excess": excess, "settled_chi2": settled_chi2}
         return SimpleNamespace(**of_record, wins_over=lambda _: fallen - risen)
 
     present, now = of(9000.0, settled), of(9000.0 - fallen, 0.0)

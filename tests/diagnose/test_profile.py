@@ -1,0 +1,58 @@
+"""A lag is known as well as others leave more: not as a derivative at one says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from rtid.diagnose import profile
+from rtid.diagnose.profile import RISE, lag_sd_s
+from rtid.model import Lag
+
+LAG_S, SD_S, RHO = 3e-3, 1e-4, 1.44
+
+
+def told(
+    monkeypatch: pytest.MonkeyPatch, excess: Callable[[float], float], local_s: float
+) -> float:
+    """The deviation of a lag whose fits leave `excess` (s -> chi2)."""
+
+    def passed(_model: Any, _chunk: Any, weights: Any, *_rest: Any, **_more: Any) -> Any:
+        return SimpleNamespace(excess=excess(weights.lag_s))
+
+    monkeypatch.setattr(profile, "one_pass", passed)
+    monkeypatch.setattr(profile, "replace", lambda weights, lag_s: SimpleNamespace(lag_s=lag_s))
+    declared = SimpleNamespace(lag=Lag(2e-3, 1e-3))
+    present: Any = SimpleNamespace(
+        weights=SimpleNamespace(lag_s=LAG_S), declared=declared, chunk=None, revision=None,
+        rho=RHO, excess=excess(LAG_S), lag_sd_s=local_s,
+    )  # fmt: skip
+    return lag_sd_s(present)
+
+
+def parabola(lag_s: float) -> float:
+    return RHO * ((lag_s - LAG_S) / SD_S) ** 2
+
+
+@pytest.mark.parametrize("local_s", [SD_S, 0.3 * SD_S])
+def test_a_parabola_gives_its_own(monkeypatch: pytest.MonkeyPatch, local_s: float) -> None:
+    sd_s = told(monkeypatch, parabola, local_s)
+    assert sd_s == pytest.approx(SD_S, rel=0.05 if local_s == SD_S else 0.2)
+
+
+def test_what_is_level_is_known_to_its_range(monkeypatch: pytest.MonkeyPatch) -> None:
+    """0 to 5 ms: from three tolerances below what is declared, and no less than none, to above."""
+    sd_s = told(monkeypatch, lambda _: 0.0, SD_S)
+    assert sd_s == pytest.approx(5e-3 / (2.0 * RISE))
+
+
+def test_it_is_never_less_than_the_derivative_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert told(monkeypatch, lambda lag_s: 100.0 * parabola(lag_s), SD_S) == SD_S
+
+
+def test_a_lag_that_is_not_told_stays_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    sd_s = told(monkeypatch, parabola, float("nan"))
+    assert sd_s != sd_s
