@@ -19,7 +19,7 @@ from rtid.diagnose.commands import behind
 from rtid.diagnose.evidence import rows_of
 from rtid.diagnose.excuse import counted
 from rtid.diagnose.fit import Fit, one_pass
-from rtid.diagnose.halves import between_halves
+from rtid.diagnose.halves import between_halves, in_its_form
 from rtid.diagnose.regression import LIMIT_SD
 from rtid.diagnose.residual import is_known
 from rtid.diagnose.trials import Trial
@@ -177,8 +177,10 @@ def _again(now: Fit, machine: Machine, chunk: FloatArray, weights: Weights) -> F
 def _size(fit: Fit, trial: Trial) -> tuple[int, float, float]:
     """The first free parameter of what was tried last: column, value, standard deviation.
 
-    One at its bound is no size: a pump that only gives way at its limit has no droop.
+    One at its bound is no size: a pump that only gives way at its limit has no droop.  That of a
+    column is of its form as it stands, which is the same in every part and on every grid.
     """
+    estimate = fit.estimate
     if trial.is_timing:
         k = len(fit.revision.timings) - 1
         timing, psi = fit.revision.timings[k]
@@ -190,9 +192,9 @@ def _size(fit: Fit, trial: Trial) -> tuple[int, float, float]:
         column = free[first]
         value = effect.shape[first] + fit.estimate.value(column)
     else:
-        column = fit.column(effect)
+        column, estimate = fit.column(effect), in_its_form(fit, effect)
         value = fit.held.value(column)
-    return column, value, fit.estimate.sd(column) * float(np.sqrt(max(1.0, fit.rho)))
+    return column, value, estimate.sd(column) * float(np.sqrt(max(1.0, fit.rho)))
 
 
 def _is_alike(value: float, apart: float, sd: float) -> bool:

@@ -44,7 +44,8 @@ class Reach:
 
     left: of the rms flow, what nothing else follows; own: its own flow, inf for a timing; bend: of
     a map's largest flow, the most of all; softer: of a modulus, where its interval is the narrower;
-    gain: chi2 that it must take to be named where only the maps show it.
+    gain: chi2 that it must take to be named where only the maps show it; moved: of that modulus,
+    whatever its interval.
     """
 
     sd: float
@@ -53,6 +54,7 @@ class Reach:
     bend: float
     softer: float
     gain: float = HIDDEN_GAIN
+    moved: float = 0.0
 
     @property
     def named_from(self) -> float:
@@ -67,15 +69,22 @@ class Reach:
         own = self.own if np.isfinite(self.own) else 0.0
         return 1.0 / max(own / OWN, self.bend / BEND, self.softer / SOFTER, NOTHING)
 
+    def beyond_interval(self, size: float) -> float | None:
+        """By how much, relative, a size moves a modulus; None where its interval holds that."""
+        return abs(size) * self.moved if abs(size) * self.softer >= SOFTER else None
+
     def not_believed(self, score: Score) -> float:
         """The size that a record shows and that matters, but which nothing confirms; else 0.
 
         What the maps' polynomials miss looks like an effect of this size, of either sign: on slow
         sweeps of five machines an external leak larger than the flow stood five to nine deviations
-        out, where none was, or one of a tenth of it.  So no smaller one would have been seen.
+        out, where none was, or one of a tenth of it.  So no smaller one would have been seen: none
+        within what its interval holds, whose upper end this is.
         """
         size = abs(score.value)
-        return size if size > max(LIMIT_SD * self.sd, self.matters_from) else 0.0
+        if not size > max(LIMIT_SD * self.sd, self.matters_from):
+            return 0.0
+        return size + Z95 * self.sd
 
 
 def clearest(scores: list[tuple[Candidate, Score]]) -> dict[Key, tuple[Candidate, Score]]:
@@ -84,14 +93,37 @@ def clearest(scores: list[tuple[Candidate, Score]]) -> dict[Key, tuple[Candidate
     Of a timing, the one as strong as its own limit, of those that the record shows: a column is
     made for one strength, and a share of 0.01 of one for 60 ms is no delay of 0.6 ms.  Of a cause
     whose form may be nothing, the one without: of a volume that is 4 ms late a quarter is seen of
-    one that is not late.
+    one that is not late.  Of what differs by numbers that the limit is not told with, as the
+    exponent of air, the one whose size is told worst: 0.025 of air of exponent 1.4 was the limit
+    where 0.030 of 1.3 was passed over, which is as soft as 0.053 of 1.0.
     """
     best: dict[Key, tuple[Candidate, Score]] = {}
-    for candidate, score in scores:
+    for candidate, score in _worst_of_untold(scores):
         known = best.get(candidate.key)
         if known is None or _rank(candidate, score) < _rank(*known):
             best[candidate.key] = candidate, score
     return best
+
+
+def _worst_of_untold(
+    scores: list[tuple[Candidate, Score]],
+) -> list[tuple[Candidate, Score]]:
+    """Of columns that differ by numbers without a unit alone, the one whose size is told worst."""
+    worst: dict[Candidate, tuple[Candidate, Score]] = {}
+    for candidate, score in scores:
+        told = candidate
+        if candidate.where != COMMAND and not candidate.is_whole:
+            told = replace(candidate, shape=tuple(value for _, value, _ in told_form(candidate)))
+        known = worst.get(told)
+        if known is None or score.sd > known[1].sd:
+            worst[told] = candidate, score
+    return list(worst.values())
+
+
+def told_form(candidate: Candidate) -> list[tuple[str, float, str]]:
+    """Name, value and unit of the numbers of its form that a limit is told with: they have one."""
+    numbers = zip(candidate.shape_names, candidate.shape, candidate.shape_units, strict=True)
+    return [(name, value, unit) for name, value, unit in numbers if unit != "1"]
 
 
 def _rank(candidate: Candidate, score: Score) -> tuple[bool, float]:
@@ -164,6 +196,7 @@ class _Gathering:
     ) -> None:
         self._fit, self._rows, self._flow_m3s, self._wanted = fit, rows, flow_m3s, wanted
         self._on_rows, self._narrow = _OnRows.of(fit, rows), _narrowness(fit)
+        self._relative = _relative(fit)
         self._used = {k - fit.first_given for k in fit.estimate.used}
         self._n, self._beside = 0, list[Volumes]()
         self._asked = list[tuple[Candidate, float, Volumes]]()
@@ -213,9 +246,10 @@ class _Gathering:
         on_rows, (shares, terms) = self._on_rows, b
         flows = on_rows.flows(terms)
         left = on_rows.rms(z - follows - on_rows.into_chambers(flows)) / self._flow_m3s
-        softer = np.max(np.abs(shares[: len(self._narrow)]) * self._narrow, initial=0.0)
+        moves = np.abs(shares[: len(self._narrow)])
+        softer, moved = (np.max(moves * by, initial=0.0) for by in (self._narrow, self._relative))
         own = np.inf if candidate.where == COMMAND else on_rows.rms(z) / self._flow_m3s
-        return Reach(sd, left, own, on_rows.bend(flows), float(softer))
+        return Reach(sd, left, own, on_rows.bend(flows), float(softer), moved=float(moved))
 
 
 def _narrowness(fit: Fit) -> FloatArray:
@@ -224,10 +258,14 @@ def _narrowness(fit: Fit) -> FloatArray:
     It is the one that is told, as of a consequence: by the noise's alone a delay of 2.5 ms would
     have been named on a sweep, where one of 6 ms moved a modulus by half of what is known of it.
     """
-    share = fit.weights.compliance / np.maximum(np.abs(fit.compliance), NOTHING)
     half = Z95 * np.sqrt(np.maximum(np.diag(counted(fit)), 0.0))
     wide = half / np.maximum(np.abs(fit.compliance), NOTHING) / SOFTER
-    return np.asarray(share / np.maximum(1.0, wide))
+    return np.asarray(_relative(fit) / np.maximum(1.0, wide))
+
+
+def _relative(fit: Fit) -> FloatArray:
+    """Relative move of each modulus per unit (chambers,)."""
+    return np.asarray(fit.weights.compliance / np.maximum(np.abs(fit.compliance), NOTHING))
 
 
 @dataclass(frozen=True)

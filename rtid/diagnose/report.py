@@ -93,6 +93,9 @@ class Unseen:
     been named, which must also matter; None where no possible one would.
     examined: False where this machine and record have no column for it: nobody looked.
     form: the numbers beside its size that the sizes are of, as the pressure at which a valve opens.
+    seen: the size that the record shows and nothing confirms, None without one; moves_beta: by how
+    much, relative, the size of what is seen and not named moves a modulus that is told without it,
+    None where the modulus' 95 % interval holds that.
     """
 
     effect: str
@@ -104,6 +107,8 @@ class Unseen:
     examined: bool = True
     named_from: float | None = None
     form: Mapping[str, Value] = field(default_factory=dict)
+    seen: Value | None = None
+    moves_beta: float | None = None
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,8 @@ from rtid.diagnose.diagnosis import Result
 from rtid.diagnose.exact import LARGE, is_refitted
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.fitted_sizes import over, parameters
-from rtid.diagnose.nameable import VISIBLE, clearest
+from rtid.diagnose.halves import in_its_form
+from rtid.diagnose.nameable import NOTHING, VISIBLE, clearest, told_form
 from rtid.diagnose.regression import LIMIT_SD, Score
 from rtid.diagnose.report import MISLED, NO_SIZE, NOBODY_LOOKED, NOT_CONFIRMED, Unseen, Value
 from rtid.diagnose.trials import detection_limit, physical
@@ -33,10 +34,22 @@ def has_size(fit: Fit, key: Key) -> bool:
     """False where the 95 % interval of an effect's size holds zero.
 
     A leak of 1.5e-12 +- 5.0e-12 was named beside a worn place whose form was wrong: it took a part
-    of the misfit, and trades with the other.
+    of the misfit, and trades with the other.  One that only trades with a number of its own form is
+    a size all the same: with air of another exponent it is another share, and none is nothing.
     """
     size = next(iter(parameters(fit, key).values()))
-    return not abs(size.value) < Z95 * size.std
+    return not abs(size.value) < Z95 * size.std * _of_its_form(fit, key)
+
+
+def _of_its_form(fit: Fit, key: Key) -> float:
+    """Deviation of an effect's size, its form being what it is, as a share of that beside it."""
+    own = [e for e in fit.revision.effects if e.key == key and not e.is_whole]
+    if not own:
+        return 1.0
+    column = fit.column(own[0])
+    sd, more = in_its_form(fit, own[0]).sd(column), dict(fit.spreads).get(column, 0.0)
+    by_form = float(np.hypot(sd * np.sqrt(max(1.0, fit.rho)), more))
+    return by_form / max(fit.sd_of(column), NOTHING)
 
 
 def _without_size(fit: Fit, key: Key) -> Unseen:
@@ -96,7 +109,17 @@ def _limit(result: Result, candidate: Candidate, score: Score) -> Unseen:
     named = max(float(named_from), taken) if may_be and known else None
     key = candidate.effect, candidate.where
     at = _form(candidate) | over(result.last, candidate)
-    return Unseen(*key, largest, unit, bool(visible), reason, named_from=named, form=at)
+    is_seen = known is not None and (bool(doubtful) or candidate.key in result.negligible)
+    moves = known.beyond_interval(score.value) if known and is_seen and by == candidate else None
+    said = *key, largest, unit, bool(visible), reason, True, named, at
+    return Unseen(*said, _seen(result.last, candidate, score) if doubtful else None, moves)
+
+
+def _seen(fit: Fit, candidate: Candidate, score: Score) -> Value:
+    """The size that the record shows of a cause, with its deviation by the misfit that is left."""
+    deviation = score.sd * float(np.sqrt(max(1.0, fit.rho)))
+    (size, unit, _), (sd, _, _) = (_sized(fit, candidate, c) for c in (abs(score.value), deviation))
+    return Value(float(size), float(sd), unit)
 
 
 def _is_misled(result: Result, candidate: Candidate) -> bool:
@@ -128,8 +151,7 @@ def _form(candidate: Candidate) -> dict[str, Value]:
     """
     if candidate.where == COMMAND or candidate.is_whole:
         return {}
-    named = zip(candidate.shape_names, candidate.shape, candidate.shape_units, strict=True)
-    return {n: Value(v, float("nan"), unit) for n, v, unit in named if v != 0.0 and unit != "1"}
+    return {n: Value(v, float("nan"), unit) for n, v, unit in told_form(candidate) if v != 0.0}
 
 
 def _sized(fit: Fit, candidate: Candidate, coefficient: float) -> tuple[float, str, bool]:

@@ -18,6 +18,7 @@ from rtid.tell.diagnosed import (
     LIMITS,
     floored,
     hidden,
+    in_the_moduli,
     judged,
     limits,
     limits_say,
@@ -102,7 +103,8 @@ def fragments(ranked: RankedDiagnosis | None, page: str, may_add: bool) -> dict[
     if diagnosis.verdict != "insufficient_data":
         parts.append(_ranking(ranked, may_add))
     parts += _unseen(diagnosis)
-    if words := "" if diagnosis.found else " ".join(seen_and_not_named(diagnosis)):
+    seen = [*seen_and_not_named(diagnosis), *in_the_moduli(diagnosis)]
+    if words := "" if diagnosis.found else " ".join(seen):
         parts.insert(0, f'<div class="card">{text(words)}</div>')
     chosen = page or next((e.effect for e in diagnosis.found), "")
     return {"ranking": "".join(parts), "page": effect_page(chosen)}

@@ -9,8 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rtid.diagnose.nameable import Reach
-from rtid.diagnose.regression import LIMIT_SD
+from rtid.diagnose.nameable import Reach, clearest
+from rtid.diagnose.regression import LIMIT_SD, Score
+from rtid.diagnose.report import NOT_CONFIRMED, Small, Unseen, Value
+from rtid.effects import effect
+from rtid.effects.column import of_page
+from rtid.tell.diagnosed import in_the_moduli, sentences
 from tests.campaign.diagnoses import IN_SET, RIGHT
 from tests.campaign.laws import Case, answer, judged
 
@@ -51,3 +55,51 @@ def test_it_is_significant_and_no_smaller_where_less_is_left(
     beside = replace(reach, left=0.0, gain=1e4)  # less may be what a clear effect's law leaves
     assert beside.named_from >= 1e2 * sd
     assert Reach(sd, 0.0, np.inf, 0.0, 0.0).named_from > 1e290, "nothing that matters: never"
+
+
+AIR = "entrained_air", "both"
+
+
+def test_a_limit_holds_for_every_exponent_that_it_is_not_told_with() -> None:
+    """3 % of air of exponent 1.3 were passed over where 0.025 was the limit, of exponent 1.4."""
+    air = of_page(effect(AIR[0]), AIR[1], shape=("polytropic_exponent",))
+    sizes = {1.0: (0.0534, 0.0031), 1.2: (0.0338, 0.0020), 1.4: (0.0251, 0.0015)}
+    scores = [
+        (replace(air, shape=(kappa,)), Score(k, size, sd, 288.0, 0.05))
+        for k, (kappa, (size, sd)) in enumerate(sizes.items())
+    ]
+    (told,) = clearest(scores).values()
+    assert told == scores[0]
+
+
+def test_of_a_volume_the_limit_is_that_of_one_that_is_not_late() -> None:
+    volume = of_page(effect("extra_dead_volume"), "a", shape=("port_lag",))
+    at_once, late = (replace(volume, shape=(lag_s,)) for lag_s in (0.0, 4e-3))
+    scores = [(late, Score(0, 1e-4, 1e-6, 99.0, 0.1)), (at_once, Score(1, 1e-4, 2e-6, 99.0, 0.1))]
+    assert clearest(scores) == {volume.key: scores[1]}
+
+
+@given(st.floats(5.0, 1e3), st.floats(1e-6, 1e-3))
+def test_what_is_not_believed_is_no_larger_than_its_limit(deviations: float, sd: float) -> None:
+    """The truth is within its interval, and so must the limit be no less than its upper end."""
+    reach = Reach(sd, 0.0, 0.0, 0.0, 1.0 / sd, moved=2.0)
+    limit = reach.not_believed(Score(0, -deviations * sd, sd, deviations**2, 0.1))
+    assert limit >= (deviations + 1.95) * sd
+    assert reach.not_believed(Score(0, 2.0 * sd, sd, 4.0, 0.1)) == 0.0
+
+
+def test_a_modulus_that_counts_what_is_not_named_is_said_to() -> None:
+    clean = judged(Case(6201, "laminar", RICH))
+    assert clean is not None and not in_the_moduli(clean.said)
+    (air,) = (u for u in clean.said.not_found if (u.effect, u.where) == AIR)
+    assert air.moves_beta is None and air.seen is None
+    reach = Reach(1e-3, 0.0, 0.0, 0.0, softer=0.5, moved=2.0)
+    moves = reach.beyond_interval(-0.03)
+    assert moves == pytest.approx(0.06) and reach.beyond_interval(0.01) is None
+    doubtful = Unseen(
+        *AIR, 0.04, "1", True, NOT_CONFIRMED, seen=Value(0.03, 1e-3, "1"), moves_beta=moves
+    )
+    said = replace(clean.said, negligible=(Small(*AIR, 1e-4),), not_found=(doubtful,))
+    text = " ".join(sentences(said))
+    assert "Entrained air (both) of 0.03" in text, "what was seen, and not its limit"
+    assert "The moduli are effective ones" in text and "(6 %)" in text
