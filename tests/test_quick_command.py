@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from rtid.study.quick_command import is_taken
-from rtid.study.quick_machine import LAG_SHARE, lag_of
+from rtid.diagnose.fit import fit, prepare
+from rtid.diagnose.revision import Revision
+from rtid.diagnose.trials import TIE
+from rtid.effects import effect
+from rtid.effects.column import of_page
+from rtid.study.quick_command import is_taken, not_told, wins
+from rtid.study.quick_machine import LAG_SHARE, Assumption, lag_of
+from tests.diagnose.records import record
 
 
 def said(verdict: str, n: int = 0, rho: float = 1.0) -> Any:
@@ -44,3 +51,46 @@ def test_a_line_is_late_by_anything_from_nothing_to_half_a_step(lag_s: float) ->
     assert tolerance_ms == pytest.approx(drawn.std(), rel=0.01)
     machine.command_step_s = 0.0
     assert lag_of(machine) == pytest.approx((1e3 * lag_s, 1e3 * LAG_SHARE * lag_s))
+
+
+VOLUME = replace(of_page(effect("extra_dead_volume"), "a", shape=("port_lag",)), shape=(0.0,))
+
+
+def half_a_sample_late(seed: int, found: Revision) -> tuple[Any, Any]:
+    """The same command on a line and held, beside a dead volume that is found or not.
+
+    The means of two samples in turn, half a step later, are what was held but for its corners.
+    """
+    model, held, _ = record("extra_dead_volume", 1e-4, seed, "sweep", "a")
+    u, half_s = 2 + model.column("u"), 0.5e-3
+    line = held.copy()
+    line[:-1, u] = 0.5 * (held[1:, u] + held[:-1, u])
+    lag = replace(model.lag, nominal_s=model.lag.nominal_s + half_s)
+    late = replace(model, lag=lag)
+    last = fit(model, held, prepare(model, held), found, bank=False)
+    on_a_line = fit(late, line, prepare(late, line), Revision(), bank=False)
+    result = SimpleNamespace(last=last)
+    first = SimpleNamespace(taught=held, diagnosed=SimpleNamespace(result=result))
+    return SimpleNamespace(fitted=on_a_line, machine=late), first
+
+
+@pytest.mark.parametrize(
+    ("seed", "found"), [(5, Revision()), (6, Revision()), (6, Revision((VOLUME,)))]
+)
+def test_what_wins_by_chance_tells_nothing_of_the_command(seed: int, found: Revision) -> None:
+    """By 1.15 of 7230 a line won beside a dead volume: 2.818 +- 0.006 ms were told of 1.845."""
+    won, least = wins(*half_a_sample_late(seed, found))
+    assert least >= TIE and abs(won) < least
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Those of a machine of which nothing is assumed."""
+
+    assumptions: tuple[Assumption, ...] = ()
+
+
+def test_that_neither_is_likelier_is_told() -> None:
+    machine: Any = Sizes()
+    (told,) = set(not_told(machine, 2e-3).assumptions) - set(machine.assumptions)
+    assert "held over its 2 ms" in told.what and "1 ms more" in told.if_wrong

@@ -27,7 +27,7 @@ from rtid.project import Project, load
 from rtid.project import guess as proposal
 from rtid.project.guess import RoleCandidate, unused
 from rtid.study.kept_record import model_for
-from rtid.study.quick_command import is_likelier, is_taken, less_known, unlikeliness
+from rtid.study.quick_command import is_taken, less_known, not_told, unlikeliness, wins
 from rtid.study.quick_machine import (
     Assumption,
     Given,
@@ -276,8 +276,12 @@ def _likeliest(
     looser = less_known(machine, study.read.samples)
     tried = [(Study(_project(file, path, source, arranged.roles, m), path), m) for m in looser]
     try:
-        if not tried or not is_likelier(tried[0][0], study):
+        if not tried:
             return held, machine
+        won, least = wins(tried[0][0], study)
+        if not won > least:
+            step_s = looser[0].command_step_s
+            return held, not_told(machine, step_s) if won > -least else machine
         study, on_a_line = min(tried, key=lambda pair: unlikeliness(pair[0].fitted))
         said = _diagnosed(study)
     except (np.linalg.LinAlgError, RtidError):  # it cannot be had so: what was said before stands

@@ -4,7 +4,8 @@ A log of 50 Hz beside a controller of 1 kHz does not say what the valves were to
 clean machine left 2 to 40 times the noise's variance there, and was `unknown`.  Where a record does
 not match with its command held, it is asked whether it is likelier with the command on a line
 between its samples, nothing being integrated across a jump.  Then a share of what is unknown of it
-(`rtid.trace.between`) is its noise: the likeliest.
+(`rtid.trace.between`) is its noise: the likeliest.  What wins no more than by chance, or leaves
+nine tenths of a misfit, tells of neither: then the command is held, as it was read first.
 """
 
 from __future__ import annotations
@@ -14,8 +15,11 @@ from dataclasses import replace
 import numpy as np
 
 from firmware_bridge.samples import Samples
-from rtid.diagnose.fit import Fit, one_pass
+from rtid.diagnose.admission import LEAST_SHARE
+from rtid.diagnose.fit import Fit, fit, one_pass
 from rtid.diagnose.report import Diagnosis
+from rtid.diagnose.revision import Revision
+from rtid.diagnose.trials import TIE
 from rtid.diagnose.verdict import AMBIGUOUS, MATCHES, MISSING
 from rtid.study.quick_machine import Assumption, MachineSizes
 from rtid.study.study import Study
@@ -60,20 +64,43 @@ def unlikeliness(fit: Fit) -> float:
     return float(fit.held.sse + fit.regression.log_noise) / max(1, fit.regression.rows)
 
 
-def is_likelier(line: Study, first: Study) -> bool:
-    """Whether a record is likelier with its command on a line than as it was first, held.
+def wins(line: Study, first: Study) -> tuple[float, float]:
+    """What chi2 falls by with the command on a line, and by how much it must to be believed.
 
     On the same rows, each with its own lag and weighed for what it has found: a fit that takes an
     oil for 9 GPa has less of the pressures' noise to answer for, and a line that is half a sample
-    late is as good as a command that is held.  One beside which no oil can be so stiff is none.
-    Either is asked without what is missing: what is hidden in both tells of neither.
+    late is as good as a command that is held.  Either is asked beside what was found with the
+    command as it was first: what is missing in both would tell for the one whose lag, or whose
+    oil, stands in for more of it.
     """
-    fit, known = line.fitted, first.taught
-    chunk, column = fit.chunk.copy(), 2 + line.machine.column("u")
+    found = first.diagnosed.result.last
+    fit_, known = _beside(line.fitted, found.revision), first.taught
+    chunk, column = fit_.chunk.copy(), 2 + line.machine.column("u")
     chunk[:, column] = known[np.searchsorted(known[:, 0], chunk[:, 0]), column]
-    weights = replace(fit.weights, lag_s=first.fitted.weights.lag_s)
-    held = one_pass(fit.declared, chunk, weights, fit.revision, None, False, thorough=False)
-    stiffest = 1.0 / max(fit.declared.beta_bounds_pa)
-    if held.compliance.min() < stiffest <= fit.compliance.min():
-        return True
-    return fit.settled_chi2 < held.settled_chi2
+    weights = replace(fit_.weights, lag_s=found.weights.lag_s)
+    revision = replace(found.revision, sizes=fit_.revision.sizes)
+    held = one_pass(fit_.declared, chunk, weights, revision, None, False, thorough=False)
+    stiffest = 1.0 / max(fit_.declared.beta_bounds_pa)
+    if held.compliance.min() < stiffest <= fit_.compliance.min():
+        return np.inf, 0.0  # beside a command that is held no oil can be so stiff: it is none
+    chance = TIE * max(1.0, fit_.rho)
+    misfit = held.settled_chi2 - held.regression.due
+    return held.settled_chi2 - fit_.settled_chi2, max(chance, LEAST_SHARE * misfit)
+
+
+def _beside(line: Fit, revision: Revision) -> Fit:
+    """A fit with what was found beside another reading of the command."""
+    if not revision.n_causes:
+        return line
+    weights, sizes = line.weights, replace(revision, sizes=())
+    return fit(line.declared, line.chunk, weights, sizes, line, bank=False)
+
+
+def not_told(machine: MachineSizes, step_s: float) -> MachineSizes:
+    """The machine, with what is assumed where neither reading is likelier than by chance."""
+    assumption = Assumption(
+        f"the command is held over its {1e3 * step_s:.3g} ms; on a line between its samples it "
+        "explains the record as well",
+        f"of a line the spools lag {500.0 * step_s:.3g} ms more (hold of u)",
+    )
+    return replace(machine, assumptions=(*machine.assumptions, assumption))
