@@ -18,6 +18,7 @@ from rtid.diagnose.fit import Fit, one_pass
 from rtid.diagnose.moving import LAG_REACH
 
 RISE = 3.0  # standard deviations at which chi2 is looked at
+ABOUT = 0.5  # of that rise, with which what the derivative says is not asked again
 
 
 def lag_sd_s(present: Fit) -> float:
@@ -39,6 +40,8 @@ def _end_s(present: Fit, step_s: float) -> float:
         weights = replace(present.weights, lag_s=at_s)
         record = present.declared, present.chunk, weights, present.revision
         risen = one_pass(*record, present, False, thorough=False).excess - present.excess
+        if low_s == now_s and risen >= ABOUT * least:
+            return at_s  # as the derivative says
         if risen >= least:
             return low_s + (at_s - low_s) * (least - low) / (risen - low)
         if at_s != now_s + step_s:
