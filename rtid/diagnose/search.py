@@ -29,7 +29,7 @@ ROW_S = 20e-3  # long rows are enough
 SIMPLEX, DOWNHILL = 0.25, 80  # first size in logarithms of the parameters; refits
 CLOSING = 3  # refits between the neighbours of the best of the bank
 FOUND = 0.02  # share of a parameter within which it is found well enough from afar
-DAMPINGS = 0.65, 1.5  # times that of the bank
+LESS_DAMPED = 0.65  # times the damping of the bank
 DEEP = 10.0  # times what a fit leaves that a timing must cost for stronger ones to be none
 OFF = 0.05  # share of a bracket that a trial stays off its ends
 # of what the lag of a fit and a timing beside the declared one have taken: each beside the other's
@@ -198,14 +198,13 @@ class Beside:
         return costs
 
     def damped(self, timing: TimingLaw, psi: Psi, gain: float) -> tuple[Psi, float]:
-        """A spool of second order with the best of a few dampings, as late on slow motion."""
-        best = psi, gain
-        for share in DAMPINGS:
-            trial = tuple(share * value for value in psi)
-            trial = tuple(np.clip(trial, timing.low, timing.high).tolist())
-            better = self.gain(timing, trial)
-            best = (trial, better) if better > best[1] else best
-        return best
+        """A spool of second order as damped as the bank's or less, as late on slow motion.
+
+        With more it is a lag of first order by another name.
+        """
+        trial = tuple(np.clip([LESS_DAMPED * value for value in psi], timing.low, timing.high))
+        less = self.gain(timing, trial)
+        return (trial, less) if less > gain else (psi, gain)
 
     def polished(self, timing: TimingLaw, bank: list[Psi]) -> Psi:
         """The best of a bank for a timing of several parameters, and from there downhill.

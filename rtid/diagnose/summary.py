@@ -13,7 +13,7 @@ from rtid.diagnose.excuse import counted, steady
 from rtid.diagnose.experiment import limits, would_separate
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.fitted_sizes import parameters
-from rtid.diagnose.profile import lag_sd_s
+from rtid.diagnose.lag_interval import lag_sd_s
 from rtid.diagnose.remains import described
 from rtid.diagnose.report import (
     Diagnosis,

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from rtid.diagnose import profile
-from rtid.diagnose.profile import RISE, lag_sd_s
+from rtid.diagnose import lag_interval
+from rtid.diagnose.lag_interval import RISE, lag_sd_s
 from rtid.model import Lag
 
 LAG_S, SD_S, RHO = 3e-3, 1e-4, 1.44
@@ -23,8 +23,10 @@ def told(
     def passed(_model: Any, _chunk: Any, weights: Any, *_rest: Any, **_more: Any) -> Any:
         return SimpleNamespace(excess=excess(weights.lag_s))
 
-    monkeypatch.setattr(profile, "one_pass", passed)
-    monkeypatch.setattr(profile, "replace", lambda weights, lag_s: SimpleNamespace(lag_s=lag_s))
+    monkeypatch.setattr(lag_interval, "one_pass", passed)
+    monkeypatch.setattr(
+        lag_interval, "replace", lambda weights, lag_s: SimpleNamespace(lag_s=lag_s)
+    )
     declared = SimpleNamespace(lag=Lag(2e-3, 1e-3))
     present: Any = SimpleNamespace(
         weights=SimpleNamespace(lag_s=LAG_S), declared=declared, chunk=None, revision=None,
