@@ -205,7 +205,9 @@ def exact_trials(
     present.unfactored().at_rest()
     gains = _from_afar(coarse, timings, other, hints, anywhere)
     # a gain from afar is that of the thinned record: 154,000 for 315,000 of chi2
-    least = max([GAIN, PROMISING * other, *(CLOSE * gain for gain, *_ in gains)])
+    least = max(
+        [0.0 if anywhere else GAIN, PROMISING * other, *(CLOSE * gain for gain, *_ in gains)]
+    )
     trials: dict[Key, Trial] = {}
     for gain, timing, psi, lag_s in gains:
         if gain < least:

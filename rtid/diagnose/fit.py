@@ -287,7 +287,7 @@ def fit(
         if step is None or halvings > HALVINGS or behind == HOPELESS:
             break
         fitted = one_pass(model, chunk, step.weights, step.revision, best, False, thorough=False)
-        if is_worse(fitted, best, stretch > 1.0):
+        if is_worse(fitted, best):
             step, halvings, stretch = halfway(best, step), halvings + 1, 1.0
         else:
             halvings, on = 0, goes_on(fitted, best)

@@ -1,49 +1,89 @@
-"""How well a record tells the spools' lag: by what other lags leave, not by a derivative at one.
+"""How well a record tells a lag or a delay: by what others leave, not by a derivative at one.
 
 Where a joystick's steps take the command from block to block, a lag of half a millisecond more has
 other rows in each, and their maps follow: the derivative knew one to 0.2 ms, of which everything
-from 2 to 6 ms left the same.  On either side the lag is moved on, twice as far each time, until
+from 2 to 6 ms left the same.  On either side it is moved on, twice as far each time, until
 chi2 has risen by that of RISE standard deviations, or its range ends:
 
     sd = (l_+ - l_-) / (2 RISE),        excess(l_+-) - excess(l) = RISE^2 rho.
+
+A delay is moved alone, and with the spools' lag as much the other way: what leaves less counts.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from rtid.diagnose.fit import Fit, one_pass
 from rtid.diagnose.moving import LAG_REACH
+from rtid.diagnose.revision import Revision
 
 RISE = 3.0  # standard deviations at which chi2 is looked at
 ABOUT = 0.5  # of that rise, with which what the derivative says is not asked again
+Leaves = Callable[[float], float]
 
 
 def lag_sd_s(present: Fit) -> float:
     """Standard deviation of the spools' lag, s; NaN where the record does not tell it."""
-    local_s = present.lag_sd_s
-    if not np.isfinite(local_s):
-        return local_s
-    ends = [_end_s(present, way * RISE * local_s) for way in (-1.0, 1.0)]
-    return max(local_s, (ends[1] - ends[0]) / (2.0 * RISE))
+    if not np.isfinite(present.lag_sd_s):
+        return present.lag_sd_s
+    room = _room_of_lag(present)
+    return _sd(present, present.lag_sd_s, room, lambda by: _left(present, by, present.revision))
 
 
-def _end_s(present: Fit, step_s: float) -> float:
-    """The lag at which chi2 has risen, s, by steps that double, or the end of its range."""
-    now_s, lag, least = present.weights.lag_s, present.declared.lag, RISE**2 * max(1.0, present.rho)
-    most_s = max(now_s, lag.nominal_s + LAG_REACH * lag.tolerance_s)
-    low_s, low = now_s, 0.0
+def delay_sd_s(present: Fit, k: int) -> float:
+    """Standard deviation of the delay that is timing k of a fit, s, beyond the derivative's."""
+    (timing, psi), low_high = present.revision.timings[k], _room_of_lag(present)
+    local = present.estimate.sd(present.timing_columns(k)[0]) * float(
+        np.sqrt(max(1.0, present.rho))
+    )
+
+    def leaves(by_s: float) -> float:
+        timings = list(present.revision.timings)
+        timings[k] = timing, (psi[0] + by_s,)
+        moved = replace(present.revision, timings=tuple(timings))
+        against = float(np.clip(-by_s, *low_high))
+        return min(_left(present, lag, moved) for lag in {0.0, against})
+
+    room = timing.low[0] - psi[0], timing.high[0] - psi[0]
+    return float(np.sqrt(_sd(present, local, room, leaves) ** 2 - local**2))
+
+
+def _room_of_lag(present: Fit) -> tuple[float, float]:
+    """By how much the spools' lag may be less and more, s."""
+    now_s, lag = present.weights.lag_s, present.declared.lag
+    if present.lag_tolerance_s == 0.0:
+        return 0.0, 0.0
+    return -now_s, max(0.0, lag.nominal_s + LAG_REACH * lag.tolerance_s - now_s)
+
+
+def _left(present: Fit, more_s: float, revision: Revision) -> float:
+    """What another revision leaves beyond its unknowns, with so much more lag of the spools."""
+    weights = replace(present.weights, lag_s=present.weights.lag_s + more_s)
+    record = present.declared, present.chunk, weights, revision
+    return one_pass(*record, present, False, thorough=False).excess
+
+
+def _sd(present: Fit, local: float, room: tuple[float, float], leaves: Leaves) -> float:
+    """By what is left on either side, and no less than the derivative says (`local`)."""
+    ends = [_end(present, way * RISE * local, room, leaves) for way in (-1.0, 1.0)]
+    return max(local, (ends[1] - ends[0]) / (2.0 * RISE))
+
+
+def _end(present: Fit, step: float, room: tuple[float, float], leaves: Leaves) -> float:
+    """How far off chi2 has risen, by steps that double, or its range ends."""
+    least, low, at_low = RISE**2 * max(1.0, present.rho), 0.0, 0.0
     while True:
-        at_s = float(np.clip(now_s + step_s, 0.0, most_s))
-        weights = replace(present.weights, lag_s=at_s)
-        record = present.declared, present.chunk, weights, present.revision
-        risen = one_pass(*record, present, False, thorough=False).excess - present.excess
-        if low_s == now_s and risen >= ABOUT * least:
-            return at_s  # as the derivative says
-        if risen >= least:
-            return low_s + (at_s - low_s) * (least - low) / (risen - low)
-        if at_s != now_s + step_s:
-            return at_s
-        low_s, low, step_s = at_s, risen, 2.0 * step_s
+        at = float(np.clip(step, *room))
+        risen = leaves(at) - present.excess
+        if low == 0.0 and risen >= ABOUT * least:
+            return at  # as the derivative says
+        if risen >= least:  # its root goes with the way
+            root = np.sqrt([max(0.0, at_low), least, risen])
+            return low + (at - low) * float((root[1] - root[0]) / (root[2] - root[0]))
+        if at != step:
+            return at
+        low, at_low, step = at, risen, 2.0 * step

@@ -202,7 +202,8 @@ class Beside:
 
         With more it is a lag of first order by another name.
         """
-        trial = tuple(np.clip([LESS_DAMPED * value for value in psi], timing.low, timing.high))
+        slower = [LESS_DAMPED * value for value in psi]
+        trial = tuple(np.clip(slower, timing.low, timing.high).tolist())
         less = self.gain(timing, trial)
         return (trial, less) if less > gain else (psi, gain)
 

@@ -167,9 +167,7 @@ def learn_beside(fit: Fit, machine: Acting, chunk: FloatArray) -> RecordFit:
     del state  # its tables are large
     solution = solve(model, told(sums, *_told(fit, machine)), counters=counters)
     solution = count_misfit(model, chunk, weights, solution)
-    lag_sd_s = 0.0
-    if not fit.revision.replaces_lag and model.lag.tolerance_s > 0:
-        lag_sd_s = fit.estimate.sd(fit.first_given)
+    lag_sd_s = fit.lag_sd_s if np.isfinite(fit.lag_sd_s) else 0.0
     return RecordFit(solution, weights, lag_sd_s, np.zeros(0), np.zeros(0))
 
 

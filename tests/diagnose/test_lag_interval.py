@@ -6,6 +6,7 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from rtid.diagnose import lag_interval
@@ -13,6 +14,7 @@ from rtid.diagnose.lag_interval import RISE, lag_sd_s
 from rtid.model import Lag
 
 LAG_S, SD_S, RHO = 3e-3, 1e-4, 1.44
+DELAY_S = 20e-3
 
 
 def told(
@@ -30,7 +32,7 @@ def told(
     declared = SimpleNamespace(lag=Lag(2e-3, 1e-3))
     present: Any = SimpleNamespace(
         weights=SimpleNamespace(lag_s=LAG_S), declared=declared, chunk=None, revision=None,
-        rho=RHO, excess=excess(LAG_S), lag_sd_s=local_s,
+        rho=RHO, excess=excess(LAG_S), lag_sd_s=local_s, lag_tolerance_s=1e-3,
     )  # fmt: skip
     return lag_sd_s(present)
 
@@ -58,3 +60,27 @@ def test_it_is_never_less_than_the_derivative_says(monkeypatch: pytest.MonkeyPat
 def test_a_lag_that_is_not_told_stays_so(monkeypatch: pytest.MonkeyPatch) -> None:
     sd_s = told(monkeypatch, parabola, float("nan"))
     assert sd_s != sd_s
+
+
+def test_a_delay_is_known_as_well_as_with_the_lag_the_other_way(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Their sum is known to SD_S, the delay itself ten times worse."""
+
+    def passed(_model: Any, _chunk: Any, weights: Any, revision: Any, *_rest: Any, **_: Any) -> Any:
+        ((_, (delay_s,)),) = revision.timings
+        off = delay_s - DELAY_S, delay_s + weights.lag_s - DELAY_S - LAG_S
+        excess = RHO * ((off[0] / (10 * SD_S)) ** 2 + (off[1] / SD_S) ** 2)
+        return SimpleNamespace(excess=excess)
+
+    monkeypatch.setattr(lag_interval, "one_pass", passed)
+    monkeypatch.setattr(lag_interval, "replace", lambda _, **changed: SimpleNamespace(**changed))
+    law = SimpleNamespace(low=(1e-4,), high=(0.1,))
+    present: Any = SimpleNamespace(
+        weights=SimpleNamespace(lag_s=LAG_S), declared=SimpleNamespace(lag=Lag(2e-3, 5e-3)),
+        chunk=None, revision=SimpleNamespace(timings=((law, (DELAY_S,)),)), rho=RHO, excess=0.0,
+        lag_tolerance_s=5e-3, timing_columns=lambda _: range(4, 5),
+        estimate=SimpleNamespace(sd=lambda _: SD_S / np.sqrt(RHO)),
+    )  # fmt: skip
+    beyond_s = lag_interval.delay_sd_s(present, 0)
+    assert np.hypot(beyond_s, SD_S) == pytest.approx(10 * SD_S, rel=0.1)
