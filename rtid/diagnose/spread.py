@@ -55,7 +55,8 @@ def with_spreads(fitted: Fit, unnamed: frozenset[Key] = frozenset()) -> Fit:
     spreads: dict[int, float] = {}
     for column, more in _spreads(fitted, fitted.rows):
         spreads[column] = max(spreads.get(column, 0.0), more)
-    for column, more in chain(_of_wholes(fitted), _of_delays(fitted), _moved_by(fitted, unnamed)):
+    of_delays = chain(_of_delays(fitted), _beside_others(fitted))
+    for column, more in chain(_of_wholes(fitted), of_delays, _moved_by(fitted, unnamed)):
         spreads[column] = float(np.hypot(spreads.get(column, 0.0), more))
     better = replace(fitted, spreads=tuple(spreads.items()))
     vars(better).update(model=fitted.model, sent=fitted.sent, view=fitted.view)
@@ -159,8 +160,7 @@ def _of_delays(fitted: Fit) -> Iterator[tuple[int, float]]:
 
     A part of a sample shares a step out between two intervals, and what reaches the lag is wider
     than it was by part (1 - part) step^2, as if the spools' lag were longer: their sum stays.  At
-    200 samples a second the lag went as far as it may, 0.8 ms, and the delay took as much.  Nor is
-    it known better than others leave more (`lag_interval`): one of 20 ms was told as 13.73 +- 0.08.
+    200 samples a second the lag went as far as it may, 0.8 ms, and the delay took as much.
     """
     lag_s, step_s = fitted.weights.lag_s, fitted.view.step_s
     for k, (timing, psi) in enumerate(fitted.revision.timings):
@@ -168,10 +168,18 @@ def _of_delays(fitted: Fit) -> Iterator[tuple[int, float]]:
             part = psi[0] / step_s % 1.0
             wider = part * (1.0 - part) * step_s**2
             longer = float(np.sqrt(lag_s**2 + wider) - lag_s)
-            longer = min(longer, LAG_REACH * fitted.lag_tolerance_s)
-            column = fitted.timing_columns(k)[0]
-            beyond = delay_sd_s(fitted, k) if column in fitted.estimate.used else 0.0
-            yield column, float(np.hypot(longer, beyond))
+            yield fitted.timing_columns(k)[0], min(longer, LAG_REACH * fitted.lag_tolerance_s)
+
+
+def _beside_others(fitted: Fit) -> Iterator[tuple[int, float]]:
+    """Column and spread of each delay that is known no better than others leave more, s.
+
+    One of 20 ms under a joystick's hard steps was told as 13.73 +- 0.08, and is +- 1.4.
+    """
+    for k, (timing, _) in enumerate(fitted.revision.timings):
+        column = fitted.timing_columns(k)[0]
+        if timing.apply is delayed and column in fitted.estimate.used:
+            yield column, delay_sd_s(fitted, k)
 
 
 def _moved_by(fitted: Fit, unnamed: frozenset[Key]) -> Iterator[tuple[int, float]]:
