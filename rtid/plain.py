@@ -53,11 +53,12 @@ def give_back() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def half_used(n: int) -> FloatArray:
-    """Zeros (n, n), for any unit, of which one triangle is used: the other takes no memory.
+def half_used(n: int, kind: type = float) -> FloatArray:
+    """Zeros (n, n) of a kind, any unit, of which one triangle is used: the other takes no memory.
 
     A huge page, which numpy asks for, would hold some of both.
     """
     if 4 * n * n < SPARED:
-        return np.zeros((n, n))
-    return np.ndarray((n, n), buffer=mmap.mmap(-1, 8 * n * n, **OWN))
+        return np.zeros((n, n), kind)
+    size = np.dtype(kind).itemsize * n * n
+    return np.ndarray((n, n), kind, buffer=mmap.mmap(-1, size, **OWN))

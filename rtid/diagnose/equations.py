@@ -47,7 +47,6 @@ def regression_of(
     projected: Projected,
     columns: Columns,
     rows: Rows,
-    dof: float,
 ) -> Regression:
     """What the projection has left, the echoes' products as its noise, and the declared priors."""
     n_c, head = len(model.chambers), len(projected.schur)
@@ -66,8 +65,7 @@ def regression_of(
         prior,
         mean,
         projected.own,
-        dof,
+        rows.due,
         rows.n,
         rows.log_noise,
-        float(rows.n - rows.told[0].n),
     )

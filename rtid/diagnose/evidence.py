@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.linalg.blas import dtrsm
-from scipy.linalg.lapack import dpotrf, dtrtri, dtrtrs
+from scipy.linalg.lapack import dpotrf, dtrtri, dtrtrs, strtri
 
 from rtid.diagnose.directions import Directions
 from rtid.effects.law import Volumes
@@ -133,6 +133,15 @@ class Rows:
         """Covariance of each block's terms (V, 6, 6): small, and kept where the factor is not."""
         return self.factor.covariances()
 
+    @cached_property
+    def due(self) -> float:
+        """What noise alone leaves of the rows, on average: their number less tr H.
+
+        H y: what the maps take of y.  A direction that few rows tell of takes as little of it:
+        along a joystick's steps 1,102 were touched, and 757 taken.
+        """
+        return self.n - self.factor.taken
+
     def forget(self) -> None:
         """Let the factor go where it is large: who asks for it again makes it anew."""
         if self.told[0].n > MANY:
@@ -159,6 +168,20 @@ class EvidenceFactor:
             upper = dpotrf(gram.T, lower=0, clean=0, overwrite_a=1)[0] if len(gram) else gram
         return cls(upper, scale, directions)
 
+    @cached_property
+    def taken(self) -> float:
+        """Degrees of freedom that the maps take, tr H = n - PRIOR_SD^-2 tr (G + prior)^-1.
+
+        Of the inverse the weak directions count, by a few digits: in single precision, half the
+        time, 0.01 of a degree.
+        """
+        if not len(self.scale):
+            return 0.0
+        with one_thread():
+            inverse = strtri(_triangle(self.upper, np.float32), lower=0, overwrite_c=1)[0]
+        variance = products.variances(inverse.T) * self.scale**2
+        return len(self.scale) - PRIOR_SD**-2 * float(variance.sum())
+
     def half(self, right: FloatArray) -> FloatArray:
         """L^-1 scale right' for right (n, m), which is used up: (m, n)."""
         right *= self.scale[:, None]
@@ -184,9 +207,9 @@ class EvidenceFactor:
         return self.directions.covariances(cov)
 
 
-def _triangle(upper: FloatArray) -> FloatArray:
+def _triangle(upper: FloatArray, kind: type = float) -> FloatArray:
     """A copy of an upper triangle (n, n) in Fortran order; the rest of it takes no memory."""
-    copy = half_used(len(upper)).T
+    copy = half_used(len(upper), kind).T
     for k in range(0, len(upper), COLUMNS_AT_ONCE):
         end = k + COLUMNS_AT_ONCE
         copy[:end, k:end] = upper[:end, k:end]

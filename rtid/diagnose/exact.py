@@ -217,7 +217,7 @@ def exact_trials(
         now = tried(state.model, state.chunk, weights, revision)
         if not (anywhere or is_inside(now)):
             continue
-        exact = present.excess - (now.estimate.sse - now.regression.due)
+        exact = present.excess - (now.estimate.sse - now.regression.dof)
         key = key_of(timing)
         if key not in trials or exact > trials[key].gain:
             trials[key] = Trial(key, exact, now.revision, now, True)

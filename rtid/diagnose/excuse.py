@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from rtid.diagnose.commands import split
-from rtid.diagnose.fit import Fit, columns_of_effects, fit, one_pass, with_covariances
+from rtid.diagnose.fit import Fit, columns_of_effects, fit, one_pass
 from rtid.diagnose.residual import effect_values
 from rtid.effects.extra import with_extra_flow
 from rtid.effects.laws import total_softness
@@ -48,8 +48,7 @@ def rho_of_all(present: Fit) -> float:
         return present.rho
     weights = replace(present.weights, missed=np.zeros_like(present.weights.missed))
     record = present.declared, present.chunk, weights, present.revision
-    alike = one_pass(*record, present, bank=False, thorough=False)
-    return with_covariances(alike, like=present).rho  # a few blocks free no more and no less
+    return one_pass(*record, present, bank=False, thorough=False).rho
 
 
 def _excused(present: Fit, most: float) -> Fit:

@@ -20,7 +20,7 @@ from dataclasses import replace
 import numpy as np
 
 from rtid.diagnose.excuse import few_excused, left_over
-from rtid.diagnose.fit import Fit, fit, one_pass, prepare, with_covariances
+from rtid.diagnose.fit import Fit, fit, one_pass, prepare
 from rtid.diagnose.jumps import cut_at_jumps
 from rtid.estimator.misfit import Misfit, can_be_explained
 from rtid.estimator.refine import CLEARLY, halved, halved_along, in_halved, parents
@@ -73,14 +73,14 @@ def halved_throughout(present: Fit) -> Fit:
         return present
     plain = present
     if present.weights.missed.any():  # what its blocks are excused hides what halving would gain
-        plain = with_covariances(_on_grid(present, present.declared)).light()
+        plain = _on_grid(present, present.declared).light()
     for axis in (1, 0):
-        trial = with_covariances(_on_grid(present, halved_along(present.declared, axis)))
+        trial = _on_grid(present, halved_along(present.declared, axis))
         more = max(1.0, plain.regression.dof - trial.regression.dof)
         is_clear = plain.held.sse - trial.held.sse > more + BY_CHANCE * float(np.sqrt(2.0 * more))
         # where rho is no smaller, twice the blocks follow noise and effects alike
         if is_clear and trial.rho < plain.rho:
-            better = with_covariances(few_excused(_to_the_end(trial)))
+            better = few_excused(_to_the_end(trial))
             if better.rho - 1.0 < LEFT * (present.rho - 1.0):
                 return better
     return present
@@ -168,5 +168,4 @@ def _is_worth(present: Fit, trial: Fit) -> bool:
 
 def _is_in_band(fitted: Fit) -> bool:
     """True where rho is off 1 by no more than so long a record gives; rare blocks are not free."""
-    known = with_covariances(fitted)
-    return known.rho < 1.0 + known.spread_of_rho
+    return fitted.rho < 1.0 + fitted.spread_of_rho

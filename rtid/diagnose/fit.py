@@ -36,7 +36,7 @@ from rtid.effects.laws.response import behind_s
 from rtid.effects.laws.timing import SUPPLY
 from rtid.effects.page import Effect
 from rtid.effects.record_view import LONG, MapTerms, RecordView
-from rtid.estimator.factor import PRIOR_SD, SHARED_PRIOR
+from rtid.estimator.factor import SHARED_PRIOR
 from rtid.estimator.misfit import Misfit
 from rtid.estimator.record import refined, summed
 from rtid.estimator.solution import sketch
@@ -119,7 +119,7 @@ class Fit:
         along: a lag of 6.5 ms, where 1.9 and a delay of 20 were true, drew a joystick's steps
         through 99 blocks that nothing else visits, and left 64 of chi2 more with 590 unknowns more.
         """
-        return self.held.sse - self.regression.due
+        return self.held.sse - self.regression.dof
 
     @property
     def spread_of_rho(self) -> float:
@@ -319,8 +319,7 @@ def one_pass(
 
     chunk (n, 2 + signals), SI: the record as declared.  start: the fit whose map gives the
     columns, or `before`, the map alone; sent: the record as it reaches the spools, where known.
-    thorough = False: without the covariances of the maps,
-    and with them what the priors leave of their freedom.
+    thorough = False: without the covariances of the maps.
     """
     if revision.replaces_lag:
         weights = replace(weights, lag_s=0.0)
@@ -340,8 +339,7 @@ def one_pass(
     first = 1 + len(model.chambers) + n_timing + len(shapes)
     view.rest()
     projected = heading.projected()
-    dof = float(rows.n - TERMS * len(rows.cells))
-    regression = regression_of(model, weights, revision, projected, columns, rows, dof)
+    regression = regression_of(model, weights, revision, projected, columns, rows)
     weak = slice(first - len(shapes) - sum(len(psi) for _, psi in revision.timings), first)
     regression.prior[weak] = RIDGE * regression.own[weak] + (regression.own[weak] == 0.0)
     at = [first + columns.candidates.index(e) for e in revision.effects]
@@ -364,7 +362,7 @@ def one_pass(
 
 
 def with_covariances(fitted: Fit, like: Fit | None = None) -> Fit:
-    """A fit with the covariances of its maps, and what their priors leave of the freedom.
+    """A fit with the covariances of its maps.
 
     like: a fit whose covariances are taken where its rows are weighed alike and meet the same
     blocks: an effect more changes them by next to nothing.
@@ -374,11 +372,7 @@ def with_covariances(fitted: Fit, like: Fit | None = None) -> Fit:
     cov = _covariances_of(like, fitted) if like is not None else None
     if cov is None:
         cov = fitted.rows.covariances
-    freed = float(np.einsum("bii->", cov)) * PRIOR_SD**-2
-    dof = fitted.rows.n - TERMS * len(fitted.rows.cells) + freed
-    better = replace(
-        fitted, map=replace(fitted.map, cov=cov), regression=replace(fitted.regression, dof=dof)
-    )
+    better = replace(fitted, map=replace(fitted.map, cov=cov))
     vars(better).update(model=fitted.model, sent=fitted.sent, view=fitted.view)
     return better
 

@@ -50,9 +50,7 @@ def between_halves(fitted: Fit, column: int) -> tuple[float, float]:
     known, projected = fitted.regression, project(rows, [*whole, *parts])
     if not projected.own[at] > 0.0:
         return 0.0, float("inf")
-    beside = regression_of(
-        fitted.model, fitted.weights, fitted.revision, projected, columns, rows, known.dof
-    )
+    beside = regression_of(fitted.model, fitted.weights, fitted.revision, projected, columns, rows)
     beside.prior[:at], beside.mean[:at] = known.prior[:at], known.mean[:at]  # none is of a bank
     own = [e for e in fitted.revision.effects if fitted.column(e) == column]
     used = in_its_form(fitted, own[0]).used if own else fitted.estimate.used

@@ -59,8 +59,8 @@ class Regression:
 
     s, noise (columns, columns); prior, mean (columns,): information and value of the priors;
     own (columns,): squares of the columns before the maps were taken out; rows: of all segments;
-    dof: what the maps leave of them; log_noise: logarithm of the determinant of their noise; due:
-    what noise alone leaves, on average: the rows less the directions of the maps that they tell.
+    dof: what the maps leave of them, see `Rows.due`; log_noise: logarithm of the determinant of
+    their noise.
     """
 
     s: FloatArray
@@ -71,7 +71,6 @@ class Regression:
     dof: float
     rows: int
     log_noise: float = 0.0
-    due: float = 0.0
 
     def fit(self, used: tuple[int, ...]) -> Estimate:
         """Least squares on some columns, errors in variables taken out."""

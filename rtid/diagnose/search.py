@@ -166,9 +166,8 @@ class Beside:
             return float("inf"), np.zeros(0)
         s = project(rows, [rows.on_rows(volumes) for volumes in self.volumes]).schur
         theta = np.linalg.lstsq(s[1:, 1:], s[1:, 0], rcond=1e-12)[0]
-        due = float(rows.n - rows.told[0].n)
         chi2 = float(s[0, 0] - s[0, 1:] @ theta)
-        return (1.0 + left_out) * chi2 - due, np.asarray(theta)
+        return (1.0 + left_out) * chi2 - rows.due, np.asarray(theta)
 
     def gain(self, timing: TimingLaw, psi: Psi) -> float:
         """What a timing lowers the cost by."""

@@ -114,6 +114,17 @@ def scaled(gram: FloatArray, prior: float, scale: FloatArray) -> None:
 
 
 @kernel
+def variances(inverse: FloatArray) -> FloatArray:
+    """Diagonal (n,) of X' X for a lower triangle X (n, n)."""
+    out = np.zeros(len(inverse))
+    for i in range(len(inverse)):
+        row = inverse[i]
+        for j in range(i + 1):
+            out[j] += row[j] * row[j]
+    return out
+
+
+@kernel
 def covariances(inverse: FloatArray, first: IntArray, scale: FloatArray, cov: FloatArray) -> None:
     """Diagonal blocks cov (V, 6, 6) of X' X scaled, X (n, n) lower; cov is changed in place.
 

@@ -86,7 +86,7 @@ def wins(line: Study, first: Study) -> tuple[float, float]:
     if held.compliance.min() < stiffest <= fit_.compliance.min():
         return np.inf, 0.0  # beside a command that is held no oil can be so stiff: it is none
     chance = TIE * max(1.0, fit_.rho)
-    misfit = held.settled_chi2 - held.regression.due
+    misfit = held.settled_chi2 - held.regression.dof
     return held.settled_chi2 - fit_.settled_chi2, max(chance, LEAST_SHARE * misfit)
 
 

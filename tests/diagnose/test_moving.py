@@ -144,7 +144,7 @@ def test_a_fit_that_takes_more_unknowns_to_leave_less_is_worse() -> None:
 
     def leaving(sse: float, due: float) -> Fit:
         held, regression = fitted.held, fitted.regression
-        return replace(fitted, held=replace(held, sse=sse), regression=replace(regression, due=due))
+        return replace(fitted, held=replace(held, sse=sse), regression=replace(regression, dof=due))
 
     many, few = leaving(4200.0, 4126.0), leaving(4300.0, 4716.0)
     assert few.wins_over(many) == pytest.approx(490.0)
