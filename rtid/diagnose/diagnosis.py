@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from rtid.diagnose.admission import (
-    WORSE,
     clearest_gain,
     explains_enough,
     is_as_credible,
@@ -19,6 +18,7 @@ from rtid.diagnose.admission import (
     is_of_another_form,
     is_refuted,
     is_within_a_form,
+    leaves_more,
     taken_in,
 )
 from rtid.diagnose.consequence import (
@@ -371,7 +371,7 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
             state.found.append(AcceptedEffect(*what, last, after, does))
             return kept, after
         state.negligible[trial.key] = share
-        is_good = after.rms_m3s <= WORSE * last.rms_m3s and is_as_credible(present, now)
+        is_good = not leaves_more(last, after) and is_as_credible(present, now)
         is_needless = is_form and present.rho < present.most_rho
         if is_good and is_noticed(present, finished[trial.key]) and not is_needless:
             return _kept_aside(state, now, trial, alike, own, last)

@@ -193,9 +193,14 @@ class _Way:
 
     @classmethod
     def of(cls, fit: Fit, stretch: float = 1.0) -> _Way:
-        """A declared lag that would leave its range stays, and the others go without it."""
+        """A declared lag that would leave its range stays, and the others go without it.
+
+        Beside a slow spool it goes to nothing at first, with all others.
+        """
         way = cls(fit, fit.estimate)
-        if not fit.revision.replaces_lag and way._lag_leaves():
+        if fit.revision.has_slow_spool and LEAST_LAG_S < fit.weights.lag_s < -way._lag_step_s:
+            stretch = min(stretch, fit.weights.lag_s / -way._lag_step_s)
+        elif not fit.revision.replaces_lag and way._lag_leaves():
             used = tuple(k for k in fit.estimate.used if k != fit.first_given)
             way = cls(fit, fit.regression.fit(used))
         return replace(way, share=min([stretch, *way._shares()]))
@@ -206,6 +211,8 @@ class _Way:
         if self.found.lag_tolerance_s == 0.0 or at not in self.estimate.used:
             return now
         low, high = (lag.nominal_s + k * reach * lag.tolerance_s for k in (-1.0, 1.0))
+        if self.found.revision.has_slow_spool:
+            low = 0.0
         target = now + self.share * self.estimate.value(at)
         # one that is farther off already was let go there when less was missing
         target = float(np.clip(target, min(max(0.0, low), now), max(high, now)))
@@ -236,8 +243,12 @@ class _Way:
         lag = self.found.model.lag
         return lag.nominal_s + LAG_REACH * lag.tolerance_s
 
+    @property
+    def _lag_step_s(self) -> float:
+        return self.estimate.value(self.found.first_given)
+
     def _lag_leaves(self) -> bool:
-        target = self.found.weights.lag_s + self.estimate.value(self.found.first_given)
+        target = self.found.weights.lag_s + self._lag_step_s
         return not 0.0 <= target <= self._most_lag_s
 
     def size(self, effect: Candidate) -> float:

@@ -7,7 +7,7 @@ behind them; of the record that has taught the blocks none need be, since its fi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,6 +37,19 @@ class Residual:
     left: FloatArray
     noise: FloatArray
     rows_per_s: float = 50.0
+
+    def at_rows_of(self, other: Residual) -> Residual:
+        """The rows alone at whose instants another has one too, of the same record.
+
+        Behind another lag a spool passes through other blocks, and other rows are judged: the rms
+        of 173 of them had risen where 36,650 of 38,399 of chi2 had gone, by the 31 that were new.
+        """
+        mine, others = (np.round(rest.t_s * self.rows_per_s) for rest in (self, other))
+        at = np.isin(mine, others)
+        return replace(
+            self, t_s=self.t_s[at], measured=self.measured[at], left=self.left[at],
+            noise=self.noise[at],
+        )  # fmt: skip
 
     @property
     def judged_s(self) -> float:

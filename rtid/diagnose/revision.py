@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from rtid.diagnose.commands import Timings
 from rtid.effects.column import Candidate
+from rtid.effects.laws.timing import lagged
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,11 @@ class Revision:
     def replaces_lag(self) -> bool:
         """True where a timing stands for the declared lag of the spools."""
         return any(timing.replaces_lag for timing, _ in self.timings)
+
+    @property
+    def has_slow_spool(self) -> bool:
+        """True where a lag more is in it: spools of one pole that is slower have no other."""
+        return any(timing.apply is lagged and not timing.of_sensor for timing, _ in self.timings)
 
     @property
     def n_causes(self) -> int:

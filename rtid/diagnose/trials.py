@@ -212,6 +212,7 @@ def with_effect(present: Fit, candidate: Candidate) -> Revision:
 
 def material_share(before: Residual, after: Residual) -> float:
     """What an effect takes off the held-out residual, root of the difference, of the rms flow."""
+    before, after = before.at_rows_of(after), after.at_rows_of(before)
     gone = before.rms_m3s**2 - after.rms_m3s**2
     return float(np.sqrt(max(0.0, gone)) / max(before.flow_m3s, 1e-12))
 

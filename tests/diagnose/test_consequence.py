@@ -17,7 +17,7 @@ from rtid.diagnose.report import Diagnosis
 from rtid.diagnose.residual import Residual, is_known
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.summary import diagnosis
-from rtid.diagnose.trials import Trial, TrialState
+from rtid.diagnose.trials import Trial, TrialState, material_share
 from rtid.diagnose.verdict import MATERIAL
 from rtid.effects.record_view import RecordView
 from rtid.plain import silent
@@ -192,3 +192,17 @@ def test_each_limb_alone_is_material() -> None:
     assert Consequence(0.0, (), (("a", -0.02),)).is_material
     assert Consequence(float("nan"), (), (), 1e-3).is_material
     assert not Consequence(0.009, (("pa", 0.009),), (("a", 0.009),)).is_material
+
+
+def test_what_is_left_is_compared_where_both_are_judged() -> None:
+    """Beside another lag other rows are: the new ones may be those that are hardly known."""
+    t_s, ones = np.arange(50) / 50.0, np.ones((50, 1))
+    before = Residual(t_s[:40], ones[:40], 0.5 * ones[:40], 0.1 * ones[:40])
+    worse = np.where(t_s[:, None] < 0.7, 0.2, 5.0)
+    after = Residual(t_s[5:], ones[5:], worse[5:], 0.1 * ones[5:])
+    assert len(before.at_rows_of(after).t_s) == len(after.at_rows_of(before).t_s) == 35
+    assert admission.leaves_more(before, after)
+    better = Residual(t_s[5:], ones[5:], np.where(t_s[5:, None] < 0.8, 0.3, 5.0), 0.1 * ones[5:])
+    assert better.rms_m3s > 2.0 * before.rms_m3s
+    assert not admission.leaves_more(before, better)
+    assert material_share(before, better) == pytest.approx(np.sqrt(0.5**2 - 0.3**2))

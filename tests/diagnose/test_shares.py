@@ -18,7 +18,7 @@ from rtid.model import Lag
 
 STEP_S = 1e-3
 DELAY = COMMAND_LAWS["delay"][0]
-LAG = COMMAND_LAWS["lag"][0]
+PLAY = COMMAND_LAWS["play"][0]
 
 
 def fitted(delay_s: float, lag_s: float, tolerance_s: float = 5e-3, sse: float = 3000.0) -> Any:
@@ -85,8 +85,8 @@ def test_another_share_of_the_sum_is_taken_where_it_is_clearly_better(
     assert len(tried) == (0 if tolerance_s < 1e-3 else 2)
 
 
-def test_what_is_no_delay_is_let_be() -> None:
+def test_what_is_no_delay_and_no_lag_is_let_be() -> None:
     state: Any = SimpleNamespace(model=SimpleNamespace(lag=Lag(0.0, 5e-3)), chunk=None)
     now = fitted(4.85e-3, 0.11e-3)
-    now.revision = Revision((), ((LAG, (4e-3,)),), ())
+    now.revision = Revision((), ((PLAY, (0.4,)),), ())
     assert exact._split_anew(state, now) is now
