@@ -9,11 +9,13 @@ from rtid.diagnose.excuse import counted, rho_of_all
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.residual import Residual
 from rtid.diagnose.trials import TrialState
+from rtid.effects.laws.timing import COMMAND
 from rtid.estimator.validity import Doubt, doubts
 from rtid.model import PROPORTIONAL, Machine
 
 MATERIAL = 0.003  # of the rms flow: what an effect must change of the held-out residual
 NAMED = 0.8  # of the misfit that effects must explain to be named where something else remains
+NAMED_TIMING, CLEARLY_LEFT = 0.95, 2.0  # of it, where a command is late; rho that is no curve's
 MOST_CUT = 0.5  # of the record, that may be lost to pressures at an end of their range
 LEAST_ROWS = 50  # filtered rows that a part must have to be judged by
 LEAST_EVIDENCE = 1000  # scalar rows of the record
@@ -88,9 +90,19 @@ def verdict(
     doubtful = last.declared.has_pressures and last.rho >= last.most_rho
     # nor is a cause told that leaves a misfit and an oil that cannot be: hum was named a line
     is_impossible = any(doubt.is_invalid for doubt in doubted)
-    if doubtful and (is_impossible or explained(state, last) < NAMED):
+    if doubtful and (is_impossible or explained(state, last) < least_explained(last)):
         return INSUFFICIENT if state.judges_itself else UNKNOWN
     return AMBIGUOUS if any(f.alike for f in state.found[:1]) else MISSING
+
+
+def least_explained(last: Fit) -> float:
+    """Share of the misfit that what was found must explain where something else remains.
+
+    What delays or lags a command has no form that may be a tenth off: a spool that may turn by 6/s
+    at most was one of first order, and left 365 times the noise, an eighth of it.
+    """
+    is_late = any(timing.where == COMMAND for timing, _ in last.revision.timings)
+    return NAMED_TIMING if is_late and last.rho > CLEARLY_LEFT else NAMED
 
 
 def explained(state: TrialState, last: Fit) -> float:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,9 +18,11 @@ from rtid.diagnose.excuse import counted
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.report import Diagnosis
 from rtid.diagnose.residual import Residual
+from rtid.diagnose.revision import Revision
 from rtid.diagnose.standing import Standing, fitted, stand
 from rtid.diagnose.summary import diagnosis
 from rtid.diagnose.trials import AcceptedEffect
+from rtid.effects.laws.timing import COMMAND_LAWS
 from rtid.estimator.chunk import to_chunk
 from rtid.estimator.validity import Doubt
 from rtid.model import Lag
@@ -243,3 +247,21 @@ def test_a_supply_that_never_reaches_its_pumps_limit_is_found_on_a_sweep() -> No
     resistance = sag.parameters["resistance"]
     assert resistance.value == pytest.approx(case.plant.hidden[0].strength, rel=0.1)
     assert found.last.rho < 1.5
+
+
+@pytest.mark.parametrize(
+    ("timing", "rho", "least"),
+    [
+        ("delay", 71.0, verdicts.NAMED_TIMING),
+        ("lag", 2.5, verdicts.NAMED_TIMING),
+        ("lag", 1.4, verdicts.NAMED),  # as much as a curve of a valve leaves
+        (None, 71.0, verdicts.NAMED),  # the form of a leak may be a tenth off
+    ],
+)
+def test_a_late_command_explains_nearly_all_or_is_none(
+    timing: str | None, rho: float, least: float
+) -> None:
+    """A spool of limited speed was a lag that left 365 times the noise, an eighth of the misfit."""
+    timings = ((COMMAND_LAWS[timing][0], (4e-3,)),) if timing else ()
+    left: Any = SimpleNamespace(revision=Revision(timings=timings), rho=rho)
+    assert verdicts.least_explained(left) == least
