@@ -115,7 +115,7 @@ def scaled(gram: FloatArray, prior: float, scale: FloatArray) -> None:
 
 @kernel
 def variances(inverse: FloatArray) -> FloatArray:
-    """Diagonal (n,) of X' X for a lower triangle X (n, n)."""
+    """Diagonal (n,) of X' X for a lower triangle X (n, n), in any unit."""
     out = np.zeros(len(inverse))
     for i in range(len(inverse)):
         row = inverse[i]
