@@ -53,7 +53,7 @@ def fine_enough(present: Fit) -> tuple[Fit, Misfit | None]:
 
 
 def finer_beside(present: Fit) -> Fit:
-    """As `fine_enough`, of a fit that knows what its priors leave and may have blocks excused."""
+    """As `fine_enough`, of a fit that may have blocks excused."""
     if not can_be_explained(present.sent):
         return present
     return fine_enough(_on_grid(present, present.declared))[0]

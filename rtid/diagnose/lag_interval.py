@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import count
 
 import numpy as np
 
@@ -22,7 +23,8 @@ from rtid.diagnose.moving import LAG_REACH
 from rtid.diagnose.revision import Revision
 
 RISE = 3.0  # standard deviations at which chi2 is looked at
-ABOUT = 0.5  # of that rise, with which what the derivative says is not asked again
+ABOUT, UNEVEN = 0.5, 1.5  # of that rise, between which what the derivative says is not asked again
+FARTHER = 3  # doublings for which another hollow is looked for
 Leaves = Callable[[float], float]
 
 
@@ -74,16 +76,25 @@ def _sd(present: Fit, local: float, room: tuple[float, float], leaves: Leaves) -
 
 
 def _end(present: Fit, step: float, room: tuple[float, float], leaves: Leaves) -> float:
-    """How far off chi2 has risen, by steps that double, or its range ends."""
-    least, low, at_low = RISE**2 * max(1.0, present.rho), 0.0, 0.0
-    while True:
-        at = float(np.clip(step, *room))
+    """How far off chi2 has risen for the last time, by steps that double, or its range ends.
+
+    Where it rises far more than the derivative says, the present lag stands in one of several
+    hollows, and others are looked for.
+    """
+    least, points = RISE**2 * max(1.0, present.rho), [(0.0, 0.0)]
+    is_uneven = False
+    for k in count():
+        at = float(np.clip(step * 2.0**k, *room))
         risen = leaves(at) - present.excess
-        if low == 0.0 and risen >= ABOUT * least:
+        points.append((at, risen))
+        if k == 0 and ABOUT * least <= risen <= UNEVEN * least:
             return at  # as the derivative says
-        if risen >= least:  # its root goes with the way
-            root = np.sqrt([max(0.0, at_low), least, risen])
-            return low + (at - low) * float((root[1] - root[0]) / (root[2] - root[0]))
-        if at != step:
-            return at
-        low, at_low, step = at, risen, 2.0 * step
+        is_uneven |= k == 0 and risen > UNEVEN * least
+        if at != step * 2.0**k or (risen >= least and not (is_uneven and k < FARTHER)):
+            break
+    last = max(k for k, (_, risen) in enumerate(points) if risen < least)
+    if last == len(points) - 1:
+        return at
+    (low, at_low), (high, at_high) = points[last : last + 2]
+    root = np.sqrt([max(0.0, at_low), least, at_high])  # which goes with the way
+    return low + (high - low) * float((root[1] - root[0]) / (root[2] - root[0]))

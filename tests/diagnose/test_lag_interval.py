@@ -53,6 +53,16 @@ def test_what_is_level_is_known_to_its_range(monkeypatch: pytest.MonkeyPatch) ->
     assert sd_s == pytest.approx(5e-3 / (2.0 * RISE))
 
 
+def test_another_hollow_is_in_its_interval(monkeypatch: pytest.MonkeyPatch) -> None:
+    """1.83 +- 0.03 ms were told of 1.13, which left less, beyond a rise of 20."""
+
+    def hollows(lag_s: float) -> float:
+        return min(parabola(lag_s), parabola(lag_s + 8.0 * SD_S) - 30.0)
+
+    sd_s = told(monkeypatch, hollows, 0.3 * SD_S)
+    assert sd_s == pytest.approx((3.0 + 8.0 + 5.5) * SD_S / (2.0 * RISE), rel=0.25)
+
+
 def test_it_is_never_less_than_the_derivative_says(monkeypatch: pytest.MonkeyPatch) -> None:
     assert told(monkeypatch, lambda lag_s: 100.0 * parabola(lag_s), SD_S) == SD_S
 
