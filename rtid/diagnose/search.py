@@ -116,7 +116,7 @@ class Beside:
             self.ahead = max(0.0, self.before - self.cost((), self.fitted_s))
 
     def cost(self, more: Timings, lag_s: float | None = None) -> float:
-        """chi2 with more timings beyond what is due (`Regression`); inf where they lose rows.
+        """chi2 with more timings beyond what is due (`Rows`); inf where they lose rows.
 
         lag_s: of the spools, s, where it is not the declared one.
         """
