@@ -211,7 +211,7 @@ class Catalog:
         byte = int(row["shift"]) // 8
         return 7 - byte if row["big_endian"] else byte
 
-    def message_source(self, message: str, channel: int | None = None) -> MessageSource:
+    def message_source(self, message: str) -> MessageSource:
         """Period and end-to-end protection as the DBC's attributes and signal names tell them.
 
         GenMsgCycleTime gives the period, E2EDataId the data id; a signal `AliveCounter` is the
@@ -226,7 +226,6 @@ class Catalog:
             counter="AliveCounter" if "AliveCounter" in names else None,
             crc="Crc" if "Crc" in names else None,
             data_id=int(data_id.value) if data_id else 0,
-            channel=channel,
         )
 
 

@@ -34,7 +34,7 @@ class FloodGate(logging.Filter):
         return entry[1] <= BURST
 
 
-def set_up(level: int = logging.INFO) -> None:
+def set_up() -> None:
     """Write to standard error, where journald and people look."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(
@@ -42,5 +42,5 @@ def set_up(level: int = logging.INFO) -> None:
     )
     handler.addFilter(FloodGate())
     logger.handlers[:] = [handler]
-    logger.setLevel(level)
+    logger.setLevel(logging.INFO)
     logger.propagate = False

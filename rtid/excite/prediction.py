@@ -71,9 +71,9 @@ class Prediction:
         """Number of valid blocks."""
         return sum(block.valid for block in self.blocks)
 
-    def sds(self, cells: Iterable[Cell], mean: bool = False) -> FloatArray:
+    def sds(self, cells: Iterable[Cell]) -> FloatArray:
         """Standard errors of the map in some blocks (n,), m3/s; inf where one was not visited."""
-        known = {b.cell: b.mean_sd if mean else b.sd for b in self.blocks}
+        known = {b.cell: b.sd for b in self.blocks}
         return np.array([known.get(cell, np.inf) for cell in cells])
 
     def limit(self, effect: str, where: str) -> float:
@@ -127,13 +127,13 @@ def limits(model: Machine, chunk: FloatArray) -> dict[Key, Limit]:
 _NONE = Limit("", "", np.inf, "")
 
 
-def median_ratio(better: Prediction, than: Prediction, mean: bool = False) -> float:
+def median_ratio(better: Prediction, than: Prediction) -> float:
     """Ratio of the median standard errors over the blocks that both visit with enough rows."""
     enough = {b.cell for b in better.blocks if b.rows >= ENOUGH}
     cells = [b.cell for b in than.blocks if b.rows >= ENOUGH and b.cell in enough]
     if not cells:
         return float("nan")
-    return float(np.median(better.sds(cells, mean)) / np.median(than.sds(cells, mean)))
+    return float(np.median(better.sds(cells)) / np.median(than.sds(cells)))
 
 
 ENOUGH = 20  # rows

@@ -70,7 +70,6 @@ def write_fmu(
     dynamics: Dynamics | None,
     provenance: Mapping[str, Any],
     version: int = 2,
-    error_percent: float = ERROR_PERCENT,
 ) -> bool:
     """Write the FMU, whole or not at all; whether there is a binary in it.
 
@@ -78,7 +77,7 @@ def write_fmu(
     """
     check_version(version)
     _check(model, dynamics)
-    header, variables = _model(model, flowmap, dynamics, error_percent)
+    header, variables = _model(model, flowmap, dynamics)
     token = hashlib.sha256(header.encode()).hexdigest()
     header = header.replace("@TOKEN@", token)
     about = "the learned machine" if dynamics else "learned flow maps"
@@ -127,7 +126,7 @@ def _check(model: Machine, dynamics: Dynamics | None) -> None:
 
 
 def _model(
-    model: Machine, flowmap: FlowMap, dynamics: Dynamics | None, error_percent: float
+    model: Machine, flowmap: FlowMap, dynamics: Dynamics | None
 ) -> tuple[str, list[FmuVariable]]:
     """rtid_model.h, and the variables as a model description lists them."""
     engine = build(model.with_taylor_maps, nominal_weights(model)).engine
@@ -154,7 +153,7 @@ def _model(
     ]
     for edge in model.edges:
         name = f"sd_{edge.name}".replace("-", "_")
-        lines += float_map(name, deviations(edge, flowmap, error_percent))
+        lines += float_map(name, deviations(edge, flowmap))
     tables = ", ".join(f"&sd_{edge.name}".replace("-", "_") for edge in model.edges)
     lines += [f"static const rtid_map *const TABLES[] = {{{tables}}};", "#endif"]
     return "\n".join(lines) + "\n", variables
@@ -211,10 +210,10 @@ def _starts(variables: Sequence[FmuVariable], n: int) -> FloatArray:
     return start
 
 
-def deviations(edge: Edge, flowmap: FlowMap, error_percent: float = ERROR_PERCENT) -> Table:
+def deviations(edge: Edge, flowmap: FlowMap) -> Table:
     """The table of an edge's standard deviation, m3/s, at the nodes of its look-up table."""
     published = flowmap[edge.shares or edge.name]
-    flow = sample(edge, published, error_percent).table
+    flow = sample(edge, published, ERROR_PERCENT).table
     w, s = np.clip(flow.w_v.astype(float), *published.grid.u_v[[0, -1]]), flow.s.astype(float)
     sd = np.nan_to_num(published.sd(w[:, None], drops(published.grid.dp_pa, s)[None, :]))
     scale = max(float(sd.max()) / MOST_COUNT, 1e-15)

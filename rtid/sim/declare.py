@@ -36,16 +36,15 @@ ENDS = {
 KINDS = (COMMAND, PRESSURE, PRESSURE, PRESSURE, PRESSURE, POSITION, VELOCITY)
 UNITS = ("V", "Pa", "Pa", "Pa", "Pa", "m", "m/s")
 RATED_DP_PA = 5e5
+DP_STEP_PA = 0.75e6  # of the default grid
 
 
-def default_grid(
-    p_max_pa: float, u_fine_v: float = 0.25, u_coarse_v: float = 0.5, dp_step_pa: float = 0.75e6
-) -> Grid:
+def default_grid(p_max_pa: float) -> Grid:
     """Fine along u from the safe band to 3 V, coarse to 10 V; along dp denser towards zero."""
-    fine = np.arange(1.0, 3.0, u_fine_v)
-    coarse = np.linspace(3.0, 10.0, round(7.0 / u_coarse_v) + 1)
+    fine = np.arange(1.0, 3.0, 0.25)
+    coarse = np.linspace(3.0, 10.0, 15)
     near_zero = np.array([-0.3e6, 0.0, 0.1e6, 0.25e6, 0.5e6, 0.9e6])
-    above = np.arange(near_zero[-1] + dp_step_pa, p_max_pa + dp_step_pa, dp_step_pa)
+    above = np.arange(near_zero[-1] + DP_STEP_PA, p_max_pa + DP_STEP_PA, DP_STEP_PA)
     return Grid(np.concatenate([fine, coarse]), np.concatenate([near_zero, above]))
 
 

@@ -73,12 +73,7 @@ def _of_law(seed: int, valves: tuple[Valve, ...], law: str) -> tuple[Valve, ...]
 
 
 def draw_hidden(
-    seed: int,
-    name: str,
-    level: str = "middle",
-    *,
-    cross_port: bool = False,
-    law: str = "orifice",
+    seed: int, name: str, level: str = "middle", *, law: str = "orifice"
 ) -> SimulatedPlant:
     """The machine with this number and an effect in it, varied +-30 %, in a random place.
 
@@ -92,7 +87,7 @@ def draw_hidden(
     where = effect.places[int(rng.integers(len(effect.places)))]
     if effect.signed:
         strength *= float(rng.choice([-1.0, 1.0]))
-    return hide(draw(seed, cross_port=cross_port, law=law), name, strength, where)
+    return hide(draw(seed, law=law), name, strength, where)
 
 
 def _vary(rng: np.random.Generator, value: float, spread: float = SPREAD) -> float:

@@ -77,7 +77,7 @@ class Recent:
         slide = f'<g class="slide">{drawn}</g>'
         return (
             f'<p class="key">{title}: {keys}; {text(words)}, last {KEPT_S:.0f} s</p>'
-            f"{_svg(slide, f'{title} over the last minute', HIGH)}"
+            f"{_svg(slide, f'{title} over the last minute')}"
         )
 
     def plane(self, edge: EdgeHealth) -> str:
@@ -158,7 +158,7 @@ def _trend_plot(lines: Sequence[TrendLine], t0: float, t1: float) -> str:
     words = f"{scale.factor * low:.4g} to {scale.factor * high:.4g}, {(t1 - t0) / 3600.0:.2g} h"
     return (
         f'<p class="key">{", ".join(keys)}; {text(words)}, bands: 95 %</p>'
-        f"{_svg(drawn, f'{lines[0].name} over hours', HIGH)}"
+        f"{_svg(drawn, f'{lines[0].name} over hours')}"
     )
 
 
@@ -205,8 +205,8 @@ def _band(
     return f'<polygon points="{" ".join(above + below)}" fill="{ink}" fill-opacity="{opacity}"/>'
 
 
-def _svg(content: str, label: str, high: float) -> str:
+def _svg(content: str, label: str) -> str:
     return (
-        f'<svg class="scope" viewBox="0 0 {WIDE:.0f} {high:.0f}" preserveAspectRatio="none" '
+        f'<svg class="scope" viewBox="0 0 {WIDE:.0f} {HIGH:.0f}" preserveAspectRatio="none" '
         f'role="img" aria-label="{label}">{content}</svg>'
     )

@@ -18,11 +18,9 @@ from rtid.units import KPA, MPA, flow_name, lpm
 NAMES = {"identification": "identification", "validation": "held-out"}
 
 
-def flow_plots(
-    time: TimePlots, view: str, lines: Lines, c: int, title: str, is_last: bool = True
-) -> list[figure]:
+def flow_plots(time: TimePlots, view: str, lines: Lines, c: int, title: str) -> list[figure]:
     """Measured and modelled flow of a chamber, and what is left below."""
-    made = [time.plot(view, flow_name(), title, False), time.plot(view, flow_name(), "", is_last)]
+    made = [time.plot(view, flow_name(), title, False), time.plot(view, flow_name())]
     lines.add(made[0], f"measured {c}", INK_TAG, 1.4)
     lines.add(made[0], f"model {c}", ORANGE, 1.0)
     lines.add(made[1], f"left {c}", BLUE, 0.8)
