@@ -14,10 +14,7 @@ from rtid.errors import RtidError
 WAIT_S = 30.0
 
 
-def accept(
-    where: Where,
-    reason: Reason = "",
-) -> None:
+def accept(where: Where, reason: Reason = "") -> None:
     """Take a changed machine for the new normal: the running daemon learns on from the change.
 
     Its maps begin anew with the samples since the change; what was learned before is kept as a

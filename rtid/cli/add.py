@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -45,7 +44,6 @@ def add(
             raise RtidError(f"{trace}: no such file", "rtid add [EFFECT[:WHERE]] TRACE -p PROJECT")
     from rtid.study.revisions import add as add_effect
     from rtid.tell.replay import progress_bar
-    from rtid.tell.revised import as_json as plain
     from rtid.tell.revised import show
 
     effect, _, where = name.partition(":")
@@ -54,8 +52,5 @@ def add(
             project, traces, effect, where,
             force=force, dry_run=dry_run, reason=reason, progress=progress,
         )  # fmt: skip
-    if as_json:
-        print(json.dumps({"trace": traces[0]} | plain(done)))
-    else:
-        show(done)
+    show(done, as_json, trace=traces[0])
     refuse_truncated(Path(traces[0]), done.counters)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rtid.cli.exits import Exit
-from rtid.cli.options import UnitsOption
+from rtid.cli.options import AsJson, StateFolder, TestBus, UnitsOption
 from rtid.errors import RtidError
 from rtid.units import System
 
@@ -49,9 +49,7 @@ def apply(
     bus: Annotated[
         str | None, typer.Option(help="INTERFACE:CHANNEL in place of the file's.")
     ] = None,
-    state: Annotated[
-        Path | None, typer.Option(help="State folder of the daemon; else the file's.")
-    ] = None,
+    state: StateFolder = None,
     log: Annotated[
         bool, typer.Option("--log", help="List what was sent, when and by whom; send nothing.")
     ] = False,
@@ -59,10 +57,8 @@ def apply(
         bool,
         typer.Option("--replace-unknown", help="Even where the controller's map is not known."),
     ] = False,
-    test_bus: Annotated[
-        bool, typer.Option("--test-bus", help="Allow udp_multicast and virtual: no authentication.")
-    ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    test_bus: TestBus = False,
+    as_json: AsJson = False,
     units: UnitsOption = System.DISPLAY,
 ) -> None:
     """Send the map that the daemon offers to the controller, all or nothing, and undo it.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rtid.cli.exits import Exit, refuse_truncated
-from rtid.cli.options import AsJson, NoCache, UnitsOption, told_apart
+from rtid.cli.options import AnyProject, AsJson, NoCache, UnitsOption, told_apart
 from rtid.errors import RtidError
 from rtid.plain import Progress, plain
 from rtid.units import System, scale_of, with_unit
@@ -38,7 +38,7 @@ def check(
             help="CAN log or table, and project file; with --bus-only the capture.",
         ),
     ],
-    project: Annotated[Path | None, typer.Option("--project", "-p", help="Project file.")] = None,
+    project: AnyProject = None,
     bus_only: Annotated[
         bool, typer.Option("--bus-only", help="No project: judge a raw capture, id by id.")
     ] = False,

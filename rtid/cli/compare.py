@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rtid.cli.exits import refuse_truncated
-from rtid.cli.options import AsJson, NoCache, ProjectOption, TracesArgument, UnitsOption
+from rtid.cli.options import (
+    AsJson,
+    NoCache,
+    PictureFormat,
+    ProjectOption,
+    TracesArgument,
+    UnitsOption,
+)
 from rtid.units import System
 
 if TYPE_CHECKING:
@@ -46,7 +53,7 @@ def compare(
         Path | None, typer.Option(help="Write the residuals here: .csv, .parquet or .mat.")
     ] = None,
     pictures: Annotated[Path | None, typer.Option(help="Folder for pictures.")] = None,
-    picture_format: Annotated[str, typer.Option(help="png or svg.")] = "png",
+    picture_format: PictureFormat = "png",
     as_json: AsJson = False,
     units: UnitsOption = System.DISPLAY,
     no_cache: NoCache = False,
@@ -78,7 +85,11 @@ def compare(
             studies, errors = [study.comparison(*references)], study.record_errors
         else:
             studies = compare_two(loaded, _single(trace), against, *references, progress=progress)
-    written = _draw(studies, pictures, picture_format) if pictures else []
+    written: list[Path] = []
+    if pictures is not None:
+        from rtid.tell.compared_pictures import draw
+
+        written = draw(studies, pictures, picture_format)
     if table is not None:
         written.append(write_residuals(table, studies))
     if as_json:
@@ -167,9 +178,3 @@ def _print(
         console.print(story(studies))
     for path in written:
         console.print(f"wrote {path}", soft_wrap=True)
-
-
-def _draw(studies: Sequence[TraceComparison], folder: Path, suffix: str) -> list[Path]:
-    from rtid.tell.compared_pictures import draw
-
-    return draw(studies, folder, suffix)

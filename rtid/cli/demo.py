@@ -166,4 +166,4 @@ def program() -> list[str]:
 def _open_page(trace: Path, project: Path) -> None:
     from rtid.cli.ui import ui
 
-    ui([trace], project, port=0, host="127.0.0.1", state=None, sheet=None, open_page=True)
+    ui([trace], project, port=0)

@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rtid.cli.exits import Exit, refuse_truncated
-from rtid.cli.options import AsJson, NoCache, ProjectOption, TracesArgument, UnitsOption
+from rtid.cli.options import (
+    AsJson,
+    NoCache,
+    PictureFormat,
+    ProjectOption,
+    TracesArgument,
+    UnitsOption,
+)
 from rtid.units import System
 
 if TYPE_CHECKING:
@@ -22,7 +29,7 @@ def diagnose(
     pictures: Annotated[
         Path | None, typer.Option(help="Folder for pictures of the evidence.")
     ] = None,
-    picture_format: Annotated[str, typer.Option(help="png or svg.")] = "png",
+    picture_format: PictureFormat = "png",
     as_json: AsJson = False,
     units: UnitsOption = System.DISPLAY,
     no_cache: NoCache = False,

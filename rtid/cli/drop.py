@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -28,7 +27,6 @@ def drop(
     """Take an effect out of the project's model; with a trace, show errors before and after."""
     from rtid.study.revisions import drop as drop_effect
     from rtid.tell.replay import progress_bar
-    from rtid.tell.revised import as_json as plain
     from rtid.tell.revised import show
 
     name, _, where = effect.partition(":")
@@ -36,9 +34,6 @@ def drop(
         done = drop_effect(
             project, name, where, trace, dry_run=dry_run, reason=reason, progress=progress
         )
-    if as_json:
-        print(json.dumps(plain(done)))
-    else:
-        show(done)
+    show(done, as_json)
     if trace is not None:
         refuse_truncated(trace, done.counters)

@@ -75,12 +75,10 @@ def export(
         typer.Option("--bytes", min=64, help="Most bytes of all tables, as 16-bit numbers."),
     ] = None,
     axes: Annotated[
-        Path | None,
-        typer.Option(help="Take the axes of these maps: .dcm, .cdfx or .csv."),
+        Path | None, typer.Option(help="Take the axes of these maps: .dcm, .cdfx or .csv.")
     ] = None,
     flashed: Annotated[
-        Path | None,
-        typer.Option(help="Tell the difference to these maps; --axes does it too."),
+        Path | None, typer.Option(help="Tell the difference to these maps; --axes does it too.")
     ] = None,
     sheet: Annotated[
         Path | None, typer.Option(help="Write a sheet to be signed (.html) of what is released.")
@@ -105,9 +103,11 @@ def export(
     .npz and .csv), and nothing is written without --force.
     """
     from rtid.maps.files import provenance
+    from rtid.maps.flashed import differences
     from rtid.maps.fmu import check_version
     from rtid.maps.prior_map import with_prior
     from rtid.maps.release import refuse_unfounded
+    from rtid.plain import plain
     from rtid.project import load
     from rtid.tell.released import sheet as sheet_of
 
@@ -117,18 +117,20 @@ def export(
     loaded = with_prior(load(project), prior_map)
     learned = _learned(loaded, source)
     if not force:
-        has_prior = learned.prior is not None
-        refuse_unfounded(
-            str(source), output.suffix, learned.invalid, learned.flowmap, has_prior=has_prior
-        )
+        what = str(source), output.suffix, learned.invalid, learned.flowmap
+        refuse_unfounded(*what, has_prior=learned.prior is not None)
     identity = loaded.name, loaded.digest, source.name, learned.effects
     origin = provenance(learned.solution, *identity)
     tables = _written(output, loaded, learned, origin, room, fmi, map_alone)
-    changes = _changes(learned, there)
+    changes = differences(learned.flowmap, there) if there else []
     if sheet is not None:
         sheet.write_text(sheet_of(output.name, tables, changes, origin), "utf-8")
-    tell = _print_json if as_json else _print
-    tell(output, loaded, learned, tables, changes)
+    if as_json:
+        facts = {"tables": [_facts(table) for table in tables], "changed": plain(changes)}
+        document = {"schema": 1, "written": str(output), "valid_blocks": learned.cells}
+        print(json.dumps(document | {"effects": learned.effects} | facts))
+    else:
+        _print(output, loaded, learned, tables, changes)
 
 
 def _room(
@@ -146,27 +148,6 @@ def _room(
     there = read_flashed(file) if file else ()
     share = 0.01 * tolerance if tolerance else None
     return Room(share, _pair(nodes), n_bytes, there if axes else ()), there
-
-
-def _changes(learned: Exported, there: tuple[FlashedMap, ...]) -> list[FlashedDifference]:
-    from rtid.maps.flashed import differences
-
-    return differences(learned.flowmap, there) if there else []
-
-
-def _print_json(
-    output: Path,
-    project: Project,
-    learned: Exported,
-    tables: Tables,
-    changes: list[FlashedDifference],
-) -> None:
-    from rtid.plain import plain
-
-    document = {"schema": 1, "written": str(output), "valid_blocks": learned.cells}
-    document |= {"effects": learned.effects}
-    document |= {"tables": [_facts(g) for g in tables], "changed": plain(changes)}
-    print(json.dumps(document))
 
 
 def _print(
@@ -192,19 +173,16 @@ def _refuse_format(output: Path, is_sized: bool) -> None:
     """RtidError for a suffix that is none, or that holds no table whose size can be asked for."""
     from rtid.errors import RtidError
     from rtid.maps.c_header import SUFFIX
-    from rtid.maps.files import TABLE_WRITERS, formats
+    from rtid.maps.files import formats
     from rtid.maps.fmu import SUFFIX as FMU
+    from rtid.maps.release import refuse_sized
 
     suffix, known = output.suffix.lower(), (*formats(), SUFFIX, FMU, *RECORDED)
     if suffix not in known:
         remedy = f"end its name in {', '.join(known)}"
         raise RtidError(f"{output}: unknown format", remedy, exit_code=2)
-    if is_sized and suffix not in TABLE_WRITERS:
-        remedy = (
-            f"end its name in {', '.join(TABLE_WRITERS)}; a header's tables follow "
-            "publish.error_percent of the project file"
-        )
-        raise RtidError(f"{output}: this format has no table of such a size", remedy, exit_code=2)
+    if is_sized:
+        refuse_sized(output)
 
 
 def _written(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rtid.cli.exits import Exit
-from rtid.cli.options import RoleOption, by_role
+from rtid.cli.options import Replace, RoleOption, by_role
 from rtid.errors import RtidError
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ def init(
         "project.toml"
     ),
     role: RoleOption = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    force: Replace = False,
 ) -> None:
     """Write a commented project file and say what is still missing.
 

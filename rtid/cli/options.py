@@ -82,6 +82,15 @@ def told_apart(
 
 
 ProjectOption = Annotated[Path, typer.Option("--project", "-p", help="Project file.")]
+AnyProject = Annotated[Path | None, typer.Option("--project", "-p", help="Project file.")]
+StateFolder = Annotated[
+    Path | None, typer.Option("--state", help="State folder of the daemon; else the file's.")
+]
+TestBus = Annotated[
+    bool, typer.Option("--test-bus", help="Allow udp_multicast and virtual: no authentication.")
+]
+Replace = Annotated[bool, typer.Option("--force", help="Replace an existing file.")]
+PictureFormat = Annotated[str, typer.Option(help="png or svg.")]
 PriorOption = Annotated[
     Path | None,
     typer.Option(

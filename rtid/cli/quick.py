@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from rtid.cli.exits import Exit, refuse_truncated
-from rtid.cli.options import AsJson, RoleOption, UnitsOption, by_role
+from rtid.cli.options import AsJson, Replace, RoleOption, UnitsOption, by_role
 from rtid.errors import RtidError
 from rtid.units import System
 
@@ -84,7 +84,7 @@ def quick(
         Path | None,
         typer.Option("--save", "-o", "--output", help="Write the project file of what was found."),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    force: Replace = False,
     as_json: AsJson = False,
     units: UnitsOption = System.DISPLAY,
 ) -> None:

@@ -12,6 +12,7 @@ from rtid.cli.exits import Exit, refuse_truncated
 from rtid.cli.options import (
     AsJson,
     NoCache,
+    PictureFormat,
     PriorOption,
     ProjectOption,
     TracesArgument,
@@ -47,7 +48,7 @@ def replay(
     pictures: Annotated[
         Path | None, typer.Option(help="Folder for pictures: coverage, maps, model and residual.")
     ] = None,
-    picture_format: Annotated[str, typer.Option(help="png or svg.")] = "png",
+    picture_format: PictureFormat = "png",
     as_json: AsJson = False,
     units: UnitsOption = System.DISPLAY,
     no_cache: NoCache = False,

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from rtid.cli.options import ProjectOption
+from rtid.cli.options import ProjectOption, StateFolder
 from rtid.errors import RtidError
 
 
@@ -16,9 +15,7 @@ def restore(
     point: Annotated[
         str, typer.Argument(help="Name of a point in `rtid history`, or its beginning.")
     ],
-    state: Annotated[
-        Path | None, typer.Option(help="The daemon's state folder; else the file's.")
-    ] = None,
+    state: StateFolder = None,
 ) -> None:
     """Go back to what was learned at a point in time; the daemon must not run.
 

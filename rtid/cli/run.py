@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rtid.cli.exits import Exit
+from rtid.cli.options import TestBus
 from rtid.errors import RtidError
 
 if TYPE_CHECKING:
@@ -39,9 +40,7 @@ def run(
     state: Annotated[
         Path | None, typer.Option(help="Folder of snapshots, history, alarms; else the file's.")
     ] = None,
-    test_bus: Annotated[
-        bool, typer.Option("--test-bus", help="Allow udp_multicast and virtual: no authentication.")
-    ] = False,
+    test_bus: TestBus = False,
     fresh: Annotated[
         bool, typer.Option("--fresh", help="Do not go on with what the folder holds.")
     ] = False,

@@ -102,7 +102,8 @@ def simulate(
         _example(example, trace, seed, hide, as_json)
         return "equations"
     _check_arguments(trace, bus, motion, plant, cross_port)
-    _check_hidden(hide, hide_at_s)
+    if hide_at_s is not None and not hide:
+        raise _usage("--hide-at: nothing is hidden", "add --hide EFFECT")
     from rtid.tell.replay import progress_bar
 
     healthy = SimulatedPlant() if plant is None else draw(plant, cross_port=cross_port)
@@ -132,13 +133,17 @@ def _files(written: list[Path]) -> dict[str, Any]:
     return {"files": [str(path) for path in written]}
 
 
+def _print_written(written: list[Path]) -> None:
+    for path in written:
+        print(f"wrote {path}")
+
+
 def _tell(machine: SimulatedPlant, run: Run, written: list[Path], sent: str) -> None:
     print(f"{len(run.samples)} samples, bulk modulus {machine.beta_pa / 1e6:.0f} MPa")
     for name, where, strength in machine.hidden:
         place = f" at {where}" if where else ""
         print(f"hidden: {name}{place}, {strength:g} {known(name).unit}")
-    for path in written:
-        print(f"wrote {path}")
+    _print_written(written)
     if sent:
         print(sent)
 
@@ -151,21 +156,13 @@ def _example(
     if hide not in (None, ["none"]):
         raise _usage("--example has one effect of its own", "--hide none leaves it out")
     recorded, written = write_example(name, table, seed, hide is None)
-    hidden = (
-        [{"effect": recorded.hidden, "size": recorded.size, "unit": recorded.unit}]
-        if recorded.size
-        else []
-    )
     if as_json:
-        print(json.dumps({"hidden": hidden} | _files(written)))
+        effect = {"effect": recorded.hidden, "size": recorded.size, "unit": recorded.unit}
+        print(json.dumps({"hidden": [effect] if recorded.size else []} | _files(written)))
         return
-    print(
-        f"hidden: {recorded.hidden}, {recorded.size:.3g} {recorded.unit}"
-        if hidden
-        else "hidden: nothing"
-    )
-    for path in written:
-        print(f"wrote {path}")
+    size = f"{recorded.hidden}, {recorded.size:.3g} {recorded.unit}"
+    print(f"hidden: {size if recorded.size else 'nothing'}")
+    _print_written(written)
 
 
 def _programmable(trace: Path | None, number: int, hide: list[str] | None, as_json: bool) -> None:
@@ -177,9 +174,8 @@ def _programmable(trace: Path | None, number: int, hide: list[str] | None, as_js
     written = record_sweep(trace, reduce(hide_wish, hide or (), five_valves(number)), number)
     if as_json:
         print(json.dumps(_files(written)))
-        return
-    for path in written:
-        print(f"wrote {path}")
+    else:
+        _print_written(written)
 
 
 def _check_arguments(
@@ -197,11 +193,6 @@ def _check_arguments(
         raise _usage(f"--motion {motion}: unknown", f"use one of {', '.join(MOTIONS)}")
     if cross_port and plant is None:
         raise _usage("--cross-port: the default machine has four valves", "add --plant NUMBER")
-
-
-def _check_hidden(hide: list[str] | None, hide_at_s: float | None) -> None:
-    if hide_at_s is not None and not hide:
-        raise _usage("--hide-at: nothing is hidden", "add --hide EFFECT")
 
 
 def _usage(message: str, remedy: str) -> RtidError:

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from rtid.cli.exits import refuse_without_bokeh
-from rtid.cli.options import told_apart
+from rtid.cli.options import AnyProject, told_apart
 from rtid.errors import RtidError
 
 
@@ -22,7 +22,7 @@ def ui(
             "project the page makes one, without a trace it is the live page.",
         ),
     ] = None,
-    project: Annotated[Path | None, typer.Option("--project", "-p", help="Project file.")] = None,
+    project: AnyProject = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="0: any that is free.")] = 5006,
     host: Annotated[str, typer.Option(help="Address to serve on.")] = "127.0.0.1",
     state: Annotated[

@@ -2,24 +2,15 @@
 
 from __future__ import annotations
 
-import json
-
 from rtid.cli.options import AsJson, ProjectOption, UnitsOption
 from rtid.units import System
 
 
 def undo(
-    project: ProjectOption,
-    as_json: AsJson = False,
-    units: UnitsOption = System.DISPLAY,
+    project: ProjectOption, as_json: AsJson = False, units: UnitsOption = System.DISPLAY
 ) -> None:
     """Restore the project file as it was before the last change, byte for byte; repeatable."""
     from rtid.study.revisions import undo as undo_change
-    from rtid.tell.revised import as_json as plain
     from rtid.tell.revised import show
 
-    done = undo_change(project)
-    if as_json:
-        print(json.dumps(plain(done)))
-    else:
-        show(done)
+    show(undo_change(project), as_json)

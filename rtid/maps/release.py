@@ -64,24 +64,29 @@ def write_release(path: Path, flowmap: FlowMap, origin: Mapping[str, Any], room:
 
     Raises RtidError where it has none and a room is asked for.
     """
-    has_tables = path.suffix.lower() in TABLE_WRITERS
-    if room.is_asked and not has_tables:
+    if room.is_asked:
+        refuse_sized(path)
+    tables = tables_for(flowmap, room) if _has_tables(path) else None
+    write_map(path, flowmap, origin, tables)
+    return tables or ()
+
+
+def refuse_sized(path: Path) -> None:
+    """RtidError for a format that holds no table whose size can be asked for."""
+    if not _has_tables(path):
         remedy = (
             f"end its name in {', '.join(TABLE_WRITERS)}; a header's tables follow "
             "publish.error_percent of the project file"
         )
         raise RtidError(f"{path}: this format has no table of such a size", remedy, exit_code=2)
-    tables = tables_for(flowmap, room) if has_tables else None
-    write_map(path, flowmap, origin, tables)
-    return tables or ()
+
+
+def _has_tables(path: Path) -> bool:
+    return path.suffix.lower() in TABLE_WRITERS
 
 
 def refuse_unfounded(
-    source: str,
-    suffix: str,
-    invalid: Sequence[Doubt],
-    flowmap: FlowMap,
-    has_prior: bool = False,
+    source: str, suffix: str, invalid: Sequence[Doubt], flowmap: FlowMap, has_prior: bool = False
 ) -> None:
     """RtidError for maps that are impossible, or that know nothing."""
     if invalid:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from math import nan
 from typing import Any
@@ -17,8 +18,11 @@ from rtid.tell.terminal import bars, make_console
 from rtid.tell.words import is_floor, quantity
 
 
-def show(done: Revised) -> None:
-    """Print what a command did, or would do."""
+def show(done: Revised, is_json: bool = False, **more: str) -> None:
+    """Print what a command did, or would do; as JSON with more of the command's own."""
+    if is_json:
+        print(json.dumps(more | as_json(done)))
+        return
     console = make_console()
     lines = [line for change in done.changes for line in sentences(change, done.is_written)]
     for line in with_convention(lines):
