@@ -24,7 +24,7 @@ from rtid.apply.judge import KnownMap
 from rtid.errors import RtidError
 from rtid.estimator.flowmap import FlowMap
 from rtid.maps.files import read_map, write_map
-from rtid.trace.state_files import read_bytes
+from rtid.trace.state_files import read_bytes, write_bytes
 
 FILE, FOLDER, MAP_FILE = "history.sqlite", "applied", "map.npz"
 TABLE = """
@@ -106,7 +106,7 @@ class Applied:
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
         for slot, data in images.items():
-            _write(partial / f"slot-{slot}.img", data)
+            write_bytes(partial / f"slot-{slot}.img", data, sync=True)
         write_map(partial / MAP_FILE, flow_map, provenance)
         shutil.rmtree(final, ignore_errors=True)  # of an apply that was never sent
         os.replace(partial, final)
@@ -181,10 +181,3 @@ def _database(folder: Path) -> sqlite3.Connection:
 
 def _numbered(crcs: dict[str, int]) -> dict[int, int]:
     return {int(slot): crc for slot, crc in crcs.items()}
-
-
-def _write(path: Path, data: bytes) -> None:
-    with path.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())

@@ -8,7 +8,6 @@ Q^-1.  They are the same functions that maps sent by `rtid apply` are evaluated 
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -24,6 +23,7 @@ from rtid.estimator.flowmap import FlowMap
 from rtid.maps.lookup import ERROR_PERCENT, Sampled, sample
 from rtid.model import Machine
 from rtid.plain import IntArray
+from rtid.trace.state_files import replacing
 
 SUFFIX = ".h"
 BESIDE = (
@@ -55,16 +55,12 @@ def write_header(
     Raises NoHeaderError, NoTableError, OSError.
     """
     sampled = tuple(sample(e, flow_map[e.name], error_percent) for e in model.maps)
-    _replace(path, "\n".join(_lines(path, sampled, provenance)) + "\n")
-    for name in BESIDE:
-        _replace(path.with_name(name), HEADER.with_name(name).read_text("utf-8"))
+    texts = {path: "\n".join(_lines(path, sampled, provenance)) + "\n"}
+    texts |= {path.with_name(n): HEADER.with_name(n).read_text("utf-8") for n in BESIDE}
+    for file, text in texts.items():
+        with replacing(file) as part:
+            part.write_text(text, "utf-8")
     return sampled
-
-
-def _replace(path: Path, text: str) -> None:
-    part = path.with_name(path.name + ".part")
-    part.write_text(text, "utf-8")
-    os.replace(part, path)
 
 
 def _lines(path: Path, sampled: Iterable[Sampled], provenance: Mapping[str, Any]) -> Iterator[str]:

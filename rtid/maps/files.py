@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.metadata import entry_points
 from io import BytesIO
@@ -32,7 +31,7 @@ from rtid.maps.pedals import ACCEL, BRAKE, write_pedals
 from rtid.maps.plc import write_st
 from rtid.model import NONE, Grid, Machine
 from rtid.plain import FloatArray, plain
-from rtid.trace.state_files import read_bytes
+from rtid.trace.state_files import read_bytes, replacing
 
 SCHEMA = "rtid-flowmap/1"
 PLUGINS = "rtid.export"  # entry points of other packages: suffix = function, as in WRITERS
@@ -72,15 +71,11 @@ def write_map(
             f"{path}: this format says L/min or m3/s, and the map is in {unit}",
             "write .csv, .json, .npz or .fmu",
         )
-    temporary = path.with_name(path.name + ".part")
-    try:
+    with replacing(path) as part:
         if write_tables is not None:
-            write_tables(temporary, tables or gridded(flowmap), provenance)
+            write_tables(part, tables or gridded(flowmap), provenance)
         elif write is not None:
-            write(temporary, flowmap, provenance)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+            write(part, flowmap, provenance)
 
 
 def formats() -> tuple[str, ...]:

@@ -36,6 +36,7 @@ from rtid.maps.fmu_description import FmuVariable, described
 from rtid.maps.lookup import ERROR_PERCENT, drops, sample
 from rtid.model import MODE, Edge, Machine
 from rtid.plain import FloatArray
+from rtid.trace.state_files import replacing
 
 SUFFIX, IDENTIFIER = ".fmu", "rtid_machine"
 VERSIONS = (2, 3)
@@ -91,12 +92,8 @@ def write_fmu(
             json.dumps(dict(provenance)), "utf-8"
         )
         has_binary = _compiled(root, version)
-        part = path.with_name(path.name + ".part")
-        try:
+        with replacing(path) as part:
             _pack(root, part)
-            part.replace(path)
-        finally:
-            part.unlink(missing_ok=True)
     return has_binary
 
 

@@ -8,7 +8,6 @@ Bilinear, within 0.1 % of the largest flow; beyond their ends the value there.
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -20,6 +19,7 @@ from firmware_bridge.lookup import OUTSIDE, SHUT, STATUS
 from rtid.errors import RtidError
 from rtid.maps.gridded import Gridded, Tables
 from rtid.plain import FloatArray
+from rtid.trace.state_files import replacing
 
 PER_LINE = 8
 MOST_ELEMENTS = 32_767  # an index is INT
@@ -49,9 +49,8 @@ def write_st(path: Path, tables: Tables, provenance: Mapping[str, Any]) -> None:
         blocks += _block(name, g)
         beside[f"{stem}_{name}.csv"] = "\n".join(_table(g)) + "\n"
     for name, text in beside.items():
-        part = path.with_name(name + ".part")
-        part.write_text(text, "utf-8")
-        os.replace(part, path.with_name(name))
+        with replacing(path.with_name(name)) as part:
+            part.write_text(text, "utf-8")
     path.write_text("\n".join(blocks) + "\n", encoding="utf-8")
 
 

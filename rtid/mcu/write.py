@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from rtid.estimator.state import Weights
 from rtid.mcu.c_tables import Tiles, sources, tables
 from rtid.model import Machine
+from rtid.trace.state_files import replacing
 
 TABLES = "rtid_estimator_tables.h"
 
@@ -28,10 +28,7 @@ def write_sources(
     texts = {TABLES: tables(model, blocks, weights, title, tiles)}
     texts |= {path.name: path.read_text(encoding="utf-8") for path in sources()}
     folder.mkdir(parents=True, exist_ok=True)
-    written = []
     for name, text in texts.items():
-        part, path = folder / f"{name}.part", folder / name
-        part.write_text(text, encoding="utf-8")
-        os.replace(part, path)
-        written.append(path)
-    return written
+        with replacing(folder / name) as part:
+            part.write_text(text, encoding="utf-8")
+    return [folder / name for name in texts]

@@ -13,6 +13,7 @@ from rtid.project import Project
 from rtid.tell.report import page, stills
 from rtid.tell.report_story import ReportStory, tell
 from rtid.tell.stills import save
+from rtid.trace.state_files import replacing
 
 
 @dataclass(frozen=True)
@@ -80,11 +81,9 @@ def _refuse_unwritable(path: Path, inputs: tuple[Path, ...]) -> None:
 
 
 def _put(path: Path, data: bytes) -> None:
-    temporary = path.with_name(path.name + ".part")
     try:
-        temporary.write_bytes(data)
-        os.replace(temporary, path)
+        with replacing(path) as part:
+            part.write_bytes(data)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
         remedy = "name a file in another folder"
         raise RtidError(f"{path} cannot be written: {error.strerror}", remedy) from None

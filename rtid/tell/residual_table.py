@@ -8,7 +8,6 @@ per chamber the pressure at that instant, measured and of the free run and k ste
 from __future__ import annotations
 
 import csv
-import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,6 +18,7 @@ from rtid.compare import Comparison, Simulation
 from rtid.errors import RtidError
 from rtid.model import Machine
 from rtid.study.compared import Held, TraceComparison
+from rtid.trace.state_files import replacing
 
 FORMATS = (".csv", ".parquet", ".mat")
 Columns = dict[str, np.ndarray]
@@ -60,9 +60,8 @@ def write_residuals(path: Path, studies: Sequence[TraceComparison]) -> Path:
     """Write `residual_columns` in the format of the suffix; whole or not at all."""
     refuse_format(path)
     write = {".csv": _csv, ".parquet": _parquet, ".mat": _mat}[path.suffix.lower()]
-    temporary = path.with_name(path.name + ".part")
-    write(temporary, residual_columns(studies))
-    os.replace(temporary, path)
+    with replacing(path) as part:
+        write(part, residual_columns(studies))
     return path
 
 
