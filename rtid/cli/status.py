@@ -52,7 +52,6 @@ def status(
         return
     daemon_status = read(folder)
     age_s = time.time() - daemon_status.now_unix_s
-    on = [alarm for alarm in daemon_status.alarms if alarm.until_unix_s is None]
     if as_json:
         print(daemon_status.to_json())
     elif metrics:
@@ -61,7 +60,7 @@ def status(
         _show(daemon_status, age_s)
         if text := as_text(folder):
             print(f"offered `rtid apply`: {text}")
-    if on or age_s > OLD_S:
+    if daemon_status.on or age_s > OLD_S:
         raise typer.Exit(Exit.NEGATIVE)
 
 
@@ -116,17 +115,12 @@ def _show(daemon_status: Status, age_s: float) -> None:
     if daemon_status.advice is not None:
         console.print(f"coach   {daemon_status.advice.text}")
     for alarm in daemon_status.alarms:
-        over = "" if alarm.until_unix_s is None else " (over)"
+        over = "" if alarm.is_on else " (over)"
         console.print(f"ALARM   {alarm.name}{over}: {alarm.words} {alarm.trace}")
 
 
 def _maps(daemon_status: Status) -> str:
     estimate = daemon_status.estimate
-    blocks = {
-        name: sum(edge.blocks.get(name, 0) for edge in estimate.edges)
-        for edge in estimate.edges
-        for name in edge.blocks
-    }
     pressure = scale_of("Pa")
     beta = ", ".join(
         f"{c.name} {pressure.known(c.beta_pa, c.beta_sd_pa or 0.0, 1)} {pressure.name}"
@@ -135,7 +129,7 @@ def _maps(daemon_status: Status) -> str:
     )
     age = "-" if estimate.age_s is None else f"{1e3 * estimate.age_s:.0f} ms"
     stale = " STALE" if estimate.stale else ""
-    text = ", ".join(f"{n} {name}" for name, n in sorted(blocks.items())) or "none yet"
+    text = ", ".join(f"{n} {name}" for name, n in estimate.blocks.items()) or "none yet"
     return (
         f"{estimate.state} {estimate.reason}, {estimate.samples} samples, newest {age} old{stale}; "
         f"blocks {text}; beta {beta or 'unknown'}"

@@ -13,8 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rtid.daemon.diagnosing import DIAGNOSER, newest
-from rtid.daemon.helper import Helper
+from rtid.daemon.diagnosing import Asking, newest
 from rtid.daemon.jobs import Answer, Coach, Coached, Publication
 from rtid.daemon.log import logger
 from rtid.daemon.status import Advice, EdgeHealth
@@ -27,22 +26,17 @@ SNAPSHOTS = "state-[01].npz"
 LIMIT_S = 900.0  # a coach that takes longer is given up
 
 
-class Coaching:
-    """One question at a time; `advice` is the newest answer."""
+class Coaching(Asking):
+    """`advice` is the newest answer."""
+
+    what, limit_s = "coach", LIMIT_S
 
     def __init__(self, project: Project, folder: Path, answer: Callable[[Answer], None]) -> None:
-        self._project, self._folder, self._answer = project, folder, answer
-        self._section = project.sections.excite
+        super().__init__(project, answer)
+        self._folder, self._section = folder, project.sections.excite
         self._every_s = project.sections.daemon.coach_s
         self._next_s = 0.0
-        self._started_s = 0.0
-        self._helper: Helper | None = None
         self.advice: Advice | None = None
-
-    @property
-    def is_running(self) -> bool:
-        """Whether a question is open."""
-        return self._helper is not None
 
     def published(self, publication: Publication) -> None:
         """Another map is known."""
@@ -52,21 +46,14 @@ class Coaching:
     def look(self, estimator: Estimator) -> None:
         """Ask if it is time and there is a snapshot; give up a coach that takes too long."""
         now_s = time.monotonic()
-        if self._helper is not None:
-            if now_s - self._started_s > LIMIT_S:
-                logger.warning("coach given up after %.0f s", LIMIT_S)
-                self.stop()
-            return
-        if self._section is None or now_s < self._next_s:
+        if self._is_busy() or self._section is None or now_s < self._next_s:
             return
         result = (path for path in self._folder.glob(SNAPSHOTS) if path.is_file())
         snapshots = sorted(result, key=lambda path: path.stat().st_mtime)
         if snapshots:
-            self._next_s, self._started_s = now_s + self._every_s, now_s
+            self._next_s = now_s + self._every_s
             job = Coach(str(snapshots[-1]), self._samples(estimator))
-            ended = Coached(None, "the coach has ended")
-            self._helper = Helper(DIAGNOSER, [str(self._project.path)], self._answer, ended)
-            self._helper.put(job)
+            self._ask(job, Coached(None, "the coach has ended"))
 
     def take(self, coached: Coached) -> None:
         """An answer has come."""
@@ -76,12 +63,6 @@ class Coaching:
             return
         self.advice = coached.advice
         logger.info("coach text=%r", coached.advice.text)
-
-    def stop(self) -> None:
-        """End a question that is open."""
-        if self._helper is not None:
-            self._helper.stop(0.0)
-            self._helper = None
 
     def _samples(self, estimator: Estimator) -> FloatArray:
         """The newest samples, where an effect is to be seen that snapshots do not tell of."""

@@ -22,17 +22,53 @@ LIMIT_S = 240.0  # a diagnosis that takes longer is given up
 BEING_WRITTEN = 100  # rows at most that one tick appends
 MATCHES = "matches"
 DIAGNOSER = "rtid.daemon.diagnoser"
+ENDED = VerdictAnswer(None, "the helper has ended")
 
 
-class Diagnosing:
-    """One diagnosis at a time, each in a process of its own."""
+class Asking:
+    """One question at a time to a process of its own, which is given up where it takes too long."""
+
+    what, limit_s = "diagnosis", LIMIT_S
 
     def __init__(self, project: Project, answer: Callable[[Answer], None]) -> None:
         self._project, self._answer = project, answer
-        self._every_s = project.sections.daemon.diagnose_s
-        self._next_s = time.monotonic() + self._every_s
         self._helper: Helper | None = None
         self._started_s = 0.0
+
+    @property
+    def is_running(self) -> bool:
+        """Whether a question is open."""
+        return self._helper is not None
+
+    def _ask(self, job: Job, ended: Answer) -> None:
+        """Begin a process for a job; ended: the answer where it ends without one."""
+        self._started_s = time.monotonic()
+        self._helper = Helper(DIAGNOSER, [str(self._project.path)], self._answer, ended)
+        self._helper.put(job)
+
+    def _is_busy(self) -> bool:
+        """Whether a question was open; one that takes too long is ended."""
+        if self._helper is None:
+            return False
+        if time.monotonic() - self._started_s > self.limit_s:
+            logger.warning("%s given up after %.0f s", self.what, self.limit_s)
+            self.stop()
+        return True
+
+    def stop(self) -> None:
+        """End a question that is open."""
+        if self._helper is not None:
+            self._helper.stop(0.0)
+            self._helper = None
+
+
+class Diagnosing(Asking):
+    """One diagnosis at a time, or one check of the project file."""
+
+    def __init__(self, project: Project, answer: Callable[[Answer], None]) -> None:
+        super().__init__(project, answer)
+        self._every_s = project.sections.daemon.diagnose_s
+        self._next_s = time.monotonic() + self._every_s
         self._since_s: float | None = None  # sample time of the change
         self._stage = 0
         self.verdict: Verdict | None = None
@@ -44,20 +80,15 @@ class Diagnosing:
         """Whether the last verdict on the present change is that nothing is missing."""
         return self.is_of_change and self.verdict is not None and self.verdict.verdict == MATCHES
 
-    @property
-    def is_running(self) -> bool:
-        """Whether one is under way."""
-        return self._helper is not None
-
     def begin(self, since_s: float) -> None:
         """The plant has changed at this sample time."""
         self._since_s, self._stage, self.is_of_change = since_s, 0, False
 
     def check(self, recording: str) -> bool:
         """Hold the project file against a recording; False while something else is under way."""
-        if self._helper is not None:
+        if self.is_running:
             return False
-        self._start(Check(recording))
+        self._ask(Check(recording), ENDED)
         return True
 
     def end(self) -> None:
@@ -69,10 +100,7 @@ class Diagnosing:
 
         newest_s: time of the newest sample, as in `to_chunk`.
         """
-        if self._helper is not None:
-            if time.monotonic() - self._started_s > LIMIT_S:
-                logger.warning("diagnosis given up after %.0f s", LIMIT_S)
-                self._end_helper()
+        if self._is_busy():
             return
         history = estimator.history
         if history is None:
@@ -85,7 +113,7 @@ class Diagnosing:
 
     def take(self, result: VerdictAnswer | Checked) -> None:
         """An answer has come."""
-        self._end_helper()
+        self.stop()
         if isinstance(result, Checked):
             self.implausible = result.errors
             return
@@ -104,22 +132,7 @@ class Diagnosing:
     def _begin(self, estimator: Estimator, span_s: float) -> None:
         assert estimator.history is not None
         chunk = newest(estimator.history, span_s)[:, : 2 + len(self._project.model.signals)]
-        self._start(Diagnose(self._project.model, chunk))
-
-    def _start(self, job: Job) -> None:
-        self._started_s = time.monotonic()
-        ended = VerdictAnswer(None, "the helper has ended")
-        self._helper = Helper(DIAGNOSER, [str(self._project.path)], self._answer, ended)
-        self._helper.put(job)
-
-    def _end_helper(self) -> None:
-        if self._helper is not None:
-            self._helper.stop(0.0)
-            self._helper = None
-
-    def stop(self) -> None:
-        """End a diagnosis under way."""
-        self._end_helper()
+        self._ask(Diagnose(self._project.model, chunk), ENDED)
 
 
 def newest(history: History, span_s: float) -> FloatArray:

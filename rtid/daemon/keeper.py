@@ -221,7 +221,7 @@ class Keeper:
         if learner.learns and not self._diagnosing.is_running:
             self._coaching.look(learner.estimator)
         self._look_at_load()
-        if self._is_news or self.alarms.on != self._alarms_told():
+        if self._is_news or self.alarms.on != self.status.on:
             self._tell_news()
 
     def _look_at_quarantine(self, implausible: bool) -> None:
@@ -299,13 +299,10 @@ class Keeper:
         self.alarms.put("signal_range", "sensor", wording.signals(now.signals))
 
     def _told(self, alarm: st.Alarm) -> None:
-        begins = alarm.until_unix_s is None
+        begins = alarm.is_on
         logger.log(30 if begins else 20, "alarm %s name=%s kind=%s text=%r",
                    "on" if begins else "over", alarm.name, alarm.kind, alarm.text)  # fmt: skip
         self._analyst.put(jobs.Note(alarm, keep=begins and alarm.kind != "loop"))
-
-    def _alarms_told(self) -> tuple[st.Alarm, ...]:
-        return tuple(alarm for alarm in self.status.alarms if alarm.until_unix_s is None)
 
     def _tell_news(self) -> None:
         """An alarm that has just begun or ended, or a snapshot, is told at once."""

@@ -68,10 +68,9 @@ def _lines(status: Status, age_s: float) -> Iterator[Line]:
         for state, count in edge.blocks.items():
             labels = machine | {"edge": edge.name, "state": state}
             yield "blocks", "gauge", "Blocks of the maps", labels, count
-    for alarm in status.alarms:
-        if alarm.until_unix_s is None:
-            labels = machine | {"alarm": alarm.name, "kind": alarm.kind}
-            yield "alarm", "gauge", "1 while it is on", labels, 1.0
+    for alarm in status.on:
+        labels = machine | {"alarm": alarm.name, "kind": alarm.kind}
+        yield "alarm", "gauge", "1 while it is on", labels, 1.0
 
 
 def _quantiles(name: str, distribution: Distribution, machine: dict[str, str]) -> Iterator[Line]:

@@ -29,16 +29,14 @@ def frames_of(status: Status, is_offered: bool, counter: int) -> list[bytes]:
     """STATUS, then BETA of each chamber whose bulk modulus is known."""
     estimate = status.estimate
     verdict = status.verdict.verdict if status.verdict is not None else ""
-    edges = [edge for edge in estimate.edges if edge.blocks]
-    blocks = sum(sum(edge.blocks.values()) for edge in edges)
-    valid = sum(edge.blocks.get("valid", 0) for edge in edges)
+    blocks, edges = estimate.blocks, [edge for edge in estimate.edges if edge.blocks]
     progress = sum(edge.progress for edge in edges) / max(1, len(edges))
     frame = protocol.status_frame(
         LEARNING.index(estimate.state),
         VERDICTS.index(verdict) if verdict in VERDICTS else 0,
-        sum(alarm.until_unix_s is None for alarm in status.alarms),
+        len(status.on),
         round(100 * progress),
-        round(100 * valid / max(1, blocks)),
+        round(100 * blocks.get("valid", 0) / max(1, sum(blocks.values()))),
         STALE * estimate.stale + IS_OFFERED * is_offered,
         counter,
     )

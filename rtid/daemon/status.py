@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections import Counter
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -191,6 +192,14 @@ class EstimateStatus:
     effects: tuple[EffectStatus, ...] = ()
     refused: dict[str, int] = field(default_factory=dict)  # all gates: bridge, watch, estimator
 
+    @property
+    def blocks(self) -> dict[str, int]:
+        """Blocks of all edges by what is known of them, in the order of the words."""
+        counts = Counter[str]()
+        for edge in self.edges:
+            counts.update(edge.blocks)
+        return dict(sorted(counts.items()))
+
 
 @dataclass(frozen=True)
 class Store:
@@ -244,9 +253,14 @@ class Alarm:
     trace: str = ""  # recording of the seconds around it
 
     @property
+    def is_on(self) -> bool:
+        """Whether it is not over."""
+        return self.until_unix_s is None
+
+    @property
     def words(self) -> str:
         """What it says; once it is over there is nothing to be decided."""
-        return self.text if self.until_unix_s is None else self.text.removesuffix(TO_DECIDE)
+        return self.text if self.is_on else self.text.removesuffix(TO_DECIDE)
 
 
 @dataclass(frozen=True)
@@ -271,9 +285,14 @@ class Status:
     scope: Scope = Scope()
     schema: int = SCHEMA
 
+    @property
+    def on(self) -> tuple[Alarm, ...]:
+        """The alarms that are on."""
+        return tuple(alarm for alarm in self.alarms if alarm.is_on)
+
     def has(self, alarm: str) -> bool:
         """Whether an alarm of this name is on."""
-        return any(event.name == alarm and event.until_unix_s is None for event in self.alarms)
+        return any(event.name == alarm for event in self.on)
 
     def to_json(self) -> str:
         """One line of JSON, part by part: a long one at once would hold up the loop."""

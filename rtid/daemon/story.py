@@ -61,10 +61,6 @@ def line(status: Status) -> str:
     )
     gap_ms = 1e3 * max((m.gap_s for m in status.messages), default=0.0)
     age = "-" if estimate.age_s is None else f"{1e3 * estimate.age_s:.0f}ms"
-    blocks: dict[str, int] = {}
-    for edge in estimate.edges:
-        for name, count in edge.blocks.items():
-            blocks[name] = blocks.get(name, 0) + count
     work, late = loop.work_1s, loop.lateness_1s
     parts = [
         f"{messages} age={age} gap={gap_ms:.0f}ms",
@@ -72,8 +68,8 @@ def line(status: Status) -> str:
         f"wake={late.p50_us:.0f}/{late.p99_us:.0f}/{late.max_us:.0f}us overruns={loop.overruns}",
         f"{estimate.state} samples={estimate.samples}",
     ]
-    if blocks:
-        parts.append("blocks " + " ".join(f"{k}={n}" for k, n in sorted(blocks.items())))
+    if blocks := estimate.blocks:
+        parts.append("blocks " + " ".join(f"{k}={n}" for k, n in blocks.items()))
     if estimate.chambers and estimate.chambers[0].beta_pa:
         parts.append(
             "beta="
@@ -85,9 +81,8 @@ def line(status: Status) -> str:
         parts.append("gates " + " ".join(f"{k}={n}" for k, n in sorted(refused.items())))
     if status.store.state == "NOT SAVED":
         parts.append("NOT SAVED")
-    on = [alarm.name for alarm in status.alarms if alarm.until_unix_s is None]
-    if on:
-        parts.append("ALARM " + " ".join(on))
+    if status.on:
+        parts.append("ALARM " + " ".join(alarm.name for alarm in status.on))
     return " | ".join(parts)
 
 

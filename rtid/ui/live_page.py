@@ -215,7 +215,7 @@ def _counts(counts: dict[str, int]) -> str:
 def _alarms(status: Status, now_s: float) -> str:
     alike: dict[tuple[str, bool], list[Alarm]] = {}
     for alarm in status.alarms:
-        alike.setdefault((alarm.name, alarm.until_unix_s is None), []).append(alarm)
+        alike.setdefault((alarm.name, alarm.is_on), []).append(alarm)
     lines = [_same_alarms(alarms, now_s) for alarms in list(alike.values())[:MOST_ALARMS]]
     shown = "".join(lines) or '<li><span class="dot ok"></span>none</li>'
     return f'<h3>Alarms</h3><ul style="list-style:none;padding:0;margin:0">{shown}</ul>'
@@ -223,7 +223,7 @@ def _alarms(status: Status, now_s: float) -> str:
 
 def _same_alarms(alarms: Sequence[Alarm], now_s: float) -> str:
     """Alarms of one name, newest first: what the newest says, and the seconds of each."""
-    newest, is_on = alarms[0], alarms[0].until_unix_s is None
+    newest, is_on = alarms[0], alarms[0].is_on
     since = _age(max(0.0, now_s - newest.since_unix_s))
     clock = _clock(newest)
     word = f"since {clock}, for {since}" if is_on else f"at {clock}, over"

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from rtid.cli.main import run
-from rtid.daemon import coaching, jobs
+from rtid.daemon import diagnosing, jobs
 from rtid.daemon.coaching import Coaching, by_valve
 from rtid.daemon.diagnoser import answer
 from rtid.daemon.status import EdgeHealth
@@ -58,7 +58,7 @@ def learned(project: Project, folder: Path, seconds: float) -> Estimator:
 def test_the_coach_is_asked_once_there_is_a_snapshot_and_now_and_then(
     project: Project, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(coaching, "Helper", Remembering)
+    monkeypatch.setattr(diagnosing, "Helper", Remembering)
     made = list[Remembering]()
     monkeypatch.setattr(Remembering, "made", made)
     folder = Generations(tmp_path, project.digest).folder
