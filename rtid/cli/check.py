@@ -85,26 +85,14 @@ def _judged(project: Project, path: Path, progress: Progress) -> Report:
     """The report of a trace, and what replay learns from it where nothing stands against that."""
     from rtid.estimator.flowmap import VALID
     from rtid.study.study import Study
-    from rtid.trace.check import judge, with_learned
+    from rtid.trace.check import judge_recording, with_learned
     from rtid.trace.reading import NoSamplesError
     from rtid.trace.signals import read_recording
 
     progress("reading", 0.0)
     read = read_recording(project, path)
     progress("judging signals and motion", 0.2)
-    stroke_m = project.sections.stroke_m
-    tables = project.table_assembly if read.is_table else None
-    assembly = tables or project.assembly
-    report = judge(
-        project.model,
-        assembly,
-        read.samples,
-        read.series,
-        read.messages,
-        read.refused,
-        stroke_m,
-        read.jitter_s,
-    )
+    report = judge_recording(project, read)
     if not report.ok:
         return report
     try:

@@ -24,7 +24,7 @@ from rtid.project import Project, load
 from rtid.study.spans import added_parts
 from rtid.study.study import diagnose_live
 from rtid.tell.diagnosed import sentences
-from rtid.trace.check import judge
+from rtid.trace.check import judge_recording
 from rtid.trace.signals import read_recording
 
 NICE = 5
@@ -44,30 +44,14 @@ def diagnose(job: Diagnose, project: Project) -> VerdictAnswer:
     pages = catalogue()
     places = [pages[e.effect].places for e in diagnosis.found if e.effect in pages]
     of_sensor = bool(diagnosis.found) and all("sensor" in place for place in places)
-    verdict = Verdict(
-        now_s,
-        diagnosis.verdict,
-        text,
-        effects,
-        (span_s, 0.0),
-        diagnosis.as_json(),
-        of_sensor and bool(places),
-    )
-    return VerdictAnswer(verdict)
+    told, is_sensor = diagnosis.as_json(), of_sensor and bool(places)
+    span = span_s, 0.0
+    return VerdictAnswer(Verdict(now_s, diagnosis.verdict, text, effects, span, told, is_sensor))
 
 
 def check(job: Check, project: Project) -> Checked:
     """What `rtid check` has against the project file, by the daemon's own recording."""
-    read = read_recording(project, Path(job.recording))
-    report = judge(
-        project.model,
-        project.assembly,
-        read.samples,
-        read.series,
-        read.messages,
-        read.refused,
-        project.sections.stroke_m,
-    )
+    report = judge_recording(project, read_recording(project, Path(job.recording)))
     errors = [finding for finding in report.findings if finding.level == "error"]
     return Checked(tuple(f"{finding.subject}: {finding.text}" for finding in errors))
 

@@ -13,12 +13,14 @@ from firmware_bridge.samples import Samples
 from firmware_bridge.sources.table import APART
 from rtid.estimator.coloured import Coloured, sensor_noise
 from rtid.model import SENSORS, Machine, Signal
+from rtid.project import Project
 from rtid.trace.arrivals import GAP_PERIODS, Timing, timing
 from rtid.trace.between import FASTEST_S, unknown_between
 from rtid.trace.coverage import Coverage, coverage
 from rtid.trace.plausible import Motion, looks_like, motion
 from rtid.trace.repeated import rows_per_value
 from rtid.trace.series import Series, SignalReport, describe
+from rtid.trace.signals import Recording
 from rtid.trace.spikes import SPIKE
 from rtid.units import limit, units_of, with_unit
 
@@ -103,6 +105,15 @@ def judge(
         refused=refused,
         findings=tuple(findings),
     )
+
+
+def judge_recording(project: Project, read: Recording) -> Report:
+    """Judge a recording against the project that it was read by."""
+    assembly = (project.table_assembly if read.is_table else None) or project.assembly
+    return judge(
+        project.model, assembly, read.samples, read.series, read.messages, read.refused,
+        project.sections.stroke_m, read.jitter_s,
+    )  # fmt: skip
 
 
 def with_learned(

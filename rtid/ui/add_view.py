@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from html import escape
 from math import isfinite
 
-import numpy as np
 from bokeh.layouts import column, row
 from bokeh.models import UIElement
 
@@ -15,8 +14,7 @@ from rtid.diagnose.report import Value
 from rtid.effects.page import title
 from rtid.project.added import AddedSection
 from rtid.study.look import Look
-from rtid.tell.axes import small_flow
-from rtid.tell.charts.blocks import LARGEST, Quantity, quantities, round_up
+from rtid.tell.charts.blocks import Quantity, quantities_of
 from rtid.tell.charts.flows import NAMES, flows_of, pressures_of
 from rtid.tell.charts.theme import INK_TAG
 from rtid.tell.charts.time_plots import TimePlots
@@ -140,11 +138,7 @@ def _planes(session: Session) -> str:
         return ""
     looks = [revision.look for revision in session.seen[-2:]]
     part = "validation" if "validation" in looks[0].parts else next(iter(looks[0].parts))
-    every = [b for look in looks for b in look.parts[part].blocks]
-    values = [b.residual_rms_m3s for b in every if isfinite(b.residual_rms_m3s)]
-    most = float(np.quantile(values, LARGEST)) if values else 0.0
-    top = round_up(small_flow().factor * most)
-    scale = quantities(top)["residual"]
+    scale = quantities_of(b for look in looks for b in look.parts[part].blocks)["residual"]
     rows = ""
     for word, look in zip(("before", "after"), looks, strict=True):
         planes = "".join(

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 
-import numpy as np
 from bokeh.layouts import column, row
 from bokeh.models import Row, UIElement
 from bokeh.plotting import figure
@@ -13,15 +12,8 @@ from bokeh.plotting import figure
 from rtid.compare import BlockRow, Dependence
 from rtid.compare.tables import CAUSES, cause_of
 from rtid.study.look import Look
-from rtid.tell.axes import axes_of, place, small_flow
-from rtid.tell.charts.blocks import (
-    HATCHES,
-    LARGEST,
-    BlockPlots,
-    Key,
-    quantities,
-    round_up,
-)
+from rtid.tell.axes import axes_of, place
+from rtid.tell.charts.blocks import HATCHES, BlockPlots, Key, quantities_of
 from rtid.tell.charts.dependence import over_signal
 from rtid.tell.charts.flows import NAMES, flows_of
 from rtid.tell.colours import CHAMBERS
@@ -48,10 +40,7 @@ class WhereView(PageView):
         self.quantity = "residual"
         self._time = bench.time
         every = [b for part in look.parts.values() for b in part.blocks]
-        values = [b.residual_rms_m3s for b in every if np.isfinite(b.residual_rms_m3s)]
-        most = float(np.quantile(values, LARGEST)) if values else 0.0
-        top = round_up(small_flow().factor * most)
-        self._quantities = quantities(top)
+        self._quantities = quantities_of(every)
         self.planes = BlockPlots(look.model, every, bench.mark_block)
         self._asked = ""  # the signal that the user wants to see
         self._over = Row(sizing_mode="stretch_both")

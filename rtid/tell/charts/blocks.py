@@ -6,7 +6,7 @@ small page the browser turns the numbers, or leaves them out (`static/plots.js`)
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -112,7 +112,14 @@ def _sd_share(block: BlockRow) -> float:
     return 100 * block.sd_m3s / flow if flow > 0 else float("nan")
 
 
-def round_up(value: float) -> float:
+def quantities_of(blocks: Iterable[BlockRow]) -> dict[str, Quantity]:
+    """The quantities, on a scale that holds nearly all residuals of these blocks."""
+    values = [b.residual_rms_m3s for b in blocks if np.isfinite(b.residual_rms_m3s)]
+    most = float(np.quantile(values, LARGEST)) if values else 0.0
+    return quantities(_round_up(small_flow().factor * most))
+
+
+def _round_up(value: float) -> float:
     """To 1, 2 or 5 times a power of ten."""
     if not np.isfinite(value) or value <= 0:
         return 1.0
