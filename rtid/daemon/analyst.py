@@ -27,13 +27,13 @@ from rtid.daemon.books import Books
 from rtid.daemon.edge_health import edges_of
 from rtid.daemon.first import against_first
 from rtid.daemon.guard import PROOF, TRUST, Guard, candidate_of, with_wear
+from rtid.daemon.jobs import MOST_BYTES, Waiting
 from rtid.daemon.map_check import Judge
 from rtid.daemon.offering import Offering
 from rtid.daemon.pipe import Pipe
 from rtid.daemon.realtime import SWITCH_S, give_way, hasten
 from rtid.daemon.shadow import Shadow
 from rtid.daemon.status import EffectStatus
-from rtid.daemon.waiting import MOST_BYTES, Waiting
 from rtid.daemon.wearing import WearWatch
 from rtid.errors import RtidError
 from rtid.estimator.estimator import Estimator

@@ -12,13 +12,11 @@ from collections import deque
 from firmware_bridge.frames import Frames
 from firmware_bridge.sources.live import Source
 from rtid.apply.answers import Answers
-from rtid.daemon.collector import Collector
+from rtid.daemon.collector import Collector, LagMeter, ScopeKeeper
 from rtid.daemon.health import Health
 from rtid.daemon.helper import Helper
 from rtid.daemon.jobs import Handover
-from rtid.daemon.lag import LagMeter
 from rtid.daemon.notify import Notifier
-from rtid.daemon.scope import ScopeKeeper
 from rtid.estimator.estimator import Estimator
 from rtid.estimator.wear import Wear
 from rtid.project import Project

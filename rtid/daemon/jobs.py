@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
+from queue import Queue
 from typing import Literal
 
 from firmware_bridge.frames import Frames
@@ -14,6 +15,8 @@ from rtid.estimator.flowmap import FlowMap
 from rtid.estimator.wear import Wear
 from rtid.model import Machine
 from rtid.plain import FloatArray
+
+MOST_BYTES = 16 << 20  # of jobs taken from the pipe while one is in work
 
 
 @dataclass(frozen=True)
@@ -246,3 +249,31 @@ Answer = (
     | Coached
     | Checked
 )
+
+
+class Waiting(Queue[Job | None]):
+    """Jobs behind the one in work, bounded by what they hold and not by how many they are.
+
+    A handover is saved as it comes from the pipe: batches that come while a solve takes its time
+    must not keep it in there.
+    """
+
+    def _init(self, maxsize: int) -> None:
+        super()._init(maxsize)
+        self._bytes = 0
+
+    def _qsize(self) -> int:
+        return self._bytes
+
+    def _put(self, item: Job | None) -> None:
+        super()._put(item)
+        self._bytes += _size(item)
+
+    def _get(self) -> Job | None:
+        item = super()._get()
+        self._bytes -= _size(item)
+        return item
+
+
+def _size(job: Job | None) -> int:
+    return 1 + (job.size_bytes if isinstance(job, Batch) else 0)

@@ -19,9 +19,9 @@ from rtid.daemon import jobs, realtime
 from rtid.daemon import status as st
 from rtid.daemon.analyst import Analyst, _receive
 from rtid.daemon.helper import Helper
+from rtid.daemon.jobs import Waiting
 from rtid.daemon.recorder import MOST_SEGMENTS, RETRY_S, Recorder
 from rtid.daemon.teller import Saving
-from rtid.daemon.waiting import Waiting
 from rtid.trace import state_files
 from rtid.trace.snapshot import Generations
 from tests.daemon.disk import fill, mounted

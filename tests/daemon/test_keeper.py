@@ -18,13 +18,12 @@ from rtid.apply.reach import is_running
 from rtid.cli import main
 from rtid.daemon import jobs
 from rtid.daemon.acceptance import FILE, Acceptance, ask
+from rtid.daemon.collector import LagMeter, ScopeKeeper
 from rtid.daemon.core import Core
 from rtid.daemon.daemon import _locked
 from rtid.daemon.health import Health
 from rtid.daemon.keeper import BEGINS_S, Keeper
-from rtid.daemon.lag import LagMeter
 from rtid.daemon.loop import Loop
-from rtid.daemon.scope import ScopeKeeper
 from rtid.daemon.status import Advice, read, write
 from rtid.daemon.teller import Facts
 from rtid.estimator.estimator import Estimator

@@ -20,11 +20,10 @@ from firmware_bridge.sources import open_log
 from rtid.daemon import log, metrics, status
 from rtid.daemon.alarms import Alarms
 from rtid.daemon.chronicle import Chronicle
-from rtid.daemon.collector import Collector
+from rtid.daemon.collector import Collector, LagMeter
 from rtid.daemon.diagnosing import newest
 from rtid.daemon.helper import Helper
 from rtid.daemon.jobs import Answer, Batch, HandoverJudgement, Publication, Ready
-from rtid.daemon.lag import LagMeter
 from rtid.daemon.pipe import Pipe, pair
 from rtid.daemon.plant_watch import PlantWatch
 from rtid.daemon.recorder import Recorder

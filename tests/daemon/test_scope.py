@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rtid.daemon.scope import ScopeKeeper
+from rtid.daemon.collector import ScopeKeeper
 from rtid.daemon.status import Scope
 
 
