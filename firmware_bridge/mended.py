@@ -32,10 +32,8 @@ LEAST_SILENCE_US = 3_000  # before a burst; stamps of 1 ms are coarse, not late
 LONGEST_RUN, SHORTEST_RUN = 1000, 16  # frames of one message; clocks drift, a line does not
 LONG_RUN = 400  # what shows its own period: a lost frame would pass for a longer one in less
 BREAK = 3.0  # of the median silence, beside 1.5 periods: a gap of the log ends a run
-REORDERED_FEWEST, REORDERED_SHARE = (
-    10,
-    0.01,
-)  # of the stamps go back: an adapter's habit and no damaged digit
+# of the stamps go back: an adapter's habit and no damaged digit
+REORDERED_FEWEST, REORDERED_SHARE = 10, 0.01
 JITTER_US = 1_000.0  # of a sender
 REASONS = ("reordered", "burst_mended", "burst_left")
 REORDERED, MENDED, LEFT = REASONS

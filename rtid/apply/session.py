@@ -71,11 +71,8 @@ class Plan:
             return "The controller holds no map."
         if reviewed.held_content is None:
             return f"The controller holds version {reviewed.held_version}, which is not from here."
-        again = (
-            ""
-            if reviewed.held_content == reviewed.held_version
-            else f" (as {reviewed.held_content})"
-        )
+        is_own = reviewed.held_content == reviewed.held_version
+        again = "" if is_own else f" (as {reviewed.held_content})"
         return f"The controller holds version {reviewed.held_version}{again}."
 
     def as_json(self) -> dict[str, Any]:

@@ -219,16 +219,14 @@ def missing(
 def _improved(information: Information, known: KnownCells) -> frozenset[int | Key]:
     """Cells and effects that a segment would still improve."""
     known_blocks = known.blocks[information.cells]
-    before, after = (
-        standard_errors(known_blocks),
-        standard_errors(known_blocks + information.blocks),
-    )
+    before = standard_errors(known_blocks)
+    after = standard_errors(known_blocks + information.blocks)
     cells = information.cells[(before > GOAL) & (after < (1.0 - IMPROVED) * before)]
+    least, present = (1.0 - IMPROVED) ** 2, known.effects.get
     effects = [
         key
         for key, value in information.effects.items()
-        if (known.effects.get(key, 0.0) + value) * (1.0 - IMPROVED) ** 2
-        > known.effects.get(key, 0.0)
+        if (present(key, 0.0) + value) * least > present(key, 0.0)
     ]
     return frozenset[int | Key]([*cells.tolist(), *effects])
 
@@ -247,20 +245,15 @@ def stitched(
 
     Segments that fit, the reference (n, 5) in SI, and the segment of each sample (n,).
     """
-    parts, kept, free = (
-        list[FloatArray](),
-        list[CandidateSegment](),
-        round(limits.duration_s / STEP_S),
-    )
+    parts, kept = list[FloatArray](), list[CandidateSegment]()
+    free = round(limits.duration_s / STEP_S)
     for candidate in segments:
         row = candidate.segment.reference[:1]
         lead = row
         if parts:
             change = row[0, SUPPLY] - parts[-1][-1, SUPPLY]
-            steps = max(
-                round(REST_S / STEP_S),
-                int(np.ceil(abs(change) / limits.supply_rate_paps / STEP_S)) + 1,
-            )
+            led = int(np.ceil(abs(change) / limits.supply_rate_paps / STEP_S)) + 1
+            steps = max(round(REST_S / STEP_S), led)
             lead = np.repeat(row, steps, axis=0)
             lead[:, SUPPLY] = row[0, SUPPLY] - change * (1.0 - np.arange(1, steps + 1) / steps)
             lead[:, SHUT] = 0.0

@@ -82,12 +82,8 @@ def drive(
     """
     e = engine[0]
     n_c = e.n_chambers
-    p, now, slopes, foot = (
-        np.zeros(2),
-        np.zeros(MAX_SIGNALS + 1),
-        np.zeros((STAGES + 1, 2)),
-        np.ones(MAX_EDGES),
-    )
+    p, now = np.zeros(2), np.zeros(MAX_SIGNALS + 1)
+    slopes, foot = np.zeros((STAGES + 1, 2)), np.ones(MAX_EDGES)
     for i in range(e.n_edges):
         foot[i] = foot_width(e, i, overlap)
     for c in range(n_c):
@@ -125,11 +121,9 @@ def drive(
         force -= piston.coulomb_n * math.tanh(v / piston.width_mps)
         for c in range(n_c):
             force += e.area_m2[c] * p[c]
-        v = (v + STEP_S * force / piston.mass_kg) / (
-            1.0 + STEP_S * piston.viscous_nspm / piston.mass_kg
-        )
-        if (v > 0.0 and x + STEP_S * v > piston.most_m) or (
-            v < 0.0 and x + STEP_S * v < piston.least_m
-        ):
+        damped = 1.0 + STEP_S * piston.viscous_nspm / piston.mass_kg
+        v = (v + STEP_S * force / piston.mass_kg) / damped
+        to = x + STEP_S * v
+        if (v > 0.0 and to > piston.most_m) or (v < 0.0 and to < piston.least_m):
             v = 0.0
     return len(reference)

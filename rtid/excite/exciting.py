@@ -155,24 +155,12 @@ def _predicted(p: Prediction, names: list[str]) -> dict[str, Any]:
         "beta_pa": p.beta_pa.tolist(),
         "beta_sd_pa": p.beta_sd_pa.tolist(),
         "limits": [
-            {
-                "effect": x.effect,
-                "where": x.where,
-                "detection_limit": x.value,
-                "unit": x.unit,
-            }
+            {"effect": x.effect, "where": x.where, "detection_limit": x.value, "unit": x.unit}
             for x in p.limits
         ],
         "blocks": [
-            {
-                "edge": names[b.edge],
-                "i": b.i,
-                "j": b.j,
-                "rows": b.rows,
-                "sd_share": b.sd,
-                "mean_sd_share": b.mean_sd,
-                "valid": b.valid,
-            }
+            {"edge": names[b.edge], "i": b.i, "j": b.j, "rows": b.rows, "sd_share": b.sd,
+             "mean_sd_share": b.mean_sd, "valid": b.valid}
             for b in p.blocks
         ],
-    }
+    }  # fmt: skip

@@ -44,10 +44,9 @@ class DrivenMachine:
     @property
     def weights(self) -> Weights:
         """Weights of the rows from the nominal map: what `refined` will find."""
-        slopes = nominal_weights(self.model).slopes
-        flow, at = np.abs(self.theta[:, 0]), 0
+        flow = np.abs(self.theta[:, 0])
         span = np.concatenate([_span(edge) for edge in self.model.edges])
-        slopes = np.where(flow > 0, flow / span, slopes[at:])
+        slopes = np.where(flow > 0, flow / span, nominal_weights(self.model).slopes)
         return Weights(slopes, self.compliance, self.model.lag.nominal_s)
 
     @cached_property
@@ -85,10 +84,8 @@ class DrivenMachine:
         lead = np.repeat(reference[:1], round(SETTLE_S / STEP_S), axis=0)
         whole = np.concatenate([lead, reference])
         n, state = len(whole), build(self.model.with_taylor_maps, self.weights)
-        signals, sample = (
-            np.empty((n, len(self.model.signals))),
-            np.zeros(2 + len(self.model.signals)),
-        )
+        columns = len(self.model.signals)
+        signals, sample = np.empty((n, columns)), np.zeros(2 + columns)
         sample[2 + self.places.tank] = self.tank_pa
         done = drive(
             state.engine, self.theta, self.compliance, OVERLAP, self.piston, self.control,

@@ -99,10 +99,8 @@ def with_rests(design: Design, rests: Segment, limits: Limits) -> Design:
     least = min(limits.pressure_pa[0], design.machine.tank_pa - NEAR_PA)
     most = max(limits.pressure_pa[1], float(rests.reference[0, SUPPLY]) + NEAR_PA)
     piston = design.machine.piston._replace(least_m=stops[0], most_m=stops[1])
-    machine, wide = (
-        replace(design.machine, piston=piston),
-        replace(limits, stroke_m=stops, pressure_pa=(least, most)),
-    )
+    machine = replace(design.machine, piston=piston)
+    wide = replace(limits, stroke_m=stops, pressure_pa=(least, most))
     told = of_blocks(machine, machine.measured(machine.run(rests.reference)))
     segments = (*design.segments, CandidateSegment(rests, told))
     kept, reference, _ = stitched(segments, wide)

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from rtid.estimator.flowmap import PRIOR, SHUT, VALID, FlowMap
+from rtid.estimator.flowmap import PRIOR, SHUT, VALID, EdgeMap, FlowMap
 from rtid.estimator.published import publish
 from rtid.estimator.solution import Solution, solve
 from rtid.fleet.archive import Archive
@@ -160,25 +160,21 @@ def deviation(machine: FleetMachine, of: Typical) -> float:
 
 def _nodes(flowmap: FlowMap) -> tuple[list[str], FloatArray, FloatArray]:
     """Edge, command and pressure drop of all centres of blocks."""
-    names: list[str] = []
-    u, dp = [], []
-    for edge in flowmap.edges:
-        centres = [0.5 * (b[1:] + b[:-1]) for b in (edge.grid.u_v, edge.grid.dp_pa)]
-        w, d = (a.ravel() for a in np.meshgrid(*centres, indexing="ij"))
-        names += [edge.name] * len(w)
-        u.append(w)
-        dp.append(d)
-    return names, np.concatenate(u), np.concatenate(dp)
+    names = [edge.name for edge in flowmap.edges for _ in range(edge.status.size)]
+    u, dp = np.concatenate([_centres(edge).reshape(2, -1) for edge in flowmap.edges], axis=1)
+    return names, u, dp
 
 
 def _known(flowmap: FlowMap) -> FloatArray:
     """Flow at these centres, NaN in blocks that do not stand on their own data."""
-    known = []
-    for edge in flowmap.edges:
-        centres = [0.5 * (b[1:] + b[:-1]) for b in (edge.grid.u_v, edge.grid.dp_pa)]
-        w, d = np.meshgrid(*centres, indexing="ij")
-        known.append(np.where(edge.status == VALID, edge.flow(w, d), np.nan).ravel())
-    return np.concatenate(known)
+    flows = (np.where(e.status == VALID, e.flow(*_centres(e)), np.nan) for e in flowmap.edges)
+    return np.concatenate([flow.ravel() for flow in flows])
+
+
+def _centres(edge: EdgeMap) -> FloatArray:
+    """Command and pressure drop (2, u, dp) in the middle of every block."""
+    centres = [0.5 * (b[1:] + b[:-1]) for b in (edge.grid.u_v, edge.grid.dp_pa)]
+    return np.stack(np.meshgrid(*centres, indexing="ij"))
 
 
 def write(

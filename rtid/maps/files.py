@@ -127,20 +127,18 @@ def provenance(
     effects: those beside which it was fitted, whose flow is not in the map; None: not known.
     """
     known: dict[str, Any] = {} if effects is None else {"effects": list(effects)}
-    return (
-        known
-        | unusual_units(solution.model)
-        | {
-            "program": f"rtid {rtid.__version__}",
-            "project": project,
-            "digest": digest,
-            "source": source,
-            "rows": solution.counters.get("rows", 0),
-            "rho": solution.rho,
-            "beta_pa": plain(solution.beta_pa),
-            "beta_sd_pa": plain(solution.beta_sd_pa),
-        }
-    )
+    return {
+        **known,
+        **unusual_units(solution.model),
+        "program": f"rtid {rtid.__version__}",
+        "project": project,
+        "digest": digest,
+        "source": source,
+        "rows": solution.counters.get("rows", 0),
+        "rho": solution.rho,
+        "beta_pa": plain(solution.beta_pa),
+        "beta_sd_pa": plain(solution.beta_sd_pa),
+    }
 
 
 def unusual_units(model: Machine) -> dict[str, str]:
@@ -200,12 +198,8 @@ def as_dict(flowmap: FlowMap, provenance: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _header(provenance: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        "schema": SCHEMA,
-        "units": _units(provenance),
-        "basis": BASIS,
-        "provenance": dict(provenance),
-    }
+    told = {"units": _units(provenance), "basis": BASIS, "provenance": dict(provenance)}
+    return {"schema": SCHEMA} | told
 
 
 def _units(provenance: Mapping[str, Any]) -> dict[str, str]:
@@ -240,11 +234,8 @@ def _edge(part: Mapping[str, Any]) -> EdgeMap:
     grid = Grid(np.asarray(part["u_v"], float), np.asarray(part["dp_pa"], float))
     theta, cov = np.asarray(part["theta_m3s"], float), np.asarray(part["cov_m6s2"], float)
     status = np.asarray(part["status"], np.str_)
-    if (theta.shape, cov.shape, status.shape) != (
-        (*grid.shape, 6),
-        (*grid.shape, 6, 6),
-        grid.shape,
-    ):
+    shapes = (*grid.shape, 6), (*grid.shape, 6, 6), grid.shape
+    if (theta.shape, cov.shape, status.shape) != shapes:
         raise ValueError(f"edge {part['name']!r} has arrays that do not fit its grid")
     safe = -np.inf if part["safe_band_v"] is None else float(part["safe_band_v"])
     reason = {(int(i), int(j)): str(text) for i, j, text in part["reason"]}

@@ -7,17 +7,8 @@ from rtid.plants.plant import PlantError
 from rtid.units import nearest
 
 # What sets the size of a parameter: the term that it multiplies, a signal, a time of the record.
-AMPLITUDE, INPUT, LIMIT, STATE, SPEED, GAP, TIME, RATE, SHARE = (
-    "amplitude",
-    "input",
-    "limit",
-    "state",
-    "speed",
-    "gap",
-    "time",
-    "rate",
-    "share",
-)
+AMPLITUDE, INPUT, LIMIT, STATE, SPEED = "amplitude", "input", "limit", "state", "speed"
+GAP, TIME, RATE, SHARE = "gap", "time", "rate", "share"
 
 
 def effects_of_plants() -> dict[str, Effect]:

@@ -46,11 +46,7 @@ class FitProblem:
     """The least-squares problem in scaled unknowns; `open` are those that may move."""
 
     def __init__(
-        self,
-        simulator: Simulator,
-        values: FloatArray,
-        opened: BoolArray,
-        mask: BoolArray,
+        self, simulator: Simulator, values: FloatArray, opened: BoolArray, mask: BoolArray
     ) -> None:
         self.simulator, self.values, self.open = simulator, values, opened
         self.mask = mask

@@ -17,10 +17,8 @@ from rtid.sim.simulated_plant import SimulatedPlant
 
 DT_S = 1e-3
 LOAD_SHARE = 700 / 4500  # of each varying load force in the load of the boom
-IDENTIFICATION, VALIDATION = (
-    80 / 110,
-    83 / 110,
-)  # shares of a record: end of one, start of the other
+# shares of a record: end of one, start of the other
+IDENTIFICATION, VALIDATION = 80 / 110, 83 / 110
 PUSH_SHARE, PUSH_LOAD_SHARE = 0.25, 0.4  # of the time; of the load of the boom
 PUSH_S, PUSH_RAMP_S = 1.5, 0.05
 BRAKE_S = 0.6

@@ -51,7 +51,7 @@ def sentences(diagnosis: Diagnosis) -> list[str]:
         lines.append(rest)
     lines += [*seen_and_not_named(diagnosis), *in_the_moduli(diagnosis)]
     doubts = [f"{doubt.text[0].upper()}{doubt.text[1:]}" for doubt in diagnosis.doubts]
-    return lines + doubts + [f"{text}" for text in diagnosis.advice[:4]]
+    return lines + doubts + list(diagnosis.advice[:4])
 
 
 def seen_and_not_named(diagnosis: Diagnosis) -> list[str]:
@@ -145,8 +145,7 @@ def remains(diagnosis: Diagnosis) -> str:
         return (
             "What remains beyond the noise is immaterial: less than "
             f"{100 * MATERIAL:g} % of the rms flow (residual variance {diagnosis.rho_after:.2f} "
-            f"times "
-            "the noise's)."
+            "times the noise's)."
         )
     if is_open:
         return ""
@@ -177,11 +176,7 @@ def _head(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict == INSUFFICIENT:
         return f"{words}{_left(diagnosis)}."
     if diagnosis.verdict in (MATCHES, UNKNOWN):
-        rho = (
-            f"{diagnosis.rho_after:.2f}"
-            if diagnosis.verdict == MATCHES
-            else f"{diagnosis.rho_after:.3g}"
-        )
+        rho = format(diagnosis.rho_after, ".2f" if diagnosis.verdict == MATCHES else ".3g")
         return (
             f"{words}: held-out error {share} of the rms flow{floored(diagnosis, ', ')}; "
             f"residual variance {rho} times the noise's."
@@ -264,13 +259,10 @@ def floored(diagnosis: Diagnosis, joined: str = "; ") -> str:
 def _found_table(diagnosis: Diagnosis) -> Table:
     rows = []
     for effect in diagnosis.found:
+        key, chance = (effect.effect, effect.where), f"{effect.p_value:.1g}"
+        gain = (f"{effect.heldout_gain_pct:.1f} %", chance)
         for k, (name, value) in enumerate(effect.parameters.items()):
-            first = (effect.effect, effect.where) if k == 0 else ("", "")
-            last = (
-                (f"{effect.heldout_gain_pct:.1f} %", f"{effect.p_value:.1g}")
-                if k == 0
-                else ("", "")
-            )
+            first, last = (key, gain) if k == 0 else (("", ""), ("", ""))
             rows.append((*first, name, quantity(value), *last))
     heads = ("effect", "where", "parameter", "value", "held-out gain|", "p|")
     return Table("found", heads, rows, keys=2)

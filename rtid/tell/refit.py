@@ -37,7 +37,11 @@ def as_json(refitted: Refitted) -> dict[str, Any]:
     """Everything in plain JSON types; NaN is null."""
     plant, model = refitted.file.plant, refitted.last
     outputs = [o.name for o in plant.outputs]
-    before, after = refitted.errors(refitted.first), refitted.errors(model)
+
+    def errors(fitted: PlantModel) -> dict[str, dict[str, Any]]:
+        parts = refitted.errors(fitted).items()
+        return {part: dict(zip(outputs, plain(e), strict=True)) for part, e in parts}
+
     document = {
         "schema": SCHEMA,
         "plant": plant.name,
@@ -46,12 +50,8 @@ def as_json(refitted: Refitted) -> dict[str, Any]:
             name: [{"from_s": plain(a), "to_s": plain(b)} for a, b in spans(record)]
             for name, record in refitted.records.named
         },
-        "rmse_before": {
-            part: dict(zip(outputs, plain(e), strict=True)) for part, e in before.items()
-        },
-        "rmse_after": {
-            part: dict(zip(outputs, plain(e), strict=True)) for part, e in after.items()
-        },
+        "rmse_before": errors(refitted.first),
+        "rmse_after": errors(model),
         "effects": [{"effect": effect, "where": where} for effect, where in model.keys],
         "parameters": [
             {"name": p.name, "value": plain(v), "std": plain(sd), "unit": unit}
