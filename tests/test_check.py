@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import io
 import json
 import re
 import shutil
-import subprocess
 from collections.abc import Callable
-from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +18,6 @@ import tomlkit
 
 from firmware_bridge.frames import EXTENDED, empty
 from firmware_bridge.samples import Samples
-from rtid.cli.main import run
 from rtid.daemon.first import wrong_signs
 from rtid.estimator.noise import estimate_noise
 from rtid.project import load
@@ -33,6 +29,7 @@ from rtid.trace.check import Finding, Report, against_signs, judge
 from rtid.trace.plausible import Motion, Spring, motion
 from rtid.trace.series import Series, describe, longest_frozen
 from rtid.trace.signals import read_recording
+from tests.command import called
 from tests.replays import shared_replays  # noqa: F401
 
 ROOT = Path(__file__).parents[1]
@@ -282,31 +279,21 @@ def test_bus_separates_channels_and_identifiers() -> None:
     assert found == [(0, "005", 3), (1, "00000005", 2), (2, "00000005", 1)]
 
 
-def rtid(*arguments: object) -> subprocess.CompletedProcess[str]:
-    """The command line in this process: exit code, stdout, stderr."""
-    out, err = io.StringIO(), io.StringIO()
-    words = [*map(str, arguments)]
-    with redirect_stdout(out), redirect_stderr(err), pytest.raises(SystemExit) as ended:
-        run(words)
-    code = ended.value.code
-    return subprocess.CompletedProcess(words, int(code or 0), out.getvalue(), err.getvalue())
-
-
 def test_command_prints_a_verdict_and_ends_with_its_code(folder: Path, tmp_path: Path) -> None:
-    done = rtid("check", folder / "trace.toml", folder / "trace.parquet")
+    done = called("check", folder / "trace.toml", folder / "trace.parquet")
     assert done.returncode == 0 and "Ready to learn" in done.stdout, done.stdout + done.stderr
     text = (folder / "trace.toml").read_text()
     wrong = tmp_path / "wrong.toml"
     wrong.write_text(text.replace("direction = 1", "direction = 2"))
-    done = rtid("check", wrong)
+    done = called("check", wrong)
     assert done.returncode == 2 and "edges.pa.direction" in done.stderr
-    done = rtid("check", folder / "trace.toml", tmp_path / "none.blf")
+    done = called("check", folder / "trace.toml", tmp_path / "none.blf")
     assert done.returncode == 3 and "none.blf" in done.stderr
 
 
 def test_command_says_negative_in_json(folder: Path) -> None:
     judged(folder, turned("u"))  # leaves edited.toml
-    done = rtid("check", folder / "edited.toml", folder / "trace.parquet", "--json")
+    done = called("check", folder / "edited.toml", folder / "trace.parquet", "--json")
     report = json.loads(done.stdout)
     assert done.returncode == 4 and report["ok"] is False
     assert report["signals"][0]["name"] == "u"
@@ -315,12 +302,12 @@ def test_command_says_negative_in_json(folder: Path) -> None:
 def test_log_without_a_wanted_frame_says_what_it_holds(folder: Path, tmp_path: Path) -> None:
     log = tmp_path / "foreign.log"
     log.write_text("".join(f"(1.{k:06d}) can0 7DF#0102\n" for k in range(50)))
-    done = rtid("check", folder / "trace.toml", log)
+    done = called("check", folder / "trace.toml", log)
     assert done.returncode == 3 and "0x7DF" in done.stderr and "ValveCommand" in done.stderr
-    done = rtid("check", "--bus-only", log)
+    done = called("check", "--bus-only", log)
     assert done.returncode == 0 and "50 frames, 1 ids" in done.stdout
     shutil.copy(log, tmp_path / "copy.log")
-    assert json.loads(rtid("check", "--bus-only", log, "--json").stdout)["frames"] == 50
+    assert json.loads(called("check", "--bus-only", log, "--json").stdout)["frames"] == 50
 
 
 def test_log_of_savvycan_is_a_log_of_frames_and_no_table(folder: Path, tmp_path: Path) -> None:
@@ -341,7 +328,7 @@ def test_log_of_savvycan_is_a_log_of_frames_and_no_table(folder: Path, tmp_path:
         lines.append(f"{t_us},{can_id:08X},false,Rx,0,{n},{shown}")
     (tmp_path / "trace.csv").write_text("\n".join([*lines, ""]))
     told = [
-        json.loads(rtid("check", folder / "trace.toml", tmp_path / name, "--json").stdout)
+        json.loads(called("check", folder / "trace.toml", tmp_path / name, "--json").stdout)
         for name in ("trace.blf", "trace.csv")
     ]
     assert told[0] == told[1]
@@ -383,7 +370,7 @@ def test_every_capture_of_python_can_is_read_or_refused_in_one_line(
     shared: Path, name: str
 ) -> None:
     count, left_out, code = CAPTURES[name]
-    done = rtid("check", "--bus-only", shared / "data/can_logs" / name, "--json")
+    done = called("check", "--bus-only", shared / "data/can_logs" / name, "--json")
     assert done.returncode == code
     assert len(done.stderr.splitlines()) == (code == 3)
     if count is not None:
@@ -397,14 +384,14 @@ def test_no_capture_of_python_can_is_left_untried(shared: Path) -> None:
 
 
 def test_a_capture_without_data_frames_says_what_it_holds(shared: Path) -> None:
-    done = rtid("check", "--bus-only", shared / "data/can_logs/test_CanErrorFrames.asc")
+    done = called("check", "--bus-only", shared / "data/can_logs/test_CanErrorFrames.asc")
     assert done.returncode == 0
     assert done.stdout.splitlines() == ["No data frames.", "Left out: error_frame 4"]
 
 
 def test_real_capture_is_timed_frame_by_frame(shared: Path) -> None:
     capture = shared / "data" / "can_j1939"
-    done = rtid(
+    done = called(
         "check", "--bus-only", capture / "vehicle.mf4", "--dbc", capture / "j1939.dbc", "--json"
     )
     report = json.loads(done.stdout)
@@ -416,7 +403,7 @@ def test_real_capture_is_timed_frame_by_frame(shared: Path) -> None:
 @pytest.mark.slow
 def test_rig_passes_and_its_sensors_are_as_told(shared: Path) -> None:
     example = ROOT / "rtid" / "project" / "examples" / "cylinder.toml"
-    done = rtid("check", example, shared / "data/rig/measured/rig_01.parquet", "--json")
+    done = called("check", example, shared / "data/rig/measured/rig_01.parquet", "--json")
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
     noise = {one["name"]: one["noise"] for one in report["signals"]}

@@ -14,8 +14,8 @@ from rtid.cli.exits import Exit
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import SimulatedPlant
+from tests.command import called
 from tests.replays import shared_replays  # noqa: F401
-from tests.test_names import rtid
 
 RECORDS = {"rich": ("rich", 12.0), "sweep": ("sweep", 12.0), "short": ("rich", 3.0)}
 
@@ -43,8 +43,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_check_says_what_replay_learns(folder: Path, name: str) -> None:
     """It once took every block with 20 rows for learned: 44 where replay learned one per edge."""
     project, trace = folder / f"{name}.toml", folder / f"{name}.parquet"
-    told = json.loads(rtid("check", project, trace, "--json").stdout)
-    replayed = json.loads(rtid("replay", trace, "-p", project, "--json").stdout)
+    told = json.loads(called("check", project, trace, "--json").stdout)
+    replayed = json.loads(called("replay", trace, "-p", project, "--json").stdout)
     valid = {edge: counts.get("valid", 0) for edge, counts in replayed["blocks"].items()}
     assert told["learned"] == valid
     rows = {
@@ -56,12 +56,12 @@ def test_check_says_what_replay_learns(folder: Path, name: str) -> None:
         f["subject"].removeprefix("edges.") for f in told["findings"] if "learns" in f["text"]
     }
     assert few <= warned
-    text = rtid("check", project, trace).stdout
+    text = called("check", project, trace).stdout
     assert f"replay learns {sum(valid.values())} blocks" in text or "Not ready" in text
 
 
 def test_a_machine_that_stands_is_not_ready(folder: Path) -> None:
-    done = rtid("check", folder / "standstill.toml", folder / "standstill.parquet")
+    done = called("check", folder / "standstill.toml", folder / "standstill.parquet")
     assert done.returncode == Exit.NEGATIVE
     assert "Not ready" in done.stdout and "never opens" in done.stdout
 
@@ -73,7 +73,7 @@ def test_a_grid_too_coarse_for_the_valve_is_named(folder: Path) -> None:
     grids = {"u_grid_v": "[1.0, 5.5, 10.0]", "dp_grid_mpa": "[-0.3, 10.0]"}
     coarse = [f"{k} = {grids[k]}" if (k := line.split(" ")[0]) in grids else line for line in lines]
     project.write_text("\n".join(coarse))
-    done = rtid("check", project, folder / "rich.parquet", "--json")
+    done = called("check", project, folder / "rich.parquet", "--json")
     found = json.loads(done.stdout)["findings"]
     coarse_edges = [f for f in found if "the grid is too coarse for the valve" in f["text"]]
     assert coarse_edges, done.stdout[-2000:]

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
-from typer.testing import CliRunner
 
 from rtid.cli.compare import compare
 from rtid.cli.export import export
@@ -50,6 +49,7 @@ from rtid.study.study import Study
 from rtid.tell.added import sentences
 from rtid.tell.charts.points import spread_points
 from rtid.units import MPA
+from tests.command import output_of
 from tests.diagnose.records import record
 from tests.estimator.cases import draw_case
 from tests.replays import shared_replays  # noqa: F401
@@ -67,12 +67,6 @@ APP = typer.Typer()
 APP.command()(compare)
 APP.command()(export)
 APP.command("replay")(replay_command)
-
-
-def call(*arguments: object) -> str:
-    result = CliRunner().invoke(APP, [str(a) for a in arguments], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.output
 
 
 @cache
@@ -318,10 +312,10 @@ def test_blocks_are_those_of_the_map_beside_the_effect(folder: Path) -> None:
 def test_compare_in_words_and_json(folder: Path, tmp_path: Path) -> None:
     arguments = ("compare", folder / "leak.parquet", "-p", folder / "leak.toml")
     against = ("--against", folder / "leak_before.toml", "--table", tmp_path / "t.csv")
-    text = " ".join(call(*arguments, *against).split())
+    text = " ".join(output_of(APP, *arguments, *against).split())
     assert "The model has Internal leakage, laminar at a-b: coefficient 0.12" in text
     assert "explains the validation part better than" in text
-    found = json.loads(call(*arguments, "--json"))
+    found = json.loads(output_of(APP, *arguments, "--json"))
     (known,) = found["added"]
     assert (known["effect"], known["where"], known["follows"]) == (LEAK, "a-b", True)
     assert known["parameters"]["coefficient"]["value"] == pytest.approx(2e-12, rel=0.15)
@@ -331,14 +325,15 @@ def test_compare_in_words_and_json(folder: Path, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_replay_learns_beside_and_keeps_the_boards_memory(folder: Path, tmp_path: Path) -> None:
     told_ = json.loads(
-        call(
-            "replay", folder / "delay.parquet", "-p", folder / "delay.toml", "--json",
+        output_of(APP, "replay", folder / "delay.parquet", "-p", folder / "delay.toml", "--json",
             "--snapshot", tmp_path / "memory.npz",
         )
     )  # fmt: skip
     assert told_["added"][0]["parameters"]["delay"]["value"] == pytest.approx(5e-3, abs=1e-4)
     assert told_["lag_s"] == pytest.approx(1.3e-3, abs=3e-4)
-    text = call("export", tmp_path / "memory.npz", tmp_path / "m.json", "-p", folder / "delay.toml")
+    text = output_of(
+        APP, "export", tmp_path / "memory.npz", tmp_path / "m.json", "-p", folder / "delay.toml"
+    )
     assert "This snapshot was learned without input_delay at command" in " ".join(text.split())
     assert read_map(tmp_path / "m.json")[1]["effects"] == []
 
@@ -349,7 +344,7 @@ def test_replay_learns_beside_and_keeps_the_boards_memory(folder: Path, tmp_path
 )
 def test_the_exported_map_names_its_effects(folder: Path, tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"map{suffix}"
-    text = call("export", folder / "leak.parquet", path, "-p", folder / "leak.toml")
+    text = output_of(APP, "export", folder / "leak.parquet", path, "-p", folder / "leak.toml")
     assert f"Learned beside {LEAK} at a-b" in text
     if suffix == ".csv":
         with path.open() as file:

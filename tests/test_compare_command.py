@@ -23,6 +23,7 @@ from rtid.project import load
 from rtid.sim.simulated_plant import SimulatedPlant
 from rtid.trace.reading import read_trace
 from rtid.trace.snapshot import save
+from tests.command import output_of
 from tests.replays import shared_replays  # noqa: F401
 
 APP = typer.Typer()
@@ -30,17 +31,11 @@ for command in (compare, export, simulate):
     APP.command()(command)
 
 
-def call(*arguments: object) -> str:
-    result = CliRunner().invoke(APP, [str(a) for a in arguments], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.output
-
-
 @pytest.fixture(scope="module")
 def trace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """12 s of the simulated machine: 8 s to learn from, 4 s to judge by."""
     path = tmp_path_factory.mktemp("compare") / "run.log"
-    call("simulate", path, "--duration", 12, "--motion", "rich", "--seed", 1)
+    output_of(APP, "simulate", path, "--duration", 12, "--motion", "rich", "--seed", 1)
     project = path.with_suffix(".toml")
     text = project.read_text()
     parts = "[record]\nidentification_s = [0, 8]\nvalidation_s = [8, 12]\n"
@@ -62,7 +57,9 @@ def sheet(tmp_path: Path) -> Path:
 
 
 def test_compare_answers_the_first_question(trace: Path, sheet: Path) -> None:
-    text = call("compare", trace, "-p", trace.with_suffix(".toml"), "--map", sheet, "--json")
+    text = output_of(
+        APP, "compare", trace, "-p", trace.with_suffix(".toml"), "--map", sheet, "--json"
+    )
     found = json.loads(text)
     own, other = found["maps"]
     assert [own["name"], other["name"]] == ["learned", "sheet"]
@@ -80,7 +77,7 @@ def test_compare_answers_the_first_question(trace: Path, sheet: Path) -> None:
 def test_compare_in_words_and_pictures(trace: Path, sheet: Path, tmp_path: Path) -> None:
     folder = tmp_path / "pictures"
     project = trace.with_suffix(".toml")
-    text = call("compare", trace, "-p", project, "--map", sheet, "--pictures", folder)
+    text = output_of(APP, "compare", trace, "-p", project, "--map", sheet, "--pictures", folder)
     assert "With the learned map" in text
     assert "With the sheet map" in text
     assert "Learned minus sheet" in text
@@ -107,7 +104,7 @@ def coarse(trace: Path) -> Path:
 def later(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Another record of the same machine."""
     path = tmp_path_factory.mktemp("later") / "later.log"
-    call("simulate", path, "--duration", 12, "--motion", "rich", "--seed", 2)
+    output_of(APP, "simulate", path, "--duration", 12, "--motion", "rich", "--seed", 2)
     return path
 
 
@@ -115,7 +112,7 @@ def later(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 def test_two_projects_on_one_trace(trace: Path, coarse: Path, tmp_path: Path) -> None:
     arguments = ("compare", trace, "-p", trace.with_suffix(".toml"), "--against", coarse)
-    text = call(*arguments, "--pictures", tmp_path)
+    text = output_of(APP, *arguments, "--pictures", tmp_path)
     assert "With the run map" in text
     assert "With the coarse map" in text
     assert "run explains the validation part better than coarse" in text
@@ -126,7 +123,7 @@ def test_two_projects_on_one_trace(trace: Path, coarse: Path, tmp_path: Path) ->
 
 def test_two_traces_with_one_project(trace: Path, later: Path) -> None:
     arguments = ("compare", trace, "-p", trace.with_suffix(".toml"), "--against", later)
-    found = json.loads(call(*arguments, "--json"))
+    found = json.loads(output_of(APP, *arguments, "--json"))
     names = [found["maps"][0]["name"], found["against"]["maps"][0]["name"]]
     assert names == ["run", "later"]
     changes = {d["edge"]: d for d in found["changes"]}
@@ -144,9 +141,9 @@ def test_two_traces_with_one_project(trace: Path, later: Path) -> None:
 def test_two_reference_maps(trace: Path, sheet: Path, tmp_path: Path) -> None:
     exported = tmp_path / "before.json"
     project = trace.with_suffix(".toml")
-    call("export", trace, exported, "-p", project)
+    output_of(APP, "export", trace, exported, "-p", project)
     arguments = ("compare", trace, "-p", project, "--map", sheet, "--map", exported)
-    found = json.loads(call(*arguments, "--json"))
+    found = json.loads(output_of(APP, *arguments, "--json"))
     names = [one["name"] for one in found["maps"]]
     assert names == ["learned", "sheet", "before"]
     assert set(found["differences_by_map"]) == {"sheet", "before"}
@@ -159,15 +156,17 @@ def test_two_reference_maps(trace: Path, sheet: Path, tmp_path: Path) -> None:
 
 def test_from_a_block_to_its_spans_and_back(trace: Path) -> None:
     arguments = ("compare", trace, "-p", trace.with_suffix(".toml"))
-    rows = json.loads(call(*arguments, "--json"))["blocks"]
+    rows = json.loads(output_of(APP, *arguments, "--json"))["blocks"]
     row = max(rows, key=lambda r: r["dwell_s"])
     place = f"{row['edge']}:{row['i']},{row['j']}"
-    spans = json.loads(call(*arguments, "--block", place, "--json"))["spans_of_block"]
+    spans = json.loads(output_of(APP, *arguments, "--block", place, "--json"))["spans_of_block"]
     assert len(spans) > 3
     t0, t1 = spans[len(spans) // 2]
-    found = json.loads(call(*arguments, "--span", f"{t0}:{t1}", "--json"))["blocks_in_span"]
+    found = json.loads(output_of(APP, *arguments, "--span", f"{t0}:{t1}", "--json"))[
+        "blocks_in_span"
+    ]
     assert [row["edge"], row["i"], row["j"]] in [[v["edge"], v["i"], v["j"]] for v in found]
-    text = call(*arguments, "--block", place, "--span", f"{t0}:{t1}")
+    text = output_of(APP, *arguments, "--block", place, "--span", f"{t0}:{t1}")
     assert f"Block {place} was visited {len(spans)} times" in text
     assert "Equation residual" not in text
 
@@ -184,7 +183,7 @@ def test_a_place_that_is_none_is_refused(trace: Path, option: tuple[str, str]) -
 @pytest.mark.parametrize("suffix", [".csv", ".parquet", ".mat"])
 def test_residuals_leave_as_a_table(trace: Path, tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"residual{suffix}"
-    call("compare", trace, "-p", trace.with_suffix(".toml"), "--table", path)
+    output_of(APP, "compare", trace, "-p", trace.with_suffix(".toml"), "--table", path)
     columns = read_table(path).columns
     t, residual = columns["t_s"], columns["residual_a_m3s"]
     assert len(t) == pytest.approx(12 * 50, abs=20)
@@ -197,12 +196,12 @@ def test_residuals_leave_as_a_table(trace: Path, tmp_path: Path, suffix: str) ->
 
 def test_a_table_of_no_known_format_is_refused_before_any_work(trace: Path) -> None:
     with pytest.raises(RtidError, match="unknown format") as caught:
-        call("compare", trace, "-p", "absent.toml", "--table", "residual.xls")
+        output_of(APP, "compare", trace, "-p", "absent.toml", "--table", "residual.xls")
     assert caught.value.exit_code == 2
 
 
 def test_every_figure_is_in_the_json(trace: Path) -> None:
-    found = json.loads(call("compare", trace, "-p", trace.with_suffix(".toml"), "--json"))
+    found = json.loads(output_of(APP, "compare", trace, "-p", trace.with_suffix(".toml"), "--json"))
     assert found["schema"] == 2
     for part in found["maps"][0]["parts"].values():
         assert set(part["simulations"]) == {"free run", "1 s ahead", "0.1 s ahead"}
@@ -220,7 +219,7 @@ def test_every_figure_is_in_the_json(trace: Path) -> None:
 @pytest.mark.parametrize("suffix", [".csv", ".json", ".npz"])
 def test_export_from_a_trace(trace: Path, tmp_path: Path, suffix: str) -> None:
     output = tmp_path / f"map{suffix}"
-    text = call("export", trace, output, "-p", trace.with_suffix(".toml"), "--json")
+    text = output_of(APP, "export", trace, output, "-p", trace.with_suffix(".toml"), "--json")
     assert json.loads(text)["valid_blocks"]["pa"] > 5
     assert output.stat().st_size > 1000
 
@@ -231,7 +230,7 @@ def test_export_from_a_snapshot_is_what_the_daemon_knows(trace: Path, tmp_path: 
     live.update(read_trace(project, trace).samples)
     save(tmp_path / "snapshot.npz", live, project.digest)
     output = tmp_path / "map.json"
-    call("export", tmp_path / "snapshot.npz", output, "-p", trace.with_suffix(".toml"))
+    output_of(APP, "export", tmp_path / "snapshot.npz", output, "-p", trace.with_suffix(".toml"))
     _, provenance = read_map(output)
     assert provenance["beta_pa"] == live.solution().beta_pa.tolist()
     assert provenance["digest"] == project.digest
@@ -239,5 +238,5 @@ def test_export_from_a_snapshot_is_what_the_daemon_knows(trace: Path, tmp_path: 
 
 def test_export_names_the_formats_before_it_works(trace: Path, tmp_path: Path) -> None:
     with pytest.raises(RtidError, match="unknown format") as caught:
-        call("export", trace, tmp_path / "map.xls", "-p", tmp_path / "absent.toml")
+        output_of(APP, "export", trace, tmp_path / "map.xls", "-p", tmp_path / "absent.toml")
     assert caught.value.exit_code == 2

@@ -13,21 +13,15 @@ from firmware_bridge import frames as fr
 from firmware_bridge.catalog import CONTROLLER_DBC
 from firmware_bridge.frames import EXTENDED
 from firmware_bridge.sources import blf, open_log
-from rtid.cli import main
 from rtid.project import load
 from rtid.trace.reading import read_trace
-
-
-def rtid(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, str]:
-    with pytest.raises(SystemExit) as ended:
-        main.run([str(word) for word in words])
-    return int(ended.value.code or 0), *capsys.readouterr()
+from tests.command import said
 
 
 @pytest.fixture
-def machine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
+def machine(tmp_path: Path) -> Path:
     """A log of the simulated cylinder, and its DBC in two files: Pressures in the second."""
-    code, _, err = rtid(capsys, "simulate", tmp_path / "run.blf", "--duration", 2)
+    code, _, err = said("simulate", tmp_path / "run.blf", "--duration", 2)
     assert code == 0, err
     text = CONTROLLER_DBC.read_text()
     pressures = re.search(r"BO_ 289 .*?\n\n", text, re.S)
@@ -52,7 +46,7 @@ def key(message: str, line: str) -> tuple[str, str]:
     return f"[messages.{message}]\n", f"[messages.{message}]\n{line}\n"
 
 
-def test_two_databases_describe_one_bus(machine: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_two_databases_describe_one_bus(machine: Path) -> None:
     project = edited(
         machine, ("builtin:controller.dbc", "a.dbc, b.dbc"), key("Pressures", "data_id = 4641")
     )
@@ -60,22 +54,20 @@ def test_two_databases_describe_one_bus(machine: Path, capsys: pytest.CaptureFix
     both = read_trace(load(project), machine / "run.blf").samples
     assert len(whole) > 1500 and np.array_equal(whole.values, both.values)
     names = f"{machine}/b.dbc,{machine}/a.dbc"
-    code, out, err = rtid(capsys, "check", "--bus-only", machine / "run.blf", "--dbc", names)
+    code, out, err = said("check", "--bus-only", machine / "run.blf", "--dbc", names)
     assert code == 0, err
     assert "b.dbc: 1 of its 1 messages are here, 2000 frames." in out
     assert "a.dbc: 2 of its 4 messages are here, 4000 frames." in out
-    code, out, _ = rtid(
-        capsys, "check", "--bus-only", machine / "run.blf", "--dbc", machine / "b.dbc", "--json"
+    code, out, _ = said(
+        "check", "--bus-only", machine / "run.blf", "--dbc", machine / "b.dbc", "--json"
     )
     assert json.loads(out)["described"]["left"] == {"120": 2000, "122": 2000}
     names = f"{machine}/a.dbc,{CONTROLLER_DBC}"
-    code, out, _ = rtid(capsys, "check", "--bus-only", machine / "run.blf", "--dbc", names)
+    code, out, _ = said("check", "--bus-only", machine / "run.blf", "--dbc", names)
     assert "120 is ValveCommand-120 and ValveCommand-120-2: a project names which" in out
 
 
-def test_one_identifier_on_two_channels_is_told_apart_by_the_project(
-    machine: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_one_identifier_on_two_channels_is_told_apart_by_the_project(machine: Path) -> None:
     frames = open_log(machine / "run.blf")
     frames.channel[frames.can_id == 289] = 1
     twin = frames[frames.can_id == 290]
@@ -84,9 +76,9 @@ def test_one_identifier_on_two_channels_is_told_apart_by_the_project(
     twin.data[:] = 0
     mixed = fr.by_time(fr.concatenate([frames, twin]))
     blf.write(machine / "mixed.blf", mixed)
-    code, out, _ = rtid(capsys, "check", "--bus-only", machine / "mixed.blf")
+    code, out, _ = said("check", "--bus-only", machine / "mixed.blf")
     assert "122 comes on channels 0, 1: a project names one, channel = 0." in out
-    code, _, err = rtid(capsys, "check", machine / "run.toml", machine / "mixed.blf")
+    code, _, err = said("check", machine / "run.toml", machine / "mixed.blf")
     assert code == 3
     assert "Motion comes on several channels: 0 (2000 frames), 1 (2000 frames)" in err
     assert "channel = 0 under [messages.Motion]" in err
@@ -94,7 +86,7 @@ def test_one_identifier_on_two_channels_is_told_apart_by_the_project(
     whole = read_trace(load(machine / "run.toml"), machine / "run.blf").samples
     apart = read_trace(load(project), machine / "mixed.blf").samples
     assert np.array_equal(whole.values, apart.values)
-    code, out, _ = rtid(capsys, "quick", machine / "mixed.blf", "--json")
+    code, out, _ = said("quick", machine / "mixed.blf", "--json")
     what = [a["what"] for a in json.loads(out)["assumptions"]]
     assert any("Motion comes on several channels, and channel 0 is meant" in w for w in what), what
 

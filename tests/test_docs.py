@@ -30,6 +30,7 @@ from rtid.kernels import layout
 from rtid.maps.files import WRITERS, write_map
 from rtid.project import load
 from rtid.project.schema import ExciteSection
+from tests.command import ends
 from tests.flow_maps import machine, orifice, solved
 from tests.replays import shared_replays  # noqa: F401
 from tools.api import PAGE, page
@@ -226,8 +227,7 @@ def test_what_is_next_goes_by_the_verdict(outcome: str) -> None:
 def test_what_is_next_behind_a_simulation_can_be_typed(
     given: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(SystemExit):
-        main.run(["simulate", str(tmp_path / given[0]), *given[1:]])
+    ends("simulate", tmp_path / given[0], *given[1:])
     next_line = capsys.readouterr().out.splitlines()[-1]
     typed = shlex.split(next_line.removeprefix("Next: rtid "))
     with pytest.raises(SystemExit) as end:
@@ -238,8 +238,7 @@ def test_what_is_next_behind_a_simulation_can_be_typed(
 
 def test_nothing_is_next_where_nothing_was_written(capsys: pytest.CaptureFixture[str]) -> None:
     words = ["simulate", "--bus", "virtual", "--channel", "x", "--duration", "0.1", "--speed", "0"]
-    with pytest.raises(SystemExit):
-        main.run(words)
+    ends(*words)
     assert "sent" in (said := capsys.readouterr().out) and "Next" not in said
 
 
@@ -248,8 +247,7 @@ def test_only_a_change_that_stands_can_be_taken_back(
 ) -> None:
     project = tmp_path / "machine.toml"
     project.write_text("")
-    with pytest.raises(SystemExit):
-        main.run(["history", "-p", str(project)])
+    ends("history", "-p", project)
     assert "no change yet" in (said := capsys.readouterr().out)
     assert "Next: rtid diagnose" in said and "undo" not in said
     assert "rtid undo" in next_step("history", {"project": project}, "changed")

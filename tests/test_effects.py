@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from rtid.cli import main
 from rtid.cli.exits import Exit
 from rtid.effects import Effect, EffectError, Expression, catalogue, effect
 from rtid.effects.dimension import (
@@ -23,6 +22,7 @@ from rtid.effects.dimension import (
 )
 from rtid.effects.page import KINDS, PLACES, pages_in
 from rtid.effects.parsing import ExpressionError
+from tests.command import ends, said
 
 TWELVE = {
     *("internal_leakage_laminar", "external_leakage_laminar", "valve_seat_leakage"),
@@ -186,24 +186,18 @@ def test_a_wrong_name_names_the_near_one() -> None:
     assert "position_dependent_leakage or valve_seat_leakage" in caught.value.remedy
 
 
-def run(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[int, str]:
-    with pytest.raises(SystemExit) as end:
-        main.run(arguments)
-    return int(end.value.code or 0), capsys.readouterr().out
-
-
-def test_command_lists_all_effects(capsys: pytest.CaptureFixture[str]) -> None:
-    code, out = run(["effects"], capsys)
+def test_command_lists_all_effects() -> None:
+    code, out, _ = said("effects")
     assert code == Exit.OK
     assert all(name in out for name in catalogue())
     assert max(len(line) for line in out.splitlines()) <= 100
-    code, out = run(["effects", "--json"], capsys)
+    code, out, _ = said("effects", "--json")
     assert [e["name"] for e in json.loads(out)["effects"]] == list(catalogue())
 
 
 @pytest.mark.parametrize("name", list(catalogue()))
-def test_command_shows_a_page_in_100_columns(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    code, out = run(["effects", name], capsys)
+def test_command_shows_a_page_in_100_columns(name: str) -> None:
+    code, out, _ = said("effects", name)
     page = effect(name)
     assert code == Exit.OK and page.title in out
     assert max(len(line) for line in out.splitlines()) <= 100
@@ -214,17 +208,15 @@ def test_command_shows_a_page_in_100_columns(name: str, capsys: pytest.CaptureFi
     assert ("swallows" in told or "invisible" in told.lower()) or not page.invisible
 
 
-def test_command_gives_a_page_as_json(capsys: pytest.CaptureFixture[str]) -> None:
-    _, out = run(["effects", "relief_valve", "--json"], capsys)
+def test_command_gives_a_page_as_json() -> None:
+    _, out, _ = said("effects", "relief_valve", "--json")
     page = json.loads(out)
     assert page["parameters"][1]["unit"] == "Pa" and page["kind"] == "flow"
     assert page["equation"][0] == "q_c = -K_r * pos(p_c - p_r)"
 
 
 def test_command_refuses_an_unknown_effect(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as end:
-        main.run(["effects", "relief"])
-    assert end.value.code == Exit.USAGE
+    assert ends("effects", "relief") == Exit.USAGE
     assert "relief_valve" in capsys.readouterr().err
 
 

@@ -16,7 +16,6 @@ import pytest
 
 from firmware_bridge.frames import Frames
 from firmware_bridge.sources import formats, open_log
-from rtid.cli import main
 from rtid.cli.exits import Exit
 from rtid.effects import catalogue, page
 from rtid.effects.live import LiveFlow
@@ -28,6 +27,7 @@ from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import SimulatedPlant
 from rtid.study import kept
 from rtid.study.on_board import on_board
+from tests.command import ends
 from tests.replays import shared_replays  # noqa: F401
 
 PAGE = Path(__file__).parents[1] / "docs" / "extending.md"
@@ -50,12 +50,6 @@ def snippet(language: str, word: str) -> str:
     """The one with that word."""
     (found,) = (code for code in snippets(language) if word in code)
     return found
-
-
-def rtid(*words: object) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main.run([str(word) for word in words])
-    return int(ended.value.code or 0)
 
 
 @pytest.fixture(scope="module")
@@ -84,18 +78,18 @@ def test_own_effects_are_scored_named_added_dropped_and_run_on_board(
     leaking: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = project(leaking, tmp_path, GAP + snippet("toml", "[effects.worn_groove]"))
-    assert rtid("diagnose", leaking, "-p", file, "--json") == Exit.OK
+    assert ends("diagnose", leaking, "-p", file, "--json") == Exit.OK
     said = json.loads(capsys.readouterr().out)
     first = said["found"][0]
     assert {first["effect"], *first["cannot_be_told_from"]} >= {"gap", "internal_leakage_laminar"}
     assert first["where"] == "a-b"
     seen = {(u["effect"], u["where"]) for u in said["not_found"]}
     assert ("worn_groove", "a-b") in seen or "worn_groove" in first["cannot_be_told_from"]
-    assert rtid("add", "gap", leaking, "-p", file, "--json") == Exit.OK
+    assert ends("add", "gap", leaking, "-p", file, "--json") == Exit.OK
     done = json.loads(capsys.readouterr().out)
     assert [(c["effect"], c["where"]) for c in done["changes"]] == [("gap", "a-b")]
     words = "add", "worn_groove", leaking, "-p", file, "--force", "--json"
-    assert rtid(*words) == Exit.OK, capsys.readouterr().err
+    assert ends(*words) == Exit.OK, capsys.readouterr().err
     gap, groove = load(file).sections.added
     assert (gap.effect, groove.effect, groove.where) == ("gap", "worn_groove", "a-b")
     assert set(groove.parameters) == {"coefficient", "x0"} and groove.parameters["x0"].unit == "m"
@@ -110,7 +104,7 @@ def test_own_effects_are_scored_named_added_dropped_and_run_on_board(
         "worn groove at a-b is learned beside the maps, its flow computed sample by sample",
     ]
     capsys.readouterr()
-    assert rtid("drop", "worn_groove", leaking, "-p", file, "--json") == Exit.OK
+    assert ends("drop", "worn_groove", leaking, "-p", file, "--json") == Exit.OK
     (gap,) = load(file).sections.added
     assert gap.parameters["coefficient"].value == pytest.approx(2e-12, rel=0.2)
 
@@ -120,9 +114,9 @@ def test_an_own_effect_in_python_is_added_and_runs_on_board(leaking: Path, tmp_p
     file = project(leaking, tmp_path, "")
     text = file.read_text().replace("[project]", '[project]\neffects_module = "own.py"', 1)
     file.write_text(text)
-    assert rtid("add", "worn_groove", leaking, "-p", file, "--force") == Exit.USAGE
-    assert rtid("trust", file) == Exit.OK
-    assert rtid("add", "worn_groove", leaking, "-p", file, "--force") == Exit.OK
+    assert ends("add", "worn_groove", leaking, "-p", file, "--force") == Exit.USAGE
+    assert ends("trust", file) == Exit.OK
+    assert ends("add", "worn_groove", leaking, "-p", file, "--force") == Exit.OK
     told: list[str] = []
     (flow,) = on_board(load(file), told.append).flows
     assert isinstance(flow, LiveFlow)
@@ -150,19 +144,19 @@ def test_an_effect_of_a_plug_in_is_one_of_the_catalogue(
     leaking: Path, tmp_path: Path, my_effects: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """One page: explained, scored, added, on board; what looks alike says so too."""
-    assert rtid("effects", "worn_end") == Exit.OK
+    assert ends("effects", "worn_end") == Exit.OK
     assert "Worn end of the stroke" in capsys.readouterr().out
     assert "worn_end" in catalogue()["internal_leakage_laminar"].confounders
     file = project(leaking, tmp_path, "")
     words = "add", "worn_end", leaking, "-p", file, "--force", "--json"
-    assert rtid(*words) == Exit.OK, capsys.readouterr().err
+    assert ends(*words) == Exit.OK, capsys.readouterr().err
     (added,) = load(file).sections.added
     assert (added.where, set(added.parameters)) == ("a-b", {"coefficient", "begin"})
     assert 0.0 <= added.parameters["begin"].value <= 2.0
     assert added.parameters["coefficient"].unit == "m3/s/Pa/m"
     told: list[str] = []
     assert on_board(load(file), told.append).flows and told[0].startswith("Worn end of the stroke")
-    assert rtid("drop", "worn_end", "-p", file) == Exit.OK
+    assert ends("drop", "worn_end", "-p", file) == Exit.OK
 
 
 def test_a_plug_in_may_define_its_effects_in_python(
@@ -173,9 +167,9 @@ def test_a_plug_in_may_define_its_effects_in_python(
     monkeypatch.syspath_prepend(str(tmp_path))
     catalogue.cache_clear()
     try:
-        assert rtid("effects", "worn_groove") == Exit.OK
+        assert ends("effects", "worn_groove") == Exit.OK
         assert "Leaks beyond x0." in capsys.readouterr().out
-        assert rtid("effects", "--json") == Exit.OK
+        assert ends("effects", "--json") == Exit.OK
         listed = {e["name"]: e for e in json.loads(capsys.readouterr().out)["effects"]}
     finally:
         catalogue.cache_clear()
@@ -189,7 +183,7 @@ def test_a_plug_in_that_fails_is_named(
     monkeypatch.syspath_prepend(str(tmp_path))
     catalogue.cache_clear()
     try:
-        assert rtid("effects") == Exit.USAGE
+        assert ends("effects") == Exit.USAGE
     finally:
         catalogue.cache_clear()
     told = capsys.readouterr().err
@@ -209,7 +203,7 @@ def test_a_page_of_a_plug_in_that_is_wrong_is_named(
 ) -> None:  # fmt: skip
     page = tmp_path / "my_effects" / "worn_end.toml"
     page.write_text(page.read_text().replace(word, wrong))
-    assert rtid("effects") == Exit.USAGE
+    assert ends("effects") == Exit.USAGE
     said = capsys.readouterr().err
     assert words in said and "worn_end" in said
 
@@ -251,7 +245,7 @@ def test_a_log_format_of_ones_own_goes_through_every_command(
     packed.write_bytes(gzip.compress(mine.read_bytes()))
 
     def said(*words: object) -> Any:
-        code = rtid(*words)
+        code = ends(*words)
         out, err = capsys.readouterr()
         assert code in (Exit.OK, Exit.NEGATIVE), err
         answer = json.loads(out)
@@ -285,14 +279,14 @@ def test_what_a_reader_of_ones_own_does_wrong_is_one_line(
 ) -> None:
     log = tmp_path / "run.mine"
     log.write_text("MY LOGGER\nnonsense\n")
-    assert rtid("check", "--bus-only", log) == Exit.INPUT
+    assert ends("check", "--bus-only", log) == Exit.INPUT
     assert re.search(
         r"run\.mine: not a readable log of my logger: .*unpack", capsys.readouterr().err
     )
     info = tmp_path / "my_package-1.dist-info"
     (info / "entry_points.txt").write_text("[rtid.formats]\nmine = my_package:ABSENT\n")
     formats.plugins.cache_clear()
-    assert rtid("check", "--bus-only", log) == Exit.INPUT
+    assert ends("check", "--bus-only", log) == Exit.INPUT
     assert "my_package:ABSENT does not load" in capsys.readouterr().err
 
 
@@ -317,7 +311,7 @@ def test_an_export_of_ones_own_is_taken(
         exec(compile(code, str(PAGE), "exec"), space)
     file = project(leaking, tmp_path, "")
     try:
-        assert rtid("export", leaking, tmp_path / "map.lines", "-p", file) == Exit.OK
+        assert ends("export", leaking, tmp_path / "map.lines", "-p", file) == Exit.OK
     finally:
         WRITERS.pop(".lines", None)
     assert set(json.loads((tmp_path / "map.lines").read_text())) == {"pa", "at", "pb", "bt"}
@@ -383,16 +377,16 @@ def test_an_effect_with_a_law_of_ones_own_goes_the_whole_way(
 ) -> None:
     """Its equation is words for a reader: no command takes it for a law that it cannot read."""
     file = project(leaking, tmp_path, "")
-    assert rtid("diagnose", leaking, "-p", file, "--json") == Exit.OK
+    assert ends("diagnose", leaking, "-p", file, "--json") == Exit.OK
     said = json.loads(capsys.readouterr().out)
     seen = {u["effect"] for u in said["not_found"]}
     assert "slow_gap" in seen | {n for f in said["found"] for n in f["cannot_be_told_from"]}
-    assert rtid("add", "slow_gap", leaking, "-p", file, "--force") == Exit.OK
+    assert ends("add", "slow_gap", leaking, "-p", file, "--force") == Exit.OK
     assert load(file).sections.added[0].parameters.keys() == {"coefficient", "settling"}
     told: list[str] = []
     on_board(load(file), told.append)
     assert "is not in the model on board, because it needs a record" in told[0]
-    assert rtid("compare", leaking, "-p", file) in (Exit.OK, Exit.NEGATIVE)
+    assert ends("compare", leaking, "-p", file) in (Exit.OK, Exit.NEGATIVE)
 
 
 def test_what_a_plug_in_changes_is_seen_though_a_fit_was_kept(
@@ -401,12 +395,12 @@ def test_what_a_plug_in_changes_is_seen_though_a_fit_was_kept(
     assert kept.PLUGINS == (page.PLUGINS, formats.PLUGINS)
     file = project(leaking, tmp_path, "")
     words = "diagnose", leaking, "-p", file, "--json"
-    assert rtid(*words) == Exit.OK
+    assert ends(*words) == Exit.OK
     changed = my_laws / "slow_gap.toml"
     changed.write_text(changed.read_text().replace("gap:slow_gap", "gap:nobody"))
     catalogue.cache_clear()
     capsys.readouterr()
-    assert rtid(*words) == Exit.USAGE
+    assert ends(*words) == Exit.USAGE
     assert "no law 'my_laws.gap:nobody'" in capsys.readouterr().err
 
 
@@ -416,7 +410,7 @@ def test_an_equation_that_cannot_be_read_is_named_with_its_effect(
     page = tmp_path / "my_effects" / "worn_end.toml"
     page.write_text(page.read_text().replace("pos(x", "posi(x"))
     file = project(leaking, tmp_path, "")
-    assert rtid("add", "worn_end", leaking, "-p", file) == Exit.USAGE
+    assert ends("add", "worn_end", leaking, "-p", file) == Exit.USAGE
     told = capsys.readouterr().err
     assert "the equation of worn_end: 'posi' is no known function" in told and "law = " in told
 
@@ -425,11 +419,11 @@ def test_the_effects_of_a_project_are_listed_and_explained_with_it(
     leaking: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = project(leaking, tmp_path, GAP)
-    assert rtid("effects", "-p", file) == Exit.OK
+    assert ends("effects", "-p", file) == Exit.OK
     assert re.search(r"^  gap +gap +a-b", capsys.readouterr().out, re.M)
-    assert rtid("effects", "gap", "-p", file) == Exit.OK
+    assert ends("effects", "gap", "-p", file) == Exit.OK
     shown = capsys.readouterr().out
     assert "acts on: a-b" in shown and "q_b = coefficient" in shown
     assert "In the residual" not in shown
-    assert rtid("effects", "gap") == Exit.USAGE
+    assert ends("effects", "gap") == Exit.USAGE
     assert "-p" in capsys.readouterr().err

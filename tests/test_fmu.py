@@ -13,7 +13,6 @@ import pyarrow.parquet
 import pytest
 
 from firmware_bridge.lookup import STATUS
-from rtid.cli import main
 from rtid.compare.motion import smooth_position
 from rtid.errors import RtidError
 from rtid.maps.fmu import VERSIONS, Dynamics, write_fmu
@@ -23,6 +22,7 @@ from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import SimulatedPlant
 from rtid.study.study import Study
+from tests.command import ends
 from tests.test_free_run import TERMS, THETA_TERMS, machine, run, signals
 
 fmpy = pytest.importorskip("fmpy", reason="pip install 'rtid[dev]'")
@@ -172,9 +172,7 @@ def test_a_log_from_the_fmu_gives_the_same_maps_again(
     run_ = simulate(SimulatedPlant(), "rich", 0, 40.0)
     write_run(tmp_path / "run.parquet", run_, 0, "rich")
     project, path = tmp_path / "run.toml", tmp_path / "machine.fmu"
-    with pytest.raises(SystemExit) as ended:
-        main.run(["export", str(tmp_path / "run.parquet"), str(path), "-p", str(project)])
-    assert ended.value.code in (0, None), capsys.readouterr()
+    assert ends("export", tmp_path / "run.parquet", path, "-p", project) == 0, capsys.readouterr()
     table = pyarrow.parquet.read_table(tmp_path / "run.parquet")
     before = Study(project, tmp_path / "run.parquet")
     x = smooth_position(before.machine, before.replay.chunk)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import subprocess
-from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import numpy as np
@@ -12,19 +10,13 @@ import pytest
 import tomlkit
 
 from firmware_bridge import catalog
-from rtid.cli.main import run
 from rtid.project import ProjectError, load
 from rtid.project.guess import RoleCandidate, from_catalog, propose
+from tests.command import called
 
 
 def init(*arguments: object) -> subprocess.CompletedProcess[str]:
-    """The command line in this process: exit code, stdout, stderr."""
-    out, err = io.StringIO(), io.StringIO()
-    words = ["init", *map(str, arguments)]
-    with redirect_stdout(out), redirect_stderr(err), pytest.raises(SystemExit) as ended:
-        run(words)
-    code = ended.value.code
-    return subprocess.CompletedProcess(words, int(code or 0), out.getvalue(), err.getvalue())
+    return called("init", *arguments)
 
 
 def filled_in(path: Path) -> Path:

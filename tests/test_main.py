@@ -18,14 +18,9 @@ from firmware_bridge.catalog import CatalogError
 from rtid.cli import main
 from rtid.cli.exits import Exit
 from rtid.errors import RtidError
+from tests.command import ends
 
 ROOT = Path(__file__).parents[1]
-
-
-def ends(arguments: list[str]) -> int:
-    with pytest.raises(SystemExit) as end:
-        main.run(arguments)
-    return int(end.value.code or 0)
 
 
 def test_version_and_help_load_neither_numba_nor_a_bus() -> None:
@@ -63,7 +58,7 @@ def test_the_page_of_a_daemon_loads_neither_numba_nor_a_bus() -> None:
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
-    assert ends(["--version"]) == Exit.OK
+    assert ends("--version") == Exit.OK
     assert capsys.readouterr().out == f"rtid {rtid.__version__}\n"
 
 
@@ -82,7 +77,7 @@ def test_linear_algebra_stays_on_one_thread_unless_asked(
 
 @pytest.mark.parametrize("arguments", [["no-such-command"], ["--no-such-option"]])
 def test_wrong_usage(arguments: list[str]) -> None:
-    assert ends(arguments) == Exit.USAGE
+    assert ends(*arguments) == Exit.USAGE
 
 
 ORDERS = {
@@ -107,9 +102,7 @@ def test_a_project_in_a_trace_s_place_is_recognised(words: str) -> None:
 def test_what_is_no_trace_and_project_is_told_so(
     words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main.run(words.split())
-    assert ended.value.code == Exit.USAGE
+    assert ends(*words.split()) == Exit.USAGE
     assert "-p PROJECT" in capsys.readouterr().err
 
 
@@ -141,7 +134,7 @@ def test_an_expected_error_is_one_plain_message(
 
     monkeypatch.setattr(main, "find_spec", lambda name: name.endswith(".demo"))
     monkeypatch.setattr(main, "_function", lambda name: fail)
-    assert ends(["demo"]) == code
+    assert ends("demo") == code
     printed = capsys.readouterr().err
     assert message in printed
     assert "Traceback" not in printed

@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 import rtid
-from rtid.cli import main
 from rtid.daemon.status import Advice, MessageHealth, SignalHealth, Verdict, write
 from rtid.tell import replay as present
+from tests.command import ends
 from tests.daemon.test_parts import full_status
 
 TOLD = "[excite] [/red] [bold]x[/bold] :warning: \\[y]"
@@ -36,8 +36,7 @@ def test_status_prints_all_texts_as_they_are(
         signals=(SignalHealth("[bold]p", "pressure", ":bar:", "m"),),
     )  # fmt: skip
     write(tmp_path, told)
-    with pytest.raises(SystemExit):
-        main.run(["status", str(tmp_path)])
+    ends("status", tmp_path)
     said = capsys.readouterr().out
     assert said.count(TOLD) == 7
     assert "[/red]  " in said and "[bold]p" in said and ":bar:" in said

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import json
 import re
-import subprocess
-from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +15,6 @@ from scipy.io import savemat
 from firmware_bridge import catalog
 from firmware_bridge.sources import read_table
 from rtid.cli.exits import Exit
-from rtid.cli.main import run
 from rtid.compare.reference import GainTable
 from rtid.errors import RtidError
 from rtid.maps.datasheet import read_reference
@@ -28,6 +24,7 @@ from rtid.project.guess import from_catalog, propose
 from rtid.study.quick_project import of_missing
 from rtid.trace.quick_source import open_source, roles_of
 from rtid.units import find_unit, split_name
+from tests.command import called
 from tests.test_init import filled_in
 
 BOOM = {"u": ("u_boom_pct", "%"), "x": ("x_boom_cm", "cm")}
@@ -52,17 +49,6 @@ STRANGERS = {
         for p in (1, 3, 5)
     },
 }
-
-
-def rtid(*arguments: object) -> subprocess.CompletedProcess[str]:
-    """The command line in this process: exit code, stdout, stderr."""
-    out, err = io.StringIO(), io.StringIO()
-    words = [str(a) for a in arguments]
-    with redirect_stdout(out), redirect_stderr(err), pytest.raises(SystemExit) as ended:
-        run(words)
-    return subprocess.CompletedProcess(
-        words, int(ended.value.code or 0), out.getvalue(), err.getvalue()
-    )
 
 
 def roles_told(text: str) -> dict[str, tuple[str, str]]:
@@ -122,7 +108,7 @@ def test_a_name_tells_its_unit_and_nothing_that_it_does_not_say(
 @pytest.mark.parametrize("name", list(STRANGERS))
 def test_init_reads_the_names_of_strangers(shared: Path, tmp_path: Path, name: str) -> None:
     table, project = shared / "data" / "strangers" / name, tmp_path / "p.toml"
-    done = rtid("init", table, "-o", project)
+    done = called("init", table, "-o", project)
     assert done.returncode == Exit.OK, done.stderr
     assert roles_told(done.stdout) == STRANGERS[name]
     used = {column for column, _ in STRANGERS[name].values()}
@@ -145,7 +131,7 @@ def test_a_record_means_the_same_in_every_kind_of_file(tmp_path: Path) -> None:
             for name, values in machine().items()
         }
         project = tmp_path / "p.toml"
-        done = rtid("init", written(tmp_path / f"m{suffix}", columns), "-o", project, "--force")
+        done = called("init", written(tmp_path / f"m{suffix}", columns), "-o", project, "--force")
         assert done.returncode == Exit.OK, done.stderr
         text = project.read_text()
         if suffix == ".mat":
@@ -181,7 +167,7 @@ def test_one_column_plays_one_role(tmp_path: Path) -> None:
     columns = machine()
     columns["P_line_1"] = columns.pop("p_a") * 1e5
     del columns["p_s"]
-    done = rtid("init", written(tmp_path / "m.csv", columns), "-o", tmp_path / "p.toml")
+    done = called("init", written(tmp_path / "m.csv", columns), "-o", tmp_path / "p.toml")
     columns_told = [column for column, _ in roles_told(done.stdout).values()]
     assert sorted(columns_told) == sorted(set(columns_told)), done.stdout
     assert "P_line_1" in columns_told
@@ -205,7 +191,7 @@ def test_signals_of_a_dbc_tell_their_units_by_their_names(tmp_path: Path) -> Non
 
 def project_of(tmp_path: Path, table: Path, **changed: str) -> Path:
     project = tmp_path / "p.toml"
-    assert rtid("init", table, "-o", project, "--force").returncode == Exit.OK
+    assert called("init", table, "-o", project, "--force").returncode == Exit.OK
     path = filled_in(project)
     for old, new in changed.items():
         path.write_text(path.read_text().replace(f'unit = "{old}"', f'unit = "{new}"'))
@@ -218,12 +204,12 @@ def test_a_project_in_another_unit_than_the_column_is_refused(tmp_path: Path) ->
     columns["x [mm]"] = columns.pop("x")
     table = written(tmp_path / "m.parquet", columns)
     project = project_of(tmp_path, table, mm="cm")
-    done = rtid("check", project, table)
+    done = called("check", project, table)
     assert done.returncode == Exit.INPUT
     assert "column 'x' is in mm, signals.x.unit says cm" in done.stderr
     assert 'set signals.x.unit = "mm", or give scale = 1.0 to insist' in done.stderr
     project.write_text(project.read_text().replace('unit = "cm"', 'unit = "cm"\nscale = 1.0'))
-    assert "says cm" not in rtid("check", project, table).stderr
+    assert "says cm" not in called("check", project, table).stderr
 
 
 def test_a_gauge_pressure_counts_from_the_air(tmp_path: Path) -> None:
@@ -272,13 +258,13 @@ def test_refit_takes_the_time_in_its_unit_and_a_column_with_its_brackets(tmp_pat
         x[k + 1] = x[k] * np.exp(-0.05) + 0.4 * u[k] * (1 - np.exp(-0.05))
     table = written(tmp_path / "m.parquet", {"t_ms": 1e3 * t, "u": u, "x [mm]": x})
     (plant := tmp_path / "lag.toml").write_text(PLANT)
-    done = rtid("refit", plant, table, "--json")
+    done = called("refit", plant, table, "--json")
     assert done.returncode == Exit.OK, done.stderr
     values = {p["name"]: p["value"] for p in json.loads(done.stdout)["parameters"]}
     assert values["a"] == pytest.approx(5.0, rel=1e-3)
     assert values["b"] == pytest.approx(2.0, rel=1e-3)
     plant.write_text(PLANT.replace('column = "x [mm]"\nunit = "mm"', 'column = "x"\nunit = "m"'))
-    done = rtid("refit", plant, table)
+    done = called("refit", plant, table)
     assert done.returncode == Exit.INPUT
     assert "column 'x' is in mm, outputs.y.unit says m" in done.stderr
 

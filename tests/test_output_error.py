@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rtid.cli import main
 from rtid.cli.exits import Exit
 from rtid.effects import Expression
 from rtid.effects.dimension import dimension, dimension_of_unit, unit_of_dimension
@@ -34,6 +33,7 @@ from rtid.plants.validation import on_record, rms
 from rtid.project.errors import ProjectError
 from rtid.project.plant_file import load_plant
 from rtid.study.refit import load_records
+from tests.command import ends
 from tests.eighty import eighty  # noqa: F401
 
 EXAMPLE = Path(__file__).parents[1] / "rtid" / "project" / "examples" / "cascaded_tanks.toml"
@@ -356,22 +356,17 @@ def test_a_record_is_cut_where_the_file_says(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("eighty")
 def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     plant, path = map(str, table(tmp_path))
-    with pytest.raises(SystemExit) as end:
-        main.run(["refit", plant, path, "--add", "dead_zone:u", "--json"])
-    assert end.value.code == Exit.OK
+    assert ends("refit", plant, path, "--add", "dead_zone:u", "--json") == Exit.OK
     found = json.loads(capsys.readouterr().out)
     assert found["effects"] == [{"effect": "dead_zone", "where": "u"}]
     value = {p["name"]: p for p in found["parameters"]}["dead_zone_u_threshold"]
     assert value["value"] == pytest.approx(0.5, abs=0.02) and value["unit"] == "V"
     assert found["rmse_after"]["validation"]["y"] == pytest.approx(0.01, rel=0.2)
     assert found["rmse_before"]["validation"]["y"] > 0.05
-    with pytest.raises(SystemExit) as end:
-        main.run(["refit", plant, path, "--add", "dead_zone:u"])
+    ends("refit", plant, path, "--add", "dead_zone:u")
     text = capsys.readouterr().out
     assert "error" in text and "dead_zone_u_threshold" in text
     sd = value["std"]  # JSON tells the standard deviation, the table 95 %
     assert f"{1.96 * sd:.2g}" in text and text.count("± is the 95 % interval.") == 1
-    with pytest.raises(SystemExit) as end:
-        main.run(["refit", plant, path, "--add", "overflow:q"])
-    assert end.value.code == Exit.USAGE
+    assert ends("refit", plant, path, "--add", "overflow:q") == Exit.USAGE
     assert "it may act at: x" in capsys.readouterr().err

@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rtid.cli import main
 from rtid.cli.exits import Exit
 from rtid.daemon import status
 from rtid.daemon.status import (
@@ -31,6 +30,7 @@ from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from rtid.tell.terminal import Printed, make_console
 from rtid.units import CONVENTION, System, limit, range_of, scale_of, show_in, with_unit
+from tests.command import ends
 from tests.eighty import eighty, lines_of, require_whole  # noqa: F401
 from tests.replays import shared_replays  # noqa: F401
 
@@ -127,9 +127,7 @@ def story(record: Path, capsys: pytest.CaptureFixture[str]) -> Told:
 
     def call(line: str, code: int = Exit.OK) -> str:
         files = {"RUN": str(record), "PROJECT": str(record.with_suffix(".toml"))}
-        with pytest.raises(SystemExit) as end:
-            main.run([files.get(word, word) for word in line.split()])
-        assert end.value.code == code, line
+        assert ends(*[files.get(word, word) for word in line.split()]) == code, line
         return capsys.readouterr().out
 
     return call

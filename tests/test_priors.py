@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rtid.cli import main
 from rtid.daemon.analyst import Analyst
 from rtid.daemon.jobs import Answer, Handover, Publication
 from rtid.errors import RtidError
@@ -22,6 +21,7 @@ from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import EDGES, SimulatedPlant, flow_points
 from rtid.study.replay import Replay, replay
+from tests.command import ends
 from tests.replays import shared_replays  # noqa: F401
 
 PLANT = SimulatedPlant()
@@ -176,9 +176,7 @@ def test_export_takes_a_prior_and_says_what_it_fills(
 ) -> None:
     trace, out = (project.path.with_name(name) for name in ("run.parquet", "out.npz"))
     words = ["export", trace, out, "-p", project.path, "--prior", trace.with_name("part.npz")]
-    with pytest.raises(SystemExit) as end:
-        main.run([str(word) for word in words])
-    assert end.value.code == 0
+    assert ends(*words) == 0
     assert "Prior map part: blocks that are its own: pa " in (told := capsys.readouterr().out)
     assert "it has no map for bt" in told
     by_edge = {edge.name: (edge.status == PRIOR).sum() for edge in read_map(out)[0].edges}
@@ -209,7 +207,5 @@ def test_the_daemon_refuses_a_prior_that_does_not_fit_before_it_listens(
     project: Project, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = named(project, "names.npz").path
-    with pytest.raises(SystemExit) as end:
-        main.run(["run", str(path), "--bus", "virtual:nobody", "--test-bus", "--for", "1"])
-    assert end.value.code == 3
+    assert ends("run", path, "--bus", "virtual:nobody", "--test-bus", "--for", "1") == 3
     assert "p_to_a" in capsys.readouterr().err

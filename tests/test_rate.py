@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import json
 import re
-from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,7 +14,6 @@ import numpy as np
 import pytest
 
 from rtid.cli.exits import Exit
-from rtid.cli.main import run
 from rtid.compare.dead_band import dead_band
 from rtid.diagnose.disturbance import with_disturbance
 from rtid.estimator.chunk import to_chunk
@@ -36,6 +33,7 @@ from rtid.ui.map_view import MapView
 from rtid.ui.shared import Session, ShownRevision
 from rtid.ui.where_view import WhereView
 from rtid.units import flow_name, show_flow_as
+from tests.command import called
 from tests.replays import shared_replays  # noqa: F401
 
 STRANGERS = Path(__file__).parents[2] / "shared/data/strangers"
@@ -90,11 +88,9 @@ class Crane:
 
 
 def said(*words: object, code: int = Exit.OK) -> str:
-    out, err = io.StringIO(), io.StringIO()
-    with redirect_stdout(out), redirect_stderr(err), pytest.raises(SystemExit) as ended:
-        run([str(word) for word in words])
-    assert int(ended.value.code or 0) == code, out.getvalue() + err.getvalue()
-    return out.getvalue() + err.getvalue()
+    done = called(*words)
+    assert done.returncode == code, done.stdout + done.stderr
+    return done.stdout + done.stderr
 
 
 @pytest.fixture(scope="module")

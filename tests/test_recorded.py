@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from firmware_bridge.sources import read_table
-from rtid.cli import main
 from rtid.errors import RtidError
 from rtid.estimator.estimator import Estimator
 from rtid.sim.recording import write_run
@@ -21,6 +20,7 @@ from rtid.study.compared import compare_trace
 from rtid.study.study import Study
 from rtid.tell.recorded import groups_of, write_recorded
 from rtid.trace.snapshot import save as save_snapshot
+from tests.command import said
 from tests.replays import shared_replays  # noqa: F401
 
 ORIGIN = {"project": "here"}
@@ -83,10 +83,7 @@ def test_mcap_reads_the_same_and_the_decoded_signals(study: Study, tmp_path: Pat
 
 
 def test_a_missing_library_and_a_snapshot_are_refused_in_words(
-    study: Study,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "mcap.writer", None)
     with pytest.raises(RtidError, match="needs mcap"):
@@ -99,9 +96,6 @@ def test_a_missing_library_and_a_snapshot_are_refused_in_words(
         (snapshot, "out.fmu", ["--fmi", "1"], "no FMI 1"),
         (empty, "out.fmu", [], "no block of its maps stands on data"),
     ):
-        with pytest.raises(SystemExit) as ended:
-            main.run(
-                ["export", str(source), str(tmp_path / output), "-p", str(project.path), *words]
-            )
-        assert ended.value.code and reason in " ".join(capsys.readouterr().err.split())
+        code, _, err = said("export", source, tmp_path / output, "-p", project.path, *words)
+        assert code and reason in " ".join(err.split())
     assert {p.name for p in tmp_path.iterdir()} == {"run.npz", "empty.npz"}

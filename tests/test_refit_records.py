@@ -10,7 +10,8 @@ import pytest
 
 from rtid.cli.exits import Exit
 from rtid.plain import FloatArray
-from tests.test_names import PLANT, rtid
+from tests.command import called
+from tests.test_names import PLANT
 
 STEP_S, A, B, NOISE = 0.02, 2.0, 3.0, 0.02
 VALIDATED = PLANT.replace('"t_ms"', '"t"') + "[validation]\nfrom_s = 24.0\n"
@@ -50,11 +51,11 @@ def test_a_free_run_begins_anew_behind_a_gap(tmp_path: Path) -> None:
     t = np.append(t, 100.0)  # a last row that stands alone
     path = table(tmp_path / "gap.csv", t=t, u=np.append(u, 0.0), x=np.append(x, 25.0))
     text = PLANT.replace('"t_ms"', '"t"')
-    done = rtid("refit", plant(tmp_path, text), path)
+    done = called("refit", plant(tmp_path, text), path)
     assert "has gaps (21 s from 11.98 s on)" in done.stdout
     assert "begins anew behind each, in 2 pieces" in " ".join(done.stdout.split())
     assert "Left out: 100 to 100 s, fewer than 20 rows beside a gap" in done.stdout
-    told = json.loads(rtid("refit", plant(tmp_path, text), path, "--json").stdout)
+    told = json.loads(called("refit", plant(tmp_path, text), path, "--json").stdout)
     values = {p["name"]: p["value"] for p in told["parameters"]}
     assert values["a"] == pytest.approx(A, rel=0.02)
     assert values["x(0) of part 2"] == pytest.approx(25.0, abs=0.1)
@@ -63,7 +64,7 @@ def test_a_free_run_begins_anew_behind_a_gap(tmp_path: Path) -> None:
         {"from_s": 0.0, "to_s": 11.98}, {"from_s": 33.0, "to_s": 44.98}
     ]  # fmt: skip
     validated = json.loads(
-        rtid("refit", plant(tmp_path, VALIDATED.replace("24.0", "10.0")), path, "--json").stdout
+        called("refit", plant(tmp_path, VALIDATED.replace("24.0", "10.0")), path, "--json").stdout
     )
     assert len(validated["parts"]["validation"]) == 2
     assert validated["rmse_after"]["validation"]["y"] == pytest.approx(NOISE, rel=0.15)
@@ -79,7 +80,7 @@ def test_what_does_not_help_on_unseen_data_is_not_named(tmp_path: Path) -> None:
         tmp_path / "late.csv", t=STEP_S * np.arange(n, dtype=np.float64), u=u, x=lagged(acts)
     )
     text = VALIDATED.replace("24.0", f"{STEP_S * split}")
-    done = rtid("refit", plant(tmp_path, text), path, "--diagnose", "--json")
+    done = called("refit", plant(tmp_path, text), path, "--diagnose", "--json")
     assert done.returncode == Exit.OK, done.stderr
     told = json.loads(done.stdout)
     assert (told["verdict"], told["found"]) == ("unknown", [])

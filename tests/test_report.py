@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rtid.cli.main import run
 from rtid.diagnose.residual import Residual
 from rtid.errors import RtidError
 from rtid.project import load
@@ -27,6 +26,7 @@ from rtid.tell.diagnosed import LIMITS_SAY, limits, sentences
 from rtid.tell.report import page, stills
 from rtid.tell.report_file import Reported, report
 from rtid.tell.report_story import ReportStory
+from tests.command import ends
 from tests.replays import shared_replays  # noqa: F401
 
 SEED, DURATION_S = 3, 40.0
@@ -174,9 +174,7 @@ def test_a_model_that_matches_and_its_history(
     before = leaking.told.diagnosed.trace.path
     add(project, before, "internal_leakage_laminar", "a-b", reason="<worn> seal & more")
     assert added_parts(load(project))
-    with pytest.raises(SystemExit) as end:
-        run(["report", str(trace), "-p", str(project), "-o", str(tmp_path / "r.html"), "--json"])
-    assert end.value.code == 0
+    assert ends("report", trace, "-p", project, "-o", tmp_path / "r.html", "--json") == 0
     told = json.loads(capsys.readouterr().out)
     _, words = read(tmp_path / "r.html")
     assert told["verdict"] == "matches"

@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 
 import rtid
-from rtid.cli import main
 from rtid.cli.exits import Exit
 from rtid.diagnose.extend import RefusedError
 from rtid.diagnose.fit import prepare
@@ -29,6 +28,7 @@ from rtid.study.revisions import add, drop, undo
 from rtid.study.spans import parts
 from rtid.study.study import diagnose_trace
 from rtid.trace.reading import Trace, read_trace
+from tests.command import ends
 from tests.replays import shared_replays  # noqa: F401
 
 LEAK, WRONG = "internal_leakage_laminar", "position_sensor_delay"
@@ -58,12 +58,6 @@ def project(leaking: Path, tmp_path: Path) -> Path:
 @pytest.fixture(scope="module")
 def trace(leaking: Path) -> Path:
     return leaking.with_name("trace.parquet")
-
-
-def ends(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as end:
-        main.run([str(a) for a in arguments])
-    return int(end.value.code or 0)
 
 
 def test_diagnose_add_matches_undo_and_named_again(

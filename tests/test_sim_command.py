@@ -26,15 +26,10 @@ from rtid.sim.random_plants import draw
 from rtid.sim.run import simulate as run_machine
 from rtid.sim.run_files import START_US
 from rtid.sim.simulated_plant import SimulatedPlant
+from tests.command import output_of
 
 APP = typer.Typer()
 APP.command()(simulate)
-
-
-def call(*arguments: object) -> str:
-    result = CliRunner().invoke(APP, [str(a) for a in arguments], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.output
 
 
 def assert_same_machine(machine: Machine, declared: Machine) -> None:
@@ -60,7 +55,7 @@ def assert_same_machine(machine: Machine, declared: Machine) -> None:
 def test_log_and_project_give_the_samples_back(tmp_path: Path, cross_port: bool) -> None:
     trace = tmp_path / "run.log"
     extra = ["--cross-port"] if cross_port else []
-    call(trace, "--plant", 7, "--motion", "rich", "--duration", 1, "--seed", 3, *extra)
+    output_of(APP, trace, "--plant", 7, "--motion", "rich", "--duration", 1, "--seed", 3, *extra)
     plant = draw(7, cross_port=cross_port)
     expected = run_machine(plant, "rich", 3, 1.0).samples
     loaded = project.load(trace.with_suffix(".toml"))
@@ -75,7 +70,7 @@ def test_log_and_project_give_the_samples_back(tmp_path: Path, cross_port: bool)
 
 def test_table(tmp_path: Path) -> None:
     trace = tmp_path / "run.parquet"
-    call(trace, "--duration", 0.5)
+    output_of(APP, trace, "--duration", 0.5)
     table = pyarrow.parquet.read_table(trace)
     expected = run_machine(SimulatedPlant(), "sweep", 0, 0.5).samples
     assert table.schema.field("p_a").metadata == {b"unit": b"Pa"}
@@ -86,7 +81,7 @@ def test_table(tmp_path: Path) -> None:
 
 def test_truth(tmp_path: Path) -> None:
     trace = tmp_path / "run.blf"
-    said = json.loads(call(trace, "--plant", 4, "--duration", 0.1, "--json"))
+    said = json.loads(output_of(APP, trace, "--plant", 4, "--duration", 0.1, "--json"))
     truth = json.loads((tmp_path / "run.truth.json").read_text())
     plant = draw(4)
     assert truth["beta_pa"] == said["beta_pa"] == plant.beta_pa
@@ -101,7 +96,7 @@ def test_hidden_effects_are_told_in_the_truth_alone(tmp_path: Path) -> None:
     trace = tmp_path / "run.parquet"
     wishes = ["--hide", "internal_leakage_laminar", "--hide", "relief_valve:b=strong"]
     wishes += ["--hide", "input_delay=0.004"]
-    output = call(trace, "--duration", 1, "--motion", "rich_record", *wishes)
+    output = output_of(APP, trace, "--duration", 1, "--motion", "rich_record", *wishes)
     assert "hidden: relief_valve at b, 2.7e-11 m3/s/Pa" in output
     truth = json.loads((tmp_path / "run.truth.json").read_text())
     told = [(h["name"], h["where"], h["strength"], h["unit"]) for h in truth["hidden"]]
@@ -119,7 +114,9 @@ def test_hidden_effects_are_told_in_the_truth_alone(tmp_path: Path) -> None:
 
 def test_as_json_the_same_is_told(tmp_path: Path) -> None:
     trace = tmp_path / "run.parquet"
-    found = json.loads(call(trace, "--duration", 1, "--hide", "input_delay=0.004", "--json"))
+    found = json.loads(
+        output_of(APP, trace, "--duration", 1, "--hide", "input_delay=0.004", "--json")
+    )
     assert (found["samples"], found["frames_sent"]) == (1000, 0)
     assert [h["strength"] for h in found["hidden"]] == [0.004]
     assert [Path(f).name for f in found["files"]] == ["run.parquet", "run.truth.json", "run.toml"]
@@ -129,7 +126,7 @@ def test_what_begins_later_is_not_there_before(tmp_path: Path) -> None:
     wish = ["--hide", "internal_leakage_laminar=strong", "--duration", 2]
     tables = []
     for name, more in (("healthy", wish[2:]), ("later", [*wish, "--hide-at", 1]), ("leak", wish)):
-        call(tmp_path / f"{name}.parquet", *more)
+        output_of(APP, tmp_path / f"{name}.parquet", *more)
         table = pyarrow.parquet.read_table(tmp_path / f"{name}.parquet")
         tables.append(np.column_stack([column.to_numpy() for column in table.columns]))
     healthy, later, leak = tables
@@ -139,7 +136,7 @@ def test_what_begins_later_is_not_there_before(tmp_path: Path) -> None:
 
 
 def test_a_record_declares_its_parts(tmp_path: Path) -> None:
-    call(tmp_path / "run.parquet", "--motion", "sweep_record", "--duration", 11)
+    output_of(APP, tmp_path / "run.parquet", "--motion", "sweep_record", "--duration", 11)
     record = tomllib.loads((tmp_path / "run.toml").read_text())["record"]
     assert record["identification_s"] == pytest.approx([0, 8])
     assert record["validation_s"] == pytest.approx([8.3, 11])
@@ -149,7 +146,7 @@ def test_a_record_declares_its_parts(tmp_path: Path) -> None:
 def test_live_on_a_bus(bus: list[str]) -> None:
     """Named as by `rtid run`, too."""
     with can.Bus("sim-live", interface="virtual") as receiver:
-        output = call("--bus", *bus, "--duration", 0.05, "--speed", 0)
+        output = output_of(APP, "--bus", *bus, "--duration", 0.05, "--speed", 0)
         assert "sent 150 frames" in output
         first = receiver.recv(0.0)
         assert first is not None and first.timestamp == START_US * 1e-6

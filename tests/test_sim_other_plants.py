@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rtid.cli import main
 from rtid.cli.exits import Exit
 from rtid.errors import RtidError
 from rtid.project.plant_file import load_plant
 from rtid.sim.other_plants import EXAMPLES, write_example
 from rtid.study.refit import Refitted, load_records, run
+from tests.command import ends
 
 
 def refitted(folder: Path, name: str, hide: bool, diagnose: bool) -> Refitted:
@@ -47,9 +47,7 @@ def test_the_record_is_written_with_its_plant_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     table = tmp_path / "drive.csv"
-    with pytest.raises(SystemExit) as end:
-        main.run(["simulate", str(table), "--example", "electric_drive", "--json"])
-    assert not end.value.code
+    assert ends("simulate", table, "--example", "electric_drive", "--json") == 0
     told = json.loads(capsys.readouterr().out)
     assert told["hidden"][0]["effect"] == "coulomb_friction:w"
     assert told["files"] == [str(table), str(table.with_suffix(".toml"))]
@@ -70,9 +68,7 @@ def test_what_cannot_be_written_is_refused(
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as end:
-        main.run(["simulate", *arguments])
-    assert end.value.code == Exit.USAGE
+    assert ends("simulate", *arguments) == Exit.USAGE
     assert words in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 

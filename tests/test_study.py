@@ -14,7 +14,6 @@ import pytest
 
 import rtid
 from firmware_bridge.samples import Samples
-from rtid.cli import main
 from rtid.diagnose.excuse import steady
 from rtid.errors import ArgumentError
 from rtid.maps.files import read_map
@@ -31,6 +30,7 @@ from rtid.study.seed import CLASSES
 from rtid.study.study import Study
 from rtid.tell.arrays import ArrayStudy
 from rtid.ui.desk import Desk
+from tests.command import ends
 from tests.replays import shared_replays  # noqa: F401
 
 DURATION_S = 25.0
@@ -60,9 +60,7 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> Any:
-    with pytest.raises(SystemExit) as end:
-        main.run([str(a) for a in (*arguments, "--json")])
-    assert not end.value.code
+    assert ends(*(*arguments, "--json")) == 0
     return json.loads(capsys.readouterr().out)
 
 

@@ -17,6 +17,7 @@ from firmware_bridge.catalog import load
 from firmware_bridge.frames import Frames, from_messages
 from rtid.sim.frames import CONTROLLER_ROUTES, cycle_frames
 from rtid.sim.run_files import START_US, write_log
+from tests.command import output_of
 from tests.rig import CONVERTER, ROOT
 from tools import table_to_can
 
@@ -44,9 +45,7 @@ def table(tmp_path: Path) -> Path:
 
 
 def convert(*arguments: object) -> str:
-    result = CliRunner().invoke(CONVERTER, [str(a) for a in arguments], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.output
+    return output_of(CONVERTER, *arguments)
 
 
 def read(path: Path) -> Frames:

@@ -14,7 +14,7 @@ import rtid.project
 from rtid.cli.exits import Exit
 from rtid.project import ProjectError, load
 from rtid.project.trust import NotTrustedError
-from tests.test_extending import rtid as command
+from tests.command import ends
 
 EXAMPLE = Path(rtid.project.__file__).parent / "examples" / "cylinder.toml"
 EFFECT = """
@@ -75,7 +75,7 @@ def test_python_outside_the_projects_folder_is_refused(
     tmp_path: Path, name: str, code: str
 ) -> None:
     file, ran = stranger(tmp_path, name, CODES[code])
-    command("trust", tmp_path / "own.py")  # trusted or not
+    ends("trust", tmp_path / "own.py")  # trusted or not
     with pytest.raises(ProjectError, match="lies outside the project's folder"):
         load(file)
     assert not ran.exists()
@@ -100,7 +100,7 @@ def test_python_outside_the_projects_folder_is_refused(
 def test_no_command_runs_it(tmp_path: Path, words: tuple[str, ...]) -> None:
     file, ran = stranger(tmp_path, "own.py")
     names = {"file": file, "none": tmp_path / "none.blf", "out": tmp_path / "out.csv"}
-    command(*(word.format(**names) for word in words))
+    ends(*(word.format(**names) for word in words))
     assert not ran.exists()
 
 
@@ -108,7 +108,7 @@ def test_trust_is_for_this_content_alone(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file, ran = stranger(tmp_path, "own.py")
-    assert command("trust", file) == Exit.OK and not ran.exists()
+    assert ends("trust", file) == Exit.OK and not ran.exists()
     assert [effect.name for effect in load(file).all_effects] == ["leak"] and ran.exists()
     python = file.with_name("own.py")
     trusted, when = python.read_text(), python.stat()
@@ -118,7 +118,7 @@ def test_trust_is_for_this_content_alone(
     assert load(file).untrusted == python and not ran.exists()
     python.write_text(trusted)
     assert load(file).untrusted is None
-    assert command("trust", "--forget", python) == Exit.OK
+    assert ends("trust", "--forget", python) == Exit.OK
     assert load(file).untrusted == python
     assert "is not trusted any more" in capsys.readouterr().out
 
@@ -133,7 +133,7 @@ def test_a_compiled_file_beside_a_trusted_one_is_not_taken(tmp_path: Path) -> No
     py_compile.compile(str(python))
     python.write_text(honest)
     os.utime(python, ns=(when.st_atime_ns, when.st_mtime_ns))
-    assert command("trust", file) == Exit.OK
+    assert ends("trust", file) == Exit.OK
     assert load(file).all_effects and not poisoned.exists()
 
 
@@ -150,7 +150,7 @@ def test_a_damaged_store_trusts_nothing(
     tmp_path: Path, settings: Path, spoil: Callable[[Path], object]
 ) -> None:
     file, ran = stranger(tmp_path, "own.py")
-    assert command("trust", file) == Exit.OK
+    assert ends("trust", file) == Exit.OK
     spoil(settings / "rtid" / "trusted")
     assert load(file).untrusted is not None and not ran.exists()
 
@@ -159,7 +159,7 @@ def test_a_store_in_the_projects_own_folder_counts_for_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file, ran = stranger(tmp_path, "own.py")
-    assert command("trust", file) == Exit.OK
+    assert ends("trust", file) == Exit.OK
     (tmp_path / "config").rename(file.parent / "config")
     monkeypatch.chdir(file.parent)
     monkeypatch.setenv("XDG_CONFIG_HOME", "config")
@@ -173,7 +173,7 @@ def test_a_command_that_needs_it_says_how_to_trust(
     file, ran = stranger(tmp_path, "own.py")
     trace = tmp_path / "trace.csv"
     trace.write_text("t\n0\n")
-    assert command("add", "leak", trace, "-p", file) == Exit.USAGE
+    assert ends("add", "leak", trace, "-p", file) == Exit.USAGE
     told = capsys.readouterr().err
     assert "is not run" in told and f"rtid trust {file.with_name('own.py')}" in told
     assert not ran.exists()

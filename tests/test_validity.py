@@ -10,20 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rtid.cli import main
 from rtid.cli.exits import Exit
 from rtid.estimator.validity import doubts, doubts_of_lag
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import SimulatedPlant
+from tests.command import ends
 from tests.diagnose.records import record
 from tests.replays import shared_replays  # noqa: F401
-
-
-def rtid(*words: object) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main.run([str(word) for word in words])
-    return int(ended.value.code or 0)
 
 
 @pytest.fixture(scope="module")
@@ -41,17 +35,17 @@ def test_an_impossible_modulus_is_invalid_everywhere(
     narrow: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     project = narrow.with_suffix(".toml")
-    assert rtid("replay", narrow, "-p", project, "--json") == Exit.NEGATIVE
+    assert ends("replay", narrow, "-p", project, "--json") == Exit.NEGATIVE
     invalid = [d["what"] for d in json.loads(capsys.readouterr().out)["doubts"] if d["is_invalid"]]
     assert invalid == ["beta_a", "beta_b"]
     out = tmp_path / "map.csv"
-    assert rtid("export", narrow, out, "-p", project) == Exit.NEGATIVE
+    assert ends("export", narrow, out, "-p", project) == Exit.NEGATIVE
     told = capsys.readouterr().err
     assert "outside the declared 100 to 400 MPa" in " ".join(told.split()) and "--force" in told
     assert not out.exists()
-    assert rtid("export", narrow, out, "-p", project, "--force") == Exit.OK and out.exists()
+    assert ends("export", narrow, out, "-p", project, "--force") == Exit.OK and out.exists()
     capsys.readouterr()
-    assert rtid("diagnose", narrow, "-p", project, "--json") == Exit.NEGATIVE
+    assert ends("diagnose", narrow, "-p", project, "--json") == Exit.NEGATIVE
     diagnosed = json.loads(capsys.readouterr().out)
     assert diagnosed["verdict"] != "matches" and diagnosed["doubts"][0]["is_invalid"]
 

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from firmware_bridge.samples import Samples
-from rtid.cli import main
 from rtid.cli.exits import Exit
 from rtid.diagnose.extend import RefusedError
 from rtid.plain import silent
@@ -22,6 +21,7 @@ from rtid.sim.simulated_plant import SimulatedPlant
 from rtid.study.revisions import add, without
 from rtid.study.study import Study
 from rtid.ui.desk import Desk
+from tests.command import ends
 from tests.diagnose.stops import STEP_S, against_the_stops
 from tests.replays import shared_replays  # noqa: F401
 
@@ -54,12 +54,6 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def project(recorded: Path, tmp_path: Path) -> Path:
     return Path(copy(recorded.with_suffix(".toml"), tmp_path / "machine.toml"))
-
-
-def ends(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as end:
-        main.run([str(a) for a in arguments])
-    return int(end.value.code or 0)
 
 
 def test_a_zero_is_named_added_and_taken_back(

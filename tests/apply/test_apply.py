@@ -20,7 +20,6 @@ from rtid.apply.plan import ApplyError
 from rtid.apply.session import Plan, apply_map
 from rtid.apply.versions import DONE, UNCONFIRMED, Applied, VersionRow
 from rtid.apply.wish import Wish
-from rtid.cli import main
 from rtid.cli.exits import Exit
 from rtid.estimator.flowmap import FlowMap
 from rtid.project import Project, load
@@ -28,6 +27,7 @@ from tests.apply.neighbour import Neighbour, learned, loaded, neighbour, offer, 
 from tests.bridge.controller import Controller, Line
 from tests.bridge.downloads import SPOILS, damaging, losing
 from tests.bridge.tables import a_table
+from tests.command import ends
 from tests.eighty import eighty  # noqa: F401
 
 
@@ -371,12 +371,6 @@ def test_somebody_else_comes_while_you_think(tmp_path: Path, maps: tuple[FlowMap
     assert controller.held(2) == (1, theirs.crc) and controller.held(0) is None
 
 
-def ends(arguments: list[str]) -> int:
-    with pytest.raises(SystemExit) as end:
-        main.run(arguments)
-    return int(end.value.code or 0)
-
-
 @pytest.mark.usefixtures("eighty")
 def test_the_command(
     tmp_path: Path, maps: tuple[FlowMap, FlowMap], capsys: pytest.CaptureFixture[str]
@@ -385,26 +379,26 @@ def test_the_command(
     offer(folder, load(path), maps[0])
     with neighbour() as there:
         call = ["apply", str(path), "--bus", f"virtual:{there.channel}", "--test-bus"]
-        assert ends(call) == Exit.USAGE  # nobody can be asked
+        assert ends(*call) == Exit.USAGE  # nobody can be asked
         assert "--yes" in capsys.readouterr().err
-        assert ends([*call, "--yes"]) == Exit.OK
+        assert ends(*call, "--yes") == Exit.OK
         out = capsys.readouterr().out
         assert "holds no map" in out and "active: version 1" in out and "on data" in out
         offer(folder, load(path), maps[1], against=1)
-        assert ends([*call, "--json", "--yes"]) == Exit.OK
+        assert ends(*call, "--json", "--yes") == Exit.OK
         told = json.loads(capsys.readouterr().out)
         assert told["applied"]["version"] == 2 and len(told["edges"]) == 4
-        assert ends([*call, "--undo", "--yes"]) == Exit.OK
+        assert ends(*call, "--undo", "--yes") == Exit.OK
         capsys.readouterr()
-        assert ends(["apply", str(path), "--log"]) == Exit.OK
+        assert ends("apply", path, "--log") == Exit.OK
         listed = capsys.readouterr().out.splitlines()
         assert "version 3, the maps of version 1: done, by " in listed[2]
         assert listed[3:] == [f"Next: rtid status {path}"]
-        assert ends(["apply", str(path), "--log", "--json"]) == Exit.OK
+        assert ends("apply", path, "--log", "--json") == Exit.OK
         assert [row["version"] for row in json.loads(capsys.readouterr().out)] == [1, 2, 3]
-        assert ends([*call, "--yes"]) == Exit.NEGATIVE  # no offer
+        assert ends(*call, "--yes") == Exit.NEGATIVE  # no offer
         assert "no map is offered" in capsys.readouterr().err
-        assert ends(["apply", str(path), "--bus", f"virtual:{there.channel}"]) == Exit.USAGE
+        assert ends("apply", path, "--bus", f"virtual:{there.channel}") == Exit.USAGE
 
 
 def test_the_project_file_must_declare_it(
@@ -412,16 +406,16 @@ def test_the_project_file_must_declare_it(
 ) -> None:
     path = project_file(tmp_path)
     path.write_text(path.read_text().replace("can_id = 1792\n", ""))
-    assert ends(["apply", str(path)]) == Exit.USAGE
+    assert ends("apply", path) == Exit.USAGE
     assert "publish.can_id" in capsys.readouterr().err
     path.write_text(path.read_text().replace("reply_id = 1793\n", ""))
-    assert ends(["apply", str(path)]) == Exit.USAGE
+    assert ends("apply", path) == Exit.USAGE
     assert "nothing can be sent" in capsys.readouterr().err
-    assert ends(["apply", str(project_file(tmp_path, can_id=0x120))]) == Exit.USAGE
+    assert ends("apply", project_file(tmp_path, can_id=0x120)) == Exit.USAGE
     assert "that of ValveCommand" in capsys.readouterr().err
-    assert ends(["apply", str(project_file(tmp_path, status=True))]) == Exit.USAGE
+    assert ends("apply", project_file(tmp_path, status=True)) == Exit.USAGE
     assert "publish.status_id" in capsys.readouterr().err
-    assert ends(["apply", str(project_file(tmp_path, first_slot=12))]) == Exit.USAGE
+    assert ends("apply", project_file(tmp_path, first_slot=12)) == Exit.USAGE
     assert "publish.first_slot" in capsys.readouterr().err
 
 
@@ -443,7 +437,7 @@ def test_no_map_is_newer_than_the_last_version(
     with neighbour(controller) as there:
         arguments = ["apply", str(path), "--bus", f"virtual:{there.channel}", "--state"]
         arguments += [str(folder), "--test-bus", "--yes", "--replace-unknown"]
-        assert ends([*arguments, *["--dry-run"] * dry_run]) == 3
+        assert ends(*arguments, *["--dry-run"] * dry_run) == 3
     said = capsys.readouterr().err
     assert f"version {LAST_VERSION}: no map can be newer" in said and "Traceback" not in said
     assert controller.held(0) == (LAST_VERSION, foreign.crc)

@@ -20,11 +20,11 @@ from firmware_bridge.lookup import crc32, numbers_of, table_of
 from firmware_bridge.protocol import Op, Reason
 from rtid.apply import reach
 from rtid.apply.versions import CONTRADICTED, DONE, UNCONFIRMED, UNVERIFIED, Applied, VersionRow
-from rtid.cli import main
 from rtid.cli.exits import Exit
 from rtid.project import load
 from tests.apply.neighbour import learned, offer, project_file
 from tests.bridge.controller import Controller, Line
+from tests.command import ends
 
 SLOTS = range(5)
 Lie = Callable[["Liar", bytes], bytes | None]  # an answer, and what is said in its place
@@ -204,10 +204,8 @@ def command(patch: pytest.MonkeyPatch, path: Path, liar: Liar, *words: str) -> t
         yield line
 
     patch.setattr(reach, "armed", armed)
-    call = ["apply", str(path), "--bus", "virtual:none", "--test-bus", "--yes", "--json", *words]
-    with pytest.raises(SystemExit) as ended:
-        main.run(call)
-    return int(ended.value.code or 0), line
+    call = ("apply", path, "--bus", "virtual:none", "--test-bus", "--yes", "--json", *words)
+    return ends(*call), line
 
 
 def holding(images: dict[int, bytes], version: int) -> Controller:

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rtid.cli import main
 from rtid.cli.exits import Exit
 from rtid.estimator.flowmap import FlowMap
 from rtid.maps.files import write_map
 from rtid.project import Project, load
 from tests.apply.neighbour import learned, offer, project_file
+from tests.command import said
 
 
 @pytest.fixture(scope="module")
@@ -37,30 +37,27 @@ def one_cell(flow_map: FlowMap, flow_m3s: float) -> FlowMap:
     return replace(flow_map, edges=(first, replace(second, theta=theta), *others))
 
 
-def dry_run(
-    folder: Path, flow_map: FlowMap, capsys: pytest.CaptureFixture[str], **keys: object
-) -> list[str]:
+def dry_run(folder: Path, flow_map: FlowMap, **keys: object) -> list[str]:
     """The objections of `rtid apply --dry-run` to a first map."""
     path = project_file(folder, error_percent=5, **keys)
     offer(folder / "cylinder.state", load(path), flow_map)
-    with pytest.raises(SystemExit) as ended:
-        main.run(["apply", str(path), "--dry-run", "--json"])
-    told = json.loads(capsys.readouterr().out)
-    assert ended.value.code == Exit.OK and told["applied"] is None
+    code, out, _ = said("apply", path, "--dry-run", "--json")
+    told = json.loads(out)
+    assert code == Exit.OK and told["applied"] is None
     assert all({"u_v", "dp_pa"} == set(e["error_at"]) for e in told["lookup"].values())
     return list(told["objections"])
 
 
 def test_a_healthy_first_map_is_not_objected_to(
-    machine: tuple[Project, FlowMap], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    machine: tuple[Project, FlowMap], tmp_path: Path
 ) -> None:
-    assert dry_run(tmp_path, machine[1], capsys, max_error_percent=6) == []
+    assert dry_run(tmp_path, machine[1], max_error_percent=6) == []
 
 
 def test_a_map_thirty_times_too_large_is_refused_with_the_place(
-    machine: tuple[Project, FlowMap], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    machine: tuple[Project, FlowMap], tmp_path: Path
 ) -> None:
-    against = dry_run(tmp_path, times(machine[1], 30.0), capsys)
+    against = dry_run(tmp_path, times(machine[1], 30.0))
     of_size = [text for text in against if "max_flow_percent is 500" in text]
     assert {text.split(":")[0] for text in of_size} == {"pa", "at", "pb", "bt"}
     assert all(" V, dp = " in text and "times what a valve" in text for text in of_size)
@@ -68,13 +65,10 @@ def test_a_map_thirty_times_too_large_is_refused_with_the_place(
 
 @pytest.mark.parametrize("flow_m3s", [1e3, -1e3])
 def test_one_absurd_cell_is_refused_and_so_is_what_it_does_to_the_others(
-    machine: tuple[Project, FlowMap],
-    tmp_path: Path,
-    flow_m3s: float,
-    capsys: pytest.CaptureFixture[str],
+    machine: tuple[Project, FlowMap], tmp_path: Path, flow_m3s: float
 ) -> None:
     """With 16 bits for 1,000 m3/s all other flows of the edge become 0."""
-    against = dry_run(tmp_path, one_cell(machine[1], flow_m3s), capsys)
+    against = dry_run(tmp_path, one_cell(machine[1], flow_m3s))
     size, table = (
         next(t for t in against if key in t) for key in ("max_flow_percent", "max_error_percent")
     )
@@ -87,7 +81,7 @@ def test_one_absurd_cell_is_refused_and_so_is_what_it_does_to_the_others(
 
 
 def test_a_map_on_data_far_from_the_prior_is_refused(
-    machine: tuple[Project, FlowMap], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    machine: tuple[Project, FlowMap], tmp_path: Path
 ) -> None:
     flow_map = machine[1]
     beta = {"beta_pa": [8e8, 8e8], "beta_sd_pa": [1e6, 1e6]}
@@ -97,9 +91,7 @@ def test_a_map_on_data_far_from_the_prior_is_refused(
         path = project_file(tmp_path, error_percent=5, max_error_percent=50, **keys)
         path.write_text(path.read_text() + '\n[prior]\nmap = "before.npz"\n')
         offer(tmp_path / "cylinder.state", load(path), times(flow_map, factor))
-        with pytest.raises(SystemExit):
-            main.run(["apply", str(path), "--dry-run", "--json"])
-        return list(json.loads(capsys.readouterr().out)["objections"])
+        return list(json.loads(said("apply", path, "--dry-run", "--json")[1])["objections"])
 
     assert objections(1.2) == []
     far = objections(6.0, max_flow_percent=1e6)

@@ -28,6 +28,7 @@ from rtid.project import load
 from rtid.project.errors import ProjectError
 from rtid.project.schema import ControllerSection
 from rtid.study.study import Study
+from tests.command import ends
 from tests.replays import shared_replays  # noqa: F401
 from tests.tracking_machines import (
     KP_1PS,
@@ -168,8 +169,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A project with a controller and a way to it, its trace beside it, and an offer."""
     folder = tmp_path_factory.mktemp("tracking")
     trace = folder / "run.blf"
-    with pytest.raises(SystemExit):
-        main.run(["simulate", str(trace), "--duration", "12", "--motion", "rich"])
+    ends("simulate", trace, "--duration", "12", "--motion", "rich")
     file = folder / "run.toml"
     text = file.read_text("utf-8")
     file.write_text(
@@ -190,9 +190,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def applied(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    with pytest.raises(SystemExit) as ended:
-        main.run(["apply", *arguments, "--dry-run"])
-    assert ended.value.code == 0
+    assert ends("apply", *arguments, "--dry-run") == 0
     return capsys.readouterr().out
 
 

@@ -11,7 +11,7 @@ from firmware_bridge.assemble import Assembler, AssemblyError
 from firmware_bridge.catalog import CatalogError
 from firmware_bridge.config import Assembly
 from firmware_bridge.frames import Frames
-from firmware_bridge.samples import GAP, ROW, Samples
+from firmware_bridge.samples import GAP, ROW, Samples, join
 from tests.bridge.machine import CATALOG, SIGNALS, START_US, assembly, cycles, without
 
 
@@ -19,15 +19,6 @@ def run(frames: Frames, declared: Assembly, chunk: int = 10**9) -> tuple[Samples
     assembler = Assembler(CATALOG, declared)
     parts = [assembler.push(part) for part in frames.chunks(chunk)] + [assembler.finish()]
     return join(parts), assembler.counters
-
-
-def join(parts: list[Samples]) -> Samples:
-    return Samples(
-        parts[0].names,
-        np.concatenate([part.t_us for part in parts]),
-        np.concatenate([part.values for part in parts]),
-        np.concatenate([part.flags for part in parts]),
-    )
 
 
 def same(a: Samples, b: Samples) -> bool:

@@ -16,6 +16,7 @@ from firmware_bridge import bits, e2e
 from firmware_bridge.catalog import Catalog, CatalogError, load
 from firmware_bridge.encode import encode_message
 from tests.bridge.machine import CATALOG
+from tests.bridge.test_e2e import plain_crc
 
 
 def signal(start: int, length: int, order: Any, **more: Any) -> Signal:
@@ -174,21 +175,12 @@ def test_bad_files_are_refused(tmp_path: Any) -> None:
         catalog_of(signal(0, 16, "little_endian", float=True)).layouts("M")
 
 
-def crc_bitwise(payload: bytes) -> int:
-    crc = 0
-    for byte in payload:
-        crc ^= byte
-        for _ in range(8):
-            crc = ((crc << 1) ^ 0x1D if crc & 0x80 else crc << 1) & 0xFF
-    return crc
-
-
 @given(st.binary(min_size=8, max_size=8), st.integers(0, 65535), st.integers(0, 7))
 @settings(max_examples=50, deadline=None)
 def test_crc_equals_long_division(payload: bytes, data_id: int, crc_byte: int) -> None:
     data = np.frombuffer(payload, np.uint8).reshape(1, 8).copy()
     covered = data_id.to_bytes(2, "little") + payload[:crc_byte] + payload[crc_byte + 1 :]
-    assert e2e.crc8_bulk(data, 8, crc_byte, data_id)[0] == crc_bitwise(covered)
+    assert e2e.crc8_bulk(data, 8, crc_byte, data_id)[0] == plain_crc(covered)
 
 
 def test_crc8_lets_few_corrupted_payloads_through() -> None:

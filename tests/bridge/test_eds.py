@@ -11,16 +11,10 @@ import pytest
 from firmware_bridge import catalog as catalogs
 from firmware_bridge.catalog import CatalogError
 from firmware_bridge.sources import blf
-from rtid.cli import main
 from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import SimulatedPlant
 from tests.bridge.canopen import bus, machine
-
-
-def rtid(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, str]:
-    with pytest.raises(SystemExit) as ended:
-        main.run([str(word) for word in words])
-    return int(ended.value.code or 0), *capsys.readouterr()
+from tests.command import said
 
 
 def test_limits_are_the_range_of_a_signal(tmp_path: Path) -> None:
@@ -40,17 +34,13 @@ def test_limits_are_the_range_of_a_signal(tmp_path: Path) -> None:
     assert np.isfinite(values[:, 1:]).all()
 
 
-def test_a_cylinder_on_canopen_is_read_by_its_eds(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_cylinder_on_canopen_is_read_by_its_eds(tmp_path: Path) -> None:
     run = simulate(SimulatedPlant(), "rich", 0, 20.0)
     names = ("u", "x", "v", "p_a", "p_b", "p_supply")
     columns = {name: run.samples.column(name)[::10] for name in names}
     blf.write(tmp_path / "run.blf", bus(columns))
     nodes = machine(tmp_path)
-    code, out, err = rtid(
-        capsys, "check", "--bus-only", tmp_path / "run.blf", "--dbc", nodes, "--json"
-    )
+    code, out, err = said("check", "--bus-only", tmp_path / "run.blf", "--dbc", nodes, "--json")
     assert code == 0, err
     report = json.loads(out)
     found = {s["name"]: (s["unit"], s["minimum"], s["maximum"]) for s in report["signals"]}
@@ -66,7 +56,7 @@ def test_a_cylinder_on_canopen_is_read_by_its_eds(
         assert high == pytest.approx(columns[name].max() / si, abs=step)
     taken = [(t["file"], t["messages"], t["present"]) for t in report["described"]["taken"]]
     assert taken == [("valve.eds:5", 1, 1), ("sensor.eds:9", 1, 1), ("encoder.dcf", 1, 1)]
-    code, out, err = rtid(capsys, "init", nodes, "-o", tmp_path / "cylinder.toml")
+    code, out, err = said("init", nodes, "-o", tmp_path / "cylinder.toml")
     assert code == 0, err
     for role, signal in (
         ("p_supply", "TPDO1-189.AI_Input_PV_Pump_pressure [bar]"),
@@ -77,7 +67,7 @@ def test_a_cylinder_on_canopen_is_read_by_its_eds(
         ("u", "RPDO1.vpoc_set_point_Value"),
     ):
         assert f"  {role:9} {signal}" in out, out
-    code, out, err = rtid(capsys, "quick", tmp_path / "run.blf", "--dbc", nodes, "--json")
+    code, out, err = said("quick", tmp_path / "run.blf", "--dbc", nodes, "--json")
     assert code in (0, 4), err
     assert json.loads(out)["data"]["level"] != "bad", out
 

@@ -16,8 +16,8 @@ from firmware_bridge import frames as fr
 from firmware_bridge.frames import EXTENDED, Frames
 from firmware_bridge.sources import LogError, blf, candump, open_file, open_log, read_table
 from firmware_bridge.sources.can_bus import CanBus
-from rtid.cli import main
 from tests.bridge.machine import cycles, equal
+from tests.command import ends
 from tests.fuzz import mutate
 from tests.fuzz.seeds import write_mcap
 
@@ -236,7 +236,5 @@ def test_bursts_repeats_and_stamps_that_go_back_are_told_with_their_effect(
     path.write_text("".join(lines))
     for words, wanted in ((["--json"], '"stamps": {"backward": 1, "repeated": 1, "in_bursts": 400'),
                           ([], "20 ms of silence")):  # fmt: skip
-        with pytest.raises(SystemExit) as ended:
-            main.run(["check", "--bus-only", str(path), *words])
-        assert not ended.value.code
+        assert ends("check", "--bus-only", path, *words) == 0
         assert wanted in " ".join(capsys.readouterr().out.split())

@@ -20,7 +20,6 @@ from firmware_bridge.config import ANY, FOUND, MessageSource
 from firmware_bridge.frames import EXTENDED, Frames
 from firmware_bridge.j1939 import Network, known_as
 from firmware_bridge.sources import blf, open_log
-from rtid.cli import main
 from rtid.estimator.flowmap import VALID, FlowMap
 from rtid.project import load
 from rtid.sim.recording import write_run
@@ -28,6 +27,7 @@ from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import SimulatedPlant
 from rtid.study.replay import replay
 from rtid.study.study import Study
+from tests.command import said
 
 MACHINE, OTHER = 0x21, 0x33
 MESSAGES = {  # name: PGN, bytes, signals with their first bit, factor, offset and unit
@@ -115,18 +115,10 @@ def network(catalog: Catalog, **addresses: int | str | None) -> Network:
     return Network(catalog, [MessageSource(n, 0.01, address=a) for n, a in names.items()])
 
 
-def rtid(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, str]:
-    with pytest.raises(SystemExit) as ended:
-        main.run([str(word) for word in words])
-    return int(ended.value.code or 0), *capsys.readouterr()
-
-
-def test_a_truck_s_signals_are_read_by_their_names(
-    shared: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_truck_s_signals_are_read_by_their_names(shared: Path) -> None:
     folder = shared / "data/can_j1939"
     words = folder / "vehicle.mf4", "--dbc", folder / "j1939.dbc", "--json"
-    code, out, _ = rtid(capsys, "check", "--bus-only", *words)
+    code, out, _ = said("check", "--bus-only", *words)
     report = json.loads(out)
     assert code == 0 and report["frames"] == 150_411
     engine = next(s for s in report["signals"] if s["name"] == "EEC1.EngineSpeed")
@@ -136,7 +128,7 @@ def test_a_truck_s_signals_are_read_by_their_names(
     (loose,) = (t["timing"] for t in report["timing"] if t["can_id"] == 0x0CF00300)
     assert [round(1e3 * loose[key], 1) for key in ("p01_s", "p99_s")] == [47.1, 53.0]
     assert round(1e3 * loose["worst_s"]) == 2014
-    code, _, err = rtid(capsys, "quick", words[0], *words[1:3])
+    code, _, err = said("quick", words[0], *words[1:3])
     assert code == 3 and "EngineSpeed [rpm]" in err  # a truck is no cylinder
 
 
@@ -288,9 +280,7 @@ def learned(folder: Path, columns: dict[str, np.ndarray], text: str, plain: bool
     return Study(load(folder / "machine.toml"), folder / "run.blf").map
 
 
-def test_a_machine_on_j1939_gives_the_maps_of_the_same_samples_on_plain_can(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_machine_on_j1939_gives_the_maps_of_the_same_samples_on_plain_can(tmp_path: Path) -> None:
     text, columns = project_text(tmp_path, 40.0)
     folders = tmp_path / "plain", tmp_path / "j1939"
     for folder in folders:
@@ -307,8 +297,8 @@ def test_a_machine_on_j1939_gives_the_maps_of_the_same_samples_on_plain_can(
     trace = replay(load(folders[1] / "machine.toml"), folders[1] / "run.blf").trace
     assert trace.counters["other_source"] > 100 and trace.counters["transport_foreign"] > 20
     assert trace.counters["j1939_request"] > 100
-    code, out, err = rtid(
-        capsys, "quick", folders[1] / "run.blf", "--dbc", folders[1] / "machine.dbc", "--json"
+    code, out, err = said(
+        "quick", folders[1] / "run.blf", "--dbc", folders[1] / "machine.dbc", "--json"
     )
     assert code in (0, 4), err
     assert "PSupply" in out
@@ -316,9 +306,7 @@ def test_a_machine_on_j1939_gives_the_maps_of_the_same_samples_on_plain_can(
 
 
 @pytest.mark.slow  # it waits for the bus
-def test_the_daemon_learns_from_j1939_as_it_comes(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_daemon_learns_from_j1939_as_it_comes(tmp_path: Path) -> None:
     """`rtid run` on a virtual bus: long messages in packets, among others' traffic."""
     text, columns = project_text(tmp_path, 8.0)
     dbc(tmp_path / "machine.dbc")
@@ -342,7 +330,7 @@ def test_the_daemon_learns_from_j1939_as_it_comes(
     sender.start()
     words = tmp_path / "machine.toml", "--bus", "virtual:j1939", "--test-bus", "--for", 3, "--json"
     try:
-        code, out, err = rtid(capsys, "run", *words, "--state", tmp_path / "state")
+        code, out, err = said("run", *words, "--state", tmp_path / "state")
     finally:
         is_over.set()
         sender.join()

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from random import Random
 
@@ -23,13 +22,6 @@ from tests.bridge.test_live import collect
 from tests.bridge.wire import KINDS, Pty, contents, noisy, read_until
 
 IDS = st.one_of(st.integers(0, 2**11 - 1), st.integers(EXTENDED, EXTENDED + 2**29 - 1))
-
-
-@pytest.fixture
-def line() -> Iterator[Pty]:
-    pty = Pty()
-    yield pty
-    pty.unplug()
 
 
 @given(st.lists(IDS, min_size=1, max_size=30), st.randoms(use_true_random=False))

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import ast
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import can
@@ -18,13 +17,6 @@ from tests.bridge.wire import Pty
 BRIDGE = Path(playback.__file__).parent
 SENDER = "playback.py"  # the only module that may send frames or write to a line
 CONFIGURES = "slcan.py"  # writes its adapter's set-up: C, Sn, Z, L or O
-
-
-@pytest.fixture
-def line() -> Iterator[Pty]:
-    pty = Pty()
-    yield pty
-    pty.unplug()
 
 
 def test_what_is_sent_is_what_a_serial_source_receives(line: Pty) -> None:

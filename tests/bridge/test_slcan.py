@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterator
 from random import Random
 
 import can
@@ -34,13 +33,6 @@ def lines(frames: Frames, stamps_ms: np.ndarray | None = None) -> bytes:
         stamp = "" if stamps_ms is None else f"{int(stamps_ms[k]):04X}"
         out.append(f"{head}{n}{frames.data[k, :n].tobytes().hex().upper()}{stamp}\r")
     return "".join(out).encode()
-
-
-@pytest.fixture
-def line() -> Iterator[Pty]:
-    pty = Pty()
-    yield pty
-    pty.unplug()
 
 
 def push(text: bytes, stamped: bool = False) -> tuple[list[tuple[int, int, bytes]], dict[str, int]]:

@@ -17,7 +17,6 @@ from urllib.request import urlopen
 import numpy as np
 import pytest
 
-from rtid.cli.main import run
 from rtid.daemon import metrics, scrape, status
 from rtid.daemon.calendar import (
     SpanNote,
@@ -32,6 +31,7 @@ from rtid.daemon.chronicle import DAY_S, FILE, Chronicle
 from rtid.daemon.jobs import Publication
 from rtid.errors import RtidError
 from rtid.estimator.flowmap import FlowMap
+from tests.command import ends
 from tests.daemon.test_parts import full_status
 
 NOW_S = 1.8e9
@@ -166,12 +166,10 @@ def test_the_command_says_it(
     project = tmp_path_factory.mktemp("project") / "m.toml"
     project.write_text(f'[daemon]\nfolder = "{history}"\n')
     words = ["history", "-p", str(project), "--days", "5", "--until", "2027-01-15T09:00"]
-    with pytest.raises(SystemExit):
-        run([*words, "--note", "new oil"])
+    ends(*words, "--note", "new oil")
     said = capsys.readouterr().out
     assert "bulk modulus a MPa" in said and "new oil" in said and "Next: " in said
-    with pytest.raises(SystemExit):
-        run([*words, "--json"])
+    ends(*words, "--json")
     told = json.loads(capsys.readouterr().out)
     assert told["notes"][0]["text"] == "new oil" and told["rows"]
 

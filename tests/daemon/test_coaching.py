@@ -11,7 +11,6 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from rtid.cli.main import run
 from rtid.daemon import diagnosing, jobs
 from rtid.daemon.coaching import Coaching, by_valve
 from rtid.daemon.diagnoser import answer
@@ -21,6 +20,7 @@ from rtid.excite import library
 from rtid.project import Project, load
 from rtid.sim.run import simulate
 from rtid.trace.snapshot import Generations
+from tests.command import ends
 from tests.excite.machines import machine, write_project
 from tests.replays import shared_replays  # noqa: F401
 
@@ -106,8 +106,7 @@ def test_the_coach_says_what_excite_after_the_same_snapshot_says(
     assert advice.blocks and set(advice.blocks) <= {edge.name for edge in project.model.edges}
     assert f"{LEAK} (a)" in advice.effects
     assert 0 < len(advice.segments) <= 3
-    with pytest.raises(SystemExit):
-        run(["excite", "-p", str(project.path), "--after", str(snapshot), "--no-compare", "--json"])
+    ends("excite", "-p", project.path, "--after", snapshot, "--no-compare", "--json")
     found = json.loads(capsys.readouterr().out)
     worth, tried = found["segments_worth_running"], found["segments_tried"]
     assert f"{worth} of {tried} pieces" in advice.text

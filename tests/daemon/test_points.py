@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from rtid.cli import main
 from rtid.estimator.chunk import to_chunk
 from rtid.estimator.estimator import Estimator
 from rtid.project import Project, load
@@ -18,6 +17,7 @@ from rtid.sim.simulated_plant import SimulatedPlant
 from rtid.trace import points
 from rtid.trace.points import MOST_POINTS, KeptPoint, points_of, surplus
 from rtid.trace.snapshot import WATCH_FILE, Generations, save
+from tests.command import ends
 from tests.faults.harness import machine
 
 DAY_S = 86_400.0
@@ -161,23 +161,17 @@ def test_a_point_is_gone_back_to(tmp_path: Path, capsys: pytest.CaptureFixture[s
     estimator.turns = 2
     generations.save(estimator)
     (generations.folder / WATCH_FILE).write_text("{}")
-    assert ended("history", "-p", str(path), "--json") == 0
+    assert ends("history", "-p", str(path), "--json") == 0
     (told,) = json.loads(capsys.readouterr().out)["points"]
     assert (
         told["name"] == point.stem and told["reason"] == "publish" and told["key"] == project.digest
     )
-    assert ended("restore", "-p", str(path), "nothing") == 3
-    assert ended("restore", "-p", str(path), point.stem) == 0
+    assert ends("restore", "-p", str(path), "nothing") == 3
+    assert ends("restore", "-p", str(path), point.stem) == 0
     restored = Generations(tmp_path / "machine.state", project.digest).restore(project.model)
     assert restored.estimator is not None and restored.estimator.turns == 1
     assert not (generations.folder / WATCH_FILE).exists()
     assert [kept.reason for kept in points_of(generations.folder)] == ["publish", "restore"]
     capsys.readouterr()
-    assert ended("history", "-p", str(path)) == 0
+    assert ends("history", "-p", str(path)) == 0
     assert point.stem in capsys.readouterr().out
-
-
-def ended(*words: str) -> int:
-    with pytest.raises(SystemExit) as end:
-        main.run(words)
-    return int(end.value.code or 0)

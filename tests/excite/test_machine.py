@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rtid.cli.main import run
 from rtid.compare.reference import theta_cells
 from rtid.errors import RtidError
 from rtid.estimator.chunk import to_chunk
@@ -28,6 +27,7 @@ from rtid.sim.declare import declared_model
 from rtid.sim.run import EXACT, P_A, P_B, U, X, simulate
 from rtid.sim.simulated_plant import SimulatedPlant
 from rtid.trace.snapshot import save
+from tests.command import ends
 from tests.eighty import eighty  # noqa: F401
 from tests.excite.machines import machine, motion, motion_of, write_project
 from tests.replays import shared_replays  # noqa: F401
@@ -92,9 +92,7 @@ def test_a_design_from_the_file_to_the_true_machine(
     project, table = write_project(tmp_path, plant, NUMBER), tmp_path / "motion.csv"
     asked = ["excite", "-p", str(project), "--duration-s", "25", "--see", EXCITE, "--no-compare"]
     picture = tmp_path / "motion.svg"
-    with pytest.raises(SystemExit) as done:
-        run([*asked, "--out", str(table), "--picture", str(picture), "--json"])
-    assert done.value.code == 0
+    assert ends(*asked, "--out", table, "--picture", picture, "--json") == 0
     told = json.loads(capsys.readouterr().out)
     assert all(e["is_kept"] for e in told["extremes"])
     assert picture.stat().st_size > 10_000
@@ -116,13 +114,10 @@ def test_a_design_from_the_file_to_the_true_machine(
     learned, snapshot = Estimator(model), tmp_path / "state.npz"
     learned.update(true.samples)
     save(snapshot, learned, load(project).digest)
-    with pytest.raises(SystemExit) as done:
-        run([*asked, "--after", str(snapshot)])
-    assert done.value.code == 0, "segments are left that are worth running"
+    assert ends(*asked, "--after", snapshot) == 0, "segments are left that are worth running"
     again = " ".join(capsys.readouterr().out.split())
     assert all(word in again for word in ("median", "±", "largest", "L/min/MPa"))
-    with pytest.raises(SystemExit):
-        run([*asked, "--after", str(snapshot), "--json"])
+    ends(*asked, "--after", snapshot, "--json")
     again = json.loads(capsys.readouterr().out)
     assert 0 < again["segments_worth_running"] <= again["segments_tried"]
 

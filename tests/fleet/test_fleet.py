@@ -13,7 +13,6 @@ import pyarrow.parquet as pq
 import pytest
 
 from firmware_bridge.samples import join
-from rtid.cli import main
 from rtid.cli.exits import Exit
 from rtid.compare.reference import ReferenceMap
 from rtid.errors import RtidError
@@ -33,6 +32,7 @@ from rtid.plain import FloatArray
 from rtid.project import load
 from rtid.tell.fleet import tell
 from rtid.trace.reading import read_trace
+from tests.command import ends
 from tests.eighty import eighty  # noqa: F401
 from tests.fleet.conftest import MACHINES, WORN
 
@@ -220,9 +220,7 @@ def test_the_command_ranks_the_machines_and_writes_what_others_read(
     for found in outcomes:
         is_diagnosed = found.job.machine == WORN and found.job.trace.stem == "day0"
         archive.keep(outcome(found.job, True) if is_diagnosed else found)
-    with pytest.raises(SystemExit) as end:
-        main.run(["fleet", str(traces / "traces"), "-p", str(project), "-o", str(out), "--json"])
-    assert not end.value.code
+    assert ends("fleet", traces / "traces", "-p", project, "-o", out, "--json") == 0
     told = json.loads(capsys.readouterr().out)
     tell(told, out)
     assert "beta, MPa" in capsys.readouterr().out
@@ -256,7 +254,5 @@ def test_a_fleet_of_failures_ends_with_input(
     out = tmp_path / "out"
     for job in find([tmp_path / "m1"], project)[0]:
         Archive(out).keep(outcome(job, False))
-    with pytest.raises(SystemExit) as end:
-        main.run(["fleet", str(tmp_path / "m1"), "-p", str(project), "-o", str(out)])
-    assert end.value.code == Exit.INPUT
+    assert ends("fleet", tmp_path / "m1", "-p", project, "-o", out) == Exit.INPUT
     assert "bad.blf" in capsys.readouterr().out

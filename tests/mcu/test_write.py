@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtid.cli.main import run
 from rtid.estimator.state import Weights, nominal_weights
 from rtid.mcu.c_tables import sizes_of, tables
 from rtid.mcu.emulated import Record
@@ -24,6 +23,7 @@ from rtid.mcu.valve import one_valve
 from rtid.mcu.write import write_sources
 from rtid.model import LAPPED, Term, Upkeep
 from rtid.project import load
+from tests.command import ends
 from tests.mcu.compiled import COMPILER, STRICT, Program
 from tests.mcu.machine import BLOCKS, Reference, small_valve, sums_apart
 from tests.rig import PROJECT
@@ -53,9 +53,7 @@ UPDATE_STACK, SOLVE_STACK = 1_400, 2_400  # bytes
 
 def command(*arguments: str) -> int:
     """Exit code of `rtid mcu`."""
-    with pytest.raises(SystemExit) as ended:
-        run(["mcu", *arguments])
-    return int(ended.value.code or 0)
+    return ends("mcu", *arguments)
 
 
 def test_command_writes_a_folder_that_compiles(

@@ -16,7 +16,6 @@ from benchmarks.paper.fig6 import compare, repeated
 from benchmarks.paper.fig6_picture import CALIBRATED, ESTIMATED, MANUFACTURER, Compared, rms_m
 from firmware_bridge.download import Image, Session, download
 from firmware_bridge.lookup import image
-from rtid.cli.main import run as main_run
 from rtid.plain import FloatArray
 from rtid.project import load
 from rtid.sim.boom_references import amplitude_m, point_to_point, swept
@@ -29,6 +28,7 @@ from rtid.trace.reading import read_trace
 from rtid.units import Z95
 from tests.bridge.controller import Controller, Line
 from tests.campaign.report import leave
+from tests.command import ends
 
 pytestmark = pytest.mark.slow
 
@@ -152,9 +152,7 @@ def test_a_boom_that_leaves_its_stroke_or_cavitates_is_lost(plant: SimulatedPlan
 
 def test_the_example_is_a_log_and_a_project_of_five_valves(tmp_path: Path) -> None:
     trace = tmp_path / "boom.blf"
-    with pytest.raises(SystemExit) as end:
-        main_run(["simulate", str(trace), "--example", "programmable_valve", "--plant", "2003"])
-    assert end.value.code == 0
+    assert ends("simulate", trace, "--example", "programmable_valve", "--plant", "2003") == 0
     project = load(trace.with_suffix(".toml"))
     samples = read_trace(project, trace).samples
     assert [edge.name for edge in project.model.edges] == list(EDGES)
