@@ -140,9 +140,6 @@ def test_solve(benchmark: Any) -> None:
     state, built = warmed(machine, valve_chunk(machine)), Controller(machine)
     built.run()
     blocks = int(state.engine[0]["n_slots"])
-    jobs = [
-        Job("C, float64, -O2", built.solve),
-        Job("rtid", lambda: solve(machine, state)),
-    ]
+    jobs = [Job("C, float64, -O2", built.solve), Job("rtid", lambda: solve(machine, state))]
     title = f"Sums of {blocks} blocks frozen and solved, covariances and statuses included"
     side_by_side(benchmark, title, "solve", jobs, "rtid")

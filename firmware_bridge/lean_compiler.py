@@ -312,10 +312,7 @@ class Compiler(CompilerBase):  # type: ignore[misc]
         return [self._passes[is_whole]]
 
 
-REPLACED = {
-    typed_passes.NativeLowering: _Lowering,
-    typed_passes.NopythonTypeInference: _Inference,
-}
+REPLACED = {typed_passes.NativeLowering: _Lowering, typed_passes.NopythonTypeInference: _Inference}
 
 
 def _is_known() -> bool:

@@ -48,10 +48,7 @@ class _Point:
 
 
 def verify(
-    session: Session,
-    images: Mapping[int, bytes],
-    version: int | None,
-    before: Mapping[int, bytes],
+    session: Session, images: Mapping[int, bytes], version: int | None, before: Mapping[int, bytes]
 ) -> Verified:
     """Read back what is active, and ask for flows.  Raises ContradictedError with the place.
 

@@ -12,11 +12,7 @@ VALUES = np.random.default_rng(4).standard_normal(300).cumsum()
 
 
 @pytest.mark.parametrize(
-    ("b", "a"),
-    [
-        ((0.0, 0.3, 0.0), (1.0, -0.7, 0.0)),
-        ((0.1, 0.2, 0.05), (1.0, -1.2, 0.5)),
-    ],
+    ("b", "a"), [((0.0, 0.3, 0.0), (1.0, -0.7, 0.0)), ((0.1, 0.2, 0.05), (1.0, -1.2, 0.5))]
 )
 def test_a_filter_is_the_difference_equation_to_the_bit(
     b: tuple[float, float, float], a: tuple[float, float, float]

@@ -50,7 +50,7 @@ ADDED = {  # by the command: options for the test's bus, and less of what only t
     "ui": "--port 0",
 }
 ENDS = {  # where that is not success alone: an alarm may be on
-    "status": (Exit.OK, Exit.NEGATIVE),
+    "status": (Exit.OK, Exit.NEGATIVE)
 }
 # Two applies within seconds are no daily practice, and the maps that are offered here are made up.
 BELOW = {"publish": "least_interval_s = 0\nmax_change_percent = 1000\nerror_percent = 1\n"}

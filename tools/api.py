@@ -26,10 +26,7 @@ SECTIONS = {
         *("rtid.model:Grid", "rtid.model:Term"),
     ),
     "Learn": (
-        *(
-            "rtid.study.replay:replay",
-            "rtid.study.replay:Replay",
-        ),
+        *("rtid.study.replay:replay", "rtid.study.replay:Replay"),
         *("rtid.estimator.estimator:Estimator", "rtid.estimator.chunk:to_chunk"),
         *("rtid.tell.arrays:fit", "rtid.study.study:Study"),
         *("rtid.estimator.record:fit_record", "rtid.estimator.record:RecordFit"),

@@ -36,11 +36,7 @@ def chosen(only: str | None) -> list[str]:
 
 
 def reproduce(
-    folder: Path,
-    keys: Sequence[str],
-    progress: Progress,
-    seed: int = SEED,
-    plants: int = PLANTS,
+    folder: Path, keys: Sequence[str], progress: Progress, seed: int = SEED, plants: int = PLANTS
 ) -> list[Part]:
     """Make the parts; pictures, `paper.md` and `paper.json` go into the folder."""
     folder.mkdir(parents=True, exist_ok=True)

@@ -61,9 +61,7 @@ def read(path: Path) -> list[tuple[str, Any, str]]:
         ),
         parse_options=reader.ParseOptions(delimiter=layout.delimiter),
         convert_options=reader.ConvertOptions(
-            decimal_point=layout.decimal,
-            strings_can_be_null=True,
-            null_values=missing,
+            decimal_point=layout.decimal, strings_can_be_null=True, null_values=missing
         ),
     )
     return list(zip(layout.names, content.columns, layout.units, strict=True))

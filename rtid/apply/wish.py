@@ -40,11 +40,7 @@ Wished = tuple[KnownMap, FloatArray, str, dict[str, Any]]
 
 
 def wished(
-    project: Project,
-    folder: Path,
-    wish: Wish,
-    applied: Applied,
-    content: int | None,
+    project: Project, folder: Path, wish: Wish, applied: Applied, content: int | None
 ) -> Wished:
     """The map to send, with the reason why it may be."""
     if wish.map_file is not None:

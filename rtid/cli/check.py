@@ -243,10 +243,7 @@ def _timing_cells(timing: Timing) -> tuple[str, ...]:
 
 
 def _print_bus(
-    timings: tuple[IdTiming, ...],
-    names: list[str],
-    count: int,
-    refused: dict[str, int],
+    timings: tuple[IdTiming, ...], names: list[str], count: int, refused: dict[str, int]
 ) -> None:
     from rtid.tell.story import Table
     from rtid.tell.terminal import make_console

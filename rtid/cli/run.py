@@ -34,8 +34,7 @@ def run(
         float | None, typer.Option("--for", min=0.1, help="Seconds to run; until stopped without.")
     ] = None,
     rate_hz: Annotated[
-        float | None,
-        typer.Option("--rate", min=1, max=20_000, help="Of the loop, Hz."),
+        float | None, typer.Option("--rate", min=1, max=20_000, help="Of the loop, Hz.")
     ] = None,
     state: Annotated[
         Path | None, typer.Option(help="Folder of snapshots, history, alarms; else the file's.")

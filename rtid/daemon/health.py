@@ -87,10 +87,7 @@ class Health:
         )
 
     def _signals(
-        self,
-        messages: tuple[MessageHealth, ...],
-        rows: NDArray[np.void],
-        frozen: BoolArray,
+        self, messages: tuple[MessageHealth, ...], rows: NDArray[np.void], frozen: BoolArray
     ) -> tuple[SignalHealth, ...]:
         by_name = {message.name: message for message in messages}
         declared = {signal.name: signal for signal in self._project.model.signals}

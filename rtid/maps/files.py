@@ -48,10 +48,7 @@ class MapFileError(RtidError):
 
 @door
 def write_map(
-    path: str | Path,
-    flowmap: FlowMap,
-    provenance: Mapping[str, Any],
-    tables: Tables | None = None,
+    path: str | Path, flowmap: FlowMap, provenance: Mapping[str, Any], tables: Tables | None = None
 ) -> None:
     """Write the map in the format that the file's suffix names; whole or not at all.
 
@@ -275,11 +272,7 @@ def _read_npz(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     return header, parts
 
 
-WRITERS: dict[str, Writer] = {
-    ".csv": _write_csv,
-    ".json": _write_json,
-    ".npz": _write_npz,
-}
+WRITERS: dict[str, Writer] = {".csv": _write_csv, ".json": _write_json, ".npz": _write_npz}
 TABLE_WRITERS: dict[str, Callable[[Path, Tables, Mapping[str, Any]], None]] = {
     ".mat": write_mat,
     ".m": write_m,

@@ -163,10 +163,7 @@ def _miss(
     """
     along = np.array([np.interp(u, at_u, column) for column in flow.T]).T
     table = np.array([np.interp(dp, at_dp, row) for row in along])
-    inside = np.ix_(
-        (u >= at_u[0]) & (u <= at_u[-1]),
-        (dp >= at_dp[0]) & (dp <= at_dp[-1]),
-    )
+    inside = np.ix_((u >= at_u[0]) & (u <= at_u[-1]), (dp >= at_dp[0]) & (dp <= at_dp[-1]))
     off = np.abs(table - exact)[inside]
     return float(off.max(initial=0.0)) / max(float(np.abs(exact).max()), 1e-12)
 

@@ -14,13 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.lookup import (
-    MOST_COUNT,
-    MOST_NODES,
-    NO_SAFE_BAND,
-    STATUS,
-    Table,
-)
+from firmware_bridge.lookup import MOST_COUNT, MOST_NODES, NO_SAFE_BAND, STATUS, Table
 from rtid.errors import RtidError
 from rtid.estimator.flowmap import EdgeMap
 from rtid.estimator.inverse import on_lattice

@@ -34,15 +34,7 @@ from rtid.plants.entries import (
     effects_of_plants,
     page_of,
 )
-from rtid.plants.plant import (
-    ANY,
-    Input,
-    Output,
-    Plant,
-    PlantError,
-    PlantParameter,
-    PlantState,
-)
+from rtid.plants.plant import ANY, Input, Output, Plant, PlantError, PlantParameter, PlantState
 
 SURROUNDINGS = ("T_amb", "p_tank", "h_a")
 

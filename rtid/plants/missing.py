@@ -17,15 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rtid.plain import FloatArray, Key, Progress, silent
-from rtid.plants.fitted import (
-    PlantModel,
-    continued,
-    exchanged,
-    polished,
-    refit,
-    roughly,
-    without,
-)
+from rtid.plants.fitted import PlantModel, continued, exchanged, polished, refit, roughly, without
 from rtid.plants.insertion import everywhere
 from rtid.plants.output_error import PlantFit
 from rtid.plants.plant import Plant, PlantRecord

@@ -70,8 +70,7 @@ class AddedSection(Section):
     trace: str = ""
     reason: str = ""
     parameters: dict[str, ParameterSection] = Field(
-        min_length=1,
-        description='parameters = {coefficient = {value = 5.8e-12, unit = "m3/s/Pa"}}',
+        min_length=1, description='parameters = {coefficient = {value = 5.8e-12, unit = "m3/s/Pa"}}'
     )
     errors: ErrorsSection = ErrorsSection()
 

@@ -15,14 +15,7 @@ from types import ModuleType
 from typing import Any
 
 from firmware_bridge.catalog import Catalog
-from rtid.effects import (
-    Effect,
-    EffectError,
-    ExpressionError,
-    catalogue,
-    from_expression,
-    names_of,
-)
+from rtid.effects import Effect, EffectError, ExpressionError, catalogue, from_expression, names_of
 from rtid.project import references, trust
 from rtid.project.errors import Problem
 from rtid.project.schema import EffectSection

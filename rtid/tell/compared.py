@@ -9,13 +9,7 @@ import numpy as np
 
 from rtid.compare import FREE_RUN
 from rtid.compare.simulation import REASONS
-from rtid.study.compared import (
-    Held,
-    TraceComparison,
-    blocks_in_span,
-    changes,
-    spans_of_block,
-)
+from rtid.study.compared import Held, TraceComparison, blocks_in_span, changes, spans_of_block
 from rtid.tell import compared_tables as tables
 from rtid.tell.story import Story, Table
 from rtid.units import CONVENTION, scale_of

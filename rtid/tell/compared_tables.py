@@ -17,9 +17,7 @@ from rtid.units import KPA, Scale, scale_of
 WORST = 12  # blocks in the printed table; --json gives all
 
 
-def _rows(
-    studies: Sequence[TraceComparison],
-) -> Iterator[tuple[Held, str, Comparison, int, str]]:
+def _rows(studies: Sequence[TraceComparison]) -> Iterator[tuple[Held, str, Comparison, int, str]]:
     """Map, part and chamber of every line of a table."""
     for comparison in studies:
         for tested in comparison.held:

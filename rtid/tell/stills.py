@@ -150,12 +150,7 @@ def _plane(axis: Axes, plane: Plane) -> AxesImage:
     place: dict[str, Any] = {"extent": extent, "origin": "lower"}
     values = np.maximum(plane.values, plane.low)  # a shut valve's noise is no colour of its own
     drawn = axis.imshow(
-        values,
-        PALETTES[plane.palette],
-        norm,
-        aspect="auto",
-        interpolation="bilinear",
-        **place,
+        values, PALETTES[plane.palette], norm, aspect="auto", interpolation="bilinear", **place
     )
     axis.contour(values, levels[1:], colors="white", linewidths=0.5, alpha=0.8, **place)
     cells = [Rectangle((x, y), width, height) for x, y, width, height in plane.veiled]

@@ -197,10 +197,7 @@ class Generations:
         return self.folder / f"state-{serial % 2}.npz"
 
     def save(
-        self,
-        estimator: Estimator,
-        if_changed: bool = False,
-        notes: Mapping[str, Any] | None = None,
+        self, estimator: Estimator, if_changed: bool = False, notes: Mapping[str, Any] | None = None
     ) -> Path:
         """Replace the older one; OSError where the disk does not take it.
 

@@ -15,12 +15,7 @@ from rtid.maps.files import formats
 from rtid.model import Axes
 from rtid.plain import FloatArray
 from rtid.tell.axes import axes_of, labels
-from rtid.tell.charts.maps import (
-    change_plane,
-    flow_plane,
-    interval_plane,
-    slice_panel,
-)
+from rtid.tell.charts.maps import change_plane, flow_plane, interval_plane, slice_panel
 from rtid.tell.charts.theme import beside
 from rtid.tell.html import choice, select, table, text
 from rtid.tell.live import PanelPlot, PlanePlot

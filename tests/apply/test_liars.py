@@ -288,8 +288,7 @@ def test_an_old_receiver_is_not_verified(
 
 
 def test_an_order_that_was_not_confirmed_is_verified_before_it_is_settled(
-    copied: tuple[Path, dict[int, dict[int, bytes]]],
-    monkeypatch: pytest.MonkeyPatch,
+    copied: tuple[Path, dict[int, dict[int, bytes]]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path, images = copied
 

@@ -30,15 +30,7 @@ from rtid.project.schema import ControllerSection
 from rtid.study.study import Study
 from tests.command import ends
 from tests.replays import shared_replays  # noqa: F401
-from tests.tracking_machines import (
-    KP_1PS,
-    Tried,
-    follow,
-    logged,
-    machine,
-    path,
-    rms_m,
-)
+from tests.tracking_machines import KP_1PS, Tried, follow, logged, machine, path, rms_m
 
 SECTION = ControllerSection(kp_per_s=KP_1PS, reference="x_ref")
 SECONDS = 8.0

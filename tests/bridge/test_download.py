@@ -12,15 +12,7 @@ from firmware_bridge import protocol
 from firmware_bridge.download import DownloadError, Session, download
 from firmware_bridge.protocol import Op
 from tests.bridge.controller import Controller, Line
-from tests.bridge.downloads import (
-    IS_NEW,
-    IS_OLD,
-    NEW,
-    SPOILS,
-    begun,
-    losing,
-    state,
-)
+from tests.bridge.downloads import IS_NEW, IS_OLD, NEW, SPOILS, begun, losing, state
 
 
 @pytest.mark.parametrize("name", SPOILS)

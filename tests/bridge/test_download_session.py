@@ -8,17 +8,7 @@ from firmware_bridge import lookup, protocol
 from firmware_bridge.download import DownloadError, Image, Session, UnconfirmedError, download
 from firmware_bridge.protocol import Op, Reason
 from tests.bridge.controller import Line
-from tests.bridge.downloads import (
-    IS_NEW,
-    IS_OLD,
-    NEW,
-    OLD,
-    asked,
-    begun,
-    is_active,
-    put,
-    state,
-)
+from tests.bridge.downloads import IS_NEW, IS_OLD, NEW, OLD, asked, begun, is_active, put, state
 from tests.bridge.tables import a_table
 
 

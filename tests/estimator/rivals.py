@@ -96,11 +96,7 @@ class Filterpy:
         self.filter.update(y, H=phi[None, :])
 
 
-RIVALS: dict[str, type[Recursion]] = {
-    "plain RLS": Plain,
-    "padasip": Padasip,
-    "filterpy": Filterpy,
-}
+RIVALS: dict[str, type[Recursion]] = {"plain RLS": Plain, "padasip": Padasip, "filterpy": Filterpy}
 
 
 def unknown() -> tuple[FloatArray, FloatArray]:

@@ -170,8 +170,7 @@ def test_progress_ends_at_one(progress: dict[Key, list[tuple[float, str]]]) -> N
 
 
 @pytest.mark.xfail(
-    strict=True,
-    reason="known at its mean working point, which moves on: falls by up to 0.38",
+    strict=True, reason="known at its mean working point, which moves on: falls by up to 0.38"
 )
 def test_progress_of_a_block_that_is_learned_never_falls(
     progress: dict[Key, list[tuple[float, str]]],

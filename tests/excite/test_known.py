@@ -75,10 +75,7 @@ def test_a_prior_is_known_to_its_share_and_tells_nothing_of_other_edges(tmp_path
 
 def test_the_nominal_machine_has_the_priors_map_where_nothing_is_learned(tmp_path: Path) -> None:
     project = with_map(tmp_path, 1.0, 10.0, "pa")
-    plain, prior = (
-        machine_of(project, section_of(project)),
-        find_prior(project),
-    )
+    plain, prior = (machine_of(project, section_of(project)), find_prior(project))
     found = machine_of(project, section_of(project), None, prior)
     n = int(np.prod(project.model.edges[0].grid.shape))
     truth = true_map(project, machine(NUMBER)).theta_cells()

@@ -64,10 +64,7 @@ def _failed_silently(figures: list[dict[str, object]]) -> dict[int, list[str]]:
 
 
 def _of(
-    row: int,
-    figures: list[dict[str, object]],
-    passed: dict[str, list[bool]],
-    failed: list[str],
+    row: int, figures: list[dict[str, object]], passed: dict[str, list[bool]], failed: list[str]
 ) -> list[str]:
     """What is said of one row, each in the last four columns."""
     lines = list(failed)

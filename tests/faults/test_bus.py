@@ -34,11 +34,7 @@ class Scripted(LiveSource[Frames]):
     """
 
     def __init__(
-        self,
-        frames: Frames,
-        down_s: tuple[float, float],
-        hang_s: float = 1e9,
-        speed: float = 1.0,
+        self, frames: Frames, down_s: tuple[float, float], hang_s: float = 1e9, speed: float = 1.0
     ) -> None:
         super().__init__(reopen_s=60.0)
         self._pieces = deque(frames.chunks(3 * CYCLES))

@@ -23,8 +23,7 @@ from tools.table_to_can import read_table
 
 # 30 cells per edge, of which the rig visits 22 to 29 with both edges together
 SMALL = Grid(
-    np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.5, 8.0]),
-    np.array([0.0, 0.5, 1.0, 2.0, 4.0, 8.0]) * 1e6,
+    np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.5, 8.0]), np.array([0.0, 0.5, 1.0, 2.0, 4.0, 8.0]) * 1e6
 )
 BLOCKS = 32
 EPS = float(np.finfo(float).eps)

@@ -10,14 +10,7 @@ import pytest
 
 from firmware_bridge import lookup
 from firmware_bridge.c_tables import BOARD
-from firmware_bridge.protocol import (
-    Op,
-    begin_frames,
-    commit_frame,
-    data_frame,
-    frame,
-    open_frame,
-)
+from firmware_bridge.protocol import Op, begin_frames, commit_frame, data_frame, frame, open_frame
 from firmware_bridge.sources import candump
 from rtid.mcu.emulated import Record, absent
 from rtid.mcu.write import write_sources

@@ -88,12 +88,7 @@ def test_the_whole_way_of_an_effect(worn: tuple[Path, Path]) -> None:
     desk.back(2)
     assert project.read_bytes() == untouched
     (line,) = re.findall(r"`(rtid undo[^`]*)` takes", desk.save().note)
-    assert shlex.split(line) == [
-        "rtid",
-        "undo",
-        "-p",
-        str(project),
-    ]
+    assert shlex.split(line) == ["rtid", "undo", "-p", str(project)]
     assert [a.key for a in load(project).sections.added] == [LEAK]
     assert [change.change for change in read(project)] == [ADD]
     desk.take_back()

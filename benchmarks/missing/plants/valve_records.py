@@ -42,12 +42,7 @@ class Simulated:
     flow: Callable[[str, ArrayLike, ArrayLike], FloatArray]
 
 
-def case_of(
-    simulated: Simulated,
-    seed: int,
-    effect: str,
-    **words: str | bool,
-) -> Case:
+def case_of(simulated: Simulated, seed: int, effect: str, **words: str | bool) -> Case:
     """The case; words: its name, simulator, law, motion, hidden, level and for_all."""
     plant = simulated.plant
     machine = declared_model(plant, seed=seed, grid=default_grid(1.25 * plant.p_supply_pa))

@@ -12,14 +12,7 @@ from typing import Any
 
 import numpy as np
 from bokeh.layouts import column
-from bokeh.models import (
-    ColumnDataSource,
-    FixedTicker,
-    HoverTool,
-    Range1d,
-    TapTool,
-    UIElement,
-)
+from bokeh.models import ColumnDataSource, FixedTicker, HoverTool, Range1d, TapTool, UIElement
 from bokeh.palettes import Blues9, interp_palette
 from bokeh.plotting import figure
 

@@ -6,13 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from bokeh.events import SelectionGeometry
-from bokeh.models import (
-    BoxSelectTool,
-    BoxZoomTool,
-    ColumnDataSource,
-    Range1d,
-    WheelZoomTool,
-)
+from bokeh.models import BoxSelectTool, BoxZoomTool, ColumnDataSource, Range1d, WheelZoomTool
 from bokeh.plotting import figure
 
 from rtid.study.look import Look

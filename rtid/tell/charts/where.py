@@ -42,12 +42,7 @@ def residual_map(model: Machine, rows: Sequence[BlockRow]) -> Figure:
         label_outer(axes, *common_labels(model))
         scale = mpl.cm.ScalarMappable(norm, colours)
         bar = figure.colorbar(
-            scale,
-            ax=axes,
-            label=f"residual, {flow_name()} rms",
-            pad=0.015,
-            aspect=40,
-            extend="max",
+            scale, ax=axes, label=f"residual, {flow_name()} rms", pad=0.015, aspect=40, extend="max"
         )
         bar.outline.set_visible(False)
         _legend(figure, rows)
