@@ -28,13 +28,9 @@ from firmware_bridge.sources.text import BAD, ERROR, FD, NOTHING, OK, OTHER, REM
 LIKE = "'1) 1.5 Rx 0120 2 00 11'"
 HEAD_BYTES, SAMPLE_BYTES = 8192, 1 << 17
 COLUMNS = {
-    "1.0": b"NOILD",
-    "1.1": b"NOTILD",
-    "1.2": b"NOBTILD",
-    "1.3": b"NOBTIRLD",
-    "2.0": b"NOTIdlD",
+    "1.0": b"NOILD", "1.1": b"NOTILD", "1.2": b"NOBTILD", "1.3": b"NOBTIRLD", "2.0": b"NOTIdlD",
     "2.1": b"NOTBIdRLD",
-}
+}  # fmt: skip
 KNOWN = re.compile(rb"[NOTBIdR]*[lL]D")
 DAY_ZERO = datetime.datetime(1899, 12, 30, tzinfo=datetime.UTC)
 

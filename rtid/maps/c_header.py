@@ -27,13 +27,9 @@ from rtid.trace.state_files import replacing
 
 SUFFIX = ".h"
 BESIDE = (
-    "rtid_map.h",
-    "rtid_map.c",
-    "rtid_map_fixed.h",
-    "rtid_map_fixed.c",
-    "rtid_map_search.h",
+    "rtid_map.h", "rtid_map.c", "rtid_map_fixed.h", "rtid_map_fixed.c", "rtid_map_search.h",
     "rtid_version.h",
-)
+)  # fmt: skip
 MICROVOLT, ROOT, FLOW = 1e6, 64.0, 1e9 * 65_536  # units of the fixed tables
 INT32_MAX = 2**31 - 1
 WIDTH, PREFIX = 100, "rtid_edge_"

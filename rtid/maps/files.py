@@ -274,11 +274,6 @@ def _read_npz(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
 
 WRITERS: dict[str, Writer] = {".csv": _write_csv, ".json": _write_json, ".npz": _write_npz}
 TABLE_WRITERS: dict[str, Callable[[Path, Tables, Mapping[str, Any]], None]] = {
-    ".mat": write_mat,
-    ".m": write_m,
-    ".dcm": write_dcm,
-    ".cdfx": write_cdfx,
-    ".a2l": write_a2l,
-    ".mo": write_mo,
-    ".st": write_st,
-}
+    ".mat": write_mat, ".m": write_m, ".dcm": write_dcm, ".cdfx": write_cdfx, ".a2l": write_a2l,
+    ".mo": write_mo, ".st": write_st,
+}  # fmt: skip

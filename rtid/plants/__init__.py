@@ -16,15 +16,6 @@ from rtid.plants.plant import (
 )
 
 __all__ = [
-    "Input",
-    "Output",
-    "Plant",
-    "PlantDiagnosis",
-    "PlantError",
-    "PlantModel",
-    "PlantParameter",
-    "PlantRecord",
-    "PlantState",
-    "diagnose",
-    "refit",
-]
+    "Input", "Output", "Plant", "PlantDiagnosis", "PlantError", "PlantModel", "PlantParameter",
+    "PlantRecord", "PlantState", "diagnose", "refit",
+]  # fmt: skip

@@ -205,14 +205,9 @@ def _play(plant: Plant, _page: Effect, where: str, by: dict[str, Node]) -> Plant
 
 
 _BUILD: dict[str, Callable[..., Plant]] = {
-    "rate": _rate,
-    "flow": _flow,
-    "force": _force,
-    "map": _map,
-    "lag": _lag,
-    "delay": _delay,
+    "rate": _rate, "flow": _flow, "force": _force, "map": _map, "lag": _lag, "delay": _delay,
     "play": _play,
-}
+}  # fmt: skip
 
 
 def _input(plant: Plant, where: str) -> Input:

@@ -112,13 +112,7 @@ class FitProblem:
         inset = 1e-9 * np.maximum(1.0, np.abs(at))  # scipy wants a start inside
         at = np.clip(at, low + inset, high - inset)
         done = least_squares(
-            self.error,
-            at,
-            self.one_sided,
-            (low, high),
-            x_scale="jac",
-            max_nfev=most,
-            ftol=tolerance,
-            xtol=1e-8,
-        )
+            self.error, at, self.one_sided, (low, high), x_scale="jac", max_nfev=most,
+            ftol=tolerance, xtol=1e-8,
+        )  # fmt: skip
         return self.full(done.x), float(done.cost)

@@ -167,16 +167,7 @@ def run(plant: SimulatedPlant, known: Knowledge, reference: FloatArray, seed: in
     y = at_rest(plant, drive[0], float(reference[0, 0]), OFF_SIDE_PA)
     record = np.empty((n, 15))
     energy_j = track(
-        machine_of(plant),
-        parts_of(plant.extra),
-        law,
-        known.maps,
-        known.may_regenerate,
-        reference,
-        drive,
-        noise,
-        sensors.resolution(),
-        y,
-        record,
-    )
+        machine_of(plant), parts_of(plant.extra), law, known.maps, known.may_regenerate, reference,
+        drive, noise, sensors.resolution(), y, record,
+    )  # fmt: skip
     return Tracked(record[:, 0], record[:, 3:10], record[:, 10:], record[:, 1:3], float(energy_j))

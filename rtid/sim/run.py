@@ -21,22 +21,9 @@ from rtid.sim.sensing import EXACT, NAMES, P_A, P_B, P_S, P_T, Sensors, U, V, X,
 from rtid.sim.simulated_plant import EDGES, SimulatedPlant
 
 __all__ = [
-    "EXACT",
-    "NAMES",
-    "P_A",
-    "P_B",
-    "P_S",
-    "P_T",
-    "PlantChange",
-    "Run",
-    "Sensors",
-    "SimulationError",
-    "Truth",
-    "U",
-    "V",
-    "X",
-    "simulate",
-]
+    "EXACT", "NAMES", "P_A", "P_B", "P_S", "P_T", "PlantChange", "Run", "Sensors",
+    "SimulationError", "Truth", "U", "V", "X", "simulate",
+]  # fmt: skip
 
 
 START_SHARE = 0.3  # of the supply pressure in chamber B
@@ -173,13 +160,9 @@ def _integrate(
     signals[:, P_S], signals[:, P_T] = record.nodes_pa[:, 0], drive[:-1, P_TANK]
     x_ref_m = drive[:-1, X_REF]
     truth = Truth(
-        signals,
-        record.opening_v,
-        record.flow_m3s,
-        x_ref_m,
-        record.nodes_pa[:, 1:],
+        signals, record.opening_v, record.flow_m3s, x_ref_m, record.nodes_pa[:, 1:],
         record.extra_m3s,
-    )
+    )  # fmt: skip
     return truth, record.x_measured_m
 
 

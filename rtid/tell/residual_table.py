@@ -128,10 +128,6 @@ def _mat(path: Path, columns: Columns) -> None:
 
     named = {re.sub(r"\W", "_", name): value(column) for name, column in columns.items()}
     savemat(
-        str(path),
-        named,
-        appendmat=False,
-        long_field_names=True,
-        do_compression=True,
+        str(path), named, appendmat=False, long_field_names=True, do_compression=True,
         oned_as="column",
-    )
+    )  # fmt: skip

@@ -40,14 +40,9 @@ MESSAGES = {  # name: PGN, bytes, signals with their first bit, factor, offset a
     ),
 }  # fmt: skip
 COLUMNS = {
-    "U": "u",
-    "PTank": "p_tank",
-    "X": "x",
-    "V": "v",
-    "PA": "p_a",
-    "PB": "p_b",
+    "U": "u", "PTank": "p_tank", "X": "x", "V": "v", "PA": "p_a", "PB": "p_b",
     "PSupply": "p_supply",
-}
+}  # fmt: skip
 
 
 def dbc(path: Path, plain: bool = False) -> Path:

@@ -133,16 +133,8 @@ def in_turn(tmp_path: Path, rows: dict[int, str]) -> tuple[list[int], list[list[
 def test_rows_that_tell_signals_in_turn(tmp_path: Path) -> None:
     """A pressure on the line to its next, a command by its mean up to the next row."""
     rows = {
-        0: ",0,2",
-        2: ",2,",
-        3: ",,4",
-        4: "4,,",
-        6: ",6,",
-        7: ",,8",
-        8: "8,,",
-        9: ",9,",
-        10: ",,9",
-    }
+        0: ",0,2", 2: ",2,", 3: ",,4", 4: "4,,", 6: ",6,", 7: ",,8", 8: "8,,", 9: ",9,", 10: ",,9",
+    }  # fmt: skip
     assert in_turn(tmp_path, rows) == ([4, 8], [[4, 4, 5], [8, 8, 8.0]])
 
 

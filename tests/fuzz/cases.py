@@ -249,11 +249,6 @@ def _bomb(_seeds: Seeds, rng: random.Random, folder: Path) -> Made:
 
 
 _MAKERS: dict[str, Callable[[Seeds, random.Random, Path], Made]] = {
-    "projects": _project,
-    "dbcs": _dbc,
-    "nodes": _nodes,
-    "logs": _log,
-    "tables": _table,
-    "plants": _plant,
-    "bombs": _bomb,
-}
+    "projects": _project, "dbcs": _dbc, "nodes": _nodes, "logs": _log, "tables": _table,
+    "plants": _plant, "bombs": _bomb,
+}  # fmt: skip

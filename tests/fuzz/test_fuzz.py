@@ -8,21 +8,9 @@ import sys
 from pathlib import Path
 
 SIZES = (
-    "--projects",
-    "16",
-    "--dbcs",
-    "12",
-    "--nodes",
-    "8",
-    "--logs",
-    "30",
-    "--tables",
-    "24",
-    "--plants",
-    "10",
-    "--bombs",
-    "0",
-)
+    "--projects", "16", "--dbcs", "12", "--nodes", "8", "--logs", "30", "--tables", "24",
+    "--plants", "10", "--bombs", "0",
+)  # fmt: skip
 
 
 def test_a_sample_of_the_fuzz_finds_nothing(tmp_path: Path) -> None:
