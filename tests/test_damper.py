@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,19 +17,11 @@ from rtid.project import ProjectError, load
 from rtid.study.quick_rate import QuickRate, quick_rate
 from rtid.study.study import Study
 from rtid.trace.quick_source import open_source
-from rtid.units import show_flow_as
 from tests.replays import shared_replays  # noqa: F401
 from tests.test_rate import said
 
 STRANGERS = Path(__file__).parents[2] / "shared/data/strangers"
 HZ = 200.0
-
-
-@pytest.fixture(autouse=True)
-def _shown_as_flows() -> Any:
-    """Another test's machine is hydraulic."""
-    yield
-    show_flow_as("m3/s")
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,20 +22,12 @@ from rtid.study.quick_rate import QuickRate, quick_rate
 from rtid.study.study import Study
 from rtid.trace.quick_source import open_source
 from rtid.trace.reading import read_trace
-from rtid.units import show_flow_as
 from tests.replays import shared_replays  # noqa: F401
 from tests.test_rate import said
 
 STRANGERS = Path(__file__).parents[2] / "shared/data/strangers"
 FULL, HZ, GRAVITY = 65535.0, 500.0, 9.80665
 SEEDS = 0, pytest.param(1, marks=pytest.mark.long)
-
-
-@pytest.fixture(autouse=True)
-def _shown_as_flows() -> Any:
-    """Another test's machine is hydraulic."""
-    yield
-    show_flow_as("m3/s")
 
 
 @dataclass(frozen=True)
@@ -277,9 +268,7 @@ def test_a_gain_that_drifts_is_followed_on_board(tmp_path: Path) -> None:
     assert errors[0] < 0.02 and errors[1] > 2.0 * errors[0]
 
 
-def test_the_sum_is_that_of_the_whole_whatever_the_pieces(
-    flown: tuple[Rotors, Path, Path],
-) -> None:
+def test_the_sum_is_that_of_the_whole_whatever_the_pieces(flown: tuple[Rotors, Path, Path]) -> None:
     """Live samples come in pieces: the running sum is the same to the bit."""
     _, table, project = flown
     loaded = load(project)

@@ -22,7 +22,6 @@ from rtid.study.quick import quick
 from rtid.study.quick_rate import QuickRate
 from rtid.study.study import Study
 from rtid.trace.reading import read_trace
-from rtid.units import show_flow_as
 from tests.replays import shared_replays  # noqa: F401
 from tests.test_rate import said
 
@@ -31,13 +30,6 @@ HZ = 100.0
 COULOMB, PRESSED, VISCOUS = (
     "coulomb_on_output", "coulomb_on_output_over_pressure", "viscous_on_output",
 )  # fmt: skip
-
-
-@pytest.fixture(autouse=True)
-def _shown_as_flows() -> Any:
-    """Another test's machine is hydraulic."""
-    yield
-    show_flow_as("m3/s")
 
 
 @dataclass(frozen=True)

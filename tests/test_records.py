@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,19 +17,11 @@ from rtid.study.quick import quick
 from rtid.study.quick_rate import QuickRate
 from rtid.study.state_run import run_error
 from rtid.study.study import Study
-from rtid.units import show_flow_as
 from tests.replays import shared_replays  # noqa: F401
 from tests.test_rate import Crane, said
 
 STRANGERS = Path(__file__).parents[2] / "shared/data/strangers"
 SESSIONS = "manual_1016_1735", "manual_1016_1720", "manual_mitch_1101_2319", "manual_ol_1006_1648"
-
-
-@pytest.fixture(autouse=True)
-def _shown_as_flows() -> Any:
-    """Another test's machine is hydraulic."""
-    yield
-    show_flow_as("m3/s")
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,6 @@ from rtid.maps.pedals import CELLS, pedal_table
 from rtid.model import Grid
 from rtid.plain import FloatArray
 from rtid.study.study import Study
-from rtid.units import show_flow_as
 from tests.replays import shared_replays  # noqa: F401
 from tests.test_rate import said
 
@@ -66,13 +65,6 @@ rows_per_s = 30
 max_gap_ms = 200
 max_sd_share = 0.03
 """
-
-
-@pytest.fixture(autouse=True)
-def _shown_as_flows() -> Any:
-    """Another test's machine is hydraulic."""
-    yield
-    show_flow_as("m3/s")
 
 
 @dataclass(frozen=True)
