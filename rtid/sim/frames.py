@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from firmware_bridge import e2e
 from firmware_bridge.catalog import Catalog
+from firmware_bridge.encode import encode_message
 from firmware_bridge.frames import Frames, by_time, concatenate
-from firmware_bridge.frames import empty as empty_frames
 from rtid.plain import FloatArray, IntArray
 
 FRAME_US = 130  # 8 data bytes at 1 Mbit/s with stuff bits
@@ -129,28 +129,10 @@ def message_frames(
     counter: IntArray,
 ) -> Frames:
     """n frames of one message at t_us (n,); signals without a route are zero."""
-    names = [signal.name for signal in catalog.message(message).signals]
-    source = catalog.message_source(message)
-    values = np.zeros((len(t_us), len(names)))
-    for name, route in routes.items():
-        if route.message == message:
-            catalog.signal(message, route.signal)  # an unknown one is named, with the nearest
-            values[:, names.index(route.signal)] = route.factor * columns[name]
-    if source.counter:
-        size = 1 << catalog.signal(message, source.counter).length
-        values[:, names.index(source.counter)] = counter % size
-    frames = empty_frames(len(t_us))
-    frames.t_us[:], frames.can_id[:] = t_us, catalog.can_id(message)
-    frames.length[:] = catalog.message(message).length
-    layouts = catalog.layouts(message, names)
-    frames.data[:] = layouts.encode(values)
-    if source.crc:
-        row = layouts.rows[names.index(source.crc)]
-        crc_byte = 7 - int(row["shift"]) // 8 if row["big_endian"] else int(row["shift"]) // 8
-        length = catalog.message(message).length
-        crc = e2e.crc8_bulk(frames.data, length, crc_byte, source.data_id)
-        frames.data[:, crc_byte] = crc
-    return frames
+    values: dict[str, Any] = dict.fromkeys((s.name for s in catalog.message(message).signals), 0.0)
+    mine = {name: route for name, route in routes.items() if route.message == message}
+    values |= {route.signal: route.factor * columns[name] for name, route in mine.items()}
+    return encode_message(catalog, message, t_us, values, counter)
 
 
 def _task_instants_us(
