@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -35,7 +34,7 @@ from rtid.apply.versions import DONE, UNCONFIRMED, UNVERIFIED, Applied, VersionR
 from rtid.apply.wish import Wish, chunk_of, wished
 from rtid.project import Project, load
 from rtid.project.folder import state_folder
-from rtid.trace.state_files import create
+from rtid.trace.state_files import locked
 
 ANY_ROOM = Accepts(1, 16, 2 * 255, 0xFFFF)
 LOCK = "apply.lock"
@@ -109,7 +108,9 @@ def apply_map(
     reach.check(project)
     folder = wish.state or state_folder(project)
     applied = Applied(folder)
-    with _alone(folder):
+    folder.mkdir(parents=True, exist_ok=True)
+    under_way = ApplyError(f"{folder}: another apply is under way", "wait for its end")
+    with locked(folder / LOCK, under_way):
         if wish.dry_run:
             plan = _plan(
                 project, folder, wish, applied, _by_the_records(project, applied), ANY_ROOM
@@ -256,15 +257,3 @@ def _undone(applied: Applied, content: int | None) -> tuple[Prepared, str, dict[
         )
     why = f"Undo: the map of version {before} in place of that of version {content}."
     return stored(applied, before), why, {"undo_of": content}
-
-
-@contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """One apply at a time from this folder."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with create(folder / LOCK) as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise ApplyError(f"{folder}: another apply is under way", "wait for its end") from None
-        yield

@@ -10,7 +10,6 @@ diagnoser      a process per diagnosis, and per question to the coach
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import signal
 import time
 import traceback
@@ -24,6 +23,7 @@ from firmware_bridge import frames as fr
 from firmware_bridge.sources import candump
 from firmware_bridge.sources.live import Source
 from rtid.apply.answers import answers_of
+from rtid.apply.reach import LOCK_FILE
 from rtid.daemon import realtime
 from rtid.daemon.coaching import Coaching
 from rtid.daemon.core import Core
@@ -43,10 +43,9 @@ from rtid.study.on_board import on_board
 from rtid.trace.described import catalog_of
 from rtid.trace.learner import Learner
 from rtid.trace.snapshot import Generations
-from rtid.trace.state_files import create
+from rtid.trace.state_files import locked
 
 ANALYST = "rtid.daemon.analyst"
-LOCK_FILE = "lock"
 
 
 class DaemonError(RtidError):
@@ -114,7 +113,8 @@ class Daemon:
         realtime.share_arenas()
         folder = self._folder
         folder.mkdir(parents=True, exist_ok=True)
-        with _locked(folder / LOCK_FILE):
+        other = f"{folder}: another daemon keeps its state here"
+        with locked(folder / LOCK_FILE, DaemonError(other, "stop it, or name a folder")):
             learner = compiled(self._learner)
             restored = self._restore(learner)
             words, priority = [str(self._project.path), str(folder)], self._priority
@@ -242,19 +242,6 @@ def _until(
         return tick(now_ns)
 
     return timed
-
-
-@contextlib.contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    """Only one daemon per state folder."""
-    with create(path) as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise DaemonError(
-                f"{path.parent}: another daemon keeps its state here", "stop it, or name a folder"
-            ) from None
-        yield
 
 
 @contextlib.contextmanager

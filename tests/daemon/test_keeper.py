@@ -20,7 +20,6 @@ from rtid.daemon import jobs
 from rtid.daemon.acceptance import FILE, Acceptance, ask
 from rtid.daemon.collector import LagMeter, ScopeKeeper
 from rtid.daemon.core import Core
-from rtid.daemon.daemon import _locked
 from rtid.daemon.health import Health
 from rtid.daemon.keeper import BEGINS_S, Keeper
 from rtid.daemon.loop import Loop
@@ -28,6 +27,7 @@ from rtid.daemon.status import Advice, read, write
 from rtid.daemon.teller import Facts
 from rtid.estimator.estimator import Estimator
 from rtid.trace.snapshot import Generations
+from rtid.trace.state_files import locked
 from tests.faults.harness import machine
 
 REQUEST = Acceptance(1e9, "an engineer", "new hoses")
@@ -265,7 +265,7 @@ def test_nothing_in_place_of_a_snapshot_stops_a_start(what: str, tmp_path: Path)
 @pytest.mark.parametrize("what", [k for k in KINDS if k != "unreadable"])
 def test_no_lock_is_waited_for_or_written_through(what: str, tmp_path: Path) -> None:
     laid(tmp_path / "lock", what)
-    with pytest.raises(OSError, match="lock"), _locked(tmp_path / "lock"):
+    with pytest.raises(OSError, match="lock"), locked(tmp_path / "lock", RuntimeError("held")):
         pytest.fail("locked what is no file")
     is_running(tmp_path)
     assert not (tmp_path / "nowhere").exists()
