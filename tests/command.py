@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import io
+import json
 import subprocess
 from contextlib import redirect_stderr, redirect_stdout
+from typing import Any
 
 import pytest
 import typer
 from typer.testing import CliRunner
 
 from rtid.cli import main
+from rtid.cli.exits import Exit
 
 
 def ends(*words: object) -> int:
@@ -26,6 +29,13 @@ def said(*words: object) -> tuple[int, str, str]:
     with redirect_stdout(out), redirect_stderr(err):
         code = ends(*words)
     return code, out.getvalue(), err.getvalue()
+
+
+def in_json(*words: object, code: int = Exit.OK) -> Any:
+    """What a command with --json says that ends with this code."""
+    ended, out, err = said(*words, "--json")
+    assert ended == code, err
+    return json.loads(out)
 
 
 def output_of(app: typer.Typer, *words: object) -> str:

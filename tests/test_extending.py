@@ -27,7 +27,7 @@ from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import SimulatedPlant
 from rtid.study import kept
 from rtid.study.on_board import on_board
-from tests.command import ends
+from tests.command import ends, in_json
 from tests.replays import shared_replays  # noqa: F401
 
 PAGE = Path(__file__).parents[1] / "docs" / "extending.md"
@@ -78,15 +78,13 @@ def test_own_effects_are_scored_named_added_dropped_and_run_on_board(
     leaking: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = project(leaking, tmp_path, GAP + snippet("toml", "[effects.worn_groove]"))
-    assert ends("diagnose", leaking, "-p", file, "--json") == Exit.OK
-    said = json.loads(capsys.readouterr().out)
+    said = in_json("diagnose", leaking, "-p", file)
     first = said["found"][0]
     assert {first["effect"], *first["cannot_be_told_from"]} >= {"gap", "internal_leakage_laminar"}
     assert first["where"] == "a-b"
     seen = {(u["effect"], u["where"]) for u in said["not_found"]}
     assert ("worn_groove", "a-b") in seen or "worn_groove" in first["cannot_be_told_from"]
-    assert ends("add", "gap", leaking, "-p", file, "--json") == Exit.OK
-    done = json.loads(capsys.readouterr().out)
+    done = in_json("add", "gap", leaking, "-p", file)
     assert [(c["effect"], c["where"]) for c in done["changes"]] == [("gap", "a-b")]
     words = "add", "worn_groove", leaking, "-p", file, "--force", "--json"
     assert ends(*words) == Exit.OK, capsys.readouterr().err
@@ -169,8 +167,7 @@ def test_a_plug_in_may_define_its_effects_in_python(
     try:
         assert ends("effects", "worn_groove") == Exit.OK
         assert "Leaks beyond x0." in capsys.readouterr().out
-        assert ends("effects", "--json") == Exit.OK
-        listed = {e["name"]: e for e in json.loads(capsys.readouterr().out)["effects"]}
+        listed = {e["name"]: e for e in in_json("effects")["effects"]}
     finally:
         catalogue.cache_clear()
     assert listed["worn_groove"]["into"] == [["a", -1], ["b", 1]]
@@ -373,12 +370,11 @@ def my_laws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def test_an_effect_with_a_law_of_ones_own_goes_the_whole_way(
-    leaking: Path, tmp_path: Path, my_laws: Path, capsys: pytest.CaptureFixture[str]
+    leaking: Path, tmp_path: Path, my_laws: Path
 ) -> None:
     """Its equation is words for a reader: no command takes it for a law that it cannot read."""
     file = project(leaking, tmp_path, "")
-    assert ends("diagnose", leaking, "-p", file, "--json") == Exit.OK
-    said = json.loads(capsys.readouterr().out)
+    said = in_json("diagnose", leaking, "-p", file)
     seen = {u["effect"] for u in said["not_found"]}
     assert "slow_gap" in seen | {n for f in said["found"] for n in f["cannot_be_told_from"]}
     assert ends("add", "slow_gap", leaking, "-p", file, "--force") == Exit.OK

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +32,7 @@ from rtid.plants.validation import on_record, rms
 from rtid.project.errors import ProjectError
 from rtid.project.plant_file import load_plant
 from rtid.study.refit import load_records
-from tests.command import ends
+from tests.command import ends, in_json
 from tests.eighty import eighty  # noqa: F401
 
 EXAMPLE = Path(__file__).parents[1] / "rtid" / "project" / "examples" / "cascaded_tanks.toml"
@@ -356,8 +355,7 @@ def test_a_record_is_cut_where_the_file_says(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("eighty")
 def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     plant, path = map(str, table(tmp_path))
-    assert ends("refit", plant, path, "--add", "dead_zone:u", "--json") == Exit.OK
-    found = json.loads(capsys.readouterr().out)
+    found = in_json("refit", plant, path, "--add", "dead_zone:u")
     assert found["effects"] == [{"effect": "dead_zone", "where": "u"}]
     value = {p["name"]: p for p in found["parameters"]}["dead_zone_u_threshold"]
     assert value["value"] == pytest.approx(0.5, abs=0.02) and value["unit"] == "V"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 from functools import cache
 from pathlib import Path
@@ -24,7 +23,7 @@ from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import SimulatedPlant
 from rtid.study.on_board import on_board
 from rtid.study.study import Study
-from tests.command import called, ends
+from tests.command import called, ends, in_json
 from tests.replays import shared_replays  # noqa: F401
 
 LEAK, TRUTH = "internal_leakage_laminar", 2e-12
@@ -37,11 +36,8 @@ def quick(*arguments: object) -> subprocess.CompletedProcess[str]:
 
 
 @cache
-def told(*arguments: object, code: int = Exit.OK) -> dict[str, Any]:
-    done = quick(*arguments, "--json")
-    assert done.returncode == code, done.stdout + done.stderr
-    found: dict[str, Any] = json.loads(done.stdout)
-    return found
+def told(*arguments: object) -> Any:
+    return in_json("quick", *arguments)
 
 
 @pytest.fixture(scope="module")

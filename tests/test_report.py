@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import re
 from dataclasses import replace
 from html import unescape
@@ -26,7 +25,7 @@ from rtid.tell.diagnosed import LIMITS_SAY, limits, sentences
 from rtid.tell.report import page, stills
 from rtid.tell.report_file import Reported, report
 from rtid.tell.report_story import ReportStory
-from tests.command import ends
+from tests.command import in_json
 from tests.replays import shared_replays  # noqa: F401
 
 SEED, DURATION_S = 3, 40.0
@@ -167,15 +166,12 @@ def test_every_effect_not_found_is_listed_once(leaking: Reported) -> None:
     assert all(size in words for u in unseen if u.visible for size in limits(u))
 
 
-def test_a_model_that_matches_and_its_history(
-    tmp_path: Path, leaking: Reported, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_model_that_matches_and_its_history(tmp_path: Path, leaking: Reported) -> None:
     trace, project = recorded(tmp_path, "")
     before = leaking.told.diagnosed.trace.path
     add(project, before, "internal_leakage_laminar", "a-b", reason="<worn> seal & more")
     assert added_parts(load(project))
-    assert ends("report", trace, "-p", project, "-o", tmp_path / "r.html", "--json") == 0
-    told = json.loads(capsys.readouterr().out)
+    told = in_json("report", trace, "-p", project, "-o", tmp_path / "r.html")
     _, words = read(tmp_path / "r.html")
     assert told["verdict"] == "matches"
     assert told["bytes"] == (tmp_path / "r.html").stat().st_size

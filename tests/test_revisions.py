@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from shutil import copy
@@ -28,7 +27,7 @@ from rtid.study.revisions import add, drop, undo
 from rtid.study.spans import parts
 from rtid.study.study import diagnose_trace
 from rtid.trace.reading import Trace, read_trace
-from tests.command import ends
+from tests.command import ends, in_json
 from tests.replays import shared_replays  # noqa: F401
 
 LEAK, WRONG = "internal_leakage_laminar", "position_sensor_delay"
@@ -64,8 +63,7 @@ def test_diagnose_add_matches_undo_and_named_again(
     project: Path, trace: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     old = project.read_bytes()
-    assert ends("add", trace, "--project", project, "--json") == Exit.OK
-    done = json.loads(capsys.readouterr().out)
+    done = in_json("add", trace, "--project", project)
     assert [(c["effect"], c["where"]) for c in done["changes"]] == [(LEAK, "a-b")]
     assert project.read_bytes().startswith(old), "what the user wrote stays, comments and all"
 
@@ -105,8 +103,7 @@ def test_diagnose_add_matches_undo_and_named_again(
     assert shares == pytest.approx([pair.before, pair.after], rel=1e-6)
 
     capsys.readouterr()
-    assert ends("history", "--project", project, "--json") == Exit.OK
-    told = json.loads(capsys.readouterr().out)["changes"]
+    told = in_json("history", "--project", project)["changes"]
     assert [c["change"] for c in told] == ["add", "undo"]
     assert told[1]["errors"]["heldout_pct"]["after"] == errors.heldout_pct.before
 

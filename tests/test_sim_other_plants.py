@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ from rtid.errors import RtidError
 from rtid.project.plant_file import load_plant
 from rtid.sim.other_plants import EXAMPLES, write_example
 from rtid.study.refit import Refitted, load_records, run
-from tests.command import ends
+from tests.command import ends, in_json
 
 
 def refitted(folder: Path, name: str, hide: bool, diagnose: bool) -> Refitted:
@@ -43,12 +42,9 @@ def test_what_is_hidden_is_found_and_the_error_falls(name: str, tmp_path: Path) 
     assert before > 3 * noise and after < 1.15 * noise
 
 
-def test_the_record_is_written_with_its_plant_file(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_record_is_written_with_its_plant_file(tmp_path: Path) -> None:
     table = tmp_path / "drive.csv"
-    assert ends("simulate", table, "--example", "electric_drive", "--json") == 0
-    told = json.loads(capsys.readouterr().out)
+    told = in_json("simulate", table, "--example", "electric_drive")
     assert told["hidden"][0]["effect"] == "coulomb_friction:w"
     assert told["files"] == [str(table), str(table.with_suffix(".toml"))]
     assert np.loadtxt(table, delimiter=",", skiprows=1).shape == (800, 3)

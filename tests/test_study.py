@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterator
 from dataclasses import replace
@@ -30,7 +29,7 @@ from rtid.study.seed import CLASSES
 from rtid.study.study import Study
 from rtid.tell.arrays import ArrayStudy
 from rtid.ui.desk import Desk
-from tests.command import ends
+from tests.command import in_json
 from tests.replays import shared_replays  # noqa: F401
 
 DURATION_S = 25.0
@@ -59,31 +58,26 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     kept._secret.cache_clear()
 
 
-def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> Any:
-    assert ends(*(*arguments, "--json")) == 0
-    return json.loads(capsys.readouterr().out)
-
-
 def files_of(folder: Path) -> list[Path]:
     return sorted((folder / kept.FOLDER).glob(f"*{kept.SUFFIX}"))
 
 
 def test_one_beta_and_one_rho_in_every_command(
-    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trace, project = folder / "clean.parquet", folder / "clean.toml"
-    diagnosis = call(capsys, "diagnose", trace, "-p", project)
-    replay = call(capsys, "replay", trace, "-p", project)
+    diagnosis = in_json("diagnose", trace, "-p", project)
+    replay = in_json("replay", trace, "-p", project)
     monkeypatch.setattr(studies, "fitted", None)  # from here on all is kept: nothing is fitted
     monkeypatch.setattr(studies, "replayed", None)
     monkeypatch.setattr(studies, "searched", None)
-    compare = call(capsys, "compare", trace, "-p", project)
+    compare = in_json("compare", trace, "-p", project)
     with monkeypatch.context() as blind:
         blind.setattr(studies, "read_trace", None)  # the maps are kept: the record is not read
-        call(capsys, "export", trace, folder / "map.json", "-p", project)
+        in_json("export", trace, folder / "map.json", "-p", project)
     origin = read_map(folder / "map.json")[1]
-    again = call(capsys, "diagnose", trace, "-p", project)
-    learned = call(capsys, "check", project, trace)["learned"]
+    again = in_json("diagnose", trace, "-p", project)
+    learned = in_json("check", project, trace)["learned"]
 
     assert again == diagnosis and diagnosis["verdict"] == "matches"
     beta = list(replay["beta_pa"].values())
@@ -108,12 +102,12 @@ def _edges(folder: Path) -> Any:
 
 
 def test_what_is_kept_may_be_deleted_damaged_or_foreign(
-    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trace, project = folder / "clean.parquet", folder / "clean.toml"
 
     def exported(*more: str) -> bytes:
-        call(capsys, "export", trace, folder / "again.json", "-p", project, *more)
+        in_json("export", trace, folder / "again.json", "-p", project, *more)
         return (folder / "again.json").read_bytes()
 
     first = exported()

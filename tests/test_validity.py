@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +14,7 @@ from rtid.estimator.validity import doubts, doubts_of_lag
 from rtid.sim.recording import write_run
 from rtid.sim.run import simulate
 from rtid.sim.simulated_plant import SimulatedPlant
-from tests.command import ends
+from tests.command import ends, in_json
 from tests.diagnose.records import record
 from tests.replays import shared_replays  # noqa: F401
 
@@ -35,8 +34,8 @@ def test_an_impossible_modulus_is_invalid_everywhere(
     narrow: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     project = narrow.with_suffix(".toml")
-    assert ends("replay", narrow, "-p", project, "--json") == Exit.NEGATIVE
-    invalid = [d["what"] for d in json.loads(capsys.readouterr().out)["doubts"] if d["is_invalid"]]
+    doubts = in_json("replay", narrow, "-p", project, code=Exit.NEGATIVE)["doubts"]
+    invalid = [doubt["what"] for doubt in doubts if doubt["is_invalid"]]
     assert invalid == ["beta_a", "beta_b"]
     out = tmp_path / "map.csv"
     assert ends("export", narrow, out, "-p", project) == Exit.NEGATIVE
@@ -45,8 +44,7 @@ def test_an_impossible_modulus_is_invalid_everywhere(
     assert not out.exists()
     assert ends("export", narrow, out, "-p", project, "--force") == Exit.OK and out.exists()
     capsys.readouterr()
-    assert ends("diagnose", narrow, "-p", project, "--json") == Exit.NEGATIVE
-    diagnosed = json.loads(capsys.readouterr().out)
+    diagnosed = in_json("diagnose", narrow, "-p", project, code=Exit.NEGATIVE)
     assert diagnosed["verdict"] != "matches" and diagnosed["doubts"][0]["is_invalid"]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from shutil import copy
@@ -21,7 +20,7 @@ from rtid.sim.simulated_plant import SimulatedPlant
 from rtid.study.revisions import add, without
 from rtid.study.study import Study
 from rtid.ui.desk import Desk
-from tests.command import ends
+from tests.command import ends, in_json
 from tests.diagnose.stops import STEP_S, against_the_stops
 from tests.replays import shared_replays  # noqa: F401
 
@@ -56,12 +55,9 @@ def project(recorded: Path, tmp_path: Path) -> Path:
     return Path(copy(recorded.with_suffix(".toml"), tmp_path / "machine.toml"))
 
 
-def test_a_zero_is_named_added_and_taken_back(
-    project: Path, recorded: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_zero_is_named_added_and_taken_back(project: Path, recorded: Path) -> None:
     old = project.read_bytes()
-    assert ends("add", recorded, "--project", project, "--json") == Exit.OK
-    done = json.loads(capsys.readouterr().out)
+    done = in_json("add", recorded, "--project", project)
     assert [(c["effect"], c["where"]) for c in done["changes"]] == [(ZERO, "p_b")]
     loaded = load(project)
     assert loaded.sections.zeros_pa["p_b"] == pytest.approx(BIAS, abs=2e3)

@@ -27,7 +27,7 @@ from tests.apply.neighbour import Neighbour, learned, loaded, neighbour, offer, 
 from tests.bridge.controller import Controller, Line
 from tests.bridge.downloads import SPOILS, damaging, losing
 from tests.bridge.tables import a_table
-from tests.command import ends
+from tests.command import ends, in_json
 from tests.eighty import eighty  # noqa: F401
 
 
@@ -394,8 +394,7 @@ def test_the_command(
         listed = capsys.readouterr().out.splitlines()
         assert "version 3, the maps of version 1: done, by " in listed[2]
         assert listed[3:] == [f"Next: rtid status {path}"]
-        assert ends("apply", path, "--log", "--json") == Exit.OK
-        assert [row["version"] for row in json.loads(capsys.readouterr().out)] == [1, 2, 3]
+        assert [row["version"] for row in in_json("apply", path, "--log")] == [1, 2, 3]
         assert ends(*call, "--yes") == Exit.NEGATIVE  # no offer
         assert "no map is offered" in capsys.readouterr().err
         assert ends("apply", path, "--bus", f"virtual:{there.channel}") == Exit.USAGE

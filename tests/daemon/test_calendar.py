@@ -31,7 +31,7 @@ from rtid.daemon.chronicle import DAY_S, FILE, Chronicle
 from rtid.daemon.jobs import Publication
 from rtid.errors import RtidError
 from rtid.estimator.flowmap import FlowMap
-from tests.command import ends
+from tests.command import ends, in_json
 from tests.daemon.test_parts import full_status
 
 NOW_S = 1.8e9
@@ -169,8 +169,7 @@ def test_the_command_says_it(
     ends(*words, "--note", "new oil")
     said = capsys.readouterr().out
     assert "bulk modulus a MPa" in said and "new oil" in said and "Next: " in said
-    ends(*words, "--json")
-    told = json.loads(capsys.readouterr().out)
+    told = in_json(*words)
     assert told["notes"][0]["text"] == "new oil" and told["rows"]
 
 

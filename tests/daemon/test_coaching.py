@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +19,7 @@ from rtid.excite import library
 from rtid.project import Project, load
 from rtid.sim.run import simulate
 from rtid.trace.snapshot import Generations
-from tests.command import ends
+from tests.command import in_json
 from tests.excite.machines import machine, write_project
 from tests.replays import shared_replays  # noqa: F401
 
@@ -88,10 +87,7 @@ def test_the_coach_is_asked_once_there_is_a_snapshot_and_now_and_then(
 @pytest.mark.long
 @pytest.mark.slow
 def test_the_coach_says_what_excite_after_the_same_snapshot_says(
-    project: Project,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    project: Project, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(library, "PACES", (0.3, 0.5))
     monkeypatch.setattr(library, "SWINGS", ((0.65, 1.0),))
@@ -106,8 +102,7 @@ def test_the_coach_says_what_excite_after_the_same_snapshot_says(
     assert advice.blocks and set(advice.blocks) <= {edge.name for edge in project.model.edges}
     assert f"{LEAK} (a)" in advice.effects
     assert 0 < len(advice.segments) <= 3
-    ends("excite", "-p", project.path, "--after", snapshot, "--no-compare", "--json")
-    found = json.loads(capsys.readouterr().out)
+    found = in_json("excite", "-p", project.path, "--after", snapshot, "--no-compare")
     worth, tried = found["segments_worth_running"], found["segments_tried"]
     assert f"{worth} of {tried} pieces" in advice.text
 

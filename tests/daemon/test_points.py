@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -17,7 +16,7 @@ from rtid.sim.simulated_plant import SimulatedPlant
 from rtid.trace import points
 from rtid.trace.points import MOST_POINTS, KeptPoint, points_of, surplus
 from rtid.trace.snapshot import WATCH_FILE, Generations, save
-from tests.command import ends
+from tests.command import ends, in_json
 from tests.faults.harness import machine
 
 DAY_S = 86_400.0
@@ -161,8 +160,7 @@ def test_a_point_is_gone_back_to(tmp_path: Path, capsys: pytest.CaptureFixture[s
     estimator.turns = 2
     generations.save(estimator)
     (generations.folder / WATCH_FILE).write_text("{}")
-    assert ends("history", "-p", str(path), "--json") == 0
-    (told,) = json.loads(capsys.readouterr().out)["points"]
+    (told,) = in_json("history", "-p", str(path))["points"]
     assert (
         told["name"] == point.stem and told["reason"] == "publish" and told["key"] == project.digest
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,7 +26,7 @@ from rtid.sim.declare import declared_model
 from rtid.sim.run import EXACT, P_A, P_B, U, X, simulate
 from rtid.sim.simulated_plant import SimulatedPlant
 from rtid.trace.snapshot import save
-from tests.command import ends
+from tests.command import ends, in_json
 from tests.eighty import eighty  # noqa: F401
 from tests.excite.machines import machine, motion, motion_of, write_project
 from tests.replays import shared_replays  # noqa: F401
@@ -92,8 +91,7 @@ def test_a_design_from_the_file_to_the_true_machine(
     project, table = write_project(tmp_path, plant, NUMBER), tmp_path / "motion.csv"
     asked = ["excite", "-p", str(project), "--duration-s", "25", "--see", EXCITE, "--no-compare"]
     picture = tmp_path / "motion.svg"
-    assert ends(*asked, "--out", table, "--picture", picture, "--json") == 0
-    told = json.loads(capsys.readouterr().out)
+    told = in_json(*asked, "--out", table, "--picture", picture)
     assert all(e["is_kept"] for e in told["extremes"])
     assert picture.stat().st_size > 10_000
     true = simulate(plant, motion_of(table), 1, told["duration_s"])
@@ -117,8 +115,7 @@ def test_a_design_from_the_file_to_the_true_machine(
     assert ends(*asked, "--after", snapshot) == 0, "segments are left that are worth running"
     again = " ".join(capsys.readouterr().out.split())
     assert all(word in again for word in ("median", "±", "largest", "L/min/MPa"))
-    ends(*asked, "--after", snapshot, "--json")
-    again = json.loads(capsys.readouterr().out)
+    again = in_json(*asked, "--after", snapshot)
     assert 0 < again["segments_worth_running"] <= again["segments_tried"]
 
 

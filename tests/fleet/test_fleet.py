@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from functools import reduce
 from operator import add
 from pathlib import Path
@@ -32,7 +31,7 @@ from rtid.plain import FloatArray
 from rtid.project import load
 from rtid.tell.fleet import tell
 from rtid.trace.reading import read_trace
-from tests.command import ends
+from tests.command import ends, in_json
 from tests.eighty import eighty  # noqa: F401
 from tests.fleet.conftest import MACHINES, WORN
 
@@ -220,8 +219,7 @@ def test_the_command_ranks_the_machines_and_writes_what_others_read(
     for found in outcomes:
         is_diagnosed = found.job.machine == WORN and found.job.trace.stem == "day0"
         archive.keep(outcome(found.job, True) if is_diagnosed else found)
-    assert ends("fleet", traces / "traces", "-p", project, "-o", out, "--json") == 0
-    told = json.loads(capsys.readouterr().out)
+    told = in_json("fleet", traces / "traces", "-p", project, "-o", out)
     tell(told, out)
     assert "beta, MPa" in capsys.readouterr().out
     assert told["traces"] == 8 and told["errors"] == []
