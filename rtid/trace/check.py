@@ -30,7 +30,7 @@ GAP_SHARE = 1e-3  # of the steps
 MISSING_SHARE = 0.01  # of the time, however few the gaps are
 OUT_OF_RANGE_SHARE = 1e-3
 OUTSIDE_GRID_SHARE = 0.02
-MIN_T = 8.0  # of the rough bulk modulus, before its sign is believed
+MIN_T = 6.0  # of the rough bulk modulus, before its sign is believed
 STIFFEST = 2.0  # of the upper bound: what is stiffer the other way is no oil, but the slow motion
 MIN_CORRELATION = 0.2
 BETA_DECADE = 30.0  # a rough bulk modulus this far outside the bounds is a wrong unit
@@ -331,11 +331,12 @@ def against_signs(model: Machine, result: Motion) -> Iterator[Finding]:
     clear = [s for s in result.springs.values() if abs(s.t) > MIN_T and -s.beta_pa < stiffest_pa]
     known = [s for s in clear if not result.is_too_slow(s)]
     soft = [s for s in known if s.t < 0]
-    if any(s.t < 0 for s in clear if result.is_too_slow(s)):
-        yield _too_slow(result)
+    is_swapped = bool(known) and len(soft) == len(known)
+    if not is_swapped and any(s.t < 0 for s in clear if result.is_too_slow(s)):
+        yield _too_slow(result)  # unless a chamber that is quick enough says so
     against = result.u_to_v < -MIN_CORRELATION
     x = model.position
-    if known and len(soft) == len(known):
+    if is_swapped:
         if against:
             text = f"{x} runs against command and pressures: its sign is reversed"
             yield _error(x, text, f"set signals.{x}.scale = -1 and offset = stroke")

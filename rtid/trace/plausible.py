@@ -1,10 +1,14 @@
 """Does the machine move as declared?  Signs, swapped chambers, stiffness, velocity.
 
 Two tests need no fit of the maps.  Open edges move the piston the way they say: over windows,
-corr(push, dx) > 0 with push = sum(direction sigma s_c w).  And each chamber is a spring: at equal
-command
+corr(push, dx) > 0 with push = sum(direction sigma s_c w).  And each chamber is a spring:
 
-    s_c A_c dx = - V_c dP_c theta_c + (what depends on u and P alone),   theta_c = 1 / beta_c > 0.
+    s_c A_c dx = - V_c dP_c theta_c + sum(k_e(u) root(dp_e)),   theta_c = 1 / beta_c > 0,
+
+root(dp) = sgn(dp) sqrt(|dp|), over what the chamber's valves lead to; k_e is straight in each bin
+of the command.  The level of P_c in their place made a drained chamber softer than nothing, where a
+pump follows its load.  Signals of a window are means by the trapezoid rule: by the samples before
+its end alone the flow is half a sample late, which looks as if pressure fell in compression.
 
 A reversed command turns the first sign alone, a reversed position both, swapped chamber pressures
 the second alone; a wrong unit makes 1 / theta_c no bulk modulus.
@@ -31,7 +35,10 @@ from rtid.units import Unit, units_of
 
 WINDOW_S = 0.02
 MIN_WINDOWS = 100
-COMMAND_BINS = 40
+COMMAND_BINS = 40  # at most
+WINDOWS_PER_BIN = 20  # at least: each bin knows its flow by six unknowns
+SAME = 1e-6  # share of the largest singular value, below which two drops are one
+TINY = 1e-300
 LONGEST = 1.25  # of WINDOW_S: a window of whole samples that is still as short as meant
 
 
@@ -97,10 +104,10 @@ def _windows(model: Machine, samples: Samples) -> Windows:
     steps = max(2, round(WINDOW_S / period_s))
     border = rows[::steps]
     total = np.concatenate([np.zeros((1, len(samples.names))), np.cumsum(samples.values, axis=0)])
-    mean = np.diff(total[border], axis=0) / np.diff(border)[:, None]
     whole, values = _unbroken(model, samples, border), samples.values[border]
-    change = np.diff(values, axis=0)[whole]
-    return Windows(mean[whole], values[:-1][whole], change, steps * period_s)
+    change = np.diff(values, axis=0)
+    mean = (np.diff(total[border], axis=0) + 0.5 * change) / np.diff(border)[:, None]
+    return Windows(mean[whole], values[:-1][whole], change[whole], steps * period_s)
 
 
 def _unbroken(model: Machine, samples: Samples, border: NDArray[np.intp]) -> BoolArray:
@@ -124,24 +131,58 @@ def _u_to_v(model: Machine, windows: Windows) -> float:
 
 
 def _spring(model: Machine, chamber: Chamber, windows: Windows) -> Spring:
-    """Regress the swept volume on V dP and P, each about its mean at equal command."""
+    """Regress the swept volume on V dP, both beside what the valves let through."""
     x, p = model.column(model.position), model.column(chamber.pressure)
-    volume = chamber.volume(windows.start[:, x])
+    stored = -chamber.volume(windows.start[:, x]) * windows.change[:, p]
     swept = chamber.sign * chamber.area_m2 * windows.change[:, x]
-    columns = (-volume * windows.change[:, p], windows.mean[:, p], swept)
-    stored, level, y = (_about_bin_mean(c, _command_bin(model, windows)) for c in columns)
-    phi = np.stack([stored, level], axis=1)
-    scale = np.linalg.norm(phi, axis=0)
-    if not (scale > 0).all():
+    beside, unknowns = _beside_valves(model, chamber, windows, np.stack([stored, swept], axis=1))
+    stored, swept = beside.T
+    dof, size = len(swept) - unknowns, float(np.dot(stored, stored))
+    if not (size > 0 and dof > 0):
         return Spring(float("nan"), float("nan"))
-    theta, *_ = np.linalg.lstsq(phi / scale, y, rcond=None)
-    gram = (phi / scale).T @ (phi / scale)
-    residual = y - phi / scale @ theta
-    sd = float(np.sqrt(np.dot(residual, residual) / len(y) * np.linalg.pinv(gram)[0, 0]))
-    if theta[0] == 0 or not sd > 0:
+    theta = float(np.dot(stored, swept)) / size
+    residual = swept - theta * stored
+    sd = float(np.sqrt(np.dot(residual, residual) / dof / size))
+    if theta == 0 or not sd > 0:
         return Spring(float("nan"), float("nan"))
-    settles_s = _settles_s(model, chamber, windows)
-    return Spring(float(scale[0] / theta[0]), float(theta[0]) / sd, settles_s)
+    return Spring(1.0 / theta, theta / sd, _settles_s(model, chamber, windows))
+
+
+def _beside_valves(
+    model: Machine, chamber: Chamber, windows: Windows, columns: FloatArray
+) -> tuple[FloatArray, int]:
+    """What a chamber's valves leave of columns (n, m) at each command, and by how many unknowns.
+
+    A supply that stands still tells no drop of its own: the rank of each bin counts.
+    """
+    flows = _flows(model, chamber, windows)
+    rest, unknowns, k = np.zeros(columns.shape), 0, _command_bin(model, windows)
+    for number in np.unique(k):
+        here = k == number
+        phi = flows[here]
+        phi /= np.maximum(np.linalg.norm(phi, axis=0), TINY)
+        by, _, rank, _ = np.linalg.lstsq(phi, columns[here], rcond=SAME)
+        rest[here] = columns[here] - phi @ by
+        unknowns += int(rank)
+    return rest, unknowns
+
+
+def _flows(model: Machine, chamber: Chamber, windows: Windows) -> FloatArray:
+    """Columns (n, m) whose sum a chamber's valves let through in a narrow range of the command."""
+    edges = [e for e in model.edges if chamber.pressure in (e.source, e.sink)]
+    drops = _drops_pa(model, chamber, windows)
+    commands = {e.command: windows.mean[:, model.column(e.command)] for e in edges}
+    roots = [np.sign(drop) * np.sqrt(np.abs(drop)) for drop in drops]
+    opened = [u * root for u in commands.values() for root in roots]
+    return np.stack([np.ones(len(windows.mean)), *commands.values(), *roots, *opened], axis=1)
+
+
+def _drops_pa(model: Machine, chamber: Chamber, windows: Windows) -> list[FloatArray]:
+    """Drops (n,), Pa, from a chamber to each pressure that its valves lead to."""
+    pairs = [(e.source, e.sink) for e in model.edges if chamber.pressure in (e.source, e.sink)]
+    ends = sorted({name for pair in pairs for name in pair} - {chamber.pressure})
+    mine = windows.mean[:, model.column(chamber.pressure)]
+    return [mine - windows.mean[:, model.column(name)] for name in ends]
 
 
 def _settles_s(model: Machine, chamber: Chamber, windows: Windows) -> float:
@@ -160,24 +201,16 @@ def _settles_s(model: Machine, chamber: Chamber, windows: Windows) -> float:
 
 def _smallest_drop_pa(model: Machine, chamber: Chamber, windows: Windows) -> float:
     """The smallest drop between a chamber and what its valves lead to, median of the windows."""
-    ends = [(e.source, e.sink) for e in model.edges if chamber.pressure in (e.source, e.sink)]
-    drops = [
-        np.abs(windows.mean[:, model.column(a)] - windows.mean[:, model.column(b)]) for a, b in ends
-    ]
-    return float(np.median(np.min(drops, axis=0))) if drops else math.inf
+    drops = np.abs(_drops_pa(model, chamber, windows))
+    return float(np.median(np.min(drops, axis=0))) if len(drops) else math.inf
 
 
 def _command_bin(model: Machine, windows: Windows) -> NDArray[np.intp]:
     """Number of the bin of the command, bins of equal count."""
     command = next(s.name for s in model.signals if s.kind == "command")
     u = windows.mean[:, model.column(command)]
-    inner = np.quantile(u, np.linspace(0, 1, COMMAND_BINS + 1)[1:-1])
-    return np.digitize(u, inner)
-
-
-def _about_bin_mean(c: FloatArray, k: NDArray[np.intp]) -> FloatArray:
-    count = np.maximum(np.bincount(k, minlength=COMMAND_BINS), 1)
-    return c - (np.bincount(k, c, COMMAND_BINS) / count)[k]
+    bins = min(COMMAND_BINS, len(u) // WINDOWS_PER_BIN)
+    return np.digitize(u, np.quantile(u, np.linspace(0, 1, bins + 1)[1:-1]))
 
 
 def _v_slope(model: Machine, samples: Samples) -> float:
