@@ -11,10 +11,11 @@ import numpy as np
 from firmware_bridge.config import Assembly
 from firmware_bridge.samples import Samples
 from firmware_bridge.sources.table import APART
-from rtid.estimator.coloured import Coloured, sensor_noise
+from rtid.estimator.coloured import Coloured
 from rtid.model import SENSORS, Machine, Signal
 from rtid.project import Project
 from rtid.trace.arrivals import GAP_PERIODS, Timing, timing
+from rtid.trace.before_filter import noise_before
 from rtid.trace.between import FASTEST_S, unknown_between
 from rtid.trace.coverage import Coverage, coverage
 from rtid.trace.plausible import Motion, looks_like, motion
@@ -224,7 +225,7 @@ def _signals(
             continue
         yield from _values(signal, item, report)
         yield from _repeats(signal, item)
-        noise = sensor_noise(model, item.name, 1e-6 * item.t_us, item.value)
+        noise = noise_before(model, item.name, 1e-6 * item.t_us, item.value)
         yield from _filtered(signal, noise)
         yield from _noise(signal, replace(report, noise=noise.noise.sd))
 

@@ -19,11 +19,11 @@ from firmware_bridge.sources import open_file, open_log
 from firmware_bridge.sources.table import Table, to_samples
 from rtid.errors import RtidError, door
 from rtid.estimator.chunk import to_chunk
-from rtid.estimator.coloured import sensor_noise
 from rtid.estimator.noise import NoiseEstimate
 from rtid.model import Machine
 from rtid.plain import FloatArray
 from rtid.project import Project
+from rtid.trace.before_filter import noise_before
 from rtid.trace.coarse import at_crossings
 from rtid.trace.described import catalog_of
 from rtid.trace.late_stamps import frames_in_time, rows_in_time
@@ -137,7 +137,7 @@ def noise_of(project: Project, series: Iterable[Series]) -> dict[str, NoiseEstim
         return {}
     asked = (s for s in series if s.name in project.noise_unknown)
     return {
-        s.name: sensor_noise(project.model, s.name, 1e-6 * s.t_us, s.value).noise for s in asked
+        s.name: noise_before(project.model, s.name, 1e-6 * s.t_us, s.value).noise for s in asked
     }
 
 
