@@ -27,7 +27,7 @@ from rtid.diagnose.report import (
 from rtid.diagnose.softer import Softer
 from rtid.diagnose.trials import AcceptedEffect, physical
 from rtid.diagnose.unseen import has_size, not_found
-from rtid.diagnose.verdict import UNKNOWN
+from rtid.diagnose.verdict import INSUFFICIENT, UNKNOWN, filtered_hz
 from rtid.diagnose.zeros import Zero, by_chance
 from rtid.effects import catalogue
 from rtid.effects.laws.pump import FLOW, PUMP, delivered, demand
@@ -177,7 +177,8 @@ def _named(result: Result, best: Key, other: Key) -> str:
 def advice(result: Result, unseen: tuple[Unseen, ...]) -> tuple[str, ...]:
     """What an unknown residual follows; which motion would tell more of what is open."""
     pages = catalogue()
-    lines = list(described(result.last)) if result.verdict == UNKNOWN else []
+    lines = _of_a_filter(result)
+    lines += described(result.last) if result.verdict == UNKNOWN else []
     lines += _of_held_commands(result)
     for f in result.found:
         for key in f.alike:
@@ -194,6 +195,18 @@ def advice(result: Result, unseen: tuple[Unseen, ...]) -> tuple[str, ...]:
         if page is not None and page.visible_when:
             lines.append(f"{name} cannot be seen in this record: {page.visible_when}")
     return tuple(dict.fromkeys(lines + _experiment(result, unseen)))
+
+
+def _of_a_filter(result: Result) -> list[str]:
+    """That the logger has filtered what it wrote, where more than noise is left, and no name."""
+    is_open = result.verdict in (UNKNOWN, INSUFFICIENT) and result.last.rho >= result.last.most_rho
+    cut_hz = filtered_hz(result.last) if is_open else 0.0
+    if not cut_hz:
+        return []
+    return [
+        f"The pressures were filtered, at about {cut_hz:.2g} Hz, which delays and rounds off what "
+        "is quick: it may be what is left. Log them unfiltered to have the rest judged."
+    ]
 
 
 def _of_held_commands(result: Result) -> list[str]:

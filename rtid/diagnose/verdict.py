@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from firmware_bridge.samples import ROW
 from rtid.diagnose.clean import saturated
 from rtid.diagnose.excuse import counted, rho_of_all
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.residual import Residual
 from rtid.diagnose.trials import TrialState
 from rtid.effects.laws.timing import COMMAND
+from rtid.estimator.coloured import noise_in
 from rtid.estimator.validity import Doubt, doubts
 from rtid.model import PROPORTIONAL, Machine
 
@@ -21,6 +23,8 @@ LEAST_ROWS = 50  # filtered rows that a part must have to be judged by
 LEAST_EVIDENCE = 1000  # scalar rows of the record
 ROWS_PER_UNKNOWN = 50
 MOVES = 5.0  # times the sensors' floor that the measured flow of a part must reach to judge by it
+
+LOW = 0.2  # cut-off of a logger's filter times the rows' interval, at most
 
 MATCHES, MISSING, AMBIGUOUS = "matches", "missing", "ambiguous"
 UNKNOWN, INSUFFICIENT = "unknown", "insufficient_data"
@@ -35,6 +39,20 @@ def is_slight(residual: Residual) -> bool:
     """True where what is left beyond the sensors' noise is immaterial for the flow."""
     beyond = max(0.0, residual.rms_m3s**2 - residual.floor_m3s**2)
     return float(np.sqrt(beyond)) < MATERIAL * residual.flow_m3s
+
+
+def filtered_hz(fit: Fit) -> float:
+    """Cut-off of the filter, Hz, behind which all chambers' pressures were logged; 0: none is seen.
+
+    What is on lines between messages looks as if filtered from a quarter of the rows' rate on.
+    """
+    chunk, model = fit.chunk[(fit.chunk[:, 1].astype(np.uint8) & ROW) != 0], fit.declared
+    names = [chamber.pressure for chamber in model.chambers if chamber.pressure]
+    cuts = [noise_in(chunk[:, 0], chunk[:, 2 + model.column(n)]).filtered_hz for n in names]
+    if not cuts or min(cuts) == 0.0 or len(chunk) < LEAST_ROWS:
+        return 0.0
+    is_low = max(cuts) * float(np.median(np.diff(chunk[:, 0]))) < LOW
+    return float(np.median(cuts)) if is_low else 0.0
 
 
 def least_evidence(model: Machine) -> int:
@@ -85,7 +103,9 @@ def verdict(
         is_open = bool(state.negligible) or is_slight(after)
         if not is_unseen and is_open and max(first.rho, rho_of_all(last)) >= last.most_rho:
             return INSUFFICIENT
-        return MATCHES if last.rho < last.most_rho and not doubted else UNKNOWN
+        return (
+            MATCHES if last.rho < last.most_rho and not doubted else _unnamed(last, after, doubted)
+        )
     # a rate without pressures is disturbed by whatever moves the machine: unseen data have judged
     doubtful = last.declared.has_pressures and last.rho >= last.most_rho
     # nor is a cause told that leaves a misfit and an oil that cannot be: hum was named a line
@@ -103,6 +123,12 @@ def least_explained(last: Fit) -> float:
     """
     is_late = any(timing.where == COMMAND for timing, _ in last.revision.timings)
     return NAMED_TIMING if is_late and last.rho > CLEARLY_LEFT else NAMED
+
+
+def _unnamed(last: Fit, after: Residual, doubted: tuple[Doubt, ...]) -> str:
+    """Of more than noise without a name: a little may be what a logger's filter rounds off."""
+    is_veiled = is_slight(after) and not doubted and filtered_hz(last) > 0.0
+    return INSUFFICIENT if is_veiled else UNKNOWN
 
 
 def explained(state: TrialState, last: Fit) -> float:

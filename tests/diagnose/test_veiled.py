@@ -1,0 +1,66 @@
+"""What a logger's filter may have left is no alarm."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.signal import butter, lfilter
+
+from firmware_bridge.samples import ROW
+from rtid.diagnose import verdict as verdicts
+from rtid.diagnose.verdict import INSUFFICIENT, MATCHES, UNKNOWN, filtered_hz, verdict
+from rtid.sim.declare import declared_model
+from rtid.sim.simulated_plant import SimulatedPlant
+
+N, RATE_HZ = 20_000, 1000.0
+
+
+def fit(cut_hz: float, rho: float = 3.9, doubled: int = 1) -> Any:
+    """What a verdict asks of a fit, on pressures of noise behind a filter; 0 Hz: behind none."""
+    model, rng = declared_model(SimulatedPlant()), np.random.default_rng(0)
+    values = rng.normal(0.0, 5e3, (N, len(model.signals)))
+    if cut_hz:
+        values = lfilter(*butter(2, cut_hz / (0.5 * RATE_HZ)), values, axis=0)
+    if doubled > 1:  # on lines between messages
+        at = np.arange(N)
+        values = np.stack([np.interp(at, at[::doubled], v[::doubled]) for v in values.T], axis=1)
+    chunk = np.column_stack([np.arange(N) / RATE_HZ, np.full(N, ROW), 5e6 + values])
+    return SimpleNamespace(
+        chunk=chunk, declared=model, rho=rho, most_rho=1.1, map=SimpleNamespace(cells=[1]),
+        regression=SimpleNamespace(rows=10_000),
+    )  # fmt: skip
+
+
+def residual(share: float) -> Any:
+    """Of a part that moves, with so much of its flow left beyond the noise."""
+    return SimpleNamespace(
+        t_s=np.zeros(1000), flow_m3s=1.0, floor_m3s=1e-4, rms_m3s=float(np.hypot(share, 1e-4))
+    )
+
+
+def test_a_filter_of_the_logger_is_seen_and_lines_between_messages_are_none() -> None:
+    assert filtered_hz(fit(60.0)) == pytest.approx(60.0, rel=0.1)
+    assert filtered_hz(fit(0.0)) == 0.0
+    assert filtered_hz(fit(0.0, doubled=2)) == 0.0
+
+
+@pytest.mark.parametrize(
+    "cut_hz,rho,share,said",
+    [
+        (60.0, 3.9, 1e-3, INSUFFICIENT),
+        (60.0, 3.9, 1e-2, UNKNOWN),
+        (60.0, 1.0, 1e-3, MATCHES),
+        (0.0, 3.9, 1e-3, UNKNOWN),
+    ],
+)
+def test_the_little_that_is_left_behind_a_filter_is_no_alarm(
+    monkeypatch: pytest.MonkeyPatch, cut_hz: float, rho: float, share: float, said: str
+) -> None:
+    """A healthy machine behind 60 Hz was `unknown`, with 0.16 % of its flow left."""
+    monkeypatch.setattr(verdicts, "saturated", lambda model, chunk: np.zeros(1, bool))
+    state: Any = SimpleNamespace(found=[], judges_itself=False, negligible={})
+    last = fit(cut_hz, rho)
+    assert verdict(state, last, last, residual(share), ()) == said
