@@ -115,8 +115,8 @@ class Cause:
         return replace(self.candidate, shape=shape)
 
     def makes(self, candidate: Candidate) -> bool:
-        """True for a candidate of this cause, whatever its shape."""
-        return replace(candidate, shape=()) == self.candidate
+        """True for a candidate of this cause, whatever its shape, and of a machine of any size."""
+        return replace(candidate, shape=(), largest=self.candidate.largest) == self.candidate
 
     def spacing(self, k: int) -> float:
         """Distance of the values of axis k to begin with."""

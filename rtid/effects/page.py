@@ -60,7 +60,9 @@ class Parameter:
     start: where a search for a nonlinear one begins; it is held at a single value.  over: the start
     is `count` values over the range that this signal has in the record, at least `least` wide, or
     `shares` of its width, as far as they are plausible.
-    size, plant_unit: what sets its size in a plant by equations, and its unit there.
+    scale: "volume" or "flow" of the machine that the range grows with, or "1/" before either; ""
+    for a range that is the same for all.  size, plant_unit: what sets its size in a plant by
+    equations, and its unit there.
     """
 
     name: str
@@ -75,6 +77,7 @@ class Parameter:
     count: int = 0
     least: float = 0.0
     shares: tuple[float, ...] = ()
+    scale: str = ""
     size: str = ""
     plant_unit: str = ""
 

@@ -22,6 +22,7 @@ from rtid.effects.law import is_of_rates, lines_of, places_of
 from rtid.effects.laws import NAMED, cause_of, causes, law_of
 from rtid.effects.laws.pump import PUMP
 from rtid.effects.laws.timing import COMMAND_LAWS, TIMINGS, TimingLaw
+from rtid.effects.magnitude import page_for
 from rtid.effects.record_view import RecordView
 from rtid.plants.entries import effects_of_plants
 from rtid.sim.recording import write_run
@@ -58,11 +59,13 @@ def test_every_column_is_that_of_its_page() -> None:
     by_law = {n for n, page in of_pressures.items() if lines_of(page) or page.law in NAMED}
     assert {c.candidate.effect for c in found} == by_law
     for cause in found:
-        column, pages = cause.candidate, parameters(cause.candidate.effect)
+        column = cause.candidate
+        page_here = page_for(catalogue()[column.effect], model)
+        pages = {p.name: p for p in page_here.parameters}
         if not column.is_whole:
             size = pages[column.parameter]
             if column.parameter == size.name and column.parameter != "stiffness":
-                assert size == catalogue()[column.effect].size
+                assert size == page_here.size
             assert (column.unit, column.largest, column.sign) == (size.unit, size.high, size.sign)
         for k, (name, unit) in enumerate(zip(column.shape_names, column.shape_units, strict=True)):
             if name != LAG:

@@ -21,6 +21,7 @@ from rtid.effects.laws.sensors import late_position, late_pressure
 from rtid.effects.laws.storage import SEED, add_echoes, total_softness
 from rtid.effects.laws.supply import supply
 from rtid.effects.laws.timing import COMMAND_LAWS
+from rtid.effects.magnitude import page_for
 from rtid.effects.page import Effect, EffectError, catalogue
 from rtid.effects.record_view import RecordView
 from rtid.units import nearest
@@ -59,6 +60,7 @@ def _of(view: RecordView, effect: Effect) -> Iterator[Cause]:
         return
     if not (view.model.has_pressures or needs_no_pressure(effect)):
         return
+    effect = page_for(effect, view.model)
     if effect.law:
         yield from law_of(effect)(view, effect)
         return

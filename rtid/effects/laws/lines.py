@@ -28,16 +28,19 @@ from rtid.effects.column import WHOLE, Candidate, Cause
 from rtid.effects.filtering import fitted
 from rtid.effects.law import Shape, Volumes, chambers_by_place
 from rtid.effects.laws.gauged import gauged
+from rtid.effects.magnitude import volume_times
 from rtid.effects.page import Effect, catalogue, correcting
 from rtid.effects.record_view import RecordView
 from rtid.kernels.jit import kernel
+from rtid.model import Machine
 from rtid.plain import FloatArray, Key
 
 LINE = "line"  # the law's name
 OF_LINES = "dead volume"  # the declared size that the oil of a line adds to
 FREQUENCY = "natural_frequency"
 AT_VALVE, AT_CYLINDER = (f"{FREQUENCY}_sensor_at_{end}" for end in ("valve", "cylinder"))
-# to begin with: natural frequencies of 12 to 2 m of hose, volumes, and the loss of laminar flow
+# to begin with: natural frequencies of 12 to 2 m of hose, volumes, and the loss of laminar flow;
+# the last two of a usual machine: a larger one has thicker lines, which lose less
 RADPS, VOLUMES_M3, RESISTANCES = (130.0, 200.0, 300.0, 450.0, 700.0), (2e-4, 6e-4), (2e8, 2e9)
 LARGEST = 3.0  # times the bank's own size that a column of it may have
 QUICK_S = 2e-3  # half width of the parabolas
@@ -62,8 +65,14 @@ def lines(view: RecordView, effect: Effect) -> Iterator[Cause]:
                 shape_units=tuple(known[n].unit for n in (FREQUENCY, "volume", "resistance")),
                 page=effect,
             )  # fmt: skip
-            axes = radps, VOLUMES_M3, RESISTANCES
+            axes = radps, *_sizes(view.model)
             yield Cause(candidate, partial(_of_chambers, column, view, at), axes)
+
+
+def _sizes(model: Machine) -> tuple[Shape, Shape]:
+    """Volumes, m3, and resistances, Pa s/m3, of the lines of a machine to begin with."""
+    times = max(1.0, volume_times(model))
+    return tuple(times * v for v in VOLUMES_M3), tuple(r / times for r in RESISTANCES)
 
 
 def is_sampled(radps: float, view: RecordView) -> bool:
