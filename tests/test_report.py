@@ -239,7 +239,7 @@ def test_a_record_of_which_nothing_could_be_judged_has_a_page_too(leaking: Repor
     reader = Reader()
     reader.feed(page(bare))
     words = "".join(reader.words)
-    assert "Too little motion to tell." in words
+    assert "This record cannot tell." in words
     assert "No flow of this record could be judged." in words
     assert "nan" not in words.split()
 

@@ -18,7 +18,7 @@ VERDICTS = {
     "missing": ("found", "Something is missing, and has a name"),
     "ambiguous": ("open", "Something is missing: one of a set"),
     "unknown": ("open", "Something unknown is missing"),
-    "insufficient_data": ("open", "Too little motion to tell"),
+    "insufficient_data": ("open", "This record cannot tell"),
 }
 
 LEAST_FLOOR = 5e-5  # of the rms flow: a floor below it is shown as 0.00 %, which no sensor has
