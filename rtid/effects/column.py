@@ -164,15 +164,19 @@ def fixed(candidate: Candidate, make: Callable[..., Volumes], *arguments: Any) -
 def by_equation(view: RecordView, placed: Placed) -> Cause:
     """The cause that an equation describes at one place."""
     page, shapes = placed.effect, placed.effect.shapes
-    axes = tuple(_axis(view, p) for p in shapes)
+    axes = tuple(_axis(view, p, placed) for p in shapes)
     candidate = of_page(page, placed.where, shape=tuple(p.name for p in shapes))
     wide = all(axis[-1] - axis[0] > p.least for axis, p in zip(axes, shapes, strict=True) if p.over)
     is_timed = not view.model.joined or LENGTH not in fitted_names(page)
     return Cause(candidate, lambda s: placed.volumes(view, s), axes, len(axes), wide and is_timed)
 
 
-def _axis(view: RecordView, p: Parameter) -> Shape:
+def _axis(view: RecordView, p: Parameter, placed: Placed) -> Shape:
     """Values of a nonlinear parameter to begin with."""
+    if p.quantiles:
+        pressures = [np.quantile(view.pressure(c), p.quantiles) for c, _ in placed.lines]
+        seen = np.clip(np.concatenate(pressures), p.low, p.high)
+        return tuple(sorted({*p.start, *seen.tolist()}))
     if p.over:
         seen = view.seen.value(p.over)
         low, high = float(seen.min()), float(seen.max())

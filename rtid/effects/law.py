@@ -40,6 +40,7 @@ LAGGED = "lag("  # before what is stored behind a port
 BEHIND_MAPS = "behind_maps"
 GAIN_DRIFT = "gain_drift"  # the law of one gain of all maps that drifts
 OF_RATES = (BEHIND_MAPS, "dahl", GAIN_DRIFT)  # laws by name of plants without pressures
+SELDOM = 0.005  # share of the samples, below which a chamber stores nothing of an effect
 NO_SHAPE: Mapping[str, float] = MappingProxyType({})
 Nodes = Mapping[str, Node]
 Volumes = dict[int, FloatArray]  # chamber -> (n - 1,) m3
@@ -83,20 +84,32 @@ class Placed:
     def volumes(self, view: RecordView, shape: Shape) -> Volumes:
         """Volume per interval (n - 1,) and chamber that a coefficient of 1 adds, m3."""
         values, result = self._values(view, shape), dict[int, FloatArray]()
+        acts = self._acts(self._soft(view, shape))
         for c, line in self.lines:
-            volume = values.volume(line)
+            volume = acts * values.volume(line)
             _refuse_endless(self.effect, view.t_s, volume, values.values)
             result[c] = result[c] + volume if c in result else volume
         return result
 
     def softness(self, view: RecordView, shape: Shape) -> Volumes:
         """What a coefficient of 1 takes up per Pa of the chamber's pressure (n,), m3/Pa."""
+        result = self._soft(view, shape)
+        acts = self._acts(result)
+        return {c: acts * soft for c, soft in result.items()}
+
+    def _soft(self, view: RecordView, shape: Shape) -> Volumes:
+        """Of each chamber by itself what a coefficient of 1 takes up per Pa (n,), m3/Pa."""
         values, result = self._values(view, shape), dict[int, FloatArray]()
         for c, line in self.lines:
             if line.inner is not None:
                 slope = derivative(line.inner, view.model.chambers[c].pressure)
                 result[c] = -values.at_samples(line.outer) * values.at_samples(slope)
         return result
+
+    def _acts(self, soft: Volumes) -> float:
+        """0 for what is stored in both chambers and acts in one alone: it is that one's; 1 else."""
+        shares = [float(np.mean(values != 0.0)) for values in soft.values()]
+        return float(self.where != BOTH or not shares or min(shares) > SELDOM)
 
     def lag_s(self, shape: Shape) -> float:
         """The time constant that what is stored follows itself with; 0 where there is none."""

@@ -60,6 +60,7 @@ class Parameter:
     start: where a search for a nonlinear one begins; it is held at a single value.  over: the start
     is `count` values over the range that this signal has in the record, at least `least` wide, or
     `shares` of its width, as far as they are plausible.
+    quantiles: of the pressures at its place, tried beside the start as far as they are plausible.
     scale: "volume" or "flow" of the machine that the range grows with, or "1/" before either; ""
     for a range that is the same for all.  size, plant_unit: what sets its size in a plant by
     equations, and its unit there.
@@ -77,6 +78,7 @@ class Parameter:
     count: int = 0
     least: float = 0.0
     shares: tuple[float, ...] = ()
+    quantiles: tuple[float, ...] = ()
     scale: str = ""
     size: str = ""
     plant_unit: str = ""
@@ -277,6 +279,7 @@ def _parameter(entry: dict[str, Any]) -> Parameter:
     Or {over, shares}.
     """
     entry = dict(entry)
+    entry["quantiles"] = tuple(entry.pop("quantiles", ()))
     start = entry.pop("start", ())
     if isinstance(start, dict) and "over" in start:
         return Parameter(**entry, **start | {"shares": tuple(start.get("shares", ()))})
