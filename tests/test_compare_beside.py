@@ -22,6 +22,7 @@ from rtid.diagnose.fit import fit, prepare
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.standing import stand
 from rtid.effects.column import Candidate
+from rtid.effects.law import chambers_by_place
 from rtid.effects.laws import causes
 from rtid.effects.record_view import RecordView
 from rtid.effects.terms import LEAST_PA, MOST_PA, SHIFTS_PA, shares, terms_of
@@ -102,8 +103,8 @@ def test_terms_are_the_columns_of_the_diagnosis(name: str) -> None:
     for cause in offered:
         shape = cause.shapes[0]
         if name in ("relief_valve", "makeup_valve", "cavitation"):
-            c = [chamber.name for chamber in view.model.chambers].index(cause.candidate.where)
-            shape = (float(np.median(view.pressure(c))), *shape[1:])
+            at = chambers_by_place(view.model)[cause.candidate.where]
+            shape = (max(float(np.median(view.pressure(c))) for c in at), *shape[1:])
         effect, value = cause.at(shape), 3e-12
         wanted = np.zeros((view.n - 1, 2))
         for c, volume in cause.column(shape).items():

@@ -81,7 +81,7 @@ def test_the_record_s_name_is_whole_where_there_is_room(opened: Opened) -> None:
     """280 px were kept for what goes on, while nothing went on."""
     opened.go()
     page = opened.page
-    page.wait_for_selector("#verdict h1 >> text=/model|missing|motion/")
+    page.wait_for_selector("#verdict h1 >> text=/model|missing|cannot tell/")
     page.set_viewport_size({"width": 1280, "height": 720})
     page.evaluate("() => { document.querySelector('#work').replaceChildren(); }")
     page.evaluate("""() => { const name = document.querySelector('#record span');

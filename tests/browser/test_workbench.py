@@ -402,7 +402,7 @@ def test_every_view_can_be_seen_at_every_width(opened: Opened) -> None:
     """The rules are in geometry.js; a wide page needs no scrolling."""
     opened.go()
     page = opened.page
-    page.wait_for_selector("#verdict h1 >> text=/model|missing|motion/")
+    page.wait_for_selector("#verdict h1 >> text=/model|missing|cannot tell/")
     for key, view in enumerate(VIEWS, 1):
         page.keyboard.press(str(key))
         drawn = f"#{view} canvas" if view in PICTURES else f"#{view} .card, #{view} table"
@@ -417,7 +417,7 @@ def judged(browser: Browser, bench: Workbench) -> Iterator[Page]:
     """One page with a verdict for all widths: at the end it is looked at in each of them."""
     for opened in open_page(browser, bench):
         opened.go()
-        opened.page.wait_for_selector("#verdict h1 >> text=/model|missing|motion/")
+        opened.page.wait_for_selector("#verdict h1 >> text=/model|missing|cannot tell/")
         yield opened.page
 
 
