@@ -11,6 +11,7 @@ import numpy as np
 from rtid.diagnose.fit import Fit, fit, one_pass, tried, with_rows_of
 from rtid.diagnose.moving import LAG_REACH
 from rtid.diagnose.regression import Score
+from rtid.diagnose.revision import is_slow_spool
 from rtid.diagnose.search import Beside
 from rtid.diagnose.trials import GAIN, Trial, TrialState, scored
 from rtid.effects.column import Candidate
@@ -258,15 +259,17 @@ def _split_anew(state: TrialState, now: Fit) -> Fit:
 
 
 def _lags_of(state: TrialState, now: Fit, both_s: float) -> list[float]:
-    """Lags of the spools to try, s, where they and the last timing come to so much."""
+    """Lags of the spools to try, s, where they and the last timing come to so much.
+
+    None where that is neither a delay nor a lag of theirs, and has other numbers.
+    """
+    last, nominal_s = now.revision.timings[-1][0], state.model.lag.nominal_s
     if now.lag_tolerance_s == 0.0:
         return []
-    if now.revision.has_slow_spool:
+    if is_slow_spool(last):
         return [0.0]
-    reach_s, nominal_s = LAG_REACH * now.lag_tolerance_s, state.model.lag.nominal_s
-    is_delay = now.revision.timings[-1][0].apply is delayed
-    lags = [share * both_s for share in SHARES if is_delay]
-    return [lag_s for lag_s in lags if abs(lag_s - nominal_s) <= reach_s]
+    lags = [share * both_s for share in SHARES if last.apply is delayed]
+    return [s for s in lags if abs(s - nominal_s) <= LAG_REACH * now.lag_tolerance_s]
 
 
 def _from_afar(

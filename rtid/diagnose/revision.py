@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from rtid.diagnose.commands import Timings
 from rtid.effects.column import Candidate
-from rtid.effects.laws.timing import lagged
+from rtid.effects.laws.timing import TimingLaw, lagged
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Revision:
     @property
     def has_slow_spool(self) -> bool:
         """True where a lag more is in it: spools of one pole that is slower have no other."""
-        return any(timing.apply is lagged and not timing.of_sensor for timing, _ in self.timings)
+        return any(is_slow_spool(timing) for timing, _ in self.timings)
 
     @property
     def n_causes(self) -> int:
@@ -38,3 +38,8 @@ class Revision:
     def has(self, key: tuple[str, str]) -> bool:
         """True where a cause is part of it."""
         return key in [e.key for e in self.effects] or any(t.is_at(*key) for t, _ in self.timings)
+
+
+def is_slow_spool(timing: TimingLaw) -> bool:
+    """True for a lag of first order before the opening curve."""
+    return timing.apply is lagged and not timing.of_sensor

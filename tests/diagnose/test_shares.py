@@ -9,16 +9,18 @@ import numpy as np
 import pytest
 
 from rtid.diagnose import exact
+from rtid.diagnose.commands import Timings
 from rtid.diagnose.moving import LAG_REACH
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.spread import _of_delays
+from rtid.effects.laws.pump import PUMP
 from rtid.effects.laws.timing import COMMAND_LAWS, delayed
 from rtid.estimator.state import Weights
 from rtid.model import Lag
 
 STEP_S = 1e-3
 DELAY = COMMAND_LAWS["delay"][0]
-PLAY = COMMAND_LAWS["play"][0]
+LAG, PLAY = COMMAND_LAWS["lag"][0], COMMAND_LAWS["play"][0]
 
 
 def fitted(delay_s: float, lag_s: float, tolerance_s: float = 5e-3, sse: float = 3000.0) -> Any:
@@ -85,8 +87,11 @@ def test_another_share_of_the_sum_is_taken_where_it_is_clearly_better(
     assert len(tried) == (0 if tolerance_s < 1e-3 else 2)
 
 
-def test_what_is_no_delay_and_no_lag_is_let_be() -> None:
+@pytest.mark.parametrize("before", [(), ((LAG, (4e-3,)),)])
+@pytest.mark.parametrize("last", [(PLAY, (0.4,)), (PUMP, (1e8, 1e-3, 1e9))])
+def test_what_is_no_delay_and_no_lag_is_let_be(before: Timings, last: tuple[Any, Any]) -> None:
+    """Whatever stands before it: a play is no time, and a pump has three numbers."""
     state: Any = SimpleNamespace(model=SimpleNamespace(lag=Lag(0.0, 5e-3)), chunk=None)
     now = fitted(4.85e-3, 0.11e-3)
-    now.revision = Revision((), ((PLAY, (0.4,)),), ())
+    now.revision = Revision((), (*before, last), ())
     assert exact._split_anew(state, now) is now
