@@ -96,9 +96,8 @@ def test_diagnose_add_matches_undo_and_named_again(
     assert [(f.effect, f.where) for f in again.found] == [(LEAK, "a-b")]
     assert not again.held_out_judged, "so short a record is judged itself"
     told = again.found[0].heldout_residual_before_m3s, again.found[0].heldout_residual_after_m3s
-    flow_m3s = diagnosed.result.found[
-        0
-    ].after.flow_m3s  # what is listed beside it leaves other rows
+    # of the rows that it was judged by: what is listed beside it leaves others
+    flow_m3s = diagnosed.result.found[0].after.flow_m3s
     shares, pair = [100 * m3s / flow_m3s for m3s in told], errors.identification_pct
     assert shares == pytest.approx([pair.before, pair.after], rel=1e-6)
 

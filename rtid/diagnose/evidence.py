@@ -234,7 +234,7 @@ def rows_of(
     e.engine[0]["x_var_m2"] /= group * means
     e.engine[0]["p_var_pa2"] /= group * means
     e.engine[0]["settle_s"] = _whole_rows(chunk, group, float(e.engine[0]["settle_s"]))
-    n, most = len(chunk), _measured(chunk).sum() // group + 1
+    n, most = len(chunk), has_position(chunk).sum() // group + 1
     counts, noise = np.zeros(4, np.int64), np.zeros((4, 2, 2))
     row_of, share = np.full(max(0, n - 1), kernel.NO_ROW), np.zeros(max(0, n - 1))
     sums, fresh = np.zeros((most + 2, 2, 3)), np.zeros(most, np.bool_)
@@ -301,11 +301,12 @@ def _whole_rows(chunk: FloatArray, group: int, time_s: float) -> float:
 
 def _period_s(chunk: FloatArray) -> float:
     """Median time between measured positions, s; 0 where there is at most one."""
-    measured = chunk[_measured(chunk), 0]
+    measured = chunk[has_position(chunk), 0]
     return float(np.median(np.diff(measured))) if len(measured) > 1 else 0.0
 
 
-def _measured(chunk: FloatArray) -> BoolArray:
+def has_position(chunk: FloatArray) -> BoolArray:
+    """True (n,) where a sample of a chunk (n, 2 + signals), SI, has measured the position."""
     return (chunk[:, 1].astype(int) & ROW_FLAG) != 0
 
 

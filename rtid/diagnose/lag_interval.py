@@ -23,7 +23,7 @@ from rtid.diagnose.moving import LAG_REACH
 from rtid.diagnose.revision import Revision
 
 RISE = 3.0  # standard deviations at which chi2 is looked at
-ABOUT, UNEVEN = 0.5, 1.5  # of that rise, between which what the derivative says is not asked again
+ABOUT, ROUGH = 0.5, 1.5  # of that rise, between which what the derivative says is not asked again
 FARTHER = 3  # doublings for which another hollow is looked for
 Leaves = Callable[[float], float]
 
@@ -87,9 +87,9 @@ def _end(present: Fit, step: float, room: tuple[float, float], leaves: Leaves) -
         at = float(np.clip(step * 2.0**k, *room))
         risen = leaves(at) - present.excess
         points.append((at, risen))
-        if k == 0 and ABOUT * least <= risen <= UNEVEN * least:
+        if k == 0 and ABOUT * least <= risen <= ROUGH * least:
             return at  # as the derivative says
-        is_uneven |= k == 0 and risen > UNEVEN * least
+        is_uneven |= k == 0 and risen > ROUGH * least
         if at != step * 2.0**k or (risen >= least and not (is_uneven and k < FARTHER)):
             break
     last = max(k for k, (_, risen) in enumerate(points) if risen < least)

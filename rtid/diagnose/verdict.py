@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from firmware_bridge.samples import ROW
 from rtid.diagnose.clean import saturated
+from rtid.diagnose.evidence import has_position
 from rtid.diagnose.excuse import counted, rho_of_all
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.residual import Residual
@@ -23,7 +23,6 @@ LEAST_ROWS = 50  # filtered rows that a part must have to be judged by
 LEAST_EVIDENCE = 1000  # scalar rows of the record
 ROWS_PER_UNKNOWN = 50
 MOVES = 5.0  # times the sensors' floor that the measured flow of a part must reach to judge by it
-
 LOW = 0.2  # cut-off of a logger's filter times the rows' interval, at most
 
 MATCHES, MISSING, AMBIGUOUS = "matches", "missing", "ambiguous"
@@ -46,7 +45,7 @@ def filtered_hz(fit: Fit) -> float:
 
     What is on lines between messages looks as if filtered from a quarter of the rows' rate on.
     """
-    chunk, model = fit.chunk[(fit.chunk[:, 1].astype(np.uint8) & ROW) != 0], fit.declared
+    chunk, model = fit.chunk[has_position(fit.chunk)], fit.declared
     names = [chamber.pressure for chamber in model.chambers if chamber.pressure]
     cuts = [noise_in(chunk[:, 0], chunk[:, 2 + model.column(n)]).filtered_hz for n in names]
     if not cuts or min(cuts) == 0.0 or len(chunk) < LEAST_ROWS:
@@ -103,9 +102,8 @@ def verdict(
         is_open = bool(state.negligible) or is_slight(after)
         if not is_unseen and is_open and max(first.rho, rho_of_all(last)) >= last.most_rho:
             return INSUFFICIENT
-        return (
-            MATCHES if last.rho < last.most_rho and not doubted else _unnamed(last, after, doubted)
-        )
+        is_match = last.rho < last.most_rho and not doubted
+        return MATCHES if is_match else _unnamed(last, after, doubted)
     # a rate without pressures is disturbed by whatever moves the machine: unseen data have judged
     doubtful = last.declared.has_pressures and last.rho >= last.most_rho
     # nor is a cause told that leaves a misfit and an oil that cannot be: hum was named a line

@@ -125,6 +125,18 @@ def test_covariances_are_blocks_of_the_inverse() -> None:
 
 
 @pytest.mark.parametrize("motion", ["rich", "sweep"])
+def test_what_is_due_is_the_trace_of_all_that_rows_tell(motion: str) -> None:
+    """In place of a count of what they touch: few rows of a block take less than it has terms."""
+    model, chunk, _ = record(motion=motion)
+    rows = rows_of(model, chunk[:3000], nominal_weights(model))
+    maps = whole_maps(rows)
+    known = np.linalg.eigvalsh(maps)
+    taken = float(np.sum(known / (known + PRIOR_SD**-2)))
+    assert rows.n - rows.due == pytest.approx(taken, abs=0.01)
+    assert taken < rows.told[0].n - 1.0
+
+
+@pytest.mark.parametrize("motion", ["rich", "sweep"])
 def test_what_is_left_out_tells_next_to_nothing_beside_the_prior(motion: str) -> None:
     """With all that rings on: products of the directions without a say, of whole maps."""
     model, chunk, _ = record(motion=motion)
