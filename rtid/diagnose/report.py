@@ -126,6 +126,7 @@ class Diagnosis:
 
     disturbance: what the rows were weighed for beside the sensors' noise, rate per sqrt(Hz);
     beta_sd_pa: what the blocks miss is counted; NaN where something unknown bends the moduli.
+    filtered_hz: cut-off of the logger's filter that may have left what has no name, Hz; 0 for none.
     """
 
     verdict: str
@@ -150,6 +151,7 @@ class Diagnosis:
     disturbance: float = 0.0
     zeros: tuple[Zero, ...] = ()
     beta_sd_pa: tuple[float, ...] = ()
+    filtered_hz: float = 0.0
 
     @property
     def is_slight(self) -> bool:

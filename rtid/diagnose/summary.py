@@ -52,6 +52,7 @@ def diagnosis(result: Result) -> Diagnosis:
         effects += (_stored(result, result.softer),) if result.softer else ()
     words = steady(last)
     unseen = not_found(result, sizeless)
+    cut_hz = _cut_hz(result)
     return Diagnosis(
         verdict=result.verdict,
         added=tuple(FittedEffect(*p.key, parameters(last, p.key)) for p in result.given),
@@ -71,12 +72,13 @@ def diagnosis(result: Result) -> Diagnosis:
         negligible=tuple(
             Small(effect, where, share) for (effect, where), share in result.negligible.items()
         ),
-        advice=advice(result, unseen),
+        advice=advice(result, unseen, cut_hz),
         doubts=result.doubts,
         cut=cuts(last.declared, last.chunk),
         disturbance=max(chamber.disturbance for chamber in last.declared.chambers),
         zeros=result.zeros,
         beta_sd_pa=_sd_of_moduli(result, words),
+        filtered_hz=cut_hz,
     )
 
 
@@ -174,10 +176,13 @@ def _named(result: Result, best: Key, other: Key) -> str:
     return other[0] if other[1] == best[1] else f"{other[0]} ({other[1]})"
 
 
-def advice(result: Result, unseen: tuple[Unseen, ...]) -> tuple[str, ...]:
-    """What an unknown residual follows; which motion would tell more of what is open."""
+def advice(result: Result, unseen: tuple[Unseen, ...], cut_hz: float = 0.0) -> tuple[str, ...]:
+    """What an unknown residual follows; which motion would tell more of what is open.
+
+    cut_hz: of the filter behind which the pressures were logged, Hz.
+    """
     pages = catalogue()
-    lines = _of_a_filter(result)
+    lines = [_of_a_filter(cut_hz)] if cut_hz else []
     lines += described(result.last) if result.verdict == UNKNOWN else []
     lines += _of_held_commands(result)
     for f in result.found:
@@ -197,16 +202,17 @@ def advice(result: Result, unseen: tuple[Unseen, ...]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(lines + _experiment(result, unseen)))
 
 
-def _of_a_filter(result: Result) -> list[str]:
-    """That the logger has filtered what it wrote, where more than noise is left, and no name."""
+def _cut_hz(result: Result) -> float:
+    """Cut-off of the logger's filter, Hz, where more than noise is left and has no name; else 0."""
     is_open = result.verdict in (UNKNOWN, INSUFFICIENT) and result.last.rho >= result.last.most_rho
-    cut_hz = filtered_hz(result.last) if is_open else 0.0
-    if not cut_hz:
-        return []
-    return [
+    return filtered_hz(result.last) if is_open else 0.0
+
+
+def _of_a_filter(cut_hz: float) -> str:
+    return (
         f"The pressures were filtered, at about {cut_hz:.2g} Hz, which delays and rounds off what "
         "is quick: it may be what is left. Log them unfiltered to have the rest judged."
-    ]
+    )
 
 
 def _of_held_commands(result: Result) -> list[str]:

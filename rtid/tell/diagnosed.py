@@ -304,17 +304,27 @@ def judged(diagnosis: Diagnosis) -> str:
     return "held-out error" if diagnosis.held_out_judged else "error on the motion it was taught by"
 
 
+def _to_record(diagnosis: Diagnosis) -> str:
+    """What would let a verdict be given."""
+    if diagnosis.filtered_hz:
+        return (
+            "log the pressures unfiltered: behind the logger's filter of about "
+            f"{diagnosis.filtered_hz:.2g} Hz what is quick is delayed and rounded off, which may "
+            "be what is left."
+        )
+    return (
+        "record a minute or more in which every valve opens over its range, under changing load "
+        "or supply pressure; Why says which motion would tell more."
+    )
+
+
 def said(diagnosis: Diagnosis) -> str:
     """The verdict and the next step."""
     rest = percent(diagnosis, diagnosis.heldout_residual_before_m3s)
     match diagnosis.verdict:
         case "insufficient_data":
             known = remains(diagnosis) or "Nothing can be said about what is missing."
-            return (
-                f"{known} Next: record a minute or more in which "
-                "every valve opens over its range, under changing load or supply pressure; Why "
-                "says which motion would tell more."
-            )
+            return f"{known} Next: {_to_record(diagnosis)}"
         case "matches":
             here = "With what was added, the" if diagnosis.added else "The"
             return (

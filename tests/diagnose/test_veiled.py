@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,9 +12,11 @@ from scipy.signal import butter, lfilter
 
 from firmware_bridge.samples import ROW
 from rtid.diagnose import verdict as verdicts
+from rtid.diagnose.report import Diagnosis
 from rtid.diagnose.verdict import INSUFFICIENT, MATCHES, UNKNOWN, filtered_hz, verdict
 from rtid.sim.declare import declared_model
 from rtid.sim.simulated_plant import SimulatedPlant
+from rtid.tell.diagnosed import said as said_of
 
 N, RATE_HZ = 20_000, 1000.0
 
@@ -64,3 +67,15 @@ def test_the_little_that_is_left_behind_a_filter_is_no_alarm(
     state: Any = SimpleNamespace(found=[], judges_itself=False, negligible={})
     last = fit(cut_hz, rho)
     assert verdict(state, last, last, residual(share), ()) == said
+
+
+def test_advice_and_headline_ask_for_pressures_without_the_filter() -> None:
+    """And not for more motion, which the record has."""
+    shown = Diagnosis(
+        INSUFFICIENT, (), (), 3.9, 3.9, 1e-7, 1e-7, 1e-7, 1e-4, (1e9, 1e9), 3e-3, 1e-4, True,
+        True, (), (), (), filtered_hz=56.0,
+    )  # fmt: skip
+    assert "Next: log the pressures unfiltered" in said_of(shown) and "about 56 Hz" in said_of(
+        shown
+    )
+    assert "record a minute" in said_of(replace(shown, filtered_hz=0.0))
