@@ -18,7 +18,7 @@ from rtid.effects.column import Candidate
 from rtid.effects.law import Shape
 from rtid.effects.laws.pump import PUMP, usual_demand
 from rtid.effects.laws.sensors import sensor_timings
-from rtid.effects.laws.timing import COMMAND, DEAD_BAND, Psi, TimingLaw, delayed, timings_of
+from rtid.effects.laws.timing import DEAD_BAND, Psi, TimingLaw, delayed, timings_of
 from rtid.effects.record_view import RecordView
 from rtid.estimator.orifice import root
 from rtid.estimator.track import pressure_drop
@@ -175,12 +175,6 @@ def _foot(w: FloatArray, gain: FloatArray) -> float:
 def _strength(timing: TimingLaw, candidate: Candidate, score: Score) -> float:
     """How strong the first order takes a timing to be: so many times that of its column."""
     return score.value * (timing.strength(candidate.shape) if candidate.shape else 1.0)
-
-
-def is_refitted(fit_: Fit, key: Key) -> bool:
-    """Whether a cause is told by exact refits where much is left, and not by its column."""
-    sensors = {key_of(timing) for timing in sensor_timings(fit_.declared)}
-    return key[1] == COMMAND or key[0] == PUMP.effect or key in sensors
 
 
 def key_of(timing: TimingLaw) -> Key:

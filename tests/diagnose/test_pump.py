@@ -17,13 +17,15 @@ from rtid.diagnose import exact
 from rtid.diagnose.experiment import varied_supply
 from rtid.diagnose.fit import Fit, fit, one_pass, prepare
 from rtid.diagnose.fitted_sizes import parameters
-from rtid.diagnose.report import MISLED
+from rtid.diagnose.regression import Score
+from rtid.diagnose.report import LOOKS_LIKE, MISLED, Unseen
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.search import Search
 from rtid.diagnose.summary import _told
 from rtid.diagnose.trials import scored
 from rtid.diagnose.unseen import _limit
 from rtid.diagnose.verdict import UNKNOWN
+from rtid.effects.column import Candidate
 from rtid.effects.laws import pump
 from rtid.effects.laws.pump import PUMP, demand, drawn_down, usual_demand
 from rtid.effects.record_view import RecordView
@@ -158,15 +160,36 @@ def test_a_pump_is_looked_for_where_its_limit_is_seen() -> None:
     assert best > 0.7 * beside.gain(PUMP, truth) > 0.0
 
 
-def test_no_limit_is_told_of_a_sag_beside_what_is_unknown() -> None:
-    present, _ = sagging()
-    pumps = [(c, score) for c, score in scored(present) if c.effect == PUMP.effect]
+def told_beside_unknown(present: Any, candidate: Candidate, score: Score) -> Unseen:
     result: Any = SimpleNamespace(last=present, verdict=UNKNOWN, reach={}, negligible={})
-    assert present.rho > exact.LARGE and pumps
-    for candidate, score in pumps:
-        unseen = _limit(result, candidate, score)
+    return _limit(result, candidate, score)
+
+
+def test_no_limit_is_told_beside_much_that_is_unknown() -> None:
+    """Of a sag, a thousandth; of two relief valves a fiftieth: each makes up for another."""
+    present, _ = sagging()
+    scores = scored(present)
+    assert present.rho > exact.LARGE and {PUMP.effect, "relief_valve"} <= {
+        c.effect for c, _ in scores
+    }
+    for candidate, score in scores:
+        unseen = told_beside_unknown(present, candidate, score)
         assert (unseen.detection_limit, unseen.named_from) == (None, None)
         assert unseen.reason == MISLED
+
+
+def test_beside_a_little_that_is_unknown_no_less_is_excluded_than_the_record_shows() -> None:
+    present, _ = sagging()
+    little: Any = SimpleNamespace(
+        **{n: getattr(present, n) for n in ("view", "declared", "weights")}
+    )
+    little.rho, little.lag_tolerance_s, little.revision = 1.21, 0.0, present.revision
+    relief, score = next((c, s) for c, s in scored(present) if c.effect == "relief_valve")
+    for value, limit in ((30.0, 32.156), (3.0, 4.4)):  # Z95 and LIMIT_SD times 1.1 on top, or alone
+        shown = replace(score, value=value * score.sd)
+        unseen = told_beside_unknown(little, relief, shown)
+        assert unseen.detection_limit == pytest.approx(limit * score.sd, rel=1e-4)
+        assert (unseen.reason == LOOKS_LIKE) == (value > 4.4)
 
 
 def test_a_pump_s_flow_that_was_never_reached_is_above_what_it_gave() -> None:
