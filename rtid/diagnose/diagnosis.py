@@ -17,8 +17,8 @@ from rtid.diagnose.admission import (
     is_noticed,
     is_of_another_form,
     is_refuted,
+    is_seen_to_harm,
     is_within_a_form,
-    leaves_more,
     taken_in,
 )
 from rtid.diagnose.consequence import (
@@ -38,6 +38,7 @@ from rtid.diagnose.exact import carried_on
 from rtid.diagnose.excuse import few_excused
 from rtid.diagnose.finer import finer_beside
 from rtid.diagnose.fit import Fit, fit, with_covariances
+from rtid.diagnose.held_again import held_again
 from rtid.diagnose.joined import joints
 from rtid.diagnose.nameable import Reach, reaches
 from rtid.diagnose.parts import AddedEffect
@@ -271,6 +272,9 @@ def _extended(state: TrialState, first: Fit, before: Residual) -> tuple[Fit, Res
         state.found, state.negligible = [], {}
         del present  # its rows are large
         present, last = _grown(state, first, before)
+    again = held_again(state, present)
+    if again is not present:
+        present, last = again, state.left(again)
     return _look_back(state, present, last)
 
 
@@ -355,7 +359,8 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
         is_shown = share >= MATERIAL
         does = None
         is_form = is_form_of_another(state, trial.key) or is_within_a_form(state, trial)
-        if not (is_shown or is_form):
+        is_harm = not is_shown and is_seen_to_harm(state, present, now, last, after)
+        if not (is_shown or is_form or is_harm):
             does = taken_in(present, now, trial, own, last, after)
         if is_shown or does is not None:
             present.unread()  # what is read beside the next one is as large
@@ -371,7 +376,7 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
             state.found.append(AcceptedEffect(*what, last, after, does))
             return kept, after
         state.negligible[trial.key] = share
-        is_good = not leaves_more(last, after) and is_as_credible(present, now)
+        is_good = not is_harm and is_as_credible(present, now)
         is_needless = is_form and present.rho < present.most_rho
         if is_good and is_noticed(present, finished[trial.key]) and not is_needless:
             return _kept_aside(state, now, trial, alike, own, last)
