@@ -11,11 +11,12 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from firmware_bridge.samples import GAP
 from rtid.diagnose.consequence import ALIKE, HIDDEN_GAIN, Consequence, consequence, is_stable
 from rtid.diagnose.fit import MATCH_RHO, Fit, one_pass
-from rtid.diagnose.residual import Residual, joined, residual
+from rtid.diagnose.residual import Residual, residual
 from rtid.diagnose.trials import AcceptedEffect, Trial, TrialState, is_at_a_bound
-from rtid.diagnose.verdict import NAMED, told_doubts
+from rtid.diagnose.verdict import NAMED, doubts_about, told_doubts
 from rtid.effects.laws.lines import is_sampled, lines_at
 from rtid.estimator.validity import Doubt
 from rtid.plain import Key
@@ -53,8 +54,13 @@ def taken_in(
 
 def leaves_more(last: Residual, after: Residual) -> bool:
     """True where unseen data, as far as both judge them, are explained worse than without it."""
-    rms_m3s = after.at_rows_of(last).rms_m3s
-    return rms_m3s > WORSE * last.at_rows_of(after).rms_m3s
+    return rise(last, after) > WORSE
+
+
+def rise(last: Residual, after: Residual) -> float:
+    """What the rms that is left is multiplied by, over the rows that both judge; NaN for none."""
+    without, with_it = last.at_rows_of(after).rms_m3s, after.at_rows_of(last).rms_m3s
+    return with_it / without if without else float("nan")
 
 
 def is_seen_to_harm(
@@ -64,24 +70,30 @@ def is_seen_to_harm(
 
     A held-out part of few moments says so of any cause beside which another one is missing: spools
     of second order, which took 64 % of a misfit beside a leak, had 12 rows against them, in which
-    the leak flowed.  So the first part of the record is asked as well, by maps that the rest has
-    taught; both count by their rows.
+    the leak flowed.  So all other parts as long are asked as well, each by maps that the rest has
+    taught, and each has one say: the mean of what the rms is multiplied by (geometric).
     """
     if not leaves_more(last, after):
         return False
-    if len(state.held_out) > len(state.chunk) // 2:  # or the record judges itself
-        return True
-    first = _of_first_part(state, present), _of_first_part(state, now)
-    without, with_it = zip((last, after), first, strict=True)
-    return leaves_more(joined(*without), joined(*with_it))
-
-
-def _of_first_part(state: TrialState, fitted: Fit) -> Residual:
-    """What a fit, learned anew without a first part as long as the held-out one, leaves of that."""
     n = len(state.held_out)
-    rest = np.concatenate([state.chunk[n:], state.held_out])
+    if n > len(state.chunk) // 2:  # or the record judges itself
+        return True
+    rises = [rise(last, after)]
+    for start in range(0, len(state.chunk) - n + 1, n):
+        without, with_it = (_of_part(state, fitted, start) for fitted in (present, now))
+        rises.append(rise(without, with_it))
+    known = [np.log(r) for r in rises if np.isfinite(r) and r > 0.0]
+    return float(np.mean(known)) > np.log(WORSE)
+
+
+def _of_part(state: TrialState, fitted: Fit, start: int) -> Residual:
+    """What a fit, learned anew without a part as long as the held-out one, leaves of that."""
+    end = start + len(state.held_out)
+    later = state.chunk[end:].copy()
+    later[:1, 1] = later[:1, 1].astype(np.int64) | GAP
+    rest = np.concatenate([state.chunk[:start], later, state.held_out])
     record = state.model, rest, fitted.weights, fitted.revision, None
-    return residual(one_pass(*record, bank=False, before=fitted.map), state.chunk[:n])
+    return residual(one_pass(*record, bank=False, before=fitted.map), state.chunk[start:end])
 
 
 def is_of_another_form(now: Fit) -> bool:
@@ -135,7 +147,7 @@ def is_as_credible(present: Fit, now: Fit) -> bool:
     Those that contradict are no licence to make one impossible: on a sweep a leak had left 1112 and
     1289 MPa, of 1075, and a line that took 436 of chi2 left 1326 and 1852.
     """
-    before, after = told_doubts(present), told_doubts(now)
+    before, after = doubts_about(present), told_doubts(now)
     if _is_invalid(after) and not _is_invalid(before):
         return False
     return bool(before) or not after

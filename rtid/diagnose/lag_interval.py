@@ -7,7 +7,8 @@ chi2 has risen by that of RISE standard deviations, or its range ends:
 
     sd = (l_+ - l_-) / (2 RISE),        excess(l_+-) - excess(l) = RISE^2 rho.
 
-A delay is moved alone, and with the spools' lag as much the other way: what leaves less counts.
+What is late as a lag is, a delay or the play of a valve, is moved alone, and with the spools' lag
+as much the other way: what leaves less counts, for the lag as for it.
 """
 
 from __future__ import annotations
@@ -19,11 +20,13 @@ from itertools import count
 import numpy as np
 
 from rtid.diagnose.fit import Fit, one_pass
-from rtid.diagnose.moving import LAG_REACH
+from rtid.diagnose.moving import LAG_REACH, NOISE
 from rtid.diagnose.revision import Revision
+from rtid.effects.laws.timing import TimingLaw, delayed, played
 
 RISE = 3.0  # standard deviations at which chi2 is looked at
 ABOUT, ROUGH = 0.5, 1.5  # of that rise, between which what the derivative says is not asked again
+CORRECTIONS = 3  # of a play beside another lag
 FARTHER = 3  # doublings for which another hollow is looked for
 Leaves = Callable[[float], float]
 
@@ -32,26 +35,95 @@ def lag_sd_s(present: Fit) -> float:
     """Standard deviation of the spools' lag, s; NaN where the record does not tell it."""
     if not np.isfinite(present.lag_sd_s):
         return present.lag_sd_s
-    room = _room_of_lag(present)
-    return _sd(present, present.lag_sd_s, room, lambda by: _left(present, by, present.revision))
+    return max(present.lag_sd_s, _wide(_ends_of_lag(present)))
 
 
-def delay_sd_s(present: Fit, k: int) -> float:
-    """Standard deviation of the delay that is timing k of a fit, s, beyond the derivative's."""
-    (timing, psi), low_high = present.revision.timings[k], _room_of_lag(present)
-    local = present.estimate.sd(present.timing_columns(k)[0]) * float(
-        np.sqrt(max(1.0, present.rho))
-    )
+def timing_sd(present: Fit, k: int) -> float:
+    """Standard deviation of the first number of timing k, in its unit, beyond the derivative's.
+
+    0 of a timing that is not late as a lag is.
+    """
+    timing, psi = present.revision.timings[k]
+    sd = present.estimate.sd(present.timing_columns(k)[0])
+    local = sd * float(np.sqrt(max(1.0, present.rho)))
+    if timing.apply is played and np.isfinite(present.lag_sd_s):
+        lags = (present.weights.lag_s + end for end in _ends_of_lag(present))
+        high, low = (shared(present, k, lag_s).revision.timings[k][1][0] for lag_s in lags)
+        return _beyond(_wide((low, high)), local)
+    if timing.apply is not delayed:
+        return 0.0
+    low_high = _room_of_lag(present)
 
     def leaves(by_s: float) -> float:
-        timings = list(present.revision.timings)
-        timings[k] = timing, (psi[0] + by_s,)
-        moved = replace(present.revision, timings=tuple(timings))
+        moved = _moved(present, k, by_s)
         against = float(np.clip(-by_s, *low_high))
         return min(_left(present, lag, moved) for lag in {0.0, against})
 
     room = timing.low[0] - psi[0], timing.high[0] - psi[0]
-    return float(np.sqrt(_sd(present, local, room, leaves) ** 2 - local**2))
+    return _beyond(_wide(_ends(present, local, room, leaves)), local)
+
+
+def shared(present: Fit, k: int, lag_s: float) -> Fit:
+    """The fit with another lag of the spools, and timing k earlier by as much.
+
+    What of a play that is goes with the flow at each reversal: it is moved on as its derivative
+    points beside that lag.
+    """
+    now = _passed(present, lag_s, _moved(present, k, present.weights.lag_s - lag_s))
+    (timing, _), column = now.revision.timings[k], present.timing_columns(k)[0]
+    used = tuple(c for c in now.estimate.used if c != now.first_given)
+    is_play = timing.apply is played and column in used
+    for _ in range(CORRECTIONS if is_play else 0):
+        first = now.revision.timings[k][1][0] + now.regression.fit(used).value(column)
+        then = _passed(now, lag_s, _with_first(now.revision, k, first))
+        if then.excess >= now.excess - NOISE:
+            break
+        now = then
+    return now
+
+
+def _of_lag(fit: Fit, timing: TimingLaw) -> float:
+    """What of a timing's first number is as late as one second of the spools' lag.
+
+    Of a play w it is what is taken up as late as the lag on the mean over the record, where that
+    moves a flow: w / 2 sign u' is nearest to tau u' where w / tau = 2 sum g^2 u'^2 / sum g^2 |u'|,
+    with g = dQ / du.
+    """
+    if timing.apply is not played:
+        return 1.0
+    squares, sizes = 0.0, 1e-300
+    for i, edge in enumerate(fit.model.edges):
+        rate = np.abs(np.diff(fit.sent[:, 2 + fit.model.column(edge.command)])) / fit.view.dt_s
+        weight = fit.view.slope_u(i) ** 2
+        squares, sizes = squares + float(weight @ rate**2), sizes + float(weight @ rate)
+    return 2.0 * squares / sizes
+
+
+def _moved(present: Fit, k: int, by_s: float) -> Revision:
+    """The revision with timing k later by so much, s."""
+    timing, psi = present.revision.timings[k]
+    return _with_first(present.revision, k, psi[0] + by_s * _of_lag(present, timing))
+
+
+def _with_first(revision: Revision, k: int, first: float) -> Revision:
+    """The revision with another first number of timing k, within its bounds."""
+    timings = list(revision.timings)
+    timing, psi = timings[k]
+    timings[k] = timing, (float(np.clip(first, timing.low[0], timing.high[0])), *psi[1:])
+    return replace(revision, timings=tuple(timings))
+
+
+def _ends_of_lag(present: Fit) -> tuple[float, float]:
+    """By how much the lag may be less and more, s, at the rise that counts."""
+    timings = enumerate(present.revision.timings)
+    late = [k for k, (timing, _) in timings if timing.apply in (delayed, played)]
+
+    def leaves(by_s: float) -> float:
+        lag_s = present.weights.lag_s + by_s
+        against = [shared(present, k, lag_s).excess for k in late]
+        return min([_left(present, by_s, present.revision), *against])
+
+    return _ends(present, present.lag_sd_s, _room_of_lag(present), leaves)
 
 
 def _room_of_lag(present: Fit) -> tuple[float, float]:
@@ -64,15 +136,37 @@ def _room_of_lag(present: Fit) -> tuple[float, float]:
 
 def _left(present: Fit, more_s: float, revision: Revision) -> float:
     """What another revision leaves beyond its unknowns, with so much more lag of the spools."""
-    weights = replace(present.weights, lag_s=present.weights.lag_s + more_s)
+    return _passed(present, present.weights.lag_s + more_s, revision).excess
+
+
+def _passed(present: Fit, lag_s: float, revision: Revision) -> Fit:
+    weights = replace(present.weights, lag_s=lag_s)
     record = present.declared, present.chunk, weights, revision
-    return one_pass(*record, present, False, thorough=False).excess
+    return one_pass(*record, present, False, thorough=False)
 
 
-def _sd(present: Fit, local: float, room: tuple[float, float], leaves: Leaves) -> float:
-    """By what is left on either side, and no less than the derivative says (`local`)."""
-    ends = [_end(present, way * RISE * local, room, leaves) for way in (-1.0, 1.0)]
-    return max(local, (ends[1] - ends[0]) / (2.0 * RISE))
+def _ends(
+    present: Fit, local: float, room: tuple[float, float], leaves: Leaves
+) -> tuple[float, float]:
+    """How far off chi2 has risen on either side, beginning with what the derivative says (`local`).
+
+    What stands at an end of its range is as little known beyond it as before: a lag that was drawn
+    to three tolerances was told to a third of what it was off by.
+    """
+    low, high = (_end(present, way * RISE * local, room, leaves) for way in (-1.0, 1.0))
+    if 0.0 in room:
+        low, high = min(low, -high), max(high, -low)
+    return low, high
+
+
+def _wide(ends: tuple[float, float]) -> float:
+    """The standard deviation of what ends there."""
+    return abs(ends[1] - ends[0]) / (2.0 * RISE)
+
+
+def _beyond(sd: float, local: float) -> float:
+    """A deviation beyond another one that counts as well."""
+    return float(np.sqrt(max(0.0, sd**2 - local**2)))
 
 
 def _end(present: Fit, step: float, room: tuple[float, float], leaves: Leaves) -> float:

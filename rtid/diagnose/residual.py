@@ -72,14 +72,6 @@ class Residual:
         return _rms(self.measured)
 
 
-def joined(a: Residual, b: Residual) -> Residual:
-    """The rows of two parts of a record, of different instants."""
-    return replace(
-        a, t_s=np.concatenate([a.t_s, b.t_s]), measured=np.concatenate([a.measured, b.measured]),
-        left=np.concatenate([a.left, b.left]), noise=np.concatenate([a.noise, b.noise]),
-    )  # fmt: skip
-
-
 def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
 

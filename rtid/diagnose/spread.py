@@ -32,7 +32,7 @@ from rtid.diagnose.bank import add_shapes, add_timing
 from rtid.diagnose.commands import commands
 from rtid.diagnose.evidence import Rows, project
 from rtid.diagnose.fit import Fit, columns_of_effects
-from rtid.diagnose.lag_interval import delay_sd_s
+from rtid.diagnose.lag_interval import timing_sd
 from rtid.diagnose.moving import LAG_REACH
 from rtid.effects.column import Columns
 from rtid.effects.law import Volumes
@@ -172,14 +172,14 @@ def _of_delays(fitted: Fit) -> Iterator[tuple[int, float]]:
 
 
 def _beside_others(fitted: Fit) -> Iterator[tuple[int, float]]:
-    """Column and spread of each delay that is known no better than others leave more, s.
+    """Column and spread of each delay and play that is known no better than others leave more.
 
-    One of 20 ms under a joystick's hard steps was told as 13.73 +- 0.08, and is +- 1.4.
+    A delay of 20 ms under a joystick's hard steps was told as 13.73 +- 0.08, and is +- 1.4.
     """
-    for k, (timing, _) in enumerate(fitted.revision.timings):
+    for k in range(len(fitted.revision.timings)):
         column = fitted.timing_columns(k)[0]
-        if timing.apply is delayed and column in fitted.estimate.used:
-            yield column, delay_sd_s(fitted, k)
+        if column in fitted.estimate.used:
+            yield column, timing_sd(fitted, k)
 
 
 def _moved_by(fitted: Fit, unnamed: frozenset[Key]) -> Iterator[tuple[int, float]]:

@@ -18,7 +18,7 @@ from rtid.diagnose.regression import LIMIT_SD, Score
 from rtid.diagnose.residual import Residual, residual
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.search import Search
-from rtid.effects.column import Candidate
+from rtid.effects.column import Candidate, Cause
 from rtid.effects.law import LENGTH, MODULUS, chambers_by_place, fitted_names
 from rtid.effects.laws import cause_of
 from rtid.effects.page import Effect
@@ -32,6 +32,7 @@ GAIN = 16.0  # chi2 of the first effect: 60 candidates, 0.4 % for all of them to
 TIE, TIE_SHARE = 12.0, 0.03  # causes within so much of the best gain are not told apart
 SHARE_OF_BEST = 0.2  # of the best gain that a cause must have for its shape to be refined
 ROUNDS = 8  # of refinement, each with half the step of the last
+AT_END = 0.01  # of an axis' spacing: as near is at its end
 SETTLED = 2e-3  # of the gain: what a round must add for another one
 
 
@@ -152,10 +153,21 @@ def best_by_key(
 
 
 def is_at_a_bound(now: Fit) -> bool:
-    """True where a form of the last effect has ended at an end of its page's range; 0 is none."""
+    """True where a form of the last effect has ended at an end of its range; 0 is none.
+
+    That of its page, or of what the record reaches: a place worn as wide as the whole way is
+    a leak of another form.
+    """
     effect = now.revision.effects[-1]
     known = [(effect.page_of(k), value) for k, value in enumerate(effect.shape)]
-    return any(p and (v > 0.99 * p.high or 0.0 < v < 1.01 * p.low) for p, v in known)
+    if any(p and (v > 0.99 * p.high or 0.0 < v < 1.01 * p.low) for p, v in known):
+        return True
+    cause = cause_of(now.view, effect)
+    return any(_is_at_end(cause, k, v) for k, (p, v) in enumerate(known) if p and p.over and v)
+
+
+def _is_at_end(cause: Cause, k: int, value: float) -> bool:
+    return min(abs(value - end) for end in cause.bounds(k)) < AT_END * cause.spacing(k)
 
 
 def physical(fit_: Fit, candidate: Candidate, value: float) -> float:

@@ -11,6 +11,8 @@ import pytest
 
 from rtid.diagnose import lag_interval
 from rtid.diagnose.lag_interval import RISE, lag_sd_s
+from rtid.diagnose.revision import Revision
+from rtid.effects.laws.timing import delayed
 from rtid.model import Lag
 
 LAG_S, SD_S, RHO = 3e-3, 1e-4, 1.44
@@ -26,12 +28,10 @@ def told(
         return SimpleNamespace(excess=excess(weights.lag_s))
 
     monkeypatch.setattr(lag_interval, "one_pass", passed)
-    monkeypatch.setattr(
-        lag_interval, "replace", lambda weights, lag_s: SimpleNamespace(lag_s=lag_s)
-    )
+    monkeypatch.setattr(lag_interval, "replace", lambda _, **changed: SimpleNamespace(**changed))
     declared = SimpleNamespace(lag=Lag(2e-3, 1e-3))
     present: Any = SimpleNamespace(
-        weights=SimpleNamespace(lag_s=LAG_S), declared=declared, chunk=None, revision=None,
+        weights=SimpleNamespace(lag_s=LAG_S), declared=declared, chunk=None, revision=Revision(),
         rho=RHO, excess=excess(LAG_S), lag_sd_s=local_s, lag_tolerance_s=1e-3,
     )  # fmt: skip
     return lag_sd_s(present)
@@ -51,6 +51,16 @@ def test_what_is_level_is_known_to_its_range(monkeypatch: pytest.MonkeyPatch) ->
     """0 to 5 ms: from three tolerances below what is declared, and no less than none, to above."""
     sd_s = told(monkeypatch, lambda _: 0.0, SD_S)
     assert sd_s == pytest.approx(5e-3 / (2.0 * RISE))
+
+
+def test_at_an_end_of_its_range_it_is_as_little_known_beyond(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """5.66 +- 0.67 ms were told at three tolerances, of 3.54: the half of what is left open."""
+    monkeypatch.setattr(lag_interval, "LAG_REACH", 1.0)  # 2 + 1 ms: it stands there
+    assert told(monkeypatch, parabola, SD_S) == pytest.approx(SD_S, rel=0.05)
+    level = told(monkeypatch, lambda lag_s: 0.0 if lag_s > LAG_S - 1.5e-3 else 1e3, SD_S)
+    assert level == pytest.approx(1.5e-3 / RISE, rel=0.3)
 
 
 def test_another_hollow_is_in_its_interval(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -85,12 +95,12 @@ def test_a_delay_is_known_as_well_as_with_the_lag_the_other_way(
 
     monkeypatch.setattr(lag_interval, "one_pass", passed)
     monkeypatch.setattr(lag_interval, "replace", lambda _, **changed: SimpleNamespace(**changed))
-    law = SimpleNamespace(low=(1e-4,), high=(0.1,))
+    law = SimpleNamespace(low=(1e-4,), high=(0.1,), apply=delayed)
     present: Any = SimpleNamespace(
         weights=SimpleNamespace(lag_s=LAG_S), declared=SimpleNamespace(lag=Lag(2e-3, 5e-3)),
         chunk=None, revision=SimpleNamespace(timings=((law, (DELAY_S,)),)), rho=RHO, excess=0.0,
         lag_tolerance_s=5e-3, timing_columns=lambda _: range(4, 5),
         estimate=SimpleNamespace(sd=lambda _: SD_S / np.sqrt(RHO)),
     )  # fmt: skip
-    beyond_s = lag_interval.delay_sd_s(present, 0)
+    beyond_s = lag_interval.timing_sd(present, 0)
     assert np.hypot(beyond_s, SD_S) == pytest.approx(10 * SD_S, rel=0.1)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtid.diagnose import exact
+from rtid.diagnose import exact, lag_interval
 from rtid.diagnose.commands import Timings
 from rtid.diagnose.moving import LAG_REACH
 from rtid.diagnose.revision import Revision
@@ -25,7 +25,11 @@ LAG, PLAY = COMMAND_LAWS["lag"][0], COMMAND_LAWS["play"][0]
 
 def fitted(delay_s: float, lag_s: float, tolerance_s: float = 5e-3, sse: float = 3000.0) -> Any:
     """What is asked of a fit with a delay."""
-    return SimpleNamespace(
+    now = SimpleNamespace(
+        declared=None,
+        chunk=None,
+        first_given=3,
+        estimate=SimpleNamespace(used=()),
         weights=Weights(np.zeros(0), np.zeros(0), lag_s),
         view=SimpleNamespace(step_s=STEP_S),
         lag_tolerance_s=tolerance_s,
@@ -34,8 +38,9 @@ def fitted(delay_s: float, lag_s: float, tolerance_s: float = 5e-3, sse: float =
         held=SimpleNamespace(sse=sse),
         regression=SimpleNamespace(dof=3000.0),
         excess=sse - 3000.0,
-        light=lambda: None,
     )
+    now.light = lambda: now
+    return now
 
 
 @pytest.mark.parametrize("part", [0.0, 0.2, 0.5, 0.9])
@@ -78,7 +83,7 @@ def test_another_share_of_the_sum_is_taken_where_it_is_clearly_better(
         is_near = weights.lag_s < 2e-3
         return fitted(delay_s, weights.lag_s, sse=3000.0 - better * is_near)
 
-    monkeypatch.setattr(exact, "one_pass", one_pass)
+    monkeypatch.setattr(lag_interval, "one_pass", one_pass)
     monkeypatch.setattr(exact, "fit", lambda _m, _c, weights, *_, **__: weights.lag_s)
     state: Any = SimpleNamespace(model=SimpleNamespace(lag=Lag(0.0, tolerance_s)), chunk=None)
     ended: Any = exact._split_anew(state, now)
@@ -88,10 +93,41 @@ def test_another_share_of_the_sum_is_taken_where_it_is_clearly_better(
 
 
 @pytest.mark.parametrize("before", [(), ((LAG, (4e-3,)),)])
-@pytest.mark.parametrize("last", [(PLAY, (0.4,)), (PUMP, (1e8, 1e-3, 1e9))])
-def test_what_is_no_delay_and_no_lag_is_let_be(before: Timings, last: tuple[Any, Any]) -> None:
-    """Whatever stands before it: a play is no time, and a pump has three numbers."""
+def test_what_is_no_delay_and_no_lag_is_let_be(before: Timings) -> None:
+    """Whatever stands before it: a pump has three numbers."""
+    last = PUMP, (1e8, 1e-3, 1e9)
     state: Any = SimpleNamespace(model=SimpleNamespace(lag=Lag(0.0, 5e-3)), chunk=None)
     now = fitted(4.85e-3, 0.11e-3)
     now.revision = Revision((), (*before, last), ())
     assert exact._split_anew(state, now) is now
+
+
+def test_a_play_and_the_lag_are_walked_along_their_valley(monkeypatch: pytest.MonkeyPatch) -> None:
+    """51 mA and 2.9 ms were told of 41 and 4.9, which left 47 less, and no derivative led there."""
+    late, wide, slope = 4.9e-3, 0.41, 100.0  # V per s, as both are late
+
+    def left(lag_s: float, play_v: float) -> float:
+        across = (play_v - wide) + slope * (lag_s - late)
+        return 3000.0 + 0.3e8 * (lag_s - late) ** 2 + 1e5 * across**2
+
+    def passed(_m: Any, _c: Any, weights: Any, revision: Revision, *_: Any, **__: Any) -> Any:
+        ((_, (play_v,)),) = revision.timings
+        now = fitted(0.0, weights.lag_s, sse=left(weights.lag_s, play_v))
+        now.revision = revision
+        return now
+
+    monkeypatch.setattr(lag_interval, "one_pass", passed)
+    monkeypatch.setattr(lag_interval, "_of_lag", lambda *_: slope)
+    monkeypatch.setattr(
+        exact, "fit", lambda _m, _c, weights, revision, *_, **__: (weights, revision)
+    )
+    start = passed(None, None, Weights(np.zeros(0), np.zeros(0), 2.9e-3), played_by(0.61))
+    state: Any = SimpleNamespace(model=SimpleNamespace(lag=Lag(2e-3, 5e-3)), chunk=None)
+    ended: Any = exact._split_anew(state, start)
+    weights, revision = ended
+    assert weights.lag_s == pytest.approx(late, abs=0.4e-3)
+    assert revision.timings[0][1][0] == pytest.approx(wide, abs=0.04)
+
+
+def played_by(width_v: float) -> Revision:
+    return Revision((), ((PLAY, (width_v,)),), ())
