@@ -73,7 +73,7 @@ def is_seen_to_harm(
     the leak flowed.  So all other parts as long are asked as well, each by maps that the rest has
     taught, and each has one say: the mean of what the rms is multiplied by (geometric).
     """
-    if not leaves_more(last, after):
+    if rise(last, after) <= WORSE:  # not where there is nothing that both judge
         return False
     n = len(state.held_out)
     if n > len(state.chunk) // 2:  # or the record judges itself
@@ -83,7 +83,7 @@ def is_seen_to_harm(
         without, with_it = (_of_part(state, fitted, start) for fitted in (present, now))
         rises.append(rise(without, with_it))
     known = [np.log(r) for r in rises if np.isfinite(r) and r > 0.0]
-    return float(np.mean(known)) > np.log(WORSE)
+    return not known or float(np.mean(known)) > np.log(WORSE)
 
 
 def _of_part(state: TrialState, fitted: Fit, start: int) -> Residual:

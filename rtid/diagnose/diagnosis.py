@@ -29,9 +29,9 @@ from rtid.diagnose.consequence import (
 from rtid.diagnose.contest import (
     as_nearly_right,
     ended,
-    hardly_worse,
+    hidden_too,
     its_turn,
-    passed_over,
+    outdone_by,
     trials_of,
 )
 from rtid.diagnose.exact import carried_on
@@ -334,7 +334,7 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
     trials = [
         t for t in trials_of(state, present) if t.gain > least and t.key not in state.ruled_out
     ]
-    finished: dict[Key, Trial] = {}
+    finished, outdone = dict[Key, Trial](), set[Key]()
     refuted: dict[Key, bool] = {}  # whether by its form alone
     turns = sorted(trials, key=lambda t: t.gain)
     while turns:
@@ -353,24 +353,27 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
                 turns.append(best)  # whose turn it is still
             continue
         finished.setdefault(trial.key, ended(present, trial, now))
-        after = state.left(now)
+        after, does = state.left(now), None
         own = own_share(state, now, trial, after)
         share = min(material_share(last, after), BENT * own)
-        is_shown = share >= MATERIAL
-        does = None
         is_form = is_form_of_another(state, trial.key) or is_within_a_form(state, trial)
+        is_shown = share >= MATERIAL
         is_harm = not is_shown and is_seen_to_harm(state, present, now, last, after)
         if not (is_shown or is_form or is_harm):
             does = taken_in(present, now, trial, own, last, after)
         if is_shown or does is not None:
             present.unread()  # what is read beside the next one is as large
             kept, after = _with_bank(state, now)
-            if does is not None:
-                as_ended = finished[trial.key]
-                alike += hardly_worse(state, as_ended, finished, HIDDEN_GAIN)
-                alike += passed_over(state, as_ended, finished)
-            if kept.rho >= kept.most_rho:
+            as_ended, is_left = finished[trial.key], kept.rho >= kept.most_rho
+            if does:
+                alike += hidden_too(state, as_ended, finished, HIDDEN_GAIN)
+            if is_left:
                 alike += as_nearly_right(state, present, now, trials, finished)
+            if is_left and (better := outdone_by(as_ended, finished, refuted, outdone)):
+                outdone.add(trial.key)
+                trials = [finished.get(t.key, t) for t in trials]
+                turns += [best, better]
+                continue
             alike = tuple(dict.fromkeys(alike))
             what = trial.key, alike, trial.gain, trial.n_parameters
             state.found.append(AcceptedEffect(*what, last, after, does))

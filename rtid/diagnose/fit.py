@@ -22,6 +22,7 @@ from rtid.diagnose.moving import (
     goes_on,
     halfway,
     is_as_good,
+    is_lost,
     is_worse,
     moved,
     reweighed,
@@ -282,7 +283,7 @@ def fit(
     beside those of the catalogue; other: the fit that it must win over, given up where it does not.
     """
     best = one_pass(model, chunk, weights, revision, start, False, thorough=False)
-    step, halvings, behind, stretch = moved(best), 0, 0, 1.0
+    step, halvings, behind, stretch, top = moved(best), 0, 0, 1.0, best.light()
     for _ in range(PASSES):
         if step is None or halvings > HALVINGS or behind == HOPELESS:
             break
@@ -295,8 +296,11 @@ def fit(
             is_at_end = is_as_good(fitted, best) and not on
             step = None if is_at_end else steadied(moved(fitted, stretch), fitted, best)
             best = fitted
+            top = best.light() if best.wins_over(top) > 0.0 else top
         behind = behind + 1 if other is not None and fitted.wins_over(other) < 0.0 else 0
         del fitted  # its rows are large
+    if is_lost(best, top):
+        best = one_pass(model, chunk, top.weights, top.revision, top, False, thorough=False)
     if not bank:
         return best
     return one_pass(model, chunk, best.weights, best.revision, best, bank, suspects=suspects)

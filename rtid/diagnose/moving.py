@@ -148,6 +148,15 @@ def is_worse(fit: Fit, best: Fit) -> bool:
     return alike and fit.excess > best.excess and not is_as_good(fit, best)
 
 
+def is_lost(fit: Fit, top: Fit) -> bool:
+    """True where a fit has ended far worse than its best pass, weighed otherwise.
+
+    On their way to weights that agree with what they find, fits may leave more; but a line ended
+    with 500 times what it had begun with, and was refuted.
+    """
+    return fit.wins_over(top) < -max(NOISE, top.held.sse)
+
+
 def counted_for(left_out: float, timings: Timings) -> float:
     """How much more a fit is taken to leave, as a share of it, that leaves out a share of the rows.
 

@@ -27,7 +27,7 @@ from rtid.diagnose.report import (
 )
 from rtid.diagnose.softer import Softer
 from rtid.diagnose.trials import AcceptedEffect, physical
-from rtid.diagnose.unseen import has_size, not_found
+from rtid.diagnose.unseen import has_size, is_unexplained, not_found
 from rtid.diagnose.verdict import INSUFFICIENT, UNKNOWN, filtered_hz
 from rtid.diagnose.zeros import Zero, by_chance
 from rtid.effects import catalogue
@@ -89,7 +89,7 @@ def _sd_of_moduli(result: Result, fit: Fit) -> tuple[float, ...]:
     Beside a line that nobody named they were 1.8 and 1.9 GPa, of 1.3: by the noise to 0.02.  And
     beside a relief valve that was, 1.06 GPa to 0.002, of 1.38: hoses were left.
     """
-    if result.verdict == UNKNOWN or fit.rho >= LARGE:
+    if is_unexplained(result) or fit.rho >= LARGE:
         return (float("nan"),) * len(fit.compliance)
     sd = np.sqrt(np.maximum(np.diag(counted(fit)), 0.0))
     return tuple(

@@ -24,7 +24,7 @@ from rtid.diagnose.report import (
     Value,
 )
 from rtid.diagnose.trials import detection_limit, physical
-from rtid.diagnose.verdict import UNKNOWN
+from rtid.diagnose.verdict import INSUFFICIENT, UNKNOWN
 from rtid.diagnose.zeros import Zero
 from rtid.effects import catalogue
 from rtid.effects.column import Candidate
@@ -104,7 +104,7 @@ def _limit(result: Result, candidate: Candidate, score: Score) -> Unseen:
     from_ = max(known.named_from, doubtful) if known else np.inf
     named_from, _, may_be = _sized(result.last, by, from_)
     if doubtful:
-        reason = LOOKS_LIKE if result.verdict == UNKNOWN else NOT_CONFIRMED
+        reason = LOOKS_LIKE if is_unexplained(result) else NOT_CONFIRMED
     elif candidate.key in result.negligible:
         reason = "present, negligible: it changes next to nothing on the held-out part"
     elif visible:
@@ -137,7 +137,13 @@ def _is_misled(result: Result) -> bool:
     A sag a thousand times its limit stood beside it; two relief valves of 5.2e-11 m3/(s Pa) beside
     2.3e-12 and 1.1e-12, where each makes up for a part of the other.
     """
-    return result.verdict == UNKNOWN and result.last.rho >= LARGE
+    return is_unexplained(result) and result.last.rho >= LARGE
+
+
+def is_unexplained(result: Result) -> bool:
+    """Whether what is left of the record is more than noise, and has no name."""
+    is_left = result.last.rho >= result.last.most_rho
+    return result.verdict == UNKNOWN or (result.verdict == INSUFFICIENT and is_left)
 
 
 def _looks_like(result: Result, score: Score) -> float:
@@ -146,7 +152,7 @@ def _looks_like(result: Result, score: Score) -> float:
     A part of what is missing may be this: less than the record shows of it is not excluded.
     """
     sd = score.sd * float(np.sqrt(max(1.0, result.last.rho)))
-    is_shown = result.verdict == UNKNOWN and abs(score.value) > LIMIT_SD * sd
+    is_shown = is_unexplained(result) and abs(score.value) > LIMIT_SD * sd
     return abs(score.value) + Z95 * sd if is_shown else 0.0
 
 

@@ -9,7 +9,14 @@ from typing import Any
 import pytest
 
 from rtid.diagnose import contest as module
-from rtid.diagnose.contest import REFUTED, alike_ones, contest, its_turn, passed_over
+from rtid.diagnose.contest import (
+    REFUTED,
+    alike_ones,
+    contest,
+    its_turn,
+    outdone_by,
+    passed_over,
+)
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.trials import TIE, TIE_SHARE, Trial
 from rtid.effects.column import Candidate
@@ -169,3 +176,13 @@ def test_what_explains_more_and_was_passed_over_stays_beside_what_is_named() -> 
     found = passed_over(state("cause 0", "cause 2"), ended[1], finished)
     assert found == (ended[0].key,)
     assert passed_over(state(), ended[1], finished) == ()
+
+
+def test_what_ended_better_outdoes_what_leaves_a_misfit() -> None:
+    """Derivatives had promised the true leak 3 % less than a hysteresis that stood in for it."""
+    play, leak, near = trial("play", 3307e3), trial("leak", 3320e3), trial("near", 3307e3 + TIE)
+    finished = {t.key: t for t in (play, leak, near)}
+    assert outdone_by(play, finished, (), ()) is leak
+    assert outdone_by(leak, finished, (), ()) is None
+    assert outdone_by(play, finished, {leak.key}, ()) is None, "by no more than a tie"
+    assert outdone_by(play, finished, (), {play.key}) is None, "the other was refuted"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from rtid.diagnose.admission import is_seen_to_harm, leaves_more
@@ -80,6 +79,8 @@ def test_a_few_rows_do_not_refuse_what_the_first_part_shows() -> None:
     assert leaves_more(*against) and not is_seen_to_harm(state, bare, leaking, *against)
     assert is_seen_to_harm(state, leaking, bare, with_it, without)
     assert not is_seen_to_harm(state, bare, leaking, without, with_it)
+    none = slice(0, 0)  # where the held-out part says nothing, the others do
+    assert not is_seen_to_harm(state, bare, leaking, of_rows(without, none), of_rows(with_it, none))
+    assert is_seen_to_harm(state, leaking, bare, of_rows(with_it, none), of_rows(without, none))
     state.held_out = state.chunk  # a record that judges itself has no other part
     assert is_seen_to_harm(state, bare, leaking, *against)
-    assert np.isfinite(with_it.rms_m3s)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +23,7 @@ from rtid.diagnose.moving import (
     goes_on,
     halfway,
     is_as_good,
+    is_lost,
     is_worse,
     moved,
     steadied,
@@ -233,3 +236,14 @@ def test_a_line_s_fit_comes_to_rest_at_the_oil_that_weighs_its_rows(
     line = replace(line, shape=(450.0, 4e-4, 2e8))
     done = fit(model, chunk, start, Revision(effects=(line,)), bank=False)
     assert done.compliance == pytest.approx(done.weights.compliance, rel=SIZED)
+
+
+def test_a_fit_that_ends_far_worse_than_its_best_pass_is_lost() -> None:
+    """A line ended with 500 times what it had begun with, weighed otherwise, and was refuted."""
+
+    def against(wins: float, sse: float = 6e3) -> bool:
+        ended: Any = SimpleNamespace(wins_over=lambda _: wins)
+        top: Any = SimpleNamespace(held=SimpleNamespace(sse=sse))
+        return is_lost(ended, top)
+
+    assert against(-19e6) and not against(-5e3) and not against(40.0)

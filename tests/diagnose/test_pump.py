@@ -183,7 +183,8 @@ def test_beside_a_little_that_is_unknown_no_less_is_excluded_than_the_record_sho
     little: Any = SimpleNamespace(
         **{n: getattr(present, n) for n in ("view", "declared", "weights")}
     )
-    little.rho, little.lag_tolerance_s, little.revision = 1.21, 0.0, present.revision
+    little.rho, little.most_rho, little.lag_tolerance_s = 1.21, 1.1, 0.0
+    little.revision = present.revision
     relief, score = next((c, s) for c, s in scored(present) if c.effect == "relief_valve")
     for value, limit in ((30.0, 32.156), (3.0, 4.4)):  # Z95 and LIMIT_SD times 1.1 on top, or alone
         shown = replace(score, value=value * score.sd)

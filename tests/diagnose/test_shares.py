@@ -111,7 +111,7 @@ def test_a_play_and_the_lag_are_walked_along_their_valley(monkeypatch: pytest.Mo
         return 3000.0 + 0.3e8 * (lag_s - late) ** 2 + 1e5 * across**2
 
     def passed(_m: Any, _c: Any, weights: Any, revision: Revision, *_: Any, **__: Any) -> Any:
-        ((_, (play_v,)),) = revision.timings
+        play_v = revision.timings[0][1][0]
         now = fitted(0.0, weights.lag_s, sse=left(weights.lag_s, play_v))
         now.revision = revision
         return now
