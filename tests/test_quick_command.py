@@ -9,14 +9,23 @@ from typing import Any
 import numpy as np
 import pytest
 
+from firmware_bridge.samples import ROW, Samples
 from rtid.diagnose.fit import fit, prepare
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.trials import TIE
 from rtid.effects import effect
 from rtid.effects.column import of_page
-from rtid.study.quick_command import is_taken, not_told, wins
+from rtid.study.quick_command import between_rows, is_taken, not_told, rows_apart_s, wins
 from rtid.study.quick_machine import LAG_SHARE, Assumption, lag_of
 from tests.diagnose.records import record
+
+
+@dataclass(frozen=True)
+class Said:
+    """What is told of a lag, s."""
+
+    lag_s: float
+    lag_sd_s: float
 
 
 def said(verdict: str, n: int = 0, rho: float = 1.0) -> Any:
@@ -51,6 +60,26 @@ def test_a_line_is_late_by_anything_from_nothing_to_half_a_step(lag_s: float) ->
     assert tolerance_ms == pytest.approx(drawn.std(), rel=0.01)
     machine.command_step_s = 0.0
     assert lag_of(machine) == pytest.approx((1e3 * lag_s, 1e3 * LAG_SHARE * lag_s))
+
+
+def test_the_lag_beside_a_held_command_may_be_half_a_row_longer() -> None:
+    """0.136 +- 0.032 ms were told of 1.610, of a controller of 1 kHz in a log of 250 Hz."""
+    first: Any = Said(0.136e-3, 0.032e-3)
+    told = between_rows(first, 4e-3)
+    assert abs(1.610e-3 - told.lag_s) < 1.96 * told.lag_sd_s
+    ahead_s = np.random.default_rng(1).uniform(0.0, 2e-3, 100_000)
+    expected = np.hypot(0.032e-3, np.sqrt(np.mean(ahead_s**2)))
+    assert told.lag_sd_s == pytest.approx(expected, rel=0.01)
+    unknown: Any = Said(0.0, float("nan"))
+    assert np.isnan(between_rows(unknown, 4e-3).lag_sd_s)
+
+
+@pytest.mark.parametrize(("step_s", "hidden_s"), [(1e-3, 0.0), (4e-3, 4e-3)])
+def test_a_log_as_fast_as_controllers_hides_nothing(step_s: float, hidden_s: float) -> None:
+    t_us = np.round(1e6 * step_s * np.arange(500)).astype(np.int64)
+    u = np.sin(2e-6 * np.pi * t_us)[:, None]
+    samples = Samples(("u",), t_us, u, np.full(500, ROW, np.uint8))
+    assert rows_apart_s(samples) == pytest.approx(hidden_s)
 
 
 VOLUME = replace(of_page(effect("extra_dead_volume"), "a", shape=("port_lag",)), shape=(0.0,))

@@ -30,6 +30,7 @@ from rtid.diagnose.moving import (
 )
 from rtid.diagnose.regression import Estimate, Regression
 from rtid.diagnose.revision import Revision
+from rtid.diagnose.steepness import with_own_slopes
 from rtid.effects.column import Candidate, Cause, Columns
 from rtid.effects.law import Shape, Volumes
 from rtid.effects.laws import cause_of
@@ -264,7 +265,8 @@ class Fit:
 
 def prepare(model: Machine, chunk: FloatArray) -> Weights:
     """Weights of the rows from a first estimate; chunk (n, 2 + signals), SI."""
-    return refined(model, sketch(model, summed(model, chunk)), model.lag.nominal_s)
+    weights = refined(model, sketch(model, summed(model, chunk)), model.lag.nominal_s)
+    return with_own_slopes(model, chunk, weights)
 
 
 def fit(

@@ -65,3 +65,8 @@ def fitted(values: FloatArray, half: int, derivative: int, step_s: float) -> Flo
     means[:half], means[-half:] = first @ values[:m], last @ values[-m:]
     correlate(np.ascontiguousarray(values), middle, means[half : len(values) - half])
     return means
+
+
+def noise_left(half: int) -> float:
+    """What parabolas through 2 half + 1 neighbours leave of the deviation of white noise."""
+    return float(np.linalg.norm(_parabola(half, 0, 1.0)[1]))

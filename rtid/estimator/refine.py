@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rtid.estimator.misfit import Misfit
+from rtid.estimator.state import variance
 from rtid.kernels.layout import MAX_BORDERS
 from rtid.model import COMMAND_ONLY, DROP_ONLY, PROPORTIONAL, Edge, Grid, Machine
 from rtid.plain import BoolArray, FloatArray, IntArray
@@ -20,6 +21,7 @@ AT_ONCE = 2  # intervals halved per axis and edge in one round
 CLEARLY = 4.0  # standard deviations above unit variance
 LEAST_ROWS = 200  # in an interval: fewer cannot tell a misfit from a few odd rows
 WHOLE = (0, DROP_ONLY), (1, COMMAND_ONLY)  # axes along which such maps do not change: never halved
+FLATTENED = 0.1  # of a slope, at most, by the noise of dp in an interval that it goes all over
 LEAST_SHARE = 0.2  # of an edge's excess that an interval must hold
 
 
@@ -38,15 +40,16 @@ def halved(model: Machine, misfit: Misfit, clearly: float = CLEARLY) -> Machine:
     """
     result = _excesses_of_maps(model, misfit)
     pairs = zip(model.edges, result, strict=True)
-    return _on(model, [_halved(edge, excess, clearly).grid for edge, excess in pairs])
+    return _on(model, [_halved(model, edge, excess, clearly).grid for edge, excess in pairs])
 
 
 def halved_along(model: Machine, axis: int) -> Machine:
     """The machine with all intervals halved along an axis: 0 the command, 1 the pressure drop.
 
-    Of maps that do not change along it, and of proportional ones, none is.
+    Of maps that do not change along it, and of proportional ones, none is, nor any interval of dp
+    in whose halves its noise would flatten the slopes.
     """
-    return _on(model, [_halved_along(edge, axis) for edge in model.edges])
+    return _on(model, [_halved_along(model, edge, axis) for edge in model.edges])
 
 
 def missing_commands(model: Machine, misfit: Misfit) -> list[list[int]]:
@@ -123,7 +126,7 @@ def _excesses_of_maps(model: Machine, misfit: Misfit) -> list[Excess]:
     return result
 
 
-def _halved(edge: Edge, excess: Excess, clearly: float) -> Edge:
+def _halved(model: Machine, edge: Edge, excess: Excess, clearly: float) -> Edge:
     """The edge with its worst intervals halved; as it is where none is clearly above the noise.
 
     A proportional map has one gain in each block on purpose: two of them would jump in between.
@@ -131,17 +134,31 @@ def _halved(edge: Edge, excess: Excess, clearly: float) -> Edge:
     if edge.basis == PROPORTIONAL:
         return edge
     axes = [_worst(excess, axis, clearly) if edge.terms != whole else [] for axis, whole in WHOLE]
+    axes[1] = _wide(model, edge, axes[1])
     u, dp = (_split(b, k) for b, k in zip((edge.grid.u_v, edge.grid.dp_pa), axes, strict=True))
     return replace(edge, grid=Grid(u, dp))
 
 
-def _halved_along(edge: Edge, axis: int) -> Grid:
+def _halved_along(model: Machine, edge: Edge, axis: int) -> Grid:
     borders = [edge.grid.u_v, edge.grid.dp_pa]
     n = len(borders[axis]) - 1
     is_whole = edge.basis == PROPORTIONAL or (axis, edge.terms) in WHOLE
     if not is_whole and 2 * n < MAX_BORDERS:
-        borders[axis] = _split(borders[axis], list(range(n)))
+        every = list(range(n))
+        borders[axis] = _split(borders[axis], _wide(model, edge, every) if axis else every)
     return Grid(*borders)
+
+
+def _wide(model: Machine, edge: Edge, intervals: list[int]) -> list[int]:
+    """Those of an edge's intervals of dp in whose halves its noise flattens no slope by much.
+
+    By s^2 / (S + s^2), where dp goes over a half with the variance S.  A bulk modulus went from 894
+    to 954 MPa with intervals of 87 kPa at 11 kPa of noise, where 879 was true.
+    """
+    noise = variance(model, edge.source) + variance(model, edge.sink)
+    half = 0.5 * np.diff(edge.grid.dp_pa)
+    is_wide = noise <= FLATTENED * (noise + half**2 / 12.0)
+    return [k for k in intervals if is_wide[k]]
 
 
 def _worst(excess: Excess, axis: int, clearly: float) -> list[int]:

@@ -27,7 +27,15 @@ from rtid.project import Project, load
 from rtid.project import guess as proposal
 from rtid.project.guess import RoleCandidate, unused
 from rtid.study.kept_record import model_for
-from rtid.study.quick_command import is_taken, less_known, not_told, unlikeliness, wins
+from rtid.study.quick_command import (
+    between_rows,
+    is_taken,
+    less_known,
+    not_told,
+    rows_apart_s,
+    unlikeliness,
+    wins,
+)
 from rtid.study.quick_machine import (
     Assumption,
     Given,
@@ -234,6 +242,7 @@ def _of_cylinder(
         level, diagnosis, machine = level_of(judged), None, arranged.machine
         if level != BAD:
             diagnosis, machine = _likeliest(file, path, source, arranged, progress)
+        hidden_s = _rows_apart_s(arranged, machine)
     return Quick(
         path,
         source,
@@ -246,7 +255,7 @@ def _of_cylinder(
         ),
         tuple(judged),
         level,
-        diagnosis,
+        between_rows(diagnosis, hidden_s) if diagnosis else None,
         tuple(_cautions(diagnosis, given, arranged.roles)),
         bool(arranged.trace.refused.get("truncated")),
     )
@@ -287,6 +296,12 @@ def _likeliest(
     except (np.linalg.LinAlgError, RtidError):  # it cannot be had so: what was said before stands
         return held, machine
     return (said, on_a_line) if is_taken(said, held) else (held, machine)
+
+
+def _rows_apart_s(arranged: Arranged, machine: MachineSizes) -> float:
+    """Time over which a command is taken as held that may move in between, s; else 0."""
+    is_line = machine.command_step_s > 0.0
+    return 0.0 if is_line or not arranged.trace.is_table else rows_apart_s(arranged.trace.samples)
 
 
 def _later(progress: Progress) -> Progress:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, replace
+from math import comb
 
 import numpy as np
 
@@ -31,6 +32,7 @@ FEWEST = 300  # crossings, to learn by them
 LINGERS = 10  # samples, within which a border that is crossed again is the same crossing
 ORDERS = range(4, 8)  # of the differences that tell the noise beside the way of a sample
 WINDOW = 32  # crossings, of which the differences' mean is one figure
+FEWEST_QUICK = 20  # windows of samples that tell the noise of quick motion
 SLOWEST = 0.25  # of these figures, that tell the sensor's own noise
 
 
@@ -42,15 +44,16 @@ class Crossings:
     x_m: FloatArray
     way_m: FloatArray
 
-    def noise(self, t_s: FloatArray) -> NoiseEstimate:
+    def noise(self, t_s: FloatArray, quick_m2: float = 0.0) -> NoiseEstimate:
         """What is left of the steps as `resolution`, and the sensor's own noise; t_s (m,), s.
 
         Of the squares of differences, the sensor's own is what is beyond that of the ways: these
-        differ from crossing to crossing, it does not.
+        differ from crossing to crossing, it does not.  Instants that it makes uneven hide it:
+        quick_m2, what quick motion shows of it (`in_quick_motion`).
         """
         ways2 = float(np.mean(self.way_m**2))
         own2 = [_own(t_s, self.x_m, self.way_m, order) for order in ORDERS]
-        sd = float(np.sqrt(ways2 / 12.0 + max(0.0, min(own2))))
+        sd = float(np.sqrt(ways2 / 12.0 + max(0.0, min(own2), quick_m2)))
         n = len(self.x_m)
         return NoiseEstimate(sd, float(np.sqrt(ways2)), float(np.sqrt(0.5 / n)), n)
 
@@ -76,13 +79,33 @@ def at_crossings(model: Machine, samples: Samples) -> tuple[Samples, NoiseEstima
     error = x_m - lines.column(model.position)[rows]
     if _like_white(error) < ALIKE:
         return samples, None
-    return lines, found.noise(t_s[found.at])
+    return lines, found.noise(t_s[found.at], in_quick_motion(x_m, raw.resolution, fresh))
 
 
 def _like_white(error: FloatArray) -> float:
     """Variance of the means of two neighbours of error (n,) over that of white noise's."""
     pairs = error[: len(error) // 2 * 2].reshape(-1, 2).mean(axis=1)
     return 2.0 * float(pairs @ pairs) / max(1, len(pairs)) / max(float(np.mean(error**2)), TINY)
+
+
+def in_quick_motion(x_m: FloatArray, step_m: float, fresh: BoolArray) -> float:
+    """Variance of the sensor's own noise, m2, of a position x_m (n,) in steps of step_m, m.
+
+    Where it goes a step and more from sample to sample its rounding is white, q^2 / 12, and what
+    differences tell beyond that is the sensor's.  fresh (n,): nothing is known before it.  0 where
+    too little is quick.
+    """
+    told = []
+    for order in ORDERS:
+        n = (len(x_m) - order) // WINDOW
+        square = np.diff(x_m, order)[: n * WINDOW] ** 2 / comb(2 * order, order)
+        moved, begins = np.abs(np.diff(x_m)), fresh[1:]
+        way, cut = (v[: n * WINDOW].reshape(n, WINDOW) for v in (moved, begins))
+        quick = (way.mean(axis=1) >= step_m) & ~cut.any(axis=1) & ~np.roll(cut.any(axis=1), -1)
+        if quick.sum() < FEWEST_QUICK:
+            return 0.0
+        told.append(float(np.median(square.reshape(n, WINDOW).mean(axis=1)[quick])))
+    return max(0.0, min(told) - step_m**2 / 12.0)
 
 
 def crossings(x_m: FloatArray, step_m: float, fresh: BoolArray) -> Crossings:
