@@ -33,12 +33,14 @@ from rtid.excite.design import candidates
 from rtid.excite.exciting import excite
 from rtid.plain import silent
 from rtid.sim.run import simulate
+from rtid.study.known_effects import learn_acting
 from tests.left import OF_RUN
 
 SHARED: tuple[Callable[..., Any], ...] = (
     *(simulate, search, searched, diagnosis, publish, candidates, excite),
 )
-LARGE: tuple[Callable[..., Any], ...] = (fitted,)  # tens of MB each: kept by a module alone
+# Tens of MB each: kept by a module alone.
+LARGE: tuple[Callable[..., Any], ...] = (fitted, learn_acting)
 ROOT = str(Path(__file__).parents[1])
 UNFIT = (pickle.PicklingError, AttributeError, TypeError, ValueError, OSError)
 

@@ -26,6 +26,7 @@ from firmware_bridge.catalog import CONTROLLER_DBC
 from rtid.cli import main
 from rtid.cli.exits import Exit
 from rtid.project import load
+from rtid.study import kept
 from tests.apply.neighbour import Neighbour, learned, offer
 from tests.bridge.controller import Controller
 from tests.faults import process
@@ -155,6 +156,8 @@ def test_the_guide_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv(kept.PLACE, str(tmp_path / "kept"))  # a reader's commands learn once
+    monkeypatch.setattr(kept, "_secret", lambda: b"the reader's")
     monkeypatch.setattr(typer, "launch", lambda url: signal.raise_signal(signal.SIGTERM))
     blocks = re.findall(r"^```(sh|sh beside|toml)\n(.*?)^```", text_of("guide.md"), re.M | re.S)
     assert set(LEFT) <= {line for _, text in blocks for line in text.splitlines()}

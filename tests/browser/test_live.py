@@ -7,7 +7,7 @@ import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
@@ -31,6 +31,7 @@ from tests.ui.test_live_page import status
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
+Running = tuple[Path, Callable[[], None]]
 CHANNEL = f"239.74.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"  # one for each test worker
 SEED = 3
 SOAK_MINUTES, SHORT_S = 30.0, 8.0
@@ -77,8 +78,11 @@ def end(process: subprocess.Popen[bytes]) -> None:
 
 
 @pytest.fixture(scope="module")
-def machine(project: Path, request: pytest.FixtureRequest) -> Iterator[Path]:
-    """A daemon and its machine on the test bus, in processes of their own; the state folder."""
+def machine(project: Path, request: pytest.FixtureRequest) -> Iterator[Running]:
+    """A daemon and its machine on the test bus, in processes of their own.
+
+    The state folder, and what ends both before the module does.
+    """
     state = project.parent / "state"
     bus = ["--bus", f"udp_multicast:{CHANNEL}", "--test-bus", "--state", str(state)]
     run = [sys.executable, "-m", "rtid", "run", str(project), *bus]
@@ -91,12 +95,12 @@ def machine(project: Path, request: pytest.FixtureRequest) -> Iterator[Path]:
         for command in (run, speak):
             process = subprocess.Popen(command, **quiet)  # type: ignore[call-overload]
             stack.callback(end, process)
-        yield state
+        yield state, stack.close
 
 
 @pytest.fixture(scope="module")
-def live(project: Path, machine: Path) -> Iterator[Workbench]:
-    with served(project=project, state=machine) as running:
+def live(project: Path, machine: Running) -> Iterator[Workbench]:
+    with served(project=project, state=machine[0]) as running:
         yield running
 
 
@@ -216,7 +220,7 @@ def test_a_page_that_another_server_refuses_says_where_to_go_and_asks_no_more(
             assert opened.page.evaluate("() => window.asked") == 1
 
 
-# The daemon and its machine run on to the end of this module: what needs them comes last.
+# The daemon and its machine run on until the last test ends them: what needs them comes last.
 
 
 @pytest.mark.slow
@@ -247,14 +251,15 @@ def test_half_an_hour_of_updates_leaves_the_tab_as_it_was(browser: Browser, open
 
 @pytest.mark.slow
 def test_stale_is_shown_as_stale(
-    browser: Browser, project: Path, machine: Path, tmp_path: Path
+    browser: Browser, project: Path, machine: Running, tmp_path: Path
 ) -> None:
     """A status that is not renewed: the page greys and says how old it is."""
-    status = machine / "status.json"
-    end = time.monotonic() + START_S
+    (folder, stop), end = machine, time.monotonic() + START_S
+    status = folder / "status.json"
     while not status.exists() and time.monotonic() < end:
         time.sleep(0.2)
     (tmp_path / "status.json").write_bytes(status.read_bytes())
+    stop()  # nobody looks at them any more, and both are busy
     with served(project=project, state=tmp_path) as bench:
         for opened in open_page(browser, bench):
             opened.go("live")

@@ -327,10 +327,10 @@ def the_map_is_released_within_8_kb(page: Page, trace: Path) -> None:
 
 
 def test_a_data_sheet_is_held_beside_the_learned_map(
-    browser: Browser, recorded: tuple[Path, Path], tmp_path: Path
+    browser: Browser, short: tuple[Path, Path], tmp_path: Path
 ) -> None:
     """Two clicks behind `rtid ui TRACE -p PROJECT --map sheet.csv`: the map, and the difference."""
-    trace, project = recorded
+    trace, project = short
     plant, w_v = draw(SEED), np.arange(0.0, 10.05, 0.1)
     gains = [1.1 * plant.flow(edge, w_v, 4e6) / 2e3 for edge in plant.edges]
     heads = ["abs_u_V", *(f"K_{edge.upper()}" for edge in plant.edges)]
