@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 
 from rtid.diagnose.fit import Fit, fit, one_pass, tried, with_rows_of
-from rtid.diagnose.lag_interval import shared
+from rtid.diagnose.lag_interval import UNEVEN, shared
 from rtid.diagnose.moving import LAG_REACH, NOISE
 from rtid.diagnose.regression import Score
 from rtid.diagnose.revision import is_slow_spool
@@ -27,7 +27,6 @@ from rtid.plain import FloatArray, Key
 
 LARGE = 1.5  # rho above which timing effects are refitted whatever their score
 SHARES = 0.25, 0.5  # of what a delay and the lag come to, at which the lag is tried
-UNEVEN = 0.01  # of the degrees of freedom: chi2 by which another share must be better
 HALVINGS = 6  # of a step along the valley of a lag and a play
 CLOSE = 0.9  # timings whose coarse gain is this share of the best are refitted finely
 # where a valve opens: shares of its largest flow gain, bins of the command, least sqrt(dp)

@@ -9,6 +9,7 @@ from rtid.diagnose.clean import as_measured, usable
 from rtid.diagnose.excuse import few_excused
 from rtid.diagnose.finer import fine_enough, halved_throughout
 from rtid.diagnose.fit import Fit, fit, one_pass, prepare
+from rtid.diagnose.lag_interval import looked_over
 from rtid.diagnose.parts import AddedEffect, recall
 from rtid.diagnose.residual import Residual, residual
 from rtid.diagnose.spread import with_spreads
@@ -56,7 +57,7 @@ def fitted(
     fine, rest = fine_enough(fit(model, chunk, weights, revision, bank=False))
     first = few_excused(fine.leaving(rest) if rest else fine)
     del fine  # its rows are large
-    first = halved_throughout(first)
+    first = looked_over(halved_throughout(first))
     record = first.declared, chunk, first.weights, first.revision
     return with_spreads(one_pass(*record, first, bank=False))
 

@@ -104,3 +104,48 @@ def test_a_delay_is_known_as_well_as_with_the_lag_the_other_way(
     )  # fmt: skip
     beyond_s = lag_interval.timing_sd(present, 0)
     assert np.hypot(beyond_s, SD_S) == pytest.approx(10 * SD_S, rel=0.1)
+
+
+def looking(
+    monkeypatch: pytest.MonkeyPatch, excess: Callable[[float], float], steps_v: float
+) -> float:
+    """The lag to which a fit is led whose command jumps by so much, blocks being 0.5 V wide."""
+
+    def at(lag_s: float) -> Any:
+        return SimpleNamespace(
+            weights=SimpleNamespace(lag_s=lag_s), excess=excess(lag_s), lag_sd_s=2e-5,
+            lag_tolerance_s=5e-3, revision=Revision(), regression=SimpleNamespace(dof=6000.0),
+            declared=machine, chunk=chunk, light=lambda: None,
+        )  # fmt: skip
+
+    edge = SimpleNamespace(command="u", grid=SimpleNamespace(u_v=np.arange(0.0, 5.0, 0.5)))
+    machine = SimpleNamespace(edges=(edge,), column=lambda _: 0, lag=Lag(2e-3, 5e-3))
+    chunk = np.zeros((50, 3))
+    chunk[:, 2] = np.repeat(np.arange(10) % 2 * steps_v, 5)
+    monkeypatch.setattr(lag_interval, "replace", lambda _, **changed: SimpleNamespace(**changed))
+    passed = _fitted_at(at)
+    monkeypatch.setattr(lag_interval, "one_pass", passed)
+    monkeypatch.setattr(lag_interval, "fit", passed)
+    return float(lag_interval.looked_over(at(6.8e-3)).weights.lag_s)
+
+
+def _fitted_at(at: Callable[[float], Any]) -> Callable[..., Any]:
+    def passed(_model: Any, _chunk: Any, weights: Any, *_: Any, **__: Any) -> Any:
+        now = at(weights.lag_s)
+        now.light = lambda: now
+        return now
+
+    return passed
+
+
+def test_where_commands_jump_all_of_the_range_is_looked_over(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """6.812 +- 0.018 ms were told of 10.8, which left 320 less; by 50 less is uneven."""
+
+    def bowl(deep: float) -> Callable[[float], float]:
+        return lambda lag_s: deep * ((lag_s - 10.8e-3) / 4e-3) ** 2
+
+    assert looking(monkeypatch, bowl(320.0), steps_v=4.0) == pytest.approx(10.8e-3, abs=0.8e-3)
+    assert looking(monkeypatch, bowl(50.0), steps_v=4.0) == 6.8e-3
+    assert looking(monkeypatch, bowl(320.0), steps_v=0.4) == 6.8e-3, "derivatives lead there"
