@@ -46,9 +46,12 @@ def filtered_hz(fit: Fit) -> float:
     What is on lines between messages looks as if filtered from a quarter of the rows' rate on.
     """
     chunk, model = fit.chunk[has_position(fit.chunk)], fit.declared
-    names = [chamber.pressure for chamber in model.chambers if chamber.pressure]
-    cuts = [noise_in(chunk[:, 0], chunk[:, 2 + model.column(n)]).filtered_hz for n in names]
-    if not cuts or min(cuts) == 0.0 or len(chunk) < LEAST_ROWS:
+    if len(chunk) < LEAST_ROWS or not model.has_pressures:
+        return 0.0
+    pressures = {end for edge in model.edges for end in (edge.source, edge.sink) if end}
+    noises = {n: noise_in(chunk[:, 0], chunk[:, 2 + model.column(n)]) for n in pressures}
+    cuts = [noise.filtered_hz for noise in noises.values() if noise.filtered_hz]
+    if not cuts or not all(noises[c.pressure].is_filtered for c in model.chambers):
         return 0.0
     is_low = max(cuts) * float(np.median(np.diff(chunk[:, 0]))) < LOW
     return float(np.median(cuts)) if is_low else 0.0

@@ -12,17 +12,18 @@ with f warped as a digital filter has it.  By what several k see n, f_c and s ar
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cache
 from math import comb
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rtid.estimator.coloured import Coloured, sensor_noise
 from rtid.estimator.noise import measurements, quantile_levels
 from rtid.model import Machine
 from rtid.plain import FloatArray, IntArray
+from rtid.trace.series import Series
 
 DIFFERENCE = 8  # order of the differences
 STRIDES = (1, 2, 3, 4, 6, 8, 12, 16)
@@ -46,31 +47,73 @@ class LowPass:
     rms: float
 
 
-def noise_before(
-    model: Machine, name: str, t_s: NDArray[np.floating], values: NDArray[np.floating]
-) -> Coloured:
-    """`sensor_noise` of values (n,), SI, at t_s (n,), s; of a filtered sensor that before it.
+def noises_before(model: Machine, series: Iterable[Series]) -> dict[str, Coloured]:
+    """`sensor_noise` of each of several signals by name, SI; of a filtered sensor that before it.
 
-    As it is behind the filter where the differences do not tell which filter it was.
+    A logger filters all that it writes alike: where motion hides of one sensor which filter it was,
+    it is that of the others, and the shortest differences tell the noise.  Two pressures whose
+    motion did had a third of their variance, beside two that told 58 and 62 Hz: 1.5 times the noise
+    was left.  As it is behind the filter where no sensor tells which it was.
     """
-    behind = sensor_noise(model, name, t_s, values)
-    if not behind.is_filtered:
-        return behind
-    known = np.isfinite(t_s) & np.isfinite(values)
-    t, y = measurements(np.asarray(t_s[known], float), np.asarray(values[known], float))
-    # in SI rounding may hide the steps of what was written in another unit
-    steps = {behind.noise.resolution, model.signals[model.column(name)].resolution}
-    low_passes = [f for step in steps if (f := filter_of(t, y, step)) is not None]
-    best = min(low_passes, key=lambda f: f.rms, default=None)
-    if best is None or best.sd < behind.noise.sd:
-        return behind
-    noise = replace(behind.noise, sd=float(np.hypot(best.sd, max(steps) / np.sqrt(12.0))))
-    return Coloured(noise, True, best.cut / float(np.median(np.diff(t))))
+    sensors = [_Sensor.of(model, item) for item in series]
+    told = [f for s in sensors if (f := s.told) is not None]
+    usual = min(told, key=lambda f: f.rms, default=None)
+    return {s.name: s.before(s.told or usual) for s in sensors}
 
 
-def filter_of(t_s: FloatArray, values: FloatArray, step: float) -> LowPass | None:
-    """The filter behind which values (n,) at t_s (n,), s, were rounded to steps; None: not told."""
-    levels2 = _levels2(t_s, values, step**2 / 12.0)
+@dataclass(frozen=True)
+class _Sensor:
+    """A signal: its noise behind the filter, and what differences see (strides,) beside each step.
+
+    told: the filter by its own differences; a cut-off there is one in Hz.
+    """
+
+    name: str
+    behind: Coloured
+    step_s: float
+    step: float
+    levels2: tuple[FloatArray, ...] = ()
+    told: LowPass | None = None
+
+    @classmethod
+    def of(cls, model: Machine, item: Series) -> _Sensor:
+        t_s = 1e-6 * item.t_us
+        behind = sensor_noise(model, item.name, t_s, item.value)
+        # in SI rounding may hide the steps of what was written in another unit
+        steps = {behind.noise.resolution, model.signals[model.column(item.name)].resolution}
+        if not behind.is_filtered:
+            return cls(item.name, behind, 0.0, max(steps))
+        known = np.isfinite(t_s) & np.isfinite(item.value)
+        t, y = measurements(np.asarray(t_s[known], float), np.asarray(item.value[known], float))
+        step_s = float(np.median(np.diff(t)))
+        levels2 = tuple(_levels2(t, y, step**2 / 12.0) for step in sorted(steps))
+        low_passes = [f for seen in levels2 if (f := filter_of(seen)) is not None]
+        best = min(low_passes, key=lambda f: f.rms, default=None)
+        told = replace(best, cut=best.cut / step_s) if best else None
+        return cls(item.name, behind, step_s, max(steps), levels2, told)
+
+    def before(self, by: LowPass | None) -> Coloured:
+        """Its noise before a filter, which has its cut-off in Hz; behind it where that is more."""
+        if by is None or not self.behind.is_filtered:
+            return self.behind
+        sd = by.sd if by is self.told else self._sd_behind(by)
+        if sd < self.behind.noise.sd:
+            return self.behind
+        noise = replace(self.behind.noise, sd=float(np.hypot(sd, self.step / np.sqrt(12.0))))
+        return Coloured(noise, True, by.cut)
+
+    def _sd_behind(self, by: LowPass) -> float:
+        """The noise before another sensor's filter, by the shortest differences; 0 if none tell."""
+        seen = [(k, float(of[k])) for of in self.levels2 for k in np.flatnonzero(of)[:1]]
+        if not seen:
+            return 0.0
+        k, level2 = max(seen, key=lambda s: s[1])
+        at = int(np.argmin(np.abs(CUTS - by.cut * self.step_s)))
+        return float(np.exp(0.5 * np.log(level2) - _log_shares(by.poles)[at, k]))
+
+
+def filter_of(levels2: FloatArray) -> LowPass | None:
+    """The filter behind which differences see such squares (strides,); None: not told."""
     known = np.flatnonzero(levels2)
     for m in range(len(known), FEWEST_LEVELS - 1, -1):  # of the longest strides motion may be part
         seen = 0.5 * np.log(levels2[known[:m]])

@@ -15,7 +15,7 @@ from rtid.estimator.coloured import Coloured
 from rtid.model import SENSORS, Machine, Signal
 from rtid.project import Project
 from rtid.trace.arrivals import GAP_PERIODS, Timing, timing
-from rtid.trace.before_filter import noise_before
+from rtid.trace.before_filter import noises_before
 from rtid.trace.between import FASTEST_S, unknown_between
 from rtid.trace.coverage import Coverage, coverage
 from rtid.trace.plausible import Motion, looks_like, motion
@@ -218,6 +218,8 @@ def _commands(assembly: Assembly, model: Machine, samples: Samples) -> Iterator[
 def _signals(
     model: Machine, series: tuple[Series, ...], reports: tuple[SignalReport, ...]
 ) -> Iterator[Finding]:
+    valued = (s for s, report in zip(series, reports, strict=True) if report.count)
+    noises = noises_before(model, valued)
     for item, report in zip(series, reports, strict=True):
         signal = model.signals[model.column(item.name)]
         if report.count == 0:
@@ -225,7 +227,7 @@ def _signals(
             continue
         yield from _values(signal, item, report)
         yield from _repeats(signal, item)
-        noise = noise_before(model, item.name, 1e-6 * item.t_us, item.value)
+        noise = noises[item.name]
         yield from _filtered(signal, noise)
         yield from _noise(signal, replace(report, noise=noise.noise.sd))
 

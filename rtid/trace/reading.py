@@ -23,7 +23,7 @@ from rtid.estimator.noise import NoiseEstimate
 from rtid.model import Machine
 from rtid.plain import FloatArray
 from rtid.project import Project
-from rtid.trace.before_filter import noise_before
+from rtid.trace.before_filter import noises_before
 from rtid.trace.coarse import at_crossings
 from rtid.trace.described import catalog_of
 from rtid.trace.late_stamps import frames_in_time, rows_in_time
@@ -136,9 +136,7 @@ def noise_of(project: Project, series: Iterable[Series]) -> dict[str, NoiseEstim
     if not project.noise_unknown:  # then nothing need be decoded
         return {}
     asked = (s for s in series if s.name in project.noise_unknown)
-    return {
-        s.name: noise_before(project.model, s.name, 1e-6 * s.t_us, s.value).noise for s in asked
-    }
+    return {name: n.noise for name, n in noises_before(project.model, asked).items()}
 
 
 def whole(
