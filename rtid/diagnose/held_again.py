@@ -33,11 +33,16 @@ def _contested(state: TrialState, present: Fit, at: int, known: AcceptedEffect) 
     without = _without(state, present, known)
     scores = best_by_key(without, scored(without))
     timed = {key: scores[key] for key in scores if key[1] == COMMAND}
-    trials = [t for t in timing_trials(state, without, timed, 0.0) if t.key[1] == COMMAND]
+    trials = [
+        t
+        for t in timing_trials(state, without, timed, 0.0)
+        if t.key[1] == COMMAND and t.key not in state.ruled_out
+    ]
     if not trials:
         return present
     best = max(trials, key=lambda t: t.gain)
     chosen, alike = contest(state, without, best, trials, {})
+    state.negligible.pop(chosen.key, None)
     others = tuple(key for key in known.alike if key[1] != COMMAND)
     state.found[at] = replace(
         known, key=chosen.key, alike=(*alike, *others), n_parameters=chosen.n_parameters
