@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rtid.diagnose import summary
 from rtid.diagnose.nameable import Reach, clearest
 from rtid.diagnose.regression import LIMIT_SD, Score
 from rtid.diagnose.report import NOT_CONFIRMED, Small, Unseen, Value
 from rtid.effects import effect
 from rtid.effects.column import of_page
+from rtid.sim.declare import declared_model
+from rtid.sim.simulated_plant import SimulatedPlant
 from rtid.tell.diagnosed import in_the_moduli, sentences
 from tests.campaign.diagnoses import IN_SET, RIGHT
 from tests.campaign.laws import Case, answer, judged
@@ -103,3 +108,22 @@ def test_a_modulus_that_counts_what_is_not_named_is_said_to() -> None:
     text = " ".join(sentences(said))
     assert "Entrained air (both) of 0.03" in text, "what was seen, and not its limit"
     assert "The moduli are effective ones" in text and "(6 %)" in text
+
+
+def test_an_interval_of_a_modulus_holds_what_is_seen_and_not_named(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of hoses that nothing confirmed 532 +- 7 MPa were told, of 835; each moved it by 40 %."""
+    monkeypatch.setattr(summary, "counted", lambda _: np.diag([1e-24, 1e-24]))
+    last: Any = SimpleNamespace(
+        rho=1.0, most_rho=1.1, compliance=np.array([2e-9, 1e-9]),
+        declared=declared_model(SimulatedPlant()),
+    )  # fmt: skip
+    result: Any = SimpleNamespace(verdict="matches", last=last)
+    hose = Unseen("hose_compliance", "a", 2.5e-13, "m3/Pa", True, NOT_CONFIRMED, moves_beta=0.4)
+    plain = summary._sd_of_moduli(result, last, ())
+    assert plain == pytest.approx((1e-12 / 4e-18, 1e-12 / 1e-18))
+    a, b = summary._sd_of_moduli(result, last, (hose,))
+    assert a == pytest.approx(0.4 / 2e-9, rel=1e-3) and b == plain[1]
+    result.verdict = "unknown"
+    assert np.isnan(summary._sd_of_moduli(result, last, ())).all()
