@@ -102,6 +102,7 @@ def its_turn(
     trials: list[Trial],
     finished: dict[Key, Trial],
     refuted: dict[Key, bool],
+    outdone: Collection[Key] = (),
 ) -> tuple[Trial, tuple[Key, ...]]:
     """The contest; where a refuted cause wins that is not told from the best one, without such.
 
@@ -110,7 +111,11 @@ def its_turn(
     refuted: of each whether by its form alone: the right form of that law may fit as well, so that
     it stays beside the other one.  Gas that comes out of oil was told as well by air with an
     exponent at its bound, 330 better of 10,600: that was refuted, and nothing was named.
+    outdone: causes that were taken before; what has ended better than one has its turn without a
+    contest, which had taken that one.
     """
+    if best.has_ended and outdone and best.key not in outdone:
+        return best, alike_ones(state, present, best, trials)
     chosen, alike = contest(state, present, best, trials, finished)
     if chosen.key not in refuted or not (
         best.key in alike or _is_as_nearly_right(finished, chosen, best)

@@ -343,7 +343,7 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
             continue
         if not explains_enough(state, present, best):
             return None
-        trial, alike = its_turn(state, present, best, trials, finished, refuted)
+        trial, alike = its_turn(state, present, best, trials, finished, refuted, outdone)
         if trial.key in refuted:
             continue
         now = with_covariances(carried_on(state, present, trial, must_win=True), like=present)

@@ -40,6 +40,11 @@ def lag_sd_s(present: Fit) -> float:
     return max(present.lag_sd_s, _wide(_ends_of_lag(present)))
 
 
+def is_at_most(present: Fit) -> bool:
+    """True where the lag has gone as far as it may, and is no lag that was declared as known."""
+    return present.lag_tolerance_s > 0.0 and _room_of_lag(present)[1] < LEAST_LAG_S
+
+
 def looked_over(present: Fit) -> Fit:
     """The fit from the lag that leaves the least over all of its range, where commands jump.
 

@@ -186,3 +186,17 @@ def test_what_ended_better_outdoes_what_leaves_a_misfit() -> None:
     assert outdone_by(leak, finished, (), ()) is None
     assert outdone_by(play, finished, {leak.key}, ()) is None, "by no more than a tie"
     assert outdone_by(play, finished, (), {play.key}) is None, "the other was refuted"
+
+
+@pytest.mark.usefixtures("refits")
+def test_what_has_outdone_another_one_is_taken_itself() -> None:
+    """Of equals the one with fewer numbers is: a delay, again, that second order had outdone."""
+    delay, second = (
+        trial("delay", 985, 1.0),
+        replace(trial("second", 1000, 1.0, 2.0), has_ended=True),
+    )
+    both, finished = [delay, second], dict[Key, Trial]()
+    chosen, _ = its_turn(state(), present(5000), second, both, finished, {})
+    assert chosen.key == delay.key
+    chosen, alike = its_turn(state(), present(5000), second, both, finished, {}, {delay.key})
+    assert (chosen.key, alike) == (second.key, (delay.key,))

@@ -17,6 +17,7 @@ from rtid.diagnose.regression import LIMIT_SD, Score
 from rtid.diagnose.report import NOT_CONFIRMED, Small, Unseen, Value
 from rtid.effects import effect
 from rtid.effects.column import of_page
+from rtid.model import Lag
 from rtid.sim.declare import declared_model
 from rtid.sim.simulated_plant import SimulatedPlant
 from rtid.tell.diagnosed import in_the_moduli, sentences
@@ -127,3 +128,22 @@ def test_an_interval_of_a_modulus_holds_what_is_seen_and_not_named(
     assert a == pytest.approx(0.4 / 2e-9, rel=1e-3) and b == plain[1]
     result.verdict = "unknown"
     assert np.isnan(summary._sd_of_moduli(result, last, ())).all()
+
+
+def test_a_lag_that_stands_in_for_what_is_missing_has_no_interval(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """At three tolerances, and beside a misfit: 6.016 +- 0.13 ms were told of 3.76."""
+    monkeypatch.setattr(summary, "lag_sd_s", lambda _: 1e-4)
+
+    def told(lag_s: float, rho: float = 1.0, verdict: str = "matches") -> float:
+        last: Any = SimpleNamespace(
+            rho=rho, most_rho=1.1, lag_tolerance_s=1e-3, weights=SimpleNamespace(lag_s=lag_s),
+            declared=SimpleNamespace(lag=Lag(3e-3, 1e-3)),
+        )  # fmt: skip
+        result: Any = SimpleNamespace(verdict=verdict, last=last)
+        return summary._sd_of_lag(result, last)
+
+    assert told(4e-3) == told(5.9e-3, 1.4, "missing") == 1e-4
+    wrong = told(6e-3), told(4e-3, 1.6), told(4e-3, 1.2, "unknown")
+    assert np.isnan(wrong).all()
