@@ -43,11 +43,11 @@ def _contested(state: TrialState, present: Fit, at: int, known: AcceptedEffect) 
     best = max(trials, key=lambda t: t.gain)
     chosen, alike = contest(state, without, best, trials, {})
     state.negligible.pop(chosen.key, None)
-    others = tuple(key for key in known.alike if key[1] != COMMAND)
-    state.found[at] = replace(
-        known, key=chosen.key, alike=(*alike, *others), n_parameters=chosen.n_parameters
-    )
-    if chosen.key == known.key:
+    is_same = chosen.key == known.key  # what was not told from it had more than what is asked now
+    others = (key for key in known.alike if is_same or key[1] != COMMAND)
+    alike = tuple(dict.fromkeys((*alike, *others)))
+    state.found[at] = replace(known, key=chosen.key, alike=alike, n_parameters=chosen.n_parameters)
+    if is_same:
         return present
     now = with_covariances(carried_on(state, without, chosen))
     return with_bank(few_excused(now), state.suspects)

@@ -9,7 +9,6 @@ import numpy as np
 from rtid.diagnose.clean import cuts
 from rtid.diagnose.consequence import Consequence
 from rtid.diagnose.diagnosis import Result
-from rtid.diagnose.exact import LARGE
 from rtid.diagnose.excuse import counted, steady
 from rtid.diagnose.experiment import limits, would_separate
 from rtid.diagnose.fit import Fit
@@ -28,7 +27,7 @@ from rtid.diagnose.report import (
 from rtid.diagnose.softer import Softer
 from rtid.diagnose.trials import AcceptedEffect, physical
 from rtid.diagnose.unseen import has_size, is_unexplained, not_found
-from rtid.diagnose.verdict import INSUFFICIENT, UNKNOWN, filtered_hz
+from rtid.diagnose.verdict import CLEARLY_LEFT, INSUFFICIENT, UNKNOWN, filtered_hz
 from rtid.diagnose.zeros import Zero, by_chance
 from rtid.effects import catalogue
 from rtid.effects.law import chambers_by_place
@@ -90,7 +89,7 @@ def _sd_of_lag(result: Result, fit: Fit) -> float:
     So it is where the lag stands at the most that it may be: there it stands in for something.
     Beside a sag that was too small to matter 6.016 +- 0.13 ms were told, its bound, of 3.76.
     """
-    if is_unexplained(result) or fit.rho >= LARGE or is_at_most(fit):
+    if is_unexplained(result) or fit.rho >= CLEARLY_LEFT or is_at_most(fit):
         return float("nan")
     return lag_sd_s(fit)
 
@@ -102,7 +101,7 @@ def _sd_of_moduli(result: Result, fit: Fit, unseen: tuple[Unseen, ...]) -> tuple
     beside a relief valve that was, 1.06 GPa to 0.002, of 1.38: hoses were left.  What was seen and
     is not named may be in them: hoses that nothing confirmed, which moved 835 MPa to 535 +- 6.
     """
-    if is_unexplained(result) or fit.rho >= LARGE:
+    if is_unexplained(result) or fit.rho >= CLEARLY_LEFT:
         return (float("nan"),) * len(fit.compliance)
     sd = np.sqrt(np.maximum(np.diag(counted(fit)), 0.0))
     places, more = chambers_by_place(fit.declared), np.zeros(len(sd))
