@@ -65,13 +65,15 @@ def test_a_line_is_late_by_anything_from_nothing_to_half_a_step(lag_s: float) ->
 def test_the_lag_beside_a_held_command_may_be_half_a_row_longer() -> None:
     """0.136 +- 0.032 ms were told of 1.610, of a controller of 1 kHz in a log of 250 Hz."""
     first: Any = Said(0.136e-3, 0.032e-3)
-    told = between_rows(first, 4e-3)
+    told = between_rows(first, 4e-3, 5e-3)
     assert abs(1.610e-3 - told.lag_s) < 1.96 * told.lag_sd_s
     ahead_s = np.random.default_rng(1).uniform(0.0, 2e-3, 100_000)
     expected = np.hypot(0.032e-3, np.sqrt(np.mean(ahead_s**2)))
     assert told.lag_sd_s == pytest.approx(expected, rel=0.01)
+    known = between_rows(first, 4e-3, 0.3e-3)  # of a lag that was declared no more is open
+    assert known.lag_sd_s == pytest.approx(np.hypot(0.032e-3, 0.3e-3))
     unknown: Any = Said(0.0, float("nan"))
-    assert np.isnan(between_rows(unknown, 4e-3).lag_sd_s)
+    assert np.isnan(between_rows(unknown, 4e-3, 5e-3).lag_sd_s)
 
 
 @pytest.mark.parametrize(("step_s", "hidden_s"), [(1e-3, 0.0), (4e-3, 4e-3)])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Set
 from dataclasses import replace
 
 import numpy as np
@@ -242,17 +242,18 @@ def as_nearly_right(
 
 
 def outdone_by(
-    trial: Trial, finished: dict[Key, Trial], refuted: Collection[Key], outdone: Collection[Key]
+    state: TrialState, trial: Trial, finished: dict[Key, Trial], passed: Set[Key]
 ) -> Trial | None:
     """The cause that as it ended explains clearly more than one that leaves a misfit; None else.
 
     Its derivatives had promised less: beside a hysteresis of 7 % of the command, which leaves each
     direction a leak of its own, the true leak took 12,400 more of 3,300,000.
-    outdone: causes that were before, which take what is left when the others are refuted.
+    passed: causes that were refuted, or outdone before: these take what is left when others are.
     """
-    rest = [t for t in finished.values() if t.key not in refuted]
+    out = passed | state.negligible.keys()
+    rest = [t for t in finished.values() if t.key not in out]
     best = max(rest, key=lambda t: t.gain, default=trial)
-    return best if trial.key not in outdone and best.gain > trial.gain + TIE else None
+    return best if trial.key not in passed and best.gain > trial.gain + TIE else None
 
 
 def _is_out_of_reach(state: TrialState, present: Fit, now: Fit, trial: Trial) -> bool:

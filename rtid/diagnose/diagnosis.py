@@ -369,7 +369,7 @@ def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Res
                 alike += hidden_too(state, as_ended, finished, HIDDEN_GAIN)
             if is_left:
                 alike += as_nearly_right(state, present, now, trials, finished)
-            if is_left and (better := outdone_by(as_ended, finished, refuted, outdone)):
+            if is_left and (better := outdone_by(state, as_ended, finished, {*refuted, *outdone})):
                 outdone.add(trial.key)
                 trials = [finished.get(t.key, t) for t in trials]
                 turns += [best, better]

@@ -95,7 +95,8 @@ class Cause:
 
     axes: values of every nonlinear parameter to begin with; all combinations of those of the first
     `banked` axes are scored, the others begin at their first value.  offered = False: the record
-    cannot hold the effect, but what another one taught counts.
+    cannot hold the effect, but what another one taught counts.  ends: between which values the
+    first of the axes may be, where that is not a spacing beyond them.
     """
 
     candidate: Candidate
@@ -103,6 +104,7 @@ class Cause:
     axes: tuple[Shape, ...] = ()
     banked: int = 1
     offered: bool = True
+    ends: tuple[tuple[float, float], ...] = ()
 
     @property
     def shapes(self) -> tuple[Shape, ...]:
@@ -127,7 +129,9 @@ class Cause:
         axis, spacing = self.axes[k], self.spacing(k)
         page = self.candidate.page_of(k)
         low, high = (page.low, page.high) if page else (min(axis[0], 0.0), np.inf)
-        return max(axis[0] - spacing, low), min(axis[-1] + spacing, high)
+        known = k < len(self.ends)
+        least, most = self.ends[k] if known else (axis[0] - spacing, axis[-1] + spacing)
+        return max(least, low), min(most, high)
 
     def slope(self, shape: Shape, k: int) -> Volumes:
         """Derivative of the column with respect to nonlinear parameter k."""

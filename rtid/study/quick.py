@@ -42,6 +42,7 @@ from rtid.study.quick_machine import (
     MachineSizes,
     first_machine,
     fitted_machine,
+    lag_of,
 )
 from rtid.study.quick_project import head_of, of_channels, of_missing, project_text
 from rtid.study.quick_rate import QuickRate, quick_rate
@@ -242,7 +243,7 @@ def _of_cylinder(
         level, diagnosis, machine = level_of(judged), None, arranged.machine
         if level != BAD:
             diagnosis, machine = _likeliest(file, path, source, arranged, progress)
-        hidden_s = _rows_apart_s(arranged, machine)
+        hidden_s, tolerance_s = _rows_apart_s(arranged, machine), 1e-3 * lag_of(machine)[1]
     return Quick(
         path,
         source,
@@ -255,7 +256,7 @@ def _of_cylinder(
         ),
         tuple(judged),
         level,
-        between_rows(diagnosis, hidden_s) if diagnosis else None,
+        between_rows(diagnosis, hidden_s, tolerance_s) if diagnosis else None,
         tuple(_cautions(diagnosis, given, arranged.roles)),
         bool(arranged.trace.refused.get("truncated")),
     )

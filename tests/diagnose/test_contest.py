@@ -182,10 +182,12 @@ def test_what_ended_better_outdoes_what_leaves_a_misfit() -> None:
     """Derivatives had promised the true leak 3 % less than a hysteresis that stood in for it."""
     play, leak, near = trial("play", 3307e3), trial("leak", 3320e3), trial("near", 3307e3 + TIE)
     finished = {t.key: t for t in (play, leak, near)}
-    assert outdone_by(play, finished, (), ()) is leak
-    assert outdone_by(leak, finished, (), ()) is None
-    assert outdone_by(play, finished, {leak.key}, ()) is None, "by no more than a tie"
-    assert outdone_by(play, finished, (), {play.key}) is None, "the other was refuted"
+    none = frozenset[Key]()
+    assert outdone_by(state(), play, finished, none) is leak
+    assert outdone_by(state(), leak, finished, none) is None
+    assert outdone_by(state(), play, finished, {leak.key}) is None, "by no more than a tie"
+    assert outdone_by(state("leak"), play, finished, none) is None, "it was too little"
+    assert outdone_by(state(), play, finished, {play.key}) is None, "the other was refuted"
 
 
 @pytest.mark.usefixtures("refits")

@@ -38,3 +38,13 @@ def test_air_that_begins_at_an_end_of_its_exponents_comes_back() -> None:
     held = fit(model, chunk, present.weights, low, present, bank=False)
     assert held.revision.effects[-1].shape == (ends[0],)
     assert held.shapes and not held.shape_columns(held.revision.effects[-1])
+
+
+def test_a_relief_valve_may_open_at_any_pressure_of_the_record() -> None:
+    """One that was open for 97 % of it stood at the end of an axis, and two leaks mended that."""
+    present = stand(*record("entrained_air", 0.01)).fit
+    relief = best_by_key(present, scored(present))["relief_valve", "a"][0]
+    cause, pressure = cause_of(present.view, relief), present.view.pressure(0)
+    low, high = cause.bounds(0)
+    assert low == pytest.approx(pressure.min(), abs=0.05e6) and low < cause.axes[0][0]
+    assert high == pytest.approx(pressure.max(), abs=0.05e6)

@@ -36,6 +36,8 @@ def _opening(view: RecordView, effect: Effect, c: int, sign: float) -> Cause:
     if sign < 0 and is_possible:
         high = min(high, MAKEUP_PA)
     pressures = tuple(float(v) for v in np.linspace(low, high, OPENINGS + 2)[1:-1])
+    # one that was open for 97 % of a record ended at the first of these, and two leaks mended that
+    ends = (float(smooth.min()), float(smooth.max() if sign > 0 else high))
 
     def make(shape: Shape) -> Volumes:
         opening, own_time_s, hysteresis = shape
@@ -47,4 +49,5 @@ def _opening(view: RecordView, effect: Effect, c: int, sign: float) -> Cause:
     shape_names = ("opening_pressure", "own_time_constant", "hysteresis")
     candidate = of_page(effect, view.model.chambers[c].name, shape=shape_names)
     times_s = OWN_TIMES_S if sign > 0 else (0.0,)  # a check valve is quick
-    return Cause(candidate, make, (pressures, times_s, (0.0, HYSTERESIS * high)), 2, is_possible)
+    axes = pressures, times_s, (0.0, HYSTERESIS * high)
+    return Cause(candidate, make, axes, 2, is_possible, (ends,))
