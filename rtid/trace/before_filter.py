@@ -113,7 +113,7 @@ class _Sensor:
 
 
 def filter_of(levels2: FloatArray) -> LowPass | None:
-    """The filter behind which differences see such squares (strides,); None: not told."""
+    """The filter behind which differences see squares (strides,), in SI; None: not told."""
     known = np.flatnonzero(levels2)
     for m in range(len(known), FEWEST_LEVELS - 1, -1):  # of the longest strides motion may be part
         seen = 0.5 * np.log(levels2[known[:m]])
