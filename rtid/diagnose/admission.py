@@ -19,7 +19,7 @@ from rtid.diagnose.trials import AcceptedEffect, Trial, TrialState, is_at_a_boun
 from rtid.diagnose.verdict import NAMED, doubts_about, told_doubts
 from rtid.effects.laws.lines import is_sampled, lines_at
 from rtid.estimator.validity import Doubt
-from rtid.plain import Key
+from rtid.plain import FloatArray, Key
 
 WORSE = 1.02  # held-out residual, as a share, that an immaterial effect may not raise
 CLEAR = 1.5  # times the variance of the sensors' noise, from which unseen data show a misfit ...
@@ -89,11 +89,18 @@ def is_seen_to_harm(
 def _of_part(state: TrialState, fitted: Fit, start: int) -> Residual:
     """What a fit, learned anew without a part as long as the held-out one, leaves of that."""
     end = start + len(state.held_out)
-    later = state.chunk[end:].copy()
-    later[:1, 1] = later[:1, 1].astype(np.int64) | GAP
-    rest = np.concatenate([state.chunk[:start], later, state.held_out])
-    record = state.model, rest, fitted.weights, fitted.revision, None
+    rest = [state.chunk[:start], _behind_gap(state.chunk[end:])]
+    if state.held_out[0, 0] > state.chunk[-1, 0]:  # it may be any span of the record
+        rest.append(_behind_gap(state.held_out))
+    record = state.model, np.concatenate(rest), fitted.weights, fitted.revision, None
     return residual(one_pass(*record, bank=False, before=fitted.map), state.chunk[start:end])
+
+
+def _behind_gap(part: FloatArray) -> FloatArray:
+    """A part of a record (n, 2 + signals), SI, of which what is before it tells nothing."""
+    part = part.copy()
+    part[:1, 1] = part[:1, 1].astype(np.int64) | GAP
+    return part
 
 
 def is_of_another_form(now: Fit) -> bool:

@@ -85,9 +85,8 @@ def timing_sd(present: Fit, k: int) -> float:
     sd = present.estimate.sd(present.timing_columns(k)[0])
     local = sd * float(np.sqrt(max(1.0, present.rho)))
     if timing.apply is played and np.isfinite(present.lag_sd_s):
-        lags = (present.weights.lag_s + end for end in _ends_of_lag(present))
-        high, low = (shared(present, k, lag_s).revision.timings[k][1][0] for lag_s in lags)
-        return _beyond(_wide((low, high)), local)
+        less, more = (_beside(present, k, end) - psi[0] for end in _ends_of_lag(present))
+        return _beyond(_wide((less, more)), local)
     if timing.apply is not delayed:
         return 0.0
     low_high = _room_of_lag(present)
@@ -99,6 +98,15 @@ def timing_sd(present: Fit, k: int) -> float:
 
     room = timing.low[0] - psi[0], timing.high[0] - psi[0]
     return _beyond(_wide(_ends(present, local, room, leaves)), local)
+
+
+def _beside(present: Fit, k: int, by_s: float) -> float:
+    """The first number of timing k beside so much more lag, s; out of its range as much within."""
+    low, high = _room_of_lag(present)
+    is_within = low <= by_s <= high
+    lag_s = present.weights.lag_s + (by_s if is_within else -by_s)
+    first = shared(present, k, lag_s).revision.timings[k][1][0]
+    return first if is_within else 2.0 * present.revision.timings[k][1][0] - first
 
 
 def shared(present: Fit, k: int, lag_s: float) -> Fit:

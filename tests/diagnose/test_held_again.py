@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
+from firmware_bridge.samples import GAP
+from rtid.diagnose import admission
 from rtid.diagnose.admission import is_seen_to_harm, leaves_more
 from rtid.diagnose.fit import Fit, fit, prepare
 from rtid.diagnose.held_again import held_again
@@ -14,7 +17,7 @@ from rtid.diagnose.residual import Residual
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.trials import AcceptedEffect, TrialState, best_by_key, scored
 from rtid.effects.laws.timing import COMMAND, Psi, TimingLaw, timings_of
-from rtid.plain import Key, silent
+from rtid.plain import FloatArray, Key, silent
 from tests.diagnose.records import record
 
 LEAK: Key = ("internal_leakage_laminar", "a-b")
@@ -84,3 +87,25 @@ def test_a_few_rows_do_not_refuse_what_the_first_part_shows() -> None:
     assert is_seen_to_harm(state, leaking, bare, of_rows(with_it, none), of_rows(without, none))
     state.held_out = state.chunk  # a record that judges itself has no other part
     assert is_seen_to_harm(state, bare, leaking, *against)
+
+
+def test_parts_are_taught_in_the_order_of_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A span that is held out may stand before what teaches; what is between two parts is a gap."""
+    model, chunk, held_out = record("internal_leakage_laminar", 2e-12)
+    bare = fit(model, chunk, prepare(model, chunk), Revision(), bank=False)
+    taught = list[FloatArray]()
+
+    def passed(_model: object, rest: FloatArray, *_: object, **__: object) -> Fit:
+        taught.append(rest)
+        return bare
+
+    monkeypatch.setattr(admission, "one_pass", passed)
+    n = len(held_out)
+    for teaches, judges in ((chunk, held_out), (chunk[n:], chunk[:n])):
+        admission._of_part(TrialState(model, teaches, judges, silent), bare, n // 2)
+    behind, before = taught
+    assert len(behind) == len(chunk) and len(before) == len(chunk) - 2 * n
+    for rest in taught:
+        steps = np.diff(rest[:, 0])
+        assert np.all(steps > 0.0)
+        assert np.all(rest[1:, 1].astype(int)[steps > 2.0 * np.median(steps)] & GAP)

@@ -149,3 +149,25 @@ def test_where_commands_jump_all_of_the_range_is_looked_over(
     assert looking(monkeypatch, bowl(320.0), steps_v=4.0) == pytest.approx(10.8e-3, abs=0.8e-3)
     assert looking(monkeypatch, bowl(50.0), steps_v=4.0) == 6.8e-3
     assert looking(monkeypatch, bowl(320.0), steps_v=0.4) == 6.8e-3, "derivatives lead there"
+
+
+@pytest.mark.parametrize("by_s", [-1e-3, 1e-3, 3e-3])
+def test_a_play_beside_a_lag_out_of_its_range_is_as_wide_within(
+    monkeypatch: pytest.MonkeyPatch, by_s: float
+) -> None:
+    """A lag of none is mirrored: nothing is fitted with a negative one."""
+    asked = list[float]()
+
+    def shared(_present: Any, _k: int, lag_s: float) -> Any:
+        asked.append(lag_s)
+        play = SimpleNamespace(revision=SimpleNamespace(timings=((None, (0.4 - 100.0 * lag_s,)),)))
+        return play
+
+    monkeypatch.setattr(lag_interval, "shared", shared)
+    present: Any = SimpleNamespace(
+        weights=SimpleNamespace(lag_s=0.0), lag_tolerance_s=1e-3,
+        declared=SimpleNamespace(lag=Lag(0.0, 1e-3)),
+        revision=SimpleNamespace(timings=((None, (0.4,)),)),
+    )  # fmt: skip
+    assert lag_interval._beside(present, 0, by_s) == pytest.approx(0.4 - 100.0 * by_s)
+    assert asked == [abs(by_s)]
