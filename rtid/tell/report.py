@@ -19,7 +19,7 @@ from rtid.tell.axes import axes_of
 from rtid.tell.charts.dependence import before_and_after
 from rtid.tell.charts.maps import maps, slices
 from rtid.tell.charts.over_time import flows
-from rtid.tell.diagnosed import LIMITS, heading, limits, limits_say, remark, sentences
+from rtid.tell.diagnosed import LIMITS, folded, heading, limits, limits_say, remark, sentences
 from rtid.tell.history import history_table
 from rtid.tell.html import rendered
 from rtid.tell.report_page import embedded, key_figures, page_of
@@ -249,8 +249,9 @@ def _candidate(ranked: Ranked) -> tuple[str, ...]:
 def _not_found(result: Diagnosis, ranking: tuple[Ranked, ...]) -> tuple[Story, ...]:
     """What was not found with its detection limits, and what the record cannot show."""
     clear = {r.key: r for r in ranking if r.after is not None and r.after > LIMIT_SD}
-    seen = [u for u in result.not_found if u.visible and u.detection_limit is not None]
-    hidden = [u for u in result.not_found if u not in seen]
+    listed = folded(result.not_found)
+    seen = [u for u in listed if u.visible and u.detection_limit is not None]
+    hidden = [u for u in listed if u not in seen]
     rows = [
         (
             title(u.effect),

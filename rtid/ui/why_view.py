@@ -17,6 +17,7 @@ from rtid.tell.charts.theme import NARROWEST_PX, beside
 from rtid.tell.diagnosed import (
     LIMITS,
     floored,
+    folded,
     hidden,
     in_the_moduli,
     judged,
@@ -204,7 +205,7 @@ def _unseen(diagnosis: Diagnosis) -> list[str]:
     """Detection limits, and what the record cannot show."""
     listed = () if diagnosis.verdict == "insufficient_data" else diagnosis.not_found
     seen = [u for u in listed if u.visible and u.detection_limit is not None]
-    blind = [u for u in diagnosis.not_found if not u.visible or u.detection_limit is None]
+    blind = [u for u in folded(diagnosis.not_found) if not u.visible or u.detection_limit is None]
     head = ("effect", "where", *LIMITS, "remark")
     parts = []
     if seen:

@@ -31,6 +31,7 @@ from rtid.effects.laws.pump import PUMP, demand, drawn_down, usual_demand
 from rtid.effects.record_view import RecordView
 from rtid.model import MODE, Machine, Signal
 from rtid.plain import FloatArray
+from rtid.tell.diagnosed import folded
 from tests.diagnose.records import record
 
 DT = 1e-3
@@ -204,3 +205,12 @@ def test_a_pump_s_flow_that_was_never_reached_is_above_what_it_gave() -> None:
     most = not_reached["pump_flow"].value
     assert 0.3 < most / usual_demand(weak.view).max() <= 1.0
     assert "pump_flow" in parameters(weak, (PUMP.effect, "p_supply")), "the file has it"
+
+
+def test_what_says_the_same_of_all_is_said_once() -> None:
+    """38 rows had the same remark; of one alone its name stays."""
+    bent = [Unseen(name, "a", None, "", True, MISLED) for name in ("relief_valve", "supply_sag")]
+    other = Unseen("entrained_air", "both", 0.01, "1", True, "")
+    told = folded([bent[0], other, bent[1]])
+    assert [u.effect for u in told] == ["entrained_air", "all 2 that it was asked for"]
+    assert told[1].reason == MISLED and folded(bent[:1]) == bent[:1]
