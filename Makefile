@@ -102,6 +102,8 @@ pictures: $(READY)
 	.venv/bin/python -m tools.tool_pictures tools/pictures
 	.venv/bin/python -m tools.screenshots out/screenshots tools/pictures
 
+# The lock names all that is needed, so that two installers share it and no one asks what depends
+# on what: half the time of one after the other.
 $(READY): requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
 	  echo "rtid needs Python 3.11 or newer, and $(PYTHON) is not:" \
@@ -111,7 +113,7 @@ $(READY): requirements.lock pyproject.toml
 	       "(Debian: apt install python3-venv)"; exit 1; }
 	@echo "Setting up .venv (once; about a minute) ..."
 	@$(PYTHON) -m venv --clear .venv
-	@$(PIP) install -qq -r requirements.lock
+	@xargs -P 2 -n 16 $(PIP) install -qq --no-deps <requirements.lock
 	@$(PIP) install -qq --no-deps --no-build-isolation --editable .
 	@touch $@
 
