@@ -87,7 +87,19 @@ def counted(present: Fit) -> FloatArray:
     estimate = known or sketch(record[0], summed(*record))
     covariance = estimate.influence[:, : len(estimate.scale_pa)]
     covariance = covariance * np.outer(estimate.scale_pa, estimate.scale_pa)
-    return np.asarray(covariance * widened(*record, estimate)) + _by_sizes(present)
+    covariance = covariance * widened(*record, estimate) + _by_sizes(present)
+    return _no_less(covariance, present.compliance_cov)
+
+
+def _no_less(covariance: FloatArray, least: FloatArray) -> FloatArray:
+    """A covariance (n, n), widened to the deviations of another one where these are larger.
+
+    Either way to the noise's own is a first order of how much of it the maps take along.  Where
+    steps leave little beside them these differ: 1102.2 +- 0.7 and +- 1.5 MPa, of 1112.1.
+    """
+    ratio = least.diagonal() / np.maximum(covariance.diagonal(), TINY)
+    more = np.sqrt(np.maximum(1.0, ratio))
+    return np.asarray(covariance * np.outer(more, more))
 
 
 def _by_sizes(present: Fit) -> FloatArray:

@@ -34,7 +34,7 @@ from rtid.effects.law import chambers_by_place
 from rtid.effects.laws.pump import FLOW, PUMP, delivered, demand
 from rtid.effects.laws.timing import COMMAND
 from rtid.effects.page import ZERO, correcting
-from rtid.plain import Key
+from rtid.plain import FloatArray, Key
 from rtid.units import limit
 
 LONG_STEP = 0.2  # share of the delay: a shorter step changes little
@@ -64,7 +64,7 @@ def diagnosis(result: Result) -> Diagnosis:
         heldout_residual_after_m3s=result.after.rms_m3s,
         noise_floor_m3s=result.after.floor_m3s,
         rms_flow_m3s=result.after.flow_m3s,
-        beta_pa=tuple(1.0 / float(c) if c else float("inf") for c in words.compliance),
+        beta_pa=moduli(words.compliance),
         lag_s=words.weights.lag_s,
         lag_sd_s=_sd_of_lag(result, words),
         something_remains=last.rho >= last.most_rho or result.verdict == UNKNOWN,
@@ -81,6 +81,14 @@ def diagnosis(result: Result) -> Diagnosis:
         beta_sd_pa=_sd_of_moduli(result, words, unseen),
         filtered_hz=cut_hz,
     )
+
+
+def moduli(compliance: FloatArray) -> tuple[float, ...]:
+    """Bulk moduli, Pa, of compliances (chambers,), 1/Pa; infinite where none is seen.
+
+    What is missing may make one less than none: -5.8 and -9.9 GPa were told beside an `unknown`.
+    """
+    return tuple(1.0 / float(c) if c > 0.0 else float("inf") for c in compliance)
 
 
 def _sd_of_lag(result: Result, fit: Fit) -> float:
@@ -110,7 +118,8 @@ def _sd_of_moduli(result: Result, fit: Fit, unseen: tuple[Unseen, ...]) -> tuple
         more[at] = np.maximum(more[at], cause.moves_beta or 0.0)
     sd = np.hypot(sd, more * fit.compliance)
     return tuple(
-        float(s / c**2) if c else float("nan") for s, c in zip(sd, fit.compliance, strict=True)
+        float(s / c**2) if c > 0.0 else float("nan")
+        for s, c in zip(sd, fit.compliance, strict=True)
     )
 
 

@@ -39,6 +39,7 @@ COMMAND_BINS = 40  # at most
 WINDOWS_PER_BIN = 20  # at least: each bin knows its flow by six unknowns
 SAME = 1e-6  # share of the largest singular value, below which two drops are one
 TINY = 1e-300
+JUMP = 0.05  # of a command's range, within a window
 LONGEST = 1.25  # of WINDOW_S: a window of whole samples that is still as short as meant
 
 
@@ -75,12 +76,27 @@ class Motion:
 
 @dataclass(frozen=True)
 class Windows:
-    """Of windows without a gap: means of all signals, first values and changes (n, m); length."""
+    """Of windows without a gap: means of all signals, first values and changes (n, m); length.
+
+    calm (n,): no command has jumped in it, or in the one before.
+    """
 
     mean: FloatArray
     start: FloatArray
     change: FloatArray
     length_s: float
+    calm: BoolArray
+
+    def calmed(self) -> Windows:
+        """Those in which no spool is behind a jump: the mean command says what it lets through.
+
+        A joystick's steps, each with its spool's lag, at 100 rows a second were a spring of -168
+        MPa, 60 standard deviations clear: the pressures of a healthy machine were swapped.
+        """
+        here = self.calm
+        return Windows(
+            self.mean[here], self.start[here], self.change[here], self.length_s, here[here]
+        )
 
 
 def motion(model: Machine, samples: Samples) -> Motion:
@@ -89,7 +105,7 @@ def motion(model: Machine, samples: Samples) -> Motion:
     if len(windows.mean) < MIN_WINDOWS:
         nothing = Spring(float("nan"), float("nan"))
         return Motion(float("nan"), {c.name: nothing for c in model.chambers}, float("nan"))
-    springs = {c.name: _spring(model, c, windows) for c in model.chambers if c.pressure}
+    springs = {c.name: _clear_spring(model, c, windows) for c in model.chambers if c.pressure}
     v_slope = _v_slope(model, samples)
     return Motion(_u_to_v(model, windows), springs, v_slope, windows.length_s)
 
@@ -99,15 +115,26 @@ def _windows(model: Machine, samples: Samples) -> Windows:
     rows = np.flatnonzero(samples.flags & ROW)
     if len(rows) < 3:
         nothing = np.empty((0, len(samples.names)))
-        return Windows(nothing, nothing, nothing, 0.0)
+        return Windows(nothing, nothing, nothing, 0.0, np.zeros(0, bool))
     period_s = float(np.median(np.diff(samples.t_us[rows]))) * 1e-6
     steps = max(2, round(WINDOW_S / period_s))
     border = rows[::steps]
     total = np.concatenate([np.zeros((1, len(samples.names))), np.cumsum(samples.values, axis=0)])
     whole, values = _unbroken(model, samples, border), samples.values[border]
     change = np.diff(values, axis=0)
+    calm = _calm(model, change, np.ptp(samples.values, axis=0))
     mean = (np.diff(total[border], axis=0) + 0.5 * change) / np.diff(border)[:, None]
-    return Windows(mean[whole], values[:-1][whole], change[whole], steps * period_s)
+    return Windows(mean[whole], values[:-1][whole], change[whole], steps * period_s, calm[whole])
+
+
+def _calm(model: Machine, change: FloatArray, sizes: FloatArray) -> BoolArray:
+    """Whether no command jumps in a window, or in the one before, bool (n,).
+
+    change (n, m): of all signals over each window; sizes (m,): their ranges in the record.
+    """
+    at = sorted({model.column(edge.command) for edge in model.edges})
+    moved = np.any(np.abs(change[:, at]) > JUMP * sizes[at], axis=1)
+    return ~(moved | np.append(False, moved[:-1]))
 
 
 def _unbroken(model: Machine, samples: Samples, border: NDArray[np.intp]) -> BoolArray:
@@ -128,6 +155,15 @@ def _u_to_v(model: Machine, windows: Windows) -> float:
     moved = windows.change[:, model.column(model.position)]
     size = float(np.sqrt(np.dot(push, push) * np.dot(moved, moved)))
     return float(np.dot(push, moved)) / size if size > 0 else float("nan")
+
+
+def _clear_spring(model: Machine, chamber: Chamber, windows: Windows) -> Spring:
+    """The spring of a chamber; of calm windows alone, where these say the opposite.
+
+    They hold less of what is quick, and so of what is compressed.
+    """
+    every, calm = (_spring(model, chamber, w) for w in (windows, windows.calmed()))
+    return calm if calm.t * every.t < 0.0 else every
 
 
 def _spring(model: Machine, chamber: Chamber, windows: Windows) -> Spring:

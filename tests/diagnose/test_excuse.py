@@ -92,7 +92,7 @@ def test_a_modulus_is_known_no_better_than_the_volume_beside_it(
     small, _ = volumed
     sd, least = (np.sqrt(np.diag(c)) for c in (counted(small), small.compliance_cov))
     off = small.compliance - 1.0 / draw(3).beta_pa
-    assert sd[0] > 0.95 * least[0] > 2.0 * sd[1]
+    assert np.all(sd >= (1.0 - 1e-12) * least) and least[0] > 2.0 * sd[1]
     assert np.all(np.abs(off) < 3.0 * sd)
 
 
@@ -114,3 +114,14 @@ def test_beside_what_is_not_known_a_covariance_is_that_of_both(seed: int, others
     present.spreads = tuple((5 + k, unit[2 + k]) for k in range(others))
     more = np.diag(excuse._by_sizes(present)) / np.diag(scale)
     assert np.all(more >= (1.0 - 1e-6) * np.diag(wanted / scale) - 1e-6)
+
+
+@given(st.integers(0, 99), st.floats(-30.0, 0.0))
+def test_neither_way_to_the_noise_is_told_smaller_than_the_other(seed: int, size: float) -> None:
+    """On a joystick's steps 1102.2 +- 0.7 MPa were told, of 1112.1, where the other says 1.5."""
+    rng = np.random.default_rng(seed)
+    first, other = (np.exp(size) * root @ root.T for root in rng.normal(size=(2, 2, 2)))
+    wider = excuse._no_less(first, other)
+    assert wider.diagonal() == pytest.approx(np.maximum(first.diagonal(), other.diagonal()))
+    share = [c[0, 1] / np.sqrt(c[0, 0] * c[1, 1]) for c in (first, wider)]
+    assert share[0] == pytest.approx(share[1])

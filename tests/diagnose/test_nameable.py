@@ -126,6 +126,10 @@ def test_an_interval_of_a_modulus_holds_what_is_seen_and_not_named(
     assert plain == pytest.approx((1e-12 / 4e-18, 1e-12 / 1e-18))
     a, b = summary._sd_of_moduli(result, last, (hose,))
     assert a == pytest.approx(0.4 / 2e-9, rel=1e-3) and b == plain[1]
+    last.compliance = np.array([2e-9, -1e-10])
+    assert summary.moduli(last.compliance) == pytest.approx((5e8, np.inf))
+    assert np.isnan(summary._sd_of_moduli(result, last, ())).tolist() == [False, True]
+    last.compliance = np.array([2e-9, 1e-9])
     result.verdict = "unknown"
     assert np.isnan(summary._sd_of_moduli(result, last, ())).all()
 
