@@ -20,7 +20,7 @@ from rtid.diagnose.evidence import rows_of
 from rtid.diagnose.excuse import counted
 from rtid.diagnose.fit import Fit, one_pass
 from rtid.diagnose.halves import between_halves, in_its_form
-from rtid.diagnose.lag_interval import lag_sd_s
+from rtid.diagnose.lag_interval import known_lag
 from rtid.diagnose.regression import LIMIT_SD
 from rtid.diagnose.residual import is_known
 from rtid.diagnose.trials import Trial
@@ -91,7 +91,7 @@ def _lag_moves(present: Fit, now: Fit) -> float:
     if not is_timing or now.revision.replaces_lag or not np.isfinite(present.lag_sd_s):
         return 0.0
     move = now.weights.lag_s - present.weights.lag_s
-    is_clear = abs(move) > Z95 * present.lag_sd_s and abs(move) > Z95 * lag_sd_s(present)
+    is_clear = abs(move) > Z95 * present.lag_sd_s and abs(move) > Z95 * known_lag(present).sd_s
     return move if is_clear else 0.0
 
 

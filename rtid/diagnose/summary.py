@@ -13,7 +13,7 @@ from rtid.diagnose.excuse import counted, steady
 from rtid.diagnose.experiment import limits, would_separate
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.fitted_sizes import parameters
-from rtid.diagnose.lag_interval import is_at_most, lag_sd_s
+from rtid.diagnose.lag_interval import LagInterval, is_at_most, known_lag
 from rtid.diagnose.remains import described
 from rtid.diagnose.report import (
     Diagnosis,
@@ -52,6 +52,7 @@ def diagnosis(result: Result) -> Diagnosis:
         effects += tuple(_shown_too_much(result, z) for z in result.zeros if z.matters)
         effects += (_stored(result, result.softer),) if result.softer else ()
     words = steady(last)
+    late = _late(result, words)
     unseen = not_found(result, sizeless)
     cut_hz = _cut_hz(result)
     return Diagnosis(
@@ -66,7 +67,7 @@ def diagnosis(result: Result) -> Diagnosis:
         rms_flow_m3s=result.after.flow_m3s,
         beta_pa=moduli(words.compliance),
         lag_s=words.weights.lag_s,
-        lag_sd_s=_sd_of_lag(result, words),
+        lag_sd_s=_sd_of_lag(words, late),
         something_remains=last.rho >= last.most_rho or result.verdict == UNKNOWN,
         held_out_judged=result.held_out_judged,
         not_found=unseen,
@@ -78,7 +79,7 @@ def diagnosis(result: Result) -> Diagnosis:
         cut=cuts(last.declared, last.chunk),
         disturbance=max(chamber.disturbance for chamber in last.declared.chambers),
         zeros=result.zeros,
-        beta_sd_pa=_sd_of_moduli(result, words, unseen),
+        beta_sd_pa=_sd_of_moduli(words, late, unseen),
         filtered_hz=cut_hz,
     )
 
@@ -91,27 +92,37 @@ def moduli(compliance: FloatArray) -> tuple[float, ...]:
     return tuple(1.0 / float(c) if c > 0.0 else float("inf") for c in compliance)
 
 
-def _sd_of_lag(result: Result, fit: Fit) -> float:
+def _late(result: Result, fit: Fit) -> LagInterval | None:
+    """How well the spools' lag is known; None where what is missing bends it, and the moduli.
+
+    Beside a line that nobody named they were 1.8 and 1.9 GPa, of 1.3: by the noise to 0.02.  And
+    beside a relief valve that was, 1.06 GPa to 0.002, of 1.38: hoses were left.
+    """
+    if is_unexplained(result) or fit.rho >= CLEARLY_LEFT:
+        return None
+    return known_lag(fit)
+
+
+def _sd_of_lag(fit: Fit, late: LagInterval | None) -> float:
     """Standard deviation of the spools' lag, s; NaN where what is missing bends it.
 
     So it is where the lag stands at the most that it may be: there it stands in for something.
     Beside a sag that was too small to matter 6.016 +- 0.13 ms were told, its bound, of 3.76.
     """
-    if is_unexplained(result) or fit.rho >= CLEARLY_LEFT or is_at_most(fit):
-        return float("nan")
-    return lag_sd_s(fit)
+    return float("nan") if late is None or is_at_most(fit) else late.sd_s
 
 
-def _sd_of_moduli(result: Result, fit: Fit, unseen: tuple[Unseen, ...]) -> tuple[float, ...]:
+def _sd_of_moduli(
+    fit: Fit, late: LagInterval | None, unseen: tuple[Unseen, ...]
+) -> tuple[float, ...]:
     """Standard deviations of the bulk moduli, Pa; NaN where what is missing bends them.
 
-    Beside a line that nobody named they were 1.8 and 1.9 GPa, of 1.3: by the noise to 0.02.  And
-    beside a relief valve that was, 1.06 GPa to 0.002, of 1.38: hoses were left.  What was seen and
-    is not named may be in them: hoses that nothing confirmed, which moved 835 MPa to 535 +- 6.
+    What was seen and is not named may be in them: hoses that nothing confirmed, which moved 835 MPa
+    to 535 +- 6.
     """
-    if is_unexplained(result) or fit.rho >= CLEARLY_LEFT:
+    if late is None:
         return (float("nan"),) * len(fit.compliance)
-    sd = np.sqrt(np.maximum(np.diag(counted(fit)), 0.0))
+    sd = np.hypot(np.sqrt(np.maximum(np.diag(counted(fit)), 0.0)), late.compliance)
     places, more = chambers_by_place(fit.declared), np.zeros(len(sd))
     for cause in unseen:
         at = list(places.get(cause.where, ()))

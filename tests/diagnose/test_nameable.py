@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rtid.diagnose import summary
+from rtid.diagnose.lag_interval import LagInterval
 from rtid.diagnose.nameable import Reach, clearest
 from rtid.diagnose.regression import LIMIT_SD, Score
 from rtid.diagnose.report import NOT_CONFIRMED, Small, Unseen, Value
@@ -120,25 +121,25 @@ def test_an_interval_of_a_modulus_holds_what_is_seen_and_not_named(
         rho=1.0, most_rho=1.1, compliance=np.array([2e-9, 1e-9]),
         declared=declared_model(SimulatedPlant()),
     )  # fmt: skip
-    result: Any = SimpleNamespace(verdict="matches", last=last)
+    late = LagInterval(1e-4, np.zeros(2))
     hose = Unseen("hose_compliance", "a", 2.5e-13, "m3/Pa", True, NOT_CONFIRMED, moves_beta=0.4)
-    plain = summary._sd_of_moduli(result, last, ())
+    plain = summary._sd_of_moduli(last, late, ())
     assert plain == pytest.approx((1e-12 / 4e-18, 1e-12 / 1e-18))
-    a, b = summary._sd_of_moduli(result, last, (hose,))
+    a, b = summary._sd_of_moduli(last, late, (hose,))
     assert a == pytest.approx(0.4 / 2e-9, rel=1e-3) and b == plain[1]
+    wider = summary._sd_of_moduli(last, LagInterval(1e-4, np.array([3e-12, 0.0])), ())
+    assert wider == pytest.approx((np.sqrt(10.0) * plain[0], plain[1]))
     last.compliance = np.array([2e-9, -1e-10])
     assert summary.moduli(last.compliance) == pytest.approx((5e8, np.inf))
-    assert np.isnan(summary._sd_of_moduli(result, last, ())).tolist() == [False, True]
-    last.compliance = np.array([2e-9, 1e-9])
-    result.verdict = "unknown"
-    assert np.isnan(summary._sd_of_moduli(result, last, ())).all()
+    assert np.isnan(summary._sd_of_moduli(last, late, ())).tolist() == [False, True]
+    assert np.isnan(summary._sd_of_moduli(last, None, ())).all()
 
 
 def test_a_lag_that_stands_in_for_what_is_missing_has_no_interval(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """At three tolerances, and beside a misfit: 6.016 +- 0.13 ms were told of 3.76."""
-    monkeypatch.setattr(summary, "lag_sd_s", lambda _: 1e-4)
+    monkeypatch.setattr(summary, "known_lag", lambda _: LagInterval(1e-4, np.zeros(2)))
 
     def told(lag_s: float, rho: float = 1.0, verdict: str = "matches") -> float:
         last: Any = SimpleNamespace(
@@ -146,7 +147,7 @@ def test_a_lag_that_stands_in_for_what_is_missing_has_no_interval(
             declared=SimpleNamespace(lag=Lag(3e-3, 1e-3)),
         )  # fmt: skip
         result: Any = SimpleNamespace(verdict=verdict, last=last)
-        return summary._sd_of_lag(result, last)
+        return summary._sd_of_lag(last, summary._late(result, last))
 
     assert told(4e-3) == told(5.9e-3, 1.4, "missing") == 1e-4
     wrong = told(6e-3), told(4e-3, 2.1), told(4e-3, 1.2, "unknown")
