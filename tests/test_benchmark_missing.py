@@ -54,6 +54,7 @@ def case() -> Case:
     return drawn
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_three_methods_answer_and_their_tables_are_written(tmp_path: Path) -> None:
     """A strong leak: the map alone cannot have it, rtid names it and predicts best."""

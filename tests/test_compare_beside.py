@@ -169,6 +169,7 @@ def test_an_effect_that_cannot_follow_is_taken_from_the_measured_pressures() -> 
     np.testing.assert_allclose(learned.solution.compliance, fitted.compliance, rtol=1e-5)
 
 
+@pytest.mark.long
 def test_maps_beside_air_are_weighed_by_what_the_air_makes_of_the_pressures_noise() -> None:
     """At low pressure air makes a chamber thirty times as soft, and the noise as large."""
     model, chunk, held_out = record("entrained_air", 0.06)
@@ -266,7 +267,7 @@ def map_error(flowmap: FlowMap) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["leak", "delay"])
+@pytest.mark.parametrize("name", [pytest.param("leak", marks=pytest.mark.long), "delay"])
 def test_held_out_errors_fall_to_those_of_the_clean_machine(folder: Path, name: str) -> None:
     clean, before, after = (studied(folder, n) for n in ("clean", f"{name}_before", name))
     (floor, floor_pa), (old, old_pa), (new, new_pa) = errors(clean), errors(before), errors(after)

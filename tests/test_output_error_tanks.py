@@ -55,6 +55,7 @@ def test_overflow_explains_more_than_the_decoy(records: Records) -> None:
     assert overflow[0] < 0.51 and overflow[1] < 0.58
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_overflow_is_found_first_and_the_error_falls(diagnosed: Refitted) -> None:
     found = diagnosed.diagnosis

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from rtid.diagnose.fit import fit
 from rtid.diagnose.fitted_sizes import parameters
@@ -14,6 +15,7 @@ from tests.diagnose.records import record
 RELIEF, SLOPE = ("relief_valve", "a"), 2.8e-10
 
 
+@pytest.mark.long
 def test_an_opening_pressure_counts_the_noise_of_its_sensor() -> None:
     model, chunk, held_out = record(RELIEF[0], SLOPE)
     present = stand(model, chunk, held_out).fit

@@ -49,6 +49,7 @@ def found(key: Key, rest: Residual) -> AcceptedEffect:
     return AcceptedEffect(key, (), 1e5, 1, rest, rest)
 
 
+@pytest.mark.long
 def test_a_delay_takes_the_place_of_the_spools_that_had_its_turn(late: TrialState) -> None:
     """Beside a drift they had taken more: 169 less, once it was known."""
     present = beside_leak(late, SECOND, (80.0, 0.7))

@@ -104,6 +104,7 @@ def test_gas_that_comes_out_below_some_pressure_is_not_called_air() -> None:
     assert 1e6 < own.parameters["saturation_pressure"].value < 6e6
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_late_command_is_found_from_afar() -> None:
     """12 ms: the derivative at zero delay points nowhere, exact refits do."""
@@ -114,6 +115,7 @@ def test_a_late_command_is_found_from_afar() -> None:
     assert found.rho_before > 10 * found.rho_after
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_play_below_the_bank_is_found_from_its_first_order() -> None:
     """22 mV, where the search begins at 50: at 50 it explains nothing."""

@@ -8,6 +8,7 @@ from rtid.diagnose.verdict import doubts_about
 from tests.campaign.laws import Case, judged
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("seed", "law"),
     [

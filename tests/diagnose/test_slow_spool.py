@@ -18,6 +18,7 @@ from tests.campaign.plants import grid
 SEED, LAG_S = 11, 10e-3
 
 
+@pytest.mark.long
 def test_it_takes_the_place_of_the_declared_lag() -> None:
     """As a pole behind the declared one both were 5 ms, and left 15 times the noise."""
     plant = replace(draw(SEED), lag_s=LAG_S)

@@ -33,6 +33,7 @@ def test_a_worn_place_is_as_wide_as_it_is() -> None:
     assert of("orifice", "position_dependent_leakage").judgement == RIGHT
 
 
+@pytest.mark.long
 def test_a_timing_that_had_stood_in_for_a_leak_is_not_named() -> None:
     """A hysteresis of 5 mV, the least of its page, beside which the leak was 37 % too small."""
     found = answer(Case(6405, "mixed", SWEEP, "internal_leakage_laminar"))
@@ -73,7 +74,7 @@ def test_laws_that_are_both_nearly_right_are_a_set(law: str, effect: str, remain
     ("law", "effect"),
     [
         pytest.param("compensated", "external_leakage_laminar", marks=pytest.mark.long),
-        ("overlap", "input_delay"),
+        pytest.param("overlap", "input_delay", marks=pytest.mark.long),
         pytest.param("choking", "valve_seat_leakage", marks=pytest.mark.long),
     ],
 )

@@ -67,6 +67,7 @@ def test_of_a_law_that_holds_the_pressures_tell_nothing_more() -> None:
     assert with_spreads(found).sd_of(column) < 1.2 * found.sd_of(column)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_interval_of_a_leak_knows_that_its_gap_widens() -> None:
     """The size that its own flow has over the record; the noise alone gave an interval of 0.1 %."""

@@ -158,6 +158,7 @@ def test_gas_that_air_of_an_impossible_exponent_tells_as_well_is_in_a_set() -> N
     assert abs(found.beta_z).max() < 3.0
 
 
+@pytest.mark.long
 def test_the_grid_is_looked_at_again_beside_what_was_found() -> None:
     """What is missing hides where a map jumps: the drift took 78 % of a misfit and was not named.
 
@@ -181,6 +182,7 @@ def test_what_begins_behind_a_step_needs_no_finer_grid() -> None:
     assert found.present.declared.n_cells < 1.2 * declared(case, found.run).n_cells
 
 
+@pytest.mark.long
 def test_a_lag_that_nobody_declared_is_found_from_nothing() -> None:
     """Slopes of blocks that were met once took the derivative: it stayed 0, at rho 46, and was
     an effect of the spools."""

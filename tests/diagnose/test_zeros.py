@@ -193,6 +193,7 @@ def test_a_valve_that_is_shut_joins_nothing() -> None:
     assert told(learned(), still) == {}
 
 
+@pytest.mark.long
 def test_a_finding_that_needs_the_flow_of_the_map_is_among_the_leaks() -> None:
     """A lag of the spools beside a rest: the leaks' columns ask for the fitted map."""
     _, chunk, _ = record(seed=3)

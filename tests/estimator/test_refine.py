@@ -37,7 +37,7 @@ def machine(seed: int, coarse: bool) -> tuple[SimulatedPlant, Machine, FloatArra
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [4, 7])
+@pytest.mark.parametrize("seed", [pytest.param(4, marks=pytest.mark.long), 7])
 def test_a_coarse_grid_is_refined_where_the_dead_band_ends(seed: int) -> None:
     plant, model, chunk = machine(seed, coarse=True)
     before, fit = fit_record(model, chunk), fitted(model, chunk)

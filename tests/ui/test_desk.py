@@ -57,6 +57,7 @@ def fit(look: Look) -> float:
     return float(part.runs["free run"].fit_percent.min())
 
 
+@pytest.mark.long
 def test_the_whole_way_of_an_effect(worn: tuple[Path, Path]) -> None:
     trace, project = worn
     untouched, desk = project.read_bytes(), Desk(silent)
