@@ -17,7 +17,7 @@ from rtid.kernels.increments import flow_noise, mean_terms, mean_windowed, term_
 from rtid.kernels.jit import inlined, kernel, part
 from rtid.kernels.layout import TAYLOR, TERMS
 from rtid.kernels.rows import fade, innovations
-from rtid.kernels.taking import resume, take
+from rtid.kernels.taking import bent_noise, resume, take
 from rtid.plain import FloatArray
 
 MEASURED, MODELLED = 0, 1
@@ -53,7 +53,7 @@ def explain(
             innovation[k - 1] = np.nan
             cell[k - 1] = SHUT
         if joined:
-            _one(e, cells, theta, compliance, sample, dt, flow[k - 1], cell[k - 1], gap)
+            _one(e, cells, theta, compliance, chunk, k, dt, flow[k - 1], cell[k - 1], gap)
             remember(e, sample)
             if (flags & ROW_FLAG) != 0:
                 _innovate(e, gap, work, innovation[k - 1])
@@ -68,22 +68,24 @@ def _one(
     cells: Any,
     theta: FloatArray,
     compliance: FloatArray,
-    sample: FloatArray,
+    chunk: FloatArray,
+    k: int,
     dt: float,
     flow: FloatArray,
     cell: Any,
     gap: FloatArray,
 ) -> None:
-    """One interval, whose working points are on the grids."""
+    """The interval to sample k, whose working points are on the grids."""
+    sample = e.sample
     x0, x1 = e.values[e.x_column], sample[2 + e.x_column]
     for c in range(e.n_chambers):
         rate = (sample[2 + e.p_column[c]] - e.values[e.p_column[c]]) / dt
         v = e.v0_m3[c] + 0.5 * e.growth_m2[c] * (x0 + x1)
         flow[MEASURED + 2 * c] = e.area_m2[c] * (x1 - x0) / dt
         flow[MODELLED + 2 * c] = -v * rate * compliance[c]
-        for k in range(e.n_terms):
-            start, end = term_rates(e, k, sample, dt)
-            flow[MODELLED + 2 * c] += e.term_sign[k, c] * e.term_theta[k] * 0.5 * (start + end)
+        for j in range(e.n_terms):
+            start, end = term_rates(e, j, sample, dt)
+            flow[MODELLED + 2 * c] += e.term_sign[j, c] * e.term_theta[j] * 0.5 * (start + end)
         e.cov[c, c] += e.q_floor[c] * dt
     for i in range(e.n_edges):
         e.cell[i, 0], e.cell[i, 1] = e.target[i, 0], e.target[i, 1]
@@ -94,6 +96,7 @@ def _one(
             for c in range(e.n_chambers):
                 flow[MODELLED + 2 * c] += e.sign[i, c] * q
             flow_noise(e, i, cells[at].slope, cells[at].missed, dt)
+            bent_noise(e, chunk, k, i, cells[at].slope, dt)
     for c in range(e.n_chambers):
         gap[c] += (flow[MEASURED + 2 * c] - flow[MODELLED + 2 * c]) * dt
 

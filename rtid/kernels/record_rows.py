@@ -22,7 +22,7 @@ from rtid.kernels.increments import flow_noise, mean_terms
 from rtid.kernels.jit import inlined, kernel, part
 from rtid.kernels.layout import TERMS
 from rtid.kernels.rows import over, position_noise
-from rtid.kernels.taking import resume, take
+from rtid.kernels.taking import bent_noise, resume, take
 from rtid.plain import BoolArray, FloatArray, IntArray
 
 IN_GROUP, N_ROWS, N_ENTRIES, GROUP_AT = range(4)  # entries of `counts`
@@ -74,7 +74,7 @@ def integrate(
             a, r = (group - counts[IN_GROUP]) / group, counts[N_ROWS]
             row_of[k - 1], share[k - 1] = r, a
             _add_measured(e, sample, dt, a, b[r], b[r + 1])
-            _add_blocks(e, cells, dt, a, counts, start[r], cell, terms, later)
+            _add_blocks(e, cells, chunk, k, dt, a, counts, start[r], cell, terms, later)
             _count_noise(e, a, noise)
             remember(e, sample)
             if (flags & ROW_FLAG) != 0:
@@ -136,6 +136,8 @@ def _add_measured(
 def _add_blocks(
     e: Any,
     cells: Any,
+    chunk: FloatArray,
+    k: int,
     dt: float,
     a: float,
     counts: IntArray,
@@ -144,7 +146,7 @@ def _add_blocks(
     terms: FloatArray,
     later: FloatArray,
 ) -> None:
-    """What the interval adds to the terms of the blocks that the working points are in."""
+    """What the interval to sample k adds to the terms of the blocks that the points are in."""
     for i in range(e.n_edges):
         e.cell[i, 0], e.cell[i, 1] = home_of(e, i)
         if e.cell[i, 0] == SHUT:
@@ -164,6 +166,7 @@ def _add_blocks(
             terms[n, j] += a * flow * e.phi[j]
             later[n, j] += (1.0 - a) * flow * e.phi[j]
         flow_noise(e, i, cells[at].slope, cells[at].missed, dt)
+        bent_noise(e, chunk, k, i, cells[at].slope, dt)
 
 
 @inlined
