@@ -21,7 +21,7 @@ class SignalSource:
     column.  `constant` replaces the measurement (a tank pressure nobody measures).  hold = "zero"
     for a command that acts until the next one, "linear" for a quantity sampled between instants.
     A `command` with hold = "linear" is a sampled monitor of a faster signal: a sample carries its
-    mean over the interval up to the next sample.
+    mean over the interval up to the next sample.  late_rows: by so many a table writes it late.
     """
 
     name: str
@@ -33,6 +33,7 @@ class SignalSource:
     constant: float | None = None
     hold: str = "linear"
     command: bool = False
+    late_rows: int = 0
 
 
 @dataclass(frozen=True)

@@ -75,6 +75,16 @@ def test_example_takes_period_protection_and_resolution_from_the_dbc() -> None:
     assert project.table_assembly.signals[1].signal == "p_A"
 
 
+def test_late_rows_are_of_a_table(raw: dict[str, Any], tmp_path: Path) -> None:
+    raw["signals"]["u"]["late_rows"] = 1
+    project = loaded(raw, tmp_path)
+    assert project.table_assembly is not None
+    assemblies = project.assembly, project.table_assembly
+    assert [assembly.signals[0].late_rows for assembly in assemblies] == [0, 1]
+    del raw["signals"]["u"]["column"]
+    assert "offset_ms" in refused(raw, tmp_path)["signals.u.late_rows"].remedy
+
+
 def test_grids_merge_pieces_and_increase() -> None:
     grid = load(EXAMPLE).model.edges[0].grid
     assert grid.dp_pa[[0, 6, 7, -1]].tolist() == pytest.approx([0.0, 2e6, 3e6, 8e6])

@@ -266,9 +266,16 @@ def _role(table: Table, source: SignalSource, n: int) -> NDArray[np.float64]:
     if source.constant is not None:
         return np.full(n, source.constant)
     column = table.column(source.signal)
+    if source.late_rows:
+        column = _in_time(column, source.late_rows)
     if source.table is not None:
         return np.interp(column, *source.table)
     return source.factor * column + source.offset
+
+
+def _in_time(column: NDArray[np.float64], late: int) -> NDArray[np.float64]:
+    """A column (n,) that is written so many rows late, where it belongs: its last are not known."""
+    return np.append(column[late:], np.full(min(late, len(column)), np.nan))
 
 
 def read_parquet(path: Path) -> Table:

@@ -272,6 +272,7 @@ def _source(
         constant=None if signal.constant is None else unit.si(signal.constant),
         hold=signal.hold or ("zero" if kind in ("command", "mode") else "linear"),
         command=kind == "command",
+        late_rows=signal.late_rows if column else 0,
     )
 
 

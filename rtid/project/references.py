@@ -160,6 +160,9 @@ def _signal_source(path: str, signal: Raw, catalog: Catalog | None, raw: Raw) ->
         if key not in signal:
             yield Problem(f"{path}.{key}", "missing", f'add {key} = "...", or constant = ...')
     message, wanted = signal.get("message"), signal.get("signal")
+    if signal.get("late_rows") and "column" not in signal:
+        remedy = "a message's age is offset_ms under [messages.NAME]"
+        yield Problem(f"{path}.late_rows", "is of the rows of a table", remedy)
     if catalog is None or message is None:
         return
     if message not in catalog.names:

@@ -170,6 +170,7 @@ class SignalSection(Section):
     """[signals.ROLE]: one column of the samples.  Numbers are in `unit`.
 
     noise_seen: what a record told of `noise = "estimate"`; on board, without a record, it is taken.
+    late_rows: by how many rows a table writes it late.
     """
 
     message: str | None = None
@@ -187,6 +188,7 @@ class SignalSection(Section):
     constant: float | None = None
     table: AngleTable | None = None
     numbers: dict[str, Annotated[int, Field(ge=0, le=MOST_MODE)]] | None = None
+    late_rows: int = Field(default=0, ge=0, description="late_rows = 1")
 
 
 class GeometrySection(Section):

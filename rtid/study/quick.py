@@ -9,6 +9,7 @@ from __future__ import annotations
 import shlex
 import tempfile
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -27,15 +28,8 @@ from rtid.project import Project, load
 from rtid.project import guess as proposal
 from rtid.project.guess import RoleCandidate, unused
 from rtid.study.kept_record import model_for
-from rtid.study.quick_command import (
-    between_rows,
-    is_taken,
-    less_known,
-    not_told,
-    rows_apart_s,
-    unlikeliness,
-    wins,
-)
+from rtid.study.quick_command import Reading, between_rows, on_a_line, rows_apart_s, said_of
+from rtid.study.quick_log import written_late
 from rtid.study.quick_machine import (
     Assumption,
     Given,
@@ -278,25 +272,19 @@ def _lag_seen_s(diagnosis: Diagnosis | None) -> float | None:
 def _likeliest(
     file: Path, path: Path, source: Source, arranged: Arranged, progress: Progress
 ) -> tuple[Diagnosis, MachineSizes]:
-    """The diagnosis, and the machine of it: its command held, or known at its samples only."""
-    study, machine = Study(arranged.project, path, _later(progress)), arranged.machine
-    held = _diagnosed(study)
-    if held.verdict == MATCHES or not arranged.trace.is_table:
-        return held, machine
-    looser = less_known(machine, study.read.samples)
-    tried = [(Study(_project(file, path, source, arranged.roles, m), path), m) for m in looser]
-    try:
-        if not tried:
-            return held, machine
-        won, least = wins(tried[0][0], study)
-        if not won > least:
-            step_s = looser[0].command_step_s
-            return held, not_told(machine, step_s) if won > -least else machine
-        study, on_a_line = min(tried, key=lambda pair: unlikeliness(pair[0].fitted))
-        said = _diagnosed(study)
-    except (np.linalg.LinAlgError, RtidError):  # it cannot be had so: what was said before stands
-        return held, machine
-    return (said, on_a_line) if is_taken(said, held) else (held, machine)
+    """The diagnosis, and the machine of it: with its command as the record likes it read."""
+
+    def at(machine: MachineSizes) -> Study:
+        return Study(_project(file, path, source, arranged.roles, machine), path)
+
+    study = Study(arranged.project, path, _later(progress))
+    reading = Reading(study, arranged.machine, said_of(study))
+    for another in (written_late, on_a_line) if arranged.trace.is_table else ():
+        if reading.said.verdict == MATCHES:
+            break
+        with suppress(np.linalg.LinAlgError, RtidError):  # it cannot be had so: as it was before
+            reading = another(reading, at)
+    return reading.said, reading.machine
 
 
 def _rows_apart_s(arranged: Arranged, machine: MachineSizes) -> float:
@@ -308,17 +296,6 @@ def _rows_apart_s(arranged: Arranged, machine: MachineSizes) -> float:
 def _later(progress: Progress) -> Progress:
     """What is done after the data are judged."""
     return lambda text, share: progress(text, 0.1 + 0.9 * share)
-
-
-def _diagnosed(study: Study) -> Diagnosis:
-    """The diagnosis; RtidError for data that its numerics cannot bear: they are anybody's."""
-    try:
-        return study.diagnosis()
-    except np.linalg.LinAlgError as error:
-        raise RtidError(
-            f"{study.path}: the fit fails on this data ({error})",
-            "record more motion; if it looks sound to you, please report it with the file",
-        ) from error
 
 
 def _noise(project: Project, trace: Recording) -> tuple[dict[str, float], list[Point]]:

@@ -10,7 +10,8 @@ nine tenths of a misfit, tells of neither: then the command is held, as it was r
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,11 +22,48 @@ from rtid.diagnose.report import Diagnosis
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.trials import TIE
 from rtid.diagnose.verdict import AMBIGUOUS, MATCHES, MISSING
+from rtid.errors import RtidError
 from rtid.study.quick_machine import Assumption, MachineSizes
 from rtid.study.study import Study
 from rtid.trace.between import FASTEST_S, unknown_between
 
 SHARES = 0.0, 0.5, 1.0  # of what is unknown between its samples, that are tried as its noise
+At = Callable[[MachineSizes], Study]  # the study of a file by the project of this machine
+
+
+@dataclass(frozen=True)
+class Reading:
+    """A machine with the way in which the command of its log is read, and what is said of it."""
+
+    study: Study
+    machine: MachineSizes
+    said: Diagnosis
+
+
+def said_of(study: Study) -> Diagnosis:
+    """The diagnosis; RtidError for data that its numerics cannot bear: they are anybody's."""
+    try:
+        return study.diagnosis()
+    except np.linalg.LinAlgError as error:
+        raise RtidError(
+            f"{study.path}: the fit fails on this data ({error})",
+            "record more motion; if it looks sound to you, please report it with the file",
+        ) from error
+
+
+def on_a_line(first: Reading, at: At) -> Reading:
+    """The record with its command on a line between its samples, where it is likelier so."""
+    looser = less_known(first.machine, first.study.read.samples)
+    tried = [Reading(at(machine), machine, first.said) for machine in looser]
+    if not tried:
+        return first
+    won, least = wins(tried[0].study, first.study)
+    if not won > least:
+        told = not_told(first.machine, looser[0].command_step_s)
+        return replace(first, machine=told) if won > -least else first
+    best = min(tried, key=lambda reading: unlikeliness(reading.study.fitted))
+    best = replace(best, said=said_of(best.study))
+    return best if is_taken(best.said, first.said) else first
 
 
 def less_known(machine: MachineSizes, samples: Samples) -> list[MachineSizes]:

@@ -128,6 +128,8 @@ def _signals(
                 section["resolution"] = source.steps[candidate.name]
         elif machine.command_noise or machine.command_hold != HELD:
             section |= {"hold": machine.command_hold, "noise": _neat(machine.command_noise)}
+        if role == "u" and machine.command_late_rows:
+            section["late_rows"] = machine.command_late_rows
         turned = role in machine.reversed
         if turned:
             section["scale"] = -1.0

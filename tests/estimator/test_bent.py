@@ -34,8 +34,10 @@ def chunk_of(p_a: FloatArray, dt_s: float) -> FloatArray:
     """A record (n, 2 + signals), SI, at one position, in which that pressure moves alone."""
     model, chunk = MODEL, np.zeros((len(p_a), 2 + len(MODEL.signals)))
     chunk[:, 0], chunk[:, 1], chunk[0, 1] = dt_s * np.arange(len(p_a)), ROW, ROW | GAP
-    for name, value in {"u": U_V, "p_a": p_a, "p_b": MIDDLE, "p_supply": P_S, "x": 0.25}.items():
+    level: dict[str, float] = {"u": U_V, "p_b": MIDDLE, "p_supply": P_S, "x": 0.25}
+    for name, value in level.items():
         chunk[:, 2 + model.column(name)] = value
+    chunk[:, 2 + model.column("p_a")] = p_a
     return chunk
 
 

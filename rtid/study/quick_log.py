@@ -1,0 +1,60 @@
+"""What a log makes of a command: rows that are written late, which is nothing of the machine.
+
+A command that is written n rows after it acted is a delay of less than nothing: what is left of the
+spools' lag ends at nothing, and no cause of the catalogue is as early.  It is asked for where less
+than a row of lag is left: a longer one has room for the row.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from rtid.diagnose.fit import Fit
+from rtid.diagnose.verdict import MATCHES
+from rtid.study.quick_command import At, Reading, is_taken, said_of, wins
+from rtid.study.quick_machine import Assumption, MachineSizes
+from rtid.study.study import Study
+
+MOST_ROWS = 3  # that a log is asked to write a command late
+
+
+def late_by(machine: MachineSizes, rows: int, step_s: float) -> MachineSizes:
+    """The machine with a log that writes its command so many rows late, of step_s, s."""
+    a_row = "a row" if rows == 1 else f"{rows} rows"
+    assumption = Assumption(
+        f"the log writes the command {a_row} late, {1e3 * rows * step_s:.3g} ms",
+        "the valves answer before they are told (late_rows of u)",
+    )
+    assumptions = *machine.assumptions, assumption
+    return replace(machine, command_late_rows=rows, assumptions=assumptions)
+
+
+def written_late(first: Reading, at: At) -> Reading:
+    """The record with its command as many rows earlier as make it likelier."""
+    samples, best = first.study.read.samples, first
+    step_s = 1e-6 * float(np.median(np.diff(samples.t_us)))
+    for rows in range(1, MOST_ROWS + 1):
+        if best.said.verdict == MATCHES or best.said.lag_s > step_s:
+            break
+        machine = late_by(first.machine, rows, step_s)
+        study = at(machine)
+        if not is_likelier(study, best.study) or not is_taken(said := said_of(study), best.said):
+            break
+        best = Reading(study, machine, said)
+    return best
+
+
+def is_likelier(study: Study, first: Study) -> bool:
+    """Whether another reading leaves less by itself than the first with all it found, or wins."""
+    last, bare = first.diagnosed.result.last, study.fitted
+    if last.revision.n_causes > bare.revision.n_causes and _excess(bare) < _excess(last):
+        return True
+    won, least = wins(study, first)
+    return won > least
+
+
+def _excess(of: Fit) -> float:
+    """What it leaves of its rows beyond their noise, weighed for exactly what it has found."""
+    return of.settled_chi2 - of.regression.dof
