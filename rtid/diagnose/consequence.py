@@ -135,10 +135,10 @@ def is_stable(now: Fit, trial: Trial, is_needed: bool = False) -> bool:
     is_told = _has_one_size(value, *halves)
     if not is_told and (is_needed or not _has_one_size(value, *between_halves(now, column))):
         return False
-    on_finer = _on_finer(now)
-    if on_finer is None:
+    finer = on_finer(now)
+    if finer is None:
         return is_told
-    _, other, other_sd = _size(on_finer, trial)
+    _, other, other_sd = _size(finer, trial)
     is_told = is_told or abs(other) > LIMIT_SD * other_sd
     return is_told and _is_alike(value, value - other, float(np.hypot(sd, other_sd)))
 
@@ -158,7 +158,7 @@ def _of_either(now: Fit, trial: Trial) -> tuple[float, float]:
     return value - other, float(np.hypot(sd, other_sd))
 
 
-def _on_finer(now: Fit) -> Fit | None:
+def on_finer(now: Fit) -> Fit | None:
     """The same revision on a grid of half the spacing; None where no freedom is left."""
     machine, weights = halved_along(halved_along(now.declared, 0), 1), now.weights
     slopes, missed = (

@@ -21,6 +21,7 @@ from rtid.diagnose.admission import (
     is_within_a_form,
     taken_in,
 )
+from rtid.diagnose.attenuation import apart_from_noise
 from rtid.diagnose.consequence import (
     ALIKE,
     BENT,
@@ -165,6 +166,8 @@ def searched(standing: Standing, progress: Progress = silent) -> Result:
         said = MISSING
     reach: dict[Key, tuple[Candidate, Reach]] = {}
     if said != INSUFFICIENT:
+        scores, nothing = apart_from_noise(present, scores)
+        negligible = {key: share for key, share in negligible.items() if key not in nothing}
         reach = reaches(present, scores, last.flow_m3s, clearest_gain(result))
     return Result(
         first, present.light(), result, negligible, scores, before, last, said, parts,

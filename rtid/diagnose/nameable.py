@@ -76,9 +76,8 @@ class Reach:
     def not_believed(self, score: Score) -> float:
         """The size that a record shows and that matters, but which nothing confirms; else 0.
 
-        What the maps' polynomials miss looks like an effect of this size, of either sign: on slow
-        sweeps of five machines an external leak larger than the flow stood five to nine deviations
-        out, where none was, or one of a tenth of it.  So no smaller one would have been seen: none
+        What the maps' polynomials miss looks like an effect, of either sign; what the pressures'
+        noise feigns is out of it (`attenuation`).  So no smaller one would have been seen: none
         within what its interval holds, whose upper end this is.
         """
         size = abs(score.value)

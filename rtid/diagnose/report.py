@@ -22,6 +22,7 @@ NOBODY_LOOKED = "Not examined: the diagnosis has no column for it here."
 MISLED = "not told: what else is missing bends the maps that would tell it"
 NOT_CONFIRMED = "not confirmed: what the maps' blocks miss may look like it in this record"
 LOOKS_LIKE = "no less than what is missing looks like: a part of it may be this"
+NOISE_ALONE = "what the maps leave of it in this record is the noise of the pressures"
 NO_SIZE = "not confirmed: the 95 % interval of its size, beside what was found, holds zero"
 OVER = "over"  # beside a change: the time in which it is so large
 

@@ -40,7 +40,7 @@ def is_told_apart(best: Fit, other: Fit, promise: float = 0.0) -> bool:
     apart = loss(other, theirs) - loss(best, ours)
     total = float(apart.sum()) - promise
     about_mean = (apart - apart.mean())[:, None]
-    blocks = [_blocks(ours, c) for c in range(ours.own.shape[1])]
+    blocks = [blocks_of(ours, c) for c in range(ours.own.shape[1])]
     return total > CLEARLY * float(np.sqrt(crossed(about_mean, blocks)[0]))
 
 
@@ -57,7 +57,7 @@ def loss(fit: Fit, rows: Rows) -> FloatArray:
     left = by_column[:, :, 0].copy()
     for column, value in theta.items():
         left -= value * by_column[:, :, at.get(column, column)]
-    left -= _by_maps(fit, rows)
+    left -= into_rows(rows, fit.map.terms)
     whitened = np.ascontiguousarray(left[:, :, None])
     products.whitened(whitened, rows.fresh, rows.whiten, rows.keep)
     factors = rows.whiten[:, : 2 * left.shape[1] : 2]
@@ -69,15 +69,15 @@ def _rows(fit: Fit) -> Rows:
     return fit.rows or rows_of(*given, soft=softened(*given, fit.revision))
 
 
-def _by_maps(fit: Fit, rows: Rows) -> FloatArray:
-    """What the maps of a fit add to its rows (rows, chambers), m3."""
-    of_entries = np.einsum("ij,ij->i", rows.terms, fit.map.terms[rows.block])
+def into_rows(rows: Rows, terms: FloatArray) -> FloatArray:
+    """What maps with terms (V, 6) add to the rows (rows, chambers), m3."""
+    of_entries = np.einsum("ij,ij->i", rows.terms, terms[rows.block])
     row, n = _row_of_entries(rows), len(rows.own)
     signs = rows.sign[rows.block, : rows.own.shape[1]].T
     return np.stack([np.bincount(row, sign * of_entries, n) for sign in signs], axis=1)
 
 
-def _blocks(rows: Rows, chamber: int) -> IntArray:
+def blocks_of(rows: Rows, chamber: int) -> IntArray:
     """The block of a chamber's edges that each row (rows,) ends in; a row without is one alone.
 
     Where valves are shut no terms miss anything: what tells a leak there is each row's own.

@@ -19,6 +19,7 @@ from rtid.diagnose.report import (
     MISLED,
     NO_SIZE,
     NOBODY_LOOKED,
+    NOISE_ALONE,
     NOT_CONFIRMED,
     Unseen,
     Value,
@@ -109,6 +110,8 @@ def _limit(result: Result, candidate: Candidate, score: Score) -> Unseen:
         reason = "present, negligible: it changes next to nothing on the held-out part"
     elif visible:
         reason = ""
+    elif np.isinf(score.sd) and score.visible > 0.0:
+        reason = NOISE_ALONE
     elif score.visible > VISIBLE:
         reason = "only a size beyond all that is possible would have shown"
     else:

@@ -74,7 +74,7 @@ def differ(monkeypatch: pytest.MonkeyPatch) -> Any:
     block = np.repeat(np.arange(BLOCKS), ROWS // BLOCKS)
     rows = SimpleNamespace(own=np.zeros((ROWS, 1, 2)))
     monkeypatch.setattr(rivals, "_rows", lambda fit: rows)
-    monkeypatch.setattr(rivals, "_blocks", lambda rows, chamber: block)
+    monkeypatch.setattr(rivals, "blocks_of", lambda rows, chamber: block)
 
     def told(apart: FloatArray) -> bool:
         monkeypatch.setattr(rivals, "loss", lambda fit, rows: fit * apart)
@@ -98,7 +98,7 @@ def test_what_one_block_likes_better_tells_nothing(differ: Any) -> None:
 def test_a_chamber_s_rows_are_in_the_blocks_of_its_own_edges() -> None:
     plain, _ = fits()
     rows = rivals._rows(plain)
-    of_a, of_b = (rivals._blocks(rows, c) for c in (0, 1))
+    of_a, of_b = (rivals.blocks_of(rows, c) for c in (0, 1))
     for c, block in enumerate((of_a, of_b)):
         moving = block < len(rows.cells)
         assert moving.any() and (rows.sign[block[moving], c] != 0).all()

@@ -1,0 +1,75 @@
+"""What the noise of the pressures feigns of a flow that the maps follow is told by its products."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from rtid.diagnose import attenuation
+from rtid.diagnose.attenuation import Believed, apart_from_noise, told_apart_from_noise
+from rtid.diagnose.fit import Fit
+from rtid.diagnose.nameable import clearest
+from rtid.diagnose.regression import LIMIT_SD, Score
+from rtid.diagnose.standing import stand
+from rtid.diagnose.trials import scored
+from rtid.plain import Key
+from tests.diagnose.records import record
+
+A, B = ("external_leakage_laminar", "a"), ("external_leakage_laminar", "b")
+
+
+@cache
+def fit_of(band: bool, leak: float = 0.0) -> Fit:
+    """Of a sweep with a constant supply, whose valves are said to be shut about 0 V, or not."""
+    model, chunk, held_out = record(A[0] if leak else "", leak, 4, "sweep_record")
+    if not band:
+        model = replace(model, edges=tuple(replace(e, safe_band_v=0.0) for e in model.edges))
+    return stand(model, chunk, held_out).fit
+
+
+def told(fit: Fit, key: Key) -> tuple[Score, Believed]:
+    """By the rows alone, and apart from the noise of the pressures."""
+    candidate, score = clearest(scored(fit))[key]
+    assert fit.rows is not None
+    (known,) = told_apart_from_noise(fit, fit.rows, [candidate])
+    return score, known
+
+
+def test_of_a_leak_that_only_noise_is_left_of_nothing_is_told() -> None:
+    """A healthy machine had one of 5.7 deviations, with a limit that one ten times as large met."""
+    fit = fit_of(band=False)
+    score, known = told(fit, B)
+    assert score.value > LIMIT_SD * score.sd, "the rows alone tell one"
+    assert not abs(known.size) > 2.0 * known.sd
+    assert known.sd > 5.0 * score.sd
+    scores, nothing = apart_from_noise(fit, scored(fit))
+    assert {A, B} <= nothing
+    assert [s.sd for c, s in scores if c.key == B] == [pytest.approx(known.sd, rel=0.3)]
+
+
+def test_where_shut_valves_tell_a_leak_its_size_stays() -> None:
+    score, known = told(fit_of(band=True, leak=1e-12), A)
+    assert known.size == pytest.approx(score.value, rel=0.05)
+    assert known.size == pytest.approx(1e-12, abs=3.0 * max(known.sd, known.sd_by_blocks))
+    assert known.sd == pytest.approx(score.sd, rel=0.1)
+
+
+def test_a_size_is_known_no_better_than_a_finer_grid_agrees(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    fit = fit_of(band=True, leak=1e-12)
+    candidate, _ = clearest(scored(fit))[A]
+    known = Believed(1e-12, 1e-14, 2e-14)
+    monkeypatch.setattr(attenuation, "on_finer", lambda _: None)
+    assert attenuation._on_any_grid(fit, candidate, known, 1.0) == known
+    monkeypatch.setattr(attenuation, "on_finer", half)
+    apart = attenuation._on_any_grid(fit, candidate, known, 1.0).sd_by_blocks
+    assert apart == pytest.approx(0.5e-12, rel=0.3), "as far as the other one is"
+
+
+def half(now: Fit) -> Fit:
+    """The same fit with half of each size."""
+    return replace(now, held=replace(now.held, theta=np.asarray(0.5 * now.held.theta)))
