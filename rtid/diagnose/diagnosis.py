@@ -46,6 +46,7 @@ from rtid.diagnose.parts import AddedEffect
 from rtid.diagnose.regression import Score
 from rtid.diagnose.residual import Residual
 from rtid.diagnose.revision import Revision
+from rtid.diagnose.sized import physical
 from rtid.diagnose.softer import Softer, softer
 from rtid.diagnose.spread import with_spreads
 from rtid.diagnose.standing import Standing, stand, with_bank
@@ -56,7 +57,6 @@ from rtid.diagnose.trials import (
     TrialState,
     material_share,
     own_share,
-    physical,
     scored,
 )
 from rtid.diagnose.verdict import (

@@ -18,6 +18,7 @@ from rtid.diagnose.exact import carried_on, exact_trials, is_inside, key_of, wit
 from rtid.diagnose.excuse import few_excused
 from rtid.diagnose.fit import MATCH_RHO
 from rtid.diagnose.report import Value
+from rtid.diagnose.sized import physical
 from rtid.diagnose.softer import softer
 from rtid.diagnose.spread import with_spreads
 from rtid.diagnose.standing import Standing, with_bank
@@ -29,7 +30,6 @@ from rtid.diagnose.trials import (
     best_by_key,
     material_share,
     own_share,
-    physical,
     refined,
     scored,
 )

@@ -30,6 +30,7 @@ from rtid.diagnose.moving import (
 )
 from rtid.diagnose.regression import Estimate, Regression
 from rtid.diagnose.revision import Revision
+from rtid.diagnose.sized import is_about_sizes
 from rtid.diagnose.steepness import with_own_slopes
 from rtid.effects.column import Candidate, Cause, Columns
 from rtid.effects.law import Shape, Volumes
@@ -295,7 +296,7 @@ def fit(
         else:
             halvings, on = 0, goes_on(fitted, best)
             stretch = 2.0 * stretch if on else 1.0
-            is_at_end = is_as_good(fitted, best) and not on
+            is_at_end = is_as_good(fitted, best) and not on and is_about_sizes(fitted)
             step = None if is_at_end else steadied(moved(fitted, stretch), fitted, best)
             best = fitted
             top = best.light() if best.wins_over(top) > 0.0 else top

@@ -8,7 +8,7 @@ import numpy as np
 
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.report import OVER, Value
-from rtid.diagnose.trials import physical
+from rtid.diagnose.sized import physical
 from rtid.effects.column import Candidate
 from rtid.effects.law import LENGTH, chambers_by_place, fitted_names
 from rtid.effects.laws.lines import LINE, inertance

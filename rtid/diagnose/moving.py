@@ -16,6 +16,7 @@ import numpy as np
 from rtid.diagnose.commands import Timings
 from rtid.diagnose.regression import Estimate
 from rtid.diagnose.revision import Revision
+from rtid.diagnose.sized import about_its_size
 from rtid.effects.column import Candidate
 from rtid.effects.laws import cause_of
 from rtid.effects.laws.timing import Psi, TimingLaw
@@ -63,6 +64,7 @@ def moved(fit: Fit, stretch: float = 1.0) -> Step | None:
         weights = replace(weights, compliance=_compliance(fit))
     is_same = (timings, effects) == (old.timings, old.effects) and _weigh_alike(sizes, old.sizes)
     is_same &= weights.lag_s == fit.weights.lag_s
+    is_same &= all(e.page is o.page for e, o in zip(effects, old.effects, strict=True))
     is_same &= weights.compliance is fit.weights.compliance
     return None if is_same else Step(Revision(effects, timings, sizes), weights)
 
@@ -138,13 +140,18 @@ def goes_on(fit: Fit, best: Fit) -> bool:
 
 
 def is_worse(fit: Fit, best: Fit) -> bool:
-    """True where a step made the misfit larger, both being weighed alike, or lost rows."""
+    """True where a step made the misfit larger, both being weighed alike, or lost rows.
+
+    Nor is a law about its size worse than one that was linear about another size.
+    """
     left_out = 1.0 - fit.regression.rows / max(1.0, best.regression.rows)
     more = counted_for(left_out, fit.revision.timings)
     if more > 0.0:
         return fit.excess + more * fit.held.sse > best.excess
     alike = np.array_equal(fit.weights.compliance, best.weights.compliance)
     alike = alike and _weigh_alike(fit.revision.sizes, best.revision.sizes)
+    pairs = zip(fit.revision.effects, best.revision.effects, strict=True)
+    alike = alike and all(effect.page is was.page for effect, was in pairs)
     return alike and fit.excess > best.excess and not is_as_good(fit, best)
 
 
@@ -245,7 +252,8 @@ class _Way:
             step = self.share * self.estimate.value(at) / size
             if self._is_open(at) and abs(step) > LEAST_SPACING * cause.spacing(k):
                 shape[k] = float(np.clip(shape[k] + step, *cause.bounds(k)))
-        return replace(effect, shape=tuple(shape))
+        moved_one = replace(effect, shape=tuple(shape))
+        return about_its_size(self.found, moved_one, self.size(effect))
 
     @property
     def _most_lag_s(self) -> float:

@@ -25,7 +25,7 @@ from rtid.diagnose.equations import softened
 from rtid.diagnose.evidence import Projected, Rows, project, rows_of
 from rtid.diagnose.fit import NO_COV, Fit
 from rtid.diagnose.residual import behind_lag, effect_values, measured, modelled, through_filter
-from rtid.diagnose.trials import physical
+from rtid.diagnose.sized import physical
 from rtid.effects.column import Candidate
 from rtid.effects.law import Volumes
 from rtid.effects.laws import cause_of

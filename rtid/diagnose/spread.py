@@ -36,12 +36,14 @@ from rtid.diagnose.lag_interval import timing_sd
 from rtid.diagnose.moving import LAG_REACH
 from rtid.effects.column import Columns
 from rtid.effects.law import Volumes
-from rtid.effects.laws import total_softness
+from rtid.effects.laws import cause_of, total_softness
 from rtid.effects.laws.timing import delayed
 from rtid.plain import FloatArray, Key
 from rtid.units import UNIFORM
 
 PARTS = 4
+STEP = 0.05  # of a size, for derivatives of a law about it
+MOST = 10.0  # times the noise's deviation: a size that its law hardly tells
 CLEARLY = 2.0  # standard deviations by which a size over the record differs from what is fitted
 
 
@@ -55,7 +57,7 @@ def with_spreads(fitted: Fit, unnamed: frozenset[Key] = frozenset()) -> Fit:
     spreads: dict[int, float] = {}
     for column, more in _spreads(fitted, fitted.rows):
         spreads[column] = max(spreads.get(column, 0.0), more)
-    of_delays = chain(_of_delays(fitted), _beside_others(fitted))
+    of_delays = chain(_of_delays(fitted), _beside_others(fitted), _about_sizes(fitted, fitted.rows))
     for column, more in chain(_of_wholes(fitted), of_delays, _moved_by(fitted, unnamed)):
         spreads[column] = float(np.hypot(spreads.get(column, 0.0), more))
     better = replace(fitted, spreads=tuple(spreads.items()))
@@ -122,6 +124,13 @@ class _Sizes:
         sizes, cov = self._free(column, [self.at[column], *(len(self.at) + k for k in more)])
         return float(sizes[0]), float(cov[0, 0])
 
+    def followed(self, column: int, more: int) -> float:
+        """How much of one of the fit's columns takes one of those more, beside the others."""
+        places = [place for c, place in self.at.items() if c != 0]
+        gram = self.s[np.ix_(places, places)] + np.diag(self.prior[places])
+        shares, _ = _solved(gram, self.s[places, len(self.at) + more])
+        return float(shares[places.index(self.at[column])])
+
     def _free(self, column: int, free: list[int]) -> tuple[FloatArray, FloatArray]:
         """Of the places `free`, without a prior, beside the fit's columns without one of them."""
         places = [place for c, place in self.at.items() if c not in (0, column)] + free
@@ -153,6 +162,26 @@ def _of_wholes(fitted: Fit) -> Iterator[tuple[int, float]]:
             share = np.sqrt(rest / max(without.sse - fitted.held.sse, rest, 1e-300)) / UNIFORM
             for k, at in fitted.shape_columns(effect).items():
                 yield at, float(share * abs(effect.shape[k] * fitted.held.value(column)))
+
+
+def _about_sizes(fitted: Fit, rows: Rows) -> Iterator[tuple[int, float]]:
+    """Column and what is more in the spread of each size that its own law is linear about.
+
+    Where the law is made about a size s a fit finds c(s), and the size is where both are one: an
+    error of c moves it by 1 / (1 - dc/ds) as much.  A column z that grows by k z per size finds
+    that share less, dc/ds = - k.
+    """
+    view = fitted.view
+    for effect in fitted.revision.effects:
+        if not effect.law.linear_about:
+            continue
+        column, size = fitted.column(effect), effect.law.inner_size
+        farther = replace(effect, page=effect.law.at_size((1.0 + STEP) * size))
+        plain, moved = (cause_of(view, e).column(e.shape) for e in (effect, farther))
+        change = {c: (moved[c] - plain[c]) / STEP for c in plain}
+        sizes = _Sizes.of(fitted, rows, _given(fitted), [change])
+        more = float(np.clip(1.0 / (1.0 + sizes.followed(column, 0)), 1.0, MOST))
+        yield column, fitted.sd_of(column) * float(np.sqrt(more**2 - 1.0))
 
 
 def _of_delays(fitted: Fit) -> Iterator[tuple[int, float]]:

@@ -24,8 +24,9 @@ from rtid.diagnose.report import (
     Unseen,
     Value,
 )
+from rtid.diagnose.sized import physical
 from rtid.diagnose.softer import Softer
-from rtid.diagnose.trials import AcceptedEffect, physical
+from rtid.diagnose.trials import AcceptedEffect
 from rtid.diagnose.unseen import has_size, is_unexplained, not_found
 from rtid.diagnose.verdict import CLEARLY_LEFT, INSUFFICIENT, UNKNOWN, filtered_hz
 from rtid.diagnose.zeros import Zero, by_chance

@@ -6,7 +6,6 @@ exactly where something large is left, because a bent map misleads their derivat
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -18,8 +17,8 @@ from rtid.diagnose.regression import LIMIT_SD, Score
 from rtid.diagnose.residual import Residual, residual
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.search import Search
+from rtid.diagnose.sized import physical
 from rtid.effects.column import Candidate, Cause
-from rtid.effects.law import LENGTH, MODULUS, chambers_by_place, fitted_names
 from rtid.effects.laws import cause_of
 from rtid.effects.page import Effect
 from rtid.model import Machine
@@ -168,22 +167,6 @@ def is_at_a_bound(now: Fit) -> bool:
 
 def _is_at_end(cause: Cause, k: int, value: float) -> bool:
     return min(abs(value - end) for end in cause.bounds(k)) < AT_END * cause.spacing(k)
-
-
-def physical(fit_: Fit, candidate: Candidate, value: float) -> float:
-    """A coefficient as the effect's parameter.
-
-    Where its equation has the oil's modulus, the fitted one counts, not that of the column; a
-    change over the record is one over its whole length.
-    """
-    by_fit = fitted_names(candidate.law)
-    if LENGTH in by_fit:
-        value *= float(fit_.view.t_s[-1] - fit_.view.t_s[0])
-    if MODULUS in by_fit:
-        at = list(chambers_by_place(fit_.model)[candidate.where])
-        fitted = float(np.mean(fit_.compliance[at]))  # none: an oil that cannot be compressed
-        value *= float(np.mean(fit_.weights.compliance[at])) / fitted if fitted else math.inf
-    return value
 
 
 def refined(state: TrialState, present: Fit, trials: list[Trial]) -> list[Trial]:

@@ -24,7 +24,8 @@ from rtid.diagnose.report import (
     Unseen,
     Value,
 )
-from rtid.diagnose.trials import detection_limit, physical
+from rtid.diagnose.sized import physical
+from rtid.diagnose.trials import detection_limit
 from rtid.diagnose.verdict import INSUFFICIENT, UNKNOWN
 from rtid.diagnose.zeros import Zero
 from rtid.effects import catalogue

@@ -111,10 +111,12 @@ class Effect:
     it always.
 
     law: name of a law in `rtid.effects.laws` where the equation cannot be one; no_law: why it has
-    none.  quantities, spills: of the states of a plant by equations on which it may act, and if
-    what it takes reaches others.  stands_on: declared sizes that its own size stands on; corrects:
-    the declared size that it is an error of.  into: (chamber, sign) pairs of a user's effect, whose
-    equation is in the names of his machine; function: its flow (view, **shape) -> (n,) in Python.
+    none.  linear_about: the constant that is its size, about which a law is linear in it; a value
+    of it is where a search begins.  quantities, spills: of the states of a plant by equations on
+    which it may act, and if what it takes reaches others.  stands_on: declared sizes that its own
+    size stands on; corrects: the declared size that it is an error of.  into: (chamber, sign) pairs
+    of a user's effect, whose equation is in the names of his machine; function: its flow (view,
+    **shape) -> (n,) in Python.
     """
 
     name: str
@@ -134,6 +136,7 @@ class Effect:
     reference: str
     law: str = ""
     no_law: str = ""
+    linear_about: str = ""
     quantities: tuple[str, ...] = ()
     spills: bool = False
     stands_on: tuple[str, ...] = ()
@@ -145,6 +148,19 @@ class Effect:
     def size(self) -> Parameter:
         """The parameter that its column is multiplied by."""
         return self.parameters[0]
+
+    @property
+    def inner_size(self) -> float:
+        """The size that its law is linear about, SI; 0 where it is linear in it."""
+        return next((s.value or 0.0 for s in self.symbols if s.name == self.linear_about), 0.0)
+
+    def at_size(self, size: float) -> Effect:
+        """The same, its law linear about this size, SI; as it is where it is linear in it."""
+        if not self.linear_about:
+            return self
+        own = {self.linear_about: size}
+        symbols = (replace(s, value=own.get(s.name, s.value)) for s in self.symbols)
+        return replace(self, symbols=tuple(symbols))
 
     @property
     def shapes(self) -> tuple[Parameter, ...]:

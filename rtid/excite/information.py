@@ -15,7 +15,8 @@ import numpy as np
 
 from rtid.diagnose.fit import one_pass
 from rtid.diagnose.revision import Revision
-from rtid.diagnose.trials import physical, scored
+from rtid.diagnose.sized import physical
+from rtid.diagnose.trials import scored
 from rtid.estimator.factor import PRIOR_SD, factorize, one_thread
 from rtid.estimator.record import summed
 from rtid.estimator.sums import Normal

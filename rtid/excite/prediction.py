@@ -13,7 +13,8 @@ import numpy as np
 
 from rtid.diagnose.fit import fit, prepare
 from rtid.diagnose.revision import Revision
-from rtid.diagnose.trials import detection_limit, physical, scored
+from rtid.diagnose.sized import physical
+from rtid.diagnose.trials import detection_limit, scored
 from rtid.estimator.blocks import VALID, Block
 from rtid.estimator.record import refined, summed
 from rtid.estimator.solution import Solution, sketch, solve

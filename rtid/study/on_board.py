@@ -281,6 +281,7 @@ def _column(project: Project, added: AddedSection) -> Candidate | None:
         return None
     names = tuple(p.name for p in effect.shapes)
     given = added.parameters
+    effect = effect.at_size(given[effect.size.name].value)
     shape = tuple(given[name].value if name in given else 0.0 for name in names)
     return replace(of_page(effect, added.where, shape=names), shape=shape)
 

@@ -23,7 +23,8 @@ from rtid.diagnose.regression import Score
 from rtid.diagnose.remains import filtered
 from rtid.diagnose.report import Diagnosis, Unseen
 from rtid.diagnose.residual import Residual, residual
-from rtid.diagnose.trials import physical, scored
+from rtid.diagnose.sized import physical
+from rtid.diagnose.trials import scored
 from rtid.diagnose.verdict import LEAST_ROWS
 from rtid.effects.column import Candidate
 from rtid.estimator.flowmap import FlowMap
