@@ -15,7 +15,15 @@ from rtid.diagnose.revision import Revision
 from rtid.diagnose.trials import TIE
 from rtid.effects import effect
 from rtid.effects.column import of_page
-from rtid.study.quick_command import between_rows, is_taken, not_told, rows_apart_s, wins
+from rtid.plain import FloatArray
+from rtid.study.quick_command import (
+    between_rows,
+    hidden_s,
+    is_taken,
+    not_told,
+    rows_apart_s,
+    wins,
+)
 from rtid.study.quick_machine import LAG_SHARE, Assumption, lag_of
 from tests.diagnose.records import record
 
@@ -62,26 +70,45 @@ def test_a_line_is_late_by_anything_from_nothing_to_half_a_step(lag_s: float) ->
     assert lag_of(machine) == pytest.approx((1e3 * lag_s, 1e3 * LAG_SHARE * lag_s))
 
 
+def rows(step_s: float, u: FloatArray) -> Samples:
+    """Of a table with such a command (n,)."""
+    t_us = np.round(1e6 * step_s * np.arange(len(u))).astype(np.int64)
+    return Samples(("u",), t_us, u[:, None], np.full(len(u), ROW, np.uint8))
+
+
+def swing(step_s: float) -> FloatArray:
+    """500 rows of a sine of 1 Hz."""
+    return np.asarray(np.sin(2.0 * np.pi * step_s * np.arange(500)))
+
+
 def test_the_lag_beside_a_held_command_may_be_half_a_row_longer() -> None:
     """0.136 +- 0.032 ms were told of 1.610, of a controller of 1 kHz in a log of 250 Hz."""
     first: Any = Said(0.136e-3, 0.032e-3)
-    told = between_rows(first, 4e-3, 5e-3)
+    slow = rows(4e-3, swing(4e-3))
+    told = between_rows(first, hidden_s(slow, False, 5e-3))
     assert abs(1.610e-3 - told.lag_s) < 1.96 * told.lag_sd_s
     ahead_s = np.random.default_rng(1).uniform(0.0, 2e-3, 100_000)
     expected = np.hypot(0.032e-3, np.sqrt(np.mean(ahead_s**2)))
     assert told.lag_sd_s == pytest.approx(expected, rel=0.01)
-    known = between_rows(first, 4e-3, 0.3e-3)  # of a lag that was declared no more is open
-    assert known.lag_sd_s == pytest.approx(np.hypot(0.032e-3, 0.3e-3))
-    unknown: Any = Said(0.0, float("nan"))
-    assert np.isnan(between_rows(unknown, 4e-3, 5e-3).lag_sd_s)
+    assert hidden_s(slow, False, 0.3e-3) == 0.3e-3, "of a lag that was declared no more is open"
+    assert np.isnan(between_rows(replace(first, lag_sd_s=np.nan), 1e-3).lag_sd_s)
 
 
-@pytest.mark.parametrize(("step_s", "hidden_s"), [(1e-3, 0.0), (4e-3, 4e-3)])
-def test_a_log_as_fast_as_controllers_hides_nothing(step_s: float, hidden_s: float) -> None:
-    t_us = np.round(1e6 * step_s * np.arange(500)).astype(np.int64)
-    u = np.sin(2e-6 * np.pi * t_us)[:, None]
-    samples = Samples(("u",), t_us, u, np.full(500, ROW, np.uint8))
-    assert rows_apart_s(samples) == pytest.approx(hidden_s)
+@pytest.mark.parametrize(("step_s", "hidden"), [(1e-3, 0.0), (4e-3, 4e-3)])
+def test_a_log_as_fast_as_controllers_hides_nothing(step_s: float, hidden: float) -> None:
+    samples = rows(step_s, swing(step_s))
+    assert rows_apart_s(samples) == pytest.approx(hidden)
+    assert hidden_s(samples, False, 1.0) == pytest.approx(hidden / np.sqrt(12.0))
+
+
+@pytest.mark.parametrize("jumps", [12, 48])
+def test_of_jumps_on_a_line_each_is_anywhere_in_its_step(jumps: int) -> None:
+    """3.412 +- 0.005 ms were told of 3.112, of a joystick's steps in a log of 200 Hz."""
+    step_s, rng = 5e-3, np.random.default_rng(jumps)
+    u = np.repeat(np.resize([1.0, -1.0], jumps + 1), 20)
+    late_s = rng.uniform(-0.5 * step_s, 0.5 * step_s, (10_000, jumps)).mean(axis=1)
+    assert hidden_s(rows(step_s, u), True, 1e-6) == pytest.approx(late_s.std(), rel=0.03)
+    assert hidden_s(rows(step_s, swing(step_s)), True, 1e-6) < 0.08e-3
 
 
 VOLUME = replace(of_page(effect("extra_dead_volume"), "a", shape=("port_lag",)), shape=(0.0,))

@@ -28,7 +28,7 @@ from rtid.project import Project, load
 from rtid.project import guess as proposal
 from rtid.project.guess import RoleCandidate, unused
 from rtid.study.kept_record import model_for
-from rtid.study.quick_command import Reading, between_rows, on_a_line, rows_apart_s, said_of
+from rtid.study.quick_command import Reading, between_rows, hidden_s, on_a_line, said_of
 from rtid.study.quick_log import written_late
 from rtid.study.quick_machine import (
     Assumption,
@@ -237,7 +237,7 @@ def _of_cylinder(
         level, diagnosis, machine = level_of(judged), None, arranged.machine
         if level != BAD:
             diagnosis, machine = _likeliest(file, path, source, arranged, progress)
-        hidden_s, tolerance_s = _rows_apart_s(arranged, machine), 1e-3 * lag_of(machine)[1]
+        late_s = _hidden_s(arranged.trace, machine)
     return Quick(
         path,
         source,
@@ -250,7 +250,7 @@ def _of_cylinder(
         ),
         tuple(judged),
         level,
-        between_rows(diagnosis, hidden_s, tolerance_s) if diagnosis else None,
+        between_rows(diagnosis, late_s) if diagnosis else None,
         tuple(_cautions(diagnosis, given, arranged.roles)),
         bool(arranged.trace.refused.get("truncated")),
     )
@@ -287,10 +287,11 @@ def _likeliest(
     return reading.said, reading.machine
 
 
-def _rows_apart_s(arranged: Arranged, machine: MachineSizes) -> float:
-    """Time over which a command is taken as held that may move in between, s; else 0."""
-    is_line = machine.command_step_s > 0.0
-    return 0.0 if is_line or not arranged.trace.is_table else rows_apart_s(arranged.trace.samples)
+def _hidden_s(trace: Recording, machine: MachineSizes) -> float:
+    """What the rows of a table hide of the spools' lag, s; nothing of a log of messages."""
+    if not trace.is_table:
+        return 0.0
+    return hidden_s(trace.samples, machine.command_step_s > 0.0, 1e-3 * lag_of(machine)[1])
 
 
 def _later(progress: Progress) -> Progress:
