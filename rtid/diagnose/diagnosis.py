@@ -41,7 +41,7 @@ from rtid.diagnose.finer import finer_beside
 from rtid.diagnose.fit import Fit, fit, with_covariances
 from rtid.diagnose.held_again import held_again
 from rtid.diagnose.joined import joints
-from rtid.diagnose.nameable import Reach, reaches
+from rtid.diagnose.nameable import Reach, known_as_moduli, reaches
 from rtid.diagnose.parts import AddedEffect
 from rtid.diagnose.regression import Score
 from rtid.diagnose.residual import Residual
@@ -168,6 +168,7 @@ def searched(standing: Standing, progress: Progress = silent) -> Result:
     if said != INSUFFICIENT:
         scores, nothing = apart_from_noise(present, scores)
         negligible = {key: share for key, share in negligible.items() if key not in nothing}
+        scores = known_as_moduli(present, scores)
         reach = reaches(present, scores, last.flow_m3s, clearest_gain(result))
     return Result(
         first, present.light(), result, negligible, scores, before, last, said, parts,

@@ -25,7 +25,7 @@ from rtid.diagnose.regression import LIMIT_SD, Score
 from rtid.diagnose.residual import KNOWN
 from rtid.diagnose.verdict import MATERIAL
 from rtid.effects.column import Candidate, Columns
-from rtid.effects.law import Volumes
+from rtid.effects.law import Volumes, chambers_by_place
 from rtid.effects.laws.timing import COMMAND
 from rtid.kernels.explain import filter_rows
 from rtid.plain import BoolArray, FloatArray, Key
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from rtid.diagnose.fit import Fit
 
 NOTHING = 1e-300
+STORAGE = "storage"  # kind of effects that trade with a modulus
 VISIBLE = 2e-3  # share of a column that must be left beside the maps
 
 
@@ -123,6 +124,24 @@ def told_form(candidate: Candidate) -> list[tuple[str, float, str]]:
     """Name, value and unit of the numbers of its form that a limit is told with: they have one."""
     numbers = zip(candidate.shape_names, candidate.shape, candidate.shape_units, strict=True)
     return [(name, value, unit) for name, value, unit in numbers if unit != "1"]
+
+
+def known_as_moduli(
+    fit: Fit, scores: list[tuple[Candidate, Score]]
+) -> list[tuple[Candidate, Score]]:
+    """The scores, of what is stored no better known than the modulus that it trades with.
+
+    What the blocks miss looks like compressed oil: air was seen from 0.1 % on beside a modulus that
+    was known to 50 times itself.
+    """
+    if not fit.declared.has_pressures:
+        return scores
+    ratio = counted(fit).diagonal() / np.maximum(fit.compliance_cov.diagonal(), NOTHING)
+    wider = np.sqrt(np.maximum(1.0, ratio))
+    places = chambers_by_place(fit.declared).items()
+    known = {(STORAGE, where): float(np.max(wider[list(at)])) for where, at in places}
+    times = [known.get((candidate.law.kind, candidate.where), 1.0) for candidate, _ in scores]
+    return [(c, replace(s, sd=by * s.sd)) for by, (c, s) in zip(times, scores, strict=True)]
 
 
 def _rank(candidate: Candidate, score: Score) -> tuple[bool, float]:

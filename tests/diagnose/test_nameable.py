@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rtid.diagnose import summary
+from rtid.diagnose import nameable, summary
 from rtid.diagnose.lag_interval import LagInterval
 from rtid.diagnose.nameable import Reach, clearest
 from rtid.diagnose.regression import LIMIT_SD, Score
@@ -152,3 +152,20 @@ def test_a_lag_that_stands_in_for_what_is_missing_has_no_interval(
     assert told(4e-3) == told(5.9e-3, 1.4, "missing") == 1e-4
     wrong = told(6e-3), told(4e-3, 2.1), told(4e-3, 1.2, "unknown")
     assert np.isnan(wrong).all()
+
+
+def test_what_is_stored_is_known_no_better_than_the_modulus_beside_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Air was "seen from" 0.1 % on beside 1.1 +- 630 GPa, and 0.45 % were there."""
+    monkeypatch.setattr(nameable, "counted", lambda _: np.diag([1e-22, 4e-24]))
+    fit: Any = SimpleNamespace(
+        declared=declared_model(SimulatedPlant()), compliance_cov=np.diag([1e-24, 4e-24])
+    )
+    causes = ("entrained_air", "a"), ("entrained_air", "b"), ("internal_leakage_laminar", "a-b")
+    asked = [(of_page(effect(name), where), Score(1, 0.0, 2.0, 0.0, 1.0)) for name, where in causes]
+    assert [s.sd for _, s in nameable.known_as_moduli(fit, asked)] == pytest.approx(
+        [20.0, 2.0, 2.0]
+    )
+    fit.declared = replace(fit.declared, chambers=(replace(fit.declared.chambers[0], pressure=""),))
+    assert nameable.known_as_moduli(fit, asked) is asked
