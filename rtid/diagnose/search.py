@@ -244,10 +244,14 @@ class Beside:
 
 
 def _vertex(at: tuple[float, float, float], gain: list[float]) -> float:
-    """Where a parabola through three points is highest, a little off the outer ones."""
+    """Where a parabola through three points is highest, a little off the outer ones.
+
+    Halfway to the better of these where there is no hill, and where one of them has lost so many
+    rows that its gain is -inf.
+    """
     (low, middle, high), (a, b, c) = at, gain
     left, right = (b - a) / (middle - low), (c - b) / (high - middle)
-    if left <= right:  # no hill
+    if left <= right or not np.isfinite(left - right):
         return 0.5 * (low + middle) if a > c else 0.5 * (middle + high)
     top = 0.5 * (low + middle) + 0.5 * (high - low) * left / (left - right)
     margin = OFF * (high - low)

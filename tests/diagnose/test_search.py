@@ -12,7 +12,7 @@ from rtid.diagnose.exact import exact_trials
 from rtid.diagnose.fit import fit, one_pass, prepare, tried
 from rtid.diagnose.moving import SIZED
 from rtid.diagnose.revision import Revision
-from rtid.diagnose.search import Search
+from rtid.diagnose.search import Search, _vertex
 from rtid.diagnose.standing import stand
 from rtid.diagnose.thinned import Thinning
 from rtid.effects.laws.sensors import sensor_timings
@@ -191,3 +191,12 @@ def test_a_spool_of_second_order_is_looked_for_in_the_place_of_a_slow_declared_l
     psi, gain = beside.closed_in(law, bank)
     assert psi[0] == pytest.approx(radps, rel=0.1)
     assert gain > 0.0
+
+
+@pytest.mark.parametrize("lost", [(True, False), (False, True), (True, True)])
+def test_between_strengths_that_lose_the_record_one_goes_on(lost: tuple[bool, bool]) -> None:
+    """A seat leak on a sweep ended in a traceback: the next strength was not a number."""
+    low, high = (-np.inf if end else 1.0 for end in lost)
+    trial = _vertex((1.0, 2.0, 4.0), [low, 2.0, high])
+    assert 1.0 < trial < 4.0 and trial != 2.0
+    assert (trial > 2.0) == lost[0]
