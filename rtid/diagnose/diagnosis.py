@@ -11,37 +11,17 @@ from dataclasses import dataclass, field, replace
 
 from rtid.diagnose.admission import (
     clearest_gain,
-    explains_enough,
-    is_as_credible,
-    is_form_of_another,
-    is_noticed,
-    is_of_another_form,
-    is_refuted,
-    is_seen_to_harm,
-    is_within_a_form,
-    taken_in,
 )
 from rtid.diagnose.attenuation import apart_from_noise
 from rtid.diagnose.consequence import (
     ALIKE,
-    BENT,
-    HIDDEN_GAIN,
 )
-from rtid.diagnose.contest import (
-    as_nearly_right,
-    ended,
-    hidden_too,
-    its_turn,
-    outdone_by,
-    trials_of,
-)
-from rtid.diagnose.exact import carried_on
-from rtid.diagnose.excuse import few_excused
 from rtid.diagnose.finer import finer_beside
-from rtid.diagnose.fit import Fit, fit, with_covariances
+from rtid.diagnose.fit import Fit, fit
 from rtid.diagnose.held_again import held_again
 from rtid.diagnose.joined import joints
 from rtid.diagnose.nameable import Reach, known_as_moduli, reaches
+from rtid.diagnose.one_round import add_best
 from rtid.diagnose.parts import AddedEffect
 from rtid.diagnose.regression import Score
 from rtid.diagnose.residual import Residual
@@ -49,21 +29,17 @@ from rtid.diagnose.revision import Revision
 from rtid.diagnose.sized import physical
 from rtid.diagnose.softer import Softer, softer
 from rtid.diagnose.spread import with_spreads
-from rtid.diagnose.standing import Standing, stand, with_bank
+from rtid.diagnose.standing import Standing, stand
 from rtid.diagnose.trials import (
     GAIN,
     AcceptedEffect,
-    Trial,
     TrialState,
-    material_share,
-    own_share,
     scored,
 )
 from rtid.diagnose.verdict import (
     AMBIGUOUS,
     INSUFFICIENT,
     MATCHES,
-    MATERIAL,
     MISSING,
     NAMED,
     UNKNOWN,
@@ -82,9 +58,7 @@ from rtid.estimator.validity import Doubt
 from rtid.model import Machine
 from rtid.plain import FloatArray, Key, Progress, silent
 
-LATER_GAIN = 25.0  # chi2 of every effect behind the first
 MOST = 6  # effects that are added at most
-MOST_NEGLIGIBLE = 4  # that are looked at
 
 
 @dataclass(frozen=True)
@@ -287,7 +261,7 @@ def _grown(state: TrialState, first: Fit, before: Residual) -> tuple[Fit, Residu
     present, last = first, before
     for k in range(MOST):
         state.progress("scoring", 0.1 + 0.8 * k / MOST)
-        added = _add_best(state, present, last)
+        added = add_best(state, present, last)
         if added is None:
             break
         if present.rows is not None and present.rows is not added[0].rows:
@@ -324,105 +298,6 @@ def _excess(state: TrialState, first: Fit) -> float:
         weights = replace(first.weights, lag_s=state.model.lag.nominal_s)
         bare = fit(state.model, state.chunk, weights, Revision(), bank=False)
     return bare.held.sse - bare.regression.dof
-
-
-def _add_best(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Residual] | None:
-    """Add the best cause that is significant and material; None when there is none.
-
-    Material is what the held-out residual shows, or what the maps have taken in (`consequence`).
-    One that is refuted is passed over.  One that changes next to nothing is only listed, unless it
-    explains a part of the misfit that would be found in another guise: beside a model that matches,
-    what is within a form that was found would only share its size.
-    """
-    least = LATER_GAIN if state.found or state.given else GAIN
-    trials = [
-        t for t in trials_of(state, present) if t.gain > least and t.key not in state.ruled_out
-    ]
-    finished, outdone = dict[Key, Trial](), set[Key]()
-    refuted: dict[Key, bool] = {}  # whether by its form alone
-    turns = sorted(trials, key=lambda t: t.gain)
-    while turns:
-        best = turns.pop()
-        if best.key in state.negligible or len(state.negligible) == MOST_NEGLIGIBLE:
-            continue
-        if not explains_enough(state, present, best):
-            return None
-        trial, alike = its_turn(state, present, best, trials, finished, refuted, outdone)
-        if trial.key in refuted:
-            continue
-        now = with_covariances(carried_on(state, present, trial, must_win=True), like=present)
-        if is_refuted(present, now, trial, least):
-            refuted[trial.key] = not trial.is_timing and is_of_another_form(now)
-            if trial.key != best.key:
-                turns.append(best)  # whose turn it is still
-            continue
-        finished.setdefault(trial.key, ended(present, trial, now))
-        after, does = state.left(now), None
-        own = own_share(state, now, trial, after)
-        share = min(material_share(last, after), BENT * own)
-        is_form = is_form_of_another(state, trial.key) or is_within_a_form(state, trial)
-        is_shown = share >= MATERIAL
-        is_harm = not is_shown and is_seen_to_harm(state, present, now, last, after)
-        if not (is_shown or is_form or is_harm):
-            does = taken_in(present, now, trial, own, last, after)
-        if is_shown or does is not None:
-            present.unread()  # what is read beside the next one is as large
-            kept, after = _with_bank(state, now)
-            as_ended, is_left = finished[trial.key], kept.rho >= kept.most_rho
-            if does:
-                alike += hidden_too(state, as_ended, finished, HIDDEN_GAIN)
-            if is_left:
-                alike += as_nearly_right(state, present, now, trials, finished)
-            if is_left and (better := outdone_by(state, as_ended, finished, {*refuted, *outdone})):
-                outdone.add(trial.key)
-                trials = [finished.get(t.key, t) for t in trials]
-                turns += [best, better]
-                continue
-            alike = tuple(dict.fromkeys(alike))
-            what = trial.key, alike, trial.gain, trial.n_parameters
-            state.found.append(AcceptedEffect(*what, last, after, does))
-            return kept, after
-        state.negligible[trial.key] = share
-        is_good = not is_harm and is_as_credible(present, now)
-        is_needless = is_form and present.rho < present.most_rho
-        if is_good and is_noticed(present, finished[trial.key]) and not is_needless:
-            return _kept_aside(state, now, trial, alike, own, last)
-        del now  # its rows are large
-    return None
-
-
-def _kept_aside(
-    state: TrialState, now: Fit, trial: Trial, alike: tuple[Key, ...], flow: float, last: Residual
-) -> tuple[Fit, Residual]:
-    """The model with what is listed only, unless it is shown beside all that the blocks hold.
-
-    flow: its own, of the rms flow; last: what the model without it leaves.
-    """
-    kept, after = _with_bank(state, now)
-    if _is_shown_now(trial.key, min(material_share(last, after), BENT * flow), state):
-        what = trial.key, alike, trial.gain, trial.n_parameters
-        state.found.append(AcceptedEffect(*what, last, after, None))
-    else:
-        state.negligible |= dict.fromkeys(alike, state.negligible[trial.key])
-    return kept, after
-
-
-def _with_bank(state: TrialState, now: Fit) -> tuple[Fit, Residual]:
-    """A fit with every candidate beside it, and what it leaves of the held-out part."""
-    kept = with_bank(few_excused(now), state.suspects)
-    return kept, state.left(kept)
-
-
-def _is_shown_now(key: Key, share: float, state: TrialState) -> bool:
-    """True where the residual shows it once the blocks that missed it are excused no longer.
-
-    share: that it takes off the held-out residual.  On a sweep a leak of 5 % of the flow was set
-    aside, and a relief valve was named for what its form misses.
-    """
-    is_shown = share >= MATERIAL and not is_form_of_another(state, key)
-    if is_shown:
-        del state.negligible[key]
-    return is_shown
 
 
 def _look_back(state: TrialState, present: Fit, last: Residual) -> tuple[Fit, Residual]:
