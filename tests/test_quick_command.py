@@ -50,6 +50,8 @@ def said(verdict: str, n: int = 0, rho: float = 1.0) -> Any:
         (said("missing", 2, 0.9), said("missing", 1), False),  # it names more
         (said("ambiguous", 1, 0.86), said("missing", 1, 0.84), True),  # neither leaves but noise
         (said("ambiguous", 1, 1.3), said("missing", 1, 1.2), False),
+        (said("unknown", rho=49.0), said("unknown", rho=8.0), False),
+        (said("unknown", rho=3.0), said("unknown", rho=8.0), True),
     ],
 )
 def test_what_is_said_in_place_of_the_first(line: Any, first: Any, is_so: bool) -> None:

@@ -117,13 +117,16 @@ def is_taken(line: Diagnosis, first: Diagnosis) -> bool:
     """Whether what is said with the command on a line stands in place of the first.
 
     What was named is not given up for a verdict that says less, nor for one that names more, or
-    leaves more than noise.
+    leaves more than noise; nor is what has no name either way for more of it: 8 times the noise,
+    of a controller as slow as its log, were 49, with moduli of 240 and 150 MPa, of 1590.
     """
     named = MISSING, AMBIGUOUS
-    if first.verdict not in named or line.verdict == MATCHES:
+    if line.verdict == MATCHES:
         return True
-    is_simpler = len(line.found) <= len(first.found)
     leaves_less = line.rho_after <= max(1.0, first.rho_after)
+    if first.verdict not in named:
+        return line.verdict in named or leaves_less
+    is_simpler = len(line.found) <= len(first.found)
     return line.verdict in named and is_simpler and leaves_less
 
 
