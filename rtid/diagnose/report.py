@@ -9,10 +9,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-import numpy as np
-
 from rtid.diagnose.clean import Cut
-from rtid.diagnose.verdict import MATERIAL
+from rtid.diagnose.verdict import is_foretold, is_immaterial
 from rtid.diagnose.zeros import Zero
 from rtid.estimator.validity import Doubt
 from rtid.plain import Key, plain
@@ -158,8 +156,14 @@ class Diagnosis:
     @property
     def is_slight(self) -> bool:
         """True where what is left beyond the sensors' noise is immaterial for the flow."""
-        rest = max(0.0, self.heldout_residual_after_m3s**2 - self.noise_floor_m3s**2)
-        return float(np.sqrt(rest)) < MATERIAL * self.rms_flow_m3s
+        left, floor = self.heldout_residual_after_m3s, self.noise_floor_m3s
+        return is_immaterial(left, floor, self.rms_flow_m3s)
+
+    @property
+    def foretells(self) -> bool:
+        """True where little but noise is left of motion that did not teach the maps."""
+        left, floor = self.heldout_residual_after_m3s, self.noise_floor_m3s
+        return not self.held_out_judged or is_foretold(left, floor, self.rms_flow_m3s)
 
     def as_json(self) -> dict[str, Any]:
         """Plain JSON types; numbers that are not finite are null."""

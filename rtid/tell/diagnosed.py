@@ -200,10 +200,19 @@ def _head(diagnosis: Diagnosis) -> str:
 def _left(diagnosis: Diagnosis) -> str:
     """What speaks against the model where nothing can be named."""
     if not diagnosis.rho_before > MATCH_RHO:
-        return ""
+        return "" if diagnosis.foretells else _untaught(diagnosis)
     return (
         f", but the model misses something: residual variance {diagnosis.rho_before:.3g} times "
         "the noise's, most of which the maps may have taken in"
+    )
+
+
+def _untaught(diagnosis: Diagnosis) -> str:
+    """Of a model that matches what taught it alone."""
+    share = percent(diagnosis, diagnosis.heldout_residual_after_m3s)
+    return (
+        ": the model follows what taught it, but does not foretell the rest: held-out error "
+        f"{share} of the rms flow{floored(diagnosis, ', ')}"
     )
 
 

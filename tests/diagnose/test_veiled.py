@@ -69,6 +69,24 @@ def test_the_little_that_is_left_behind_a_filter_is_no_alarm(
     assert verdict(state, last, last, residual(share), ()) == said
 
 
+@pytest.mark.parametrize(
+    ("share", "is_unseen", "said"),
+    [
+        (1e-4, True, MATCHES),
+        (2e-3, True, MATCHES),
+        (9e-3, True, INSUFFICIENT),
+        (9e-3, False, MATCHES),
+    ],
+)
+def test_what_matches_alone_what_taught_it_is_no_match(
+    share: float, is_unseen: bool, said: str
+) -> None:
+    """Six times the floor was left of unseen motion, "and no model could be much better"."""
+    state: Any = SimpleNamespace(found=[], negligible={}, judges_itself=False)
+    first = fit(0.0, 0.55)
+    assert verdict(state, first, first, residual(share), (), is_unseen) == said
+
+
 def test_advice_and_headline_ask_for_pressures_without_the_filter() -> None:
     """And not for more motion, which the record has."""
     shown = Diagnosis(
