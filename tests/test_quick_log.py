@@ -16,7 +16,7 @@ from rtid.diagnose.fit import fit, prepare
 from rtid.diagnose.revision import Revision
 from rtid.model import Lag, Machine
 from rtid.plain import FloatArray
-from rtid.study.quick_log import is_likelier
+from rtid.study.quick_log import is_between_rows, is_likelier
 from tests.diagnose.records import record
 
 N = 5_000
@@ -69,3 +69,21 @@ def test_a_command_that_is_written_late_is_likelier_where_it_was() -> None:
 
 def test_a_command_that_is_written_in_time_is_not() -> None:
     assert not is_likelier(*readings(0))
+
+
+@pytest.mark.parametrize(
+    ("name", "alike", "is_so"),
+    [
+        ("input_delay", (), True),
+        ("spool_lag_first_order", ("input_delay",), True),
+        ("spool_lag_first_order", (), False),  # a spool may be slow behind a log that is late
+        ("internal_leakage_laminar", (), False),
+    ],
+)
+def test_a_row_earlier_and_a_part_of_it_later_is_no_late_log(
+    name: str, alike: tuple[str, ...], is_so: bool
+) -> None:
+    """A healthy machine at 50 rows a second: a row of 20 ms, and a delay of 11."""
+    found = SimpleNamespace(effect=name, cannot_be_told_from=alike)
+    said: Any = SimpleNamespace(found=(found,))
+    assert is_between_rows(said) is is_so
