@@ -19,7 +19,7 @@ from rtid.study.quick_command import At, Reading, is_taken, said_of, wins
 from rtid.study.quick_machine import Assumption, MachineSizes
 from rtid.study.study import Study
 
-MOST_ROWS = 3  # that a log is asked to write a command late
+MOST_ROWS = 1  # that a log is asked to write a command late: each asks for a diagnosis of its own
 
 
 def late_by(machine: MachineSizes, rows: int, step_s: float) -> MachineSizes:
