@@ -94,9 +94,10 @@ class Windows:
         MPa, 60 standard deviations clear: the pressures of a healthy machine were swapped.
         """
         here = self.calm
-        return Windows(
-            self.mean[here], self.start[here], self.change[here], self.length_s, here[here]
-        )
+        mean, start, change, calm = (
+            self.mean[here], self.start[here], self.change[here], self.calm[here],
+        )  # fmt: skip
+        return Windows(mean, start, change, self.length_s, calm)
 
 
 def motion(model: Machine, samples: Samples) -> Motion:
