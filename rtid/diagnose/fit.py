@@ -295,8 +295,11 @@ def fit(
             step, halvings, stretch = halfway(best, step), halvings + 1, 1.0
         else:
             halvings, on = 0, goes_on(fitted, best)
+            # as good on the other side of the least is no end: a lag stayed 45 us too long
+            is_over = stretch > 1.0
             stretch = 2.0 * stretch if on else 1.0
-            is_at_end = is_as_good(fitted, best) and not on and is_about_sizes(fitted)
+            is_done = is_as_good(fitted, best) and not (on or is_over)
+            is_at_end = is_done and is_about_sizes(fitted)
             step = None if is_at_end else steadied(moved(fitted, stretch), fitted, best)
             best = fitted
             top = best.light() if best.wins_over(top) > 0.0 else top
