@@ -8,6 +8,7 @@ import json
 import os
 import signal
 import tempfile
+from collections import Counter
 from collections.abc import Iterator
 from multiprocessing import resource_tracker
 from pathlib import Path
@@ -43,6 +44,19 @@ SHARED = ROOT.parent / "shared"
 def pytest_configure(config: pytest.Config) -> None:
     """Before there is anything that the workers share."""
     of_this_run(config)
+
+
+CASES = Counter[tuple[Path, str]]()  # collected so far of each parametrized test
+
+
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """`first_of(n)`: what stands behind the first n cases of a parametrized test is long."""
+    few = item.get_closest_marker("first_of")
+    if few is not None:
+        test = item.path, item.name.partition("[")[0]
+        CASES[test] += 1
+        if CASES[test] > few.args[0]:
+            item.add_marker(pytest.mark.long)
 
 
 @pytest.hookimpl(trylast=True)  # of those that are chosen

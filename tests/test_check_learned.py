@@ -38,6 +38,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.first_of(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(RECORDS))
 def test_check_says_what_replay_learns(folder: Path, name: str) -> None:

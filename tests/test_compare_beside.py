@@ -200,6 +200,7 @@ def stored(model: Machine, term: Term, values: FloatArray) -> float:
     return -float(taken[0, 0])
 
 
+@pytest.mark.long
 def test_a_drift_acts_on_blocks_as_well_that_the_fit_had_to_leave_out() -> None:
     """The fit is of a third of the record, the maps are of all of it."""
     model, chunk, _ = record("valve_gain_drift", 0.09)
@@ -266,8 +267,8 @@ def map_error(flowmap: FlowMap) -> float:
     return float(np.sqrt(np.mean(np.concatenate(off) ** 2)))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [pytest.param("leak", marks=pytest.mark.long), "delay"])
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["leak", "delay"])
 def test_held_out_errors_fall_to_those_of_the_clean_machine(folder: Path, name: str) -> None:
     clean, before, after = (studied(folder, n) for n in ("clean", f"{name}_before", name))
     (floor, floor_pa), (old, old_pa), (new, new_pa) = errors(clean), errors(before), errors(after)
@@ -278,7 +279,7 @@ def test_held_out_errors_fall_to_those_of_the_clean_machine(folder: Path, name: 
     assert before.replay.added == ()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_drift_acts_on_flows_that_the_fit_has_not_visited(folder: Path) -> None:
     """Its flow is a share of the valves': on unseen motion that of the published map."""
     clean, before, after = (studied(folder, n) for n in ("clean", "drift_before", "drift"))
@@ -288,7 +289,9 @@ def test_a_drift_acts_on_flows_that_the_fit_has_not_visited(folder: Path) -> Non
     assert "taken from the measured pressures" in " ".join(sentences(after.replay.added))
 
 
-@pytest.mark.parametrize(("name", "of_clean"), [("leak", 3.0), ("delay", 1.3)])
+@pytest.mark.parametrize(
+    ("name", "of_clean"), [("leak", 3.0), pytest.param("delay", 1.3, marks=pytest.mark.long)]
+)
 def test_the_map_and_beta_come_nearer_to_the_truth(
     folder: Path, name: str, of_clean: float
 ) -> None:

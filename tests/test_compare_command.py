@@ -73,7 +73,7 @@ def test_compare_answers_the_first_question(trace: Path, sheet: Path) -> None:
     assert len(found["blocks"]) > 50
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_compare_in_words_and_pictures(trace: Path, sheet: Path, tmp_path: Path) -> None:
     folder = tmp_path / "pictures"
     project = trace.with_suffix(".toml")

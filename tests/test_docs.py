@@ -183,7 +183,7 @@ def test_the_api_page_is_what_the_docstrings_say() -> None:
     assert PAGE.read_text() == page(), "run: python -m tools.api"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_notebook_tells_its_story(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -220,6 +220,7 @@ def test_what_is_next_goes_by_the_verdict(outcome: str) -> None:
     assert set(commands) <= set(EXAMPLES)
 
 
+@pytest.mark.first_of(1)
 @pytest.mark.parametrize("given", [
     ("drive.csv", "--example", "electric_drive"), ("room.csv", "--example", "heated_room"),
     ("run.parquet", "--duration", "2"),

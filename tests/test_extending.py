@@ -369,6 +369,7 @@ def my_laws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     catalogue.cache_clear()
 
 
+@pytest.mark.long
 def test_an_effect_with_a_law_of_ones_own_goes_the_whole_way(
     leaking: Path, tmp_path: Path, my_laws: Path
 ) -> None:
@@ -385,6 +386,7 @@ def test_an_effect_with_a_law_of_ones_own_goes_the_whole_way(
     assert ends("compare", leaking, "-p", file) in (Exit.OK, Exit.NEGATIVE)
 
 
+@pytest.mark.long
 def test_what_a_plug_in_changes_is_seen_though_a_fit_was_kept(
     leaking: Path, tmp_path: Path, my_laws: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -58,6 +58,7 @@ def simulated(path: Path, model: Machine, chunk: FloatArray) -> np.ndarray:
     )  # fmt: skip
 
 
+@pytest.mark.first_of(2)
 @pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize(("terms", "lag_s"), [((), 0.0), (TERMS, 1.3e-3)])
 def test_the_fmu_is_the_free_run(
@@ -164,6 +165,7 @@ def driven(path: Path, names: list[str], rows: FloatArray, start: list[float]) -
     return out
 
 
+@pytest.mark.long
 @pytest.mark.slow  # two records are learned
 def test_a_log_from_the_fmu_gives_the_same_maps_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

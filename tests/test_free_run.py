@@ -128,6 +128,7 @@ def truth(model: Machine, flowmap: FlowMap, chunk: FloatArray, lag_s: float) -> 
     return np.array(found)
 
 
+@pytest.mark.first_of(2)
 @pytest.mark.parametrize("terms", [(), TERMS])
 @pytest.mark.parametrize("lag_s", [0.0, 1.3e-3])
 def test_free_run_is_the_solution_of_the_equation(terms: tuple[Term, ...], lag_s: float) -> None:

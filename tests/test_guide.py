@@ -11,7 +11,6 @@ import asyncio
 import contextlib
 import re
 import shlex
-import shutil
 import signal
 import subprocess
 import sys
@@ -22,7 +21,6 @@ from pathlib import Path
 import pytest
 import typer
 
-from firmware_bridge.catalog import CONTROLLER_DBC
 from rtid.cli import main
 from rtid.cli.exits import Exit
 from rtid.project import load
@@ -34,6 +32,8 @@ from tests.replays import shared_replays  # noqa: F401
 from tests.test_docs import read, text_of
 
 LEFT = {
+    "rtid quick run.blf --dbc machine.dbc --bore 50 --rod 36 --stroke 500 --save quick.toml":
+        "a diagnosis; tests/test_quick.py saves a project beside its database",
     "rtid excite -p run.toml --after learned.npz --see valve_seat_leakage --out motion.csv":
         "9 s; tests/excite/test_machine.py designs after a record, and for an effect",
     "rtid compare run.blf -p run.toml --map sheet.csv --pictures pictures":
@@ -78,7 +78,7 @@ class Reader:
         self._said, self.group = said, process.a_group()
         self.told: dict[str, str] = {}
         self.beside = contextlib.ExitStack()
-        self.before = {"quick": self.dbc, "apply": self.offers, "fleet": self.traces}
+        self.before = {"apply": self.offers, "fleet": self.traces}
 
     def block(self, mark: str, text: str) -> None:
         """Enter a section into the project file, or call the lines."""
@@ -125,10 +125,6 @@ class Reader:
         self.beside.enter_context(process.sender(self.group, 5.0, trace=Path("run.blf").resolve()))
         at.wait(lambda status: status.estimate.samples > 1000)
 
-    def dbc(self) -> None:
-        """The catalog of the simulated machine."""
-        shutil.copy(CONTROLLER_DBC, "machine.dbc")
-
     def offers(self) -> None:
         """A controller with the map of yesterday, and what the daemon offers in its place."""
         it = Neighbour(self.group, Controller(), lambda data, _: [data], "udp_multicast")
@@ -139,8 +135,8 @@ class Reader:
         offer(folder, project, learned(project, 0, 1.1), against=1)
 
     def traces(self) -> None:
-        """A day of three machines."""
-        for k in (1, 2, 3):
+        """A day of two machines."""
+        for k in (1, 2):
             Path(f"traces/m{k}").mkdir(parents=True)
             self.record(f"traces/m{k}/day1", k)
 

@@ -112,6 +112,7 @@ def lag_of(quick: QuickRate) -> float:
     return float(sizes[0]["time_constant"].value) if sizes else 0.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_lag_behind_the_map_is_found_whatever_the_noise(tmp_path: Path, seed: int) -> None:
     rng = np.random.default_rng([20, seed])
@@ -122,7 +123,8 @@ def test_a_lag_behind_the_map_is_found_whatever_the_noise(tmp_path: Path, seed: 
     assert [c.name for c in quick.pair.commands] == [f"motor_{k}" for k in (1, 2, 3, 4)]
 
 
-@pytest.mark.parametrize("drift", [pytest.param(-0.004, marks=pytest.mark.long), 0.003])
+@pytest.mark.long
+@pytest.mark.parametrize("drift", [-0.004, 0.003])
 def test_a_battery_that_empties_is_a_drift_of_the_gain(tmp_path: Path, drift: float) -> None:
     """Beside the lag, from the first half of a flight; none is named where there is none."""
     rng = np.random.default_rng([22, round(1e4 * abs(drift))])
@@ -137,6 +139,7 @@ def test_a_battery_that_empties_is_a_drift_of_the_gain(tmp_path: Path, drift: fl
             assert rate.unit == "1/s" and abs(rate.value - drift) < 0.15 * abs(drift)
 
 
+@pytest.mark.long
 def test_what_is_left_of_the_samples_is_that_of_a_flight_behind_its_last_gain(
     tmp_path: Path,
 ) -> None:
@@ -312,6 +315,7 @@ def test_what_is_wrong_with_a_project_is_said_with_its_place(
     assert place in {problem.path for problem in error.value.problems}
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not STRANGERS.is_dir(), reason="no measurements of others beside this tree")
 def test_the_thrust_of_a_stranger_s_quadrotor(tmp_path: Path) -> None:
     """One map of four motors, and their lag behind it, in one command."""

@@ -94,7 +94,7 @@ def test_what_a_motor_has_not_is_said(tmp_path: Path, old: str, new: str, place:
     assert any(place in problem.path for problem in caught.value.problems)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_motor_is_learned_while_it_goes_round() -> None:
     """Some forty turns: its maps, and the bulk modulus of both sides in their intervals."""
     plant = Textbook(MOTOR, 7101)
@@ -105,7 +105,7 @@ def test_a_motor_is_learned_while_it_goes_round() -> None:
     assert np.abs(said.valid.error).mean() < 0.003
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_quick_finds_a_motor_and_its_leak(tmp_path: Path) -> None:
     """A table with an angle of many turns; the leak counts in the displacement that is assumed."""
     plant = Textbook(MOTOR, 7102, hidden="internal_leakage_laminar")

@@ -89,6 +89,7 @@ def called(*arguments: str) -> str:
     return done.stdout
 
 
+@pytest.mark.first_of(4)
 @pytest.mark.parametrize("offered", OFFERED)
 def test_what_a_comment_offers_works_through_replay_and_export(
     offered: str, trace: Path, tmp_path: Path

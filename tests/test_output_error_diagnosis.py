@@ -249,6 +249,7 @@ def show(diagnosis: PlantDiagnosis) -> None:
     print(diagnosis.verdict, [f.key for f in diagnosis.negligible])
 
 
+@pytest.mark.first_of(3)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "effect", "where"),
@@ -284,6 +285,7 @@ def test_nonlinear_parameters_of_a_hydraulic_plant() -> None:
     assert found.rmse[0] == pytest.approx(5e3, rel=0.1)
 
 
+@pytest.mark.first_of(2)
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [21, pytest.param(22, marks=CAMPAIGN)])
 @pytest.mark.parametrize("name", list(PLANTS))

@@ -72,7 +72,7 @@ def test_overflow_is_found_first_and_the_error_falls(diagnosed: Refitted) -> Non
     assert after["validation"][0] <= 0.30
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_report_names_what_the_diagnosis_found(diagnosed: Refitted) -> None:
     told: dict[str, Any] = json.loads(json.dumps(as_json(diagnosed), allow_nan=False))
     first = told["found"][0]

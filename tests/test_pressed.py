@@ -109,6 +109,7 @@ def test_a_pressure_alone_has_no_friction(tmp_path: Path, seed: int) -> None:
     assert not named(looked) and looked.diagnosis.verdict == "matches"
 
 
+@pytest.mark.long
 def test_friction_of_one_kind_is_not_taken_for_another(tmp_path: Path) -> None:
     rng = np.random.default_rng(53)
     drawn = Pulled.drawn(rng)

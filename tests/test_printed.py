@@ -153,6 +153,7 @@ def test_every_table_of_a_command_is_whole_at_80_columns(story: Told, line: str)
     assert "+-" not in shown
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("eighty")
 def test_the_history_is_whole_and_an_effect_reads_alike_before_and_after(story: Told) -> None:
     """The same residual has the same words in what `add` follows and in what follows it."""

@@ -54,6 +54,7 @@ def on_terminal(words: list[str], folder: Path) -> str:
     return shown.decode(errors="replace")
 
 
+@pytest.mark.first_of(1)
 @pytest.mark.parametrize("name", list(COMMANDS))
 def test_what_is_being_done_is_shown_on_a_terminal(folder: Path, name: str) -> None:
     words, step = COMMANDS[name]

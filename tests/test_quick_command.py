@@ -134,6 +134,7 @@ def half_a_sample_late(seed: int, found: Revision) -> tuple[Any, Any]:
     return SimpleNamespace(fitted=on_a_line, machine=late), first
 
 
+@pytest.mark.first_of(1)
 @pytest.mark.parametrize(
     ("seed", "found"), [(5, Revision()), (6, Revision()), (6, Revision((VOLUME,)))]
 )

@@ -120,7 +120,7 @@ def test_volts_behind_a_name_are_no_velocity() -> None:
     assert "v" not in propose([volts]) and propose([volts, speed])["v"].name == "v_ist"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_measured_tanks_go_the_way_of_equations(shared: Path, tmp_path: Path) -> None:
     """0.669 -> 0.263 V on the record of the table that judges."""
     table = shared / "data" / "real" / "cascaded_tanks.csv"

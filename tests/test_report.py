@@ -166,6 +166,7 @@ def test_every_effect_not_found_is_listed_once(leaking: Reported) -> None:
     assert all(size in words for u in unseen if u.visible for size in limits(u))
 
 
+@pytest.mark.long
 def test_a_model_that_matches_and_its_history(tmp_path: Path, leaking: Reported) -> None:
     trace, project = recorded(tmp_path, "")
     before = leaking.told.diagnosed.trace.path
@@ -256,5 +257,6 @@ def test_a_floor_of_nothing_is_no_floor(leaking: Reported) -> None:
     assert not stills(story)["errors"].axes[0].get_lines()
 
 
+@pytest.mark.long
 def test_the_same_story_gives_the_same_page(leaking: Reported) -> None:
     assert page(leaking.told) == leaking.path.read_text("utf-8")

@@ -177,6 +177,7 @@ def test_what_this_machine_cannot_have(
     assert caught.value.remedy
 
 
+@pytest.mark.long
 def test_a_set_of_equals_needs_a_choice(tmp_path: Path) -> None:
     """20 s do not tell oil in a hose from the hose's wall."""
     project = recorded(tmp_path, "extra_dead_volume=middle", 20.0)
@@ -199,6 +200,7 @@ def found(effect: str, where: str, *alike: tuple[str, str]) -> Any:
     return SimpleNamespace(effect=effect, where=where, alike=alike, cannot_be_told_from=names)
 
 
+@pytest.mark.long
 def test_all_that_is_clear_is_added_and_the_choice_is_told(
     project: Path, trace: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -253,6 +255,7 @@ def test_parts_come_back_with_their_shapes(project: Path, trace: Path) -> None:
         assert "rtid drop" in caught.value.remedy
 
 
+@pytest.mark.long
 def test_a_study_reads_once_and_adds_as_the_command_does(
     project: Path, trace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

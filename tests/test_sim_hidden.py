@@ -66,6 +66,7 @@ def test_the_plain_machine_has_not_changed() -> None:
     assert s[[0, 1, 2, 5]] == pytest.approx(PLAIN_FIGURES, rel=1e-9)
 
 
+@pytest.mark.first_of(9)
 @pytest.mark.parametrize("name", HIDDEN)
 def test_the_step_is_fine_enough(name: str) -> None:
     """Twice the substeps change pressures by less than 1e-4 of them."""
@@ -74,6 +75,7 @@ def test_the_step_is_fine_enough(name: str) -> None:
     assert np.abs(coarse / fine - 1).max() < 1e-4
 
 
+@pytest.mark.first_of(9)
 @pytest.mark.parametrize("name", HIDDEN)
 def test_effects_are_felt_and_grow(name: str) -> None:
     """Each strength moves what is measured, more than the weaker one."""

@@ -30,6 +30,7 @@ def test_the_equations_are_enough_where_nothing_is_hidden(name: str, tmp_path: P
         assert part[0] == pytest.approx(noise, rel=0.1)
 
 
+@pytest.mark.long
 @pytest.mark.hidden_effect
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_what_is_hidden_is_found_and_the_error_falls(name: str, tmp_path: Path) -> None:

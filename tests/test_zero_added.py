@@ -98,6 +98,7 @@ def test_in_memory_it_is_what_the_file_says(project: Path, recorded: Path) -> No
     assert back.standing.held_out.rms_m3s == pytest.approx(before, rel=1e-9)
 
 
+@pytest.mark.long
 def test_the_page_adds_it_and_the_report_tells_it(
     project: Path, recorded: Path, tmp_path: Path
 ) -> None:

@@ -165,6 +165,7 @@ def test_cut_anywhere_keeps_what_stands_before_and_says_truncated(
     assert min(shares) >= 0.995
 
 
+@pytest.mark.first_of(2)
 def test_a_flipped_bit_costs_one_line_or_container(whole: Log, tmp_path: Path) -> None:
     """A digit that became another one passes as text; its CRC keeps it out of the samples."""
     rng = np.random.default_rng(16)

@@ -300,6 +300,7 @@ def test_a_machine_on_j1939_gives_the_maps_of_the_same_samples_on_plain_can(tmp_
     assert len(open_log(folders[1] / "run.blf")) > len(columns["u"]) * 3
 
 
+@pytest.mark.long
 @pytest.mark.slow  # it waits for the bus
 def test_the_daemon_learns_from_j1939_as_it_comes(tmp_path: Path) -> None:
     """`rtid run` on a virtual bus: long messages in packets, among others' traffic."""

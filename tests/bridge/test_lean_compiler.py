@@ -100,6 +100,7 @@ def allocating(table: Any, values: Any) -> float:
 CASES = fields, elements, loops, arithmetic, allocating
 
 
+@pytest.mark.first_of(4)
 @pytest.mark.parametrize("align", [True, False])
 @pytest.mark.parametrize("function", CASES, ids=lambda case: case.__name__)
 def test_as_numba_has_it(function: Callable[..., float], align: bool) -> None:

@@ -57,6 +57,7 @@ def test_from_a_file_alone_to_the_missing_effect(
         assert loaded.sections.chambers["a"].piston_diameter_m == pytest.approx(0.052)
 
 
+@pytest.mark.long
 def test_a_role_and_the_sizes_in_six_clicks(
     browser: Browser, door: Workbench, short: tuple[Path, Path], tmp_path: Path
 ) -> None:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.slow
 
 
+@pytest.mark.long
 def test_the_page_shows_all_records_of_a_project(browser: Browser, tmp_path: Path) -> None:
     """It learned from the first alone, cut where the others stand."""
     rng = np.random.default_rng(30)

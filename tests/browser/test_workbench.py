@@ -127,6 +127,7 @@ def test_zooming_draws_what_is_seen_anew(opened: Opened) -> None:
     page.wait_for_function(whole)
 
 
+@pytest.mark.long
 def test_zooming_far_brings_every_sample(opened: Opened) -> None:
     """The page has the record in bins; what it looks at closely is asked for."""
     opened.go("compare")
@@ -165,6 +166,7 @@ def test_the_block_with_the_largest_error_lights_its_spans(opened: Opened) -> No
     page.wait_for_selector("text=Click a block")
 
 
+@pytest.mark.long
 def test_a_time_span_outlines_its_blocks(opened: Opened) -> None:
     opened.go("where")
     page = opened.page
@@ -326,6 +328,7 @@ def the_map_is_released_within_8_kb(page: Page, trace: Path) -> None:
     assert "released, date" in trace.with_suffix(".map.sheet.html").read_text("utf-8")
 
 
+@pytest.mark.long
 def test_a_data_sheet_is_held_beside_the_learned_map(
     browser: Browser, short: tuple[Path, Path], tmp_path: Path
 ) -> None:

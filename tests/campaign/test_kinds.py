@@ -32,7 +32,7 @@ FIRST, MOST_SKIPPED = 7000, 20
 DRIVE_COMPLIANCE, DRIVE_LEAKAGE = "drive_compliance", "drive_leakage"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_spool_with_its_zero_off_raises_no_alarm() -> None:
     found = outcome(KindCase(FIRST, SPOOL))
     assert found is not None and found.verdict not in ALARMS

@@ -13,7 +13,8 @@ FIRST_SEED = 7000
 DURATION_S = {"rich": 15.0, "sweep": 20.0}
 
 
-@pytest.mark.parametrize("p_noise_pa", [10e3, pytest.param(20e3, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("p_noise_pa", [10e3, 20e3])
 def test_a_few_plants(p_noise_pa: float) -> None:
     trials = [Trial(FIRST_SEED + k, "rich", 15.0, p_noise_pa) for k in range(6)]
     found = bias(s for s in map(score, trials) if s is not None)

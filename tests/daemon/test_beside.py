@@ -50,7 +50,7 @@ def learned(project: Project, plant: SimulatedPlant) -> Estimator:
     return learner.estimator
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_leak_is_learned_beside_the_maps() -> None:
     """The maps are those of the machine without the leak; with the plain model they are not."""
     worn = hide_wish(SimulatedPlant(), f"{LEAK}=strong")

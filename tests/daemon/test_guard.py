@@ -272,6 +272,7 @@ def test_a_healthy_machine_goes_on_learning(bench: Bench, state: Path, tmp_path:
     assert not (folder / machine().project.digest / WATCH_FILE).exists()
 
 
+@pytest.mark.long
 def test_a_suspicion_goes_back_to_the_newest_estimate_before_it(tmp_path: Path) -> None:
     """The baseline is older; an alarm of a sensor, which may be as old as it likes, goes there."""
     learner, answers = machine().learner(), list[jobs.Answer]()
@@ -291,6 +292,7 @@ def test_a_suspicion_goes_back_to_the_newest_estimate_before_it(tmp_path: Path) 
         assert recalled.estimator.state.engine[0]["t_s"] == expected
 
 
+@pytest.mark.long
 def test_a_proof_goes_on_where_a_kill_has_ended_it(
     bench: Bench, state: Path, tmp_path: Path
 ) -> None:
@@ -335,6 +337,7 @@ def test_a_later_map_is_the_baseline_only_where_it_foretells_as_well(
     assert analyst._baseline is (learned if gain == 1.0 else None)
 
 
+@pytest.mark.long
 def test_what_waited_to_be_trusted_waits_on_after_a_kill(
     bench: Bench, state: Path, tmp_path: Path
 ) -> None:
@@ -357,6 +360,7 @@ def test_what_waited_to_be_trusted_waits_on_after_a_kill(
     assert kept.estimator.state.engine[0]["t_s"] == chunk[-1, 0]
 
 
+@pytest.mark.long
 def test_a_cause_that_healthy_samples_hide_is_named_later(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -375,6 +379,7 @@ def test_a_cause_that_healthy_samples_hide_is_named_later(
     assert causes and "a leak from a to b" in causes[0].text
 
 
+@pytest.mark.long
 def test_a_command_that_turns_its_sign_in_a_run_is_named(bench: Bench) -> None:
     """The machine keeps out of all that the map knows: the causes must not wait for it."""
     model, solution = machine().project.model, fault_free()
@@ -392,6 +397,7 @@ def test_a_command_that_turns_its_sign_in_a_run_is_named(bench: Bench) -> None:
     assert begin_s - 6.0 <= guard.since_s <= begin_s + 1.0, "what was learned before is kept"
 
 
+@pytest.mark.long
 def test_a_lost_baseline_yields_to_a_shadow_that_foretells(
     bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -50,6 +50,7 @@ def test_of_a_leak_that_only_noise_is_left_of_nothing_is_told() -> None:
     assert [s.sd for c, s in scores if c.key == B] == [pytest.approx(known.sd, rel=0.3)]
 
 
+@pytest.mark.long
 def test_where_shut_valves_tell_a_leak_its_size_stays() -> None:
     score, known = told(fit_of(band=True, leak=1e-12), A)
     assert known.size == pytest.approx(score.value, rel=0.05)

@@ -59,6 +59,7 @@ def test_a_lag_behind_the_opening_is_no_delay_and_no_late_sensor() -> None:
     assert found.last.rho < 0.02 * found.first.rho
 
 
+@pytest.mark.long
 def test_the_maps_show_where_their_valves_open() -> None:
     model, chunk = record(0.0)
     fit = fitted(model, chunk[:32_000])

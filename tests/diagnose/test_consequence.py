@@ -180,7 +180,8 @@ def test_the_form_of_what_was_found_is_no_effect_of_its_own(result: Result) -> N
     assert not is_form_of_another(state, other)
 
 
-@pytest.mark.parametrize("seed", [*(pytest.param(k, marks=pytest.mark.long) for k in (3, 4)), 5])
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [3, 4, 5])
 def test_a_clean_sweep_stays_quiet(seed: int) -> None:
     said = diagnosis(search(*record("", 0.0, seed, "sweep")))
     assert (said.verdict, said.found) == ("matches", ())

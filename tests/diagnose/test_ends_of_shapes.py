@@ -15,6 +15,7 @@ from tests.diagnose.records import record
 AIR = "entrained_air", "both"
 
 
+@pytest.mark.long
 def test_air_that_begins_at_an_end_of_its_exponents_comes_back() -> None:
     """It stood there for good, and was refuted for it: 1 % of air was `unknown` at rho 156.
 

@@ -30,6 +30,7 @@ def leaking() -> Fit:
     return fit(model, chunk, prepare(model, chunk), Revision(), bank=False)
 
 
+@pytest.mark.long
 def test_blocks_that_miss_the_flow_are_excused(leaking: Fit) -> None:
     assert leaking.rho > 2.0
     assert steady(leaking).weights.missed.any() and steady(leaking).rho < leaking.rho

@@ -24,6 +24,7 @@ def fitted(motion: str) -> Fit:
     return fit(model, chunk, prepare(model, chunk), Revision())
 
 
+@pytest.mark.long
 def test_detection_limits_of_leaks_are_foretold() -> None:
     """Within a factor of 1.5 of what a record with such a supply then has."""
     swept, varied = fitted("sweep"), fitted("supply")

@@ -41,6 +41,7 @@ def sizes(now: Fit) -> tuple[float, float, float]:
     return now.held.value(column), *between_halves(now, column)
 
 
+@pytest.mark.first_of(1)
 @pytest.mark.parametrize(
     ("key", "strength", "motion"),
     [(key, size, motion) for key, size in ((LEAK, 1e-12), (VOLUME, 1e-4)) for motion in MOTIONS],
@@ -53,6 +54,7 @@ def test_what_is_there_all_the_time_has_one_size(key: Key, strength: float, moti
     assert sd < 0.1 * size
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("strength", [0.01, 0.03])
 def test_a_size_that_trades_with_its_own_form_alone_is_one_size(strength: float) -> None:
     """Of air its exponent: 3 % were not confirmed, the moduli told 7 and 11 % low."""
@@ -105,7 +107,7 @@ def test_halves_of_a_short_record_on_a_wide_grid_have_their_say() -> None:
     assert is_stable(now, trial, is_needed=True) and not is_stable(now, trial)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_polynomials_miss_alike_in_both_halves_is_no_leak() -> None:
     """A clean sweep that matches without it: one size, 1.2 times the flow, and 174 of chi2."""
     now, trial = of_case(Case(5111, "flow_force", "sweep_record"))

@@ -70,6 +70,7 @@ def of_rows(rest: Residual, rows: slice) -> Residual:
     return replace(rest, **cut)
 
 
+@pytest.mark.long
 def test_a_few_rows_do_not_refuse_what_the_first_part_shows() -> None:
     """Spools that took 64 % of a misfit beside a leak had 12 rows against them."""
     model, chunk, held_out = record("internal_leakage_laminar", 2e-12)

@@ -78,8 +78,11 @@ def test_a_lag_that_is_declared_as_anything_is_learned(seed: int) -> None:
         ("internal_leakage_laminar", 4e-12, 4e-12, 3),
         pytest.param(*("internal_leakage_laminar", 4e-12, 4e-12, 6), marks=pytest.mark.long),
         # warms up with 1.5 records: so much of it in the 30 of 40 s that the fit sees
-        ("valve_gain_drift", 0.06, 0.06 * (1 - np.exp(-0.5)) / (1 - np.exp(-1 / 1.5)), 3),
-        ("entrained_air", 0.05, 0.05, 3),
+        pytest.param(
+            *("valve_gain_drift", 0.06, 0.06 * (1 - np.exp(-0.5)) / (1 - np.exp(-1 / 1.5)), 3),
+            marks=pytest.mark.long,
+        ),
+        pytest.param("entrained_air", 0.05, 0.05, 3, marks=pytest.mark.long),
     ],
 )
 def test_an_effect_is_named_and_sized(
@@ -161,7 +164,7 @@ def test_every_key_of_the_json_is_described() -> None:
         assert f"`{key}`" in described, key
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_effect_of_the_user_s_own_is_offered_and_found() -> None:
     """The same leak, unknown to the catalogue but written as a formula by the user."""
     model, chunk, held_out = record("internal_leakage_laminar", 4e-12)
@@ -178,6 +181,7 @@ def test_an_effect_of_the_user_s_own_is_offered_and_found() -> None:
     assert names == {"gap_of_the_piston", "internal_leakage_laminar"}
 
 
+@pytest.mark.long
 def test_the_record_judges_where_little_of_the_held_out_part_is_known() -> None:
     """Half a second held out: the errors are those of the record, and the text says so."""
     model, chunk, held_out = record("internal_leakage_laminar", 4e-12)

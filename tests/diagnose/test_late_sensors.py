@@ -72,13 +72,10 @@ def test_a_slow_signal_is_put_right_up_to_the_window() -> None:
     assert np.abs(quickened(slow, DT_S, (tau_s,)) - wave)[20:-20].max() < 5e-3
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("effect", "strength"),
-    [
-        pytest.param("position_sensor_delay", 1.5e-3, marks=pytest.mark.long),
-        ("pressure_sensor_lag", 2e-3),
-    ],
+    [("position_sensor_delay", 1.5e-3), ("pressure_sensor_lag", 2e-3)],
 )
 def test_a_late_sensor_is_named_and_sized(effect: str, strength: float) -> None:
     """It was "spool lag", or nothing: its derivative alone is no measure of it."""

@@ -38,6 +38,7 @@ def named(effect: str) -> FoundEffect:
     return line
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("effect", "end"), ENDS)
 def test_a_line_is_named_with_what_it_is(effect: str, end: str) -> None:
     line, (volume, radps) = named(effect), true_line()

@@ -44,6 +44,7 @@ def test_a_short_clean_record_raises_no_alarm(seconds: float) -> None:
     assert found.found == ()
 
 
+@pytest.mark.long
 def test_a_leak_that_the_maps_have_taken_in_is_no_match() -> None:
     """15 s with a leak and nothing else to judge by: its error is small, the misfit is not."""
     model, chunk, held_out = record("internal_leakage_laminar", 2e-12)
@@ -54,6 +55,7 @@ def test_a_leak_that_the_maps_have_taken_in_is_no_match() -> None:
         assert "misses something" in " ".join(sentences(found))
 
 
+@pytest.mark.long
 def test_a_lag_that_nobody_declared_is_found() -> None:
     """The spools' lag, and with it in a set what this motion does not tell from it."""
     model, chunk, held_out = record()

@@ -17,6 +17,7 @@ def running(model: Machine, history_s: float) -> Estimator:
     return Estimator(replace(model, upkeep=Upkeep(every_s=10.0, history_s=history_s)))
 
 
+@pytest.mark.long
 def test_a_leak_is_named_from_the_ring_buffer() -> None:
     model, chunk, _ = record("internal_leakage_laminar", 4e-12)
     estimator = running(model, 60.0)

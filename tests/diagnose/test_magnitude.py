@@ -29,6 +29,7 @@ def grown(model: Machine, times: float) -> Machine:
     return replace(model, chambers=chambers, edges=edges)
 
 
+@pytest.mark.long
 def test_a_machine_of_ten_times_the_size_has_the_same_answer() -> None:
     """A hose of 14 pm3/Pa was impossible, and a dead volume was named alone."""
     effect = "hose_compliance"

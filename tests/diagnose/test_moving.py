@@ -154,6 +154,7 @@ def test_a_fit_that_takes_more_unknowns_to_leave_less_is_worse() -> None:
     assert is_worse(many, few) and not is_worse(few, many)
 
 
+@pytest.mark.first_of(1)
 @pytest.mark.parametrize("start_s", [8e-3, 11e-3, 13e-3])
 def test_a_fit_ends_where_nothing_is_left_to_move(start_s: float) -> None:
     """From a third too little, which is farther than the search from afar leaves."""
@@ -223,6 +224,7 @@ def test_what_is_hardly_known_goes_as_far_as_it_may_and_the_size_with_it() -> No
     assert weighs == pytest.approx(present.held.value(size) * (1.0 - 0.5 * gone))
 
 
+@pytest.mark.long
 def test_a_line_s_fit_comes_to_rest_at_the_oil_that_weighs_its_rows(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

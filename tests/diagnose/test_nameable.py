@@ -29,13 +29,12 @@ RICH = "rich_record"
 SHARES = st.floats(1e-3, 1e3)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("seed", "law", "effect", "where"),
     [
         (6201, "laminar", "external_leakage_laminar", "a"),
-        pytest.param(
-            *(6202, "asymmetric", "internal_leakage_laminar", "a-b"), marks=pytest.mark.long
-        ),
+        (6202, "asymmetric", "internal_leakage_laminar", "a-b"),
     ],
 )
 def test_twice_the_size_is_named_and_what_is_not_significant_is_not(

@@ -46,6 +46,7 @@ def slope_of(trend: Rise) -> tuple[float, float]:
     return float(weight @ y / (weight @ x)), float(1.0 / np.sqrt(weight @ x))
 
 
+@pytest.mark.long
 def test_the_points_rise_by_the_coefficient_before_and_by_nothing_after(exhibit: Exhibit) -> None:
     named = exhibit.named
     assert named.key == ("internal_leakage_laminar", "a-b")

@@ -152,6 +152,7 @@ def sagging() -> tuple[Fit, tuple[float, float, float]]:
     return fit(model, declared, prepare(model, declared), Revision()), psi
 
 
+@pytest.mark.long
 def test_a_pump_is_looked_for_where_its_limit_is_seen() -> None:
     """About a droop alone the search began in a valley that explains nothing of it."""
     present, truth = sagging()

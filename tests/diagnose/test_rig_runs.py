@@ -33,7 +33,6 @@ HIDDEN = {
     13: ("relief_valve", "opening_pressure", 3.6e6),
     14: ("supply_sag", "", 0.0),
 }
-IN_FULL = (8, 10, 11, 13, 14)  # by `make long`: a diagnosis of each takes its time
 ONE_COLUMN = {11: ("hose_compliance",)}  # a dead volume is what a hose that does not stiffen is
 
 
@@ -54,8 +53,7 @@ def diagnosis_of(
 def runs(missed: dict[int, str]) -> list[Any]:
     """The runs with something hidden; missed: of some, what is reached of a figure that is not."""
     marks = {k: [pytest.mark.xfail(strict=True, reason=v)] for k, v in missed.items()}
-    in_full = {key: [pytest.mark.long] for key in IN_FULL}
-    return [pytest.param(k, marks=[*marks.get(k, []), *in_full.get(k, [])]) for k in HIDDEN]
+    return [pytest.param(k, marks=[*marks.get(k, []), pytest.mark.long]) for k in HIDDEN]
 
 
 @pytest.mark.slow

@@ -151,6 +151,7 @@ def test_a_timing_must_gain_what_the_lag_of_the_fit_has_gained_already() -> None
     assert Search(blind, chunk).beside(known).ahead == 0.0
 
 
+@pytest.mark.long
 def test_a_late_position_and_a_lag_that_nobody_has_declared_are_told_apart() -> None:
     """The lag of the fit is the sum of both, which gains more than the position alone: it was not
     refitted, and named a dead volume.  Shared by both it gains what neither does.

@@ -34,6 +34,7 @@ def lagging(model: Machine, chunk: FloatArray) -> Fit:
     return one_pass(model, chunk, prepare(model, chunk), revision, None, False, thorough=False)
 
 
+@pytest.mark.first_of(1)
 @pytest.mark.parametrize("seed", [3, 7, 11])
 def test_a_lag_of_the_spools_explains_no_relief_valve(
     seed: int, monkeypatch: pytest.MonkeyPatch

@@ -45,6 +45,7 @@ def leaking(effect: str, strength: float, where: str, seed: int = 3) -> tuple[Fi
     return found, found.column(leak)
 
 
+@pytest.mark.first_of(1)
 @pytest.mark.parametrize(("seed", "is_far"), [(3, True), (4, True), (5, False)])
 def test_a_size_is_as_far_from_that_over_the_record_as_it_says(seed: int, is_far: bool) -> None:
     """The gap widens with the mean pressure, and what tells the leak is not all of its flow."""

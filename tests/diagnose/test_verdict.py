@@ -84,10 +84,10 @@ def test_what_is_slight_and_more_than_noise_is_no_match(unexplained: Diagnosis) 
     assert any("The model is right to 0.3 %" in text for text in sentences(slight))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("seed", "law"),
-    [(6703, "notch"), pytest.param(5101, "compensated", marks=pytest.mark.long)],
+    [(6703, "notch"), (5101, "compensated")],
 )
 def test_a_curve_that_all_blocks_miss_by_a_little_is_no_alarm(seed: int, law: str) -> None:
     """On somebody's grid rho was 1.11 and 1.13: half the width along one axis explains it."""
@@ -106,7 +106,7 @@ def test_a_curve_that_all_blocks_miss_by_a_little_is_no_alarm(seed: int, law: st
     assert all(sorted(axes) == [1, 2] for axes in halved)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_weak_leak_is_no_curve_of_the_maps() -> None:
     """It left rho 1.25: a grid of half the width leaves half of that, and is not taken."""
     case = Case(5101, "orifice", "rich_record", "external_leakage_laminar", 1.5e-13)

@@ -108,6 +108,7 @@ def test_sensors_that_agree_are_said_to(seed: int) -> None:
     assert all(u.visible and 0.0 < (u.detection_limit or 0.0) < 20e3 for u in limits.values())
 
 
+@pytest.mark.long
 def test_a_zero_that_bends_no_map_is_told_and_not_named() -> None:
     model, chunk, held_out = record(seed=3)
     first, last = (
@@ -127,6 +128,7 @@ def test_a_record_that_never_rests_with_an_open_valve_tells_nothing() -> None:
     assert not unseen.visible
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("strength", [6e-13, 2e-12])
 def test_a_leak_that_a_valve_feeds_at_rest_is_in_the_interval(strength: float) -> None:
     """Its drop over the open valve passes for a zero otherwise: up to 0.1 MPa here."""

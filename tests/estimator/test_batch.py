@@ -86,6 +86,7 @@ def test_parameters_of_random_plants(seed: int, form: str, cross_port: bool) -> 
     assert parameter_error(plant_case(seed, form, cross_port)) <= LIMIT[form]
 
 
+@pytest.mark.first_of(6)
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("seed", range(6))
 def test_recursive_equals_batch(seed: int, form: str) -> None:

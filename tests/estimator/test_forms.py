@@ -30,6 +30,7 @@ from tests.estimator.test_batch import accumulated, batch_of, check
 FORMS = ("integral", "carry", "restart")
 
 
+@pytest.mark.first_of(4)
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("basis", [LAPPED, BLENDED])
 @pytest.mark.parametrize("seed", range(2))
@@ -42,6 +43,7 @@ def test_restart_form(seed: int) -> None:
     check(draw_case(610 + seed, "restart", faults=seed, jitter=0.2 * seed))
 
 
+@pytest.mark.first_of(4)
 @pytest.mark.parametrize("basis", BASES)
 @pytest.mark.parametrize("form", FORMS)
 def test_modes_with_two_edges_open(form: str, basis: str) -> None:
@@ -112,6 +114,7 @@ def drive_case(form: str, basis: str) -> Case:
     return Case(model, t, np.column_stack([u, load, omega]).astype(np.float64), np.ones(n))
 
 
+@pytest.mark.first_of(4)
 @pytest.mark.parametrize("basis", BASES)
 @pytest.mark.parametrize("form", FORMS)
 def test_a_plant_without_pressures(form: str, basis: str) -> None:

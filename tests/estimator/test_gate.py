@@ -145,6 +145,7 @@ def last_before_changes(n: int) -> list[int]:
     return found
 
 
+@pytest.mark.first_of(1)
 @pytest.mark.parametrize(("column", "size"), [(X, 1e-3), (P_A, 5e5), (P_A, 1.5e6)])
 def test_single_outliers_are_refused_and_cost_little(column: int, size: float) -> None:
     clean = exact_record(90_000)

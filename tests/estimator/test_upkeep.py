@@ -285,6 +285,7 @@ def test_a_stamp_that_is_no_number_does_not_hold_up_the_rest() -> None:
     assert learned(chunk, upkeep=Upkeep(0.1)).turns >= 29
 
 
+@pytest.mark.long
 def test_ten_minutes_with_upkeep_every_tenth_of_a_second() -> None:
     t_us = [1_700_000_000_000_000 + 1001 * k for k in range(600_000)]
     est = at_stamps(t_us, 10_000, 0.1)

@@ -62,6 +62,7 @@ def minute() -> Learned:
     return Learned(model, estimator, estimator.sums, estimator.solution())
 
 
+@pytest.mark.long
 def test_each_valves_change_of_gain_is_seen(minute: Learned) -> None:
     plant = leaking(1.0)
     gains = (*CHANGES, 0.0)

@@ -114,7 +114,7 @@ def few_segments(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(library, "ZIGZAGS", (0.3,))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.usefixtures("few_segments")
 def test_a_segment_tells_less_where_a_prior_knows(tmp_path: Path) -> None:
     """By the determinant; the map's error may fall more where a prior adds what is lacking."""

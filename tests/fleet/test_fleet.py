@@ -178,6 +178,7 @@ def test_a_defect_is_a_row_too(
     assert found.row["error"] == "ZeroDivisionError: boom" and "report" in found.row["remedy"]
 
 
+@pytest.mark.long
 def test_a_run_goes_on_where_it_was_stopped(traces: Path, project: Path, tmp_path: Path) -> None:
     """Stopped after three of eight: no trace twice, none missing; workers of their own."""
     jobs = find([traces / "traces"], project)[0]

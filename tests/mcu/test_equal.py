@@ -162,6 +162,7 @@ def drawn(seed: int) -> tuple[Machine, Record]:
     return model, Record(t_us, case.values[:, columns], case.flags)
 
 
+@pytest.mark.first_of(4)
 @pytest.mark.parametrize("seed", range(12))
 def test_random_machines_differ_by_rounding(tmp_path: Path, seed: int) -> None:
     """Records of 1.5 s, most of whose blocks are known badly: all unknowns within the bound."""
@@ -173,6 +174,7 @@ def test_random_machines_differ_by_rounding(tmp_path: Path, seed: int) -> None:
     assert solutions_apart(outcome, reference).roundings <= ROUNDINGS
 
 
+@pytest.mark.first_of(1)
 @pytest.mark.parametrize("seed", range(3))
 def test_random_machines_under_sanitizers(tmp_path: Path, seed: int) -> None:
     """Gaps, NaN, values out of range, points off the grid, rows now and then, shared terms."""

@@ -38,6 +38,7 @@ def board(blocks: int, single: bool, tmp_path_factory: pytest.TempPathFactory) -
     return Board(valve(blocks), tmp_path_factory.mktemp("board"), blocks, single, extra=STRICT)
 
 
+@pytest.mark.first_of(8)
 @pytest.mark.parametrize("name", NAMES)
 def test_no_tick_is_long_and_nothing_is_lost(
     board: Board, blocks: int, single: bool, name: str

@@ -34,6 +34,7 @@ def test_the_paper_s_own_errors() -> None:
     assert np.isfinite(error).mean() == PAPER_CELLS
 
 
+@pytest.mark.long
 def test_table_1(learned: Learned) -> None:
     """Mean error at most 0.5 %, largest 1.5 %, as many cells on data as in the paper."""
     cells = table_cells(learned)
@@ -59,6 +60,7 @@ def test_the_condition_threshold_keeps_wild_blocks_out(learned: Learned) -> None
     assert blocks.published[~wild].max() < 0.01
 
 
+@pytest.mark.long
 def test_fine_blocks_near_the_dead_band_pay(learned: Learned) -> None:
     near = near_error(learned)
     assert near < 0.005

@@ -41,6 +41,7 @@ def test_frames_carry_the_record(chunk: FloatArray) -> None:
         assert high - 0.1 < column.max() <= high
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("basis", SURFACES)
 def test_rms_error_is_at_most_one_percent(estimates: dict[str, Estimate], basis: str) -> None:
     assert estimates[basis].valid_share > 0.9

@@ -30,7 +30,7 @@ from tests.bridge.controller import Controller, Line
 from tests.campaign.report import leave
 from tests.command import ends
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 
 NUMBER = 2003
 CHANGING = 2000  # its load becomes too small to regenerate while it is lowered

@@ -29,7 +29,7 @@ from rtid.ui.worker import in_words
 from tests.replays import shared_replays  # noqa: F401
 
 pytestmark = pytest.mark.slow
-SEED, DURATION_S = 3, 40.0
+SEED, DURATION_S = 3, 25.0
 LEAK = "internal_leakage_laminar", "a-b"
 
 
@@ -119,6 +119,7 @@ def test_what_the_diagnosis_has_fitted_is_not_fitted_again(worn: tuple[Path, Pat
     assert known.after.fit.spreads == again.after.fit.spreads
 
 
+@pytest.mark.long
 def test_what_would_do_better_stands_beside_what_speaks_against(worn: tuple[Path, Path]) -> None:
     """What a modulus alone tells is to be declared: the page says so as the command does."""
     trace, project = worn
