@@ -289,9 +289,8 @@ def test_a_drift_acts_on_flows_that_the_fit_has_not_visited(folder: Path) -> Non
     assert "taken from the measured pressures" in " ".join(sentences(after.replay.added))
 
 
-@pytest.mark.parametrize(
-    ("name", "of_clean"), [("leak", 3.0), pytest.param("delay", 1.3, marks=pytest.mark.long)]
-)
+@pytest.mark.long
+@pytest.mark.parametrize(("name", "of_clean"), [("leak", 3.0), ("delay", 1.3)])
 def test_the_map_and_beta_come_nearer_to_the_truth(
     folder: Path, name: str, of_clean: float
 ) -> None:

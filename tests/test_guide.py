@@ -135,8 +135,8 @@ class Reader:
         offer(folder, project, learned(project, 0, 1.1), against=1)
 
     def traces(self) -> None:
-        """A day of two machines."""
-        for k in (1, 2):
+        """A day of three machines."""
+        for k in (1, 2, 3):
             Path(f"traces/m{k}").mkdir(parents=True)
             self.record(f"traces/m{k}/day1", k)
 
@@ -147,7 +147,7 @@ class Reader:
         Path(f"{name}.toml").unlink()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_guide_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

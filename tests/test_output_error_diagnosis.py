@@ -249,7 +249,7 @@ def show(diagnosis: PlantDiagnosis) -> None:
     print(diagnosis.verdict, [f.key for f in diagnosis.negligible])
 
 
-@pytest.mark.first_of(3)
+@pytest.mark.first_of(2)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "effect", "where"),

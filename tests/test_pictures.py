@@ -174,6 +174,7 @@ def test_the_beginning_of_the_failure_is_marked(model: Machine) -> None:
     assert [25.0, 25.0] in [list(line.get_xdata()) for line in axis.lines]  # type: ignore[arg-type]
 
 
+@pytest.mark.first_of(1)
 @pytest.mark.parametrize("suffix", [".png", ".svg"])
 def test_every_picture_is_written(
     model: Machine, flowmap: FlowMap, tmp_path: Path, suffix: str

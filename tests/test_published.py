@@ -96,6 +96,7 @@ def marked(edge: EdgeMap) -> Mask:
     return found[1:-1, 1:-1]
 
 
+@pytest.mark.long
 def test_flow_rises_with_the_command_where_it_is_valid(
     maps: list[FlowMap], free_maps: list[FlowMap]
 ) -> None:
@@ -116,6 +117,7 @@ def test_flow_rises_with_the_command_where_it_is_valid(
     assert flagged < 0.04 * cells
 
 
+@pytest.mark.long
 def test_the_change_stays_within_its_limit_and_costs_nothing(
     fits: list[Fit], maps: list[FlowMap], free_maps: list[FlowMap]
 ) -> None:
@@ -133,6 +135,7 @@ def test_the_change_stays_within_its_limit_and_costs_nothing(
     assert rms < 1.2e-3
 
 
+@pytest.mark.long
 def test_the_slopes_that_must_not_fall_are_the_maps_own(maps: list[FlowMap]) -> None:
     """Their linear form in the terms, for random terms, is the gradient to 1e-12."""
     rng = np.random.default_rng(3)
@@ -160,6 +163,7 @@ def test_what_contradicts_a_rising_flow_is_kept_and_marked() -> None:
     np.testing.assert_allclose(edge.flow(w, dp), hump(w, dp), atol=0.02 * RATED_Q_M3S)
 
 
+@pytest.mark.long
 def test_truth_lies_within_two_sd_of_extrapolated_cells(
     fits: list[Fit], maps: list[FlowMap]
 ) -> None:
@@ -231,6 +235,7 @@ def test_the_combination_is_honest() -> None:
     assert np.mean(np.abs(every) < 2) >= 0.90
 
 
+@pytest.mark.long
 def test_another_machines_map_is_a_prior_on_any_grid(fits: list[Fit], maps: list[FlowMap]) -> None:
     """Learned on one plant, used on another of its type; it adds its own standard deviation."""
     _, solution = fits[0]

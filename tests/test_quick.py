@@ -166,6 +166,7 @@ def test_what_is_written_is_right_on_board(folder: Path, tmp_path: Path) -> None
     assert on_board(load(project), lambda _: None).model.lag.nominal_s == lag.seen_s
 
 
+@pytest.mark.long
 def test_a_project_beside_its_database_names_it_as_it_lies_there(
     folder: Path, tmp_path: Path
 ) -> None:
@@ -305,7 +306,8 @@ def test_data_that_cannot_bear_a_verdict_end_with_4(
     assert "No verdict" in done.stdout
 
 
-@pytest.mark.parametrize("is_noisy", [False, pytest.param(True, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("is_noisy", [False, True])
 def test_a_machine_that_rests_at_the_end_is_judged_by_the_end_of_its_motion(
     folder: Path, tmp_path: Path, is_noisy: bool
 ) -> None:
@@ -344,6 +346,7 @@ def test_a_foreign_bus_needs_its_dbc(folder: Path, tmp_path: Path) -> None:
     assert quick(folder / "leak.blf", "--bore", 30, "--rod", 40).returncode == Exit.USAGE
 
 
+@pytest.mark.long
 def test_a_saved_project_runs_on_board_as_it_is(folder: Path, tmp_path: Path) -> None:
     """Whoever follows `Next:` from a log to the machine edits no file by hand."""
     project = tmp_path / "p.toml"

@@ -172,6 +172,7 @@ def load_model() -> Any:
     return declared_model(SimulatedPlant())
 
 
+@pytest.mark.long
 def test_the_page_and_the_command_add_the_same(folder: Path) -> None:
     trace, project = folder / "leak.parquet", folder / "leak.toml"
     desk = Desk(lambda _text, _share: None)

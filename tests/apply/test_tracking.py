@@ -36,6 +36,9 @@ SECTION = ControllerSection(kp_per_s=KP_1PS, reference="x_ref")
 SECONDS = 8.0
 
 
+pytestmark = pytest.mark.long  # machines are driven and learned for it
+
+
 @pytest.fixture(scope="module")
 def tried() -> Tried:
     return machine(3, 30.0)

@@ -136,6 +136,7 @@ def most(log: Log) -> int:
     return 1 if log.suffix != ".blf" else -(-CONTAINER // OBJECT) + 1
 
 
+@pytest.mark.first_of(3)
 def test_the_whole_log_is_read(whole: Log) -> None:
     frames = cycles(1500)
     assert whole.frames.refused == {}

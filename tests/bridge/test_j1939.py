@@ -275,6 +275,7 @@ def learned(folder: Path, columns: dict[str, np.ndarray], text: str, plain: bool
     return Study(load(folder / "machine.toml"), folder / "run.blf").map
 
 
+@pytest.mark.long
 def test_a_machine_on_j1939_gives_the_maps_of_the_same_samples_on_plain_can(tmp_path: Path) -> None:
     text, columns = project_text(tmp_path, 40.0)
     folders = tmp_path / "plain", tmp_path / "j1939"

@@ -41,7 +41,7 @@ FLAGS = [
     f"--disable-features={','.join(UNWANTED)}",
 ]
 SIZE = {"width": 1366, "height": 768}
-SEED, DURATION_S = 3, 25.0
+SEED, DURATION_S = 3, 40.0
 SHORT_S = 20.0  # names the leak, and matches with it, for half of the processor time
 UNTOUCHED = "untouched.toml"  # a copy of the project, to which the workbench's tests save
 PATIENCE_MS = 120_000  # cold kernels on a loaded machine

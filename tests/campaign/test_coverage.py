@@ -25,6 +25,7 @@ def covered(z: FloatArray) -> float:
     return float((np.abs(z) < Z95).mean())
 
 
+@pytest.mark.first_of(1)
 @pytest.mark.parametrize("motion", ["rich", "sweep"])
 def test_a_few_plants(motion: str) -> None:
     """Bounds that chance alone breaks once in some thousand runs."""

@@ -201,10 +201,8 @@ def test_what_is_saved_is_trusted_once_the_motion_behind_it_shows_no_fault(
     assert baseline_s() == saved_s
 
 
-@pytest.mark.parametrize(
-    ("name", "said"),
-    [("u reversed", "u"), pytest.param(*("x reversed", "x"), marks=pytest.mark.long)],
-)
+@pytest.mark.long
+@pytest.mark.parametrize(("name", "said"), [("u reversed", "u"), ("x reversed", "x")])
 def test_samples_with_a_wrong_sign_prove_no_map(bench: Bench, name: str, said: str) -> None:
     """Also where they fall on hardly any cell that the map knows."""
     model, solution = machine().project.model, fault_free()

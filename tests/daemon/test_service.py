@@ -94,6 +94,7 @@ def test_a_bus_that_cannot_be_opened_is_a_plain_error(tmp_path: Path) -> None:
     assert "/dev/no_such_port" in found.stderr and "Traceback" not in found.stderr
 
 
+@pytest.mark.first_of(1)
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_stop_before_the_bus_is_open_is_heard(number: signal.Signals, tmp_path: Path) -> None:
     """While kernels are being loaded, in the background of a script, where SIGINT is ignored."""

@@ -59,6 +59,7 @@ def test_the_points_rise_by_the_coefficient_before_and_by_nothing_after(exhibit:
     assert named.before.slope > 20 * named.before.sd
 
 
+@pytest.mark.long
 def test_the_best_rival_is_shown_and_leaves_the_named_one_standing(exhibit: Exhibit) -> None:
     rival = exhibit.rival
     assert rival is not None

@@ -82,6 +82,7 @@ def test_the_interval_of_a_leak_knows_that_its_gap_widens() -> None:
     assert abs(size.value - true) < Z95 * size.std < 0.1 * true
 
 
+@pytest.mark.long
 def test_what_nobody_is_told_of_widens_what_it_moves() -> None:
     """A relief valve beside a leak whose gap widens: with it the leak is another one."""
     model, chunk, _ = record(LEAK, 2e-12)

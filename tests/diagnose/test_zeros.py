@@ -59,6 +59,7 @@ def told(result: Result, chunk: FloatArray) -> dict[str, Zero]:
     return {zero.signal: zero for zero in zeros(result.last, found)}
 
 
+@pytest.mark.first_of(1)
 @pytest.mark.parametrize(("seed", "signal", "bias"), [(3, "p_b", 0.1e6), (4, "p_a", -0.25e6)])
 def test_a_zero_that_is_off_is_named_with_its_size(seed: int, signal: str, bias: float) -> None:
     model, chunk, held_out = record(seed=seed)
@@ -94,6 +95,7 @@ def test_what_a_zero_bends_is_what_it_moves_the_true_map_by() -> None:
         assert off.maps[edge] == pytest.approx(bend, rel=0.25)
 
 
+@pytest.mark.first_of(1)
 @pytest.mark.parametrize("seed", [3, 4])
 def test_sensors_that_agree_are_said_to(seed: int) -> None:
     model, chunk, held_out = record(seed=seed)

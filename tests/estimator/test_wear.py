@@ -73,6 +73,7 @@ def test_each_valves_change_of_gain_is_seen(minute: Learned) -> None:
     assert (sd.gain < 1e-4).all()
 
 
+@pytest.mark.long
 def test_a_machine_that_has_not_changed_shows_nothing(minute: Learned) -> None:
     wear, _ = wear_since(minute.sums, minute.solution, minute.later(leaking(1.0)))
     assert np.abs(wear.gain).max() < 3e-4 and np.abs(wear.terms).max() < 0.1

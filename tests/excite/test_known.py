@@ -136,6 +136,7 @@ def test_a_segment_tells_less_where_a_prior_knows(tmp_path: Path) -> None:
     assert np.array_equal(more.any(axis=(1, 2)), priors)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("few_segments")
 def test_where_all_is_known_no_motion_is_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

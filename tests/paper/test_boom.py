@@ -43,6 +43,7 @@ def test_table_1(learned: Learned) -> None:
     assert cells.valid.mean() >= PAPER_CELLS
 
 
+@pytest.mark.long
 def test_corners_between_valid_blocks(learned: Learned) -> None:
     corners = nodes(learned)
     assert len(corners.error) > 30
