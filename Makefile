@@ -10,11 +10,11 @@ READY = .venv/.ready
 demo: $(READY)
 	.venv/bin/rtid demo
 
-# Four on two cores: what waits for a browser, a process or a kernel that is compiled leaves one idle.
+# Three on two cores: what waits for a browser or a process leaves one idle; a fourth gains nothing.
 # Bytecode is kept whatever the environment says: the tests start hundreds of interpreters.
 test: export PYTHONDONTWRITEBYTECODE =
 test: $(READY)
-	.venv/bin/python -m pytest -q -n 4 --dist loadfile --no-loadscope-reorder -p no:benchmark -p tools.spent
+	.venv/bin/python -m pytest -q -n 3 --dist loadfile --no-loadscope-reorder -p no:benchmark -p tools.spent
 
 # One more case, or a whole way, of what `make test` holds: whole records that are diagnosed for tens of seconds.
 long: $(READY)
