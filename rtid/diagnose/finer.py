@@ -36,6 +36,7 @@ LEFT = 0.35  # of the misfit in the halved intervals, at most: 1/8 at a corner, 
 LITTLE = 1.5  # rho from which on a misfit is no matter of the grid's detail alone
 MOST_BLOCKS = 600  # that are all halved: a solution's time grows with their cube
 LEFT_OF_A_JUMP = 0.7  # of all that is missed, at most: nearly all of what is missing would be
+FURTHER = 0.95  # the same, of borders behind which there may be others
 
 
 def fine_enough(present: Fit) -> tuple[Fit, Misfit | None]:
@@ -49,7 +50,10 @@ def fine_enough(present: Fit) -> tuple[Fit, Misfit | None]:
     present, rest = _finest(present, left_over(present))  # the first one's rows are large
     if present.declared is declared:
         return present, rest
-    return _to_the_end(present), None
+    present = _to_the_end(present)
+    if _jumps(present) and not _is_in_band(present):
+        present = _with_its_lag(present, declared)
+    return present, None
 
 
 def finer_beside(present: Fit) -> Fit:
@@ -125,15 +129,40 @@ def _better(present: Fit, rest: Misfit, machine: Machine) -> tuple[Fit, Misfit] 
 
 
 def _about_a_jump(present: Fit, rest: Misfit) -> tuple[Fit, Misfit] | None:
-    """As `_better`, with a border where each map jumps."""
-    if _is_in_band(present):
-        return None
-    machine = cut_at_jumps(present, rest)
-    if machine.n_cells == present.declared.n_cells:
-        return None
-    trial = _on_grid(present, machine)
-    gone = trial.rho - 1.0 < LEFT_OF_A_JUMP * (present.rho - 1.0)
-    return (trial, left_over(trial)) if gone and _is_worth(present, trial) else None
+    """As `_better`, with borders where the maps jump.
+
+    Time after time, each beside those before: of four edges that open within 3 % of the command
+    the first borders explain a quarter of what is missed, and all together nearly all.
+    """
+    last, gone, better = (present, rest), 1.0, None
+    for _ in range(ROUNDS):
+        before = last[0]
+        machine = before.declared if _is_in_band(before) else cut_at_jumps(*last)
+        if machine.n_cells == before.declared.n_cells:
+            break
+        trial = _on_grid(before, machine)
+        if not (trial.rho - 1.0 < FURTHER * (before.rho - 1.0) and _is_worth(before, trial)):
+            break
+        last, gone = (trial, left_over(trial)), LEFT_OF_A_JUMP * gone
+        better = last if trial.rho - 1.0 < gone * (present.rho - 1.0) else better
+    return better
+
+
+def _jumps(present: Fit) -> bool:
+    """Whether its grid has borders where a map jumps."""
+    return present.declared.gates.hysteresis == 0.0
+
+
+def _with_its_lag(present: Fit, declared: Machine) -> Fit:
+    """The fit on the grid that a declared one becomes with this fit's lag, where that is better.
+
+    A border where a map jumps lies as far off as the lag that it was looked for with.
+    """
+    weights = _own_weights(present, declared)
+    record = declared, present.chunk, weights, present.revision
+    again = one_pass(*record, None, bank=False, thorough=False)
+    again = _to_the_end(_finest(again, left_over(again))[0])
+    return again if again.rho < present.rho else present
 
 
 def _on_grid(present: Fit, machine: Machine) -> Fit:
@@ -150,9 +179,14 @@ def _on_grid(present: Fit, machine: Machine) -> Fit:
 
 def _to_the_end(trial: Fit) -> Fit:
     """The revision fitted to the end on its new grid, whose own slopes weigh the rows."""
-    known, weights = trial.unfactored().weights, prepare(trial.declared, trial.chunk)
-    weights = replace(weights, lag_s=known.lag_s, compliance=known.compliance)
+    weights = _own_weights(trial.unfactored(), trial.declared)
     return fit(trial.declared, trial.chunk, weights, trial.revision, trial, bank=False)
+
+
+def _own_weights(known: Fit, machine: Machine) -> Weights:
+    """Weights by the slopes of a machine's own grid, with the lag and the moduli of a fit."""
+    weights = prepare(machine, known.chunk)
+    return replace(weights, lag_s=known.weights.lag_s, compliance=known.weights.compliance)
 
 
 def _beyond(rest: Misfit, here: BoolArray) -> float:
