@@ -131,7 +131,7 @@ def test_gradient_equals_finite_differences(seed: int, safe: bool) -> None:
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=100, deadline=None)
 def test_inverse_gives_back_the_command(seed: int) -> None:
     """To 1e-9 of the command's range, from the foot at the safe band to the end of the grid."""
     rng, grid = np.random.default_rng(seed), random_map(seed).grid

@@ -11,6 +11,7 @@ import asyncio
 import contextlib
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -21,6 +22,7 @@ from pathlib import Path
 import pytest
 import typer
 
+from firmware_bridge.catalog import CONTROLLER_DBC
 from rtid.cli import main
 from rtid.cli.exits import Exit
 from rtid.project import load
@@ -32,8 +34,6 @@ from tests.replays import shared_replays  # noqa: F401
 from tests.test_docs import read, text_of
 
 LEFT = {
-    "rtid quick run.blf --dbc machine.dbc --bore 50 --rod 36 --stroke 500 --save quick.toml":
-        "a diagnosis; tests/test_quick.py saves a project beside its database",
     "rtid excite -p run.toml --after learned.npz --see valve_seat_leakage --out motion.csv":
         "9 s; tests/excite/test_machine.py designs after a record, and for an effect",
     "rtid compare run.blf -p run.toml --map sheet.csv --pictures pictures":
@@ -78,7 +78,7 @@ class Reader:
         self._said, self.group = said, process.a_group()
         self.told: dict[str, str] = {}
         self.beside = contextlib.ExitStack()
-        self.before = {"apply": self.offers, "fleet": self.traces}
+        self.before = {"quick": self.dbc, "apply": self.offers, "fleet": self.traces}
 
     def block(self, mark: str, text: str) -> None:
         """Enter a section into the project file, or call the lines."""
@@ -124,6 +124,10 @@ class Reader:
         at.wait(lambda status: status.bus.state == "open")
         self.beside.enter_context(process.sender(self.group, 5.0, trace=Path("run.blf").resolve()))
         at.wait(lambda status: status.estimate.samples > 1000)
+
+    def dbc(self) -> None:
+        """The catalog of the simulated machine."""
+        shutil.copy(CONTROLLER_DBC, "machine.dbc")
 
     def offers(self) -> None:
         """A controller with the map of yesterday, and what the daemon offers in its place."""
