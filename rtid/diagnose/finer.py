@@ -36,7 +36,7 @@ LEFT = 0.35  # of the misfit in the halved intervals, at most: 1/8 at a corner, 
 LITTLE = 1.5  # rho from which on a misfit is no matter of the grid's detail alone
 MOST_BLOCKS = 600  # that are all halved: a solution's time grows with their cube
 LEFT_OF_A_JUMP = 0.7  # of all that is missed, at most: nearly all of what is missing would be
-FURTHER = 0.95  # the same, of borders behind which there may be others
+FURTHER = 0.95  # of what is missed, at most, for others to be looked for beside these borders
 
 
 def fine_enough(present: Fit) -> tuple[Fit, Misfit | None]:
@@ -51,7 +51,8 @@ def fine_enough(present: Fit) -> tuple[Fit, Misfit | None]:
     if present.declared is declared:
         return present, rest
     present = _to_the_end(present)
-    if _jumps(present) and not _is_in_band(present):
+    has_jumps = present.declared.gates != declared.gates
+    if has_jumps and not _is_in_band(present):
         present = _with_its_lag(present, declared)
     return present, None
 
@@ -134,23 +135,19 @@ def _about_a_jump(present: Fit, rest: Misfit) -> tuple[Fit, Misfit] | None:
     Time after time, each beside those before: of four edges that open within 3 % of the command
     the first borders explain a quarter of what is missed, and all together nearly all.
     """
-    last, gone, better = (present, rest), 1.0, None
+    before, most, better = present, present.rho - 1.0, None
     for _ in range(ROUNDS):
-        before = last[0]
-        machine = before.declared if _is_in_band(before) else cut_at_jumps(*last)
+        if _is_in_band(before):
+            break
+        machine = cut_at_jumps(before, rest)
         if machine.n_cells == before.declared.n_cells:
             break
         trial = _on_grid(before, machine)
         if not (trial.rho - 1.0 < FURTHER * (before.rho - 1.0) and _is_worth(before, trial)):
             break
-        last, gone = (trial, left_over(trial)), LEFT_OF_A_JUMP * gone
-        better = last if trial.rho - 1.0 < gone * (present.rho - 1.0) else better
+        before, rest, most = trial, left_over(trial), LEFT_OF_A_JUMP * most
+        better = (trial, rest) if trial.rho - 1.0 < most else better
     return better
-
-
-def _jumps(present: Fit) -> bool:
-    """Whether its grid has borders where a map jumps."""
-    return present.declared.gates.hysteresis == 0.0
 
 
 def _with_its_lag(present: Fit, declared: Machine) -> Fit:
