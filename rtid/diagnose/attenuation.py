@@ -29,7 +29,7 @@ import numpy as np
 from rtid.diagnose.bank import columns_of
 from rtid.diagnose.commands import commands
 from rtid.diagnose.consequence import on_finer
-from rtid.diagnose.evidence import Projected, Rows, project
+from rtid.diagnose.evidence import Projected, Rows, project, rows_of
 from rtid.diagnose.fit import NO_COV, Fit, one_pass
 from rtid.diagnose.nameable import VISIBLE, clearest
 from rtid.diagnose.regression import FAINTEST, LIMIT_SD, Score
@@ -90,9 +90,31 @@ def apart_from_noise(
     return [(c, s) for c, s in scores if c.key not in asked] + better, nothing
 
 
+def stands_apart(fit: Fit, candidate: Candidate) -> bool:
+    """Whether a record tells of a flow that is not in a fit of it, the pressures' noise apart.
+
+    True of what the maps do not follow, and without pressures.
+    """
+    if not _may_be_followed(candidate) or not fit.view.has_pressures:
+        return True
+    rows = fit.rows or rows_of(fit.model, fit.sent, fit.weights)
+    (known,) = told_apart_from_noise(fit, rows, [candidate])
+    return _is_clear(known, float(np.sqrt(max(1.0, fit.rho))))
+
+
+def _is_clear(known: Believed, wide: float) -> bool:
+    """Whether a size stands out of the rows' noise, so many times as wide, and of the blocks'."""
+    return abs(known.size) > LIMIT_SD * max(wide * known.sd, known.sd_by_blocks)
+
+
+def _may_be_followed(candidate: Candidate) -> bool:
+    """Whether the maps may follow its flow."""
+    return candidate.law.kind in FLOWS and candidate.where != COMMAND and not candidate.is_whole
+
+
 def _is_doubtful(candidate: Candidate, score: Score, wide: float) -> bool:
     """True of a flow of which little is left, or that stands out; wide: times the noise."""
-    if candidate.law.kind not in FLOWS or candidate.where == COMMAND or candidate.is_whole:
+    if not _may_be_followed(candidate):
         return False
     stands_out = abs(score.value) > LIMIT_SD * wide * score.sd
     return bool(np.isfinite(score.sd)) and (score.visible <= VISIBLE or stands_out)
@@ -104,7 +126,7 @@ def _on_any_grid(fit: Fit, candidate: Candidate, known: Believed, wide: float) -
     What six terms miss alike in every block scatters between none: on a sweep of overlapped spools
     an internal leak of 8.1e-13 was 4.5e-13 +- 0.8e-13, and 1.3e-13 on half the spacing.
     """
-    if not abs(known.size) > LIMIT_SD * max(wide * known.sd, known.sd_by_blocks):
+    if not _is_clear(known, wide):
         return known
     beside = with_effect(fit, candidate)
     record = fit.declared, fit.chunk, fit.weights, beside, fit

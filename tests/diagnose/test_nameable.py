@@ -107,6 +107,7 @@ def test_a_modulus_that_counts_what_is_not_named_is_said_to() -> None:
     )
     said = replace(clean.said, negligible=(Small(*AIR, 1e-4),), not_found=(doubtful,))
     text = " ".join(sentences(said))
+    assert "Seen, not confirmed" in text and "Too small to matter" not in text
     assert "Entrained air (both) of 0.03" in text, "what was seen, and not its limit"
     assert "The moduli are effective ones" in text and "(6 %)" in text
 
