@@ -29,6 +29,10 @@ from tests.replays import shared_replays  # noqa: F401
 
 LEAK, TRUTH = "internal_leakage_laminar", 2e-12
 TWICE = ("--bore", 100, "--rod", 70)  # of what is assumed
+STILL = pytest.mark.xfail(
+    strict=True,
+    reason="insufficient_data: a position five times as noisy at rest leaves 4.2 times the floor",
+)
 WIRED = ("chambers", "x", "u", "units")
 SIZES = ("--bore", 50, "--rod", 36, "--stroke", 500, "--dead-volume", 0.6)
 
@@ -307,7 +311,7 @@ def test_data_that_cannot_bear_a_verdict_end_with_4(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("is_noisy", [False, True])
+@pytest.mark.parametrize("is_noisy", [False, pytest.param(True, marks=STILL)])
 def test_a_machine_that_rests_at_the_end_is_judged_by_the_end_of_its_motion(
     folder: Path, tmp_path: Path, is_noisy: bool
 ) -> None:
@@ -377,7 +381,9 @@ def test_a_supply_that_nobody_measures_is_asked_for_first(folder: Path, tmp_path
     points = [point["text"] for point in silent["data"]["points"]]
     assert not any("stays within" in text for text in points), "of a figure that was assumed"
     project = tmp_path / "said.toml"
-    said = told(table, "--supply", 7, "--save", project)
+    # it swings from 6.4 to 8.4: neither what is missing nor that nothing is can be told
+    said = in_json("quick", table, "--supply", 7, "--save", project, code=Exit.NEGATIVE)
+    assert said["diagnosis"]["verdict"] == "insufficient_data"
     assert not any("supply" in a["what"] for a in said["assumptions"])
     assert load(project).sections.signals["p_supply"].constant == 7e6
     remedies = ["".join(point["remedy"] for point in d["data"]["points"]) for d in (silent, said)]
