@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import tomllib
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,7 +26,7 @@ from rtid.study.quick_machine import (
     rated_flow,
 )
 from rtid.study.quick_project import project_text
-from rtid.trace.quick_source import open_source, roles_of
+from rtid.trace.quick_source import Source, open_source, roles_of
 from tests.test_quick import as_csv
 
 
@@ -59,6 +61,19 @@ def test_a_safe_band_is_in_the_unit_of_the_command() -> None:
     machine = fitted_machine(first_machine(roles, Given()), samples)
     (said,) = (a.what for a in machine.assumptions if "--safe-band" in a.what)
     assert f"|u| = {1e3 * (machine.safe_band or 0.0):.3g} mA," in said
+
+
+def test_the_noise_of_a_command_is_written_in_its_unit() -> None:
+    """What is unknown of it between its samples; the position has its own unit as well."""
+    ends = {"x": ("mm", 0.0, 500.0), "p_a": ("bar", 0.0, 70.0), "p_b": ("bar", 0.0, 70.0)}
+    ends["u"] = ("mA", -400.0, 400.0)
+    roles = {role: RoleCandidate(role, "", *known) for role, known in ends.items()}
+    first = first_machine(roles, Given())
+    machine = replace(first, command_hold="linear", command_noise=0.003, noise_seen={"x": 1e-5})
+    source = Source({"kind": "table"}, list(roles.values()), {}, {})
+    signals = tomllib.loads(project_text("m", source, roles, machine))["signals"]
+    assert (signals["u"]["noise"], signals["u"]["unit"]) == (pytest.approx(3.0), "mA")
+    assert signals["x"]["noise_seen"] == pytest.approx(0.01)
 
 
 def test_a_stamp_years_ahead_costs_no_memory() -> None:

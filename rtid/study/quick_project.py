@@ -127,7 +127,8 @@ def _signals(
             if candidate.name in source.steps:
                 section["resolution"] = source.steps[candidate.name]
         elif machine.command_noise or machine.command_hold != HELD:
-            section |= {"hold": machine.command_hold, "noise": _neat(machine.command_noise)}
+            noise = _neat(machine.command_noise / unit_of(candidate).factor)
+            section |= {"hold": machine.command_hold, "noise": noise}
         if role == "u" and machine.command_late_rows:
             section["late_rows"] = machine.command_late_rows
         turned = role in machine.reversed
