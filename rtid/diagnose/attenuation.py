@@ -82,8 +82,9 @@ def apart_from_noise(
     wide = float(np.sqrt(max(1.0, fit.rho)))
     asked = {c.key: (c, s) for c, s in clearest(scores).values() if _is_doubtful(c, s, wide)}
     sizes = told_apart_from_noise(fit, fit.rows, [candidate for candidate, _ in asked.values()])
+    finer = on_finer(fit) if any(_is_clear(known, wide) for known in sizes) else None
     better = [
-        (candidate, _scored_again(score, _on_any_grid(fit, candidate, known, wide), wide))
+        (candidate, _scored_again(score, _on_any_grid(fit, finer, candidate, known, wide), wide))
         for (candidate, score), known in zip(asked.values(), sizes, strict=True)
     ]
     nothing = frozenset(c.key for c, s in better if not s.gain > (LIMIT_SD * wide) ** 2)
@@ -120,24 +121,31 @@ def _is_doubtful(candidate: Candidate, score: Score, wide: float) -> bool:
     return bool(np.isfinite(score.sd)) and (score.visible <= VISIBLE or stands_out)
 
 
-def _on_any_grid(fit: Fit, candidate: Candidate, known: Believed, wide: float) -> Believed:
+def _on_any_grid(
+    fit: Fit, finer: Fit | None, candidate: Candidate, known: Believed, wide: float
+) -> Believed:
     """What is told of a size that stands out, and how far that of a finer grid is from it.
 
     What six terms miss alike in every block scatters between none: on a sweep of overlapped spools
     an internal leak of 8.1e-13 was 4.5e-13 +- 0.8e-13, and 1.3e-13 on half the spacing.
+
+    finer: the fit there, whose rows serve every candidate; None where no freedom is left.
     """
-    if not _is_clear(known, wide):
+    if finer is None or not _is_clear(known, wide):
         return known
+    (value, sd), (other, other_sd) = (_size_beside(on, candidate) for on in (fit, finer))
+    more = max(0.0, other_sd**2 - sd**2)
+    beyond = float(np.sqrt(max(0.0, (other - value) ** 2 - wide**2 * more)))
+    return replace(known, sd_by_blocks=float(np.hypot(known.sd_by_blocks, beyond)))
+
+
+def _size_beside(fit: Fit, candidate: Candidate) -> tuple[float, float]:
+    """Size of a candidate beside what a fit has, on its rows, and its standard deviation."""
     beside = with_effect(fit, candidate)
     record = fit.declared, fit.chunk, fit.weights, beside, fit
-    now = one_pass(*record, bank=False, thorough=False)
-    finer = on_finer(now)
-    if finer is None:
-        return known
-    apart = finer.held.value(finer.column(candidate)) - now.held.value(now.column(candidate))
-    more = finer.held.sd(finer.column(candidate)) ** 2 - now.held.sd(now.column(candidate)) ** 2
-    beyond = float(np.sqrt(max(0.0, apart**2 - wide**2 * max(0.0, more))))
-    return replace(known, sd_by_blocks=float(np.hypot(known.sd_by_blocks, beyond)))
+    now = one_pass(*record, bank=False, thorough=False, sent=fit.sent)
+    column = now.column(candidate)
+    return now.held.value(column), now.held.sd(column)
 
 
 def _scored_again(score: Score, known: Believed, wide: float) -> Score:

@@ -5,16 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
-import numpy as np
 import pytest
 
 from rtid.diagnose import attenuation
 from rtid.diagnose.attenuation import Believed, apart_from_noise, told_apart_from_noise
-from rtid.diagnose.fit import Fit
+from rtid.diagnose.consequence import on_finer
+from rtid.diagnose.fit import Fit, one_pass
 from rtid.diagnose.nameable import clearest
 from rtid.diagnose.regression import LIMIT_SD, Score
 from rtid.diagnose.standing import stand
-from rtid.diagnose.trials import scored
+from rtid.diagnose.trials import scored, with_effect
 from rtid.plain import Key
 from tests.diagnose.records import record
 
@@ -64,13 +64,24 @@ def test_a_size_is_known_no_better_than_a_finer_grid_agrees(
     fit = fit_of(band=True, leak=1e-12)
     candidate, _ = clearest(scored(fit))[A]
     known = Believed(1e-12, 1e-14, 2e-14)
-    monkeypatch.setattr(attenuation, "on_finer", lambda _: None)
-    assert attenuation._on_any_grid(fit, candidate, known, 1.0) == known
-    monkeypatch.setattr(attenuation, "on_finer", half)
-    apart = attenuation._on_any_grid(fit, candidate, known, 1.0).sd_by_blocks
-    assert apart == pytest.approx(0.5e-12, rel=0.3), "as far as the other one is"
+    assert attenuation._on_any_grid(fit, None, candidate, known, 1.0) == known
+    finer = replace(fit)
+    monkeypatch.setattr(
+        attenuation, "_size_beside", lambda on, _: (1e-12 if on is fit else 0.5e-12, 1e-15)
+    )
+    apart = attenuation._on_any_grid(fit, finer, candidate, known, 1.0).sd_by_blocks
+    assert apart == pytest.approx(0.5e-12, rel=0.01), "as far as the other one is"
 
 
-def half(now: Fit) -> Fit:
-    """The same fit with half of each size."""
-    return replace(now, held=replace(now.held, theta=np.asarray(0.5 * now.held.theta)))
+def test_the_rows_of_a_finer_grid_serve_every_candidate() -> None:
+    """The size beside a fit there is that of a fit with the candidate in it, made anew there."""
+    fit = fit_of(band=True, leak=1e-12)
+    candidate, _ = clearest(scored(fit))[A]
+    finer = on_finer(fit)
+    assert finer is not None
+    value, sd = attenuation._size_beside(finer, candidate)
+    record = fit.declared, fit.chunk, fit.weights, with_effect(fit, candidate), fit
+    anew = on_finer(one_pass(*record, bank=False, thorough=False))
+    assert anew is not None
+    assert value == pytest.approx(anew.held.value(anew.column(candidate)), abs=0.01 * sd)
+    assert sd == pytest.approx(anew.held.sd(anew.column(candidate)), rel=0.01)
