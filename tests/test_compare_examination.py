@@ -355,6 +355,7 @@ def test_the_residual_of_a_leak_depends_on_the_pressure(machine: Machine) -> Non
     assert p.explained[0] > found["x"].explained[0]
 
 
+@pytest.mark.long
 def test_error_bars_hold_the_mean_of_a_clean_plant(clean: list[tuple[Machine, Comparison]]) -> None:
     z = [
         d.mean_m3s / d.error_m3s

@@ -66,6 +66,7 @@ def looked_at(table: Path) -> QuickRate:
     return quick_rate(table, open_source(table, None), {})
 
 
+@pytest.mark.first_of(1)
 @pytest.mark.parametrize("seed", range(2))
 def test_the_loop_of_a_force_is_named(tmp_path: Path, seed: int) -> None:
     rng = np.random.default_rng([31, seed])

@@ -70,6 +70,7 @@ def _smooth(values: np.ndarray, lag_s: float) -> np.ndarray:
     return np.convolve(values, taps / taps.sum())[: len(values)]
 
 
+@pytest.mark.first_of(1)
 @pytest.mark.parametrize("seed", range(2))
 def test_a_pump_s_way_and_compliance_are_found(tmp_path: Path, seed: int) -> None:
     rng = np.random.default_rng([41, seed])
@@ -249,6 +250,7 @@ def test_a_stranger_s_pump_in_one_command(tmp_path: Path) -> None:
     assert len(runs) == 2 and np.mean(runs) < 0.8e-3
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not STRANGERS.is_dir(), reason="no measurements of others beside this tree")
 def test_a_stranger_s_pump(tmp_path: Path) -> None:
     """Loads 1 and 2 teach, load 3 judges: 3.7 mm by the pump's turns alone."""

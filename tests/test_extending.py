@@ -225,6 +225,7 @@ def write_mine(path: Path, frames: Frames) -> None:
     path.write_text("\n".join(["MY LOGGER", *lines]))
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("own_format")
 def test_a_log_format_of_ones_own_goes_through_every_command(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

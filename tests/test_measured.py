@@ -173,6 +173,7 @@ def test_noise_does_not_make_the_lag_shorter(tmp_path: Path) -> None:
     assert behind_s(fit.revision.timings) == pytest.approx(plant.lag_s, rel=0.05)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_lag_before_the_map_is_none_behind_it(tmp_path: Path, seed: int) -> None:
     """A map with a knee passes it at another instant: the two places are told apart."""

@@ -87,6 +87,7 @@ def named(looked: QuickRate) -> dict[str, Any]:
     return {found.effect: found for found in looked.diagnosis.found}
 
 
+@pytest.mark.first_of(1)
 @pytest.mark.parametrize("seed", range(2))
 def test_friction_that_grows_with_pressure_is_named(tmp_path: Path, seed: int) -> None:
     rng = np.random.default_rng([51, seed])

@@ -61,6 +61,7 @@ def test_what_is_being_done_is_shown_on_a_terminal(folder: Path, name: str) -> N
     assert step in on_terminal(words, folder)
 
 
+@pytest.mark.long
 def test_nothing_is_shown_where_there_is_no_terminal(folder: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "rtid", *COMMANDS["check"][0]],

@@ -137,6 +137,7 @@ def test_what_is_given_is_not_assumed(folder: Path) -> None:
     assert found["dead_volumes_m3"] == pytest.approx({"a": 0.6e-3, "b": 0.6e-3})
 
 
+@pytest.mark.long
 def test_the_saved_project_says_the_same_in_every_other_command(
     folder: Path, tmp_path: Path
 ) -> None:

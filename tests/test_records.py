@@ -174,6 +174,7 @@ def test_a_delay_is_looked_for_that_a_bent_map_hides() -> None:
     assert min(band.gain_below, band.gain_above) > 15e-3
 
 
+@pytest.mark.first_of(1)
 @pytest.mark.slow
 @pytest.mark.skipif(not STRANGERS.is_dir(), reason="no measurements of others beside this tree")
 @pytest.mark.parametrize(

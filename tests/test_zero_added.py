@@ -75,6 +75,7 @@ def test_a_zero_is_named_added_and_taken_back(project: Path, recorded: Path) -> 
     assert project.read_bytes() == old
 
 
+@pytest.mark.long
 def test_the_maps_are_the_machine_s_once_the_zero_is_right(project: Path, recorded: Path) -> None:
     plant, u, dp = SimulatedPlant(), np.array([3.0, 4.0]), np.array([1.5e6, 2.5e6])
     errors = []
@@ -85,6 +86,7 @@ def test_the_maps_are_the_machine_s_once_the_zero_is_right(project: Path, record
     assert errors[0] > 0.03 > 10 * errors[1]
 
 
+@pytest.mark.long
 def test_in_memory_it_is_what_the_file_says(project: Path, recorded: Path) -> None:
     study = Study(project, recorded)
     before = study.standing.held_out.rms_m3s

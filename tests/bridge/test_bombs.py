@@ -143,6 +143,7 @@ def test_a_map_that_unpacks_to_too_much_is_refused_by_name(tmp_path: Path) -> No
         read_map(tmp_path / "map.npz")
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_longest_log_takes_less_than_a_gigabyte(tmp_path: Path) -> None:
     count = most_frames_blf(tmp_path / "t.blf")

@@ -41,6 +41,7 @@ def test_air_that_begins_at_an_end_of_its_exponents_comes_back() -> None:
     assert held.shapes and not held.shape_columns(held.revision.effects[-1])
 
 
+@pytest.mark.long
 def test_a_relief_valve_may_open_at_any_pressure_of_the_record() -> None:
     """One that was open for 97 % of it stood at the end of an axis, and two leaks mended that."""
     present = stand(*record("entrained_air", 0.01)).fit

@@ -46,6 +46,7 @@ def test_a_leak_is_told_from_nothing_and_nothing_from_a_leak_never() -> None:
     assert not is_told_apart(leaking, leaking)
 
 
+@pytest.mark.long
 def test_what_is_out_of_reach_as_it_stands_is_told_apart_at_its_end_too() -> None:
     """And what does the same as the best one, or next to it, is fitted to its end."""
     plain, leaking = fits()

@@ -95,6 +95,7 @@ def test_what_a_zero_bends_is_what_it_moves_the_true_map_by() -> None:
         assert off.maps[edge] == pytest.approx(bend, rel=0.25)
 
 
+@pytest.mark.long
 @pytest.mark.first_of(1)
 @pytest.mark.parametrize("seed", [3, 4])
 def test_sensors_that_agree_are_said_to(seed: int) -> None:

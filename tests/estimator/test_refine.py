@@ -92,6 +92,7 @@ def test_a_border_is_put_where_a_valve_opens_with_a_jump() -> None:
     assert fit.rho < MATCH_RHO
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_edges_that_open_with_jumps_have_their_borders_one_after_the_other() -> None:
     """None explained most of what was missed beside the others, and none was put: rho was 3.5.

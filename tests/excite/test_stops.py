@@ -62,6 +62,7 @@ def at_rest(design: Design) -> FloatArray:
     return chunk
 
 
+@pytest.mark.long
 def test_rests_tell_the_zeros_of_all_pressure_sensors(tmp_path: Path) -> None:
     nominal, limits = with_stops(tmp_path)
     rests = against_stops(limits, nominal)

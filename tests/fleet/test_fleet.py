@@ -121,6 +121,7 @@ def test_sums_come_back_from_their_bytes(learned: Archive) -> None:
         np.testing.assert_array_equal(getattr(again, name), getattr(first, name))
 
 
+@pytest.mark.long
 def test_the_worn_machine_stands_out_and_the_typical_map_is_a_reference(
     project: Path, learned: Archive, tmp_path: Path
 ) -> None:

@@ -58,6 +58,7 @@ def test_the_tick_is_bounded_whatever_comes(board: Board, blocks: int) -> None:
     assert ticks.counts["block_changes"] > 0.2 * ticks.counts["samples"]
 
 
+@pytest.mark.long
 def test_a_budget_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Five boards, built and run: the choice is measured."""
     if lacking := absent():

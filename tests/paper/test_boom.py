@@ -52,6 +52,7 @@ def test_corners_between_valid_blocks(learned: Learned) -> None:
     assert corners.covered.mean() >= 0.93
 
 
+@pytest.mark.long
 def test_the_condition_threshold_keeps_wild_blocks_out(learned: Learned) -> None:
     """Beyond it a block's own terms miss by a multiple; the published map does not follow them."""
     blocks = block_errors(learned)
@@ -68,6 +69,7 @@ def test_fine_blocks_near_the_dead_band_pay(learned: Learned) -> None:
     assert near < near_error(learn(boom(), seed=3, blocks=even()))
 
 
+@pytest.mark.first_of(1)
 @pytest.mark.parametrize("w_v", [3.0, 6.0])
 def test_one_dimensional_maps(w_v: float) -> None:
     found = one_dimensional(w_v, seed=3)
