@@ -19,7 +19,7 @@ from rtid.study.study import Study
 from rtid.ui.headline import work_line
 from rtid.ui.server import Workbench
 from rtid.ui.views import VIEWS
-from tests.browser.conftest import DURATION_S, SEED, Opened, open_page
+from tests.browser.conftest import DURATION_S, SEED, SIZE, Opened, open_page
 from tests.browser.geometry import SIZES, assert_clear
 from tests.ui.plugins import install, snippet
 from tests.ui.served import served
@@ -288,6 +288,25 @@ def the_evidence_can_be_looked_at(page: Page) -> None:
     assert seen.startswith("Over the regressor of Internal leakage, laminar (a-b)")
     assert "best rival" in seen
     assert_clear(page, "#why_says", sizes=SIZES)
+    page.set_viewport_size({"width": 1024, "height": 768})
+    page.wait_for_function(f"() => ({CUT})().length === 0")
+    page.set_viewport_size(SIZE)  # type: ignore[arg-type]
+
+
+# lines of the figures above the plots that are seen, which are longer than these are wide
+CUT = """() => {
+  const cut = [], pen = document.createElement("canvas").getContext("2d");
+  const look = (views) => { for (const v of views) {
+    const above = v.model.type === "Figure" && v.bbox.width > 0 ? v.model.above : [];
+    for (const t of above.filter((t) => t.type === "Title")) {
+      pen.font = `${t.text_font_style} ${t.text_font_size} ${t.text_font}`;
+      cut.push(...t.text.split("\\n").filter(
+        (line) => pen.measureText(line).width > v.bbox.width - v.frame.bbox.left));
+    }
+    look(v.child_views || []); } };
+  look(Object.values(Bokeh.index.roots || Bokeh.index));
+  return cut;
+}"""
 
 
 def the_bar_falls(opened: Opened) -> float:

@@ -115,8 +115,10 @@ const plots = (() => {
 
   const told = new Map();  // a title: its words, how they are shown, and in what width
 
-  function wrap(view) {
-    const { title } = view.model, outer = view.bbox.width, known = told.get(title);
+  const titles = ({ title, above }) => [title, ...above.filter(({ type }) => type === "Title")];
+
+  function wrap(view, title) {
+    const outer = view.bbox.width, known = told.get(title);
     const isKnown = known && known.shown === title.text;
     if (isKnown && known.outer === outer) return;
     const words = isKnown ? known.words : title.text;
@@ -141,7 +143,7 @@ const plots = (() => {
 
   function fit(view) {
     const { x_range: x, y_range: y, renderers } = view.model, { width, height } = view.frame.bbox;
-    wrap(view);
+    for (const title of titles(view.model)) wrap(view, title);
     for (const one of renderers.filter(isFigures))
       place(one, width / (x.end - x.start), height / (y.end - y.start));
   }
@@ -151,7 +153,8 @@ const plots = (() => {
   function fitFromNowOn(view) {
     if (fitted.has(view)) return;
     fitted.add(view);
-    view.model.title.properties.text.change.connect(() => fit(view));
+    for (const title of titles(view.model))
+      title.properties.text.change.connect(() => fit(view));
     for (const one of view.model.renderers.filter(isFigures))
       one.data_source.properties.data.change.connect(() => fit(view));
   }
