@@ -103,8 +103,8 @@ pictures: $(READY)
 	.venv/bin/python -m tools.screenshots out/screenshots tools/pictures
 
 # The lock names all that is needed, so that two installers share it and no one asks what depends
-# on what: half the time of one after the other.  Bytecode is made of what rtid imports, a fifth of
-# what is installed; where PYTHONDONTWRITEBYTECODE is set no command would keep any.
+# on what: half the time of one after the other.  What is editable no installer compiles, nor, where
+# PYTHONDONTWRITEBYTECODE is set, does any command, each of which then took half a second for it.
 $(READY): requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
 	  echo "rtid needs Python 3.11 or newer, and $(PYTHON) is not:" \
@@ -114,11 +114,9 @@ $(READY): requirements.lock pyproject.toml
 	       "(Debian: apt install python3-venv)"; exit 1; }
 	@echo "Setting up .venv (once; about a minute) ..."
 	@$(PYTHON) -m venv --clear .venv
-	@xargs -P 2 -n 16 $(PIP) install -qq --no-deps --no-compile <requirements.lock
+	@xargs -P 2 -n 16 $(PIP) install -qq --no-deps <requirements.lock
 	@$(PIP) install -qq --no-deps --no-build-isolation --editable .
-	@.venv/bin/python -m compileall -q -j 2 rtid firmware_bridge
-	@PYTHONDONTWRITEBYTECODE= .venv/bin/python -c 'import pkgutil, rtid; [__import__(m.name) \
-	  for m in pkgutil.walk_packages(rtid.__path__, "rtid.") if "__main__" not in m.name]'
+	@.venv/bin/python -m compileall -q rtid firmware_bridge
 	@touch $@
 
 # The newest versions that pyproject.toml admits, for the core and [dev].
