@@ -29,7 +29,7 @@ import numpy as np
 from rtid.diagnose.bank import columns_of
 from rtid.diagnose.commands import commands
 from rtid.diagnose.consequence import on_finer
-from rtid.diagnose.evidence import Projected, Rows, project, rows_of
+from rtid.diagnose.evidence import Projected, Rows, project
 from rtid.diagnose.fit import NO_COV, Fit, one_pass
 from rtid.diagnose.nameable import VISIBLE, clearest
 from rtid.diagnose.regression import FAINTEST, LIMIT_SD, Score
@@ -98,8 +98,7 @@ def stands_apart(fit: Fit, candidate: Candidate) -> bool:
     """
     if not _may_be_followed(candidate) or not fit.view.has_pressures:
         return True
-    rows = fit.rows or rows_of(fit.model, fit.sent, fit.weights)
-    (known,) = told_apart_from_noise(fit, rows, [candidate])
+    (known,) = told_apart_from_noise(fit, fit.own_rows, [candidate])
     return _is_clear(known, float(np.sqrt(max(1.0, fit.rho))))
 
 
@@ -143,7 +142,7 @@ def _size_beside(fit: Fit, candidate: Candidate) -> tuple[float, float]:
     """Size of a candidate beside what a fit has, on its rows, and its standard deviation."""
     beside = with_effect(fit, candidate)
     record = fit.declared, fit.chunk, fit.weights, beside, fit
-    now = one_pass(*record, bank=False, thorough=False, sent=fit.sent)
+    now = one_pass(*record, bank=False, thorough=False)
     column = now.column(candidate)
     return now.held.value(column), now.held.sd(column)
 

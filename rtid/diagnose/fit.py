@@ -216,6 +216,12 @@ class Fit:
         """Number of columns before the given ones: y and theta_beta."""
         return 1 + len(self.model.chambers)
 
+    @property
+    def own_rows(self) -> Rows:
+        """Its rows, made again where they were let go."""
+        given = self.model, self.sent, self.weights
+        return self.rows or rows_of(*given, soft=softened(*given, self.revision))
+
     def light(self) -> Fit:
         """The same without the rows, and without what can be made again."""
         return replace(self, rows=None)

@@ -18,8 +18,8 @@ import numpy as np
 
 from rtid.diagnose.bank import columns_of
 from rtid.diagnose.commands import commands
-from rtid.diagnose.equations import regression_of, softened
-from rtid.diagnose.evidence import project, rows_of
+from rtid.diagnose.equations import regression_of
+from rtid.diagnose.evidence import project
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.regression import Estimate
 from rtid.effects.column import Candidate
@@ -35,8 +35,7 @@ def between_halves(fitted: Fit, column: int) -> tuple[float, float]:
     The form of an effect is as it stands.  The deviation is inf where one row holds half of the
     column.
     """
-    given = fitted.model, fitted.sent, fitted.weights
-    rows = fitted.rows or rows_of(*given, soft=softened(*given, fitted.revision))
+    rows = fitted.own_rows
     sent = commands(fitted.declared, fitted.chunk)
     whole, first = list[Volumes](), fitted.first_given
     columns, _, _ = columns_of(

@@ -21,8 +21,7 @@ from rtid.compare.dependence import Dependence, binned, inflation_of
 from rtid.diagnose.bank import opening_change
 from rtid.diagnose.commands import commands, through
 from rtid.diagnose.diagnosis import Result
-from rtid.diagnose.equations import softened
-from rtid.diagnose.evidence import Projected, Rows, project, rows_of
+from rtid.diagnose.evidence import Projected, Rows, project
 from rtid.diagnose.fit import NO_COV, Fit
 from rtid.diagnose.residual import behind_lag, effect_values, measured, modelled, through_filter
 from rtid.diagnose.sized import physical
@@ -110,9 +109,7 @@ class _Bench:
 
     @classmethod
     def of(cls, result: Result) -> _Bench:
-        fit = result.last
-        soft = softened(fit.model, fit.sent, fit.weights, fit.revision)
-        rows = rows_of(fit.model, fit.sent, fit.weights, soft=soft)
+        fit, rows = result.last, result.last.own_rows
         effects = {e.key: (e, cause_of(fit.view, e).column(e.shape)) for e in fit.revision.effects}
         for k, (timing, _) in enumerate(fit.revision.timings):
             where = fit.view.supply_name if timing.where == SUPPLY else timing.where

@@ -18,8 +18,7 @@ import numpy as np
 
 from rtid.diagnose.bank import columns_of
 from rtid.diagnose.commands import commands
-from rtid.diagnose.equations import softened
-from rtid.diagnose.evidence import Rows, rows_of
+from rtid.diagnose.evidence import Rows
 from rtid.diagnose.fit import Fit
 from rtid.effects.law import Volumes
 from rtid.estimator.misfit import crossed
@@ -34,7 +33,7 @@ def is_told_apart(best: Fit, other: Fit, promise: float = 0.0) -> bool:
 
     promise: of -2 ln likelihood, what the other one may still gain.
     """
-    ours, theirs = _rows(best), _rows(other)
+    ours, theirs = best.own_rows, other.own_rows
     if len(ours.own) != len(theirs.own):
         return True  # what has left the grids is no row: there is no difference row by row
     apart = loss(other, theirs) - loss(best, ours)
@@ -62,11 +61,6 @@ def loss(fit: Fit, rows: Rows) -> FloatArray:
     products.whitened(whitened, rows.fresh, rows.whiten, rows.keep)
     factors = rows.whiten[:, : 2 * left.shape[1] : 2]
     return np.asarray((whitened[:, :, 0] ** 2 - 2.0 * np.log(factors)).sum(axis=1))
-
-
-def _rows(fit: Fit) -> Rows:
-    given = fit.model, fit.sent, fit.weights
-    return fit.rows or rows_of(*given, soft=softened(*given, fit.revision))
 
 
 def into_rows(rows: Rows, terms: FloatArray) -> FloatArray:

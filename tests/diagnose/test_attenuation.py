@@ -73,13 +73,15 @@ def test_a_size_is_known_no_better_than_a_finer_grid_agrees(
     assert apart == pytest.approx(0.5e-12, rel=0.01), "as far as the other one is"
 
 
-def test_the_rows_of_a_finer_grid_serve_every_candidate() -> None:
+def test_the_rows_of_a_finer_grid_serve_every_candidate(monkeypatch: pytest.MonkeyPatch) -> None:
     """The size beside a fit there is that of a fit with the candidate in it, made anew there."""
     fit = fit_of(band=True, leak=1e-12)
     candidate, _ = clearest(scored(fit))[A]
     finer = on_finer(fit)
     assert finer is not None
-    value, sd = attenuation._size_beside(finer, candidate)
+    with monkeypatch.context() as held:
+        held.setattr("rtid.diagnose.fit.rows_of", lambda *_, **__: pytest.fail("made anew"))
+        value, sd = attenuation._size_beside(finer, candidate)
     record = fit.declared, fit.chunk, fit.weights, with_effect(fit, candidate), fit
     anew = on_finer(one_pass(*record, bank=False, thorough=False))
     assert anew is not None

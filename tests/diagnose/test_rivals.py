@@ -34,7 +34,7 @@ def fits() -> tuple[Fit, Fit]:
 
 def test_the_rows_lose_what_the_fit_loses() -> None:
     plain, leaking = fits()
-    lost = [float(loss(fit, rivals._rows(fit)).sum()) for fit in (plain, leaking)]
+    lost = [float(loss(fit, fit.own_rows).sum()) for fit in (plain, leaking)]
     assert leaking.wins_over(plain) > 1000.0
     assert lost[0] - lost[1] == pytest.approx(leaking.wins_over(plain), rel=0.02)
 
@@ -98,7 +98,7 @@ def test_what_one_block_likes_better_tells_nothing(differ: Any) -> None:
 
 def test_a_chamber_s_rows_are_in_the_blocks_of_its_own_edges() -> None:
     plain, _ = fits()
-    rows = rivals._rows(plain)
+    rows = plain.own_rows
     of_a, of_b = (rivals.blocks_of(rows, c) for c in (0, 1))
     for c, block in enumerate((of_a, of_b)):
         moving = block < len(rows.cells)
