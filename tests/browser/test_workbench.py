@@ -289,23 +289,28 @@ def the_evidence_can_be_looked_at(page: Page) -> None:
     assert "best rival" in seen
     assert_clear(page, "#why_says", sizes=SIZES)
     page.set_viewport_size({"width": 1024, "height": 768})
-    page.wait_for_function(f"() => ({CUT})().length === 0")
+    page.wait_for_function(
+        f"() => {{ const {{ lines, cut }} = ({FIGURES})(); return lines > 3 && !cut; }}"
+    )
     page.set_viewport_size(SIZE)  # type: ignore[arg-type]
 
 
-# lines of the figures above the plots that are seen, which are longer than these are wide
-CUT = """() => {
-  const cut = [], pen = document.createElement("canvas").getContext("2d");
+# of the figures above the plots that are seen: how many lines, and how many of them are cut off
+FIGURES = """() => {
+  let lines = 0, cut = 0;
+  const pen = document.createElement("canvas").getContext("2d");
   const look = (views) => { for (const v of views) {
     const above = v.model.type === "Figure" && v.bbox.width > 0 ? v.model.above : [];
     for (const t of above.filter((t) => t.type === "Title")) {
       pen.font = `${t.text_font_style} ${t.text_font_size} ${t.text_font}`;
-      cut.push(...t.text.split("\\n").filter(
-        (line) => pen.measureText(line).width > v.bbox.width - v.frame.bbox.left));
+      for (const line of t.text.split("\\n")) {
+        lines += 1;
+        cut += pen.measureText(line).width > v.bbox.width - v.frame.bbox.left;
+      }
     }
     look(v.child_views || []); } };
   look(Object.values(Bokeh.index.roots || Bokeh.index));
-  return cut;
+  return { lines, cut };
 }"""
 
 
