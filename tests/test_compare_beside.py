@@ -301,7 +301,6 @@ def test_the_map_and_beta_come_nearer_to_the_truth(
     np.testing.assert_allclose(after.held[0].beta_pa, SimulatedPlant().beta_pa, rtol=0.01)
 
 
-@pytest.mark.long
 def test_blocks_are_those_of_the_map_beside_the_effect(folder: Path) -> None:
     before, after = studied(folder, "leak_before"), studied(folder, "leak")
     rms = [

@@ -245,7 +245,6 @@ def test_a_record_of_which_nothing_could_be_judged_has_a_page_too(leaking: Repor
     assert "nan" not in words.split()
 
 
-@pytest.mark.long
 def test_a_floor_of_nothing_is_no_floor(leaking: Reported) -> None:
     """Where one disturbance stands for all that the command does not say, no sensor has a part."""
     told = leaking.told

@@ -128,7 +128,6 @@ SIZES: dict[str, Callable[[Run], Pair]] = {
 }
 
 
-@pytest.mark.first_of(10)
 @pytest.mark.parametrize("motion", [pytest.param("sweep", marks=pytest.mark.long), "rich"])
 @pytest.mark.parametrize("name", SIZES)
 def test_stated_size_is_the_effective_one(name: str, motion: str) -> None:

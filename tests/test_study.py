@@ -188,7 +188,6 @@ def test_the_page_and_the_command_add_the_same(folder: Path) -> None:
     assert added.section["parameters"] == page["parameters"], "named by the diagnosis: the same"
 
 
-@pytest.mark.long
 def test_a_missing_effect_is_no_excuse_and_bends_no_modulus(folder: Path) -> None:
     study = Study(folder / "leak.toml", folder / "leak.parquet")
     present = study.fitted

@@ -153,7 +153,6 @@ def test_a_second_that_two_pieces_share_is_counted_once(bench: Bench) -> None:
     assert 8 <= guard.progress["moved"] <= 13
 
 
-@pytest.mark.long
 def test_what_is_saved_is_trusted_once_the_motion_behind_it_shows_no_fault(
     bench: Bench, tmp_path: Path
 ) -> None:

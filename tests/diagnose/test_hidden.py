@@ -61,7 +61,7 @@ def test_a_clean_record_matches(seed: int) -> None:
 
 
 @pytest.mark.first_of(1)
-@pytest.mark.parametrize("seed", [3, 4, pytest.param(5, marks=pytest.mark.long)])
+@pytest.mark.parametrize("seed", [3, 4, 5])
 def test_a_lag_that_is_declared_as_anything_is_learned(seed: int) -> None:
     """0 +- 5 ms, as `rtid init` writes it: the spools' 1.3 ms are no missing effect."""
     model, chunk, held_out = record(seed=seed)

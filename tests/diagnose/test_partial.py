@@ -69,7 +69,6 @@ def test_the_best_rival_is_shown_and_leaves_the_named_one_standing(exhibit: Exhi
     assert exhibit.instead > NEAR * exhibit.instead_sd
 
 
-@pytest.mark.long
 def test_the_picture_its_numbers_and_its_sentence_are_the_same(exhibit: Exhibit) -> None:
     (chart,) = charts_of([exhibit])
     named, rival = chart.panels[0]

@@ -96,7 +96,6 @@ def test_what_a_zero_bends_is_what_it_moves_the_true_map_by() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.first_of(1)
 @pytest.mark.parametrize("seed", [3, 4])
 def test_sensors_that_agree_are_said_to(seed: int) -> None:
     model, chunk, held_out = record(seed=seed)

@@ -32,7 +32,6 @@ def test_standstill(way: str) -> None:
     assert np.abs(found.beta_drift).max() < 0.01
 
 
-@pytest.mark.first_of(1)
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @pytest.mark.parametrize("name", RIVALS)
 def test_standstill_breaks_a_covariance_that_forgets(name: str) -> None:

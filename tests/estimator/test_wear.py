@@ -79,7 +79,6 @@ def test_a_machine_that_has_not_changed_shows_nothing(minute: Learned) -> None:
     assert np.abs(wear.gain).max() < 3e-4 and np.abs(wear.terms).max() < 0.1
 
 
-@pytest.mark.long
 def test_other_oil_is_no_wear(minute: Learned) -> None:
     plant = leaking(1.0)
     softer = plant.constants._replace(beta_pa=0.95 * plant.constants.beta_pa)

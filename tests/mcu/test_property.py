@@ -66,7 +66,6 @@ def check_counts(outcome: Outcome) -> None:
     assert counts["rows"] <= (verdicts == TAKEN).sum()
 
 
-@pytest.mark.first_of(1)
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     seed=st.integers(0, 2**32 - 1),

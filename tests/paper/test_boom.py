@@ -52,7 +52,6 @@ def test_corners_between_valid_blocks(learned: Learned) -> None:
     assert corners.covered.mean() >= 0.93
 
 
-@pytest.mark.long
 def test_the_condition_threshold_keeps_wild_blocks_out(learned: Learned) -> None:
     """Beyond it a block's own terms miss by a multiple; the published map does not follow them."""
     blocks = block_errors(learned)
