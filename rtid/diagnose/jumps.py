@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rtid.diagnose.evidence import project, rows_of
+from rtid.diagnose.evidence import project
 from rtid.diagnose.fit import Fit, columns_of_effects
 from rtid.effects.law import Volumes
 from rtid.estimator.misfit import Misfit
@@ -28,7 +28,7 @@ from rtid.estimator.orifice import root
 from rtid.estimator.refine import cut, missing_commands
 from rtid.estimator.track import pressure_drop
 from rtid.model import Machine
-from rtid.plain import FloatArray
+from rtid.plain import FloatArray, IntArray
 
 PLACES = 15  # steps that are tried at once in an interval, and again about the best of them
 NEARER = 5  # times, each within an eighth of the reach before
@@ -93,9 +93,9 @@ def _best(present: Fit, rest: Misfit, steps: list[Jump]) -> tuple[float, list[Ju
 
 def _gains(present: Fit, rest: Misfit, steps: list[Jump]) -> FloatArray:
     """What chi2 falls by with each step (steps,), the maps and the effects being free to follow."""
-    rows = present.rows or rows_of(present.model, present.sent, present.weights)
+    rows, along = present.own_rows, _along(present, rest)
     known = columns_of_effects(present)
-    given = [*known, *(_column(present, rest, step) for step in steps)]
+    given = [*known, *(_column(present, along, step) for step in steps)]
     s = project(rows, [rows.on_rows(g) for g in given]).schur
     n = present.first_given + len(known)
     inner = s[1:n, 1:n] + np.diag(np.maximum(1e-9 * np.diag(s)[1:n], 1e-300))
@@ -103,18 +103,44 @@ def _gains(present: Fit, rest: Misfit, steps: list[Jump]) -> FloatArray:
     return np.asarray(left[0, n:] ** 2 / np.maximum(np.diag(left)[n:], 1e-300))
 
 
-def _column(present: Fit, rest: Misfit, step: Jump) -> Volumes:
-    """Volumes per interval (n - 1,) that a step of one sqrt(Pa) would add to each chamber."""
-    model, view = present.model, present.view
-    flows = []
+@dataclass(frozen=True)
+class _Along:
+    """An edge along the record (n - 1,): opening and by how much it moves, V, and mean sqrt(dp).
+
+    place (n - 1,): its interval of the command, -1 where no block is met; owner: the map it shares.
+    """
+
+    owner: int
+    opening: FloatArray
+    moves: FloatArray
+    root: FloatArray
+    place: IntArray
+
+
+def _along(present: Fit, rest: Misfit) -> list[_Along]:
+    """Each edge along the record; rest: what the maps miss."""
+    model, view, edges = present.model, present.view, []
     for i, edge in enumerate(model.edges):
-        opening = view.opening(i)
+        opening, cells = view.opening(i), rest.cells[:, i]
         moves = np.maximum(np.abs(np.gradient(opening)), 1e-9)
-        beyond = np.clip((opening - step.w_v) / moves + 0.5, 0.0, 1.0)
-        place = (rest.cells[:, i] - model.first_cells[i]) // edge.grid.shape[1]
-        here = (rest.cells[:, i] >= 0) & (model.owners[i] == step.edge)
-        here &= place == np.searchsorted(edge.grid.u_v, step.low_v, side="right") - 1
+        place = np.where(cells < 0, -1, (cells - model.first_cells[i]) // edge.grid.shape[1])
         s = root(pressure_drop(model, edge, present.sent[:, 2:]))
-        flows.append(np.where(here, beyond * 0.5 * (s[1:] + s[:-1]), 0.0))
-    chambers = range(len(model.chambers))
+        edges.append(_Along(model.owners[i], opening, moves, 0.5 * (s[1:] + s[:-1]), place))
+    return edges
+
+
+def _column(present: Fit, along: list[_Along], step: Jump) -> Volumes:
+    """Volumes per interval (n - 1,) that a step of one sqrt(Pa) would add to each chamber."""
+    view = present.view
+    borders = present.model.edges[step.edge].grid.u_v
+    interval = np.searchsorted(borders, step.low_v, side="right") - 1
+    nothing = np.zeros(view.n - 1)
+    flows = [nothing] * len(along)
+    for i, edge in enumerate(along):
+        if edge.owner == step.edge:
+            here = np.flatnonzero(edge.place == interval)
+            beyond = np.clip((edge.opening[here] - step.w_v) / edge.moves[here] + 0.5, 0.0, 1.0)
+            flows[i] = nothing.copy()
+            flows[i][here] = beyond * edge.root[here]
+    chambers = range(len(present.model.chambers))
     return {c: view.into_chamber(c, flows) * view.dt_s for c in chambers}

@@ -74,12 +74,12 @@ def differ(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Two fits of one chamber whose rows differ as given, in blocks of equal length."""
     block = np.repeat(np.arange(BLOCKS), ROWS // BLOCKS)
     rows = SimpleNamespace(own=np.zeros((ROWS, 1, 2)))
-    monkeypatch.setattr(rivals, "_rows", lambda fit: rows)
     monkeypatch.setattr(rivals, "blocks_of", lambda rows, chamber: block)
 
     def told(apart: FloatArray) -> bool:
-        monkeypatch.setattr(rivals, "loss", lambda fit, rows: fit * apart)
-        return is_told_apart(0.0, 1.0)  # type: ignore[arg-type]
+        monkeypatch.setattr(rivals, "loss", lambda fit, rows: fit.loses * apart)
+        best, other = (SimpleNamespace(own_rows=rows, loses=share) for share in (0.0, 1.0))
+        return is_told_apart(best, other)  # type: ignore[arg-type]
 
     return told
 
