@@ -20,6 +20,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 import rtid
+from firmware_bridge.kept_out import keep_out_asammdf
 from rtid.cli.exits import Exit
 from rtid.cli.teaching import EXAMPLES, GUIDE, next_step, panel
 
@@ -198,15 +199,13 @@ def main() -> NoReturn:
 
     Linear algebra stays on one thread, unless the environment says otherwise: matrices are small,
     and OpenBLAS' threads spin while they wait (`refit --diagnose` of the tanks beside another
-    program: 142 s instead of 39, with the same result).  python-can's own MF4 support is left out:
-    where asammdf is installed it loads that and pandas, 0.4 s and 100 MB at each start, and we use
-    it in a process of its own (`firmware_bridge.sources.mf4`): None is what is not to be found.
+    program: 142 s instead of 39, with the same result).
     Python looks for circles of dead objects after each 700 new ones, and a start makes 250,000 that
     stay: 8 % of a replay's time.  A command that ends looks less often.
     """
     return_large_memory()
     if not set(LASTING) & set(sys.argv[1:2]):
         gc.set_threshold(*SWEPT_AFTER)
-    sys.modules.setdefault("asammdf", None)  # type: ignore[arg-type]
+    keep_out_asammdf()
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read at the first import of numpy
     run(sys.argv[1:])

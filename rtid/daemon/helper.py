@@ -27,8 +27,9 @@ RESTART_S = (1.0, 60.0)  # first and longest pause before a helper is started ag
 
 
 class Helper:
-    """One `python -m MODULE FD ARGUMENTS...`; `answer` is called from its own thread.
+    """One `python -m MODULE FD ARGUMENTS...`, by `rtid.daemon.helped`.
 
+    `answer` is called from its own thread.
     failures counts how often it had to be started again; with `ended` it is not, and its end is
     answered by that.  is_real_time: so is the loop, and what is to be saved comes next to it.
     """
@@ -42,7 +43,7 @@ class Helper:
         is_real_time: bool = False,
     ) -> None:
         self._ended, self._is_real_time = ended, is_real_time
-        self._command = [sys.executable, "-m", module]
+        self._command = [sys.executable, "-m", "rtid.daemon.helped", module]
         self._arguments, self._answer = arguments, answer
         self._jobs: deque[Job] = deque()
         self._bytes = 0  # of the batches among them

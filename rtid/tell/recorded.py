@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import os
-import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -19,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from firmware_bridge.kept_out import let_in_asammdf
 from firmware_bridge.lookup import STATUS
 from rtid.errors import RtidError
 from rtid.plain import FloatArray
@@ -113,8 +113,7 @@ def write_recorded(path: Path, study: Study, provenance: Mapping[str, Any]) -> N
     Raises RtidError where a library is missing, OSError.
     """
     module, extra = NEEDED[path.suffix.lower()]
-    if sys.modules.get("asammdf", module) is None:  # kept from python-can, see `cli.main`
-        del sys.modules["asammdf"]
+    let_in_asammdf()
     try:
         import_module(module)
     except ImportError:

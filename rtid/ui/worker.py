@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,6 +16,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
+from firmware_bridge.kept_out import keep_out_asammdf
 from rtid.errors import RtidError
 from rtid.plain import Progress, give_back
 from rtid.ui.parcel import packed
@@ -58,7 +58,7 @@ def serve(pipe: Connection, folder: Path, stop: Event) -> None:
     folder: for what is large in an answer; stop: is set when nobody waits for the job any more.
     """
     os.nice(POLITE)  # the page comes first
-    sys.modules.setdefault("asammdf", None)  # type: ignore[arg-type]  # as `cli.main` does
+    keep_out_asammdf()
     from rtid.ui.reader import Reader  # noqa: PLC0415 - only the worker imports what reads
 
     def progress(text: str, share: float) -> None:

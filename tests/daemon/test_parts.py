@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import os
 import sqlite3
+import subprocess
+import sys
 import time
 from collections import deque
 from collections.abc import Callable
@@ -315,6 +317,14 @@ def test_a_helper_that_gets_little_of_a_busy_computer_ends_its_work(
     helper.put(Batch(np.zeros((5, 2)), None))
     until(lambda: len(answers) == 1)
     assert helper.stop(patience_s=1.0)
+
+
+def test_a_helper_goes_without_what_python_can_loads_of_itself(tmp_path: Path) -> None:
+    """asammdf and pandas, where they are installed: 77 MB on the gateway."""
+    (tmp_path / "shown.py").write_text("import sys, can\nprint(sys.argv, 'pandas' in sys.modules)")
+    command = [sys.executable, "-m", "rtid.daemon.helped", "shown", "5"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [f"['{tmp_path / 'shown.py'}',", "'5']", "False"]
 
 
 def test_a_helper_that_hangs_at_the_end_is_ended(echo: str) -> None:
