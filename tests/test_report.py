@@ -28,7 +28,7 @@ from rtid.tell.report_story import ReportStory
 from tests.command import in_json
 from tests.replays import shared_replays  # noqa: F401
 
-SEED, DURATION_S = 3, 40.0
+SEED, DURATION_S = 3, 30.0
 MOST_BYTES = 3_000_000
 LOADS = ("src", "href", "data", "poster", "srcset", "action", "background", "xlink:href")
 

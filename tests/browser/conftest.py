@@ -41,9 +41,7 @@ FLAGS = [
     f"--disable-features={','.join(UNWANTED)}",
 ]
 SIZE = {"width": 1366, "height": 768}
-SEED, DURATION_S = 3, 40.0
-SHORT_S = 20.0  # names the leak, and matches with it, for half of the processor time
-UNTOUCHED = "untouched.toml"  # a copy of the project, to which the workbench's tests save
+SEED, DURATION_S = 3, 20.0  # names the leak, and matches with it
 PATIENCE_MS = 120_000  # cold kernels on a loaded machine
 COOKIES: dict[str, list[Any]] = {}  # of the browser that has opened an address
 
@@ -91,15 +89,7 @@ def browser() -> Iterator[Browser]:
 @pytest.fixture(scope="session")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Trace and project of a machine whose piston seal leaks."""
-    trace, project = record(tmp_path_factory.mktemp("worn"), DURATION_S)
-    shutil.copy(project, project.with_name(UNTOUCHED))
-    return trace, project
-
-
-@pytest.fixture(scope="session")
-def short(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """The same for what opens a workbench of its own, which learns and diagnoses anew."""
-    return record(tmp_path_factory.mktemp("short"), SHORT_S)
+    return record(tmp_path_factory.mktemp("worn"), DURATION_S)
 
 
 def record(folder: Path, duration_s: float) -> tuple[Path, Path]:

@@ -31,13 +31,13 @@ def door(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Workbench]
 
 
 def test_from_a_file_alone_to_the_missing_effect(
-    browser: Browser, door: Workbench, short: tuple[Path, Path], tmp_path: Path
+    browser: Browser, door: Workbench, recorded: tuple[Path, Path], tmp_path: Path
 ) -> None:
     for opened in open_page(browser, door):
         opened.go()
         page = opened.page
         page.wait_for_selector("text=There is none.")
-        page.set_input_files("#arrival_file", short[0])
+        page.set_input_files("#arrival_file", recorded[0])
         page.wait_for_selector("#arrival_signals .curve[data-name=p_a] polygon")
         page.wait_for_selector("#arrival_told h3.found >> text=Something is missing")
         page.fill("#size_bore", "52")
@@ -59,10 +59,10 @@ def test_from_a_file_alone_to_the_missing_effect(
 
 @pytest.mark.long
 def test_a_role_and_the_sizes_in_six_clicks(
-    browser: Browser, door: Workbench, short: tuple[Path, Path], tmp_path: Path
+    browser: Browser, door: Workbench, recorded: tuple[Path, Path], tmp_path: Path
 ) -> None:
     """A signal whose name says nothing; its small curve is clicked."""
-    table = read_table(short[0])
+    table = read_table(recorded[0])
     names = ["Sensor_17" if name == "p_a" else name for name in table.column_names]
     write_table(table.rename_columns(names), tmp_path / "nameless.parquet")
     for opened in open_page(browser, door):

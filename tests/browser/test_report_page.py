@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -11,12 +10,13 @@ from PIL import Image
 
 from rtid.project import load
 from rtid.tell.report_file import Reported, report
-from tests.browser.conftest import SIZE, UNTOUCHED
+from tests.browser.conftest import SIZE, record
 from tests.browser.geometry import SIZES, assert_clear
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
+LONG_ENOUGH_S = 30.0  # to have a part that the fit has not seen
 MOST_BYTES, MOST_PAGES = 3_000_000, 4  # of the file, and of its print on A4
 # every plot: how many lines or dots it draws, and how wide it is
 DRAWN = """() => [...Bokeh.documents].flatMap(d => [...d.all_models])
@@ -25,10 +25,10 @@ DRAWN = """() => [...Bokeh.documents].flatMap(d => [...d.all_models])
 
 
 @pytest.fixture(scope="module")
-def written(recorded: tuple[Path, Path]) -> Reported:
-    trace, folder = recorded[0], recorded[0].parent
-    project = load(folder / UNTOUCHED)
-    return report(project, trace, folder / "r.html", pictures=folder / "stills")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Reported:
+    folder = tmp_path_factory.mktemp("report")
+    trace, project = record(folder, LONG_ENOUGH_S)
+    return report(load(project), trace, folder / "r.html", pictures=folder / "stills")
 
 
 @pytest.mark.slow

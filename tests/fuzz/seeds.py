@@ -35,7 +35,7 @@ LOGS = (
     *(".asc.gz", ".savvy.csv", ".shown.log", ".fd.log"),
 )
 TABLES = (".parquet", ".csv", ".mat", ".tsv", ".mcap", ".mf4")
-LOG_S, TABLE_S = "0.5", "24"  # a log that is read in no time; a table in which quick finds enough
+LOG_S, TABLE_S = "0.5", "12"  # a log that is read in no time; a table in which quick finds enough
 EVERY = 20  # rows of the table at 1 kHz of which one is kept
 
 

@@ -29,7 +29,7 @@ from rtid.ui.worker import in_words
 from tests.replays import shared_replays  # noqa: F401
 
 pytestmark = pytest.mark.slow
-SEED, DURATION_S = 3, 40.0
+SEED, DURATION_S = 3, 30.0
 LEAK = "internal_leakage_laminar", "a-b"
 
 
