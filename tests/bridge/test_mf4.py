@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import re
 import struct
 import subprocess
@@ -20,7 +21,6 @@ from firmware_bridge.sources import LogError, mf4, mf4_child, open_log, read_tab
 from tests.bridge.machine import cycles, equal
 
 N = 50
-HELD_UP_S = 3.0
 LOOP = "    try:\n        while True:\n            pass\n        columns"
 HEAD = 48  # bytes of the head of a compressed block
 
@@ -189,14 +189,18 @@ def test_processor_time_ends_a_read_and_waiting_does_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A child that gets no processor for longer than its limit reads its whole log all the same."""
-    path = measurement(tmp_path / "t.mf4")
-    monkeypatch.setattr(mf4, "CPU_S", 2.0)
-    started = subprocess.run
+    path, started = measurement(tmp_path / "t.mf4"), subprocess.run
+    before = os.times()
+    read_table(path)
+    limit_s = 2.0 + 2.0 * (os.times().children_user - before.children_user)  # enough for it here
 
     def held_up(arguments: list[str], **options: Any) -> subprocess.CompletedProcess[bytes]:
-        wait = f"import os, sys, time; time.sleep({HELD_UP_S}); os.execv(sys.argv[1], sys.argv[1:])"
+        wait = (
+            f"import os, sys, time; time.sleep({limit_s + 1}); os.execv(sys.argv[1], sys.argv[1:])"
+        )
         return started([sys.executable, "-c", wait, *arguments], **options)
 
+    monkeypatch.setattr(mf4, "CPU_S", limit_s)
     monkeypatch.setattr(subprocess, "run", held_up)
     assert len(read_table(path).column("p0")) == 100
     monkeypatch.setattr(subprocess, "run", started)
