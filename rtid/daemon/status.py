@@ -19,7 +19,7 @@ from pydantic import TypeAdapter
 
 from rtid.errors import RtidError
 from rtid.plain import plain
-from rtid.trace.state_files import create, exchange, read_bytes
+from rtid.trace.state_files import exchange, overwritten, read_settled
 
 SCHEMA = 1
 STATUS_FILE = "status.json"
@@ -323,7 +323,7 @@ def write(folder: Path, status: Status) -> None:
     is told by the very status that it would not have room for.
     """
     temporary, content = folder / (STATUS_FILE + ".part"), status.to_json().encode()
-    with create(temporary) as file:
+    with overwritten(temporary) as file:
         size = os.fstat(file.fileno()).st_size
         if len(content) > size:
             size = ROOM_BYTES * (1 + 3 * len(content) // (2 * ROOM_BYTES))
@@ -335,7 +335,7 @@ def read(folder: Path) -> Status:
     """The newest status of the daemon that keeps its state in this folder."""
     path = folder / STATUS_FILE
     try:
-        content = read_bytes(path)
+        content = read_settled(path)
     except FileNotFoundError:
         raise StatusError(f"{path}: no daemon has run here", "start it with `rtid run`") from None
     except OSError as error:

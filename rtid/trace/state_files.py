@@ -11,6 +11,7 @@ import errno
 import fcntl
 import os
 import stat
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -19,12 +20,46 @@ from typing import BinaryIO
 
 FOR_WRITING = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # of Linux: fcntl.h, linux/fs.h
+LOOKS, PAUSE_S = 50, 2e-3  # for a file that nobody writes over
 
 
 def read_bytes(path: Path, follow: bool = True) -> bytes:
     """What a file holds; OSError where it is none.  follow: where a link leads to one as well."""
     with opened(path, os.O_RDONLY | (0 if follow else os.O_NOFOLLOW)) as file:
         return file.read()
+
+
+def read_settled(path: Path) -> bytes:
+    """The same of a file that is `overwritten` and exchanged, never half of it.
+
+    What a reader has opened may be the older one by the time that it reads: the writer has it then,
+    and another stands in its place.
+    """
+    for _ in range(LOOKS):
+        with opened(path) as file:
+            if _is_locked(file, fcntl.LOCK_SH):
+                return file.read()
+        time.sleep(PAUSE_S)
+    return read_bytes(path)
+
+
+def overwritten(path: Path) -> BinaryIO:
+    """A file to write over that nobody reads; where somebody does, a new one.  OSError."""
+    file = create(path)
+    if not _is_locked(file, fcntl.LOCK_EX):
+        file.close()
+        path.unlink()
+        file = create(path)
+    return file
+
+
+def _is_locked(file: BinaryIO, how: int) -> bool:
+    """True once it is locked, until it is closed, or where the file system has no locks."""
+    try:
+        fcntl.flock(file, how | fcntl.LOCK_NB)
+    except OSError as error:
+        return not isinstance(error, BlockingIOError)
+    return True
 
 
 def write_bytes(path: Path, content: bytes, sync: bool = False) -> None:

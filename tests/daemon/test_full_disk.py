@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import subprocess
 import threading
@@ -73,7 +74,10 @@ def test_a_reader_never_sees_half_a_status(tmp_path: Path) -> None:
 
     def look() -> None:
         while not stop.is_set():
-            reason = st.read(tmp_path).store.reason
+            try:
+                reason = st.read(tmp_path).store.reason
+            except st.StatusError as error:
+                reason = str(error)
             if len(set(reason)) > 1:
                 wrong.append(reason)
 
@@ -84,6 +88,20 @@ def test_a_reader_never_sees_half_a_status(tmp_path: Path) -> None:
     stop.set()
     reader.join()
     assert not wrong
+
+
+def test_what_a_reader_has_open_is_not_written_over(tmp_path: Path) -> None:
+    """Nor does one that hangs hold up the status."""
+    for _ in range(2):
+        st.write(tmp_path, status())
+    with state_files.opened(tmp_path / st.STATUS_FILE) as file:
+        fcntl.flock(file, fcntl.LOCK_SH)
+        content = file.read()
+        for text in ("one", "two", "three"):
+            st.write(tmp_path, status(text))
+            assert st.read(tmp_path).store.reason == text
+        file.seek(0)
+        assert file.read() == content
 
 
 def test_where_names_cannot_be_exchanged_the_new_file_replaces_the_old(
