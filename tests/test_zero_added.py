@@ -45,7 +45,7 @@ def with_stops(run: Run, bias_pa: float) -> Run:
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     trace = tmp_path_factory.mktemp("zero") / "trace.parquet"
-    run = simulate(SimulatedPlant(), "rich", 0, 20.0)
+    run = simulate(SimulatedPlant(), "rich", 0, 40.0)
     write_run(trace, with_stops(run, BIAS), 0, "rich")
     return trace
 
