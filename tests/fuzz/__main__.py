@@ -24,7 +24,7 @@ import pyarrow as pa
 
 from tests.fuzz.cases import KINDS, Case, make
 from tests.fuzz.command import call
-from tests.fuzz.forked import Running, Verdict
+from tests.fuzz.forked import MOST_CPU_S, Running, Verdict
 from tests.fuzz.judge import judge
 from tests.fuzz.seeds import Seeds
 from tests.fuzz.seeds import make as make_seeds
@@ -33,6 +33,7 @@ SIZES = {
     "projects": 500, "dbcs": 500, "nodes": 500, "logs": 5000, "tables": 3000, "plants": 200,
     "bombs": 8,
 }  # fmt: skip
+TIMES = 2.0  # what a sound table takes: no hang, where a slow machine takes that long
 DEFECTS = ("traceback", "hang", "memory", "crash", "loss", "output")
 
 
@@ -42,8 +43,8 @@ def main() -> int:
     scratch = Path(tempfile.mkdtemp(prefix="rtid-fuzz-"))
     try:
         seeds = make_seeds(_made(scratch / "seeds"))
-        _warm(seeds, scratch, asked.kinds)
-        verdicts = list(_run(seeds, asked, scratch))
+        sound_s = _warm(seeds, scratch, asked.kinds)
+        verdicts = list(_run(seeds, asked, scratch, max(1.0, TIMES * sound_s / MOST_CPU_S)))
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
     print(table(verdicts))
@@ -76,8 +77,11 @@ def _made(folder: Path) -> Path:
     return folder
 
 
-def _warm(seeds: Seeds, scratch: Path, kinds: set[str]) -> None:
-    """Import and load what the commands need, once, before any fork."""
+def _warm(seeds: Seeds, scratch: Path, kinds: set[str]) -> float:
+    """Import and load what the commands need, once, before any fork.
+
+    Processor time, s, that `quick` takes of a sound table with that; 0 where no kind asks for it.
+    """
     pa.set_cpu_count(1)
     pa.set_io_thread_count(1)
     at = seeds.folder
@@ -90,22 +94,27 @@ def _warm(seeds: Seeds, scratch: Path, kinds: set[str]) -> None:
         call(["excite", "-p", str(at / "cylinder.toml"), str(scratch / "motion.csv"), "--json"])
     if kinds & {"projects", "tables"}:
         call(["diagnose", table_, "-p", str(at / "table.toml"), "--json"])
+    begin_s = end_s = time.process_time()
     if kinds & {"dbcs", "nodes", "logs", "tables", "bombs"}:
         call(["quick", table_, "--json"])
+        end_s = time.process_time()
         call(["init", str(at / "machine.dbc"), "-o", str(scratch / "new.toml")])
     if kinds & {"plants", "tables"}:
         for name in seeds.plants:
             call(["refit", str(at / f"{name}.toml"), str(at / f"{name}.csv"), "--json"])
+    return end_s - begin_s
 
 
-def _run(seeds: Seeds, asked: argparse.Namespace, scratch: Path) -> Iterator[Verdict]:
-    """All verdicts; as many cases at once as there are workers."""
+def _run(
+    seeds: Seeds, asked: argparse.Namespace, scratch: Path, slower: float
+) -> Iterator[Verdict]:
+    """All verdicts; as many cases at once as there are workers.  slower: see `Running`."""
     waiting, done = list(reversed(asked.cases)), 0
     running: list[Running] = []
     while waiting or running:
         while waiting and len(running) < asked.workers:
             kind, number = waiting.pop()
-            running.append(_started(seeds, asked.seed, kind, number, scratch))
+            running.append(_started(seeds, asked.seed, kind, number, scratch, slower))
         for one in list(running):
             verdict = one.poll()
             if verdict is None:
@@ -121,7 +130,9 @@ def _run(seeds: Seeds, asked: argparse.Namespace, scratch: Path) -> Iterator[Ver
         time.sleep(0.002)
 
 
-def _started(seeds: Seeds, seed: int, kind: str, number: int, scratch: Path) -> Running:
+def _started(
+    seeds: Seeds, seed: int, kind: str, number: int, scratch: Path, slower: float
+) -> Running:
     def work(folder: Path) -> dict[str, object]:
         case: Case = make(seeds, seed, kind, number, folder)
         outcome = call(case.arguments)
@@ -132,7 +143,7 @@ def _started(seeds: Seeds, seed: int, kind: str, number: int, scratch: Path) -> 
         }  # fmt: skip
 
     name = f"{kind}-{number}"
-    return Running(name, scratch / name).start(work)
+    return Running(name, scratch / name, slower).start(work)
 
 
 def table(verdicts: Sequence[Verdict]) -> str:
