@@ -104,6 +104,13 @@ def test_what_a_reader_has_open_is_not_written_over(tmp_path: Path) -> None:
         assert file.read() == content
 
 
+def test_a_lock_that_a_stranger_keeps_holds_up_no_reader(tmp_path: Path) -> None:
+    st.write(tmp_path, status("one"))
+    with state_files.opened(tmp_path / st.STATUS_FILE) as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        assert st.read(tmp_path).store.reason == "one"
+
+
 def test_where_names_cannot_be_exchanged_the_new_file_replaces_the_old(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -11,7 +11,8 @@ import pytest
 
 from rtid.diagnose import admission, contest, rivals
 from rtid.diagnose.admission import is_as_credible, makes_impossible
-from rtid.diagnose.fit import Fit, one_pass, prepare
+from rtid.diagnose.evidence import rows_of
+from rtid.diagnose.fit import Fit, fit, one_pass, prepare
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.rivals import CLEARLY, is_told_apart, loss
 from rtid.diagnose.trials import Trial, TrialState, best_by_key, scored, with_effect
@@ -61,6 +62,21 @@ def test_what_is_out_of_reach_as_it_stands_is_told_apart_at_its_end_too() -> Non
     for t in trials:
         end = contest._finished(state, plain, t).fit
         assert end is not None and (is_told_apart(leaking, end) or not far[t.key])
+
+
+def test_rows_that_were_let_go_are_made_again_as_soft() -> None:
+    """What more than the declared volume stores is in what the pressures' noise is taken for."""
+    model, chunk, _ = record("extra_dead_volume", 4e-4)
+    weights = prepare(model, chunk)
+    plain = one_pass(model, chunk, weights, Revision(), None, bank=True)
+    volume = best_by_key(plain, scored(plain))["extra_dead_volume", "a"][0]
+    fitted = fit(model, chunk, weights, with_effect(plain, volume), plain, bank=False)
+    again, rows = fitted.light().own_rows, fitted.rows
+    assert rows is not None and rows.soft.max() > 0.0
+    np.testing.assert_array_equal(again.whiten, rows.whiten)
+    np.testing.assert_array_equal(again.own, rows.own)
+    unsoft = rows_of(fitted.model, fitted.sent, fitted.weights)
+    assert np.abs(unsoft.whiten / again.whiten - 1.0)[:, 0].max() > 1e-3
 
 
 def test_what_a_cause_may_still_gain_is_no_difference() -> None:
