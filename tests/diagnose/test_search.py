@@ -9,7 +9,7 @@ import pytest
 from scipy.signal import savgol_filter
 
 from rtid.diagnose.exact import exact_trials
-from rtid.diagnose.fit import fit, one_pass, prepare, tried
+from rtid.diagnose.fit import Fit, fit, one_pass, prepare, tried
 from rtid.diagnose.moving import SIZED
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.search import Search, _vertex
@@ -19,12 +19,21 @@ from rtid.effects.laws.sensors import sensor_timings
 from rtid.effects.laws.timing import TIMINGS, TimingLaw
 from rtid.effects.record_view import RecordView
 from rtid.kernels.engine import GAP_FLAG
-from rtid.model import Lag
+from rtid.model import Lag, Machine
+from rtid.plain import FloatArray
 from tests.diagnose.records import record
 
 
 def timing(effect: str) -> TimingLaw:
     return next(t for t in TIMINGS if t.effect == effect)
+
+
+def without_and_with_leak(model: Machine, chunk: FloatArray) -> list[Fit]:
+    """Fits without any effect, and with an external leak of chamber a."""
+    weights = prepare(model, chunk)
+    bank = one_pass(model, chunk, weights, Revision(), None, True).columns.candidates
+    leak = next(c for c in bank if c.key == ("external_leakage_laminar", "a"))
+    return [fit(model, chunk, weights, Revision(e), bank=False) for e in ((), (leak,))]
 
 
 def test_means_move_by_what_flows_between_them() -> None:
@@ -175,6 +184,35 @@ def test_a_late_position_and_a_lag_that_nobody_has_declared_are_told_apart() -> 
     assert found[0] + trial.fit.estimate.value(trial.fit.timing_columns(0)[0]) == pytest.approx(
         late_s, rel=0.1
     )
+
+
+def test_beside_an_effect_the_moduli_are_searched_for_as_well() -> None:
+    """A leak per m3/s/Pa is 1e14 times a modulus' column: the moduli fell out of what was looked
+    for beside it, and weights began at the highest that is possible.
+    """
+    model, chunk, _ = record("external_leakage_laminar", 3e-12)
+    alone, present = without_and_with_leak(model, chunk)
+    search = Search(model, chunk)
+    beside = search.beside(present)
+    assert beside.before < search.beside(alone).before
+    known = beside.weights((), present.weights, present.weights.lag_s).compliance
+    assert known == pytest.approx(present.weights.compliance, rel=0.1)
+    beside.volumes = [{c: 1e-15 * v for c, v in volumes.items()} for volumes in beside.volumes]
+    assert beside.cost(()) == pytest.approx(beside.before, rel=1e-6)
+
+
+def test_a_delay_beside_a_leak_is_closed_in_on() -> None:
+    """What is found first must not hide what is second."""
+    late_s = 8e-3
+    model, chunk, _ = record("external_leakage_laminar", 3e-12)
+    for command in {edge.command for edge in model.edges}:
+        column = 2 + model.column(command)
+        chunk[:-8, column] = chunk[8:, column].copy()  # told before it is sent
+    _, present = without_and_with_leak(model, chunk)
+    beside = Search(model, chunk).beside(present)
+    psi, gain = beside.closed_in(timing("input_delay"), beside.bank(timing("input_delay")))
+    assert psi[0] == pytest.approx(late_s, rel=0.1)
+    assert gain > 0.8 * beside.before
 
 
 def test_a_spool_of_second_order_is_looked_for_in_the_place_of_a_slow_declared_lag() -> None:
