@@ -111,6 +111,7 @@ class Beside:
             for volumes in columns_of_effects(fit)
         ]
         self.most_rows = 0
+        self._known: dict[tuple[Timings, float], tuple[float, FloatArray]] = {}
         self.before = self.cost(())
         self.ahead, self.fitted_s = 0.0, fit.weights.lag_s
         if self.fitted_s != search.lag_s:
@@ -155,10 +156,19 @@ class Beside:
         return replace(like, compliance=np.clip(compliance, low, high))
 
     def _solved(self, more: Timings, lag_s: float | None = None) -> tuple[float, FloatArray]:
-        """The cost with more timings, and the coefficients of compliances and effects."""
+        """The cost with more timings, and the coefficients of compliances and effects.
+
+        Kept: a bank ends where the closing in begins, and both where the lag takes its share.
+        """
+        asked = more, self.search.lag_s if lag_s is None else lag_s
+        if asked not in self._known:
+            self._known[asked] = self._solved_anew(*asked)
+        return self._known[asked]
+
+    def _solved_anew(self, more: Timings, lag_s: float) -> tuple[float, FloatArray]:
         search, timings = self.search, (*self.timings, *more)
         weights = search.weights
-        sent = search.sent(timings, search.lag_s if lag_s is None else lag_s)
+        sent = search.sent(timings, lag_s)
         soft = softened(search.split, sent, weights, Revision((), timings))
         rows = rows_of(search.split, sent, weights, ROW_S, soft, search.thinning.m)
         self.most_rows = max(self.most_rows, rows.n)
