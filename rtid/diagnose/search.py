@@ -30,7 +30,7 @@ SIMPLEX, DOWNHILL = 0.25, 80  # first size in logarithms of the parameters; refi
 CLOSING = 3  # refits between the neighbours of the best of the bank
 FOUND = 0.02  # share of a parameter within which it is found well enough from afar
 LESS_DAMPED = 0.65  # times the damping of the bank
-DEEP = 10.0  # times what a fit leaves that a timing must cost for stronger ones to be none
+DEEP = 3.0  # times what a fit leaves that a timing must cost for stronger ones to be none
 RANK = 1e-12  # of products of columns of length 1, below which one is made of others
 OFF = 0.05  # share of a bracket that a trial stays off its ends
 # of what the lag of a fit and a timing beside the declared one have taken: each beside the other's
