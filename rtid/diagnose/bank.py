@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
-from rtid.diagnose.commands import change_of, half_of
+from rtid.diagnose.commands import change_of, half_of, through
 from rtid.diagnose.regression import Estimate
 from rtid.diagnose.revision import Revision
 from rtid.effects.column import Candidate, Cause, Columns
@@ -53,7 +53,7 @@ def add_timing(
 
     sent: the commands (n,), V, before any timing.
     """
-    dt_s, n = view.step_s, 0
+    dt_s, instants, n = view.step_s, view.instants, 0
     if not revision.replaces_lag:
         columns.add(opening_change(view, _slower(view, weights.lag_s)))
         n += 1
@@ -65,7 +65,7 @@ def add_timing(
                 columns.add(late(view, timing, psi))
             else:
                 change = {
-                    name: change_of(u, d, dt_s, revision.timings, k, j)
+                    name: change_of(u, d, instants, revision.timings, k, j)
                     for name, (d, u) in sent.items()
                 }
                 columns.add(opening_change(view, change))
@@ -76,12 +76,13 @@ def add_timing(
 def _slower(view: RecordView, lag_s: float) -> dict[str, FloatArray]:
     """How the commands at the spools (n,) follow the lag, V/s."""
     above, below = lag_s + LAG_STEP_S, max(0.0, lag_s - LAG_STEP_S)
+    even_s = view.instants.even_s
 
     def slower(u: FloatArray) -> FloatArray:
-        rise = lagged_command(u, view.step_s, (above,)) - lagged_command(u, view.step_s, (below,))
+        rise = lagged_command(u, even_s, (above,)) - lagged_command(u, even_s, (below,))
         return rise / (above - below)
 
-    return {name: slower(u) for name, (_, u) in _at_spools(view).items()}
+    return {name: view.instants.over(u, slower) for name, (_, u) in _at_spools(view).items()}
 
 
 def add_shapes(view: RecordView, columns: Columns, revision: Revision) -> Iterator[tuple[int, int]]:
@@ -170,7 +171,8 @@ def _offer_timings(view: RecordView, columns: Columns, revision: Revision) -> No
             continue
         for psi in timing.bank:
             change = {
-                name: timing.on(u, d, view.step_s, psi) - u for name, (d, u) in halves.items()
+                name: through(u, d, view.instants, ((timing, psi),)) - u
+                for name, (d, u) in halves.items()
             }
             columns.offer(
                 Candidate(

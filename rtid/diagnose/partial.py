@@ -19,7 +19,7 @@ import numpy as np
 
 from rtid.compare.dependence import Dependence, binned, inflation_of
 from rtid.diagnose.bank import opening_change
-from rtid.diagnose.commands import commands, through
+from rtid.diagnose.commands import commands, slowed, through
 from rtid.diagnose.diagnosis import Result
 from rtid.diagnose.evidence import Projected, Rows, project
 from rtid.diagnose.fit import NO_COV, Fit
@@ -31,7 +31,7 @@ from rtid.effects.laws import cause_of
 from rtid.effects.laws.common import supply_change
 from rtid.effects.laws.pump import demand
 from rtid.effects.laws.sensors import late
-from rtid.effects.laws.timing import SUPPLY, lagged
+from rtid.effects.laws.timing import SUPPLY
 from rtid.effects.record_view import MapTerms, RecordView
 from rtid.plain import FloatArray, Key
 
@@ -233,10 +233,10 @@ def _changed(fit: Fit, k: int) -> Volumes:
     others = timings[:k] + timings[k + 1 :]
     change = {}
     for name, (direction, u) in commands(fit.declared, fit.chunk).items():
-        without = through(u, direction, view.step_s, others)
+        without = through(u, direction, view.instants, others)
         if timing.replaces_lag:
-            without = lagged(without, view.step_s, (fit.declared.lag.nominal_s,))
-        change[name] = through(u, direction, view.step_s, timings) - without
+            without = slowed(without, view.instants, fit.declared.lag.nominal_s)
+        change[name] = through(u, direction, view.instants, timings) - without
     return opening_change(view, change)
 
 

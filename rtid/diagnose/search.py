@@ -12,15 +12,24 @@ from typing import Any
 
 import numpy as np
 
-from rtid.diagnose.commands import Timings, commands, split, through, transformed
+from rtid.diagnose.commands import (
+    Timings,
+    commands,
+    cut_off,
+    slowed,
+    split,
+    through,
+    transformed,
+)
 from rtid.diagnose.equations import softened
 from rtid.diagnose.evidence import project, rows_of
 from rtid.diagnose.fit import Fit, columns_of_effects, prepare
 from rtid.diagnose.moving import counted_for
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.thinned import Thinning
+from rtid.effects.instants import Instants
 from rtid.effects.law import Volumes
-from rtid.effects.laws.timing import COMMAND, Psi, TimingLaw, lagged
+from rtid.effects.laws.timing import COMMAND, Psi, TimingLaw
 from rtid.estimator.state import Weights
 from rtid.model import Grid, Machine
 from rtid.plain import FloatArray
@@ -64,9 +73,10 @@ class Search:
         self.model = self.thinning.model(coarse(model))
         self.split = split(self.model)
         self.declared, self.chunk = model, chunk
-        self.step_s = float(np.median(np.diff(chunk[:, 0])))
+        self.instants = Instants.of(chunk, model.gates.max_gap_s)
         self._given = commands(model, chunk).values()
         self.record = self.thinning.record(model, chunk)
+        self._thin_instants = Instants.of(self.record, self.model.gates.max_gap_s)
         weights = prepare(self.model, self.record)
         self.lag_s, self.weights = weights.lag_s, replace(weights, lag_s=0.0)
 
@@ -74,9 +84,10 @@ class Search:
         """Costs beside a fit."""
         return Beside(self, fit)
 
-    def sent(self, timings: Timings, lag_s: float) -> FloatArray:
+    def sent(self, timings: Timings, lag_s: float) -> tuple[FloatArray, float]:
         """The thinned record (n // m, 2 + signals), SI, of the split machine, its spools' lag in.
 
+        And how long nobody knows what acts in it behind its gaps, s.
         lag_s: of those whose lag no timing replaces.
         The commands of the split machine stand behind its columns.
         """
@@ -86,12 +97,13 @@ class Search:
             whole = whole[:, : self.chunk.shape[1]]
             record = self.thinning.record(self.declared, whole)
         lag_s = 0.0 if any(timing.replaces_lag for timing, _ in timings) else lag_s
-        sent = [self._thinned(through(u, d, self.step_s, timings), lag_s) for d, u in self._given]
-        return np.column_stack([record, *sent])
+        sent = [self._thinned(through(u, d, self.instants, timings), lag_s) for d, u in self._given]
+        thin = np.column_stack([record, *sent])
+        return thin, cut_off(thin, self._thin_instants, timings)
 
     def _thinned(self, command: FloatArray, lag_s: float) -> FloatArray:
         """A command (n,) behind a lag, as over the intervals (n // m,) of the thinned record."""
-        return self.thinning.command(lagged(command, self.step_s, (lag_s,)) if lag_s else command)
+        return self.thinning.command(slowed(command, self.instants, lag_s))
 
 
 class Beside:
@@ -168,11 +180,12 @@ class Beside:
     def _solved_anew(self, more: Timings, lag_s: float) -> tuple[float, FloatArray]:
         search, timings = self.search, (*self.timings, *more)
         weights = search.weights
-        sent = search.sent(timings, lag_s)
+        sent, unknown_s = search.sent(timings, lag_s)
         soft = softened(search.split, sent, weights, Revision((), timings))
         rows = rows_of(search.split, sent, weights, ROW_S, soft, search.thinning.m)
-        self.most_rows = max(self.most_rows, rows.n)
-        left_out = counted_for(1.0 - rows.n / max(1, self.most_rows), timings)
+        n = rows.n + round(unknown_s / ROW_S) * len(search.model.chambers)  # lost by no trial
+        self.most_rows = max(self.most_rows, n)
+        left_out = counted_for(1.0 - n / max(1, self.most_rows), timings)
         if np.isinf(left_out):
             return float("inf"), np.zeros(0)
         chi2, theta = _least(project(rows, [rows.on_rows(v) for v in self.volumes]).schur)

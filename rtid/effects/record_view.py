@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from rtid.effects.filtering import fitted
+from rtid.effects.instants import Instants
 from rtid.effects.view import View as Seen
 from rtid.estimator.state import Weights, build
 from rtid.kernels.following import follow_map
@@ -122,6 +123,11 @@ class RecordView:
     def step_s(self) -> float:
         """The usual length of an interval."""
         return float(np.median(self.dt_s))
+
+    @cached_property
+    def instants(self) -> Instants:
+        """The instants, with the gaps between them."""
+        return Instants.of(self.chunk, self.model.gates.max_gap_s)
 
     def signal(self, name: str) -> FloatArray:
         """A signal by its name (n,), SI; zero for a quantity that is not there."""
