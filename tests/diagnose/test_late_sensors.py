@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from firmware_bridge.samples import GAP
+from firmware_bridge.samples import GAP, ROW
 from rtid.diagnose.commands import transformed
 from rtid.diagnose.diagnosis import search
+from rtid.diagnose.fit import one_pass, prepare
 from rtid.diagnose.parts import AddedEffect, recall
 from rtid.diagnose.report import Diagnosis
+from rtid.diagnose.revision import Revision
 from rtid.diagnose.standing import fitted
 from rtid.diagnose.summary import diagnosis
 from rtid.effects.law import BOTH
@@ -63,6 +65,26 @@ def test_a_late_position_goes_on_at_its_ends_and_begins_anew_behind_a_gap() -> N
     put_right = transformed(model, rows, ((late, (late_s,)),))[:, x]
     slope = np.where(np.arange(2000) < 1000, 0.2, -0.1)
     assert put_right == pytest.approx(rows[:, x] + slope * late_s, abs=1e-9)
+
+
+def test_a_late_position_that_comes_rarely_stands_where_it_was_measured() -> None:
+    """On the line between two of them each row was a chord: 10 ms, each 20 ms, left 6.8 times the
+    noise.
+    """
+    model, chunk, _ = record("position_sensor_delay", 10e-3)
+    x, came = 2 + model.column(model.position), np.arange(0, len(chunk), 20)
+    rows = chunk[: came[-1] + 1].copy()
+    rows[:, x] = np.interp(np.arange(len(rows)), came, chunk[came, x])
+    rows[:, 1] = rows[:, 1].astype(int) & ~ROW
+    rows[came, 1] += ROW
+    (late,) = (t for t in sensor_timings(model) if t.where == model.position)
+    timings = ((late, (10e-3,)),)
+    put_right = transformed(model, rows, timings)
+    measured = np.flatnonzero(put_right[:, 1].astype(int) & ROW)
+    assert measured.tolist() == (came[1:] - 10).tolist()
+    assert put_right[measured, x] == pytest.approx(chunk[came[1:], x], abs=1e-9)
+    weights = prepare(model, rows)
+    assert one_pass(model, rows, weights, Revision((), timings), None, False).rho < 1.15
 
 
 def test_a_slow_signal_is_put_right_up_to_the_window() -> None:
