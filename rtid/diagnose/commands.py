@@ -84,7 +84,7 @@ def transformed(
     instants = Instants.of(chunk, model.gates.max_gap_s)
     sent = [through(u, d, instants, timings) for d, u in commands(model, chunk).values()]
     record = np.column_stack([chunk, *sent])
-    cut_off(record, instants, timings)
+    cut_off(record, instants, memory_s(timings))
     return _put_right(split(model), record, instants, timings, compliance)
 
 
@@ -93,13 +93,14 @@ def memory_s(timings: Timings) -> float:
     return sum(timing.memory_s(psi) for timing, psi in timings if timing.where == COMMAND)
 
 
-def cut_off(record: FloatArray, instants: Instants, timings: Timings) -> float:
+def cut_off(record: FloatArray, instants: Instants, remembered_s: float) -> float:
     """Mark as gaps, in place, what stands so soon behind one that nobody knows what acted there.
 
-    record (n, 2 + signals), SI; returns how long that is in all, s.  With 0.15 s lost each second a
-    delay of 20 ms left 21 times the noise, and a leak beside it had no name.
+    record (n, 2 + signals), SI; remembered_s: how long what was sent acts; returns how long is cut
+    off in all, s.  With 0.15 s lost each second a delay of 20 ms left 21 times the noise, and a
+    leak beside it had no name.
     """
-    here = instants.unknown_for(memory_s(timings))
+    here = instants.unknown_for(remembered_s)
     record[here, 1] = record[here, 1].astype(np.int64) | GAP
     return len(here) * instants.step_s
 

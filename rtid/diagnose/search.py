@@ -16,6 +16,7 @@ from rtid.diagnose.commands import (
     Timings,
     commands,
     cut_off,
+    memory_s,
     slowed,
     split,
     through,
@@ -29,7 +30,7 @@ from rtid.diagnose.revision import Revision
 from rtid.diagnose.thinned import Thinning
 from rtid.effects.instants import Instants
 from rtid.effects.law import Volumes
-from rtid.effects.laws.timing import COMMAND, Psi, TimingLaw
+from rtid.effects.laws.timing import COMMAND, SETTLES, Psi, TimingLaw
 from rtid.estimator.state import Weights
 from rtid.model import Grid, Machine
 from rtid.plain import FloatArray
@@ -99,7 +100,8 @@ class Search:
         lag_s = 0.0 if any(timing.replaces_lag for timing, _ in timings) else lag_s
         sent = [self._thinned(through(u, d, self.instants, timings), lag_s) for d, u in self._given]
         thin = np.column_stack([record, *sent])
-        return thin, cut_off(thin, self._thin_instants, timings)
+        remembered_s = memory_s(timings) + SETTLES * lag_s
+        return thin, cut_off(thin, self._thin_instants, remembered_s)
 
     def _thinned(self, command: FloatArray, lag_s: float) -> FloatArray:
         """A command (n,) behind a lag, as over the intervals (n // m,) of the thinned record."""
