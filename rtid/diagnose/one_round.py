@@ -47,7 +47,7 @@ from rtid.diagnose.verdict import MATERIAL
 from rtid.plain import Key
 
 LATER_GAIN = 25.0  # chi2 of every effect behind the first
-MOST_NEGLIGIBLE = 4  # that are looked at
+MOST_NEGLIGIBLE = 4  # of a round, that are refitted and judged: each takes seconds
 Model = tuple[Fit, Residual]  # and what it leaves of the held-out part
 
 
@@ -62,9 +62,9 @@ def add_best(state: TrialState, present: Fit, last: Residual) -> Model | None:
     ]
     this = _Round(state, present, last, least, trials)
     turns = sorted(trials, key=lambda t: t.gain)
-    while turns:
+    while turns and this.n_negligible < MOST_NEGLIGIBLE:
         best = turns.pop()
-        if best.key in state.negligible or len(state.negligible) == MOST_NEGLIGIBLE:
+        if best.key in state.negligible:
             continue
         if not explains_enough(state, present, best):
             return None
@@ -81,6 +81,9 @@ class _Round:
     last: what the present model leaves of the held-out part; least: chi2 that a cause must take.
     finished: trials that were fitted to their end; refuted: those that the record speaks against,
     and whether by their form alone; outdone: those in whose place another one came.
+    n_negligible: trials that were judged to change next to nothing.  What is listed with one that
+    it is not told from is no trial, nor what an earlier round has judged: an extra volume and three
+    causes like it were four, and a leak had no turn beside them.
     """
 
     state: TrialState
@@ -91,6 +94,7 @@ class _Round:
     finished: dict[Key, Trial] = field(default_factory=dict)
     refuted: dict[Key, bool] = field(default_factory=dict)
     outdone: set[Key] = field(default_factory=set)
+    n_negligible: int = 0
 
     def tried(self, best: Trial, turns: list[Trial]) -> Model | None:
         """The model with the cause whose turn it is, if that deserves it; turns: those to come."""
@@ -128,6 +132,7 @@ class _Round:
         if is_shown or does is not None:
             return self._taken(best, trial, alike, now, does, turns)
         state.negligible[trial.key] = share
+        self.n_negligible += 1
         is_good = not is_harm and is_as_credible(present, now)
         is_needless = is_form and present.rho < present.most_rho
         if is_good and is_noticed(present, self.finished[trial.key]) and not is_needless:
