@@ -31,15 +31,18 @@ CLEARLY = 3.0  # standard deviations of the difference, by blocks
 def is_told_apart(best: Fit, other: Fit, promise: float = 0.0) -> bool:
     """True where a record likes one fit of it clearly better than another one, by its blocks.
 
+    Over the time of which both have rows: what has left the grids is none.  By their number alone a
+    fit was told from itself less a row of 3,000, and one of rho 88 was better than one of 1.03.
     promise: of -2 ln likelihood, what the other one may still gain.
     """
     ours, theirs = best.own_rows, other.own_rows
-    if len(ours.own) != len(theirs.own):
-        return True  # what has left the grids is no row: there is no difference row by row
-    apart = loss(other, theirs) - loss(best, ours)
+    at, others = ours.paired(theirs)
+    if not len(at):
+        return False
+    apart = loss(other, theirs)[others] - loss(best, ours)[at]
     total = float(apart.sum()) - promise
     about_mean = (apart - apart.mean())[:, None]
-    blocks = [blocks_of(ours, c) for c in range(ours.own.shape[1])]
+    blocks = [blocks_of(ours, c)[at] for c in range(ours.own.shape[1])]
     return total > CLEARLY * float(np.sqrt(crossed(about_mean, blocks)[0]))
 
 

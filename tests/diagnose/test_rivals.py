@@ -47,6 +47,47 @@ def test_a_leak_is_told_from_nothing_and_nothing_from_a_leak_never() -> None:
     assert not is_told_apart(leaking, leaking)
 
 
+def without_a_row(fitted: Fit, sample: int) -> Fit:
+    """The same revision, fitted where a sample has left the grids."""
+    chunk = fitted.chunk.copy()
+    for command in {edge.command for edge in fitted.declared.edges}:
+        chunk[sample, 2 + fitted.declared.column(command)] = 1e3
+    record = fitted.declared, chunk, fitted.weights, fitted.revision, None
+    return one_pass(*record, bank=False, thorough=False, before=fitted.before)
+
+
+@pytest.mark.parametrize("sample", [1010, 7013])
+def test_rows_that_one_fit_alone_has_tell_nothing(sample: int) -> None:
+    """A fit was told from itself less a row of 3,000; without an effect, less one, it won over the
+    leak.
+    """
+    plain, leaking = fits()
+    less, plainly_less = (without_a_row(fitted, sample) for fitted in (leaking, plain))
+    assert 0 < leaking.own_rows.n - less.own_rows.n < 0.01 * leaking.own_rows.n
+    assert not is_told_apart(leaking, less) and not is_told_apart(less, leaking)
+    assert is_told_apart(leaking, plainly_less) and is_told_apart(less, plain)
+    assert not is_told_apart(plainly_less, leaking) and not is_told_apart(plain, less)
+
+
+@pytest.mark.parametrize("sample", range(1010, 1020))
+def test_rows_of_two_fits_are_paired_by_their_time(sample: int) -> None:
+    """Also where those of one begin some samples later, behind what left its grids alone."""
+    _, leaking = fits()
+    rows, less = leaking.own_rows, without_a_row(leaking, sample).own_rows
+    assert [len(each.spans) for each in (rows, less)] == [len(rows.own), len(less.own)]
+    at, others = rows.paired(less)
+    assert set(range(90)) <= set(at) and 100 not in at
+    assert len(rows.own) - len(at) < 10
+    assert len(set(at)) == len(set(others)) == len(at)
+    assert np.abs(rows.spans[at] - less.spans[others]).max() <= 5  # of 10
+    assert abs(len(less.paired(rows)[0]) - len(at)) <= 1
+
+
+def test_rows_are_paired_with_themselves() -> None:
+    rows, whole = fits()[1].own_rows, np.arange(len(fits()[1].own_rows.own))
+    np.testing.assert_array_equal(rows.paired(rows), (whole, whole))
+
+
 @pytest.mark.long
 def test_what_is_out_of_reach_as_it_stands_is_told_apart_at_its_end_too() -> None:
     """And what does the same as the best one, or next to it, is fitted to its end."""
@@ -89,7 +130,8 @@ def test_what_a_cause_may_still_gain_is_no_difference() -> None:
 def differ(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Two fits of one chamber whose rows differ as given, in blocks of equal length."""
     block = np.repeat(np.arange(BLOCKS), ROWS // BLOCKS)
-    rows = SimpleNamespace(own=np.zeros((ROWS, 1, 2)))
+    whole = np.arange(ROWS)
+    rows = SimpleNamespace(own=np.zeros((ROWS, 1, 2)), paired=lambda _: (whole, whole))
     monkeypatch.setattr(rivals, "blocks_of", lambda rows, chamber: block)
 
     def told(apart: FloatArray) -> bool:
