@@ -68,4 +68,5 @@ def regression_of(
         rows.due,
         rows.n,
         rows.log_noise,
+        rows.weighed,
     )

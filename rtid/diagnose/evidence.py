@@ -17,6 +17,7 @@ from scipy.linalg.blas import dtrsm
 from scipy.linalg.lapack import dpotrf, dtrtri, dtrtrs, strtri
 
 from rtid.diagnose.directions import Directions
+from rtid.diagnose.weighed_rows import WeighedRows
 from rtid.effects.law import Volumes
 from rtid.estimator.factor import PRIOR_SD, one_thread
 from rtid.estimator.state import Weights, build
@@ -72,31 +73,14 @@ class Rows:
         return -2.0 * float(np.log(factors).sum())
 
     @cached_property
-    def spans(self) -> IntArray:
-        """First and last interval of each row (rows, 2): what leaves the grids has no row."""
+    def weighed(self) -> WeighedRows:
+        """When each of them is, and for which noise it is weighed."""
         at = np.flatnonzero((self.row_of != kernel.NO_ROW) & (self.row_of < len(self.own)))
         row = self.row_of[at]
-        is_first = np.diff(row, prepend=kernel.NO_ROW) != 0
-        is_last = np.diff(row, append=len(self.own)) != 0
-        return np.stack([at[is_first], at[is_last]], axis=1)
-
-    def paired(self, other: Rows) -> tuple[IntArray, IntArray]:
-        """Numbers of its rows, and of another one's, that are of the same time of a record.
-
-        Of half of their intervals at least: behind what left the grids of one alone, its rows begin
-        at other samples than the other one's.  One that is fresh knows nothing of a row before it,
-        and is none that is not.
-        """
-        first, last = self.spans.T
-        theirs = other.row_of[(first + last) // 2]
-        at = np.flatnonzero((theirs != kernel.NO_ROW) & (theirs < len(other.own)))
-        at = at[np.diff(theirs[at], prepend=kernel.NO_ROW) > 0]
-        theirs = theirs[at]
-        begun, end = other.spans[theirs].T
-        shared = 1 + np.minimum(last[at], end) - np.maximum(first[at], begun)
-        alike = 2 * shared > np.maximum(last[at] - first[at], end - begun)
-        alike &= self.fresh[at] == other.fresh[theirs]
-        return at[alike], theirs[alike]
+        first = at[np.diff(row, prepend=kernel.NO_ROW) != 0].astype(np.int32)
+        last = at[np.diff(row, append=len(self.own)) != 0].astype(np.int32)
+        factors = self.whiten[:, : 2 * self.own.shape[1] : 2]
+        return WeighedRows(first, last, self.fresh, -2.0 * np.log(factors).sum(axis=1))
 
     def condensed(self, series: FloatArray) -> FloatArray:
         """What a series (n - 1,) of volumes per interval, m3, adds to each row (rows,), m3."""

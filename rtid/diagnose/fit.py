@@ -146,11 +146,17 @@ class Fit:
         sweeps a hose took 730 off chi2, and its pressure's noise had spread the rows by 815.  A lag
         behind the maps transforms what is measured, A y with A = 1 + tau d/dt: ln det of the noise
         rises by 2 ln det A, and so does the density of y, so that chi2 alone is left.
+        Where one has rows that the other has not, ln det counts of those of the same time.
         """
         gain = other.excess - self.excess
+        ours, theirs = self.regression, other.regression
         lags = {behind_s(fit.revision.timings) for fit in (self, other)}
-        if self.regression.rows == other.regression.rows and len(lags) == 1:
-            gain += other.regression.log_noise - self.regression.log_noise
+        if len(lags) > 1:
+            return gain
+        if ours.rows == theirs.rows:
+            return gain + theirs.log_noise - ours.log_noise
+        if ours.weighed and theirs.weighed:
+            gain += theirs.weighed.noisier_than(ours.weighed)
         return gain
 
     @cached_property

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import eigh
 
+from rtid.diagnose.weighed_rows import WeighedRows
 from rtid.plain import FloatArray, IntArray
 
 CLEARLY = 3.0  # standard deviations of the noise's own products by which a column must exceed it
@@ -60,7 +61,7 @@ class Regression:
     s, noise (columns, columns); prior, mean (columns,): information and value of the priors;
     own (columns,): squares of the columns before the maps were taken out; rows: of all segments;
     dof: what the maps leave of them, see `Rows.due`; log_noise: logarithm of the determinant of
-    their noise.
+    their noise; weighed: what each of them is weighed for.
     """
 
     s: FloatArray
@@ -71,6 +72,7 @@ class Regression:
     dof: float
     rows: int
     log_noise: float = 0.0
+    weighed: WeighedRows | None = None
 
     def fit(self, used: tuple[int, ...]) -> Estimate:
         """Least squares on some columns, errors in variables taken out."""

@@ -36,7 +36,7 @@ def is_told_apart(best: Fit, other: Fit, promise: float = 0.0) -> bool:
     promise: of -2 ln likelihood, what the other one may still gain.
     """
     ours, theirs = best.own_rows, other.own_rows
-    at, others = ours.paired(theirs)
+    at, others = ours.weighed.paired(theirs.weighed)
     if not len(at):
         return False
     apart = loss(other, theirs)[others] - loss(best, ours)[at]
