@@ -192,16 +192,20 @@ def _already(effect: str, where: str) -> RefusedError:
 
 
 def _against(before: Standing, after: Standing, trial: Trial) -> Iterator[str]:
-    """What speaks against an effect, with figures."""
-    old, new = before.held_out, after.held_out
+    """What speaks against an effect, with figures: over the held-out rows that both fits judge.
+
+    A lag moves the points to other blocks, of which some are known by one fit alone.
+    """
+    last, now = before.held_out, after.held_out
+    old, new = last.at_rows_of(now), now.at_rows_of(last)
     without, having = (100 * residual.rms_m3s / new.flow_m3s for residual in (old, new))
     figures = f"held-out error {without:.2f} % without it, {having:.2f} % with it"
     if not np.isfinite(new.rms_m3s + old.rms_m3s):
         yield UNJUDGED
         return
-    share = own_share(after.state, after.fit, trial, new)
+    share = own_share(after.state, after.fit, trial, now)
     is_slight = min(share, material_share(old, new)) < MATERIAL
-    if is_slight and taken_in(before.fit, after.fit, trial, share, old, new):
+    if is_slight and taken_in(before.fit, after.fit, trial, share, last, now):
         pass  # the maps hide it
     elif new.rms_m3s >= old.rms_m3s:
         yield f"it does not lower the held-out error: {figures}"
