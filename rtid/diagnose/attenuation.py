@@ -34,6 +34,7 @@ from rtid.diagnose.fit import NO_COV, Fit, one_pass
 from rtid.diagnose.nameable import VISIBLE, clearest
 from rtid.diagnose.regression import FAINTEST, LIMIT_SD, Score
 from rtid.diagnose.rivals import blocks_of, into_rows
+from rtid.diagnose.sensor_noise import noise_of
 from rtid.diagnose.trials import with_effect
 from rtid.effects.column import Candidate
 from rtid.effects.law import Volumes
@@ -298,9 +299,8 @@ def _drawn(view: RecordView, rng: np.random.Generator) -> dict[str, FloatArray]:
     names |= {name for e in model.edges for name in (e.source, e.sink)}
     noise = {}
     for name in sorted(names - {""}):
-        sd = np.sqrt(variance(model, name))
-        if sd > 0.0 and np.ptp(view.signal(name)) > 0.0:  # or it is a nominal value
-            noise[name] = sd * rng.standard_normal(view.n)
+        if variance(model, name) > 0.0 and np.ptp(view.signal(name)) > 0.0:  # or it is nominal
+            noise[name] = noise_of(view, name, rng)
     return noise
 
 

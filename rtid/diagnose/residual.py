@@ -13,6 +13,7 @@ import numpy as np
 
 from rtid.diagnose.commands import transformed
 from rtid.diagnose.fit import Fit
+from rtid.diagnose.sensor_noise import noise_of
 from rtid.effects.column import Candidate
 from rtid.effects.laws import SEED, cause_of, total_softness
 from rtid.effects.laws.response import behind_s, left_behind
@@ -179,11 +180,7 @@ def _noise(fit: Fit, view: RecordView) -> FloatArray:
     rng, model = np.random.default_rng(SEED), view.model
     names = {model.position, *(c.pressure for c in model.chambers)}
     names |= {n for e in model.edges for n in (e.source, e.sink) if n}
-    noise = {
-        name: np.sqrt(variance(model, name)) * rng.standard_normal(view.n)
-        for name in sorted(names)
-        if variance(model, name) > 0
-    }
+    noise = {name: noise_of(view, name, rng) for name in sorted(names) if variance(model, name) > 0}
     still = np.zeros(view.n)
     softness = total_softness(view, effect_values(fit))
     result = np.empty((view.n - 1, len(model.chambers)))
