@@ -23,6 +23,9 @@ FEWEST = 4  # windows that tell of a noise
 QUIET = 0.25  # the quantile of the windows that the floor starts from
 LIKELY = 0.999  # of the clean windows lie below the limit that counts as quiet
 ROUNDING = 1e-8  # share of the largest value below which steps are rounding errors
+SINGLE = 2.0**-24  # of the largest value, that one in single precision is off by
+DISTINCT = 20.0  # times what values are off by, from which on a step is none of their rounding
+RECURS = 4  # times that a level is come to, of a signal whose steps were written in finer ones
 FEW_LEVELS = 6
 HELD_SHARE = 0.3  # of equal neighbours, from which on repeats are looked at
 EVEN = 0.01  # scatter of the sampling intervals up to which plain differences do
@@ -62,7 +65,7 @@ def estimate_noise(
     known = np.isfinite(t_s) & np.isfinite(values)
     t, y = t_s[known], values[known]
     every = np.unique(y)
-    step, levels = _resolution(every), len(every)
+    step, levels = _resolution(y, every), len(every)
     if held_command and levels < FEW_LEVELS:
         step = 0.0  # the levels of a switched command
     least = float(step / np.sqrt(12.0))
@@ -92,16 +95,43 @@ def pooled(estimates: Sequence[NoiseEstimate]) -> NoiseEstimate:
 def resolution_of(values: FloatArray) -> float:
     """The step of which all differences of values (n,) are multiples, in their unit; 0: none.
 
-    Euclid's algorithm.
+    Euclid's algorithm, or where values are rounded, in single precision or to few decimals, the
+    even step that their levels have but for that.
 
     With few levels they must be neighbours: what a signal jumps between is not its resolution.
     """
-    return _resolution(np.unique(values))
+    return _resolution(values, np.unique(values))
 
 
-def _resolution(levels: FloatArray) -> float:
+def _resolution(values: FloatArray, levels: FloatArray) -> float:
+    """The step of values (n,), which have those levels, sorted.
+
+    A pressure in steps of 6104 Pa, written in hundreds of Pa, has levels 61 or 62 of those apart.
+    A ramp has even levels too, by its speed, but comes to each of them once.
+    """
     if len(levels) < 2:
         return 0.0
+    step, single = _common_step(levels), SINGLE * float(np.abs(levels).max())
+    changes = np.count_nonzero(np.diff(values))
+    if step > 4.0 * single and changes < RECURS * len(levels):  # no bits of its last place
+        return step
+    return _even_step(levels, max(0.5 * step, single)) or step
+
+
+def _even_step(levels: FloatArray, off: float) -> float:
+    """The step of levels (m,), sorted, that are off it by so much at most; 0: there is none."""
+    gaps = np.diff(levels)
+    if len(levels) < FEW_LEVELS or gaps.min() < DISTINCT * off:
+        return 0.0
+    count = np.append(0.0, np.cumsum(np.round(gaps / gaps.min())))
+    count -= count.mean()
+    step = float(count @ levels / (count @ count))
+    beside = np.abs(levels - levels.mean() - step * count).max()
+    return step if beside <= 2.0 * off else 0.0
+
+
+def _common_step(levels: FloatArray) -> float:
+    """The step of which all differences of levels (m,), sorted, are multiples; 0: none."""
     rounding = ROUNDING * float(np.abs(levels).max())
     rest = np.unique(np.diff(levels))
     step, rest = float(rest[-1]), rest[rest > rounding]

@@ -137,6 +137,39 @@ def test_a_continuous_signal_has_no_resolution() -> None:
     assert resolution_of(np.full(5, 3.0)) == 0.0
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+@pytest.mark.parametrize("step", [5e-4, 1e-4, 1e-5])
+def test_single_precision_keeps_the_resolution(step: float, noise: float) -> None:
+    """Its values are off by up to 6e-8 of themselves, and Euclid ran down to nothing: x in steps
+    of 0.5 mm had 22 um of noise for 144."""
+    x = quantised(0.25 + 0.2 * motion(T_S) + white(noise * step), step)
+    single = x.astype(np.float32)
+    assert resolution_of(single.astype(np.float64)) == pytest.approx(step, rel=1e-6)
+    assert estimate_noise(T_S, single).sd == pytest.approx(estimate_noise(T_S, x).sd, rel=1e-4)
+    in_mm = 1e3 * single.astype(np.float64)  # what is read in another unit is no longer single
+    assert resolution_of(in_mm) == pytest.approx(1e3 * step, rel=1e-6)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_steps_that_are_written_with_few_decimals_are_seen_through_them(noise: float) -> None:
+    """A pressure in steps of 6.1 kPa had a resolution of 100 Pa where it is written in 0.1 kPa."""
+    step, times = 25e6 / 4096, np.linspace(0.0, 59.999, 60_000)
+    pressure = quantised(8e6 + 3e6 * motion(times) + white(noise * step, n=60_000), step)
+    assert resolution_of(quantised(pressure, 100.0)) == pytest.approx(step, rel=1e-4)
+
+
+@pytest.mark.parametrize("n", [30, 300, 20_000])
+@pytest.mark.parametrize("seed", range(5))
+def test_rounding_makes_no_resolution_of_a_continuous_signal(n: int, seed: int) -> None:
+    noise = 0.3 + 0.1 * white(1.0, seed, n)
+    tiny = 1e-6 * float(np.abs(noise).max())
+    assert resolution_of(noise) == 0.0
+    assert resolution_of(noise.astype(np.float32).astype(np.float64)) < tiny
+    assert resolution_of(quantised(noise, 1e-4)) == pytest.approx(1e-4)
+    ramp = quantised(0.01234 * np.arange(n, dtype=np.float64), 1e-4)  # a speed is no resolution
+    assert resolution_of(np.concatenate([ramp, ramp[::-1]])) == pytest.approx(1e-4)
+
+
 def test_a_command_has_its_resolution_only() -> None:
     held = np.repeat(quantised(white(2.0, n=2000), 0.005), 10)
     found = estimate_noise(T_S, held, held_command=True)
