@@ -24,7 +24,7 @@ from rtid.effects.column import Candidate
 from rtid.effects.laws import cause_of
 from rtid.effects.record_view import RecordView
 from rtid.kernels.engine import GAP_FLAG
-from rtid.model import Chamber, Edge, Machine
+from rtid.model import Chamber, Edge, Machine, Signal
 from rtid.plain import BoolArray, FloatArray, IntArray
 from rtid.units import UNIFORM
 
@@ -250,14 +250,27 @@ def _spans(
     resistance = np.where(at, _resistance(fit, edge, opening), 0.0)
     drop = -0.5 * edge.sign(chamber) * resistance * known
     doubt = resistance * (_net_flow(fit, chunk, windows, chamber) + unseen) / UNIFORM
-    noise = np.hypot(source.noise, sink.noise)
+    noise, stuck = np.hypot(source.noise, sink.noise), _stuck(source) + _stuck(sink)
     for span in np.split(np.arange(len(at)), 1 + np.flatnonzero(np.diff(at.astype(int)))):
         if at[span[0]] and np.abs(apart[span]).max() < MOST_PA:
             samples = float(windows.count[span].sum())
-            random = np.sqrt(noise**2 / samples + np.var(apart[span]) / len(span))
+            random = np.sqrt(noise**2 / samples + np.var(apart[span]) / len(span) + stuck)
             yield Joint(
                 edge.name, edge.source, edge.sink,
                 float(np.mean((apart - drop)[span])), float(np.hypot(random, doubt[span].max())),
                 float(np.mean(drop[span])),
                 float(windows.t_s[span[0]]), float(windows.t_s[span[-1]] + 2 * HALF_S),
             )  # fmt: skip
+
+
+def _stuck(signal: Signal) -> float:
+    """Variance, SI squared, of what rounding adds to the mean of any number of samples at rest.
+
+    A level between two steps q is off by the same at each sample, q^2/12, unless noise s dithers
+    it: then its k-th harmonic is left by exp(-(2 pi k s/q)^2), and no more than the first of all.
+    Without it a zero of 2.5 kPa in steps of 6.1 kPa was told as 6104 +- 19 Pa.
+    """
+    if not signal.resolution:
+        return 0.0
+    dithered = np.exp(-((2.0 * np.pi * signal.noise / signal.resolution) ** 2))
+    return float(dithered * signal.resolution**2 / 12.0)
