@@ -84,6 +84,17 @@ def test_a_stamp_years_ahead_costs_no_memory() -> None:
     assert span is not None and span[1] - span[0] == quick_machine.MOST_S
 
 
+@pytest.mark.parametrize("rate_hz", [0.9, 1.0, 2.0])
+def test_a_motion_that_a_look_each_second_misses_is_motion(rate_hz: float) -> None:
+    """One of 1 Hz was a standstill, and the rest before it was looked at."""
+    t_us = np.arange(0, 600_000_000, 5_000)
+    t_s = 1e-6 * t_us
+    x = np.where((t_s > 400.0) & (t_s < 520.0), 0.05 * np.sin(2 * np.pi * rate_hz * t_s), 0.0)
+    x += 1e-5 * np.random.default_rng(0).standard_normal(len(x))
+    samples = Samples(("x",), t_us, x[:, None], np.full(len(x), ROW, np.uint8))
+    assert quick_machine._span(samples, x) == pytest.approx((400.0, 520.0), abs=1.0)
+
+
 @pytest.mark.parametrize("power", [0.5, 1.0, 1.6])
 def test_the_rated_flow_is_that_of_a_valve_that_opens_on_as_it_did(power: float) -> None:
     """A straight line from neutral took a valve of 16.5 L/min for one of 11.2."""

@@ -30,6 +30,7 @@ MOST_POWER = 2.0  # of the opening, that a valve's gain is taken to follow beyon
 WIDE = 0.5  # of the largest command beyond the dead band: from there on a valve is wide open
 LEAST_FLOW = 1e-7  # m3/s
 WINDOW_S = 0.02  # over which the speed is taken
+STROKE_S = 0.05  # over which a position is taken, to tell how far it goes
 LAG_MS, LAG_TOLERANCE_MS = 2.0, 5.0  # of a spool: every real one has some lag
 LAG_SHARE = 0.2  # by which a data sheet's lag may be off
 LONGEST_S = 1e6  # of a record, seconds: behind a damaged stamp nothing is looked for
@@ -357,9 +358,23 @@ def _span(samples: Samples, x: FloatArray) -> tuple[float, float] | None:
     t = (samples.t_us - samples.t_us[0]) * 1e-6
     if t[-1] <= MOST_S:
         return None
-    seconds = np.arange(int(min(t[-1], LONGEST_S)) + 1)
-    smooth = np.interp(seconds, t, x)
-    way = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(smooth)))])
+    way = _way(t, x)
     last = len(way) - int(MOST_S) - 1
     start = float(np.argmax(way[int(MOST_S) :][: last + 1] - way[: last + 1]))
     return start, start + MOST_S
+
+
+def _way(t_s: FloatArray, x: FloatArray) -> FloatArray:
+    """The way, in the unit of x, up to each whole second of positions x (n,) at t_s (n,) from 0.
+
+    Between means over STROKE_S: of one sample a second a motion of 1 Hz is none, and of 600 s the
+    120 s of rest were looked at.
+    """
+    last = int(min(t_s[-1], LONGEST_S))
+    known = t_s <= LONGEST_S
+    t_s, x = t_s[known], x[known]
+    first = np.flatnonzero(np.diff(np.floor(t_s / STROKE_S), prepend=-1.0))
+    mean = np.add.reduceat(x, first) / np.diff(first, append=len(x))
+    second = t_s[first[1:]].astype(np.int64)
+    per_second = np.bincount(second, np.abs(np.diff(mean)), minlength=last)
+    return np.append(0.0, np.cumsum(per_second))[: last + 1]
