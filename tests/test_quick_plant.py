@@ -51,6 +51,21 @@ def heater(file: Path) -> Path:
     return file
 
 
+@pytest.mark.parametrize("scale", [1e-9, 1e-3, 1e3, 1e7])
+def test_what_moves_itself_does_so_in_any_unit(scale: float) -> None:
+    """Of a vessel that x explains 0.64 of, it was nothing in 1e-7 of its unit, and -0.48 in 1e7."""
+    t_s, x = np.arange(1000.0), np.zeros(1000)
+    rng = np.random.default_rng(0)
+    u = commands(rng, 1000, 20, 0.0, 5.0)
+    for k in range(999):
+        x[k + 1] = x[k] + 0.3 * u[k] - 0.1 * x[k]
+    x += 0.01 * rng.standard_normal(1000)
+    once = moves_itself(t_s, u, x)
+    assert once > 0.5
+    assert moves_itself(t_s, u, scale * x) == pytest.approx(once, rel=1e-6)
+    assert moves_itself(t_s, u, 0.0 * x) == 0.0
+
+
 def test_a_heater_is_a_body_that_loses_heat(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

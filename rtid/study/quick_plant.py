@@ -169,9 +169,10 @@ def moves_itself(t_s: FloatArray, u: FloatArray, x: FloatArray) -> float:
     step = max(1, len(t_s) // MOST_LOOKED)
     t_s, u, x = t_s[::step], u[::step], x[::step]
     rate = slope_of(t_s, x)
-    total, own = float(np.var(rate)), x[:, None] - x.mean()
-    if total <= 0.0:
+    total, size = float(np.var(rate)), float(x.std())
+    if total <= 0.0 or size <= 0.0:
         return 0.0
+    own = (x[:, None] - x.mean()) / size  # beside hats of 1: in its own unit it was left out
 
     def explained(columns: FloatArray) -> float:
         left = rate - columns @ np.linalg.lstsq(columns, rate, rcond=1e-6)[0]
