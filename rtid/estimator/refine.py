@@ -166,7 +166,7 @@ def _worst(excess: Excess, axis: int, clearly: float) -> list[int]:
     rows, beyond = excess.rows.sum(axis=1 - axis), excess.beyond.sum(axis=1 - axis)
     clear = _is_clear(rows, beyond, clearly)
     share = beyond > LEAST_SHARE * max(float(beyond[beyond > 0].sum()), 1e-12)
-    worst = np.argsort(-beyond)[: min(AT_ONCE, MAX_BORDERS - 2 - len(rows))]
+    worst = np.argsort(-beyond)[: max(0, min(AT_ONCE, MAX_BORDERS - 2 - len(rows)))]
     return [int(k) for k in worst if clear[k] and share[k]]
 
 

@@ -14,7 +14,7 @@ from rtid.diagnose.revision import Revision
 from rtid.diagnose.standing import fitted
 from rtid.estimator.chunk import to_chunk
 from rtid.estimator.record import fit_record
-from rtid.estimator.refine import cut, halved_along, parents
+from rtid.estimator.refine import CLEARLY, Excess, _worst, cut, halved_along, parents
 from rtid.model import Grid, Lag, Machine
 from rtid.plain import FloatArray
 from rtid.sim.declare import declared_model, default_grid
@@ -53,6 +53,14 @@ def test_a_coarse_grid_is_refined_where_the_dead_band_ends(seed: int) -> None:
     missed = fit.weights.missed
     assert not missed.any() or missed.sum() < before.weights.missed.sum()
     assert error.max() < 0.005
+
+
+@pytest.mark.parametrize(("intervals", "cut_at"), [(100, {60, 90}), (127, set()), (128, set())])
+def test_a_full_grid_is_not_halved(intervals: int, cut_at: set[int]) -> None:
+    """From all but the last one four of 128 were, of which 129 borders are possible."""
+    rows, beyond = np.full((intervals, 1), 1000.0), np.zeros((intervals, 1))
+    beyond[[3, 30], 0], beyond[[60, 90], 0] = 1e4, 2e4
+    assert set(_worst(Excess(rows, beyond), 0, CLEARLY)) == cut_at
 
 
 def test_every_block_is_cut_into_four_where_there_is_room() -> None:
