@@ -14,7 +14,7 @@ from collections.abc import Collection, Iterator
 import numpy as np
 
 from rtid.diagnose.fit import Fit, one_pass
-from rtid.diagnose.regression import LIMIT_SD
+from rtid.diagnose.regression import Score
 from rtid.effects.column import Candidate
 from rtid.effects.laws.timing import command_times
 from rtid.plain import FloatArray, Key
@@ -27,7 +27,7 @@ FLOW = "flow"  # kind of an effect
 AT_REST_S = 1.0  # with all valves shut: enough to tell a leak from a map
 STEADY = 0.05  # of its mean: a supply that varies less is constant
 
-Limits = dict[Candidate, tuple[float, float]]
+BothScores = dict[Candidate, tuple[Score, Score]]
 
 
 def varied_supply(fit: Fit) -> FloatArray | None:
@@ -56,8 +56,8 @@ def varied_supply(fit: Fit) -> FloatArray | None:
     return chunk
 
 
-def limits(fit: Fit, keys: Collection[Key]) -> Limits:
-    """Detection limits as recorded, and with a wandering supply, of the candidates of some causes.
+def foretold(fit: Fit, keys: Collection[Key]) -> BothScores:
+    """Scores as recorded, and with a wandering supply, of the candidates of some causes.
 
     keys: those of the causes.
     """
@@ -68,16 +68,17 @@ def limits(fit: Fit, keys: Collection[Key]) -> Limits:
         fit.declared, chunk, fit.weights, fit.revision, fit, True, thorough=False,
         suspects=fit.suspects,
     )  # fmt: skip
-    limits_of: Limits = {}
+    both: BothScores = {}
     for k, candidate in enumerate(fit.columns.candidates):
         is_free = candidate.key in keys and candidate not in fit.revision.effects
         if not is_free or candidate not in other.columns.candidates:
             continue
-        before = fit.regression.score(fit.estimate.used, fit.first + k).sd
         column = other.first + other.columns.candidates.index(candidate)
-        after = other.regression.score(other.estimate.used, column).sd
-        limits_of[candidate] = LIMIT_SD * before, LIMIT_SD * after
-    return limits_of
+        both[candidate] = (
+            fit.regression.score(fit.estimate.used, fit.first + k),
+            other.regression.score(other.estimate.used, column),
+        )
+    return both
 
 
 def would_separate(fit: Fit, kind: str) -> Iterator[str]:

@@ -10,10 +10,12 @@ from rtid.diagnose.clean import cuts
 from rtid.diagnose.consequence import Consequence
 from rtid.diagnose.diagnosis import Result
 from rtid.diagnose.excuse import counted, steady
-from rtid.diagnose.experiment import limits, would_separate
+from rtid.diagnose.experiment import SWING, foretold, would_separate
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.fitted_sizes import parameters
 from rtid.diagnose.lag_interval import LagInterval, is_at_most, known_lag
+from rtid.diagnose.nameable import clearest, known_as_moduli
+from rtid.diagnose.regression import Score
 from rtid.diagnose.remains import described
 from rtid.diagnose.report import (
     Diagnosis,
@@ -24,16 +26,16 @@ from rtid.diagnose.report import (
     Unseen,
     Value,
 )
-from rtid.diagnose.sized import physical
 from rtid.diagnose.softer import Softer
-from rtid.diagnose.trials import AcceptedEffect
-from rtid.diagnose.unseen import has_size, is_unexplained, not_found
+from rtid.diagnose.trials import AcceptedEffect, detection_limit
+from rtid.diagnose.unseen import has_size, in_its_unit, is_unexplained, not_found
 from rtid.diagnose.verdict import CLEARLY_LEFT, INSUFFICIENT, UNKNOWN, filtered_hz
 from rtid.diagnose.zeros import Zero, by_chance
 from rtid.effects import catalogue
+from rtid.effects.column import Candidate
 from rtid.effects.law import chambers_by_place
 from rtid.effects.laws.pump import FLOW, PUMP, delivered, demand
-from rtid.effects.laws.timing import COMMAND
+from rtid.effects.laws.timing import COMMAND, RATE
 from rtid.effects.page import ZERO, correcting
 from rtid.plain import FloatArray, Key
 from rtid.units import limit
@@ -284,19 +286,39 @@ def _experiment(result: Result, unseen: tuple[Unseen, ...]) -> list[str]:
     closed = {(u.effect, u.where) for u in unseen if not u.visible}
     closed |= {key for f in result.found for key in (f.key, *f.alike) if f.alike}
     closed &= {candidate.key for candidate in result.last.columns.candidates}
-    best: dict[Key, tuple[float, float]] = {}
-    for candidate, (before, after) in (limits(result.last, closed) if closed else {}).items():
-        if np.isfinite(after) and after > 0:
-            scale = physical(result.last, candidate, 1.0)
-            known = best.get(candidate.key)
-            if known is None or scale * after < known[1]:
-                best[candidate.key] = scale * before, scale * after
-    here = result.last.declared.unit_here
-    units = {c.key: here(c.unit) for c, _ in result.scores}
+    fit = result.last
+    both = foretold(fit, closed) if closed else {}
+    here, varied = (
+        dict(known_as_moduli(fit, [(c, s[k]) for c, s in both.items()])) for k in range(2)
+    )
+    before, after = clearest([*here.items()]), clearest([*varied.items()])
+    lines = list[str]()
+    for key, (candidate, score) in after.items():
+        # the column of a timing or a line is of one strength, and each record tells another one;
+        # all else is compared in one form
+        is_strong = candidate.where == COMMAND or candidate.is_whole
+        own = before[key] if is_strong else (candidate, here[candidate])
+        lines += _would_be_seen(fit, own, (candidate, score))
+    return lines
+
+
+def _would_be_seen(
+    fit: Fit, here: tuple[Candidate, Score], varied: tuple[Candidate, Score]
+) -> list[str]:
+    """The sizes of a cause that this record and a varied supply tell, if that is worth it.
+
+    Of two lines "0.042" and "0.0012" were told, of 8.9 and 0.4 MPa s2/m3: shares of their columns.
+    """
+    (now, _, is_now), (then, unit, is_possible) = (
+        in_its_unit(fit, candidate, detection_limit(score, fit.rho))
+        for candidate, score in (here, varied)
+    )
+    less, more = (then, now) if unit != RATE else (now, then)  # a fast spool is the smaller lag
+    if not (is_possible and 0.0 < then < np.inf) or (is_now and more <= WORTH * less):
+        return []
+    effect, where = varied[0].key
+    instead = limit(now, unit) if is_now and np.isfinite(now) else "at no possible size"
     return [
-        f"Supply varied by 20 % in the same motion: {effect} ({where}) would be seen from "
-        f"{limit(after, units.get((effect, where), '1'))} on, instead of "
-        f"{limit(before, units.get((effect, where), '1'))}."
-        for (effect, where), (before, after) in best.items()
-        if before > WORTH * after
+        f"Supply varied by {100 * SWING:.0f} % in the same motion: {effect} ({where}) would be "
+        f"seen from {limit(then, unit)} {'down' if unit == RATE else 'on'}, instead of {instead}."
     ]

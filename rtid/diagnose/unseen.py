@@ -101,10 +101,10 @@ def _limit(result: Result, candidate: Candidate, score: Score) -> Unseen:
     doubtful = known.not_believed(score) if known and by == candidate else 0.0
     doubtful = doubtful or _looks_like(result, score)
     least = max(detection_limit(score, result.last.rho), doubtful)
-    limit, unit, is_possible = _sized(result.last, candidate, least)
+    limit, unit, is_possible = in_its_unit(result.last, candidate, least)
     visible = score.visible > VISIBLE and is_possible
     from_ = max(known.named_from, doubtful) if known else np.inf
-    named_from, _, may_be = _sized(result.last, by, from_)
+    named_from, _, may_be = in_its_unit(result.last, by, from_)
     if doubtful:
         reason = LOOKS_LIKE if is_unexplained(result) else NOT_CONFIRMED
     elif candidate.key in result.negligible:
@@ -131,7 +131,9 @@ def _limit(result: Result, candidate: Candidate, score: Score) -> Unseen:
 def _seen(fit: Fit, candidate: Candidate, score: Score) -> Value:
     """The size that the record shows of a cause, with its deviation by the misfit that is left."""
     deviation = score.sd * float(np.sqrt(max(1.0, fit.rho)))
-    (size, unit, _), (sd, _, _) = (_sized(fit, candidate, c) for c in (abs(score.value), deviation))
+    (size, unit, _), (sd, _, _) = (
+        in_its_unit(fit, candidate, c) for c in (abs(score.value), deviation)
+    )
     return Value(float(size), float(sd), unit)
 
 
@@ -182,7 +184,7 @@ def _form(candidate: Candidate) -> dict[str, Value]:
     return {n: Value(v, float("nan"), unit) for n, v, unit in told_form(candidate) if v != 0.0}
 
 
-def _sized(fit: Fit, candidate: Candidate, coefficient: float) -> tuple[float, str, bool]:
+def in_its_unit(fit: Fit, candidate: Candidate, coefficient: float) -> tuple[float, str, bool]:
     """A coefficient as the size that people know, its unit, and whether it is possible.
 
     That of a timing is times the value that its column was made for.

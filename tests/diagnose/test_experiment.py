@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from rtid.diagnose.experiment import limits, varied_supply
+from rtid.diagnose.diagnosis import search
+from rtid.diagnose.experiment import foretold, varied_supply
 from rtid.diagnose.fit import Fit, fit, prepare
-from rtid.diagnose.regression import LIMIT_SD
 from rtid.diagnose.revision import Revision
+from rtid.diagnose.summary import _experiment
+from rtid.diagnose.unseen import not_found
 from rtid.model import Edge, Machine
 from rtid.plain import FloatArray
+from rtid.units import limit
 from tests.diagnose.records import record
 
 pytestmark = pytest.mark.hidden_effect
+SAID = re.compile(
+    r"motion: (?P<effect>\w+) \((?P<where>.+)\) would be seen from (?P<size>.+) "
+    r"(?P<way>on|down), instead of (?P<instead>.+)\.$"
+)
 LEAKS = ("internal_leakage_laminar", "external_leakage_laminar", "external_leakage_turbulent")
 
 
@@ -29,13 +37,31 @@ def test_detection_limits_of_leaks_are_foretold() -> None:
     """Within a factor of 1.5 of what a record with such a supply then has."""
     swept, varied = fitted("sweep"), fitted("supply")
     leaks = {c.key for c in swept.columns.candidates if c.effect in LEAKS}
-    foretold = {c: after for c, (_, after) in limits(swept, leaks).items()}
     ratios = []
-    for candidate, after in foretold.items():
+    for candidate, (_, after) in foretold(swept, leaks).items():
         score = varied.regression.score(varied.estimate.used, varied.column(candidate))
-        ratios.append(after / (LIMIT_SD * score.sd))
+        ratios.append(after.sd / score.sd)
     assert len(ratios) == 5
     assert np.abs(np.log(ratios)).max() < np.log(1.5)
+
+
+def test_what_a_varied_supply_would_show_is_told_in_the_limits_unit() -> None:
+    """Of timings and lines shares of a column were told, as if they were sizes without a unit."""
+    result = search(*record(seed=4, motion="sweep"))
+    listed = {(u.effect, u.where): u for u in not_found(result, ())}
+    closed = tuple(replace(u, visible=False) for u in listed.values())
+    said = [words for line in _experiment(result, closed) if (words := SAID.search(line))]
+    named = {words["effect"] for words in said}
+    assert {"line_dynamics", "input_delay", "spool_lag_second_order", "entrained_air"} <= named
+    for words in said:
+        unseen = listed[words["effect"], words["where"]]
+        is_lag = unseen.unit == "rad/s"
+        assert unseen.detection_limit is not None
+        if not unseen.form:  # another one is told best of a varied supply
+            assert words["instead"] == limit(unseen.detection_limit, unseen.unit)
+        assert words["way"] == ("down" if is_lag else "on")
+        sizes = [float(words[name].split()[0]) for name in ("size", "instead")]
+        assert (sizes[0] > sizes[1]) is is_lag
 
 
 def moved(model: Machine, chunk: FloatArray) -> FloatArray:
