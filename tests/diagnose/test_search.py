@@ -235,6 +235,7 @@ def test_a_delay_beside_a_leak_is_closed_in_on() -> None:
     """What is found first must not hide what is second."""
     late_s = 8e-3
     model, chunk, _ = record("external_leakage_laminar", 3e-12)
+    chunk = chunk.copy()  # the record is kept for all tests
     for command in {edge.command for edge in model.edges}:
         column = 2 + model.column(command)
         chunk[:-8, column] = chunk[8:, column].copy()  # told before it is sent
