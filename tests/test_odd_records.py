@@ -98,9 +98,8 @@ def test_a_lag_is_told_from_the_command_itself(
     found = re.search(r"the lag is (\d+) to (\d+) ms, (\d+) ms on average", " ".join(words.split()))
     assert found is not None
     low, high, usual = (int(n) for n in found.groups())
-    own = 20 * (written is in_turn)  # ms: a command that is written so often is older still
-    assert low < 1e3 * LAG_S < high + own
-    assert usual == pytest.approx(1e3 * LAG_S - own / 2, abs=6)
+    assert low < 1e3 * LAG_S < high
+    assert usual == pytest.approx(1e3 * LAG_S, abs=6)
 
 
 def test_a_speed_that_follows_its_command_is_what_the_map_gives(tmp_path: Path) -> None:

@@ -178,7 +178,7 @@ def test_a_delay_is_looked_for_that_a_bent_map_hides() -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(not STRANGERS.is_dir(), reason="no measurements of others beside this tree")
 @pytest.mark.parametrize(
-    ("what", "own", "others", "late_ms"), [("boom", 1.55, 1.55, 125), ("stick", 2.4, 3.3, 100)]
+    ("what", "own", "others", "late_ms"), [("boom", 1.55, 1.55, 112), ("stick", 2.4, 3.3, 100)]
 )
 def test_an_excavator_s_other_days(
     what: str, own: float, others: float, late_ms: float, tmp_path: Path

@@ -18,8 +18,9 @@ from rtid.effects.laws.sensors import sensors_of
 from rtid.effects.laws.timing import COMMAND, SUPPLY, Psi, TimingLaw, lagged
 from rtid.effects.record_view import NONE, RecordView
 from rtid.model import Edge, Machine
-from rtid.plain import FloatArray
+from rtid.plain import FloatArray, IntArray
 
+GAP_STEPS = 1.5  # usual steps: what is marked as a gap and takes no longer is all there
 OFTEN = 0.9  # of the samples: a position that each of them holds is marked in all
 FADED = 1e-4  # of the largest command of a map, to which a spool's has faded that is shut
 Timings = tuple[tuple[TimingLaw, Psi], ...]
@@ -96,13 +97,13 @@ def memory_s(timings: Timings) -> float:
 def cut_off(record: FloatArray, instants: Instants, remembered_s: float) -> float:
     """Mark as gaps, in place, what stands so soon behind one that nobody knows what acted there.
 
-    record (n, 2 + signals), SI; remembered_s: how long what was sent acts; returns how long is cut
-    off in all, s.  With 0.15 s lost each second a delay of 20 ms left 21 times the noise, and a
+    record (n, 2 + signals), SI; remembered_s: how long what was sent acts; returns which share of
+    it is cut off.  With 0.15 s lost each second a delay of 20 ms left 21 times the noise, and a
     leak beside it had no name.
     """
     here = instants.unknown_for(remembered_s)
     record[here, 1] = record[here, 1].astype(np.int64) | GAP
-    return len(here) * instants.step_s
+    return len(here) / len(record)
 
 
 def _put_right(
@@ -120,7 +121,7 @@ def _put_right(
         if timing.of_sensor and not model.measured:
             for name in sensors_of(model, timing):
                 column = 2 + model.column(name)
-                runs = np.split(chunk[:, column], instants.starts)
+                runs = np.split(chunk[:, column], _gaps(chunk, dt_s))
                 chunk[:, column] = np.concatenate([timing.apply(r, dt_s, psi) for r in runs])
                 if name == model.position:
                     _measured_before(chunk, instants, psi[0])
@@ -150,8 +151,15 @@ def _measured_before(chunk: FloatArray, instants: Instants, late_s: float) -> No
     chunk[nearest[at_s > begun_s - 0.5 * instants.step_s], 1] += ROW
 
 
+def _gaps(chunk: FloatArray, dt_s: float) -> IntArray:
+    """Rows of a chunk (n, 2 + signals), SI, before which samples are missing, dt_s: usual step."""
+    steps = np.diff(chunk[:, 0], prepend=chunk[0, 0])
+    marked = chunk[:, 1].astype(np.int64) & GAP != 0
+    return np.flatnonzero(marked & (steps > GAP_STEPS * dt_s))
+
+
 def through(u: FloatArray, direction: int, instants: Instants, timings: Timings) -> FloatArray:
-    """What timings let through of a command (n,) to the edges of one direction."""
+    """What timings let through of a command (n,), V, to the edges of one direction."""
     return instants.over(u, lambda even: _through(even, direction, instants.even_s, timings))
 
 

@@ -88,7 +88,7 @@ class Search:
     def sent(self, timings: Timings, lag_s: float) -> tuple[FloatArray, float]:
         """The thinned record (n // m, 2 + signals), SI, of the split machine, its spools' lag in.
 
-        And how long nobody knows what acts in it behind its gaps, s.
+        And in which share of it nobody knows what acts, behind its gaps.
         lag_s: of those whose lag no timing replaces.
         The commands of the split machine stand behind its columns.
         """
@@ -128,7 +128,7 @@ class Beside:
             {c: thinned(series) for c, series in volumes.items()}
             for volumes in columns_of_effects(fit)
         ]
-        self._rows: int | None = None  # of the fit as it is, whose cost is the first
+        self._rows: float | None = None  # of the fit as it is, whose cost is the first
         self._known: dict[tuple[Timings, float], tuple[float, FloatArray]] = {}
         self.before = self.cost(())
         self.ahead, self.fitted_s = 0.0, fit.weights.lag_s
@@ -186,12 +186,12 @@ class Beside:
     def _solved_anew(self, more: Timings, lag_s: float) -> tuple[float, FloatArray]:
         search, timings = self.search, (*self.timings, *more)
         weights = search.weights
-        sent, unknown_s = search.sent(timings, lag_s)
+        sent, unknown = search.sent(timings, lag_s)
         soft = softened(search.split, sent, weights, Revision((), timings))
         rows = rows_of(search.split, sent, weights, ROW_S, soft, search.thinning.m)
-        n = rows.n + round(unknown_s / ROW_S) * len(search.model.chambers)  # lost by no trial
+        n = rows.n / (1.0 - unknown)  # what nobody knows is lost by no trial
         self._rows = n if self._rows is None else self._rows
-        left_out = counted_for(1.0 - n / max(1, self._rows), timings)
+        left_out = counted_for(1.0 - n / max(1.0, self._rows), timings)
         if np.isinf(left_out):
             return float("inf"), np.zeros(0)
         chi2, theta = _least(project(rows, [rows.on_rows(v) for v in self.volumes]).schur)

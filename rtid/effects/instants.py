@@ -20,10 +20,8 @@ from functools import cached_property
 
 import numpy as np
 
-from firmware_bridge.samples import GAP
 from rtid.plain import FloatArray, IntArray
 
-GAP_STEPS = 1.5  # usual steps: what is marked as a gap and takes no longer is all there
 UNEVEN = 0.25  # of the usual step, by which another is no longer as long
 SHORT, FINEST = 0.05, 0.25  # share of the steps that are shorter than h; h in usual steps, at least
 RUNG_S = 12e-3  # the first of what is left out behind a gap
@@ -39,11 +37,13 @@ class Instants:
 
     @classmethod
     def of(cls, chunk: FloatArray, max_gap_s: float) -> Instants:
-        """Those of a record, chunk (n, 2 + signals), SI; max_gap_s: of steps that are no gaps."""
+        """Those of a record, chunk (n, 2 + signals), SI; max_gap_s: of steps that are no gaps.
+
+        Where a row alone is missing the one before it holds its command for longer.
+        """
         steps = np.diff(chunk[:, 0], prepend=chunk[:1, 0])
         usual_s = float(np.median(steps[1:])) if len(steps) > 1 else 0.0
-        marked = (chunk[:, 1].astype(np.int64) & GAP != 0) & (steps > GAP_STEPS * usual_s)
-        return cls(chunk[:, 0], np.flatnonzero(marked | (steps > max(max_gap_s, usual_s))))
+        return cls(chunk[:, 0], np.flatnonzero(steps > max(max_gap_s, usual_s)))
 
     @cached_property
     def step_s(self) -> float:
@@ -67,7 +67,7 @@ class Instants:
         return np.delete(np.diff(self.t_s), self.starts - 1)
 
     def over(self, u: FloatArray, law: Through) -> FloatArray:
-        """A command (n,) behind a law of even samples: its mean over each interval (n,)."""
+        """A command (n,), V, behind a law of even samples: its mean over each interval (n,), V."""
         if not len(self.starts):
             return self._of_run(self.t_s, u, law)
         runs = zip(np.split(self.t_s, self.starts), np.split(u, self.starts), strict=True)
@@ -85,13 +85,13 @@ class Instants:
         return np.diff(reached) / np.diff(ends)
 
     def unknown_for(self, memory_s: float) -> IntArray:
-        """Samples so soon behind the beginning, or a gap, that what was sent before still acts.
+        """Samples (m,) so soon behind a gap that what was sent within it still acts.
 
         On rungs twice as long each: what is left out must not change with every step of a search.
         """
-        if memory_s <= 0.0:
+        if memory_s <= 0.0 or not len(self.starts):
             return np.zeros(0, np.int64)
         memory_s = RUNG_S * 2.0 ** max(0.0, np.ceil(np.log2(memory_s / RUNG_S)))
-        first = self.t_s[np.append(0, self.starts)]
-        since = self.t_s - first[np.searchsorted(self.starts, np.arange(len(self.t_s)), "right")]
-        return np.flatnonzero(since < memory_s)
+        run = np.searchsorted(self.starts, np.arange(len(self.t_s)), "right")
+        since = self.t_s - self.t_s[np.append(0, self.starts)][run]
+        return np.flatnonzero((run > 0) & (since < memory_s))
