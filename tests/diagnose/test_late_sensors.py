@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from firmware_bridge.samples import GAP, ROW
 from rtid.diagnose.commands import transformed
 from rtid.diagnose.diagnosis import search
-from rtid.diagnose.fit import one_pass, prepare
+from rtid.diagnose.fit import Fit, one_pass, prepare
 from rtid.diagnose.parts import AddedEffect, recall
 from rtid.diagnose.report import Diagnosis
 from rtid.diagnose.revision import Revision
@@ -85,6 +87,27 @@ def test_a_late_position_that_comes_rarely_stands_where_it_was_measured() -> Non
     assert put_right[measured, x] == pytest.approx(chunk[came[1:], x], abs=1e-9)
     weights = prepare(model, rows)
     assert one_pass(model, rows, weights, Revision((), timings), None, False).rho < 1.15
+
+
+@pytest.mark.parametrize("off_s", [-3e-4, 3e-4])
+def test_a_late_position_against_the_lag_has_the_slope_of_chi2(off_s: float) -> None:
+    """Both together move the pressures alone: by the rates of 40 ms half of the slope was told."""
+    late_s = 7e-3
+    model, chunk, _ = record("position_sensor_delay", late_s)
+    (law,) = (t for t in sensor_timings(model) if t.where == model.position)
+    weights = prepare(model, chunk)
+
+    def at(by_s: float) -> Fit:
+        beside = replace(weights, lag_s=weights.lag_s + by_s)
+        revision = Revision((), ((law, (late_s - by_s,)),))
+        return one_pass(model, chunk, beside, revision, None, False, thorough=False)
+
+    start, (ahead_, behind) = at(off_s), (at(off_s + way * 1e-4) for way in (1.0, -1.0))
+    used, s = list(start.held.used), start.regression.s
+    columns = [start.first_given, start.timing_columns(0)[0]]
+    of_lag, of_position = -2.0 * (s[columns, 0] - s[np.ix_(columns, used)] @ start.held.theta)
+    numeric = (ahead_.held.sse - behind.held.sse) / 2e-4
+    assert of_lag - of_position == pytest.approx(numeric, rel=0.15)
 
 
 def test_a_slow_signal_is_put_right_up_to_the_window() -> None:
