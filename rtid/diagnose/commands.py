@@ -85,25 +85,17 @@ def transformed(
     instants = Instants.of(chunk, model.gates.max_gap_s)
     sent = [through(u, d, instants, timings) for d, u in commands(model, chunk).values()]
     record = np.column_stack([chunk, *sent])
-    cut_off(record, instants, memory_s(timings))
+    cut_off(record, instants)
     return _put_right(split(model), record, instants, timings, compliance)
 
 
-def memory_s(timings: Timings) -> float:
-    """How long a command that was sent acts behind timings, s."""
-    return sum(timing.memory_s(psi) for timing, psi in timings if timing.where == COMMAND)
-
-
-def cut_off(record: FloatArray, instants: Instants, remembered_s: float) -> float:
+def cut_off(record: FloatArray, instants: Instants) -> None:
     """Mark as gaps, in place, what stands so soon behind one that nobody knows what acted there.
 
-    record (n, 2 + signals), SI; remembered_s: how long what was sent acts; returns which share of
-    it is cut off.  With 0.15 s lost each second a delay of 20 ms left 21 times the noise, and a
-    leak beside it had no name.
+    record (n, 2 + signals), SI.  With 0.15 s lost each second a delay of 20 ms left 21 times the
+    noise, and a leak beside it had no name.
     """
-    here = instants.unknown_for(remembered_s)
-    record[here, 1] = record[here, 1].astype(np.int64) | GAP
-    return len(here) / len(record)
+    record[instants.unknown, 1] = record[instants.unknown, 1].astype(np.int64) | GAP
 
 
 def _put_right(

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from rtid.diagnose.bank import columns_of, pointing_out
-from rtid.diagnose.commands import behind, commands, memory_s, transformed
+from rtid.diagnose.commands import behind, commands, transformed
 from rtid.diagnose.equations import regression_of, softened
 from rtid.diagnose.evidence import Heading, Rows, project, rows_of
 from rtid.diagnose.moving import (
@@ -33,7 +33,6 @@ from rtid.diagnose.revision import Revision
 from rtid.diagnose.sized import is_about_sizes
 from rtid.diagnose.steepness import with_own_slopes
 from rtid.effects.column import Candidate, Cause, Columns
-from rtid.effects.instants import Instants
 from rtid.effects.law import Shape, Volumes
 from rtid.effects.laws import cause_of
 from rtid.effects.laws.response import behind_s
@@ -217,17 +216,6 @@ class Fit:
         """Of a lag or a timing, and how far it clearly points on from where it has ended."""
         sd, ahead = self.sd_of(column), abs(self.estimate.value(column))
         return float(np.hypot(sd, ahead)) if ahead > CLEAR * sd else sd
-
-    @cached_property
-    def rows_but_for_gaps(self) -> float:
-        """Number of its rows, if commands behind the record's gaps were known as well."""
-        remembered_s = memory_s(self.revision.timings)
-        if not remembered_s:
-            return float(self.regression.rows)
-        instants = Instants.of(self.chunk, self.declared.gates.max_gap_s)
-        return self.regression.rows / (
-            1.0 - len(instants.unknown_for(remembered_s)) / len(self.chunk)
-        )
 
     @property
     def first_given(self) -> int:

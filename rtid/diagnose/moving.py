@@ -144,7 +144,7 @@ def is_worse(fit: Fit, best: Fit) -> bool:
 
     Nor is a law about its size worse than one that was linear about another size.
     """
-    left_out = 1.0 - fit.rows_but_for_gaps / max(1.0, best.rows_but_for_gaps)
+    left_out = 1.0 - fit.regression.rows / max(1.0, best.regression.rows)
     more = counted_for(left_out, fit.revision.timings)
     if more > 0.0:
         return fit.excess + more * fit.held.sse > best.excess

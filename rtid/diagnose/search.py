@@ -16,7 +16,6 @@ from rtid.diagnose.commands import (
     Timings,
     commands,
     cut_off,
-    memory_s,
     slowed,
     split,
     through,
@@ -30,7 +29,7 @@ from rtid.diagnose.revision import Revision
 from rtid.diagnose.thinned import Thinning
 from rtid.effects.instants import Instants
 from rtid.effects.law import Volumes
-from rtid.effects.laws.timing import COMMAND, SETTLES, Psi, TimingLaw
+from rtid.effects.laws.timing import COMMAND, Psi, TimingLaw
 from rtid.estimator.state import Weights
 from rtid.model import Grid, Machine
 from rtid.plain import FloatArray
@@ -85,10 +84,9 @@ class Search:
         """Costs beside a fit."""
         return Beside(self, fit)
 
-    def sent(self, timings: Timings, lag_s: float) -> tuple[FloatArray, float]:
+    def sent(self, timings: Timings, lag_s: float) -> FloatArray:
         """The thinned record (n // m, 2 + signals), SI, of the split machine, its spools' lag in.
 
-        And in which share of it nobody knows what acts, behind its gaps.
         lag_s: of those whose lag no timing replaces.
         The commands of the split machine stand behind its columns.
         """
@@ -100,8 +98,8 @@ class Search:
         lag_s = 0.0 if any(timing.replaces_lag for timing, _ in timings) else lag_s
         sent = [self._thinned(through(u, d, self.instants, timings), lag_s) for d, u in self._given]
         thin = np.column_stack([record, *sent])
-        remembered_s = memory_s(timings) + SETTLES * lag_s
-        return thin, cut_off(thin, self._thin_instants, remembered_s)
+        cut_off(thin, self._thin_instants)
+        return thin
 
     def _thinned(self, command: FloatArray, lag_s: float) -> FloatArray:
         """A command (n,) behind a lag, as over the intervals (n // m,) of the thinned record."""
@@ -128,7 +126,7 @@ class Beside:
             {c: thinned(series) for c, series in volumes.items()}
             for volumes in columns_of_effects(fit)
         ]
-        self._rows: float | None = None  # of the fit as it is, whose cost is the first
+        self._rows: int | None = None  # of the fit as it is, whose cost is the first
         self._known: dict[tuple[Timings, float], tuple[float, FloatArray]] = {}
         self.before = self.cost(())
         self.ahead, self.fitted_s = 0.0, fit.weights.lag_s
@@ -186,12 +184,11 @@ class Beside:
     def _solved_anew(self, more: Timings, lag_s: float) -> tuple[float, FloatArray]:
         search, timings = self.search, (*self.timings, *more)
         weights = search.weights
-        sent, unknown = search.sent(timings, lag_s)
+        sent = search.sent(timings, lag_s)
         soft = softened(search.split, sent, weights, Revision((), timings))
         rows = rows_of(search.split, sent, weights, ROW_S, soft, search.thinning.m)
-        n = rows.n / (1.0 - unknown)  # what nobody knows is lost by no trial
-        self._rows = n if self._rows is None else self._rows
-        left_out = counted_for(1.0 - n / max(1.0, self._rows), timings)
+        self._rows = rows.n if self._rows is None else self._rows
+        left_out = counted_for(1.0 - rows.n / max(1, self._rows), timings)
         if np.isinf(left_out):
             return float("inf"), np.zeros(0)
         chi2, theta = _least(project(rows, [rows.on_rows(v) for v in self.volumes]).schur)

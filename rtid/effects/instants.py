@@ -24,7 +24,8 @@ from rtid.plain import FloatArray, IntArray
 
 UNEVEN = 0.25  # of the usual step, by which another is no longer as long
 SHORT, FINEST = 0.05, 0.25  # share of the steps that are shorter than h; h in usual steps, at least
-RUNG_S = 12e-3  # the first of what is left out behind a gap
+# after which a command is forgotten, steps being no longer; of a record, that is cut off at most
+FORGOTTEN_S, QUICK_S, MOST_CUT = 0.2, 0.01, 0.2
 Through = Callable[[FloatArray], FloatArray]
 
 
@@ -84,14 +85,14 @@ class Instants:
         reached = np.interp(ends, grid, np.append(0.0, np.cumsum(out * h)))
         return np.diff(reached) / np.diff(ends)
 
-    def unknown_for(self, memory_s: float) -> IntArray:
-        """Samples (m,) so soon behind a gap that what was sent within it still acts.
+    @cached_property
+    def unknown(self) -> IntArray:
+        """Samples (m,) so soon behind a gap that what was sent within it may still act.
 
-        On rungs twice as long each: what is left out must not change with every step of a search.
+        The same for whatever is late: a step of a search must not change which rows count.
         """
-        if memory_s <= 0.0 or not len(self.starts):
-            return np.zeros(0, np.int64)
-        memory_s = RUNG_S * 2.0 ** max(0.0, np.ceil(np.log2(memory_s / RUNG_S)))
         run = np.searchsorted(self.starts, np.arange(len(self.t_s)), "right")
-        since = self.t_s - self.t_s[np.append(0, self.starts)][run]
-        return np.flatnonzero((run > 0) & (since < memory_s))
+        since = np.where(run > 0, self.t_s - self.t_s[np.append(0, self.starts)][run], np.inf)
+        forgotten_s = FORGOTTEN_S * max(1.0, self.step_s / QUICK_S)
+        most = int(MOST_CUT * len(since))
+        return np.flatnonzero(since < min(forgotten_s, float(np.partition(since, most)[most])))

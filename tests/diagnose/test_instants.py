@@ -89,9 +89,10 @@ def test_behind_a_gap_it_begins_anew() -> None:
     assert instants.starts.tolist() == [50]
     out = instants.over(u, lambda even: delayed(even, instants.even_s, (5e-3,)))
     assert np.array_equal(out, u)
-    for memory_s, n in ((0.0, 0), (3.5e-3, 12), (12.1e-3, 24), (23e-3, 24)):
-        expected = [*range(50, 50 + n)]
-        assert instants.unknown_for(memory_s).tolist() == expected
+    assert instants.unknown.tolist() == list(range(50, 70)), "a fifth of the record at most"
+    behind = np.concatenate([np.arange(9000), 10_000 + np.arange(1000)]) / 1024
+    assert instants_of(behind).unknown.tolist() == list(range(9000, 9205)), "0.2 s"
+    assert not len(instants_of(behind[:9000]).unknown), "what began a record is taken as it was"
     assert instants_of(t_s[lost], (20, 49)).starts.tolist() == [49]
 
 

@@ -31,7 +31,6 @@ DEAD_BAND = "dead_band"  # behind which a lag may sit
 USUAL_STEP_S = 0.01  # up to which the banks are those of the pages
 OF_COMMAND, USUAL_COMMAND = "V", 10.0  # unit on the pages of what is in a command's, its largest
 ALIKE = 2.0  # times the usual largest, up to which the banks are those of the pages
-SETTLES = 4.0  # time constants until what was before a record's beginning is forgotten
 AT_BOUND = 1.01  # times a bound, within which a parameter is at it
 
 
@@ -44,7 +43,7 @@ class TimingLaw:
     own_spools: each direction follows its own part of the command; where: a command, the
     demand on the supply, from which `apply` makes what the supply gives way, or the place of a
     sensor; is_rate: psi[0] is a
-    rate, so that a smaller one does more; remembers: times its time constant.
+    rate, so that a smaller one does more.
     """
 
     effect: str
@@ -59,7 +58,6 @@ class TimingLaw:
     own_spools: bool = False
     where: str = COMMAND
     is_rate: bool = False
-    remembers: float = SETTLES
 
     def is_at(self, effect: str, where: str) -> bool:
         """True for the timing of that name and place."""
@@ -108,12 +106,6 @@ class TimingLaw:
         if self.is_rate:
             return psi[0] >= self.high[0] / AT_BOUND
         return psi[0] <= AT_BOUND * self.low[0]
-
-    def memory_s(self, psi: Psi) -> float:
-        """How long what was sent acts, s; 0 of what takes no time."""
-        if self.is_rate:
-            return self.remembers / (psi[0] * psi[1])
-        return self.remembers * psi[0] if self.units[0] == "s" else 0.0
 
     def strength(self, psi: Psi) -> float:
         """How much a command is changed, 0 for not at all."""
@@ -225,7 +217,7 @@ def of_law(
 
 
 COMMAND_LAWS: dict[str, tuple[TimingLaw, ...]] = {
-    "delay": (of_law("delay", delayed, remembers=1.0),),
+    "delay": (of_law("delay", delayed),),
     "lag": (
         *(of_law("lag", lagged, (LAG_S,), own_spools=its_own) for its_own in (False, True)),
         of_law("lag", lagged_opening, (LAG_S, DEAD_BAND), own_spools=True, is_linear=False),
