@@ -89,6 +89,21 @@ def test_a_pump_s_way_and_compliance_are_found(tmp_path: Path, seed: int) -> Non
     assert 2 * np.pi * band.gain_below == pytest.approx(plant.back, rel=0.01)
 
 
+def test_a_pump_is_known_where_rows_come_2_4_and_8_ms_apart(tmp_path: Path) -> None:
+    """Each third of them began anew, as behind a gap: no window of the means was whole."""
+    rng = np.random.default_rng([41, 1])
+    plant = replace(Driven.drawn(rng), compliance=0.0)
+    table = plant.recorded(tmp_path / "pump.csv", rng, 2e6)
+    head, *lines = table.read_text().splitlines()
+    at = np.cumsum(rng.choice([1, 2, 4], len(lines)))
+    table.write_text("\n".join([head, *(lines[k] for k in at[at < len(lines)])]) + "\n")
+    looked = quick(table)
+    assert isinstance(looked, QuickRate) and looked.diagnosis.verdict == "matches"
+    band = looked.bands["f"]
+    assert 2 * np.pi * band.gain_above == pytest.approx(plant.out, rel=0.002)
+    assert 2 * np.pi * band.gain_below == pytest.approx(plant.back, rel=0.002)
+
+
 def test_a_record_too_short_for_a_pump_says_what_goes_on(tmp_path: Path) -> None:
     """It ended with a key of a project file that there is not."""
     rng = np.random.default_rng(45)

@@ -54,6 +54,15 @@ def test_steps_that_are_never_alike_are_no_gaps() -> None:
     assert longest_step(even) == pytest.approx(15_000.0)
 
 
+def test_messages_of_5_10_and_20_ms_are_no_gaps() -> None:
+    """Twice the usual step is a lost row only where the usual step is the shortest."""
+    rng = np.random.default_rng(3)
+    mixed = rng.choice([5_000, 10_000, 20_000], 2000)
+    assert np.mean(mixed > longest_step(mixed)) == 0.0
+    kept = np.flatnonzero(rng.random(2000) < 0.7)
+    assert longest_step(10_000 * np.diff(kept)) == pytest.approx(15_000.0)
+
+
 def test_the_noise_of_a_sensor_that_is_read_at_any_time() -> None:
     rng = np.random.default_rng(2)
     t_s = MS * np.cumsum(rng.integers(5, 26, 4000))

@@ -252,12 +252,15 @@ def longest_step(steps: NDArray[np.int64]) -> float:
     """What a step (n,) may take that is no gap, us: 1.5 median steps, of even rows.
 
     Where more than 5 % are longer, and no multiples of the usual step as behind rows that are lost,
-    no two steps are alike: 1.5 times what 95 % stay below.
+    no two steps are alike: 1.5 times what 95 % stay below.  So it is where more than 5 % are that
+    much shorter: rows that are lost make no step shorter.
     """
     usual = float(np.median(steps))
-    often, long = float(np.quantile(steps, OFTEN)), steps[steps > PERIODS * usual] / max(usual, 1.0)
+    often = float(np.quantile(steps, OFTEN, method="lower"))  # never the longest alone
+    long = steps[steps > PERIODS * usual] / max(usual, 1.0)
     is_lost = np.abs(long - np.round(long)) < ALIKE
-    if often <= PERIODS * usual or np.mean(is_lost) > 0.5:
+    are_even = float(np.mean(PERIODS * steps < usual)) <= 1.0 - OFTEN
+    if often <= PERIODS * usual or (are_even and np.mean(is_lost) > 0.5):
         return PERIODS * usual
     return PERIODS * often
 
