@@ -23,6 +23,8 @@ from rtid.maps.datasheet import read_reference
 from rtid.maps.files import read_map
 from rtid.plain import FloatArray
 from rtid.project import ProjectError, load
+from rtid.study.quick import quick
+from rtid.study.quick_rate import QuickRate
 from rtid.study.study import Study
 from rtid.tell.charts.blocks import quantities
 from rtid.tell.charts.maps import flow_plane
@@ -125,6 +127,25 @@ def test_neutral_band_gains_and_delay_are_found(crane: tuple[Crane, Path, Path])
     w = np.linspace(-5, 5, 41)
     q = 1e3 * study.map["f"].flow(w, np.zeros(len(w)))
     assert np.sqrt(np.mean((q - plant.rate(w)) ** 2)) < 0.03 * np.abs(plant.rate(w)).max()
+
+
+def test_a_position_that_rows_repeat_is_no_delay(tmp_path: Path) -> None:
+    """Sent each 40 ms in rows of 10 ms: on the mean it was 15 ms old, and a delay of 15 was named.
+
+    On lines between the instants at which it is sent nothing is late.
+    """
+    rng, table = np.random.default_rng(20), tmp_path / "jib.csv"
+    plant = Crane.drawn(rng)
+    fine = 1e-3 * np.arange(200_000)
+    u = np.repeat(rng.uniform(-6, 6, 250) * (rng.random(250) < 0.7), 800)
+    sent = (np.cumsum(plant.rate(u)) * 1e-3 + 300)[::40] + 0.1 * rng.standard_normal(5000)
+    x = np.repeat(np.round(sent / 0.2) * 0.2, 4)
+    rows = np.column_stack([1e3 * fine[::10], u[::10] + plant.neutral, x])
+    head = "t_ms,u_jib_pct,x_jib_mm"
+    np.savetxt(table, rows, "%.7g", ",", header=head, comments="")
+    looked = quick(table)
+    assert isinstance(looked, QuickRate)
+    assert looked.diagnosis.verdict == "matches" and not looked.diagnosis.found
 
 
 def test_every_command_takes_it(crane: tuple[Crane, Path, Path], folder: Path) -> None:

@@ -87,7 +87,7 @@ def where_sent(model: Machine, samples: Samples) -> tuple[Samples, int]:
 def _repeated(model: Machine, samples: Samples) -> dict[str, IntArray]:
     """The samples in which each repeated sensor is sent, by name; unknown behind a gap."""
     each = {}
-    for signal in model.signals if model.has_pressures else ():
+    for signal in model.signals:
         if signal.kind in SENSORS and signal.name in samples.names:
             values = samples.column(signal.name)
             if (rows := rows_per_value(values)) > 1.0:
