@@ -148,6 +148,20 @@ def test_a_position_that_rows_repeat_is_no_delay(tmp_path: Path) -> None:
     assert looked.diagnosis.verdict == "matches" and not looked.diagnosis.found
 
 
+def test_a_rate_is_told_by_where_a_coarse_position_crosses_its_steps(tmp_path: Path) -> None:
+    """Of 1 mm at 50 Hz: taken for white noise the steps hid the motion, and nothing was judged."""
+    rng, table = np.random.default_rng(20), tmp_path / "jib.csv"
+    plant = Crane.drawn(rng)
+    u = np.repeat(rng.uniform(-6, 6, 250) * (rng.random(250) < 0.7), 800)
+    x = (np.cumsum(plant.rate(u)) * 1e-3 + 300)[::20] + 0.1 * rng.standard_normal(10_000)
+    rows = np.column_stack([20.0 * np.arange(10_000), u[::20] + plant.neutral, np.round(x)])
+    head = "t_ms,u_jib_pct,x_jib_mm"
+    np.savetxt(table, rows, "%.7g", ",", header=head, comments="")
+    looked = quick(table)
+    assert isinstance(looked, QuickRate) and looked.diagnosis.verdict == "matches"
+    assert 1e3 * looked.bands["f"].gain_above == pytest.approx(plant.gain_above, rel=0.05)
+
+
 def test_every_command_takes_it(crane: tuple[Crane, Path, Path], folder: Path) -> None:
     _, table, project = crane
     assert "Ready to learn" in said("check", project, table)
