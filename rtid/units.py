@@ -111,6 +111,7 @@ SIGNAL_UNITS = (
     Unit("ns", "ns", "time", 1e-9),
     Unit("min", "min", "time", 60.0),
     Unit("h", "h", "time", 3600.0),
+    Unit("d", "d", "time", 86_400.0),
     Unit("L/s", "lps", "flow", 1e-3),
     Unit("rpm", "rpm", "rotation", math.pi / 30),
     Unit("rad/s", "radps", "rotation", 1.0),
@@ -161,12 +162,13 @@ _ALIASES = {
     "seconds": "s",
     "msec": "ms",
     "usec": "us",
+    "days": "d",
 }
 NO_UNIT = {"", "-", "--", "1", "raw", "none", "n/a", "counts"}  # said, and says nothing
 # Last words of a name that mean something else as often: p_a is a chamber, p_s a supply, p_in an
 # inlet, x_min the lowest.  They count as units where a word of the stem is of their dimension.
 _AMBIGUOUS = {"m", "s", "a", "v", "l", "in", "n", "g", "h", "k", "pa", "min", "mode"}
-_AMBIGUOUS |= {"ms", "us", "ns"}  # p_us is upstream
+_AMBIGUOUS |= {"ms", "us", "ns", "d"}  # p_us is upstream, x_d is desired
 _OF_DIMENSION = {
     "time": {"t", "time", "timestamp", "zeit"},
     "length": {"x", "y", "z", "s", "pos", "position", "stroke", "length", "displacement", "level"},

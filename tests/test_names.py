@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -334,6 +335,27 @@ def test_counts_of_a_converter_are_no_position(tmp_path: Path) -> None:
     with pytest.raises(RtidError, match="in no unit of length") as refused:
         roles_of(path, open_source(path, None))
     assert "x_mm" in str(refused.value.remedy)
+
+
+@pytest.mark.parametrize(
+    "coarse",
+    [lambda t: np.round(t, 2), lambda t: 45_352 + t / 86_400],
+    ids=["10 ms", "days, and no unit"],
+)
+def test_a_time_that_stands_while_rows_come_is_refused(
+    tmp_path: Path, coarse: Callable[[FloatArray], FloatArray]
+) -> None:
+    """Four of five rows were left out, or the fault was one of a file that nobody has."""
+    columns = machine()
+    t = columns.pop("t")
+    fine = {"t": coarse(t[0] + 0.002 * np.arange(len(t)))} | columns
+    np.savetxt(
+        tmp_path / "m.csv", np.column_stack([*fine.values()]), "%.12g", ",",
+        header=",".join(fine), comments="",
+    )  # fmt: skip
+    with pytest.raises(RtidError, match="times for") as refused:
+        open_source(tmp_path / "m.csv", None)
+    assert "[d]" in str(refused.value.remedy)
 
 
 @pytest.mark.parametrize("overlap", [False, True])

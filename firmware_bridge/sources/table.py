@@ -25,7 +25,7 @@ from firmware_bridge.sources import mat, text_table
 from firmware_bridge.sources.errors import LogError
 from firmware_bridge.sources.unpacked import Budget
 
-NUMBER_BYTES = 8
+NUMBER_BYTES, DAY_S = 8, 86_400.0
 MINUS = " - "  # between the names of two columns
 MOST_US = 2.0**62  # of a time stamp
 PERIODS, OFTEN = 1.5, 0.95  # of the usual step: more is a gap; share of the steps that are usual
@@ -37,7 +37,10 @@ TIME_NAMES = ("t", "time", "timestamp", "zeit")  # with or without a unit behind
 TIMES = {*TIME_NAMES, "datetime", "date_time", "uhrzeit", "zeitstempel", "elapsed_time", "x_value"}
 TIME_UNITS = {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
 TIME_UNITS |= {"sec": 1.0, "seconds": 1.0, "msec": 1e-3, "usec": 1e-6, "h": 3600.0}
+TIME_UNITS |= {"d": DAY_S, "days": DAY_S}  # as spreadsheets keep a date
 TIME_UNITS["\N{GREEK SMALL LETTER MU}s"] = 1e-6
+WRAPS = 2.0**16, 2.0**32  # ticks after which a counter begins again
+NEAR = 10.0  # usual steps: what goes on behind the end of a counter does so within
 
 Column = tuple[str, NDArray[np.float64], str]  # title, values (n,) and unit, "" if unknown
 
@@ -89,11 +92,14 @@ class Table:
         return self.units.get(name, "") or _split_time(name)[1]
 
     def seconds(self, name: str, unit: str | None = None) -> NDArray[np.float64]:
-        """A column of times in s, float64 (n,), from the unit given or its own; LogError."""
+        """A column of times in s, float64 (n,), from the unit given or its own; LogError.
+
+        What begins again, a counter or the time of day, goes on.
+        """
         unit = self.time_unit(name) if unit is None else unit
         if unit.lower() not in TIME_UNITS:
             raise LogError(f"{self.path}: time column {name!r} has unit {unit!r}; use s")
-        return self.column(name) * TIME_UNITS[unit.lower()]
+        return unwrapped(self.column(name), TIME_UNITS[unit.lower()])
 
     def t_us(self) -> NDArray[np.int64]:
         """Time stamps, int64 (n,) microseconds; LogError if no column looks like time."""
@@ -105,13 +111,35 @@ class Table:
         return np.where(usable, np.rint(t), np.iinfo(np.int64).min).astype(np.int64)
 
 
+def unwrapped(ticks: NDArray[np.float64], tick_s: float) -> NDArray[np.float64]:
+    """Times (n,) in s of ticks (n,), each tick_s long, that may begin again: they go on.
+
+    After 2^16 or 2^32 ticks, as counters do, or a day, as the time since midnight does: a step back
+    by that, less a usual step or a few, is no row out of its order.
+    """
+    known = np.flatnonzero(np.isfinite(ticks))
+    steps = np.diff(ticks[known], prepend=ticks[known[:1]])
+    ahead = steps[steps > 0.0]
+    if not len(ahead) or len(ahead) == len(steps) - 1:
+        return ticks * tick_s
+    later, most = np.zeros(len(steps)), NEAR * float(np.median(ahead))
+    for turn in (*WRAPS, DAY_S / tick_s):
+        goes_on = (steps < 0.0) & (steps + turn > 0.0) & (steps + turn <= most)
+        later[goes_on & (later == 0.0)] = turn
+    result = ticks.copy()
+    result[known] += np.cumsum(later)
+    return result * tick_s
+
+
 def is_time(name: str) -> bool:
     """Whether a column looks like time: t, time_s, Zeit, t_ms."""
     return _split_time(name)[0].lower().replace(" ", "_") in TIMES
 
 
 def _split_time(name: str) -> tuple[str, str]:
-    return split_unit(name, lambda unit, _stem: bool(unit) and unit.lower() in TIME_UNITS)
+    """Name and unit of a time; a d says days in brackets alone: t_d is a dead time as well."""
+    named = TIME_UNITS.keys() - {"", "d"}
+    return split_unit(name, lambda unit, _stem: unit.lower() in named)
 
 
 def to_samples(table: Table, assembly: Assembly) -> tuple[Samples, dict[str, int]]:

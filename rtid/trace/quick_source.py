@@ -17,6 +17,7 @@ from firmware_bridge.frames import Frames
 from firmware_bridge.sources import open_file
 from firmware_bridge.sources.table import MINUS, Table
 from rtid.errors import RtidError
+from rtid.plain import IntArray
 from rtid.project import guess as proposal
 from rtid.project.guess import RoleCandidate
 from rtid.trace.described import by_message
@@ -32,6 +33,7 @@ NEEDED = {
 }
 NOBODY: Mapping[str, RoleCandidate] = MappingProxyType({})
 ACTS = 0.02  # share of its largest value from which on a command acts, and of the time that it does
+SAME_TIME = 0.5  # share of rows with the time of the one before, from which on time tells nothing
 LEAST_STEP = 1e-6  # of a signal's range: computed values have no noise of their own
 
 
@@ -73,8 +75,23 @@ def _of_table(table: Table) -> Source:
         span = candidate.high - candidate.low
         steps[candidate.name] = max(smallest_step(values[np.isfinite(values)]), LEAST_STEP * span)
     t_us = table.t_us()
+    _refuse_coarse_stamps(table, time, t_us)
     step_ms = 1e-3 * period_of(t_us) if len(t_us) > 1 else 0.0
     return Source({"time_column": time, "time_unit": unit}, signals, {}, steps, step_ms)
+
+
+def _refuse_coarse_stamps(table: Table, time: str, t_us: IntArray) -> None:
+    """RtidError where most rows tell something new at the time of the row before; t_us (n,)."""
+    others = np.array([column for name, column in table.columns.items() if name != time])
+    is_new = np.any(np.diff(others, axis=1) != 0.0, axis=0) if len(others) else np.zeros(0, bool)
+    if len(t_us) < 3 or np.mean((np.diff(t_us) == 0) & is_new) <= SAME_TIME:
+        return
+    raise RtidError(
+        f"{table.path}: {len(np.unique(t_us))} times for {len(t_us)} rows: {time} is coarser than "
+        "its rows come, or in another unit",
+        f'log times as fine as the rows, or name the unit, "{time} [ms]"; "{time} [d]" of days, as '
+        "spreadsheets keep dates",
+    )
 
 
 def _one_command(table: Table, signals: list[RoleCandidate]) -> list[RoleCandidate]:

@@ -77,6 +77,34 @@ def test_dates_and_times_of_day(tmp_path: Path, first: str, second: str) -> None
     assert table.units["timestamp"] == "s"
 
 
+@pytest.mark.parametrize(
+    ("title", "first", "per_ms", "turn"),
+    [
+        ("time_ms", 86_399_000, 1, 86_400_000),  # since midnight
+        ("t [s]", 86_399.0, 1e-3, 86_400.0),
+        ("t_ms", 65_000, 1, 1 << 16),
+        ("t_us", 0, 1000, 1 << 16),  # over and over
+        ("t_us", (1 << 32) - 10_000, 1000, 1 << 32),
+        ("Zeit [d]", 45_352.5, 1 / 86_400_000, 1e9),  # as a spreadsheet keeps a date
+    ],
+)
+def test_a_time_that_begins_again_goes_on(
+    tmp_path: Path, title: str, first: float, per_ms: float, turn: float
+) -> None:
+    """A row each 4 ms; half of a record behind midnight was out of its order, and left out."""
+    stamps = (first + 4 * per_ms * np.arange(1000)) % turn
+    table = read(tmp_path, f"{title};u\n" + "".join(f"{t:.17g};1\n" for t in stamps))
+    steps = np.diff(table.t_us())
+    assert np.abs(steps - 4000).max() <= 2  # a double has days to 0.6 us
+
+
+def test_a_time_that_goes_back_by_anything_else_stays(tmp_path: Path) -> None:
+    """A second record behind the first, or rows out of their order."""
+    stamps = [*range(0, 60_000, 4), *range(0, 60_000, 4)]
+    table = read(tmp_path, "t_ms;u\n" + "".join(f"{t};1\n" for t in stamps))
+    assert table.t_us().tolist() == [1000 * t for t in stamps]
+
+
 def test_seconds_of_a_day_alone(tmp_path: Path) -> None:
     """pyarrow takes them for a type of its own."""
     assert np.diff(read(tmp_path, "Time,u\n08:00:00,1\n08:00:01,2\n").t_us()).tolist() == [10**6]
