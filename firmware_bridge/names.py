@@ -9,7 +9,9 @@ import re
 from collections.abc import Callable
 
 IsUnit = Callable[[str, str], bool]  # whether a text is a unit behind this stem
-_BRACKETS = re.compile(r"^(?P<stem>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]\s*$")
+_BRACKETS = re.compile(  # which may hold some of their own: [bar(a)]
+    r"^(?P<stem>.*?)\s*[\[(](?P<unit>(?:[^\[\]()]|[\[(][^\[\]()]*[\])])*)[\])]\s*$"
+)
 _QUOTIENT = re.compile(r"^(?P<stem>[^/]*?)\s*/\s*\(?(?P<unit>[^()]+)\)?\s*$")
 _WORDS = re.compile(r"[_\s.,]+")
 

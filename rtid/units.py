@@ -123,6 +123,8 @@ SIGNAL_UNITS = (
     Unit("degC", "degc", "temperature", 1.0, 273.15),
     Unit("K", "k", "temperature", 1.0),
     Unit("kg", "kg", "mass", 1.0),
+    # of a converter: of a command as good as any, and of what is measured no unit
+    Unit("counts", "counts", "duty", 1.0),
 )
 _KNOWN = UNITS + SIGNAL_UNITS
 _BY_NAME = {unit.name: unit for unit in _KNOWN}
@@ -134,6 +136,18 @@ _ALIASES = {
     "n/mm2": "MPa",
     "n/mm²": "MPa",
     "bara": "bar",
+    "bar gauge": "barg",
+    "bar (g)": "barg",
+    "bar g": "barg",
+    "psia": "psi",
+    "psi(a)": "psi",
+    "psi(g)": "psig",
+    "psi gauge": "psig",
+    "psi g": "psig",
+    "count": "counts",
+    "digits": "counts",
+    "digit": "counts",
+    "lsb": "counts",
     "bar(g)": "barg",
     "bar(a)": "bar",
     "1/min": "rpm",
@@ -164,7 +178,9 @@ _ALIASES = {
     "usec": "us",
     "days": "d",
 }
-NO_UNIT = {"", "-", "--", "1", "raw", "none", "n/a", "counts"}  # said, and says nothing
+NO_UNIT = {"", "-", "--", "1", "raw", "none", "n/a"}  # said, and says nothing
+# of a pressure; what is said of none is taken for absolute as well
+_ABSOLUTE = re.compile(r"(?<=\w)[\s_]*\(?\babs(?:\.|olute|olut|olu)?\)?$", re.IGNORECASE)
 # Last words of a name that mean something else as often: p_a is a chamber, p_s a supply, p_in an
 # inlet, x_min the lowest.  They count as units where a word of the stem is of their dimension.
 _AMBIGUOUS = {"m", "s", "a", "v", "l", "in", "n", "g", "h", "k", "pa", "min", "mode"}
@@ -286,7 +302,7 @@ def _digits(value: float) -> str:
 
 def find_unit(name: str) -> Unit | None:
     """The unit called `name`, exact spelling first ("mA" is not "MA"); None if there is none."""
-    name = name.strip()
+    name = _ABSOLUTE.sub("", name.strip())
     folded = name.casefold()
     alias = _BY_NAME.get(_ALIASES.get(folded, ""))
     return _BY_NAME.get(name) or alias or _BY_FOLDED_NAME.get(folded)

@@ -22,7 +22,7 @@ from rtid.maps.datasheet import read_reference
 from rtid.plain import FloatArray
 from rtid.project import load
 from rtid.project.guess import from_catalog, propose
-from rtid.study.quick_project import of_missing
+from rtid.study.quick_project import of_missing, of_units
 from rtid.trace.quick_source import open_source, roles_of
 from rtid.units import find_unit, split_name
 from tests.command import called
@@ -335,6 +335,56 @@ def test_counts_of_a_converter_are_no_position(tmp_path: Path) -> None:
     with pytest.raises(RtidError, match="in no unit of length") as refused:
         roles_of(path, open_source(path, None))
     assert "x_mm" in str(refused.value.remedy)
+
+
+@pytest.mark.parametrize(
+    ("title", "x", "says"),
+    [("x [counts]", 100.0, "the position"), ("x", 200.0, "in no unit of length")],
+)
+def test_counts_that_are_said_or_as_large_are_no_position(
+    tmp_path: Path, title: str, x: float, says: str
+) -> None:
+    """Those of 16 bits were um, with a stroke of 50 mm of 452."""
+    columns = machine()
+    columns[title] = x * columns.pop("x")
+    path = written(tmp_path / "m.csv", columns)
+    with pytest.raises(RtidError, match=says):
+        roles_of(path, open_source(path, None))
+
+
+def test_pressures_of_no_unit_s_size_are_asked_for(tmp_path: Path) -> None:
+    """70,000 mbar were taken for Pa."""
+    columns = machine() | {k: 1000 * v for k, v in machine().items() if k.startswith("p_")}
+    path = written(tmp_path / "m.csv", columns)
+    with pytest.raises(RtidError, match=r"p_s goes from .*: in no unit of pressure"):
+        roles_of(path, open_source(path, None))
+
+
+def test_a_unit_that_is_guessed_is_an_assumption(tmp_path: Path) -> None:
+    path = written(tmp_path / "m.csv", machine())
+    said_ = [a.what for a in of_units(roles_of(path, open_source(path, None)))]
+    assert said_ == ["p_s, p_t, p_a, p_b are in bar, by their range", "x is in mm, by its range"]
+
+
+@pytest.mark.parametrize(
+    ("written_", "known"),
+    [
+        ("bar(a)", "bar"), ("bar abs", "bar"), ("mbar abs.", "mbar"), ("bar (absolut)", "bar"),
+        ("MPa absolute", "MPa"), ("psi(g)", "psig"), ("bar(g)", "barg"), ("psia", "psi"),
+    ],
+)  # fmt: skip
+def test_absolute_and_gauge_pressures_keep_their_unit(written_: str, known: str) -> None:
+    """Behind "p_s [bar(a)]" no supply was seen, and one of 10 MPa was assumed."""
+    assert split_name(f"p_s [{written_}]") == split_name(f"p_s ({written_})") == ("p_s", known)
+
+
+def test_a_unit_of_pressure_that_nobody_knows_is_asked_for(tmp_path: Path) -> None:
+    """A table of a cylinder was one without pressures."""
+    columns = {f"{k} [kp]" if k[:2] == "p_" else k: v for k, v in machine().items()}
+    path = written(tmp_path / "m.csv", columns)
+    done = called("quick", path)
+    assert done.returncode == Exit.INPUT
+    assert "p_a [kp], p_b [kp]: no unit of pressure that is known" in " ".join(done.stderr.split())
 
 
 @pytest.mark.parametrize(

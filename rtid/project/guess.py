@@ -246,16 +246,19 @@ def with_unit(candidate: RoleCandidate, role: Role) -> RoleCandidate:
 def _likely(size: float, dimension: str, low: float, high: float) -> str:
     """The unit in which the largest value of a signal lies between two SI values; "" if none."""
     fitting = [u.name for u in units_of(dimension) if low <= size * u.factor <= high]
+    fitting = [name for name in fitting if name != "um"]  # of that size are a converter's counts
     preferred = [n for n in ("Pa", "bar", "m", "mm", "m/s", "mm/s", "MPa") if n in fitting]
     return (preferred or fitting or [""])[0]
 
 
 def is_beyond_units(candidate: RoleCandidate, kind: str) -> bool:
-    """Whether values in a unit that was guessed are larger than any machine's: they are counts."""
+    """Whether values in a unit that was guessed are no machine's in any: they may be counts."""
     unit = find_unit(candidate.unit)
+    least = 0.0 if kind == "position" else min(low for low, _ in LARGEST[kind])  # strokes are short
     most = max(high for _, high in LARGEST[kind])
     size = max(abs(candidate.low), abs(candidate.high))
-    return candidate.guessed_unit and unit is not None and size * unit.factor > most
+    is_one = unit is not None and (size == 0.0 or least <= size * unit.factor <= most)
+    return candidate.guessed_unit and not is_one
 
 
 def _number(value: object, otherwise: float) -> float:

@@ -38,7 +38,7 @@ from rtid.study.quick_machine import (
     fitted_machine,
     lag_of,
 )
-from rtid.study.quick_project import head_of, of_channels, of_missing, project_text
+from rtid.study.quick_project import head_of, of_channels, of_missing, of_units, project_text
 from rtid.study.quick_rate import QuickRate, quick_rate
 from rtid.study.rate_pairs import driven_pairs, pressed_pairs
 from rtid.study.rate_project import of_records, placed_near
@@ -46,7 +46,7 @@ from rtid.study.study import Study
 from rtid.trace.check import Report, judge
 from rtid.trace.coarse import at_crossings
 from rtid.trace.quick_data import BAD, Point, level_of, points
-from rtid.trace.quick_source import Source, open_source, roles_of
+from rtid.trace.quick_source import Source, open_source, refuse_unknown_units, roles_of
 from rtid.trace.reading import NoSamplesError, noise_of
 from rtid.trace.signals import Recording, read_recording
 
@@ -98,7 +98,7 @@ class Quick:
         """Whatever nobody has said."""
         missing = of_missing(self.roles, self.machine.supply_pa)
         channels = of_channels(self.source, self.roles)
-        return (*missing, *channels, *self.machine.assumptions)
+        return (*missing, *of_units(self.roles), *channels, *self.machine.assumptions)
 
     def text_for(self, file: Path) -> str:
         """The project file that was judged, with its assumptions, as it is written to a file."""
@@ -174,6 +174,7 @@ def quick(
     source = open_source(path, dbc)
     named = proposal.named(source.signals, roles)
     guessed = proposal.with_named(proposal.propose(source.signals), named)
+    refuse_unknown_units(path, source, guessed)
     is_table = "time_column" in source.keys
     if is_table and _is_rate(path, source, guessed, named):
         from rtid.study.quick_plant import quick_plant  # noqa: PLC0415 - brings the plants with it

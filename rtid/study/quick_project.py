@@ -160,6 +160,24 @@ def of_missing(roles: dict[str, RoleCandidate], supply_pa: float | None) -> list
     return assumptions
 
 
+def of_units(roles: dict[str, RoleCandidate]) -> list[Assumption]:
+    """Units that no file and no name says, guessed from how far a signal goes."""
+    assumptions = []
+    pressures = [c for r, c in roles.items() if r.startswith("p_") and c.guessed_unit]
+    if pressures:
+        names = ", ".join(c.name for c in pressures)
+        assumptions.append(Assumption(
+            f"{names} are in {pressures[0].unit}, by their range",
+            "every modulus is scaled by the true unit over this one",
+        ))  # fmt: skip
+    if roles["x"].guessed_unit:
+        assumptions.append(Assumption(
+            f"{roles['x'].name} is in {roles['x'].unit}, by its range",
+            "every flow, leak and map is scaled by the true unit over this one",
+        ))  # fmt: skip
+    return assumptions
+
+
 def of_channels(source: Source, roles: dict[str, RoleCandidate]) -> list[Assumption]:
     """Which channel is taken of a message that comes on several."""
     messages = sorted({c.message for c in roles.values()} & set(source.channels))

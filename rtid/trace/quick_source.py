@@ -187,13 +187,48 @@ def roles_of(
             f"{path}: {roles['x'].name} is an angle, and only you know what position it means",
             "write a project file with its table: rtid init",
         )
-    if proposal.is_beyond_units(roles["x"], "position"):
-        x = roles["x"]
+    _refuse_no_unit(path, roles["x"], "position", "length")
+    roles = _alike(roles)
+    pressures = (c for r, c in roles.items() if r.startswith("p_"))
+    _refuse_no_unit(path, max(pressures, key=lambda c: abs(c.high)), "pressure", "pressure")
+    return roles
+
+
+def _refuse_no_unit(path: Path, of: RoleCandidate, kind: str, what: str) -> None:
+    """RtidError for a signal without a unit whose size is none of a machine in any."""
+    if proposal.is_beyond_units(of, kind):
+        example = {"length": "mm", "pressure": "bar"}[what]
         raise RtidError(
-            f"{path}: {x.name} goes from {x.low:.4g} to {x.high:.4g}: in no unit of length",
-            f'counts of a converter? Give lengths, with the unit in the name, "{x.stem}_mm"',
+            f"{path}: {of.name} goes from {of.low:.4g} to {of.high:.4g}: in no unit of {what}",
+            f"counts of a converter? Give {what}s, with the unit in the name, "
+            f'"{of.stem}_{example}"',
         )
-    return _alike(roles)
+
+
+def refuse_unknown_units(path: Path, source: Source, roles: Mapping[str, RoleCandidate]) -> None:
+    """RtidError where chambers' pressures are none for their unit alone, which nobody knows."""
+    bare = [replace(c, unit="") if not find_unit(c.unit) else c for c in source.signals]
+    without = proposal.propose(bare)
+    lost = [c for c in source.signals for r in ("p_a", "p_b") if _is_lost(c, r, roles, without)]
+    if lost:
+        units = ", ".join(f"{c.name} [{c.unit}]" for c in lost)
+        raise RtidError(
+            f"{path}: {units}: no unit of pressure that is known",
+            "write Pa, kPa, MPa, bar, mbar or psi in its place; barg and psig count from the air",
+        )
+
+
+def _is_lost(
+    signal: RoleCandidate,
+    role: str,
+    roles: Mapping[str, RoleCandidate],
+    without: Mapping[str, RoleCandidate],
+) -> bool:
+    """Whether a signal would play a role that nobody plays, but for its unit."""
+    if role in roles or role not in without or not signal.unit:
+        return False
+    bare = without[role]
+    return (bare.message, bare.name) == (signal.message, signal.name) and bool(bare.guessed_unit)
 
 
 def is_motor(roles: Mapping[str, RoleCandidate]) -> bool:
