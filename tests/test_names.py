@@ -387,6 +387,18 @@ def test_a_unit_of_pressure_that_nobody_knows_is_asked_for(tmp_path: Path) -> No
     assert "p_a [kp], p_b [kp]: no unit of pressure that is known" in " ".join(done.stderr.split())
 
 
+@pytest.mark.parametrize("pattern", ["{}{}", "{}_{}", "cyl{1}_{0}"])
+def test_of_two_cylinders_that_are_numbered_one_is_taken(tmp_path: Path, pattern: str) -> None:
+    """The 2 of p_b2 was one more word for chamber b: of one cylinder were p_a, u and x."""
+    both = [(k, n) for n in (1, 2) for k in ("u", "x", "p_a", "p_b")]
+    columns = machine()
+    numbered = {pattern.format(k, n): columns[k] + n for k, n in both}
+    path = written(tmp_path / "m.csv", {"t": columns["t"], **numbered, "p_s": columns["p_s"]})
+    roles = roles_of(path, open_source(path, None))
+    of_one = {role: pattern.format(role, 1) for role in ("u", "x", "p_a", "p_b")}
+    assert {role: c.name for role, c in roles.items()} == of_one | {"p_supply": "p_s"}
+
+
 @pytest.mark.parametrize(
     "coarse",
     [lambda t: np.round(t, 2), lambda t: 45_352 + t / 86_400],

@@ -218,6 +218,8 @@ def _score(role: Role, candidate: RoleCandidate) -> float:
     if words & _ELSEWHERE:
         return 0.0
     known = role.words
+    if any(word in known and not word.isdigit() for word in words):
+        words = {word for word in words if not word.isdigit()}  # p_b2 is one of the second cylinder
     if role.kind == "pressure" and not (fits or words & _PRESSURE):
         known = frozenset(word for word in known if len(word) > 1)  # motor_1 is no chamber
     matched = len(words & known) + 2 * ("".join(sorted(words)) in role.alone)
