@@ -400,6 +400,25 @@ def test_of_two_cylinders_that_are_numbered_one_is_taken(tmp_path: Path, pattern
 
 
 @pytest.mark.parametrize(
+    "names",
+    [
+        "Temps,Commande,Position,Pression A,Pression B,Pression pompe,Pression retour",
+        "Tempo,Comando,Posição,Pressão A,Pressão B,Pressão bomba,Pressão tanque",
+    ],
+)
+def test_other_languages_have_a_time_a_supply_and_a_tank(tmp_path: Path, names: str) -> None:
+    """No column looked like time; a supply that was measured was assumed."""
+    columns, units = list(machine().values())[:7], ("s", "V", "mm", "bar", "bar", "bar", "bar")
+    titles = [f"{name} [{unit}]" for name, unit in zip(names.split(","), units, strict=True)]
+    roles = roles_of(
+        path := written(tmp_path / "m.csv", dict(zip(titles, columns, strict=True))),
+        open_source(path, None),
+    )
+    order = ("u", "x", "p_a", "p_b", "p_supply", "p_tank")
+    assert [roles[role].name for role in order] == names.split(",")[1:]
+
+
+@pytest.mark.parametrize(
     "coarse",
     [lambda t: np.round(t, 2), lambda t: 45_352 + t / 86_400],
     ids=["10 ms", "days, and no unit"],

@@ -35,6 +35,7 @@ APART = "in_turn"  # counter of the rows that give what they tell to others
 ALIKE = 0.1  # of a step: so near to a multiple it is one
 TIME_NAMES = ("t", "time", "timestamp", "zeit")  # with or without a unit behind: t_ms, time_s
 TIMES = {*TIME_NAMES, "datetime", "date_time", "uhrzeit", "zeitstempel", "elapsed_time", "x_value"}
+TIMES |= {"temps", "tempo", "tiempo", "\u65f6\u95f4"}
 TIME_UNITS = {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
 TIME_UNITS |= {"sec": 1.0, "seconds": 1.0, "msec": 1e-3, "usec": 1e-6, "h": 3600.0}
 TIME_UNITS |= {"d": DAY_S, "days": DAY_S}  # as spreadsheets keep a date

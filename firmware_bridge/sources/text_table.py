@@ -26,7 +26,8 @@ from firmware_bridge.sources.errors import LogError
 LOOKED_AT, LONGEST = 200, 1 << 20  # lines in which the names are looked for, characters of each
 DELIMITERS = ";\t,"
 NULLS = ("NA", "N/A", "n/a", "NULL", "null", "#N/A")  # pyarrow knows them by itself
-MISSING = ("---", "--", "-", "?", "OL", "Overload", "#NV", "#DIV/0!", "#VALUE!")
+OF_SHEETS = ("#NV", "#DIV/0!", "#VALUE!", "#NUM!", "#REF!", "#NAME?")
+MISSING = ("---", "--", "-", "?", "OL", "Overload", "None", "<NA>", *OF_SHEETS)
 UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 STAMP = re.compile(
     r"\s*(?:(\d{1,4})([-./])(\d{1,2})\2(\d{1,4})[T ]\s*)?(\d{1,3}):(\d\d):(\d\d)(?:[.,](\d+))?"

@@ -74,13 +74,14 @@ ROLES = (
         "p_supply",
         "pressure",
         "supply pump pmp system main line sup outlet pumpe pumpendruck systemdruck speisedruck "
-        "versorgung versorgungsdruck zulauf zulaufdruck",
+        "versorgung versorgungsdruck zulauf zulaufdruck pompe bomba alimentation",
         "ps p0 pp psys pressp presp pressurep druckp",
     ),
     _role(
         "p_tank",
         "pressure",
-        "tank return reservoir drain tankdruck ruecklauf ruecklaufdruck ablauf ablaufdruck",
+        "tank return reservoir drain tankdruck ruecklauf ruecklaufdruck ablauf ablaufdruck "
+        "retour retorno tanque",
         "pt pr pret",
     ),
     _role(

@@ -129,9 +129,9 @@ def test_a_spreadsheet_s_encoding(tmp_path: Path, code: str) -> None:
 
 
 def test_words_of_a_logger_for_nothing_are_missing_values(tmp_path: Path) -> None:
-    table = read(tmp_path, "t,p_a,p_b\n0,1,---\n1,OL,2\n2,3,#NV\n")
-    assert np.isnan(table.columns["p_a"]).tolist() == [False, True, False]
-    assert np.isnan(table.columns["p_b"]).tolist() == [True, False, True]
+    table = read(tmp_path, "t,p_a,p_b\n0,1,---\n1,OL,2\n2,3,#NV\n3,None,4\n4,<NA>,5\n5,6,#NUM!\n")
+    assert np.isnan(table.columns["p_a"]).tolist() == [False, True, False, True, True, False]
+    assert np.isnan(table.columns["p_b"]).tolist() == [True, False, True, False, False, True]
 
 
 def test_two_columns_of_one_name(tmp_path: Path) -> None:
