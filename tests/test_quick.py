@@ -221,6 +221,24 @@ def test_signs_and_units_are_found(
         assert units == {"p_a": "bar", "p_b": "bar", "p_supply": "bar", "u": "%", "x": "mm"}
 
 
+def test_a_command_of_4_to_20_ma_is_counted_from_12(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It opened one way alone: "edges.at never opens", and no verdict."""
+    monkeypatch.setattr(studies, "_likeliest", lambda *of: (None, of[3].machine))
+    c = columns(folder / "leak.parquet")
+    named = {name: c[name] for name in ("t", "x", "p_a", "p_b", "p_supply")}
+    looked = studies.quick(as_csv(tmp_path / "t.csv", u_of_mA__=12.0 + 0.8 * c["u"], **named))
+    assert isinstance(looked, studies.Quick)
+    assert looked.level == "fair"
+    assert looked.machine.u_zero == pytest.approx(12e-3, abs=0.2e-3)
+    assert any("u is counted from 1" in a.what for a in looked.assumptions)
+    saved = tmp_path / "machine.toml"
+    saved.write_text(looked.text_for(saved), "utf-8")
+    u = Study(load(saved), tmp_path / "t.csv").trace.samples.column("u")
+    assert u == pytest.approx(0.8e-3 * c["u"], abs=0.2e-3)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("what", WIRED)
 def test_the_verdict_is_that_of_the_machine_as_it_is_wired(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rtid.study.quick_band import creep, settled, shut_band
+from rtid.study.quick_band import BINS, creep, neutral_within, settled, shut_band
 
 
 def test_the_dead_band_is_half_of_where_motion_begins() -> None:
@@ -42,3 +42,31 @@ def test_a_machine_that_runs_on_is_not_one_that_moves() -> None:
     speed = 0.1 * np.where(t % 0.6 < 0.3, 1.0, np.exp((0.3 - t % 0.6) / 0.02)) * np.sign(u)
     assert shut_band(u, speed, settled(u, t)) == pytest.approx(4.0, abs=0.2)
     assert not settled(u, t)[u == 0.3].all(), "unless what was just before counts"
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+@pytest.mark.parametrize(("zero", "volt"), [(12.0, 0.8), (5.0, 0.5), (500.0, 48.0), (-2.5, 0.2)])
+def test_a_command_of_one_sign_that_drives_both_ways_is_counted_from_the_middle(
+    zero: float, volt: float, way: float
+) -> None:
+    """4 to 20 mA, 0 to 10 V, pulses: they opened one way only, and the other valves never did."""
+    v = np.linspace(-9.0, 7.0, 16_001)
+    speed = 0.03 * way * np.sign(v) * np.maximum(0.0, np.abs(v) - 1.2)
+    speed += np.random.default_rng(3).normal(0.0, 1e-3, len(v))
+    assert neutral_within(zero + volt * v, speed) == pytest.approx(zero, abs=16.0 * volt / BINS)
+    rests = np.append(v, np.zeros(4000))
+    assert neutral_within(zero + volt * rests, np.append(speed, np.zeros(4000))) == zero
+    overlapped = neutral_within(zero + volt * v, 0.03 * way * v)
+    assert overlapped == pytest.approx(zero, abs=16.0 * volt / BINS)
+
+
+def test_a_command_of_both_signs_or_of_one_way_is_counted_as_it_is() -> None:
+    v = np.linspace(-9.0, 7.0, 16_001)
+    speed = 0.03 * np.sign(v) * np.maximum(0.0, np.abs(v) - 1.2)
+    assert neutral_within(v, speed) == 0.0
+    assert neutral_within(np.abs(v), np.abs(speed)) == 0.0
+    assert neutral_within(np.abs(v), speed) == 0.0, "of either way at the same command"
+    assert neutral_within(np.maximum(v, 0.0), np.where(v > 1.2, speed, 0.0)) == 0.0
+    assert neutral_within(np.zeros(9), np.zeros(9)) == 0.0
+    assert neutral_within(12.0 + v, 0.0 * speed) == 0.0, "of a machine that never moves"
+    assert neutral_within(np.full(9, 12.0), np.zeros(9)) == 0.0

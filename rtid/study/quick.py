@@ -34,11 +34,19 @@ from rtid.study.quick_machine import (
     Assumption,
     Given,
     MachineSizes,
+    counted_from,
     first_machine,
     fitted_machine,
     lag_of,
 )
-from rtid.study.quick_project import head_of, of_channels, of_missing, of_units, project_text
+from rtid.study.quick_project import (
+    head_of,
+    of_channels,
+    of_missing,
+    of_neutral,
+    of_units,
+    project_text,
+)
 from rtid.study.quick_rate import QuickRate, quick_rate
 from rtid.study.rate_pairs import driven_pairs, pressed_pairs
 from rtid.study.rate_project import of_records, placed_near
@@ -98,7 +106,8 @@ class Quick:
         """Whatever nobody has said."""
         missing = of_missing(self.roles, self.machine.supply_pa)
         channels = of_channels(self.source, self.roles)
-        return (*missing, *of_units(self.roles), *channels, *self.machine.assumptions)
+        neutral = of_neutral(self.roles["u"], self.machine)
+        return (*missing, *of_units(self.roles), *neutral, *channels, *self.machine.assumptions)
 
     def text_for(self, file: Path) -> str:
         """The project file that was judged, with its assumptions, as it is written to a file."""
@@ -325,15 +334,17 @@ def _arranged(
     file: Path, path: Path, source: Source, roles: dict[str, RoleCandidate], given: Given
 ) -> Arranged:
     """Roles and machine with the signs that the motion asks for, and what check says of them."""
-    notes, turned = tuple[Assumption, ...](), frozenset[str]()
+    notes, turned, zero = tuple[Assumption, ...](), frozenset[str](), None
     while True:
-        first = replace(first_machine(roles, given), reversed=turned)
+        first = replace(first_machine(roles, given, zero or 0.0), reversed=turned)
         project = _project(file, path, source, roles, first)
         trace = read_recording(project, path)
         if len(trace.samples) < 2:
             raise RtidError(
                 f"{path}: no two complete samples", "`rtid check` counts what is refused"
             )
+        if zero is None and (zero := counted_from(trace.samples)):
+            continue
         # over 20 ms a position in steps of 0.5 mm stands still up to 25 mm/s
         lines = at_crossings(project.model, trace.samples)[0].values
         machine = fitted_machine(first, replace(trace.samples, values=lines))

@@ -16,6 +16,8 @@ STRAIGHT = 3.5  # times further to the next of them: 4 where it rises straight, 
 BINS = 80  # of the command
 STILL_BINS = 2  # by which a command may have been larger just before
 SETTLES_S = 0.1  # of just before: a machine that runs on stops within
+COMMON = 0.2  # share of the commands at which it stands that are one and the same: its neutral
+OBEYS = 0.8  # share of its way that a machine goes as its command says
 HALF, LEAST = 0.5, 0.125  # of the command where motion begins; the least, of where it is seen
 
 
@@ -58,6 +60,40 @@ def shut_band(u: FloatArray, speed: FloatArray, is_settled: BoolArray | None = N
         return min(HALF * begins, max(HALF * _begins(w, beyond, every), LEAST * begins))
 
     return min(surely(way * u / top) for way in (1, -1)) * top
+
+
+def neutral_within(u: FloatArray, speed: FloatArray) -> float:
+    """The neutral of a command of one sign that drives both ways: 4 to 20 mA rest at 12.
+
+    0 of any other: it is counted from its neutral, or drives one way, or the machine goes either
+    way at the same command.  u (n,) in any unit; speed (n,): dx/dt, m/s.
+    """
+    low, high = float(u.min(initial=0.0)), float(u.max(initial=0.0))
+    if min(-low, high) > MOVES * (high - low) or np.ptp(u) == 0.0:
+        return 0.0
+    forward = np.sign(np.sum((u - u.mean()) * speed)) * speed
+    neutral = _middle(u, forward, MOVES * float(np.quantile(np.abs(speed), 0.99)))
+    obeyed = forward * np.sign(u - neutral)
+    obeys = float(obeyed[obeyed > 0.0].sum()) > OBEYS * float(np.abs(speed).sum())
+    return neutral if obeys else 0.0
+
+
+def _middle(u: FloatArray, forward: FloatArray, stands: float) -> float:
+    """The middle of the commands (n,) at which the speed (n,) is less, or where it rests most.
+
+    nan where all motion is one way; forward: the larger the larger the command is; stands: m/s.
+    """
+    low, wide = float(u.min()), float(np.ptp(u))
+    place = np.minimum((BINS * (u - low) / wide).astype(int), BINS - 1)
+    bins, median = _rising(place, forward)
+    if min(-median[0], median[-1]) <= stands:
+        return float("nan")
+    still, turns = bins[np.abs(median) <= stands], int(np.searchsorted(median, 0.0))
+    still = still if len(still) else bins[turns - 1 : turns + 1]
+    values, counts = np.unique(u[(place >= still[0]) & (place <= still[-1])], return_counts=True)
+    if counts.max() >= COMMON * counts.sum():
+        return float(values[counts.argmax()])
+    return low + wide * float(still[0] + still[-1] + 1) / (2 * BINS)
 
 
 def _begins(w: FloatArray, beyond: FloatArray, usable: BoolArray) -> float:

@@ -15,7 +15,7 @@ from firmware_bridge.samples import ROW, Samples
 from rtid.plain import FloatArray
 from rtid.project.guess import RoleCandidate
 from rtid.project.template import EDGES, nice
-from rtid.study.quick_band import MOVES, creep, settled, shut_band
+from rtid.study.quick_band import MOVES, creep, neutral_within, settled, shut_band
 from rtid.study.spans import HELD_OUT_SHARE
 from rtid.trace.neutral import last_part_from
 from rtid.trace.quick_source import is_motor, unit_of
@@ -70,7 +70,7 @@ class MachineSizes:
     command_unit: that of its column.  noise_seen: 1 sigma by role, as the record tells it.
     supply_pa: of a supply that is not measured, as it was said.  extra_volumes: dead volume of each
     chamber beyond the assumed one, as fitted, m3, with its standard deviation.  lag_seen_s: as the
-    record tells it, None where it does not.
+    record tells it, None where it does not.  u_zero: what the command is counted from.
     """
 
     bore_m: float
@@ -97,6 +97,7 @@ class MachineSizes:
     supply_pa: float | None = None
     extra_volumes: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     lag_seen_s: float | None = None
+    u_zero: float = 0.0
 
     @property
     def displacement_m3(self) -> float:
@@ -117,16 +118,22 @@ def lag_of(machine: MachineSizes) -> tuple[float, float]:
     return lag_ms + quarter_ms, math.hypot(tolerance_ms, quarter_ms / math.sqrt(3.0))
 
 
-def first_machine(roles: dict[str, RoleCandidate], given: Given) -> MachineSizes:
-    """The machine from the ranges of its signals alone, as far as it takes to read the samples."""
-    return _first_motor(roles, given) if is_motor(roles) else _first_cylinder(roles, given)
+def first_machine(
+    roles: dict[str, RoleCandidate], given: Given, u_zero: float = 0.0
+) -> MachineSizes:
+    """The machine from the ranges of its signals alone, as far as it takes to read the samples.
+
+    u_zero: what its command is counted from, SI.
+    """
+    first = _first_motor if is_motor(roles) else _first_cylinder
+    return first(roles, given, u_zero)
 
 
-def _first_motor(roles: dict[str, RoleCandidate], given: Given) -> MachineSizes:
+def _first_motor(roles: dict[str, RoleCandidate], given: Given, u_zero: float) -> MachineSizes:
     volumes = given.dead_volumes_m3
     as_cylinder = replace(given, bore_m=math.sqrt(2.0 * TURN_M3) / math.pi, rod_m=0.0, stroke_m=1.0,
                           dead_volumes_m3=volumes or 2 * (DEAD_TURNS * TURN_M3,))  # fmt: skip
-    first = _first_cylinder(roles, as_cylinder)
+    first = _first_cylinder(roles, as_cylinder, u_zero)
     assumptions = (*_of_displacement(), *_of_dead_volumes(volumes is None))
     return replace(
         first,
@@ -152,7 +159,7 @@ def _of_dead_volumes(are_fitted: bool) -> Iterator[Assumption]:
         )
 
 
-def _first_cylinder(roles: dict[str, RoleCandidate], given: Given) -> MachineSizes:
+def _first_cylinder(roles: dict[str, RoleCandidate], given: Given, u_zero: float) -> MachineSizes:
     bore = given.bore_m or BORE_M
     rod = given.rod_m if given.rod_m is not None else ROD_SHARE * bore
     x, u = roles["x"], roles["u"]
@@ -160,7 +167,7 @@ def _first_cylinder(roles: dict[str, RoleCandidate], given: Given) -> MachineSiz
     zero = min(low, 0.0)
     stroke = given.stroke_m or nice(high - zero, 1.0)
     swept = math.pi / 4 * bore**2 * stroke
-    u_max = nice(max(abs(u.low), abs(u.high)) * unit_of(u).factor, 10.0)
+    u_max = nice(max(abs(unit_of(u).factor * end - u_zero) for end in (u.low, u.high)), 10.0)
     highest = max(unit_of(c).si(c.high) for r, c in roles.items() if r.startswith("p_"))
     top = nice(highest, SUPPLY_PA)
     return MachineSizes(
@@ -178,6 +185,7 @@ def _first_cylinder(roles: dict[str, RoleCandidate], given: Given) -> MachineSiz
         unit_of(u),
         assumptions=tuple(_of_geometry(given, bore, rod, stroke, zero)),
         supply_pa=given.supply_pa,
+        u_zero=u_zero,
     )
 
 
@@ -213,6 +221,11 @@ def _of_geometry(
             volumes.replace("volume of b is", "volumes are"),
         ))  # fmt: skip
     return [*assumptions, *_of_dead_volumes(fitted)]
+
+
+def counted_from(samples: Samples) -> float:
+    """The neutral of a command of one sign that drives both ways, SI; 0 of any other."""
+    return neutral_within(samples.column("u"), _speed(samples))
 
 
 def fitted_machine(machine: MachineSizes, samples: Samples) -> MachineSizes:

@@ -137,12 +137,32 @@ def _signals(
         if role == "x" and (turned or machine.x_zero_m):
             end_m = machine.stroke_m + machine.x_zero_m if turned else -machine.x_zero_m
             section["offset"] = end_m / unit_of(candidate).factor
+        if role == "u" and machine.u_zero:
+            section["offset"] = _neat(-section.get("scale", 1.0) * _from(candidate, machine))
         sections[role] = section
     if "p_supply" not in roles:
         sections["p_supply"] = {"unit": "Pa", "constant": machine.supply_pa or _supply_pa(roles)}
     if "p_tank" not in roles:
         sections["p_tank"] = {"unit": "Pa", "constant": TANK_PA}
     return sections
+
+
+def _from(command: RoleCandidate, machine: MachineSizes) -> float:
+    """What a command is counted from, in its unit."""
+    return machine.u_zero / unit_of(command).factor
+
+
+def of_neutral(command: RoleCandidate, machine: MachineSizes) -> list[Assumption]:
+    """What a command is counted from that never changes its sign."""
+    if not machine.u_zero:
+        return []
+    zero = f"{_from(command, machine):.4g} {command.unit}".rstrip()
+    return [
+        Assumption(
+            f"{command.name} is counted from {zero}, in the middle of where x stands (offset)",
+            "every map begins at another command, and one of each pair opens too early",
+        )
+    ]
 
 
 def of_missing(roles: dict[str, RoleCandidate], supply_pa: float | None) -> list[Assumption]:
