@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +10,7 @@ import pytest
 from pyarrow import array
 from pyarrow.parquet import read_table, write_table
 
-from tests.browser.conftest import Opened, open_page
+from tests.browser.conftest import Opened, open_page, record
 from tests.browser.geometry import DRAWN, SIZES
 from tests.ui.served import served
 
@@ -20,6 +19,7 @@ if TYPE_CHECKING:
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 TAU, HUM_HZ = 2.0 * np.pi, 11.0
+DURATION_S = 40.0
 # Every word that is written on a canvas since it was cleared, with its box in pixels of the window.
 LISTEN = """() => {
   const paper = CanvasRenderingContext2D.prototype, { fillText, clearRect } = paper;
@@ -46,17 +46,15 @@ CLASHES = """() => { const said = [];
 
 
 @pytest.fixture(scope="module")
-def unexplained(
-    browser: Browser, recorded: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Page]:
+def unexplained(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
     """The page of a record that no known effect explains: a pressure hums."""
-    trace, project = recorded
+    trace, project = record(tmp_path_factory.mktemp("hums"), DURATION_S)
     table = read_table(trace)
     at, t_s = table.column_names.index("p_a"), 1e-3 * np.arange(len(table))
     hums = array(table["p_a"].to_numpy() + 2e5 * np.sin(TAU * HUM_HZ * t_s))
     other = tmp_path_factory.mktemp("unexplained") / "hum.parquet"
     write_table(table.set_column(at, "p_a", hums), other)
-    with served(project=project.with_name("untouched.toml"), trace=other) as bench:
+    with served(project=project, trace=other) as bench:
         for opened in open_page(browser, bench):
             opened.page.add_init_script(f"({LISTEN})()")
             opened.go("why")
