@@ -439,6 +439,19 @@ def test_a_time_that_stands_while_rows_come_is_refused(
     assert "[d]" in str(refused.value.remedy)
 
 
+def test_rows_of_one_time_that_tell_signals_in_turn_are_read(tmp_path: Path) -> None:
+    """Four rows for each time, each with a signal of its own: none of them tells another time."""
+    names, lines = ("u [V]", "x [mm]", "p_a [bar]", "p_b [bar]"), list[str]()
+    for k in range(200):
+        for j in range(4):
+            told = ["", "", "", ""]
+            told[j] = f"{5.0 + np.sin(0.1 * k + j):.5f}"
+            lines.append(f"{0.01 * k:.2f},{','.join(told)}")
+    path = tmp_path / "m.csv"
+    path.write_text("\n".join([f"t [s],{','.join(names)}", *lines]) + "\n")
+    assert [c.stem for c in open_source(path, None).signals] == ["u", "x", "p_a", "p_b"]
+
+
 @pytest.mark.parametrize("overlap", [False, True])
 @pytest.mark.parametrize("prefix", ["", "valve - "])
 def test_a_coil_for_either_direction_is_one_command(

@@ -91,6 +91,8 @@ class Instants:
 
         The same for whatever is late: a step of a search must not change which rows count.
         """
+        if not len(self.starts):
+            return np.zeros(0, np.int64)
         run = np.searchsorted(self.starts, np.arange(len(self.t_s)), "right")
         since = np.where(run > 0, self.t_s - self.t_s[np.append(0, self.starts)][run], np.inf)
         forgotten_s = FORGOTTEN_S * max(1.0, self.step_s / QUICK_S)

@@ -66,7 +66,8 @@ def neutral_within(u: FloatArray, speed: FloatArray) -> float:
     """The neutral of a command of one sign that drives both ways: 4 to 20 mA rest at 12.
 
     0 of any other: it is counted from its neutral, or drives one way, or the machine goes either
-    way at the same command.  u (n,) in any unit; speed (n,): dx/dt, m/s.
+    way at the same command.  Where it stands, as plants without pressures take it, was the end of
+    the dead band on which a load leant: 12.9 mA.  u (n,) in any unit; speed (n,): dx/dt, m/s.
     """
     low, high = float(u.min(initial=0.0)), float(u.max(initial=0.0))
     if min(-low, high) > MOVES * (high - low) or np.ptp(u) == 0.0:

@@ -138,7 +138,7 @@ def _signals(
             end_m = machine.stroke_m + machine.x_zero_m if turned else -machine.x_zero_m
             section["offset"] = end_m / unit_of(candidate).factor
         if role == "u" and machine.u_zero:
-            section["offset"] = _neat(-section.get("scale", 1.0) * _from(candidate, machine))
+            section["offset"] = _neat(-section.get("scale", 1.0) * _neutral(candidate, machine))
         sections[role] = section
     if "p_supply" not in roles:
         sections["p_supply"] = {"unit": "Pa", "constant": machine.supply_pa or _supply_pa(roles)}
@@ -147,7 +147,7 @@ def _signals(
     return sections
 
 
-def _from(command: RoleCandidate, machine: MachineSizes) -> float:
+def _neutral(command: RoleCandidate, machine: MachineSizes) -> float:
     """What a command is counted from, in its unit."""
     return machine.u_zero / unit_of(command).factor
 
@@ -156,7 +156,7 @@ def of_neutral(command: RoleCandidate, machine: MachineSizes) -> list[Assumption
     """What a command is counted from that never changes its sign."""
     if not machine.u_zero:
         return []
-    zero = f"{_from(command, machine):.4g} {command.unit}".rstrip()
+    zero = f"{_neutral(command, machine):.4g} {command.unit}".rstrip()
     return [
         Assumption(
             f"{command.name} is counted from {zero}, in the middle of where x stands (offset)",

@@ -94,6 +94,7 @@ def test_behind_a_gap_it_begins_anew() -> None:
     assert instants_of(behind).unknown.tolist() == list(range(9000, 9205)), "0.2 s"
     assert not len(instants_of(behind[:9000]).unknown), "what began a record is taken as it was"
     assert instants_of(t_s[lost], (20, 49)).starts.tolist() == [49]
+    assert not len(instants_of(t_s[:0]).unknown), "nor is there any of an empty record"
 
 
 def rho_of(model: Machine, chunk: FloatArray, late_s: float) -> float:
