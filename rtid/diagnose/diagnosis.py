@@ -16,6 +16,7 @@ from rtid.diagnose.attenuation import apart_from_noise
 from rtid.diagnose.consequence import (
     ALIKE,
 )
+from rtid.diagnose.excuse import counting
 from rtid.diagnose.finer import finer_beside
 from rtid.diagnose.fit import Fit, fit
 from rtid.diagnose.held_again import held_again
@@ -140,6 +141,7 @@ def searched(standing: Standing, progress: Progress = silent) -> Result:
         said = MISSING
     reach: dict[Key, tuple[Candidate, Reach]] = {}
     if said != INSUFFICIENT:
+        present = counting(present)
         scores, nothing = apart_from_noise(present, scores)
         negligible = {key: share for key, share in negligible.items() if key not in nothing}
         scores = known_as_moduli(present, scores)

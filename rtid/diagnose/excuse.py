@@ -80,6 +80,8 @@ def counted(present: Fit) -> FloatArray:
 
     The noise's alone of a record that cannot be explained.
     """
+    if present.known_cov is not None:
+        return present.known_cov
     if not can_be_explained(present.sent):
         return present.compliance_cov
     record = *_machine(present), present.weights
@@ -89,6 +91,11 @@ def counted(present: Fit) -> FloatArray:
     covariance = covariance * np.outer(estimate.scale_pa, estimate.scale_pa)
     covariance = covariance * widened(*record, estimate) + _by_sizes(present)
     return _no_less(covariance, present.compliance_cov)
+
+
+def counting(present: Fit) -> Fit:
+    """The fit, which knows that covariance from now on."""
+    return present.knowing(known_cov=counted(present))
 
 
 def _no_less(covariance: FloatArray, least: FloatArray) -> FloatArray:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -71,8 +72,10 @@ class Fit:
     where they are, to which `map` belongs and which everything else is judged by.
     shapes: (effect, nonlinear parameter) of each column of shapes.  rows: of the record, for
     another fit with the same commands and weights; large.  suspects: scored beside the catalogue.
-    rest: what the maps leave of the record, if somebody has asked before.
-    spreads: (column, how far its size is from one number), where somebody has asked (`spread`).
+    rest: what the maps leave of the record, if somebody has asked before; known_cov: so of
+    `excuse.counted`.
+    spreads: (column, how far its size is from one number), where somebody has asked (`spread`);
+    shifts: (column, what its size over the whole record is more than what the rows show of it).
     """
 
     declared: Machine
@@ -90,7 +93,9 @@ class Fit:
     rows: Rows | None = None
     suspects: tuple[Effect, ...] = ()
     rest: Misfit | None = None
+    known_cov: FloatArray | None = None
     spreads: tuple[tuple[int, float], ...] = ()
+    shifts: tuple[tuple[int, float], ...] = ()
 
     @cached_property
     def model(self) -> Machine:
@@ -207,6 +212,10 @@ class Fit:
             return float("nan")
         return self.sd_on_its_way(at)
 
+    def size_of(self, column: int) -> float:
+        """A size over the whole record, SI."""
+        return self.held.value(column) + dict(self.shifts).get(column, 0.0)
+
     def sd_of(self, column: int) -> float:
         """Of a size, by the misfit that is left and by how far it is from one number."""
         sd = self.estimate.sd(column) * float(np.sqrt(max(1.0, self.rho)))
@@ -242,7 +251,11 @@ class Fit:
         """The same, with what its maps leave of the record; a long one has no room to keep it."""
         if len(self.chunk) >= LONG:
             return self
-        better = replace(self, rest=rest)
+        return self.knowing(rest=rest)
+
+    def knowing(self, **more: Any) -> Fit:
+        """The same with other fields, and with what was made of the record."""
+        better = replace(self, **more)
         kept = {"model", "sent", "view"} & vars(self).keys()
         vars(better).update({name: vars(self)[name] for name in kept})
         return better

@@ -31,7 +31,7 @@ def parameters(fit: Fit, key: Key) -> dict[str, Value]:
     for effect in fit.revision.effects:
         if effect.key == key:
             column = fit.column(effect)
-            value, sd = fit.held.value(column), fit.sd_of(column)
+            value, sd = fit.size_of(column), fit.sd_of(column)
             scale = physical(fit, effect, 1.0)
             if not effect.is_whole:
                 values[effect.parameter] = Value(scale * value, abs(scale) * sd, here(effect.unit))

@@ -37,7 +37,7 @@ def test_the_spread_is_what_sizes_differ_by_beyond_their_noise() -> None:
 
 def leaking(effect: str, strength: float, where: str, seed: int = 3) -> tuple[Fit, int]:
     """A machine that leaks, fitted with the leak, and the column of that."""
-    model, chunk, _ = record(effect, strength, seed)
+    model, chunk, _ = record(effect, strength, seed, where="" if where == "a-b" else where)
     weights = prepare(model, chunk)
     plain = one_pass(model, chunk, weights, Revision(), None, bank=True)
     leak = best_by_key(plain, scored(plain))[effect, where][0]
@@ -45,21 +45,39 @@ def leaking(effect: str, strength: float, where: str, seed: int = 3) -> tuple[Fi
     return found, found.column(leak)
 
 
-@pytest.mark.first_of(1)
-@pytest.mark.parametrize(("seed", "is_far"), [(3, True), (4, True), (5, False)])
-def test_a_size_is_as_far_from_that_over_the_record_as_it_says(seed: int, is_far: bool) -> None:
-    """The gap widens with the mean pressure, and what tells the leak is not all of its flow."""
-    found, column = leaking(LEAK, 2e-12, "a-b", seed)
-    size, (a, b) = found.held.value(column), (found.view.pressure(c) for c in (0, 1))
-    true = float(gap_flow.py_func(2e-12, a, b) @ (a - b) / ((a - b) @ (a - b)))
-    assert abs(size - true) < Z95 * with_spreads(found).sd_of(column) < 0.12 * size
-    assert not is_far or abs(size - true) > 5.0 * found.sd_of(column)
+@pytest.mark.first_of(2)
+@pytest.mark.parametrize(
+    ("where", "seed"), [("a-b", 6), ("b", 4), ("a-b", 3), ("b", 6), ("a-b", 5)]
+)
+def test_the_size_over_the_record_is_told_and_not_that_of_what_is_seen(
+    where: str, seed: int
+) -> None:
+    """The gap widens with a pressure, and the maps leave little but its slope: 2 to 12 % more."""
+    effect = LEAK if where == "a-b" else "external_leakage_laminar"
+    found, column = leaking(effect, 2e-12, where, seed)
+    p, other = (found.view.pressure(c) for c in (0, 1)) if where == "a-b" else (
+        found.view.pressure(1), np.zeros(found.view.n)
+    )  # fmt: skip
+    true = float(gap_flow.py_func(2e-12, p, other) @ (p - other) / ((p - other) @ (p - other)))
+    known = with_spreads(found)
+    size, sd = known.size_of(column), known.sd_of(column)
+    assert abs(size - true) < Z95 * sd < 0.02 * size
+    assert abs(found.held.value(column) - true) > 5.0 * sd
 
 
-def test_what_is_no_clear_difference_widens_no_interval() -> None:
-    assert spreading._beyond(1.9, 1.0) == 0.0 == spreading._beyond(0.0, 0.0)
-    assert spreading._beyond(-5.0, 16.0) == 0.0 and spreading._beyond(-5.0, 4.0) > 4.0
-    assert spreading._beyond(3.0, -1e-9) == 3.0  # rounding of two variances that are equal
+def test_a_size_goes_with_a_pressure_as_far_as_one_may_believe() -> None:
+    """By a prior among the normal equations; and where nothing is known of it, both are free."""
+    rng = np.random.default_rng(4)
+    y, z, more = rng.standard_normal((3, 40))
+    columns = np.stack([y + 2.0 * z + 0.7 * more, z, more + 0.8 * z], axis=1)
+    sizes = spreading._Sizes(columns.T @ columns, {0: 0, 5: 1}, np.zeros(3), np.zeros(3), 1.3)
+    for sd in (1e-6, 0.1, 0.5, 1e6):
+        gram = sizes.s[1:, 1:] + np.diag([0.0, 1.3 / sd**2])
+        size, var, _ = sizes.rising(5, 0, sd)
+        assert size == pytest.approx(np.linalg.solve(gram, sizes.s[1:, 0])[0], rel=1e-6)
+        assert var == pytest.approx(1.3 * np.linalg.inv(gram)[0, 0], rel=1e-6)
+    assert sizes.rising(5, 0, 1e-6)[:2] == pytest.approx(sizes.beside(5), rel=1e-6)
+    assert sizes.rising(5, 0, 0.3)[2] > sizes.rising(5, 0, 1e-3)[2]  # it does go with it
 
 
 def test_of_a_law_that_holds_the_pressures_tell_nothing_more() -> None:
@@ -71,15 +89,17 @@ def test_of_a_law_that_holds_the_pressures_tell_nothing_more() -> None:
 @pytest.mark.long
 @pytest.mark.slow
 def test_the_interval_of_a_leak_knows_that_its_gap_widens() -> None:
-    """The size that its own flow has over the record; the noise alone gave an interval of 0.1 %."""
+    """The size that its own flow has over what has taught it, and 3 % less than what is seen."""
     model, chunk, held_out = record(LEAK, 2e-12)
     (found,) = diagnosis(search(model, chunk, held_out)).found
     (size,) = found.parameters.values()
     truth = simulate(hide(draw(3), LEAK, 2e-12), "rich", 3, DURATION_S).truth
-    drop, flow = truth.signals[:, P_A] - truth.signals[:, P_B], -truth.extra_m3s[:, 0]
+    taught = slice(len(chunk))
+    drop = truth.signals[taught, P_A] - truth.signals[taught, P_B]
+    flow = -truth.extra_m3s[taught, 0]
     true = float(flow @ drop / (drop @ drop))
     print(f"{size.value:.4g} +- {Z95 * size.std:.2g}, true {true:.4g}")
-    assert abs(size.value - true) < Z95 * size.std < 0.1 * true
+    assert abs(size.value - true) < Z95 * size.std < 0.02 * true
 
 
 @pytest.mark.long
