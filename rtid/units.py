@@ -123,6 +123,7 @@ SIGNAL_UNITS = (
     Unit("degC", "degc", "temperature", 1.0, 273.15),
     Unit("K", "k", "temperature", 1.0),
     Unit("kg", "kg", "mass", 1.0),
+    Unit("‰", "permille", "duty", 0.1),
     # of a converter: of a command as good as any, and of what is measured no unit
     Unit("counts", "counts", "duty", 1.0),
 )
@@ -165,6 +166,12 @@ _ALIASES = {
     "degrees": "deg",
     "volt": "V",
     "percent": "%",
+    "permille": "‰",
+    "per mille": "‰",
+    "permil": "‰",
+    "promille": "‰",
+    "millimeter": "mm",
+    "millimetre": "mm",
     "µm": "um",
     "µs": "us",
     "\N{GREEK SMALL LETTER MU}m": "um",
@@ -199,6 +206,24 @@ _OF_DIMENSION = {
 _UPPER, _LOWER = "[A-ZÄÖÜ]", "[a-zäöüß]"
 _WORD = re.compile(rf"{_UPPER}+(?={_UPPER}{_LOWER})|{_UPPER}?{_LOWER}+|{_UPPER}+|\d+")
 _SPELT = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss"})
+_BARE = str.maketrans({"ł": "l", "Ł": "L", "ø": "o", "Ø": "O"})  # which are no letter and accent
+_IN_CHINESE = {
+    "\u65e0\u6746\u8154": "cap",
+    "\u6709\u6746\u8154": "rod",
+    "\u538b\u529b": "pressure",
+    "\u4f9b\u6cb9": "supply",
+    "\u7cfb\u7edf": "system",
+    "\u6cf5": "pump",
+    "\u56de\u6cb9": "return",
+    "\u6cb9\u7bb1": "tank",
+    "\u4f4d\u79fb": "position",
+    "\u4f4d\u7f6e": "position",
+    "\u884c\u7a0b": "stroke",
+    "\u901f\u5ea6": "velocity",
+    "\u6307\u4ee4": "command",
+    "\u63a7\u5236": "command",
+    "\u9600": "valve",
+}
 
 
 FLOW = "m3/s"  # of what the equations of a machine with pressures are in
@@ -330,9 +355,17 @@ def said(text: str) -> str:
 
 
 def words_of(name: str) -> set[str]:
-    """Words of a name: "PSupply" -> p, supply; "Rücklauf" -> ruecklauf, as it is often spelt."""
+    """Words of a name: "PSupply" -> p, supply; "Rücklauf" -> ruecklauf, as it is often spelt.
+
+    Accents are left out, Chinese ones are in English.
+    """
     composed = normalize("NFC", name)  # some systems write an umlaut as two letters
-    return {word.lower().translate(_SPELT) for word in _WORD.findall(composed)}
+    for written, meant in _IN_CHINESE.items():
+        composed = composed.replace(written, f" {meant} ")
+    plain = "".join(
+        letter if letter.lower() in "äöü" else normalize("NFD", letter)[0] for letter in composed
+    )
+    return {word.lower().translate(_SPELT) for word in _WORD.findall(plain.translate(_BARE))}
 
 
 def _suffix(text: str, stem: str, dimensions: Collection[str]) -> Unit | None:

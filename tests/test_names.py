@@ -22,8 +22,10 @@ from rtid.maps.datasheet import read_reference
 from rtid.plain import FloatArray
 from rtid.project import load
 from rtid.project.guess import from_catalog, propose
-from rtid.study.quick_project import of_missing, of_units
-from rtid.trace.quick_source import open_source, roles_of
+from rtid.study.quick_machine import Given, first_machine
+from rtid.study.quick_project import of_missing, of_units, project_text
+from rtid.trace.quick_source import open_source, refuse_unknown_units, roles_of
+from rtid.trace.signals import read_recording
 from rtid.units import find_unit, split_name
 from tests.command import called
 from tests.test_init import filled_in
@@ -387,6 +389,66 @@ def test_a_unit_of_pressure_that_nobody_knows_is_asked_for(tmp_path: Path) -> No
     assert "p_a [kp], p_b [kp]: no unit of pressure that is known" in " ".join(done.stderr.split())
 
 
+@pytest.mark.parametrize(
+    ("name", "title", "says", "remedy"),
+    [
+        ("x", "Position [%]", "Position [%]: no unit of length", "a hundredth of the stroke"),
+        ("x", "x [1/10 mm]", "x [1/10 mm]: no unit of length", "write mm"),
+        ("u", "u [mA/10]", "u [mA/10]: no unit of a command", "write V, mV, A, mA, %"),
+    ],
+)
+def test_a_unit_that_takes_a_role_away_is_named(
+    tmp_path: Path, name: str, title: str, says: str, remedy: str
+) -> None:
+    """No signal "could be the position"; what stood against it, nobody said."""
+    columns = machine()
+    columns[title] = columns.pop(name)
+    path = written(tmp_path / "m.csv", columns)
+    source = open_source(path, None)
+    with pytest.raises(RtidError, match=re.escape(says)) as refused:
+        refuse_unknown_units(path, source, propose(source.signals))
+    assert remedy in str(refused.value.remedy)
+
+
+def test_a_command_in_per_mille_is_one_in_per_cent(tmp_path: Path) -> None:
+    """Its project counts in %, as its grid does."""
+    columns = machine()
+    columns["u [‰]"] = 100.0 * columns.pop("u")
+    path = written(tmp_path / "m.csv", columns)
+    source = open_source(path, None)
+    roles = roles_of(path, source)
+    project = tmp_path / "p.toml"
+    machine_ = first_machine(roles, Given())
+    project.write_text(project_text("m", source, roles, machine_))
+    loaded = load(project)
+    u = read_recording(loaded, path).samples.column("u")
+    assert np.abs(u).max() == pytest.approx(80.0, rel=1e-3)
+    assert next(s.unit for s in loaded.model.signals if s.name == "u") == "%"
+
+
+@pytest.mark.parametrize("title", ["p_t [Pa]", "p_a [Pa]", "u [V]"])
+def test_a_column_of_no_numbers_that_would_play_a_role_is_named(tmp_path: Path, title: str) -> None:
+    """A tank that was measured was assumed, for a separator of thousands."""
+    columns = machine()
+    del columns[title[: title.index(" ")]]
+    rows = np.column_stack(list(columns.values()))
+    lines = [",".join([*columns, title]), *(",".join(map(str, row)) + ',"1,013.5"' for row in rows)]
+    path = tmp_path / "m.csv"
+    path.write_text("\n".join(lines))
+    says = f"{title}: '1,013.5' in line 2 is no number"
+    with pytest.raises(RtidError, match=re.escape(says)) as refused:
+        open_source(path, None)
+    assert "no separators of thousands" in str(refused.value.remedy)
+
+
+def test_a_time_that_is_none_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "m.csv"
+    path.write_text("Time,u\n59:58.0,1\n59:58.1,2\n")
+    with pytest.raises(RtidError, match=r"Time: '59:58.0' in line 2") as refused:
+        open_source(path, None)
+    assert "14:05:09.250" in str(refused.value.remedy)
+
+
 @pytest.mark.parametrize("pattern", ["{}{}", "{}_{}", "cyl{1}_{0}"])
 def test_of_two_cylinders_that_are_numbered_one_is_taken(tmp_path: Path, pattern: str) -> None:
     """The 2 of p_b2 was one more word for chamber b: of one cylinder were p_a, u and x."""
@@ -404,6 +466,15 @@ def test_of_two_cylinders_that_are_numbered_one_is_taken(tmp_path: Path, pattern
     [
         "Temps,Commande,Position,Pression A,Pression B,Pression pompe,Pression retour",
         "Tempo,Comando,Posição,Pressão A,Pressão B,Pressão bomba,Pressão tanque",
+        "Tempo,Comando,Curso,Pressão pistão,Pressão haste,Pressão de alimentação,Pressão retorno",
+        "Zeit,Stellsignal,Weg,Druck Kolbenseite,Druck Stangenseite,Pumpendruck,Rücklauf",
+        "Czas,Sterowanie,Położenie,Ciśnienie A,Ciśnienie B,Ciśnienie zasilania,Ciśnienie powrotu",
+        "czas,zawór,pozycja,cisnienie A,cisnienie B,cisnienie pompy,cisnienie zbiornika",
+        "时间,阀指令,活塞位移,A腔压力,B腔压力,供油压力,回油压力",
+        "时间,控制信号,位移,无杆腔压力,有杆腔压力,泵压力,油箱压力",
+        "Time,Valve::u,Motion::x,Press::p_a,Press::p_b,Press::p_s,Press::p_t",
+        "time,u:1,x:1,p_a:1,p_b:1,p_s:1,p_t:1",
+        "time,u\\CCP:1,x\\CCP:1,p_a\\CCP:1,p_b\\CCP:1,p_s\\CCP:1,p_t\\CCP:1",
     ],
 )
 def test_other_languages_have_a_time_a_supply_and_a_tank(tmp_path: Path, names: str) -> None:

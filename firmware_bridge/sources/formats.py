@@ -223,7 +223,7 @@ def _read(known: Format, file: Path, path: Path) -> Content:
 def _checked(table: Table) -> Table:
     """The table with NaN, a missing value, for what no sensor sends: its square must be finite."""
     if not table.columns:
-        raise LogError(f"{table.path}: holds no numeric column")
+        raise LogError(f"{table.path}: holds no numeric column{table.unread_said}")
     return replace(table, columns={n: _believable(c) for n, c in table.columns.items()})
 
 

@@ -8,8 +8,8 @@ kind of file, "p_a [MPa]" or "p_a (MPa)"; the unit in the metadata goes before i
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ APART = "in_turn"  # counter of the rows that give what they tell to others
 ALIKE = 0.1  # of a step: so near to a multiple it is one
 TIME_NAMES = ("t", "time", "timestamp", "zeit")  # with or without a unit behind: t_ms, time_s
 TIMES = {*TIME_NAMES, "datetime", "date_time", "uhrzeit", "zeitstempel", "elapsed_time", "x_value"}
-TIMES |= {"temps", "tempo", "tiempo", "\u65f6\u95f4"}
+TIMES |= {"temps", "tempo", "tiempo", "czas", "\u65f6\u95f4"}
 TIME_UNITS = {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
 TIME_UNITS |= {"sec": 1.0, "seconds": 1.0, "msec": 1e-3, "usec": 1e-6, "h": 3600.0}
 TIME_UNITS |= {"d": DAY_S, "days": DAY_S}  # as spreadsheets keep a date
@@ -48,11 +48,15 @@ Column = tuple[str, NDArray[np.float64], str]  # title, values (n,) and unit, ""
 
 @dataclass(frozen=True)
 class Table:
-    """Named columns float64 (n,) in the units of the file, and these units ("" if unknown)."""
+    """Named columns float64 (n,) in the units of the file, and these units ("" if unknown).
+
+    unread: why a column that may be meant is none of them, by its title.
+    """
 
     path: Path
     columns: dict[str, NDArray[np.float64]]
     units: dict[str, str]
+    unread: Mapping[str, str] = field(default_factory=dict)
 
     def known_as(self, name: str) -> str:
         """The name under which a column is kept; LogError with the nearest name if there is none.
@@ -82,6 +86,12 @@ class Table:
         parts = name.split(MINUS)
         halves = ((MINUS.join(parts[:k]), MINUS.join(parts[k:])) for k in range(1, len(parts)))
         return next((pair for pair in halves if all(one in self.columns for one in pair)), ())
+
+    @property
+    def unread_said(self) -> str:
+        """What is not read, and why, as the end of a sentence; "" where all is."""
+        said = ", ".join(f"{title} ({why})" for title, why in self.unread.items())
+        return f"; not read: {said}" if said else ""
 
     def time_name(self) -> str | None:
         """The column that looks like time, by its name; None if none does."""
@@ -319,20 +329,21 @@ def read_parquet(path: Path) -> Table:
     stamps = [field.name for field in file.schema_arrow if _is_stamp(field.type)]
     Budget(path).take(file.metadata.num_rows * NUMBER_BYTES * (len(fields) + len(stamps) + 1))
     result: list[Column] = []
-    for field in fields:
-        numbers = _numbers(file.read([field.name]).column(field.name))
-        meta = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
+    for entry in fields:
+        numbers = _numbers(file.read([entry.name]).column(entry.name))
+        meta = {k.decode().lower(): v.decode() for k, v in (entry.metadata or {}).items()}
         scale, offset = float(meta.get("scale", 1.0)), float(meta.get("offset", 0.0))
         with np.errstate(over="ignore", invalid="ignore"):  # damaged ones: missing values
             values = offset + scale * numbers
-        result.append((field.name, values, meta.get("unit", "")))
+        result.append((entry.name, values, meta.get("unit") or meta.get("units", "")))
     result += _timed((name, file.read([name]).column(name), "") for name in stamps)
     return named_columns(path, result)
 
 
 def read_text(path: Path) -> Table:
     """A table of text: .csv, .tsv, .txt; where its numbers begin is found, as is the delimiter."""
-    return named_columns(path, _timed(text_table.read(path)))
+    columns, unread = text_table.read(path)
+    return replace(named_columns(path, _timed(columns)), unread=unread)
 
 
 def _timed(columns: Iterable[tuple[str, Any, str]]) -> Iterator[Column]:

@@ -24,16 +24,17 @@ from firmware_bridge.names import split_brackets
 from firmware_bridge.sources.errors import LogError
 
 LOOKED_AT, LONGEST = 200, 1 << 20  # lines in which the names are looked for, characters of each
-DELIMITERS = ";\t,"
+DELIMITERS = ";\t,|"
 NULLS = ("NA", "N/A", "n/a", "NULL", "null", "#N/A")  # pyarrow knows them by itself
 OF_SHEETS = ("#NV", "#DIV/0!", "#VALUE!", "#NUM!", "#REF!", "#NAME?")
-MISSING = ("---", "--", "-", "?", "OL", "Overload", "None", "<NA>", *OF_SHEETS)
+MISSING = ("---", "--", "-", "?", "OL", "Overload", "None", "<NA>", "1.#INF", "-1.#INF", *OF_SHEETS)
 UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 STAMP = re.compile(
-    r"\s*(?:(\d{1,4})([-./])(\d{1,2})\2(\d{1,4})[T ]\s*)?(\d{1,3}):(\d\d):(\d\d)(?:[.,](\d+))?"
-    r"\s*(?:Z|[+-]\d\d:?\d\d)?\s*"
+    r"\s*(?:(\d{1,4})([-./])(\d{1,2})\2(\d{1,4})[T ]\s*)?(\d{1,3}):(\d\d):(\d\d)(?:[.,:](\d+))?"
+    r"\s*(?:([AaPp])\.?[Mm]\.?)?\s*(?:Z|[+-]\d\d:?\d\d)?\s*"
 )
 COMMA = re.compile(r"\d,\d")  # a decimal one, where no comma parts the columns
+DIGIT = "[0-9]"
 DAY_S, CENTURY = 86_400, 2000  # of years that are written with two digits
 
 
@@ -49,8 +50,11 @@ class Layout:
     encoding: str
 
 
-def read(path: Path) -> list[tuple[str, Any, str]]:
-    """Names, pyarrow columns, and units of a table of text; LogError, and pyarrow's errors."""
+def read(path: Path) -> tuple[list[tuple[str, Any, str]], dict[str, str]]:
+    """Names, pyarrow columns, and units of a table of text; and why a column is not read, by name.
+
+    Raises LogError, and pyarrow's errors.
+    """
     from pyarrow import csv as reader  # noqa: PLC0415  30 MB that only tables need
 
     layout = layout_of(path)
@@ -65,7 +69,60 @@ def read(path: Path) -> list[tuple[str, Any, str]]:
             decimal_point=layout.decimal, strings_can_be_null=True, null_values=missing
         ),
     )
-    return list(zip(layout.names, content.columns, layout.units, strict=True))
+    columns = [_without_words(column, layout.decimal) for column in content.columns]
+    unread = {}
+    for name, column in zip(layout.names, columns, strict=True):
+        if (k := _no_number(column, layout.decimal)) is not None:
+            written = column[k].as_py().strip()
+            unread[name] = f"{written!r} in line {layout.first + k + 1} is no number"
+    return list(zip(layout.names, columns, layout.units, strict=True)), unread
+
+
+def _without_words(column: Any, decimal: str) -> Any:
+    """A pyarrow column of numbers and a few words, "Error", as numbers, null for the words.
+
+    Any other as it is: what has digits and is no number is not taken for a missing value.
+    """
+    import pyarrow as pa  # noqa: PLC0415
+    import pyarrow.compute as pc  # noqa: PLC0415
+
+    if not _may_be_numbers(column):
+        return column
+    numbers = pc.if_else(pc.match_substring_regex(column, DIGIT), column, None)
+    if decimal == ",":  # a point parts thousands
+        numbers = pc.replace_substring(pc.replace_substring(numbers, ".", "?"), ",", ".")
+    try:
+        return numbers.cast(pa.float64())
+    except pa.ArrowInvalid:
+        return column
+
+
+def _no_number(column: Any, decimal: str) -> int | None:
+    """Where the first thing with digits stands that is no number, in a column of what should be."""
+    if not _may_be_numbers(column):
+        return None
+    other = "," if decimal == "." else "."
+    written = [k for k, value in enumerate(column) if value.is_valid]
+    texts = ((k, column[k].as_py()) for k in written)
+    strange = (k for k, text in texts if other in text or not _is_number(text))
+    return next((k for k in strange if re.search(DIGIT, column[k].as_py())), written[0])
+
+
+def _may_be_numbers(column: Any) -> bool:
+    """Whether at least half of a pyarrow column of text has digits, and it is no time."""
+    import pyarrow as pa  # noqa: PLC0415
+    import pyarrow.compute as pc  # noqa: PLC0415
+
+    if not pa.types.is_string(column.type) or _is_stamped(column):
+        return False
+    has_digits = pc.sum(pc.match_substring_regex(column, DIGIT)).as_py() or 0
+    return has_digits > 0 and 2 * has_digits >= len(column) - column.null_count
+
+
+def _is_stamped(column: Any) -> bool:
+    """Whether the first that is written in a pyarrow column of text is a time."""
+    written = (value.as_py() for value in column if value.is_valid)
+    return STAMP.fullmatch(next(written, "")) is not None
 
 
 def rows_of(path: Path) -> tuple[Layout, list[list[str]]]:
@@ -161,10 +218,15 @@ def _are_values(fields: list[str]) -> bool:
 
 
 def _is_value(field: str) -> bool:
+    is_one = _is_number(field) or STAMP.fullmatch(field) is not None
+    return is_one or field in (*MISSING, *NULLS)
+
+
+def _is_number(field: str) -> bool:
     try:
         float(field.replace(",", "."))
     except ValueError:
-        return STAMP.fullmatch(field) is not None or field in (*MISSING, *NULLS)
+        return False
     return True
 
 
@@ -187,8 +249,7 @@ def seconds(column: Any) -> NDArray[np.float64] | None:
         ticks = column.cast(pa.int32() if kind.bit_width == 32 else pa.int64())
         times = np.asarray(ticks.cast(pa.float64(), safe=False).to_numpy()) / per_s
         return times if pa.types.is_timestamp(kind) else _over_midnight(times)
-    written = (value.as_py() for value in column if value.is_valid)
-    if not pa.types.is_string(kind) or not STAMP.fullmatch(next(written, "")):
+    if not pa.types.is_string(kind) or not _is_stamped(column):
         return None
     stamps = np.fromiter(_stamps(column), np.float64, len(column))
     return stamps if np.nanmax(stamps) >= DAY_S else _over_midnight(stamps)
@@ -201,9 +262,10 @@ def _stamps(column: Any) -> Iterator[float]:
 
 
 def _second(match: re.Match[str]) -> float:
-    one, _, two, three, hours, minutes, whole, part = match.groups()
+    one, _, two, three, hours, minutes, whole, part, half = match.groups()
     days = _day(one, two, three) if one else 0
-    return DAY_S * days + 3600 * int(hours) + 60 * int(minutes) + float(f"{whole}.{part or 0}")
+    hour = int(hours) % 12 + 12 * (half in "Pp") if half else int(hours)
+    return DAY_S * days + 3600 * hour + 60 * int(minutes) + float(f"{whole}.{part or 0}")
 
 
 @lru_cache(maxsize=100)

@@ -33,7 +33,7 @@ from rtid.model import (
 from rtid.project.project import Sections
 from rtid.project.references import KINDS, OTHERS
 from rtid.project.schema import EdgeSection, MapSection, SignalSection
-from rtid.units import Unit, find_unit
+from rtid.units import Unit, find_unit, units_of
 
 MIN_GAP_S = 0.05
 _SI_UNIT = {"pressure": "Pa", "position": "m", "velocity": "m/s"}
@@ -227,7 +227,10 @@ def _si_unit(kind: str, unit: Unit, signal: SignalSection) -> str | None:
 
 
 def _command_unit(unit: Unit) -> str:
-    return unit.name if unit.factor == 1.0 else unit.name[-1]
+    """A command's own unit, without a prefix: of mA it is A, of ‰ it is %."""
+    if unit.factor == 1.0:
+        return unit.name
+    return next(known.name for known in units_of(unit.dimension) if known.factor == 1.0)
 
 
 def _kind(signal: SignalSection, unit: Unit) -> str:

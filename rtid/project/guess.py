@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,8 +15,9 @@ from rtid.errors import RtidError
 from rtid.project.references import KIND_DIMENSIONS
 from rtid.units import COMMAND_DIMENSIONS, find_unit, nearest, said, split_name, units_of, words_of
 
-_PRESSURE = {"p", "pressure", "press", "pres", "prs", "druck"}
+_PRESSURE = {"p", "pressure", "press", "pres", "prs", "druck", "pression", "pressao", "cisnienie"}
 _WANTED_NOT_MEASURED = {"ref", "reference", "set", "setpoint", "target", "desired", "demand", "des"}
+_WANTED_NOT_MEASURED |= {"soll", "sollwert"}
 # What the messages of an engine, a gearbox and a cab speak of, and no cylinder
 _ELSEWHERE = {
     *("engine", "eng", "vehicle", "wheel", "fuel", "coolant", "brake", "tire", "tyre", "intake"),
@@ -30,6 +32,7 @@ LARGEST = {
     "position": ((0.02, 5.0),),
     "velocity": ((0.005, 5.0),),
 }
+_PATH, _DEVICE = re.compile(r"::|[./]"), re.compile(r"(?:\\[\w:]+|:\d+)$")  # p_s\CCP:1
 _KIN = 0.25  # for each word that two signals of one cylinder share
 
 
@@ -48,6 +51,11 @@ class RoleCandidate:
     def stem(self) -> str:
         """The name without its unit."""
         return split_name(self.name)[0]
+
+    @property
+    def last_name(self) -> str:
+        """The stem without the path before it, and the port or device behind: "Press::p_s:1"."""
+        return _PATH.split(_DEVICE.sub("", self.stem))[-1]
 
     @property
     def full_name(self) -> str:
@@ -74,34 +82,45 @@ ROLES = (
         "p_supply",
         "pressure",
         "supply pump pmp system main line sup outlet pumpe pumpendruck systemdruck speisedruck "
-        "versorgung versorgungsdruck zulauf zulaufdruck pompe bomba alimentation",
+        "versorgung versorgungsdruck zulauf zulaufdruck pompe bomba alimentation alimentacao "
+        "zasilania zasilanie pompy",
         "ps p0 pp psys pressp presp pressurep druckp",
     ),
     _role(
         "p_tank",
         "pressure",
         "tank return reservoir drain tankdruck ruecklauf ruecklaufdruck ablauf ablaufdruck "
-        "retour retorno tanque",
+        "retour retorno tanque powrotu powrot zbiornika zbiornik",
         "pt pr pret",
     ),
     _role(
-        "p_a", "pressure", "a cap bore head piston 1 bottom base extend kolbendruck", "pa p1 pcap"
+        "p_a",
+        "pressure",
+        "a cap bore head piston 1 bottom base extend kolbendruck kolbenseite kolbenraum bodenseite "
+        "pistao tloka",
+        "pa p1 pcap",
     ),
     _role(
-        "p_b", "pressure", "b rod ring annulus 2 top retract stangendruck ringdruck", "pb p2 prod"
+        "p_b",
+        "pressure",
+        "b rod ring annulus 2 top retract stangendruck ringdruck stangenseite stangenraum "
+        "ringseite ringraum haste tloczyska",
+        "pb p2 prod",
     ),
     _role(
         "x",
         "position",
-        "x pos position stroke displacement length extension angle weg kolbenweg zylinderweg hub",
+        "x pos position stroke displacement length extension angle weg kolbenweg zylinderweg hub "
+        "zylinderhub posicao curso deslocamento polozenie pozycja przemieszczenie",
         "x s y",
     ),
-    _role("v", "velocity", "v vel velocity speed geschwindigkeit", "v xdot"),
+    _role("v", "velocity", "v vel velocity speed geschwindigkeit predkosc", "v xdot"),
     _role(
         "u",
         "command",
         "u cmd command valve vlv vpoc spool coil solenoid current pwm duty out voltage "
-        "ventil ventilstrom ventilspannung",
+        "ventil ventilstrom ventilspannung stellsignal stellgroesse sollwert commande comando "
+        "valvula sterowanie zaworu",
         "u i uv",
     ),
 )
@@ -224,7 +243,7 @@ def _score(role: Role, candidate: RoleCandidate) -> float:
     if role.kind == "pressure" and not (fits or words & _PRESSURE):
         known = frozenset(word for word in known if len(word) > 1)  # motor_1 is no chamber
     matched = len(words & known) + 2 * ("".join(sorted(words)) in role.alone)
-    matched += 2 * (candidate.stem.lower().replace("_", "") in role.alone)
+    matched += 2 * (candidate.last_name.lower().replace("_", "") in role.alone)
     only_kind = fits and role.kind in ("position", "velocity", "command")
     if not matched and not only_kind:
         return 0.0

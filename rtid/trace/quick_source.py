@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -23,13 +23,19 @@ from rtid.project.guess import RoleCandidate
 from rtid.trace.described import by_message
 from rtid.trace.steady import period_of
 from rtid.trace.table import time_of
-from rtid.units import Unit, find_unit
+from rtid.units import Unit, find_unit, split_name
 
 NEEDED = {
     "u": "the command of the valves",
     "x": "the position of the piston",
     "p_a": "the pressure of the chamber that grows with x",
     "p_b": "the pressure of the other chamber",
+}
+UNITS_OF = {
+    "pressure": "write Pa, kPa, MPa, bar, mbar or psi in its place; barg and psig count from the "
+    "air",
+    "length": "write mm, cm, m, um or in in its place",
+    "a command": "write V, mV, A, mA, %, ‰ or counts in its place, or nothing",
 }
 NOBODY: Mapping[str, RoleCandidate] = MappingProxyType({})
 ACTS = 0.02  # share of its largest value from which on a command acts, and of the time that it does
@@ -68,7 +74,9 @@ def _of_table(table: Table) -> Source:
     from rtid.trace.series import smallest_step  # noqa: PLC0415 - it brings the estimator with it
 
     time, unit = time_of(table)
-    signals = _one_command(table, proposal.from_table(table))
+    signals = proposal.from_table(table)
+    _refuse_unread(table, signals)
+    signals = _one_command(table, signals)
     steps = {}
     for candidate in signals:
         values = table.column(candidate.name)
@@ -78,6 +86,23 @@ def _of_table(table: Table) -> Source:
     _refuse_coarse_stamps(table, time, t_us)
     step_ms = 1e-3 * period_of(t_us) if len(t_us) > 1 else 0.0
     return Source({"time_column": time, "time_unit": unit}, signals, {}, steps, step_ms)
+
+
+def _refuse_unread(table: Table, signals: list[RoleCandidate]) -> None:
+    """RtidError where a column would play a role that none of the signals plays, were it read."""
+    titles = {split_name(title)[0]: title for title in table.unread}
+    texts = [RoleCandidate(split_name(t)[0], "", split_name(t)[1], 0.0, 0.0) for t in table.unread]
+    played = proposal.propose(signals).keys()
+    lost = [
+        titles[candidate.name]
+        for role, candidate in proposal.propose([*signals, *texts]).items()
+        if role not in played and candidate.name in titles
+    ]
+    if lost:
+        raise RtidError(
+            f"{table.path}: " + "; ".join(f"{title}: {table.unread[title]}" for title in lost),
+            "write plain numbers, 1234.5: no separators of thousands, no units in the fields",
+        )
 
 
 def _refuse_coarse_stamps(table: Table, time: str, t_us: IntArray) -> None:
@@ -212,29 +237,43 @@ def _refuse_no_unit(path: Path, of: RoleCandidate, kind: str, what: str) -> None
 
 
 def refuse_unknown_units(path: Path, source: Source, roles: Mapping[str, RoleCandidate]) -> None:
-    """RtidError where chambers' pressures are none for their unit alone, which nobody knows."""
+    """RtidError where a signal plays no role of a cylinder for its unit alone.
+
+    Chambers' pressures of a unit that nobody knows; beside them a position and a command of any.
+    """
+    known = {(c.message, c.name) for c in roles.values()}
     bare = [replace(c, unit="") if not find_unit(c.unit) else c for c in source.signals]
-    without = proposal.propose(bare)
-    lost = [c for c in source.signals for r in ("p_a", "p_b") if _is_lost(c, r, roles, without)]
-    if lost:
-        units = ", ".join(f"{c.name} [{c.unit}]" for c in lost)
-        raise RtidError(
-            f"{path}: {units}: no unit of pressure that is known",
-            "write Pa, kPa, MPa, bar, mbar or psi in its place; barg and psig count from the air",
-        )
+    _refuse_lost(path, "pressure", _lost(source, bare, ("p_a", "p_b"), roles))
+    if {"p_a", "p_b"} <= roles.keys():
+        bare = [c if (c.message, c.name) in known else replace(c, unit="") for c in source.signals]
+        _refuse_lost(path, "length", _lost(source, bare, ("x",), roles))
+        _refuse_lost(path, "a command", _lost(source, bare, ("u",), roles))
 
 
-def _is_lost(
-    signal: RoleCandidate,
-    role: str,
+def _refuse_lost(path: Path, kind: str, lost: list[RoleCandidate]) -> None:
+    if not lost:
+        return
+    units = ", ".join(f"{c.name} [{c.unit}]" for c in lost)
+    remedy = UNITS_OF[kind]
+    if kind == "length" and lost[0].unit == "%":
+        remedy = f'give it in mm, "{lost[0].stem} [mm]": 1 % is a hundredth of the stroke'
+    raise RtidError(f"{path}: {units}: no unit of {kind} that is known", remedy)
+
+
+def _lost(
+    source: Source,
+    bare: list[RoleCandidate],
+    wanted: Sequence[str],
     roles: Mapping[str, RoleCandidate],
-    without: Mapping[str, RoleCandidate],
-) -> bool:
-    """Whether a signal would play a role that nobody plays, but for its unit."""
-    if role in roles or role not in without or not signal.unit:
-        return False
-    bare = without[role]
-    return (bare.message, bare.name) == (signal.message, signal.name) and bool(bare.guessed_unit)
+) -> list[RoleCandidate]:
+    """The signals that would play a role of those wanted, which nobody plays, but for their unit.
+
+    bare: the same signals, some of them without one.
+    """
+    without = proposal.propose(bare)
+    played = (without[r] for r in wanted if r in without and r not in roles)
+    names = [(c.message, c.name) for c in played if c.guessed_unit]
+    return [c for c in source.signals if c.unit and (c.message, c.name) in names]
 
 
 def is_motor(roles: Mapping[str, RoleCandidate]) -> bool:

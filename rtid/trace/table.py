@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from firmware_bridge.config import Assembly
-from firmware_bridge.sources.table import TIME_NAMES, Table
+from firmware_bridge.sources.table import TIME_NAMES, Table, is_time
 from rtid.errors import RtidError
 from rtid.project.guess import unit_said
 from rtid.project.project import Project
@@ -69,9 +69,17 @@ def time_of(table: Table) -> tuple[str, str]:
     """The column that looks like time, and its unit.  Raises RtidError, LogError."""
     name = table.time_name()
     if name is None:
+        written = next((title for title in table.unread if is_time(title)), None)
+        if written is not None:
+            raise RtidError(
+                f"{table.path}: {written}: {table.unread[written]} and no time that is known",
+                "write seconds, or 14:05:09.250, with or without a date, 2026-03-01, before it",
+            )
         raise RtidError(
-            f"{table.path}: no column looks like time; it has {', '.join(table.columns)}",
-            f"call it one of {', '.join(TIME_NAMES)}, with its unit behind: t_ms",
+            f"{table.path}: no column looks like time; it has {', '.join(table.columns)}"
+            f"{table.unread_said}",
+            f"call it one of {', '.join(TIME_NAMES)}, with its unit behind: t_ms; the names stand "
+            "in one line, right above the numbers or above one of units",
         )
     table.seconds(name)  # refuses a unit that is none of time
     return name, said(table.time_unit(name)) or "s"

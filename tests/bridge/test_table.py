@@ -69,6 +69,13 @@ def test_parquet_scale_offset_unit(tmp_path: Path) -> None:
     assert counts == {}
 
 
+@pytest.mark.parametrize("key", ["unit", "Unit", "units"])
+def test_a_unit_in_parquet_is_read_however_its_key_is_spelt(tmp_path: Path, key: str) -> None:
+    schema = pa.schema([pa.field("p_a", pa.float64(), metadata={key: "bar"})])
+    pq.write_table(pa.Table.from_arrays([pa.array([1.0])], schema=schema), tmp_path / "t.parquet")
+    assert read_table(tmp_path / "t.parquet").units == {"p_a": "bar"}
+
+
 def test_mat(tmp_path: Path) -> None:
     t = np.arange(5) * 1e-3
     savemat(tmp_path / "t.mat", {"t": t[:, None], "u": t * 2, "p": t, "k": 3.0, "m": np.eye(3)})

@@ -164,3 +164,52 @@ def test_a_line_without_end_is_no_table(tmp_path: Path) -> None:
     """It was cut into lines of their own, and the numbers began in its middle."""
     with pytest.raises(LogError, match="more than a million characters"):
         read(tmp_path, "t,u," + "x," * 600_000 + "\n0,1\n")
+
+
+@pytest.mark.parametrize(
+    "stamps",
+    [
+        ("11:59:59.500 AM", "12:00:00.000 PM"),
+        ("3/1/2026 11:59:59.500 am", "3/1/2026 12:00:00.000 pm"),
+        ("11:59:59:500", "12:00:00:000"),
+    ],
+)
+def test_halves_of_a_day_and_colons_before_milliseconds(
+    tmp_path: Path, stamps: tuple[str, str]
+) -> None:
+    table = read(tmp_path, f"Time,p\n{stamps[0]},1\n{stamps[1]},2\n")
+    first, second = table.seconds("Time")
+    assert first % 86_400 == 43_199.5 and second - first == 0.5
+
+
+@pytest.mark.parametrize("word", ["Bad", "*", "########", " ", "∞", "1.#INF", "NaN (Ind)"])
+@pytest.mark.parametrize("comma", [True, False])
+def test_words_among_numbers_are_missing_values(tmp_path: Path, word: str, comma: bool) -> None:
+    text = f"t;p\n0.5;1.5\n1.5;{word}\n2.5;2.5\n3.5;3.5\n"
+    text = text.replace(".5", ",5") if comma else text
+    np.testing.assert_array_equal(read(tmp_path, text).columns["p"], [1.5, np.nan, 2.5, 3.5])
+
+
+@pytest.mark.parametrize(
+    ("text", "written", "line"),
+    [
+        ('t,p [Pa]\n0,950.5\n1,bad\n2,"1,234.5"\n', "1,234.5", 4),
+        ("t;p [Pa]\n0,5;950,5\n1,5;1.234,5\n", "1.234,5", 3),
+        ("t;p [Pa]\n0,5;950,5\n1,5;1.234\n", "1.234", 3),
+        ("# of the rig\nt;p [Pa]\n\n0.5;2 Pa\n1.5;3 Pa\n", "2 Pa", 4),
+    ],
+)
+def test_a_number_that_is_none_is_named_with_its_line(
+    tmp_path: Path, text: str, written: str, line: int
+) -> None:
+    table = read(tmp_path, text)
+    assert table.unread == {"p [Pa]": f"{written!r} in line {line} is no number"}
+
+
+def test_words_alone_are_a_text_and_nothing_that_is_missed(tmp_path: Path) -> None:
+    table = read(tmp_path, "t,state\n0,idle\n1,step 2\n2,idle\n")
+    assert not table.unread and set(table.columns) == {"t"}
+
+
+def test_columns_that_are_parted_by_strokes(tmp_path: Path) -> None:
+    assert columns(read(tmp_path, "t|p\n0|1.5\n1|2.5\n")) == {"t": [0, 1], "p": [1.5, 2.5]}
