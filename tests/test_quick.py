@@ -239,6 +239,23 @@ def test_a_command_of_4_to_20_ma_is_counted_from_12(
     assert u == pytest.approx(0.8e-3 * c["u"], abs=0.2e-3)
 
 
+def test_a_machine_that_is_off_at_4_ma_is_told_to_be_cut_out(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Four fifths of the record: the neutral was 0 mA, and what to do was "command less"."""
+    monkeypatch.setattr(studies, "_likeliest", lambda *of: (None, of[3].machine))
+    c = {name: values[::4] for name, values in columns(folder / "leak.parquet").items()}
+    off, noise = 4 * len(c["t"]), np.random.default_rng(1).normal(0.0, 1e-4, 4 * len(c["t"]))
+    named = {name: np.append(c[name][0] * (1 + noise), c[name]) for name in ("x", "p_a", "p_b")}
+    u = np.append(np.full(off, 4.0), 12.0 + 0.8 * c["u"])
+    table = as_csv(tmp_path / "t.csv", t=0.004 * np.arange(len(u)), u_of_mA__=u, **named)
+    looked = studies.quick(table)
+    assert isinstance(looked, studies.Quick)
+    assert looked.machine.u_zero == pytest.approx(12e-3, abs=0.2e-3)
+    (ends,) = (one for one in looked.points if one.text.startswith("u stands at its end"))
+    assert "nothing moves" in ends.text and "cut that out" in ends.remedy
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("what", WIRED)
 def test_the_verdict_is_that_of_the_machine_as_it_is_wired(

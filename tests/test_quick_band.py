@@ -60,6 +60,21 @@ def test_a_command_of_one_sign_that_drives_both_ways_is_counted_from_the_middle(
     assert overlapped == pytest.approx(zero, abs=16.0 * volt / BINS)
 
 
+@pytest.mark.parametrize("rests", [400, 400_000])
+def test_a_command_that_rests_at_4_ma_before_it_is_switched_on_is_counted_from_12(
+    rests: int,
+) -> None:
+    """Of a machine that was off for 99 % of its record no neutral was found."""
+    v = np.linspace(-7.0, 7.0, 1_601)
+    speed = 0.03 * np.sign(v) * np.maximum(0.0, np.abs(v) - 1.2)
+    u = np.append(np.full(rests, 4.0), 12.0 + v)
+    noise = np.random.default_rng(3).normal(0.0, 1e-3, rests)
+    found = neutral_within(u, np.append(noise, speed))
+    assert found == pytest.approx(12.0, abs=16.0 / BINS)
+    one_way = np.append(np.full(rests, 4.0), 12.0 + np.abs(v))
+    assert neutral_within(one_way, np.append(np.zeros(rests), np.abs(speed))) == 0.0
+
+
 def test_a_command_of_both_signs_or_of_one_way_is_counted_as_it_is() -> None:
     v = np.linspace(-9.0, 7.0, 16_001)
     speed = 0.03 * np.sign(v) * np.maximum(0.0, np.abs(v) - 1.2)

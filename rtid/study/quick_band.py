@@ -67,8 +67,18 @@ def neutral_within(u: FloatArray, speed: FloatArray) -> float:
 
     0 of any other: it is counted from its neutral, or drives one way, or the machine goes either
     way at the same command.  Where it stands, as plants without pressures take it, was the end of
-    the dead band on which a load leant: 12.9 mA.  u (n,) in any unit; speed (n,): dx/dt, m/s.
+    the dead band on which a load leant: 12.9 mA.  Before it is switched on such a command rests at
+    its least, 4 mA, and that tells nothing.  u (n,) in any unit; speed (n,): dx/dt, m/s.
     """
+    neutral = _neutral_of(u, speed)
+    if neutral or not len(u):
+        return neutral
+    is_on = u > u.min() + np.ptp(u) / BINS
+    return _neutral_of(u[is_on], speed[is_on]) if is_on.any() else 0.0
+
+
+def _neutral_of(u: FloatArray, speed: FloatArray) -> float:
+    """The neutral as above, of all samples (n,) alike."""
     low, high = float(u.min(initial=0.0)), float(u.max(initial=0.0))
     if min(-low, high) > MOVES * (high - low) or np.ptp(u) == 0.0:
         return 0.0

@@ -23,6 +23,7 @@ LEAST_S, FEW_S = 10.0, 30.0
 LEAST_HZ, FEW_HZ = 10.0, 200.0  # rows per second
 ENOUGH = "a minute or two, every signal as often as the controller has it"
 FEW_BLOCKS = 10  # of one valve, with enough rows
+STILL = 0.02  # of the whole way of the position: it stands
 AT_END = 0.01  # share of the samples at one and the same extreme value
 HELD_STILL = 0.05  # share of the time with shut valves that tells leaks from maps
 VARIED = 0.05  # of its mean: from which on a supply is said to vary
@@ -118,17 +119,30 @@ def _ends(model: Machine, trace: Recording) -> Iterator[Point]:
         if signal.kind not in ("command", "pressure"):
             continue
         values = trace.samples.column(signal.name)
-        shares = [float((values == end).mean()) for end in (values.min(), values.max())]
-        if np.ptp(values) > 0 and max(shares) > AT_END and _rests_at_end(values, max(shares)):
-            text = f"{signal.name} stands at its end value {100 * max(shares):.1f} % of the time"
+        if np.ptp(values) == 0.0:
+            continue
+        ends = (float(values.min()), float(values.max()))
+        share, end = max((float((values == end).mean()), end) for end in ends)
+        is_off = signal.kind == "command" and _is_off(model, trace, values, end)
+        if share > AT_END and (is_off or _rests_at_end(values)):
+            text = f"{signal.name} stands at its end value {100 * share:.1f} % of the time"
             what = "command less" if signal.kind == "command" else "is the sensor's range enough?"
+            if is_off:
+                text += ", and nothing moves meanwhile"
+                what += "; if the machine was off, cut that out: the maps learn no flow there"
             yield Point(FAIR, text, what)
 
 
-def _rests_at_end(values: FloatArray, share: float) -> bool:
+def _is_off(model: Machine, trace: Recording, u: FloatArray, end: float) -> bool:
+    """Whether the machine stands wherever the command u (n,) is at this end, which is not zero."""
+    x = trace.samples.column(model.position)
+    return bool(abs(end) > AT_END * np.ptp(u) and np.ptp(x[u == end]) <= STILL * np.ptp(x))
+
+
+def _rests_at_end(values: FloatArray) -> bool:
     """True where the end is no usual value, as zero is for a command that rests."""
     usual = float(np.median(values))
-    return usual not in (values.min(), values.max()) and share > AT_END
+    return usual not in (values.min(), values.max())
 
 
 def _coverage(report: Report) -> Iterator[Point]:
