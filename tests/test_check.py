@@ -276,6 +276,17 @@ def test_series_without_values_and_frozen_spans() -> None:
     assert (nothing.count, nothing.missing) == (0, 3000)
 
 
+def test_a_time_that_begins_again_is_no_log_to_be_sorted(folder: Path, tmp_path: Path) -> None:
+    """Half of the record was left out, and what to do was "sort the log"."""
+    table = pq.read_table(folder / "trace.parquet")
+    pq.write_table(pa.concat_tables([table, table]), tmp_path / "trace.parquet")
+    (tmp_path / "trace.toml").write_text((folder / "trace.toml").read_text())
+    found = judged(tmp_path, lambda raw: None).findings
+    (said,) = (finding for finding in found if "go back" in finding.text)
+    assert f"{len(table)} samples are left out" in said.text
+    assert "two records in one file?" in said.remedy
+
+
 def test_timing_counts_gaps_and_backward_stamps() -> None:
     t_us = np.arange(1000, dtype=np.int64) * 10_000
     t_us[500:] += 90_000

@@ -346,6 +346,15 @@ def test_data_that_cannot_bear_a_verdict_end_with_4(
     assert "No verdict" in done.stdout
 
 
+def test_a_time_in_ms_that_does_not_say_so_is_asked_for(folder: Path, tmp_path: Path) -> None:
+    """24 s were 24,000, and too little: "record a minute or two"."""
+    c = {name: values[::4] for name, values in columns(folder / "leak.parquet").items()}
+    named = {name: c[name] for name in ("u", "x", "p_a", "p_b")}
+    looked = studies.quick(as_csv(tmp_path / "t.csv", time=1e3 * c["t"], **named))
+    assert isinstance(looked, studies.Quick)
+    assert 'name the unit of its time, "t [ms]"' in looked.points[0].remedy
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("is_noisy", [False, pytest.param(True, marks=STILL)])
 def test_a_machine_that_rests_at_the_end_is_judged_by_the_end_of_its_motion(

@@ -44,6 +44,7 @@ PACKED = {  # what unpacks them
     ".zip": "unzip",
 }
 HEAD_BYTES, PIECE_BYTES = 256, 1 << 20
+TWICE = 0.25  # share of rows that are the row before once more, from which on that is a rule
 LARGEST = 1e30  # of any number in a table
 
 Content = Frames | Table
@@ -224,7 +225,24 @@ def _checked(table: Table) -> Table:
     """The table with NaN, a missing value, for what no sensor sends: its square must be finite."""
     if not table.columns:
         raise LogError(f"{table.path}: holds no numeric column{table.unread_said}")
-    return replace(table, columns={n: _believable(c) for n, c in table.columns.items()})
+    return _once(replace(table, columns={n: _believable(c) for n, c in table.columns.items()}))
+
+
+def _once(table: Table) -> Table:
+    """The table of a logger that writes rows twice, their time too, without the second ones.
+
+    A few are counted as what comes too late (`to_samples`).
+    """
+    columns = table.columns.values()
+    if table.time_name() is None or len(next(iter(columns))) < 2:
+        return table
+    again = np.logical_and.reduce(
+        [(c[1:] == c[:-1]) | (np.isnan(c[1:]) & np.isnan(c[:-1])) for c in columns]
+    )
+    if again.mean() <= TWICE:
+        return table
+    kept = np.append(True, ~again)
+    return replace(table, columns={name: c[kept] for name, c in table.columns.items()})
 
 
 def _believable(column: NDArray[np.float64]) -> NDArray[np.float64]:

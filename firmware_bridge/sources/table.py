@@ -32,6 +32,7 @@ PERIODS, OFTEN = 1.5, 0.95  # of the usual step: more is a gap; share of the ste
 IN_TURN = 0.2  # share of blank rows, from which on a column is written in turn with others
 JUMP, JUMPS = "command_jump", 10.0  # counter of them; times what is usual of a moving command
 APART = "in_turn"  # counter of the rows that give what they tell to others
+FALLS = 0.3  # share of rows that are earlier than the one before: they are in no order
 ALIKE = 0.1  # of a step: so near to a multiple it is one
 TIME_NAMES = ("t", "time", "timestamp", "zeit")  # with or without a unit behind: t_ms, time_s
 TIMES = {*TIME_NAMES, "datetime", "date_time", "uhrzeit", "zeitstempel", "elapsed_time", "x_value"}
@@ -164,6 +165,7 @@ def to_samples(table: Table, assembly: Assembly) -> tuple[Samples, dict[str, int
     the others ("in_turn") say what is between them.
     """
     t_us = table.t_us()
+    _refuse_falling(table.path, t_us)
     columns = [_role(table, s, len(t_us)) for s in assembly.signals]
     at = _rows(columns, [s.command for s in assembly.signals])
     each = zip(columns, assembly.signals, strict=True)
@@ -191,6 +193,14 @@ def to_samples(table: Table, assembly: Assembly) -> tuple[Samples, dict[str, int
         add_counts(counts, {"gap": int(gaps.sum())})
     flags[:1] |= GAP
     return Samples(tuple(s.name for s in assembly.signals), t_us, values, flags), counts
+
+
+def _refuse_falling(path: Path, t_us: NDArray[np.int64]) -> None:
+    """LogError where times (n,) fall again and again: all rows but those few would be left out."""
+    known = t_us[t_us > np.iinfo(np.int64).min]
+    falls = int((np.diff(known) < 0).sum())
+    if falls > FALLS * len(known):
+        raise LogError(f"{path}: its time falls {falls} times in {len(known)} rows; sort the rows")
 
 
 def _rows(columns: list[NDArray[np.float64]], are_commands: list[bool]) -> NDArray[np.int64]:

@@ -25,6 +25,7 @@ from rtid.trace.signals import Recording
 from rtid.trace.spikes import SPIKE
 from rtid.units import limit, units_of, with_unit
 
+LATE, AGAIN = "out_of_order", 100  # samples after a stamp that goes back: a time that begins again
 PERIOD_TOLERANCE = 0.1
 NOISE_FACTOR = 1.5
 GAP_SHARE = 1e-3  # of the steps
@@ -180,8 +181,13 @@ def _timing(
             text += f": {100 * arrivals.missing:.2g} % of the record is missing"
             yield _warning(name, text, "look for lost frames or rows: bus load, logger, wiring")
         if arrivals.backward:
-            text = f"{arrivals.backward} time stamps go back"
-            yield _warning(name, text, "sort the log, or record with one clock")
+            text, late = f"{arrivals.backward} time stamps go back", refused.get(LATE, 0)
+            if late > AGAIN * arrivals.backward:
+                text += f", and {late} samples are left out that are earlier than one before"
+                remedy = "two records in one file? Part it where its time begins again, name both"
+            else:
+                remedy = "sort the log, or record with one clock"
+            yield _warning(name, text, remedy)
     if spiked := refused.get(SPIKE, 0):
         text = f"{spiked} are left out: a sensor jumps away and back within milliseconds"
         yield _warning("samples", text, "look at the sensors' plugs, cables and messages")

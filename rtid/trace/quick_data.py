@@ -21,6 +21,7 @@ from rtid.trace.signals import Recording
 
 LEAST_S, FEW_S = 10.0, 30.0
 LEAST_HZ, FEW_HZ = 10.0, 200.0  # rows per second
+SLOW_HZ = 2.0  # so slow is a table whose time in ms is taken for one in s
 ENOUGH = "a minute or two, every signal as often as the controller has it"
 FEW_BLOCKS = 10  # of one valve, with enough rows
 STILL = 0.02  # of the whole way of the position: it stands
@@ -72,7 +73,8 @@ def _size(trace: Recording, report: Report) -> Iterator[Point]:
     rate = rows / report.duration_s if report.duration_s > 0 else 0.0
     text = f"{report.duration_s:.1f} s with {rate:.0f} positions per second"
     if report.duration_s < LEAST_S or rate < LEAST_HZ:
-        yield Point(BAD, f"{text}: too little", f"record {ENOUGH}")
+        in_ms = ', or name the unit of its time, "t [ms]"' * (trace.is_table and rate <= SLOW_HZ)
+        yield Point(BAD, f"{text}: too little", f"record {ENOUGH}{in_ms}")
     elif report.duration_s < FEW_S or rate < FEW_HZ:
         yield Point(FAIR, f"{text}: stiffness and timing show coarsely", f"record {ENOUGH}")
     else:

@@ -191,3 +191,24 @@ def test_a_difference_of_two_columns(tmp_path: Path) -> None:
     assert table.column("a - b - a - c").tolist() == [-4, -5]
     with pytest.raises(LogError, match="no numeric column 'out - off'"):
         table.column("out - off")
+
+
+def test_a_row_that_is_written_twice_counts_once(tmp_path: Path) -> None:
+    """Each sensor "was sent every 0 ms and repeated", and 100 % of the record was missing."""
+    path = tmp_path / "t.csv"
+    path.write_text("t,u,p\n0,1,\n0,1,\n1,1,2\n1,1,2\n1,1,3\n2,1,3\n")
+    table = read_table(path)
+    assert table.columns["t"].tolist() == [0, 1, 1, 2]
+    path.write_text("u,p\n1,2\n1,2\n")
+    assert len(read_table(path).columns["u"]) == 2, "of no time"
+
+
+@pytest.mark.parametrize("order", [slice(None, None, -1), [3, 1, 4, 0, 5, 2]])
+def test_rows_in_no_order_are_refused(tmp_path: Path, order: slice | list[int]) -> None:
+    """They were "no two complete samples", or a record of a hundredth of its rows."""
+    rows = ["0,1,2", "1,1,2", "2,1,3", "3,1,3", "4,1,3", "5,1,3"]
+    chosen = rows[order] if isinstance(order, slice) else [rows[k] for k in order]
+    path = tmp_path / "t.csv"
+    path.write_text("\n".join(["t,u,p", *chosen]))
+    with pytest.raises(LogError, match=r"its time falls \d times in 6 rows; sort the rows"):
+        to_samples(read_table(path), ROLES)
