@@ -165,6 +165,8 @@ _ALIASES = {
     "degree": "deg",
     "degrees": "deg",
     "volt": "V",
+    "volts": "V",
+    "amps": "A",
     "percent": "%",
     "permille": "‰",
     "per mille": "‰",

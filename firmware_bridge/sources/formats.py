@@ -47,6 +47,14 @@ HEAD_BYTES, PIECE_BYTES = 256, 1 << 20
 TWICE = 0.25  # share of rows that are the row before once more, from which on that is a rule
 LARGEST = 1e30  # of any number in a table
 
+FOREIGN = {  # what nothing here reads, by its first bytes: what to do
+    b"PK\x03\x04": "packed, or a spreadsheet; unpack it, or save its sheet as .csv",
+    b"\xd0\xcf\x11\xe0": "a spreadsheet; save its sheet as .csv",
+    b"\x89HDF\r\n": "HDF5; write its columns as .parquet, .mat (save(..., '-v7')) or .csv",
+    b"TDSm": "TDMS; export it as .csv or .mf4",
+    b"ARROW1": "Feather; write it as .parquet",
+}
+
 Content = Frames | Table
 
 
@@ -85,7 +93,7 @@ FORMATS = [
     Format("MATLAB table", (".mat",), tables.read_mat, rb"\AMATLAB \d"),
     Format("MCAP", (".mcap",), bags.read, rb"\A\x89MCAP0\r\n"),
     Format("ROS bag", (".db3", ".bag"), bags.read, rb"\A(#ROSBAG V2|SQLite format 3\x00)"),
-    Format("table of text", (".csv", ".tsv", ".txt"), tables.read_text),
+    Format("table of text", (".csv", ".tsv", ".txt", ".lvm"), tables.read_text),
 ]
 
 
@@ -181,14 +189,28 @@ def _formats() -> tuple[tuple[Format, ...], tuple[str, ...]]:
 
 def _known(inner: Unpacked) -> Format:
     """The format of a file; LogError if none fits."""
-    known = _by_head(inner.file) or _by_suffix(inner.name)
+    known = _by_head(inner.file)
+    if known is None:
+        _refuse_foreign(inner)
+        known = _by_suffix(inner.name)
     if known is None:
         wrong = "".join(f"; {text}" for text in _formats()[1])
         suffix, all_known = inner.name.suffix, ", ".join(suffixes())
         if suffix.lower() in SPREADSHEETS:
             raise LogError(f"{inner.name}: a spreadsheet; save its sheet as .csv")
-        raise LogError(f"{inner.name}: unknown suffix {suffix!r}; known are {all_known}{wrong}")
+        export = "of other tools export .csv or .mf4, and call a table of text .csv"
+        known_are = f"known are {all_known}{wrong}; {export}"
+        raise LogError(f"{inner.name}: unknown suffix {suffix!r}; {known_are}")
     return known
+
+
+def _refuse_foreign(inner: Unpacked) -> None:
+    """LogError for what is no format of ours whatever its suffix says, with what to do."""
+    with inner.file.open("rb") as file:
+        head = file.read(HEAD_BYTES)
+    remedy = next((text for magic, text in FOREIGN.items() if head.startswith(magic)), None)
+    if remedy and inner.name.suffix.lower() not in SPREADSHEETS:
+        raise LogError(f"{inner.name}: {remedy}")
 
 
 def _by_head(path: Path) -> Format | None:

@@ -39,6 +39,8 @@ def read(path: Path) -> Frames | Table:
     raw = path.read_bytes()
     if not raw.startswith((b"MDF ", UNFINISHED)):
         raise LogError(f"{path}: not an MF4 file; check the file or its suffix")
+    if raw[8:9] in (b"2", b"3"):
+        raise LogError(f"{path}: MDF 3; write it as MF4: MDF(...).convert('4.10') of asammdf")
     blocks = Blocks(raw, Budget(path))
     try:
         frames = mf4_bus.read(blocks)

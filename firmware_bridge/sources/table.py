@@ -413,10 +413,22 @@ def _numbers(column: Any) -> NDArray[np.float64]:
 
 
 def read_mat(path: Path) -> Table:
-    """The longest vectors of a MATLAB file up to version 7; LogError for a later one."""
+    """The vectors of a MATLAB file up to version 7 that are as long as its time, or the longest.
+
+    LogError for a later version, and where there are no two of them.
+    """
     try:
-        vectors = mat.vectors(path)
+        vectors, unread = mat.vectors(path)
     except NotImplementedError:
         raise LogError(f"{path}: a MATLAB 7.3 file; save it with save(..., '-v7')") from None
-    longest = max((len(value) for value in vectors.values()), default=0)
-    return named_columns(path, [(k, v, "") for k, v in vectors.items() if len(v) == longest])
+    except ValueError as error:
+        remedy = "save it with save(..., '-v7')"
+        raise LogError(f"{path}: no readable MATLAB file ({error}); {remedy}") from error
+    times = [len(values) for name, values in vectors.items() if is_time(name)]
+    longest = max(times or map(len, vectors.values()), default=0)
+    columns = [(k, v, "") for k, v in vectors.items() if len(v) == longest]
+    table = replace(named_columns(path, columns), unread=unread)
+    if len(columns) < 2 and unread:
+        remedy = "save one vector for each signal: save('run.mat', 't', 'u', 'x', 'p_a', ...)"
+        raise LogError(f"{path}: holds {len(columns)} vectors{table.unread_said}; {remedy}")
+    return table

@@ -11,7 +11,7 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date
 from functools import lru_cache
 from pathlib import Path
@@ -24,6 +24,7 @@ from firmware_bridge.names import split_brackets
 from firmware_bridge.sources.errors import LogError
 
 LOOKED_AT, LONGEST = 200, 1 << 20  # lines in which the names are looked for, characters of each
+SHOWN = 120  # characters of a row that is wrong
 DELIMITERS = ";\t,|"
 NULLS = ("NA", "N/A", "n/a", "NULL", "null", "#N/A")  # pyarrow knows them by itself
 OF_SHEETS = ("#NV", "#DIV/0!", "#VALUE!", "#NUM!", "#REF!", "#NAME?")
@@ -33,6 +34,7 @@ STAMP = re.compile(
     r"\s*(?:(\d{1,4})([-./])(\d{1,2})\2(\d{1,4})[T ]\s*)?(\d{1,3}):(\d\d):(\d\d)(?:[.,:](\d+))?"
     r"\s*(?:([AaPp])\.?[Mm]\.?)?\s*(?:Z|[+-]\d\d:?\d\d)?\s*"
 )
+LVM_END, LVM_UNITS = "***End_of_Header***", "Y_Unit_Label"  # of LabVIEW
 COMMA = re.compile(r"\d,\d")  # a decimal one, where no comma parts the columns
 DIGIT = "[0-9]"
 DAY_S, CENTURY = 86_400, 2000  # of years that are written with two digits
@@ -55,20 +57,25 @@ def read(path: Path) -> tuple[list[tuple[str, Any, str]], dict[str, str]]:
 
     Raises LogError, and pyarrow's errors.
     """
-    from pyarrow import csv as reader  # noqa: PLC0415  30 MB that only tables need
+    import pyarrow as pa  # noqa: PLC0415  30 MB that only tables need
+    from pyarrow import csv as reader  # noqa: PLC0415
 
     layout = layout_of(path)
     missing = [*reader.ConvertOptions().null_values, *MISSING]
-    content = reader.read_csv(
-        path,
-        read_options=reader.ReadOptions(
-            skip_rows=layout.first, column_names=_apart(layout.names), encoding=layout.encoding
-        ),
-        parse_options=reader.ParseOptions(delimiter=layout.delimiter),
-        convert_options=reader.ConvertOptions(
-            decimal_point=layout.decimal, strings_can_be_null=True, null_values=missing
-        ),
-    )
+    try:
+        content = reader.read_csv(
+            path,
+            read_options=reader.ReadOptions(
+                skip_rows=layout.first, column_names=_apart(layout.names), encoding=layout.encoding
+            ),
+            parse_options=reader.ParseOptions(delimiter=layout.delimiter),
+            convert_options=reader.ConvertOptions(
+                decimal_point=layout.decimal, strings_can_be_null=True, null_values=missing
+            ),
+        )
+    except pa.ArrowInvalid as error:
+        hint = "; decimal commas? Then part the columns by semicolons" * (layout.delimiter == ",")
+        raise LogError(f"{path}: no table of text: {str(error)[:SHOWN]}{hint}") from error
     columns = [_without_words(column, layout.decimal) for column in content.columns]
     unread = {}
     for name, column in zip(layout.names, columns, strict=True):
@@ -149,9 +156,20 @@ def layout_of(path: Path) -> Layout:
     written = [k for k, line in enumerate(lines) if line.strip() and not line.startswith("#")]
     if not written:
         raise LogError(f"{path}: holds nothing but comments")
+    last = max((k for k in written[:-1] if lines[k].startswith(LVM_END)), default=-1)
+    written = [k for k in written if k > last]
     tried = (_layout_from(lines, written[i:], encoding) for i in range(len(written)))
-    known = next((layout for layout in tried if layout), None)
-    return known or _plain(lines, written, encoding)
+    known = next((layout for layout in tried if layout), None) or _plain(lines, written, encoding)
+    return _with_labels(known, lines[: last + 1])
+
+
+def _with_labels(layout: Layout, above: list[str]) -> Layout:
+    """The layout with the units that LabVIEW writes into its second header, the time's aside."""
+    labels = [line for line in above if line.startswith(LVM_UNITS)]
+    if not labels:
+        return layout
+    units = ["", *_fields(labels[-1], layout.delimiter)[1:], *[""] * len(layout.names)]
+    return replace(layout, units=tuple(units[: len(layout.names)]))
 
 
 def _beginning(path: Path) -> tuple[str, list[str]]:
@@ -163,6 +181,8 @@ def _beginning(path: Path) -> tuple[str, list[str]]:
         lines = [file.readline(LONGEST) for _ in range(LOOKED_AT)]
     if any(len(line) == LONGEST for line in lines):
         raise LogError(f"{path}: has a line of more than a million characters: no table of text")
+    if any("\0" in line for line in lines):
+        raise LogError(f"{path}: holds bytes that are no text; is its suffix right?")
     return encoding, [_decoded(line) for line in lines if line]
 
 

@@ -63,7 +63,8 @@ class Source:
 def open_source(path: Path, dbc: Path | None) -> Source:
     """Open a table or a CAN log.  Raises RtidError, and the readers' errors."""
     if not path.is_file():
-        raise RtidError(f"{path}: no such file", "name a table or a CAN log", 2)
+        what = "a folder" if path.is_dir() else "no such file"
+        raise RtidError(f"{path}: {what}", "name a table or a CAN log", 2)
     content = open_file(path)
     if isinstance(content, Table):
         return _of_table(content)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -83,6 +84,64 @@ def test_mat(tmp_path: Path) -> None:
     assert set(table.columns) == {"t", "u", "p"}
     samples, _ = to_samples(table, ROLES)
     np.testing.assert_array_equal(samples.column("u_v"), t * 2)
+
+
+@pytest.mark.parametrize("is_packed", [True, False])
+def test_a_struct_of_vectors(tmp_path: Path, is_packed: bool) -> None:
+    t, path = np.arange(5) * 1e-3, tmp_path / "t.mat"
+    savemat(path, {"data": {"t": t[:, None], "u": 2 * t, "k": 3.0}}, do_compression=is_packed)
+    assert {k: v.tolist() for k, v in read_table(path).columns.items()} == {
+        "t": t.tolist(), "u": (2 * t).tolist()
+    }  # fmt: skip
+    savemat(path, {"a": {"Time": t, "Data": t}, "b": {"Time": t, "Data": 2 * t}})
+    assert set(read_table(path).columns) == {"a.Time", "a.Data", "b.Time", "b.Data"}
+
+
+def test_a_vector_that_is_longer_than_the_time_takes_nothing_away(tmp_path: Path) -> None:
+    """Of a file with a longer vector that was all that was read."""
+    savemat(tmp_path / "t.mat", {"t": np.arange(5.0), "u": np.arange(5.0), "more": np.arange(9.0)})
+    assert set(read_table(tmp_path / "t.mat").columns) == {"t", "u"}
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ({"data": np.ones((5, 3))}, "not read: data (a double of 5 x 3)"),
+        ({"tout": np.arange(5.0), "yout": np.ones((5, 3))}, "holds 1 vectors; not read: yout"),
+        ({"scope": {"time": np.arange(5.0), "signals": {"values": np.ones(5)}}}, "scope (a struct"),
+    ],
+)
+def test_what_is_no_vector_in_mat_is_named(
+    tmp_path: Path, content: dict[str, object], words: str
+) -> None:
+    """It was "holds no numeric column", or a time without signals."""
+    savemat(tmp_path / "t.mat", content)
+    with pytest.raises(LogError, match=re.escape(words) + r".*; save one vector for each signal"):
+        read_table(tmp_path / "t.mat")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.csv", b"PK\x03\x04" + bytes(99), "packed, or a spreadsheet"),
+        ("a.csv", b"\xd0\xcf\x11\xe0" + bytes(99), "a spreadsheet; save its sheet"),
+        ("a.h5", b"\x89HDF\r\n\x1a\n" + bytes(99), "HDF5; write its columns as .parquet"),
+        ("a.tdms", b"TDSm" + bytes(99), "TDMS; export it as .csv"),
+        ("a.csv", b"\x89PNG\r\n" + bytes(99), "holds bytes that are no text"),
+        ("a.mat", b"0.0 1.0\n0.1 2.0\n" * 20, r"save it with save\(..., '-v7'\)"),
+        ("a.mdf", b"MDF     3.30    " + bytes(199), r"MDF 3; write it as MF4"),
+        ("a.dat", b"DIAEHEADER", "of other tools export .csv or .mf4"),
+        ("a.csv", b"t,u\n0,1\n0,5,1,5\n", "decimal commas"),
+    ],
+)
+def test_a_file_of_another_kind_says_what_to_do(
+    tmp_path: Path, name: str, content: bytes, words: str
+) -> None:
+    """Bytes were printed, or "copy the log again" was said of a version."""
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(LogError, match=words) as refused:
+        read_table(tmp_path / name)
+    assert str(refused.value).isprintable()
 
 
 def test_clear_errors(tmp_path: Path) -> None:

@@ -56,6 +56,18 @@ def test_a_preamble_and_a_title_without_values(tmp_path: Path, comment: str, end
     assert table.t_us().tolist() == [0, 1000]
 
 
+def test_both_headers_of_labview(tmp_path: Path) -> None:
+    """The second tells the units; its "Channels 2" was taken for the names."""
+    text = (
+        f"{LABVIEW}\t\nChannels\t2\t\nSamples\t2\t2\nY_Unit_Label\tVolts\tbar\n"
+        "X0\t0.0E+0\t0.0E+0\n***End_of_Header***\t\t\nX_Value\tu\tp\tComment\n"
+        "0.000\t1.5\t2\n0.001\t2.5\t3\n"
+    )
+    table = read(tmp_path, text, "t.lvm")
+    assert columns(table) == {"X_Value": [0, 0.001], "u": [1.5, 2.5], "p": [2, 3]}
+    assert table.units["u"] == "Volts" and table.units["p"] == "bar"
+
+
 @pytest.mark.parametrize(
     ("first", "second"),
     [
