@@ -68,6 +68,9 @@ class Table:
         for known in (name, split_brackets(name)[0], *self._difference(name)[:1]):
             if known in self.columns:
                 return known
+        for title, why in self.unread.items():
+            if split_brackets(title)[0] == split_brackets(name)[0]:
+                raise LogError(f"{self.path}: column {title!r}: {why}")
         close = get_close_matches(name, list(self.columns), 1, 0.5)
         hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(self.columns)}"
         raise LogError(f"{self.path}: no numeric column {name!r}; {hint}")

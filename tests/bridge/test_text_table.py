@@ -216,6 +216,8 @@ def test_a_number_that_is_none_is_named_with_its_line(
 ) -> None:
     table = read(tmp_path, text)
     assert table.unread == {"p [Pa]": f"{written!r} in line {line} is no number"}
+    with pytest.raises(LogError, match=r"column 'p \[Pa\]': .* is no number"):
+        table.column("p")
 
 
 def test_words_alone_are_a_text_and_nothing_that_is_missed(tmp_path: Path) -> None:
