@@ -23,7 +23,14 @@ from rtid.diagnose.commands import commands, slowed, through
 from rtid.diagnose.diagnosis import Result
 from rtid.diagnose.evidence import Projected, Rows, project
 from rtid.diagnose.fit import NO_COV, Fit
-from rtid.diagnose.residual import behind_lag, effect_values, measured, modelled, through_filter
+from rtid.diagnose.residual import (
+    behind_lag,
+    effect_values,
+    is_known,
+    measured,
+    modelled,
+    through_filter,
+)
 from rtid.diagnose.sized import physical
 from rtid.effects.column import Candidate
 from rtid.effects.law import Volumes
@@ -175,7 +182,7 @@ class _Bench:
             self.effects[named][1], list(others.values())
         )
         rates = [behind_lag(self.fit, view, rate) for rate in (before, after)]
-        _, parts = through_filter(view, [*rates, *x])
+        _, parts = through_filter(view, [*rates, *x], is_known(view))
         acting = [c for c, v in volumes.items() if np.any(v != 0.0)]
         rest = [part.T[acting].ravel() for part in parts]
         name = f"{candidate.effect}:{candidate.where}"

@@ -127,6 +127,7 @@ class Diagnosis:
     disturbance: what the rows were weighed for beside the sensors' noise, rate per sqrt(Hz);
     beta_sd_pa: what the blocks miss is counted; NaN where something unknown bends the moduli.
     filtered_hz: cut-off of the logger's filter that may have left what has no name, Hz; 0 for none.
+    map_sd_m3s: of what the maps foretell of the held-out part, by their own deviations.
     """
 
     verdict: str
@@ -152,6 +153,7 @@ class Diagnosis:
     zeros: tuple[Zero, ...] = ()
     beta_sd_pa: tuple[float, ...] = ()
     filtered_hz: float = 0.0
+    map_sd_m3s: float = 0.0
 
     @property
     def is_slight(self) -> bool:
@@ -163,7 +165,8 @@ class Diagnosis:
     def foretells(self) -> bool:
         """True where little but noise is left of motion that did not teach the maps."""
         left, floor = self.heldout_residual_after_m3s, self.noise_floor_m3s
-        return not self.held_out_judged or is_foretold(left, floor, self.rms_flow_m3s)
+        of = left, floor, self.rms_flow_m3s, self.map_sd_m3s
+        return not self.held_out_judged or is_foretold(*of)
 
     def as_json(self) -> dict[str, Any]:
         """Plain JSON types; numbers that are not finite are null."""

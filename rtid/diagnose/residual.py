@@ -30,7 +30,8 @@ KNOWN = 4.0  # times what a valid block may be uncertain by: where the map is kn
 class Residual:
     """Filtered rows: t_s (rows,), measured, left and noise (rows, chambers) in m3/s.
 
-    left: measured less modelled; noise: what simulated sensor noise gives on the same path.
+    left: measured less modelled; noise: what simulated sensor noise gives on the same path;
+    map_sd_m3s: root mean square, over all rows, of the deviations that the maps state there.
     """
 
     t_s: FloatArray
@@ -38,6 +39,7 @@ class Residual:
     left: FloatArray
     noise: FloatArray
     rows_per_s: float = 50.0
+    map_sd_m3s: float = 0.0
 
     def at_rows_of(self, other: Residual) -> Residual:
         """The rows alone at whose instants another has one too, of the same record.
@@ -114,8 +116,12 @@ def residual(
         behind_lag(fit, view, flows - modelled(fit, view, leave_out)),
         behind_lag(fit, view, _noise(fit, view)),
     ]
-    t_s, (moved, left, noise) = through_filter(view, rates, everywhere)
-    return Residual(t_s, moved, left, noise, fit.model.filter.rows_per_s)
+    flow_sd = view.flow_sd()
+    known = view.inside if everywhere else _is_known(view, flow_sd)
+    t_s, (moved, left, noise) = through_filter(view, rates, known)
+    return Residual(
+        t_s, moved, left, noise, fit.model.filter.rows_per_s, _of_maps(view, flow_sd[:, known])
+    )
 
 
 def seen_rates(view: RecordView, flows: FloatArray) -> FloatArray:
@@ -140,19 +146,28 @@ def measured(view: RecordView) -> FloatArray:
 
 def is_known(view: RecordView) -> BoolArray:
     """True (n - 1,) where the open edges are on their grids and the map is known well."""
+    return _is_known(view, view.flow_sd())
+
+
+def _is_known(view: RecordView, flow_sd: FloatArray) -> BoolArray:
     worst = KNOWN * view.model.gates.max_sd_share
-    return view.inside & (view.flow_sd() <= worst)
+    return view.inside & (view.share_of_rated(flow_sd) <= worst)
+
+
+def _of_maps(view: RecordView, flow_sd: FloatArray) -> float:
+    """Root mean square over chambers of what edges' deviations (edges, n) sum up to, m3/s."""
+    feeds = [[e.sign(c) != 0 for e in view.model.edges] for c in view.model.chambers]
+    return _rms(np.sqrt(np.array(feeds, float) @ flow_sd**2))
 
 
 def through_filter(
-    view: RecordView, rates: list[FloatArray], everywhere: bool = False
+    view: RecordView, rates: list[FloatArray], known: BoolArray
 ) -> tuple[FloatArray, list[FloatArray]]:
     """Instants (rows,) and rows (rows, chambers) of rates (n - 1, chambers) behind H_f.
 
-    Instants in s, rates in m3/s.  view: the record beside the map, whose unknown places are
-    left out, or with `everywhere` those off its grid alone.
+    Instants in s, rates in m3/s.  known (n - 1,): where they are not left out.
     """
-    by, lost = view.model.filter, ~(view.inside if everywhere else is_known(view))
+    by, lost = view.model.filter, ~known
     for rate in rates:
         lost |= np.isnan(rate).any(axis=1)
     period = 1.0 / by.rows_per_s

@@ -84,6 +84,7 @@ def diagnosis(result: Result) -> Diagnosis:
         zeros=result.zeros,
         beta_sd_pa=_sd_of_moduli(words, late, unseen),
         filtered_hz=cut_hz,
+        map_sd_m3s=result.after.map_sd_m3s,
     )
 
 

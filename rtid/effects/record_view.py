@@ -208,9 +208,13 @@ class RecordView:
         return self._along(OPENING)[i]
 
     def flow_sd(self) -> FloatArray:
-        """Largest standard deviation of open edges (n - 1,), as a share of the rated flow."""
+        """Standard deviation of each edge's flow (edges, n - 1), m3/s; 0 where it is shut."""
+        return self._followed((FLOW_SD,))[FLOW_SD]
+
+    def share_of_rated(self, flow: FloatArray) -> FloatArray:
+        """The largest share (n - 1,) that flows (edges, n - 1), m3/s, are of the rated ones."""
         rated = np.array([edge.rated_q_m3s for edge in self.model.edges])
-        return np.asarray((self._followed((FLOW_SD,))[FLOW_SD] / rated[:, None]).max(axis=0))
+        return np.asarray((flow / rated[:, None]).max(axis=0))
 
     def rest(self) -> None:
         """Let go of what a long record gives again when it is asked for: 0.3 kB a sample."""
