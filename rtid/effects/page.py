@@ -241,7 +241,8 @@ def correcting(size: str) -> tuple[Effect, ...]:
     return tuple(sorted(pages, key=lambda page: page.size.name not in size))
 
 
-DEAD_VOLUME = "dead volume"  # as the pages call the declared size
+# as the pages call the declared sizes
+DEAD_VOLUME, PRESSURE_ZERO = "dead volume", "zero of pressures"
 ZERO = "zero of a pressure sensor"  # what is taken out of the samples, and no part of a fit
 
 

@@ -39,6 +39,7 @@ from rtid.study.quick_machine import (
     fitted_machine,
     lag_of,
 )
+from rtid.study.quick_pressures import from_air
 from rtid.study.quick_project import (
     head_of,
     of_channels,
@@ -289,7 +290,8 @@ def _likeliest(
 
     study = Study(arranged.project, path, _later(progress))
     reading = Reading(study, arranged.machine, said_of(study))
-    for another in (written_late, on_a_line) if arranged.trace.is_table else ():
+    of_tables = (written_late, on_a_line) if arranged.trace.is_table else ()
+    for another in (from_air, *of_tables):
         if reading.said.verdict == MATCHES:
             break
         with suppress(np.linalg.LinAlgError, RtidError):  # it cannot be had so: as it was before

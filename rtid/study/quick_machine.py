@@ -66,7 +66,8 @@ class MachineSizes:
     goes_round: a motor, whose x is an angle.  command_hold, command_noise: how the command runs
     between its samples, and what is unknown of it there, in SI; command_step_s: from one to
     the next of a sample of a faster one, which may act up to half of it later than on the line.
-    command_late_rows: by how many rows the log writes it late.
+    command_late_rows: by how many rows the log writes it late.  pressures_from_air: what sensors
+    say counts from the air, though their unit does not say so.
     command_unit: that of its column.  noise_seen: 1 sigma by role, as the record tells it.
     supply_pa: of a supply that is not measured, as it was said.  extra_volumes: dead volume of each
     chamber beyond the assumed one, as fitted, m3, with its standard deviation.  lag_seen_s: as the
@@ -93,6 +94,7 @@ class MachineSizes:
     command_noise: float = 0.0
     command_step_s: float = 0.0
     command_late_rows: int = 0
+    pressures_from_air: bool = False
     noise_seen: Mapping[str, float] = field(default_factory=dict)
     supply_pa: float | None = None
     extra_volumes: Mapping[str, tuple[float, float]] = field(default_factory=dict)

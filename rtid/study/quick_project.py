@@ -17,7 +17,7 @@ from rtid.project.guess import RoleCandidate
 from rtid.project.template import EDGES, nice
 from rtid.study.quick_machine import RATED_DP_PA, SUPPLY_PA, Assumption, MachineSizes, lag_of
 from rtid.trace.quick_source import Source, unit_of
-from rtid.units import LPM, units_of
+from rtid.units import AIR_PA, LPM, units_of
 
 TANK_PA = 1e5
 HELD = "zero"  # how a command runs to its next sample, unless it is said
@@ -131,6 +131,8 @@ def _signals(
             section |= {"hold": machine.command_hold, "noise": noise}
         if role == "u" and machine.command_late_rows:
             section["late_rows"] = machine.command_late_rows
+        if role.startswith("p_") and machine.pressures_from_air:
+            section["offset"] = _neat(AIR_PA / unit_of(candidate).factor)
         turned = role in machine.reversed
         if turned:
             section["scale"] = -1.0
