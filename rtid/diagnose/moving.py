@@ -142,7 +142,10 @@ def goes_on(fit: Fit, best: Fit) -> bool:
 def is_worse(fit: Fit, best: Fit) -> bool:
     """True where a step made the misfit larger, both being weighed alike, or lost rows.
 
-    Nor is a law about its size worse than one that was linear about another size.
+    Nor is a law about its size worse than one that was linear about another size, nor a shape that
+    leaves more of rows which it weighs for less noise.  What air takes up of a pressure's noise
+    goes with its exponent: on the way from 1.36 to the 1.315 that explained most, chi2 rose by 69
+    and ln det of the noise fell by 83, so that it stayed at 1.36 +- 0.01.
     """
     left_out = 1.0 - fit.regression.rows / max(1.0, best.regression.rows)
     more = counted_for(left_out, fit.revision.timings)
@@ -152,7 +155,8 @@ def is_worse(fit: Fit, best: Fit) -> bool:
     alike = alike and _weigh_alike(fit.revision.sizes, best.revision.sizes)
     pairs = zip(fit.revision.effects, best.revision.effects, strict=True)
     alike = alike and all(effect.page is was.page for effect, was in pairs)
-    return alike and fit.excess > best.excess and not is_as_good(fit, best)
+    is_more = fit.excess > best.excess and fit.wins_over(best) < 0.0
+    return alike and is_more and not is_as_good(fit, best)
 
 
 def is_lost(fit: Fit, top: Fit) -> bool:
