@@ -30,7 +30,7 @@ from rtid.diagnose.revision import Revision
 from rtid.diagnose.sized import physical
 from rtid.diagnose.softer import Softer, softer
 from rtid.diagnose.spread import with_spreads
-from rtid.diagnose.standing import Standing, stand
+from rtid.diagnose.standing import Standing, on_its_grid, stand
 from rtid.diagnose.trials import (
     GAIN,
     AcceptedEffect,
@@ -184,14 +184,26 @@ def _on_finer_grid(state: TrialState, present: Fit, last: Residual) -> Fit | Non
     finer = finer_beside(present.light())
     if finer.declared is present.declared:
         return None
-    machine = finer.declared
+    again = _without(state, finer.light())
     del finer  # its rows are large
-    again = stand(
-        machine, state.chunk, state.held_out, state.given, state.progress, suspects=state.suspects
-    )
     state.begin(again.state.model)
     state.excess = _excess(state, again.fit)
     return again.fit
+
+
+def _without(state: TrialState, beside: Fit) -> Standing:
+    """The model without what was found, on the grid that the record needs beside it, or a finer.
+
+    Not on a finer one that leaves more than what was found does on its own: of a spool that moves
+    at 20 strokes a second at most the maps of 840 blocks more had followed all, by 213 of chi2 less
+    well than two numbers, and the record matched.
+    """
+    parts = state.given, state.progress
+    again = stand(beside.declared, state.chunk, state.held_out, *parts, suspects=state.suspects)
+    if again.state.model.n_cells > beside.declared.n_cells and beside.wins_over(again.fit) > 0.0:
+        bare = on_its_grid(beside.declared, state.chunk, state.given, state.suspects)
+        return stand(bare.declared, bare.chunk, state.held_out, *parts, bare, state.suspects)
+    return again
 
 
 def stored(state: TrialState, first: Fit, last: Fit, said: str) -> Softer | None:

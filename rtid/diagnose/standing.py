@@ -51,15 +51,25 @@ def fitted(
     record needs.  suspects: effects of the user's, of which parts may be.  Raises PartError where
     the record has no column for a part.
     """
-    model, chunk = as_measured(model, chunk), usable(model, chunk)
-    weights = prepare(model, chunk)
-    revision = recall(model, chunk, weights, parts, suspects)
-    fine, rest = fine_enough(fit(model, chunk, weights, revision, bank=False))
+    fine, rest = fine_enough(on_its_grid(model, chunk, parts, suspects))
     first = few_excused(fine.leaving(rest) if rest else fine)
     del fine  # its rows are large
     first = looked_over(halved_throughout(first))
     record = first.declared, chunk, first.weights, first.revision
     return with_spreads(one_pass(*record, first, bank=False))
+
+
+def on_its_grid(
+    model: Machine,
+    chunk: FloatArray,
+    parts: tuple[AddedEffect, ...] = (),
+    suspects: tuple[Effect, ...] = (),
+) -> Fit:
+    """As `fitted`, on the grid that is declared, whatever that misses."""
+    model, chunk = as_measured(model, chunk), usable(model, chunk)
+    weights = prepare(model, chunk)
+    revision = recall(model, chunk, weights, parts, suspects)
+    return fit(model, chunk, weights, revision, bank=False)
 
 
 def stand(
