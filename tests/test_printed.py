@@ -165,7 +165,7 @@ def test_the_history_is_whole_and_an_effect_reads_alike_before_and_after(story: 
         assert re.search(leak, shown) and shown.count(CONVENTION) == 1
         after = " ".join(story("diagnose RUN -p PROJECT").split())
         story("history -p PROJECT")
-        words = "What remains beyond the noise is immaterial"
+        words = "Something remains beyond the noise, and is immaterial"
         assert (words in before) == (words in after)
         assert "Something else remains" not in before + after
     finally:

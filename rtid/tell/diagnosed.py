@@ -153,7 +153,7 @@ def remains(diagnosis: Diagnosis) -> str:
         )
     if diagnosis.is_slight:
         return (
-            "What remains beyond the noise is immaterial: less than "
+            "Something remains beyond the noise, and is immaterial: less than "
             f"{100 * MATERIAL:g} % of the rms flow (residual variance {diagnosis.rho_after:.2f} "
             "times the noise's)."
         )
