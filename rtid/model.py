@@ -311,8 +311,8 @@ class Machine:
         V is that of its command, m3/s that of its equations: of a force that is measured, N.
         """
         rate = self.chambers[0].unit
-        if unit == "V":
-            return self.signals[self.column(self.edges[0].command)].unit
+        if unit in ("V", "V/s"):
+            return self.signals[self.column(self.edges[0].command)].unit + unit.removeprefix("V")
         if unit == FLOW or unit.startswith(f"{FLOW}/"):
             return rate + unit.removeprefix(FLOW)
         if self.has_pressures or not (unit == VOLUME or unit.startswith(f"{VOLUME}/")):

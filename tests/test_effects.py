@@ -31,7 +31,7 @@ TWELVE = {
 }
 REST = {
     *("internal_leakage_turbulent", "external_leakage_turbulent", "hose_compliance"),
-    *("spool_lag_first_order", "deadband_shift", "makeup_valve", "cavitation"),
+    *("spool_lag_first_order", "spool_rate_limit", "deadband_shift", "makeup_valve", "cavitation"),
     *("pressure_sensor_lag", "pressure_sensor_bias", "position_sensor_delay", "velocity_scale"),
     *("position_dependent_leakage", "load_compensated_valve"),
 }

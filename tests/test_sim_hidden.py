@@ -378,6 +378,7 @@ def test_an_effect_is_hidden_once_in_a_place() -> None:
     ("first", "second", "where"),
     [
         ("spool_lag_second_order", "spool_lag_first_order", ""),
+        ("spool_rate_limit", "spool_lag_second_order", ""),
         ("supply_sag", "supply_sag_measured", ""),
         ("extra_dead_volume", "extra_dead_volume", "a"),
         ("line_dynamics", "line_dynamics_seen_at_valve", ""),
@@ -408,11 +409,17 @@ def test_random_machines_hide_a_varied_strength_in_a_varied_place() -> None:
     assert bare == draw_hidden(3, "input_delay", "weak")
 
 
-def test_kernels_agree_with_their_python_source(monkeypatch: pytest.MonkeyPatch) -> None:
+SPOOLS = {"spool_lag_first_order", "spool_lag_second_order", "spool_rate_limit"}
+
+
+@pytest.mark.parametrize("spools", ["spool_lag_second_order", "spool_rate_limit"])
+def test_kernels_agree_with_their_python_source(
+    spools: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A machine that hides everything, six samples, every kernel as plain Python."""
-    plant = SimulatedPlant()
+    plant, others = SimulatedPlant(), {*SPOOLS - {spools}, "line_dynamics", "supply_sag_measured"}
     for name, effect in HIDDEN.items():
-        if name not in ("spool_lag_first_order", "line_dynamics", "supply_sag_measured"):
+        if name not in others:
             plant = hide(plant, name, effect.strengths[0])
     compiled = simulate(plant, "rich", 2, 0.006)
     for module in (dynamics, closed_loop, extra_flows, spool, sensing):

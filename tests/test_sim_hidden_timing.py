@@ -67,6 +67,19 @@ def test_an_additional_lag_is_a_second_one_behind_the_first() -> None:
     assert opening("spool_lag_first_order", b, lag_s=0.0) == pytest.approx(alone, abs=1e-12)
 
 
+@pytest.mark.parametrize("lag_s", [0.0, 1.3e-3, 10e-3])
+def test_a_limit_takes_a_step_in_a_straight_line_and_then_as_its_lag(lag_s: float) -> None:
+    rate, edge = 60.0, "pb"  # whose spools are as fast as is stated
+    t = np.maximum(np.arange(400) * 1e-3 - AT_MS * 1e-3, 0)
+    near = rate * lag_s
+    bend = (SIZE_V - near) / rate
+    fading = near * np.exp(-np.maximum(t - bend, 0.0) / max(lag_s, 1e-9))
+    expected = np.where(t < bend, rate * t, SIZE_V - fading)
+    assert opening("spool_rate_limit", rate, edge, lag_s) == pytest.approx(expected, abs=1e-9)
+    slow, fast = (opening("spool_rate_limit", rate, e, lag_s) for e in ("pa", "at"))
+    assert slow[AT_MS + 20] == pytest.approx(0.98 * fast[AT_MS + 20], rel=1e-3)
+
+
 @pytest.mark.parametrize("damping", [0.2, 1.0 - 1e-12, 1.0, 3.0])
 def test_propagator_is_the_exponential_of_its_matrix(damping: float) -> None:
     from scipy.linalg import expm

@@ -166,8 +166,8 @@ def offer(
 def _offer_timings(view: RecordView, columns: Columns, revision: Revision) -> None:
     """What each timing of the bank would change, first order in the opening; coefficient 1."""
     halves = _at_spools(view)
-    for timing in timings_of(view.model, view.t_s):
-        if revision.has((timing.effect, COMMAND)) or timing.own_spools:
+    for timing in timings_of(view.model, view.chunk):
+        if revision.has((timing.effect, COMMAND)) or timing.own_spools or timing.is_within_lag:
             continue
         for psi in timing.bank:
             change = {

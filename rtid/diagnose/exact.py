@@ -32,6 +32,9 @@ CLOSE = 0.9  # timings whose coarse gain is this share of the best are refitted 
 # where a valve opens: shares of its largest flow gain, bins of the command, least sqrt(dp)
 RISES, BINS, LEAST_ROOT = (0.15, 0.4), 40, 300.0
 NO_HINTS: Mapping[Key, float] = MappingProxyType({})
+# of the best gain from afar, from which a limit and the lag that it is in are found by a simplex of
+# this size, in this many refits: the derivative of one says next to nothing beside maps it has bent
+LIKELY, NARROW, POLISHING = 0.5, 0.15, 24
 PROMISING = 0.3  # share of the best gain that a timing must reach from afar to be refitted
 # pumps to begin with: droops as shares of that seen, quantiles of the demand, stiffness in Pa/m3.
 # The cost has a valley for each lag: of a supply that took 0.4 s for a droop 1.6 times the one seen
@@ -122,7 +125,7 @@ def timing_trials(
     A delay always is: where commands jump, its first order sees no further than a sample, and one
     of 20 ms was a lag of 9.6 ms that matched.
     """
-    timings = (*timings_of(state.model, state.chunk[:, 0]), *sensor_timings(state.model))
+    timings = (*timings_of(state.model, state.chunk), *sensor_timings(state.model))
     open_ = [t for t in timings if not present.revision.has(key_of(t))]
     if not state.model.has_pressures and (state.model.measured or present.revision.timings):
         stirred = {c.key for c, score in scored(present) if score.gain > GAIN}
@@ -136,10 +139,19 @@ def timing_trials(
     return exact_trials(state, present, open_, other, hints)
 
 
-def _behind_openings(present: Fit, timings: list[TimingLaw]) -> Iterator[TimingLaw]:
-    """The timings; one behind the opening curve begins at the dead band that the maps show."""
+def _begun(present: Fit, timings: list[TimingLaw]) -> Iterator[TimingLaw]:
+    """The timings; one behind the opening curve begins at the dead band that the maps show.
+
+    A limit is within the lag of the spools, where they are declared to have one.
+    """
+    lag, lag_s = present.declared.lag, present.weights.lag_s
+    has_lag = lag.nominal_s + lag.tolerance_s > 0.0
     for timing in timings:
-        if DEAD_BAND not in timing.parameters:
+        if timing.is_limit and timing.is_within_lag == has_lag:
+            yield timing.beside_lag(lag_s) if has_lag else timing
+        elif timing.is_limit:
+            continue
+        elif DEAD_BAND not in timing.parameters:
             yield timing
         elif (dead_v := opens_at(present.view)) > 0.0:
             yield replace(timing, bank=tuple((psi[0], dead_v) for psi in timing.bank))
@@ -197,7 +209,7 @@ def exact_trials(
     strengths by name to try as well, where they are below those of the bank.  anywhere: those too
     that end at nothing or at a bound, and so are no causes.
     """
-    timings, coarse = [*_behind_openings(present, timings)], state.coarse.beside(present)
+    timings, coarse = [*_begun(present, timings)], state.coarse.beside(present)
     present.unfactored().at_rest()
     gains = _from_afar(coarse, timings, other, hints, anywhere)
     # a gain from afar is that of the thinned record: 154,000 for 315,000 of chi2
@@ -298,7 +310,7 @@ def _from_afar(
     beside = [timing for timing in timings if not timing.replaces_lag]
     banks = {timing: coarse.bank(timing, hints.get(key_of(timing), 0.0)) for timing in beside}
     ahead, instead = 0.0 if anywhere else coarse.ahead, _instead_of_the_lag(coarse, timings)
-    starts = {t: coarse.closed_in(t, bank) for t, bank in banks.items()} if ahead else {}
+    starts = {t: _closed_in(coarse, t, bank) for t, bank in banks.items() if ahead or t.is_limit}
     seen = {timing: _best_of(coarse, timing, bank) - ahead for timing, bank in banks.items()}
     for timing, start in starts.items():
         seen[timing] = max(seen[timing], coarse.shared(timing, *start)[2] - ahead)
@@ -309,6 +321,9 @@ def _from_afar(
         if not anywhere and (seen[timing] < bar or seen[timing] <= 0.0):
             continue
         start = instead.get(timing) or starts.get(timing) or coarse.closed_in(timing, banks[timing])
+        if timing.is_limit and seen[timing] > LIKELY * max(seen.values()):
+            psi = coarse.polished(timing, [start[0]], NARROW, POLISHING)
+            start = psi, coarse.gain(timing, psi)
         psi, lag_s, gain = coarse.shared(timing, *start)
         gain -= ahead
         own = timing.replaces_lag and timing.own_spools
@@ -332,9 +347,17 @@ def _instead_of_the_lag(
         if known:
             found[timing] = known[0], coarse.gain(timing, known[0])
         else:
-            start = coarse.closed_in(timing, coarse.bank(timing))
-            found[timing] = coarse.damped(timing, *start)
+            start = _closed_in(coarse, timing, coarse.bank(timing))
+            found[timing] = start if timing.is_limit else coarse.damped(timing, *start)
     return found
+
+
+def _closed_in(coarse: Beside, timing: TimingLaw, bank: Mapping[float, float]) -> tuple[Psi, float]:
+    """Where a bank leads; a limit is closed in on where a little of it explains anything at all."""
+    if timing.is_limit and max(bank.values()) <= 0.0:
+        strength = max(list(bank)[1:], key=lambda x: bank[x])
+        return timing.at(strength), bank[strength]
+    return coarse.closed_in(timing, dict(bank))
 
 
 def _best_of(coarse: Beside, timing: TimingLaw, bank: Mapping[float, float]) -> float:

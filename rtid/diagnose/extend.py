@@ -131,7 +131,7 @@ def _nothing(tried: Extension) -> RefusedError:
 def _timings(present: Standing, effect: str, where: str) -> list[Trial]:
     """Refits with a timing of that name; none if there is no such timing."""
     model = present.state.model
-    all_timings = (*timings_of(model, present.state.chunk[:, 0]), *sensor_timings(model))
+    all_timings = (*timings_of(model, present.state.chunk), *sensor_timings(model))
     timings = [t for t in all_timings if t.effect == effect]
     if not timings:
         return []

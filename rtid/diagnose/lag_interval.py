@@ -22,7 +22,7 @@ import numpy as np
 from rtid.diagnose.fit import Fit, fit, one_pass
 from rtid.diagnose.moving import LAG_REACH, LEAST_LAG_S, NOISE
 from rtid.diagnose.revision import Revision
-from rtid.effects.laws.timing import TimingLaw, delayed, played
+from rtid.effects.laws.timing import Psi, TimingLaw, delayed, played, rate_limited
 from rtid.plain import FloatArray
 
 RISE = 3.0  # standard deviations at which chi2 is looked at
@@ -102,7 +102,7 @@ def _jumps(present: Fit) -> bool:
 def timing_sd(present: Fit, k: int) -> float:
     """Standard deviation of the first number of timing k, in its unit, beyond the derivative's.
 
-    0 of a timing that is not late as a lag is.
+    0 of a timing that is not late as a lag is, nor a limit.
     """
     timing, psi = present.revision.timings[k]
     sd = present.estimate.sd(present.timing_columns(k)[0])
@@ -110,6 +110,8 @@ def timing_sd(present: Fit, k: int) -> float:
     if timing.apply is played and np.isfinite(present.lag_sd_s):
         less, more = (_beside(present, k, end) - psi[0] for end in _ends_of_lag(present))
         return _beyond(_wide((less, more)), local)
+    if timing.apply is rate_limited:
+        return _beyond(_wide(_ends_of_limit(present, k, local)), local)
     if timing.apply is not delayed:
         return 0.0
     low_high = _room_of_lag(present)
@@ -121,6 +123,35 @@ def timing_sd(present: Fit, k: int) -> float:
 
     room = timing.low[0] - psi[0], timing.high[0] - psi[0]
     return _beyond(_wide(_ends(present, local, room, leaves)), local)
+
+
+def _ends_of_limit(present: Fit, k: int, local: float) -> tuple[float, float]:
+    """By how much the rate of timing k may be less and more at the rise that counts, V/s.
+
+    Alone, and with what the lag that it is in goes along by: maps that follow a part of it in each
+    block bend derivatives, not what is left.
+    """
+    timing, psi = present.revision.timings[k]
+    first, *rest = present.timing_columns(k)
+    used, cov = present.estimate.used, present.estimate.cov
+    at = used.index(first)
+    along = [cov[used.index(j), at] / max(cov[at, at], 1e-300) if j in used else 0.0 for j in rest]
+
+    def leaves(by: float) -> float:
+        lags = (psi[1:], tuple(v + slope * by for v, slope in zip(psi[1:], along, strict=True)))
+        timings = [
+            (timing, tuple(np.clip((psi[0] + by, *lag), timing.low, timing.high).tolist()))
+            for lag in dict.fromkeys(lags)
+        ]
+        return min(_left(present, 0.0, _with(present.revision, k, new)) for new in timings)
+
+    return _ends(present, local, (timing.low[0] - psi[0], timing.high[0] - psi[0]), leaves)
+
+
+def _with(revision: Revision, k: int, timing: tuple[TimingLaw, Psi]) -> Revision:
+    """The revision with another timing k."""
+    timings = revision.timings
+    return replace(revision, timings=(*timings[:k], timing, *timings[k + 1 :]))
 
 
 def _beside(present: Fit, k: int, by_s: float) -> float:
@@ -176,10 +207,9 @@ def _moved(present: Fit, k: int, by_s: float) -> Revision:
 
 def _with_first(revision: Revision, k: int, first: float) -> Revision:
     """The revision with another first number of timing k, within its bounds."""
-    timings = list(revision.timings)
-    timing, psi = timings[k]
-    timings[k] = timing, (float(np.clip(first, timing.low[0], timing.high[0])), *psi[1:])
-    return replace(revision, timings=tuple(timings))
+    timing, psi = revision.timings[k]
+    first = float(np.clip(first, timing.low[0], timing.high[0]))
+    return _with(revision, k, (timing, (first, *psi[1:])))
 
 
 def _ends_of_lag(present: Fit) -> tuple[float, float]:

@@ -57,7 +57,7 @@ def recall(
 
     Raises PartError where a part fits no effect of this machine and record.
     """
-    known = (*timings_of(model, chunk[:, 0]), PUMP, *sensor_timings(model))
+    known = (*timings_of(model, chunk), PUMP, *sensor_timings(model))
     told = [(part, _timing(part, known)) for part in parts]
     timings = tuple(timing for _, timing in told if timing is not None)
     fixed = [part for part, timing in told if timing is None]

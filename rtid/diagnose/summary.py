@@ -35,7 +35,7 @@ from rtid.effects import catalogue
 from rtid.effects.column import Candidate
 from rtid.effects.law import chambers_by_place
 from rtid.effects.laws.pump import FLOW, PUMP, delivered, demand
-from rtid.effects.laws.timing import COMMAND, RATE
+from rtid.effects.laws.timing import COMMAND, RATES
 from rtid.effects.page import ZERO, correcting
 from rtid.plain import FloatArray, Key
 from rtid.units import limit
@@ -314,12 +314,13 @@ def _would_be_seen(
         in_its_unit(fit, candidate, detection_limit(score, fit.rho))
         for candidate, score in (here, varied)
     )
-    less, more = (then, now) if unit != RATE else (now, then)  # a fast spool is the smaller lag
+    is_rate = varied[0].parameter == "share" and varied[0].shape_units[0] in RATES
+    less, more = (now, then) if is_rate else (then, now)  # a fast spool is the smaller lag
     if not (is_possible and 0.0 < then < np.inf) or (is_now and more <= WORTH * less):
         return []
     effect, where = varied[0].key
     instead = limit(now, unit) if is_now and np.isfinite(now) else "at no possible size"
     return [
         f"Supply varied by {100 * SWING:.0f} % in the same motion: {effect} ({where}) would be "
-        f"seen from {limit(then, unit)} {'down' if unit == RATE else 'on'}, instead of {instead}."
+        f"seen from {limit(then, unit)} {'down' if is_rate else 'on'}, instead of {instead}."
     ]

@@ -32,7 +32,14 @@ from rtid.effects import catalogue
 from rtid.effects.column import Candidate
 from rtid.effects.law import is_of_rates
 from rtid.effects.laws.lines import inertance
-from rtid.effects.laws.timing import COMMAND, OF_COMMAND, RATE, command_times
+from rtid.effects.laws.timing import (
+    COMMAND,
+    COMMAND_RATE,
+    OF_COMMAND,
+    RATES,
+    command_times,
+    outrun_rates,
+)
 from rtid.effects.page import ZERO, correcting
 from rtid.plain import Key
 from rtid.units import Z95
@@ -195,10 +202,12 @@ def in_its_unit(fit: Fit, candidate: Candidate, coefficient: float) -> tuple[flo
         return size, unit, size < candidate.law.size.high
     if candidate.parameter == "share":
         size, (unit,) = _of_timing(candidate, size), candidate.shape_units
+        if unit == COMMAND_RATE:  # what no command outruns does nothing
+            size = min(size, max(outrun_rates(fit.declared, fit.chunk), default=np.inf))
         pages = catalogue()[candidate.effect].parameters
         (page,) = [p for p in pages if p.name in candidate.shape_names]
-        high = page.high * (command_times(fit.declared) if page.unit == OF_COMMAND else 1.0)
-        is_possible = page.low < size if page.unit == RATE else size < high
+        times = command_times(fit.declared) if page.unit in OF_COMMAND else 1.0
+        is_possible = times * page.low < size if page.unit in RATES else size < times * page.high
         return size, fit.declared.unit_here(unit), is_possible
     return size, fit.declared.unit_here(unit), size < candidate.largest
 
@@ -212,4 +221,4 @@ def _told_by_joints(zero: Zero) -> Unseen:
 def _of_timing(candidate: Candidate, share: float) -> float:
     """Share of a timing as its parameter: a spool is the slower the lower its frequency."""
     (shape,), (unit,) = candidate.shape, candidate.shape_units
-    return shape / share if unit == RATE else shape * share
+    return shape / share if unit in RATES else shape * share

@@ -17,7 +17,7 @@ from rtid.sim.compiled import compiled
 from rtid.sim.dynamics import flows, runge_kutta
 from rtid.sim.extra_flows import PORT_A, PORT_B, SUPPLY, extra_flows, extra_valve_flows
 from rtid.sim.simulated_plant import Constants, Controller, flow_gain
-from rtid.sim.spool import PLAYS, acting, move_spools, play, spool_table, sticking_pilot, travel
+from rtid.sim.spool import PLAYS, acting, follow, play, spool_table, sticking_pilot, travel
 
 # columns of the drive; the last two are of extra physics: factor of all gains, bursts
 X_REF, V_REF, DITHER, P_SUPPLY, P_TANK, LOAD, FACTOR, BURST = range(8)
@@ -123,7 +123,7 @@ def advance(
             else:
                 until_s = change_s - (step + 0.5 * (half - 1)) * h_s
                 if until_s <= 0.0:
-                    move_spools(after, table, w, rate)
+                    follow(e, m.lag_s, after, 0.5 * h_s, table, w, rate)
                 else:
                     travel(e, m.lag_s, before, after, until_s, 0.5 * h_s, table, w, rate)
             for edge in range(5):
@@ -229,7 +229,8 @@ def run_loop(
     spools = new_spools(e, m.lag_s, 0.5 * h_s, len(x))
     at_once = m.lag_s <= 0.0
     if e is not None:
-        at_once = m.lag_s + e.whole.spool_lag_s + e.whole.spool_radps <= 0.0
+        moves = e.whole.spool_lag_s + e.whole.spool_radps + e.whole.spool_rate_vps
+        at_once = m.lag_s + moves <= 0.0
     for i in range(len(x)):
         for j in range(4):
             record.signals[i, 1 + j] = y[j]

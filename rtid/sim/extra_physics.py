@@ -57,7 +57,8 @@ class Extra(NamedTuple):
     spool_radps: float = 0.0  # natural frequency; 0: first order
     spool_damping: float = 0.0
     spool_lag_s: float = 0.0  # a lag besides the spool's own
-    spool_order: float = 0.0  # 2: natural frequency and damping, 1: two lags, 0: the plain lag
+    spool_rate_vps: float = 0.0  # the fastest that it moves; 0: as fast as its lag has it
+    spool_order: float = 0.0  # 3: limited, 2: frequency and damping, 1: two lags, 0: plain
     # sensors
     pressure_lag_s: Pair = NO_PAIR
     pressure_bias_pa: Pair = NO_PAIR

@@ -132,6 +132,10 @@ def _second_lag(plant: SimulatedPlant, strength: float, where: str) -> Simulated
     return _extra(plant, spool_lag_s=strength, spool_order=1.0)
 
 
+def _rate_limit(plant: SimulatedPlant, strength: float, where: str) -> SimulatedPlant:
+    return _extra(plant, spool_rate_vps=strength, spool_order=3.0)
+
+
 def _deadbands(plant: SimulatedPlant, strength: float, where: str) -> SimulatedPlant:
     shares = zip(plant.valves, (1.0, 1.1, 0.9, 1.05, 0.95), strict=True)
     wider = tuple(replace(v, deadband_v=v.deadband_v + share * strength) for v, share in shares)
@@ -204,6 +208,8 @@ _CATALOGUE = (
      (2e-12, 6e-12, 18e-12), ANYWHERE, _number("groove")),
     ("load_compensated_valve", "the flow's share that saturates above 0.2 MPa, as at 2 MPa",
      (0.1, 0.3, 0.9), (*VALVES, ""), _at("compensated", EDGES)),
+    ("spool_rate_limit", "five spools, each of its lag, whose fastest is slightly different",
+     (120.0, 60.0, 30.0), ANYWHERE, _rate_limit),
     ("oil_stiffening", "modulus that rises in a straight line with the absolute pressure",
      (3e-9, 9e-9, 27e-9), ANYWHERE, _number("stiffening")),
 )

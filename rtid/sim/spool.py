@@ -1,9 +1,10 @@
-"""From the held command to the spools: play, a sticking pilot, dead time, lag.
+"""From the held command to the spools: play, a sticking pilot, dead time, lag, a fastest rate.
 
 play     w = mean of 8 plays of widths 0.65 to 1.35 times the stated full width: rounded corners
 pilot    holds its place until the command is `stick_v` away, then follows until it rests
 delay    w(t) = u(t - d), exact also between samples
 spool    w'' + 2 zeta wn w' + wn^2 (w - u) = 0, exact for a held u; without wn: first order
+limit    w' = clip((u - w) / tau, -r, r), exact for a held u
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ PLAY_SPREAD = 0.35
 PILOT_REST_V = 0.01  # per sample: slower than 10 V/s, the pilot sticks
 PILOT_LAG = 0.1  # of the rate it feels, per sample
 EDGE_SPEED = (0.97, 1.03, 1.0, 0.98, 1.02)  # natural frequencies of the five spools of one type
+RATE_SPREAD = 1.0 / 3.0  # of that of the frequencies, by which their fastest rates are apart
 
 
 @compiled
@@ -94,6 +96,38 @@ def move_spools(commands: FloatArray, table: FloatArray, w: FloatArray, rate: Fl
 
 
 @compiled
+def limit_spools(
+    most_vps: float, lag_s: float, commands: FloatArray, h_s: float, w: FloatArray
+) -> None:
+    """Let the spools w (5,), V, go towards held commands (5,) at no more than a rate, in place."""
+    for edge in range(5):
+        rate = most_vps * (1.0 + RATE_SPREAD * (EDGE_SPEED[edge] - 1.0))
+        way = commands[edge] - w[edge]
+        straight = min(h_s, max(abs(way) - rate * lag_s, 0.0) / rate)
+        left = way - math.copysign(rate * straight, way)
+        if straight < h_s:
+            left *= math.exp((straight - h_s) / lag_s) if lag_s > 0.0 else 0.0
+        w[edge] = commands[edge] - left
+
+
+@compiled
+def follow(
+    e: Any,
+    lag_s: float,
+    commands: FloatArray,
+    h_s: float,
+    table: FloatArray,
+    w: FloatArray,
+    rate: FloatArray,
+) -> None:
+    """Let the spools go towards held commands (5,) over h_s, in place; table: of h_s."""
+    if e.whole.spool_rate_vps > 0.0:
+        limit_spools(e.whole.spool_rate_vps, lag_s, commands, h_s, w)
+    else:
+        move_spools(commands, table, w, rate)
+
+
+@compiled
 def travel(
     e: Any,
     lag_s: float,
@@ -107,13 +141,13 @@ def travel(
 ) -> None:
     """Move the spools w (5,), V, over h_s; the first until_s > 0 see the commands `before` (5,)."""
     if until_s >= h_s:
-        move_spools(before, table, w, rate)
+        follow(e, lag_s, before, h_s, table, w, rate)
     else:
         part = np.empty((5, 4))
         spool_table(e, lag_s, until_s, part)
-        move_spools(before, part, w, rate)
+        follow(e, lag_s, before, until_s, part, w, rate)
         spool_table(e, lag_s, h_s - until_s, part)
-        move_spools(after, part, w, rate)
+        follow(e, lag_s, after, h_s - until_s, part, w, rate)
 
 
 @compiled

@@ -94,7 +94,7 @@ class Seed:
         def with_page(effect: Candidate) -> Candidate:
             return replace(effect, page=pages.get(effect.effect))
 
-        laws = (*timings_of(model, chunk[:, 0]), PUMP, *sensor_timings(model))
+        laws = (*timings_of(model, chunk), PUMP, *sensor_timings(model))
         kinds = {(t.effect, t.where, t.own_spools, len(t.parameters)): t for t in laws}
         timings = tuple(
             (kinds[effect, at, apart, len(psi)], psi) for effect, at, apart, psi in self.timings

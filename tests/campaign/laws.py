@@ -23,7 +23,7 @@ from rtid.diagnose.report import OVER, Diagnosis, Unseen
 from rtid.diagnose.standing import fitted, stand
 from rtid.diagnose.summary import diagnosis
 from rtid.effects.laws import causes
-from rtid.effects.laws.timing import RATE
+from rtid.effects.laws.timing import RATES
 from rtid.estimator.chunk import to_chunk
 from rtid.estimator.flowmap import EXTRAPOLATED, VALID, EdgeMap
 from rtid.estimator.published import publish
@@ -294,7 +294,7 @@ def of_limit(hidden: Planted, unseen: Iterable[Unseen]) -> float:
     if at.named_from is None:
         return 0.0
     size = hidden.strength / at.named_from
-    return 1.0 / size if at.unit == RATE else size
+    return 1.0 / size if at.unit in RATES else size
 
 
 def told(fit: Fit) -> Solution:

@@ -33,7 +33,7 @@ def late() -> TrialState:
 
 def timing(state: TrialState, key: Key) -> TimingLaw:
     """The law of a name."""
-    return next(t for t in timings_of(state.model, state.chunk[:, 0]) if t.is_at(*key))
+    return next(t for t in timings_of(state.model, state.chunk) if t.is_at(*key))
 
 
 def beside_leak(state: TrialState, key: Key, psi: Psi) -> Fit:

@@ -131,6 +131,36 @@ def test_a_play_below_the_bank_is_found_from_its_first_order() -> None:
     assert found.rho_before > 5 > 4 * found.rho_after
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("rate", "seed"), [(100.0, 5), pytest.param(40.0, 4, marks=pytest.mark.long)]
+)
+def test_a_spool_that_moves_no_faster_is_no_lag(rate: float, seed: int) -> None:
+    """Within its interval, and within 2 %: five spools are up to 1 % apart."""
+    found = diagnosed("spool_rate_limit", rate, seed)
+    assert [own.effect for own in found.found] == ["spool_rate_limit"]
+    own = found.found[0].parameters["rate"]
+    assert own.unit == "V/s"
+    assert own.value == pytest.approx(rate, rel=0.02)
+    assert abs(own.value - rate) < 3.0 * own.std
+    assert found.rho_before > 20 * found.rho_after
+
+
+@pytest.mark.long
+@pytest.mark.slow
+def test_a_slow_spool_is_no_limit() -> None:
+    found = diagnosed("spool_lag_second_order", 200.0, 4)
+    assert [own.effect for own in found.found] == ["spool_lag_second_order"]
+    assert found.found[0].cannot_be_told_from == ()
+
+
+def test_a_limit_that_the_command_never_outruns_would_not_have_shown() -> None:
+    """The fastest that it goes on for 12 ms is 208 V/s: a share of that column said 12,000."""
+    unseen = next(u for u in diagnosed().not_found if u.effect == "spool_rate_limit")
+    assert unseen.unit == "V/s"
+    assert unseen.detection_limit is not None and 100.0 < unseen.detection_limit < 210.0
+
+
 def test_what_was_not_found_has_a_limit() -> None:
     """Every hydraulic effect of the catalogue is found, bounded, or declared invisible."""
     found = diagnosed()

@@ -12,13 +12,20 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from rtid.effects.laws import timing
-from rtid.effects.laws.timing import TIMINGS, delayed, lagged, played, second_order, timings_of
+from rtid.effects.laws.timing import (
+    TIMINGS,
+    delayed,
+    lagged,
+    played,
+    rate_limited,
+    second_order,
+    timings_of,
+)
 from rtid.model import Machine
 from rtid.sim.declare import declared_model
 from rtid.sim.random_plants import draw
 
 DT = 1e-3
-INSTANTS_S = np.linspace(0.0, 8 * DT, 9)
 
 
 def steps(seed: int, n: int = 400) -> np.ndarray:
@@ -65,6 +72,33 @@ def test_a_second_order_spool() -> None:
     assert error.max() < 1.1 * (wn * DT) ** 2 / 12 * np.ptp(u)
 
 
+@pytest.mark.parametrize("tau", [1e-3, 4e-3])
+@pytest.mark.parametrize("rate", [60.0, 500.0])
+def test_a_limit_is_exact(rate: float, tau: float) -> None:
+    """ds/dt = clip((u - s) / tau, -r, r); without a lag s stays at u once it has come there."""
+    u, fine = steps(4, 100), 200
+    expected, at = np.empty(len(u)), u[0]
+    for k, value in enumerate(u):
+        passed = 0.0
+        for _ in range(fine):
+            before, h = at, DT / fine
+            middle = at + 0.5 * h * np.clip((value - at) / tau, -rate, rate)
+            at += h * np.clip((value - middle) / tau, -rate, rate)
+            passed += 0.5 * (before + at) / fine
+        expected[k] = passed
+    assert rate_limited(u, DT, (rate, tau)) == pytest.approx(expected, abs=1e-3 * rate * DT)
+    timing._follow.py_func(u, DT, rate, tau, out := np.empty(len(u)))
+    assert out == pytest.approx(rate_limited(u, DT, (rate, tau)), abs=1e-12)
+    assert rate_limited(u, DT, (rate, 1e-9)) == pytest.approx(rate_limited(u, DT, (rate,)))
+
+
+def test_a_limit_that_no_command_outruns_does_nothing() -> None:
+    u = np.cumsum(np.full(300, 0.02))  # 20 V/s
+    assert np.abs(rate_limited(u, DT, (20.1,)) - u).max() < 0.5 * 0.02 + 1e-12
+    late = u[-1] - rate_limited(u, DT, (10.0,))[-1]
+    assert late == pytest.approx(299 * 0.01, rel=0.01)
+
+
 @given(st.integers(0, 1000), st.floats(0.0, 2.0))
 def test_play_stays_within_half_its_width(seed: int, width: float) -> None:
     u = steps(seed)
@@ -91,7 +125,8 @@ def test_derivatives_point_the_way(effect: timing.TimingLaw) -> None:
         moved[k] = 1.01 * value
         change = effect.on(u, 1, DT, tuple(moved)) - effect.on(u, 1, DT, psi)
         slope = effect.change(u, 1, DT, psi, k) * 0.01 * value
-        assert np.linalg.norm(change - slope) < 0.25 * np.linalg.norm(change) + 1e-9
+        most = 0.5 if effect.is_limit else 0.25  # of what begins and ends with a sample
+        assert np.linalg.norm(change - slope) < most * np.linalg.norm(change) + 1e-9
 
 
 def commanded(largest: float) -> Machine:
@@ -103,13 +138,20 @@ def commanded(largest: float) -> Machine:
     return replace(model, edges=tuple(edges))
 
 
+def at_rest(model: Machine) -> np.ndarray:
+    """A record (9, 2 + signals) in which nothing is commanded."""
+    chunk = np.zeros((9, 2 + len(model.signals)))
+    chunk[:, 0] = DT * np.arange(9)
+    return chunk
+
+
 @pytest.mark.parametrize("largest", [0.02, 0.7, 1.0, 100.0, 700.0])
 def test_what_is_in_the_command_s_unit_is_looked_for_in_shares_of_its_span(largest: float) -> None:
     """A play of 3 % of +-100 % is 3: the bound was there, and the bank ended at 0.6."""
-    by = largest / 10.0
-    for usual, here in zip(TIMINGS, timings_of(commanded(largest), INSTANTS_S), strict=True):
+    by, model = largest / 10.0, commanded(largest)
+    for usual, here in zip(TIMINGS, timings_of(model, at_rest(model)), strict=True):
         for k, unit in enumerate(usual.units):
-            times = by if unit == "V" else 1.0
+            times = by if unit in ("V", "V/s") else 1.0
             banks = [psi[k] for psi in usual.bank], [psi[k] for psi in here.bank]
             assert banks[1] == pytest.approx([times * value for value in banks[0]])
             assert here.low[k] == pytest.approx(times * usual.low[k])
@@ -118,4 +160,17 @@ def test_what_is_in_the_command_s_unit_is_looked_for_in_shares_of_its_span(large
 
 @pytest.mark.parametrize("largest", [6.0, 9.7, 10.0, 12.0])
 def test_of_some_ten_volts_the_banks_are_those_of_the_pages(largest: float) -> None:
-    assert timings_of(commanded(largest), INSTANTS_S) == TIMINGS
+    model = commanded(largest)
+    assert timings_of(model, at_rest(model)) == TIMINGS
+
+
+def test_a_limit_is_looked_for_where_the_command_outruns_it() -> None:
+    """A ramp of 30 V/s for 0.1 s: for 12 ms it goes on at 30 V/s, for 0.19 s at half of that."""
+    model = commanded(10.0)
+    chunk = np.zeros((500, 2 + len(model.signals)))
+    chunk[:, 0] = DT * np.arange(500)
+    chunk[:, 2 + model.column(model.edges[0].command)] = np.clip(30.0 * chunk[:, 0] - 6, 0.0, 3.0)
+    limit = next(t for t in timings_of(model, chunk) if t.is_limit)
+    rates = [psi[0] for psi in limit.bank]
+    assert rates == sorted(rates) and rates[-1] == pytest.approx(30.0, rel=1e-6)
+    assert any(rate == pytest.approx(3.0 / 0.19, rel=1e-6) for rate in rates)

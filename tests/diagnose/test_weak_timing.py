@@ -16,7 +16,7 @@ def test_who_asks_for_a_delay_gets_it_whatever_it_gains(monkeypatch: pytest.Monk
     """As `rtid add --effect input_delay` where next to nothing is late."""
     standing = stand(*record())
     state, fit = standing.state, standing.fit
-    laws = [t for t in timings_of(state.model, state.chunk[:, 0]) if t.effect == "input_delay"]
+    laws = [t for t in timings_of(state.model, state.chunk) if t.effect == "input_delay"]
     weak = 0.5 * GAIN, laws[0], laws[0].bank[0], fit.weights.lag_s
     monkeypatch.setattr(exact, "_from_afar", lambda *_: [weak])
     assert not exact_trials(state, fit, laws)

@@ -8,6 +8,7 @@ part of the command and rests at zero meanwhile: so there is one command for eit
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import product
@@ -24,13 +25,18 @@ from rtid.plain import FloatArray
 
 Psi = tuple[float, ...]
 COMMAND, SUPPLY = "command", "supply"  # what a timing transforms; else a sensor at its place
-RATE = "rad/s"  # unit of a parameter that does the more the smaller it is
+COMMAND_RATE = "V/s"
+RATES = "rad/s", COMMAND_RATE  # units of a parameter that does the more the smaller it is
 SHUT = 2e-3  # of the largest command, from which an opening counts for one
-LAG_S = "time_constant"
+OF_TIME = "s", "rad/s"  # of one that is sought among others where samples are far apart
+LAG_S, MOST_RATE = "time_constant", "rate"
 DEAD_BAND = "dead_band"  # behind which a lag may sit
 USUAL_STEP_S = 0.01  # up to which the banks are those of the pages
-OF_COMMAND, USUAL_COMMAND = "V", 10.0  # unit on the pages of what is in a command's, its largest
+OF_COMMAND = "V", COMMAND_RATE  # units on the pages of what is in a command's
+USUAL_COMMAND = 10.0  # the largest command of the pages, V
 ALIKE = 2.0  # times the usual largest, up to which the banks are those of the pages
+# for which a command goes on as far: a limit that it outruns for so long is worth looking for
+OUTRUN_S = 0.012, 0.03, 0.075, 0.19, 0.47
 AT_BOUND = 1.01  # times a bound, within which a parameter is at it
 
 
@@ -64,6 +70,16 @@ class TimingLaw:
         return self.effect == effect and self.where in (COMMAND, SUPPLY, where)
 
     @property
+    def is_limit(self) -> bool:
+        """True where a little more of it than there is costs far more than all that it explains."""
+        return self.apply is rate_limited
+
+    @property
+    def is_within_lag(self) -> bool:
+        """True for a form that has the lag of the spools in it, beside one that comes before it."""
+        return self.replaces_lag and self.is_limit
+
+    @property
     def of_sensor(self) -> bool:
         """True where it puts a measurement right."""
         return self.where not in (COMMAND, SUPPLY)
@@ -74,7 +90,7 @@ class TimingLaw:
         step_s: usual step of the record.  A time below a fraction of it shows nothing.
         """
         times = step_s / USUAL_STEP_S
-        if times <= 1.0 or self.units[0] not in ("s", RATE):
+        if times <= 1.0 or self.units[0] not in OF_TIME:
             return self
         by = 1.0 / times if self.is_rate else times
 
@@ -87,7 +103,7 @@ class TimingLaw:
 
     def at_command(self, times: float) -> TimingLaw:
         """The same for commands so many times as large as the pages': `command_times`."""
-        by = [times if unit == OF_COMMAND else 1.0 for unit in self.units]
+        by = [times if unit in OF_COMMAND else 1.0 for unit in self.units]
         if all(k == 1.0 for k in by):
             return self
 
@@ -96,6 +112,22 @@ class TimingLaw:
 
         bank = tuple(wider(psi) for psi in self.bank)
         return replace(self, bank=bank, low=wider(self.low), high=wider(self.high))
+
+    def for_record(self, model: Machine, chunk: FloatArray) -> TimingLaw:
+        """The same for a record: a limit of a rate is looked for where its commands outrun it.
+
+        chunk (n, 2 + signals), SI.
+        """
+        if not self.is_limit:
+            return self
+        rates = {r for r in outrun_rates(model, chunk) if self.low[0] < r < self.high[0]}
+        bank = tuple((r, *self.bank[0][1:]) for r in sorted(rates))
+        return replace(self, bank=bank or self.bank)
+
+    def beside_lag(self, lag_s: float) -> TimingLaw:
+        """A limit within the lag of the spools, looked for beside so much of it, s."""
+        lag = max(lag_s, self.low[1])
+        return replace(self, bank=tuple((psi[0], lag) for psi in self.bank))
 
     def is_free(self, psi: Psi, k: int) -> bool:
         """True where parameter k is not at a bound."""
@@ -190,6 +222,47 @@ def _play(u: FloatArray, half: float, out: FloatArray) -> None:
         out[k] = at
 
 
+def rate_limited(u: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
+    """What follows u (n,) at no more than a rate psi[0], V/s: mean over each interval (n,), exact.
+
+    ds/dt = clip((u - s) / tau, -r, r), of a lag tau = psi[1]; without one s is at u once it has
+    come there.  Where it is outrun since t_0, ds/dr = sign(u - s) (t - t_0); else r does nothing.
+    """
+    rate, tau = psi if len(psi) > 1 else (psi[0], 0.0)
+    out = np.empty(len(u))
+    _follow(np.ascontiguousarray(u), dt_s, rate, tau, out)
+    return out
+
+
+@kernel
+def _follow(u: FloatArray, dt: float, rate: float, tau: float, out: FloatArray) -> None:
+    at, near = u[0], rate * tau
+    for k in range(len(u)):
+        way = u[k] - at
+        far = max(abs(way) - near, 0.0)
+        straight = min(dt, far / rate)  # as fast as it may, then as the lag has it
+        moved = math.copysign(rate * straight, way)
+        left, rest = way - moved, dt - straight
+        faded = math.exp(-rest / tau) if tau > 0.0 else 0.0
+        if rest <= 0.0:
+            faded = 1.0
+        behind = (way - 0.5 * moved) * straight + left * tau * (1.0 - faded)
+        out[k] = u[k] - behind / dt
+        at = u[k] - left * faded
+
+
+def outrun_rates(model: Machine, chunk: FloatArray) -> set[float]:
+    """The fastest that a command goes on for each of OUTRUN_S, V/s; chunk (n, 2 + signals), SI."""
+    step_s = float(np.median(np.diff(chunk[:, 0]))) if len(chunk) > 1 else 0.0
+    spans = {max(1, round(span_s / step_s)) for span_s in OUTRUN_S} if step_s > 0.0 else set()
+    columns = {2 + model.column(edge.command) for edge in model.edges}
+    return {
+        max(float(np.abs(chunk[m:, c] - chunk[:-m, c]).max()) for c in columns) / (m * step_s)
+        for m in spans
+        if m < len(chunk)
+    }
+
+
 def of_law(
     law: str, apply: Callable[[FloatArray, float, Psi], FloatArray], names: tuple[str, ...] = (),
     **keys: Any,
@@ -211,7 +284,7 @@ def of_law(
         tuple(p.low for p in parameters),
         tuple(p.high for p in parameters),
         apply,
-        is_rate=parameters[0].unit == RATE,
+        is_rate=parameters[0].unit in RATES,
         **keys,
     )
 
@@ -227,12 +300,16 @@ COMMAND_LAWS: dict[str, tuple[TimingLaw, ...]] = {
         for its_own in (False, True)
     ),
     "play": (of_law("play", played, is_linear=False),),
+    "rate_limit": (
+        of_law("rate_limit", rate_limited, (MOST_RATE,), is_linear=False),
+        of_law("rate_limit", rate_limited, (MOST_RATE, LAG_S), is_linear=False, replaces_lag=True),
+    ),
 }
 TIMINGS = tuple(timing for timings in COMMAND_LAWS.values() for timing in timings)
 
 
-def timings_of(model: Machine, t_s: FloatArray) -> tuple[TimingLaw, ...]:
-    """The timings that a command of this machine can have in a record with these instants (n,), s.
+def timings_of(model: Machine, chunk: FloatArray) -> tuple[TimingLaw, ...]:
+    """The timings that a command of this machine can have in a record, chunk (n, 2 + signals), SI.
 
     A plant without pressures has no spools of their own: its maps are over the signed command.
     Between what is measured, a pump's speed or a piston's, and what it does there is no spool.
@@ -240,9 +317,9 @@ def timings_of(model: Machine, t_s: FloatArray) -> tuple[TimingLaw, ...]:
     times = command_times(model)
     if not times:
         return ()
-    step_s = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
+    step_s = float(np.median(np.diff(chunk[:, 0]))) if len(chunk) > 1 else 0.0
     can_be = [t for t in TIMINGS if model.has_pressures or not t.own_spools]
-    return tuple(t.at_step(step_s).at_command(times) for t in can_be)
+    return tuple(t.at_step(step_s).at_command(times).for_record(model, chunk) for t in can_be)
 
 
 def command_times(model: Machine) -> float:
