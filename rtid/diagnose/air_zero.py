@@ -55,7 +55,8 @@ def with_air(known: Fit, chunk: FloatArray) -> Fit | None:
     airs = [cause for cause in causes(first.view) if cause.offered and _is_air(cause.candidate)]
     more = [(cause, shape) for cause in airs for shape in cause.shapes]
     seen = one_pass(*record, revision, first, False, more, thorough=False)
-    best = max(best_by_key(seen, scored(seen)).values(), key=lambda one: one[1].gain, default=None)
+    by_key = best_by_key(seen, scored(seen)).values()
+    best = max(by_key, key=lambda pair: pair[1].gain, default=None)
     if best is None:
         return None
     return fit(*record, with_effect(seen, best[0]), seen, bank=False)

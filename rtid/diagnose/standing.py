@@ -65,7 +65,7 @@ def on_its_grid(
     parts: tuple[AddedEffect, ...] = (),
     suspects: tuple[Effect, ...] = (),
 ) -> Fit:
-    """As `fitted`, on the grid that is declared, whatever that misses."""
+    """As `fitted`, on the grid that is declared; chunk (n, 2 + signals), SI."""
     model, chunk = as_measured(model, chunk), usable(model, chunk)
     weights = prepare(model, chunk)
     revision = recall(model, chunk, weights, parts, suspects)
