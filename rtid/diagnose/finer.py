@@ -169,7 +169,7 @@ def _on_grid(present: Fit, machine: Machine) -> Fit:
     """
     known = present.unfactored().weights
     slopes = known.slopes[parents(present.declared, machine)]
-    weights = replace(known, slopes=slopes, missed=np.zeros(0))
+    weights = Weights(slopes, known.compliance, known.lag_s)
     record = machine, present.chunk, weights, present.revision
     return one_pass(*record, None, bank=False, thorough=False, sent=present.sent)
 

@@ -285,7 +285,7 @@ def flow_noise(model: Machine, cells: IntArray, dt: float, weights: Weights) -> 
 
     (chambers, chambers), m6.  cells (edges, 2): the interval's block per edge, -1 when shut.
     """
-    q = np.diag(flow_noise_floor(model, weights.floor)) * dt
+    q = np.diag(flow_noise_floor(model)) * dt
     for (a, b), edge, first in zip(cells, model.edges, model.first_cells, strict=True):
         if a >= 0:
             at = first + a * edge.grid.shape[1] + b

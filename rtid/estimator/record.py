@@ -34,9 +34,6 @@ from rtid.plain import FloatArray
 
 LAG_PROBE = 0.1  # of the lag, plus 0.05 ms: distance of the finite differences
 OFFSET_PROBE = 0.1  # of an offset's tolerance
-OWN_FLOOR = (
-    1e-3  # least flow noise beside the record's own slopes, share of the rated one's variance
-)
 
 
 Assemble = Callable[[FloatArray], FloatArray]
@@ -162,9 +159,7 @@ def refined(model: Machine, sketched: Sketch, lag_s: float) -> Weights:
     there.  No valve's flow rises faster than in proportion to dp.  The noise of a command, known at
     its samples only, enters by dQ/dw: as so much more noise of dp.
 
-    A compliance outside its declared bounds tells that the motion did not show it.  Slopes that are
-    the record's own need a lower floor than guessed ones: at the rated drop of a data sheet they
-    are 3 times as steep as where a machine works, and of noisy pressures rho was 0.8.
+    A compliance outside its declared bounds tells that the motion did not show it.
     """
     slopes = nominal_weights(model).slopes.copy()
     span = np.concatenate([_span(edge) for edge in model.maps])
@@ -176,7 +171,7 @@ def refined(model: Machine, sketched: Sketch, lag_s: float) -> Weights:
     low, high = 1 / model.beta_bounds_pa[1], 1 / model.beta_bounds_pa[0]
     possible = (sketched.compliance >= low) & (sketched.compliance <= high)
     compliance = np.where(possible, sketched.compliance, 1 / model.beta_nominal_pa)
-    return Weights(slopes, compliance, lag_s, floor=OWN_FLOOR)
+    return Weights(slopes, compliance, lag_s)
 
 
 def _command_noise(model: Machine) -> FloatArray:

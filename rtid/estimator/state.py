@@ -151,15 +151,13 @@ class Weights:
 
     slopes (cells,): dQ/ddp in m3/s/Pa per grid cell, in the order of the edges; compliance
     (chambers,): 1 / beta in 1/Pa; lag_s: first-order lag of the spools; missed (cells,): variance
-    rate of the flow that a block's terms miss, m6/s, none when not given; floor: least flow noise,
-    as a share of the variance that the rated slope gives.
+    rate of the flow that a block's terms miss, m6/s, none when not given.
     """
 
     slopes: FloatArray
     compliance: FloatArray
     lag_s: float
     missed: FloatArray = field(default_factory=lambda: np.zeros(0))
-    floor: float = FLOW_NOISE_FLOOR
 
     def __post_init__(self) -> None:
         """Give every cell its value."""
@@ -195,7 +193,6 @@ def build(model: Machine, weights: Weights | None = None) -> State:
     cells["slope"], cells["missed"] = weights.slopes, weights.missed
     engine = np.zeros(1, layout.ENGINE)
     _configure(engine[0], model)
-    engine[0]["q_floor"][: len(model.chambers)] = flow_noise_floor(model, weights.floor)
     engine[0]["compliance"][: len(model.chambers)] = weights.compliance
     engine[0]["lag_s"] = weights.lag_s
     housekeeping.clear(engine, cells)
@@ -242,6 +239,7 @@ def _configure(e: np.void, model: Machine) -> None:
     for i, owner in enumerate(model.owners):
         e["owner"][i] = owner
         e["is_shared"][i] = model.owners.count(owner) > 1
+    e["q_floor"][:n_chambers] = flow_noise_floor(model)
     e["mode_column"], e["max_open"] = _column(model, model.mode), most_open(model)
     e["hysteresis"], e["max_gap_s"] = model.gates.hysteresis, model.gates.max_gap_s
     e["recovery_s"] = model.gates.recovery_s
@@ -269,11 +267,11 @@ def _configure_edge(e: np.void, model: Machine, i: int, edge: Edge, first_cell: 
         e["sign"][i, c] = edge.sign(chamber)
 
 
-def flow_noise_floor(model: Machine, share: float) -> FloatArray:
+def flow_noise_floor(model: Machine) -> FloatArray:
     """Least intensity of the flow noise (chambers,), m6/s.
 
-    A share of the variance that the rated slope of the noisiest edge gives, and what is declared as
-    disturbance; where neither is there, what lets the whitener forget within MEMORY_S.
+    A share of what the rated slope of the noisiest edge gives, and what is declared as disturbance;
+    where neither is there, what lets the whitener forget within MEMORY_S.
     """
     least, period = np.zeros(len(model.chambers)), model.pressure_period_s or 1e-3
     for c, chamber in enumerate(model.chambers):
@@ -281,7 +279,7 @@ def flow_noise_floor(model: Machine, share: float) -> FloatArray:
             if edge.sign(chamber) != 0:
                 slope = 0.5 * edge.rated_q_m3s / edge.rated_dp_pa
                 noise = variance(model, edge.source) + variance(model, edge.sink)
-                least[c] = max(least[c], share * slope**2 * noise * period)
+                least[c] = max(least[c], FLOW_NOISE_FLOOR * slope**2 * noise * period)
         least[c] += chamber.disturbance**2
         if least[c] == 0.0:
             row_noise = chamber.area_m2**2 * variance(model, model.position)

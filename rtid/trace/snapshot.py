@@ -26,7 +26,7 @@ import numpy as np
 from rtid.errors import RtidError, door
 from rtid.estimator.estimator import Estimator
 from rtid.estimator.ring import History
-from rtid.estimator.state import FLOW_NOISE_FLOOR, State, Weights
+from rtid.estimator.state import State, Weights
 from rtid.estimator.sums import Sums
 from rtid.model import Machine
 from rtid.trace import points
@@ -73,7 +73,7 @@ def save(
     weights = estimator.weights
     if weights is not None:
         arrays |= {name: getattr(weights, name) for name in WEIGHTS}
-        header |= {"lag_s": weights.lag_s, "floor": weights.floor}
+        header["lag_s"] = weights.lag_s
     for k, fold in enumerate(estimator.folds):
         arrays |= {f"fold{k}_{name}": getattr(fold, name) for name in FOLD}
     if estimator.history is not None:
@@ -105,8 +105,7 @@ def load(path: str | Path, model: Machine, digest: str) -> Estimator:
     weights = None
     if "slopes" in content:
         slopes, compliance, missed = (content[name] for name in WEIGHTS)
-        floor = float(header.get("floor", FLOW_NOISE_FLOOR))
-        weights = Weights(slopes, compliance, float(header["lag_s"]), missed, floor)
+        weights = Weights(slopes, compliance, float(header["lag_s"]), missed)
     estimator = Estimator(model, weights)
     for name, array in zip(ARRAYS, estimator.state.arrays, strict=True):
         if content[name].dtype != array.dtype:
