@@ -317,7 +317,7 @@ def test_compare_in_words_and_json(folder: Path, tmp_path: Path) -> None:
     arguments = ("compare", folder / "leak.parquet", "-p", folder / "leak.toml")
     against = ("--against", folder / "leak_before.toml", "--table", tmp_path / "t.csv")
     text = " ".join(output_of(APP, *arguments, *against).split())
-    assert "The model has Internal leakage, laminar at a-b: coefficient 0.12" in text
+    assert "The model has Internal leakage, laminar at a-b: coefficient 0.11" in text
     assert "explains the validation part better than" in text
     found = json.loads(output_of(APP, *arguments, "--json"))
     (known,) = found["added"]

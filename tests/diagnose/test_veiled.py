@@ -37,11 +37,12 @@ def fit(cut_hz: float, rho: float = 3.9, doubled: int = 1) -> Any:
     )  # fmt: skip
 
 
-def residual(share: float) -> Any:
+def residual(share: float, map_sd_m3s: float = 0.0) -> Any:
     """Of a part that moves, with so much of its flow left beyond the noise."""
     return SimpleNamespace(
-        t_s=np.zeros(1000), flow_m3s=1.0, floor_m3s=1e-4, rms_m3s=float(np.hypot(share, 1e-4))
-    )
+        t_s=np.zeros(1000), flow_m3s=1.0, floor_m3s=1e-4, rms_m3s=float(np.hypot(share, 1e-4)),
+        map_sd_m3s=map_sd_m3s,
+    )  # fmt: skip
 
 
 def test_a_filter_of_the_logger_is_seen_and_lines_between_messages_are_none() -> None:
@@ -85,6 +86,14 @@ def test_what_matches_alone_what_taught_it_is_no_match(
     state: Any = SimpleNamespace(found=[], negligible={}, judges_itself=False)
     first = fit(0.0, 0.55)
     assert verdict(state, first, first, residual(share), (), is_unseen) == said
+
+
+def test_what_maps_say_that_they_may_be_off_is_foretold() -> None:
+    """A healthy machine of noisy pressures left 2.9 times the floor, and 1.05 times both."""
+    state: Any = SimpleNamespace(found=[], negligible={}, judges_itself=False)
+    first = fit(0.0, 0.55)
+    assert verdict(state, first, first, residual(9e-3, 4.6e-3), ()) == MATCHES
+    assert verdict(state, first, first, residual(9e-3, 4.4e-3), ()) == INSUFFICIENT
 
 
 def test_advice_and_headline_ask_for_pressures_without_the_filter() -> None:

@@ -311,14 +311,16 @@ TIMINGS = tuple(timing for timings in COMMAND_LAWS.values() for timing in timing
 def timings_of(model: Machine, chunk: FloatArray) -> tuple[TimingLaw, ...]:
     """The timings that a command of this machine can have in a record, chunk (n, 2 + signals), SI.
 
-    A plant without pressures has no spools of their own: its maps are over the signed command.
-    Between what is measured, a pump's speed or a piston's, and what it does there is no spool.
+    A plant without pressures has no spools of their own: its maps are over the signed command.  Nor
+    is a limit of their rate told there: of an excavator's boom one day alone had one, 6.8 %/s, and
+    the others a delay.  Between what is measured, a pump's speed or a piston's, and what it does
+    there is no spool.
     """
     times = command_times(model)
     if not times:
         return ()
     step_s = float(np.median(np.diff(chunk[:, 0]))) if len(chunk) > 1 else 0.0
-    can_be = [t for t in TIMINGS if model.has_pressures or not t.own_spools]
+    can_be = [t for t in TIMINGS if model.has_pressures or not (t.own_spools or t.is_limit)]
     return tuple(t.at_step(step_s).at_command(times).for_record(model, chunk) for t in can_be)
 
 
