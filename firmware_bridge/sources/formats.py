@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from firmware_bridge.frames import Frames, add_counts
 from firmware_bridge.mended import mend
 from firmware_bridge.sources import asc, bags, blf, can_csv, candump, gvret, mf4, trc
-from firmware_bridge.sources import table as tables
+from firmware_bridge.sources import table_files as tables
 from firmware_bridge.sources.errors import LogError
 from firmware_bridge.sources.table import Table
 from firmware_bridge.sources.unpacked import Budget

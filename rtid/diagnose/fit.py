@@ -72,8 +72,8 @@ class Fit:
     where they are, to which `map` belongs and which everything else is judged by.
     shapes: (effect, nonlinear parameter) of each column of shapes.  rows: of the record, for
     another fit with the same commands and weights; large.  suspects: scored beside the catalogue.
-    rest: what the maps leave of the record, if somebody has asked before; known_cov: so of
-    `excuse.counted`.
+    rest, known_cov: what the maps leave of the record, and `excuse.counted`, if somebody has asked
+    before.
     spreads: (column, how far its size is from one number), where somebody has asked (`spread`);
     shifts: (column, what its size over the whole record is more than what the rows show of it).
     """

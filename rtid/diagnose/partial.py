@@ -41,6 +41,7 @@ from rtid.effects.laws.sensors import late
 from rtid.effects.laws.timing import SUPPLY
 from rtid.effects.record_view import MapTerms, RecordView
 from rtid.plain import FloatArray, Key
+from rtid.units import Z95
 
 BINS = 14
 SHARE = "share"  # what the coefficient of a timing is called
@@ -83,7 +84,8 @@ class Exhibit:
 
     coefficient, sd: of the named effect as the diagnosis fitted it; instead, instead_sd: what it
     would still be with the rival in its place (NaN without a rival).  alike: names of what the
-    record cannot tell from it.
+    record cannot tell from it.  whole, whole_sd: its size over the whole record, where the rows
+    show another one (`spread`); else NaN.
     """
 
     named: AddedVariable
@@ -93,6 +95,8 @@ class Exhibit:
     instead: float = float("nan")
     instead_sd: float = float("nan")
     alike: tuple[str, ...] = ()
+    whole: float = float("nan")
+    whole_sd: float = float("nan")
 
 
 def exhibits(result: Result) -> tuple[Exhibit, ...]:
@@ -100,10 +104,13 @@ def exhibits(result: Result) -> tuple[Exhibit, ...]:
     if not result.found:
         return ()
     bench = _Bench.of(result)
-    return tuple(
-        replace(bench.exhibit(f.key, f.alike), alike=tuple(key[0] for key in f.alike))
-        for f in result.found
-    )
+    return tuple(_exhibit(bench, f.key, f.alike) for f in result.found)
+
+
+def _exhibit(bench: _Bench, key: Key, alike: tuple[Key, ...]) -> Exhibit:
+    whole, whole_sd = bench.over_the_record(key)
+    names = tuple(effect for effect, _ in alike)
+    return replace(bench.exhibit(key, alike), alike=names, whole=whole, whole_sd=whole_sd)
 
 
 @dataclass(frozen=True)
@@ -137,6 +144,20 @@ class _Bench:
         beside = self._added(rival, cause_of(self.fit.view, rival).column(rival.shape), key)
         used = (*self._used_without(candidate), self.fit.column(rival))
         return Exhibit(named, beside, value, sd, *self._coefficient(candidate, used))
+
+    def over_the_record(self, key: Key) -> tuple[float, float]:
+        """The size of an effect over the whole record, and its deviation; NaN where it is no other.
+
+        Both in its unit.
+        """
+        candidate = self.effects[key][0]
+        if candidate not in self.fit.revision.effects:
+            return float("nan"), float("nan")
+        value, sd = self._coefficient(candidate, self._used_without(candidate))
+        at, scale = self.fit.column(candidate), physical(self.fit, candidate, 1.0)
+        whole, whole_sd = scale * self.fit.size_of(at), abs(scale) * self.fit.sd_of(at)
+        is_other = abs(whole - value) > Z95 * np.hypot(sd, whole_sd)
+        return (whole, whole_sd) if is_other else (float("nan"), float("nan"))
 
     def _used_without(self, candidate: Candidate) -> tuple[int, ...]:
         """Columns of the regression that stand beside an effect."""

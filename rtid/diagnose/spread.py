@@ -28,7 +28,7 @@ for the 7.46 that it let through.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import chain
 
 import numpy as np
@@ -39,7 +39,8 @@ from rtid.diagnose.evidence import Rows, project
 from rtid.diagnose.fit import Fit, columns_of_effects
 from rtid.diagnose.lag_interval import timing_sd
 from rtid.diagnose.moving import LAG_REACH
-from rtid.effects.column import Columns
+from rtid.diagnose.sized import physical
+from rtid.effects.column import Candidate, Columns
 from rtid.effects.law import Volumes
 from rtid.effects.laws import cause_of, total_softness
 from rtid.effects.laws.timing import delayed
@@ -61,7 +62,9 @@ def with_spreads(fitted: Fit, unnamed: frozenset[Key] = frozenset()) -> Fit:
     if fitted.rows is None or not (fitted.revision.effects or fitted.revision.timings):
         return fitted
     given = _given(fitted)
-    risen = {column: _Risen.of(fitted, fitted.rows, given, column) for column in _flows(fitted)}
+    risen = {
+        fitted.column(flow): _Risen.of(fitted, fitted.rows, given, flow) for flow in _flows(fitted)
+    }
     spreads = _of_parts(fitted, fitted.rows, given, risen)
     for column, over in risen.items():
         spreads[column] = float(np.hypot(spreads[column], over.sd))
@@ -72,10 +75,10 @@ def with_spreads(fitted: Fit, unnamed: frozenset[Key] = frozenset()) -> Fit:
     return fitted.knowing(spreads=tuple(spreads.items()), shifts=shifts, known_cov=None)
 
 
-def _flows(fitted: Fit) -> list[int]:
-    """Columns of the effects that are flows: what is stored has another share of the noise."""
+def _flows(fitted: Fit) -> list[Candidate]:
+    """The effects that are flows: what is stored has another share of the noise."""
     return [
-        fitted.column(effect)
+        effect
         for effect in fitted.revision.effects
         if not total_softness(fitted.view, ((effect, 1.0),)).any()
     ]
@@ -88,13 +91,12 @@ def _of_parts(
     columns = [fitted.timing_columns(k)[0] for k in range(len(fitted.revision.timings))]
     columns += risen
     parts = [part for column in columns for part in _parts(given[column])]
-    beside = [risen[column].column for column in columns if column in risen]
-    sizes, free = _Sizes.of(fitted, rows, given, [*parts, *beside]), len(parts)
+    along = [column for column, over in risen.items() if over.column]
+    sizes = _Sizes.of(fitted, rows, given, [*parts, *(risen[column].column for column in along)])
     spreads: dict[int, float] = {}
     for k, column in enumerate(columns):
-        more = [free + list(risen).index(column)] if column in risen else []
-        in_parts = [*range(PARTS * k, PARTS * (k + 1)), *more]
-        found, cov = sizes.in_place_of(column, in_parts)
+        beside = [len(parts) + along.index(column)] if column in along else []
+        found, cov = sizes.in_place_of(column, [*range(PARTS * k, PARTS * (k + 1)), *beside])
         spreads[column] = spread(found[:PARTS], cov[:PARTS, :PARTS])
     return spreads
 
@@ -104,29 +106,27 @@ class _Risen:
     """A size that goes with a pressure: what it is over the whole record.
 
     shift: more than where it does not, sd: beyond what the noise leaves of that, in its unit;
-    column: of the pressure that the record makes likeliest.
+    column: of the pressure that the record makes likeliest; empty where there is none.
     """
 
-    shift: float
-    sd: float
-    column: Volumes
+    shift: float = 0.0
+    sd: float = 0.0
+    column: Volumes = field(default_factory=dict)
 
     @classmethod
-    def of(cls, fitted: Fit, rows: Rows, given: dict[int, Volumes], column: int) -> _Risen:
-        volumes, size = given[column], fitted.held.value(column)
-        levels = _levels(fitted, volumes)
-        if not levels:
-            return cls(0.0, 0.0, {})
-        risen, spans = zip(*(_risen(volumes, by) for by in levels), strict=True)
-        sizes = _Sizes.of(fitted, rows, given, list(risen))
-        plain, known = sizes.beside(column)
-        told = [sizes.rising(column, k, WIDENS * by * size) for k, by in enumerate(spans)]
-        c0, var, likely = np.array(told).T
-        share = np.exp(0.5 * (likely - likely.max()))
-        share /= share.sum()
-        mean = float(share @ c0)
-        more = float(share @ (var + (c0 - mean) ** 2)) - known
-        return cls(mean - plain, float(np.sqrt(max(0.0, more))), risen[int(np.argmax(likely))])
+    def of(cls, fitted: Fit, rows: Rows, given: dict[int, Volumes], flow: Candidate) -> _Risen:
+        """Of one of the effects that are flows; its own size stands where the other cannot be."""
+        column = fitted.column(flow)
+        grown = [_grown(given[column], by) for by in _levels(fitted, given[column])]
+        if not grown:
+            return cls()
+        sizes = _Sizes.of(fitted, rows, given, [volumes for volumes, _ in grown])
+        (plain, known), size = sizes.beside(column), fitted.held.value(column)
+        c0, more, best = sizes.averaged(column, [WIDENS * span * size for _, span in grown])
+        shift, sd = c0 - plain, float(np.sqrt(max(0.0, more - known)))
+        if not flow.is_possible(physical(fitted, flow, size + shift)):
+            shift, sd = 0.0, float(np.hypot(sd, shift))
+        return cls(shift, sd, grown[best][0])
 
 
 @dataclass(frozen=True)
@@ -171,6 +171,18 @@ class _Sizes:
         known, free = max(v[1, 1], 1e-300), v[1, 1] + sd**2
         likely = c1**2 / known - c1**2 / free - np.log(free / known)
         return c0 - v[0, 1] / free * c1, v[0, 0] - v[0, 1] ** 2 / free, likely
+
+    def averaged(self, column: int, sds: list[float]) -> tuple[float, float, int]:
+        """Size and variance over all of those more, as likely as each is, and the likeliest.
+
+        sds: within which their own are 0, as of `rising`.
+        """
+        each = [self.rising(column, k, sd) for k, sd in enumerate(sds)]
+        c0, var, likely = np.array(each).T
+        share = np.exp(0.5 * (likely - likely.max()))
+        share /= share.sum()
+        mean = float(share @ c0)
+        return mean, float(share @ (var + (c0 - mean) ** 2)), int(np.argmax(likely))
 
     def followed(self, column: int, more: int) -> float:
         """How much of one of the fit's columns takes one of those more, beside the others."""
@@ -308,7 +320,7 @@ def _levels(fitted: Fit, volumes: Volumes) -> list[Volumes]:
     return [by for by in levels if any(np.ptp(level) > 0.0 for level in by.values())]
 
 
-def _risen(volumes: Volumes, levels: Volumes) -> tuple[Volumes, float]:
+def _grown(volumes: Volumes, levels: Volumes) -> tuple[Volumes, float]:
     """A column that grows with levels, in their deviations over its square; and those, Pa."""
     off = {c: levels[c] - _mean(volumes, levels) for c in volumes}
     sd = max(np.sqrt(_mean(volumes, {c: by**2 for c, by in off.items()})), 1e-300)

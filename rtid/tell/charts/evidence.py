@@ -140,6 +140,12 @@ def caption(exhibit: Exhibit) -> str:
         f"by {_slope(added, added.before)} before; once it is in the model, by "
         f"{_slope(added, added.after)}{_level(added)}."
     )
+    if exhibit.whole == exhibit.whole:
+        whole = _rounded(exhibit.whole, exhibit.whole_sd, added.unit)
+        text += (
+            " The maps leave of it how it rises with a pressure, and its size goes with that: "
+            f"over the whole record it is {whole}."
+        )
     if rival is None:
         return text
     kind = "what cannot be told from it" if rival.key[0] in exhibit.alike else "its best rival"
