@@ -25,7 +25,7 @@ from rtid.diagnose.regression import LIMIT_SD
 from rtid.diagnose.residual import is_known
 from rtid.diagnose.trials import Trial
 from rtid.effects.record_view import RecordView
-from rtid.estimator.refine import halved_along
+from rtid.estimator.refine import halved_along, parents
 from rtid.estimator.state import Weights
 from rtid.kernels.layout import TERMS
 from rtid.model import Machine
@@ -161,10 +161,8 @@ def _of_either(now: Fit, trial: Trial) -> tuple[float, float]:
 def on_finer(now: Fit) -> Fit | None:
     """The same revision on a grid of half the spacing; None where no freedom is left."""
     machine, weights = halved_along(halved_along(now.declared, 0), 1), now.weights
-    slopes, missed = (
-        _spread(now.declared, machine, each) for each in (weights.slopes, weights.missed)
-    )
-    weights = replace(weights, slopes=slopes, missed=missed)
+    of_whole = parents(now.declared, machine)
+    weights = replace(weights, slopes=weights.slopes[of_whole], missed=weights.missed[of_whole])
     rows = rows_of(behind(machine, now.revision.timings), now.sent, weights)
     if rows.n <= TERMS * len(rows.cells):  # asked first: factors of 13,500 unknowns took 20 s
         return None
@@ -202,15 +200,3 @@ def _size(fit: Fit, trial: Trial) -> tuple[int, float, float]:
 def _is_alike(value: float, apart: float, sd: float) -> bool:
     """True for a difference of sizes that their deviation explains, or that is a tenth of them."""
     return abs(apart) <= max(Z95 * sd, ALIKE * abs(value))
-
-
-def _spread(machine: Machine, finer_one: Machine, of_cells: FloatArray) -> FloatArray:
-    """What every cell has (cells,), given to those that the finer machine cuts it into."""
-    parts = []
-    sizes = [edge.grid.shape[0] * edge.grid.shape[1] for edge in machine.maps]
-    of_maps = zip(machine.maps, finer_one.maps, strict=True)
-    for (edge, cut), mine in zip(of_maps, np.split(of_cells, np.cumsum(sizes)[:-1]), strict=True):
-        times = cut.grid.shape[0] // edge.grid.shape[0]
-        here = mine.reshape(edge.grid.shape)
-        parts.append(here.repeat(times, axis=0).repeat(times, axis=1).ravel())
-    return np.concatenate(parts)
