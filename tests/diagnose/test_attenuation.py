@@ -8,14 +8,26 @@ from functools import cache
 import pytest
 
 from rtid.diagnose import attenuation
-from rtid.diagnose.attenuation import Believed, apart_from_noise, told_apart_from_noise
+from rtid.diagnose.attenuation import (
+    Believed,
+    apart_from_noise,
+    stands_apart,
+    told_apart_from_noise,
+)
 from rtid.diagnose.consequence import on_finer
 from rtid.diagnose.fit import Fit, one_pass
 from rtid.diagnose.nameable import clearest
 from rtid.diagnose.regression import LIMIT_SD, Score
-from rtid.diagnose.standing import stand
+from rtid.diagnose.standing import fitted, stand
 from rtid.diagnose.trials import scored, with_effect
+from rtid.effects.column import Candidate
+from rtid.effects.laws import causes
+from rtid.effects.laws.lines import AT_CYLINDER
+from rtid.estimator.chunk import to_chunk
 from rtid.plain import Key
+from rtid.sim.demand import IDENTIFICATION
+from rtid.sim.run import simulate
+from tests.campaign.laws import RECORD_S, Case, declared
 from tests.diagnose.records import record
 
 A, B = ("external_leakage_laminar", "a"), ("external_leakage_laminar", "b")
@@ -87,3 +99,48 @@ def test_the_rows_of_a_finer_grid_serve_every_candidate(monkeypatch: pytest.Monk
     assert anew is not None
     assert value == pytest.approx(anew.held.value(anew.column(candidate)), abs=0.01 * sd)
     assert sd == pytest.approx(anew.held.sd(anew.column(candidate)), rel=0.01)
+
+
+FEIGNED = (902.6, 8.23e-6, 3.8e9)  # rad/s, m3, Pa s/m3: what the noise of a sweep looked like
+TRUE = (290.4, 3.0e-4, 3.2e8)
+
+
+def line(fit: Fit, where: str, shape: tuple[float, ...]) -> Candidate:
+    """A line seen at the cylinder, of these numbers."""
+    (plain,) = (
+        c.candidate
+        for c in causes(fit.view)
+        if c.candidate.key == ("line_dynamics", where) and AT_CYLINDER in c.candidate.shape_names
+    )
+    return replace(plain, shape=shape)
+
+
+@pytest.mark.parametrize(
+    ("known", "is_there"),
+    [(Believed(0.36, 0.108, 0.19), False), (Believed(0.72, 0.005, 0.016), True)],
+)
+def test_a_line_is_asked_what_is_there_of_it_apart_from_the_noise(
+    monkeypatch: pytest.MonkeyPatch, known: Believed, is_there: bool
+) -> None:
+    fit = fit_of(band=True, leak=1e-12)
+    monkeypatch.setattr(attenuation, "told_apart_from_noise", lambda *_: [known])
+    assert stands_apart(fit, line(fit, "b", FEIGNED)) == is_there
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("case", "where", "shape", "is_there"),
+    [
+        (Case(7001, "orifice", "sweep_record", "internal_leakage_laminar"), "b", FEIGNED, False),
+        (Case(7005, "asymmetric", "rich_record", "line_dynamics"), "both", TRUE, True),
+    ],
+)
+def test_a_line_that_only_makes_rows_quieter_is_none(
+    case: Case, where: str, shape: tuple[float, ...], is_there: bool
+) -> None:
+    """It took 1,139 of chi2 on a sweep that matched, and was named with maps bent by 8 %."""
+    run = simulate(case.plant, case.motion, case.seed, RECORD_S, case.sensors)
+    model = declared(case, run)
+    chunk = to_chunk(model, run.samples, 0)
+    fit = fitted(model, chunk[chunk[:, 0] < IDENTIFICATION * RECORD_S])
+    assert stands_apart(fit, line(fit, where, shape)) == is_there
