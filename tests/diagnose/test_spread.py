@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rtid.diagnose import spread as spreading
 from rtid.diagnose.diagnosis import search
 from rtid.diagnose.fit import Fit, fit, one_pass, prepare
 from rtid.diagnose.revision import Revision
+from rtid.diagnose.rising import SizesBeside
 from rtid.diagnose.spread import spread, with_spreads
 from rtid.diagnose.standing import with_bank
 from rtid.diagnose.summary import diagnosis
@@ -70,7 +70,7 @@ def test_a_size_goes_with_a_pressure_as_far_as_one_may_believe() -> None:
     rng = np.random.default_rng(4)
     y, z, more = rng.standard_normal((3, 40))
     columns = np.stack([y + 2.0 * z + 0.7 * more, z, more + 0.8 * z], axis=1)
-    sizes = spreading._Sizes(columns.T @ columns, {0: 0, 5: 1}, np.zeros(3), np.zeros(3), 1.3)
+    sizes = SizesBeside(columns.T @ columns, {0: 0, 5: 1}, np.zeros(3), np.zeros(3), 1.3)
     for sd in (1e-6, 0.1, 0.5, 1e6):
         gram = sizes.s[1:, 1:] + np.diag([0.0, 1.3 / sd**2])
         size, var, _ = sizes.rising(5, 0, sd)
