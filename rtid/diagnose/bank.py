@@ -140,6 +140,10 @@ def opening_change(view: RecordView, change: dict[str, FloatArray]) -> Volumes:
     return {c: view.into_chamber(c, flows) * view.dt_s for c in range(n_c)}
 
 
+def _every(_candidate: Candidate) -> bool:
+    return True
+
+
 def offer(
     view: RecordView,
     columns: Columns,
@@ -147,43 +151,42 @@ def offer(
     bank: bool,
     more: Iterable[tuple[Cause, Shape]],
     suspects: tuple[Effect, ...],
+    wants: Callable[[Candidate], bool] = _every,
 ) -> None:
-    """Columns of the revision's effects, and of all that is to be scored: suspects as well."""
+    """Columns of the revision's effects, and of all that is to be scored: suspects as well.
+
+    wants: asked before a column of the bank is made, which takes long.
+    """
     for effect in revision.effects:
         columns.offer(effect, cause_of(view, effect).column(effect.shape), is_aside=False)
     for cause in causes(view, suspects) if bank else ():
         if cause.offered and not any(map(cause.makes, revision.effects)):
-            for shape in cause.shapes:
-                volumes = cause.column(shape)
+            for candidate in filter(wants, map(cause.at, cause.shapes)):
+                volumes = cause.column(candidate.shape)
                 if any(series.any() for series in volumes.values()):  # else it cannot act here
-                    columns.offer(cause.at(shape), volumes)
+                    columns.offer(candidate, volumes)
     for cause, shape in more:
         columns.offer(cause.at(shape), cause.column(shape))
     if bank:
-        _offer_timings(view, columns, revision)
+        _offer_timings(view, columns, revision, wants)
 
 
-def _offer_timings(view: RecordView, columns: Columns, revision: Revision) -> None:
+def _offer_timings(
+    view: RecordView, columns: Columns, revision: Revision, wants: Callable[[Candidate], bool]
+) -> None:
     """What each timing of the bank would change, first order in the opening; coefficient 1."""
     halves = _at_spools(view)
     for timing in timings_of(view.model, view.chunk):
         if revision.has((timing.effect, COMMAND)) or timing.own_spools or timing.is_within_lag:
             continue
         for psi in timing.bank:
-            change = {
-                name: through(u, d, view.instants, ((timing, psi),)) - u
-                for name, (d, u) in halves.items()
-            }
-            columns.offer(
-                Candidate(
-                    timing.effect,
-                    COMMAND,
-                    "share",
-                    "1",
-                    20.0,
-                    shape=psi[:1],
-                    shape_names=timing.parameters[:1],
-                    shape_units=timing.units[:1],
-                ),
-                opening_change(view, change),
-            )
+            candidate = Candidate(
+                timing.effect, COMMAND, "share", "1", 20.0, shape=psi[:1],
+                shape_names=timing.parameters[:1], shape_units=timing.units[:1],
+            )  # fmt: skip
+            if wants(candidate):
+                change = {
+                    name: through(u, d, view.instants, ((timing, psi),)) - u
+                    for name, (d, u) in halves.items()
+                }
+                columns.offer(candidate, opening_change(view, change))

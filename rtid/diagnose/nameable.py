@@ -194,38 +194,44 @@ def _reaches(
     fit: Fit, rows: Rows, wanted: list[tuple[Candidate, float]], flow_m3s: float
 ) -> list[tuple[Candidate, Reach]]:
     """What leaving out each wanted candidate does; with them the deviations of their sizes."""
-    at = {fit.column(candidate) - fit.first_given: (candidate, sd) for candidate, sd in wanted}
-    gathering = _Gathering(fit, rows, flow_m3s, at)
+    gathering = _Gathering(fit, rows, flow_m3s, dict(wanted))
     columns = Columns(gathering.take)
     add_timing(fit.view, columns, commands(fit.declared, fit.chunk), fit.weights, fit.revision)
     list(add_shapes(fit.view, columns, fit.revision))
-    offer(fit.view, columns, fit.revision, True, (), fit.suspects)
+    offer(fit.view, columns, fit.revision, True, (), fit.suspects, gathering.wants)
     return gathering.ended()
 
 
 class _Gathering:
     """Takes the columns of a bank as they come, and tells of a few at a time.
 
-    wanted: candidate and deviation of its size, by the number of its column behind the compliances.
+    wanted: deviation of the size of each candidate, of which the first column counts.
     """
 
     def __init__(
-        self, fit: Fit, rows: Rows, flow_m3s: float, wanted: dict[int, tuple[Candidate, float]]
+        self, fit: Fit, rows: Rows, flow_m3s: float, wanted: dict[Candidate, float]
     ) -> None:
         self._fit, self._rows, self._flow_m3s, self._wanted = fit, rows, flow_m3s, wanted
         self._on_rows, self._narrow = _OnRows.of(fit, rows), _narrowness(fit)
         self._relative = _relative(fit)
         self._used = {k - fit.first_given for k in fit.estimate.used}
         self._n, self._beside = 0, list[Volumes]()
+        self._next: tuple[Candidate, float] | None = None
         self._asked = list[tuple[Candidate, float, Volumes]]()
         self._told = list[tuple[Candidate, Reach]]()
 
-    def take(self, volumes: Volumes, _is_aside: bool) -> None:
-        """The next column; those in use come before those that are wanted."""
-        if self._n in self._used:
+    def wants(self, candidate: Candidate) -> bool:
+        """True for one that is to be told of; its column comes next, if it has any."""
+        is_wanted = candidate in self._wanted
+        self._next = (candidate, self._wanted.pop(candidate)) if is_wanted else None
+        return is_wanted
+
+    def take(self, volumes: Volumes, is_aside: bool) -> None:
+        """The next column; those in use come before those that are wanted, which stand aside."""
+        if self._next and is_aside:
+            self._asked.append((*self._next, self._rows.on_rows(volumes)))
+        elif self._n in self._used:
             self._beside.append(self._rows.on_rows(volumes))
-        elif self._n in self._wanted:
-            self._asked.append((*self._wanted[self._n], self._rows.on_rows(volumes)))
         self._n += 1
         if len(self._asked) == AT_ONCE:
             self._tell()

@@ -84,7 +84,7 @@ class Placed:
     def volumes(self, view: RecordView, shape: Shape) -> Volumes:
         """Volume per interval (n - 1,) and chamber that a coefficient of 1 adds, m3."""
         values, result = self._values(view, shape), dict[int, FloatArray]()
-        acts = self._acts(view, shape)
+        acts = self._acts(self._soft(view, shape)) if self.where == BOTH else 1.0
         for c, line in self.lines:
             volume = acts * values.volume(line)
             _refuse_endless(self.effect, view.t_s, volume, values.values)
@@ -93,8 +93,9 @@ class Placed:
 
     def softness(self, view: RecordView, shape: Shape) -> Volumes:
         """What a coefficient of 1 takes up per Pa of the chamber's pressure (n,), m3/Pa."""
-        acts = self._acts(view, shape)
-        return {c: acts * soft for c, soft in self._soft(view, shape).items()}
+        soft = self._soft(view, shape)
+        acts = self._acts(soft)
+        return {c: acts * each for c, each in soft.items()}
 
     def _soft(self, view: RecordView, shape: Shape) -> Volumes:
         """Of each chamber by itself what a coefficient of 1 takes up per Pa (n,), m3/Pa."""
@@ -105,11 +106,11 @@ class Placed:
                 result[c] = -values.at_samples(line.outer) * values.at_samples(slope)
         return result
 
-    def _acts(self, view: RecordView, shape: Shape) -> float:
+    def _acts(self, soft: Volumes) -> float:
         """0 for what is stored in both chambers and acts in one alone: it is that one's; 1 else."""
         if self.where != BOTH:
             return 1.0
-        shares = [float(np.mean(soft != 0.0)) for soft in self._soft(view, shape).values()]
+        shares = [float(np.mean(each != 0.0)) for each in soft.values()]
         return float(min(shares, default=1.0) > SELDOM)
 
     def lag_s(self, shape: Shape) -> float:
