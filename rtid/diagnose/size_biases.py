@@ -2,7 +2,7 @@
 
 The terms of the maps are made of pressures as they are measured, whose noise flattens the maps:
 what they leave of the record then feigns a leak, or hides one.  `attenuation` tells the size
-without it, the more of another one the finer the grid is.
+without it, to first order: where it is much, as much again may be left, either way.
 
 What six terms miss of a map is alike in all blocks, as is what they leave of a leak: a fit takes
 one for the other.  Half the spacing leaves 1/8 to 1/2 of it.  With d what a size moves by there,
@@ -77,9 +77,9 @@ def _of_noise(fitted: Fit, known: Believed, column: int) -> SizeBias:
     """
     if not np.isfinite(known.sd):
         return NO_BIAS
-    more = max(0.0, known.sd**2 - fitted.estimate.sd(column) ** 2)
+    more = max(1.0, fitted.rho) * max(0.0, known.sd**2 - fitted.estimate.sd(column) ** 2)
     shift = known.size - fitted.estimate.value(column)
-    return SizeBias(shift, float(np.sqrt(max(1.0, fitted.rho) * more)))
+    return SizeBias(shift, float(np.hypot(np.sqrt(more), shift / UNIFORM)))
 
 
 def _of_grid(rho: float, here: Believed, there: Believed) -> SizeBias:
