@@ -20,7 +20,7 @@ BoolArray = NDArray[np.bool_]
 Progress = Callable[[str, float], None]  # what is being done, and the share that is done
 Key = tuple[str, str]  # an effect and where it sits
 LARGE = 1 << 22  # bytes of an array for which numpy asks for huge pages
-SPARED = 1 << 24  # bytes that half a matrix must have to be worth pages that are small, and slower
+SPARED = 1 << 23  # bytes that half a matrix must have to be worth pages that are small, and slower
 OWN = {"flags": mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS} if hasattr(mmap, "MAP_PRIVATE") else {}
 
 

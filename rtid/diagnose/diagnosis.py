@@ -146,8 +146,9 @@ def searched(standing: Standing, progress: Progress = silent) -> Result:
         negligible = {key: share for key, share in negligible.items() if key not in nothing}
         scores = known_as_moduli(present, scores)
         reach = reaches(present, scores, last.flow_m3s, clearest_gain(result))
+    present = present.unfactored(always=True).light()  # others are made beside it
     return Result(
-        first, present.light(), result, negligible, scores, before, last, said, parts,
+        first, present, result, negligible, scores, before, last, said, parts,
         held_out_judged=judged, zeros=apart, reach=reach, doubts=doubted,
         softer=soft,
     )  # fmt: skip

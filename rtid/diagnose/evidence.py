@@ -153,9 +153,9 @@ class Rows:
         """
         return self.n - self.factor.taken
 
-    def forget(self) -> None:
-        """Let the factor go where it is large: who asks for it again makes it anew."""
-        if self.told[0].n > MANY:
+    def forget(self, always: bool = False) -> None:
+        """Let the factor go where it is large, or always: who asks for it again makes it anew."""
+        if always or self.told[0].n > MANY:
             vars(self).pop("factor", None)
 
 

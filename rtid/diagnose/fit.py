@@ -241,10 +241,10 @@ class Fit:
         """The same without the rows, and without what can be made again."""
         return replace(self, rows=None)
 
-    def unfactored(self) -> Fit:
+    def unfactored(self, always: bool = False) -> Fit:
         """The same, the factor of its rows let go: one with other rows is made beside it."""
         if self.rows is not None:
-            self.rows.forget()
+            self.rows.forget(always)
         return self
 
     def leaving(self, rest: Misfit) -> Fit:
