@@ -109,7 +109,8 @@ class Edge:
     """A metering edge with its own map Q(u, dp), dp = p_source - p_sink, Q > 0 from source to sink.
 
     `source` and `sink` name pressure signals.  The edge opens with w = direction * u of the signal
-    `command`; for w <= safe_band_v it passes nothing (prior knowledge, can be -inf to switch off).
+    `command`; for w <= safe_band_v it passes nothing (prior knowledge, below 0 where an underlap
+    stands open at rest, can be -inf to switch off).
     The grid is in terms of w.  rated_* give the size of the flow for scaling and first weights.
 
     basis: TAYLOR, eq. (6), LAPPED, local cosines under the windows of (12), BLENDED, Taylor terms
@@ -135,6 +136,11 @@ class Edge:
     modes: tuple[int, ...] = ()
     signs: tuple[tuple[str, int], ...] = ()
     shares: str = NONE
+
+    @property
+    def shut_up_to_v(self) -> float:
+        """Command up to which it passes next to nothing: its band, 0 where none is declared."""
+        return self.safe_band_v if np.isfinite(self.safe_band_v) else 0.0
 
     def sign(self, chamber: Chamber) -> int:
         """+1 where the edge feeds the chamber, -1 where it drains it, else 0."""

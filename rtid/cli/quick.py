@@ -64,8 +64,8 @@ def quick(
     safe_band: Annotated[
         float | None,
         typer.Option(
-            min=0.0,
-            help="Command up to which the valves are shut for sure, in the unit of its column.",
+            help="Command up to which the valves are shut for sure, in the unit of its column; "
+            "below 0 where they stand open at rest.",
         ),
     ] = None,
     lag_ms: Annotated[

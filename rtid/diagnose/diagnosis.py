@@ -23,6 +23,7 @@ from rtid.diagnose.held_again import held_again
 from rtid.diagnose.joined import joints
 from rtid.diagnose.nameable import Reach, known_as_moduli, reaches
 from rtid.diagnose.one_round import add_best
+from rtid.diagnose.overlap import beside_openings
 from rtid.diagnose.parts import AddedEffect
 from rtid.diagnose.regression import Score
 from rtid.diagnose.residual import Residual
@@ -121,6 +122,7 @@ def searched(standing: Standing, progress: Progress = silent) -> Result:
             last, judged = _judging(state, present, last)
             before = state.left(first)
     state.found = [beside_its_line(state, told_apart(state, effect)) for effect in state.found]
+    state.found = beside_openings(state.found, present)
     doubted = told_doubts(present)
     said = verdict(state, first, present, last, doubted, judged)
     soft = stored(state, first, present, said)

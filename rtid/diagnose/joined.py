@@ -125,7 +125,7 @@ def _resting(
     is_open = _opening(machine, chunk, edge) >= opens_v
     for other in machine.edges:
         if other is not edge and other.sign(chamber):
-            is_open &= _opening(machine, chunk, other) <= max(0.0, other.safe_band_v)
+            is_open &= _opening(machine, chunk, other) <= other.shut_up_to_v
     flow = _net_flow(fit, chunk, windows, chamber)
     return windows.everywhere(is_open) & (flow < STILL * edge.rated_q_m3s)
 

@@ -243,6 +243,7 @@ def correcting(size: str) -> tuple[Effect, ...]:
 
 # as the pages call the declared sizes
 DEAD_VOLUME, PRESSURE_ZERO = "dead volume", "zero of pressures"
+OPENING = "command at which a valve opens"
 ZERO = "zero of a pressure sensor"  # what is taken out of the samples, and no part of a fit
 
 

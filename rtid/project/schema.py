@@ -277,7 +277,7 @@ class EdgeDefaults(Section):
     command: str | None = None
     u_grid_v: Annotated[Borders | None, COMMAND] = None
     dp_grid_pa: Annotated[Borders | None, PRESSURE] = None
-    safe_band_v: Annotated[float | None, COMMAND] = Field(default=None, ge=0)
+    safe_band_v: Annotated[float | None, COMMAND] = None
     rated_flow_m3s: Annotated[float | None, FLOW] = Field(default=None, gt=0)
     rated_dp_pa: Annotated[float | None, PRESSURE] = Field(default=None, gt=0)
     basis: Literal["taylor", "lapped", "blended"] | None = None

@@ -39,6 +39,7 @@ from rtid.study.quick_machine import (
     fitted_machine,
     lag_of,
 )
+from rtid.study.quick_overlap import below_its_band
 from rtid.study.quick_pressures import from_air
 from rtid.study.quick_project import (
     head_of,
@@ -247,7 +248,8 @@ def _of_cylinder(
         judged += doubts
         level, diagnosis, machine = level_of(judged), None, arranged.machine
         if level != BAD:
-            diagnosis, machine = _likeliest(file, path, source, arranged, progress)
+            is_known = given.safe_band is not None
+            diagnosis, machine = _likeliest(file, path, source, arranged, progress, is_known)
         late_s = _hidden_s(arranged.trace, machine)
     return Quick(
         path,
@@ -281,9 +283,14 @@ def _lag_seen_s(diagnosis: Diagnosis | None) -> float | None:
 
 
 def _likeliest(
-    file: Path, path: Path, source: Source, arranged: Arranged, progress: Progress
+    file: Path,
+    path: Path,
+    source: Source,
+    arranged: Arranged,
+    progress: Progress,
+    band_is_known: bool,
 ) -> tuple[Diagnosis, MachineSizes]:
-    """The diagnosis, and the machine of it: with its command as the record likes it read."""
+    """The diagnosis, and the machine of it: with band and command as the record likes them."""
 
     def at(machine: MachineSizes) -> Study:
         return Study(_project(file, path, source, arranged.roles, machine), path)
@@ -291,7 +298,8 @@ def _likeliest(
     study = Study(arranged.project, path, _later(progress))
     reading = Reading(study, arranged.machine, said_of(study))
     of_tables = (written_late, on_a_line) if arranged.trace.is_table else ()
-    for another in (from_air, *of_tables):
+    of_bands = () if band_is_known else (below_its_band,)
+    for another in (*of_bands, from_air, *of_tables):
         if reading.said.verdict == MATCHES:
             break
         with suppress(np.linalg.LinAlgError, RtidError):  # it cannot be had so: as it was before

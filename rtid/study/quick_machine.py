@@ -266,11 +266,7 @@ def _of_samples(
 ) -> list[Assumption]:
     assumptions = []
     if machine.safe_band is None:
-        assumptions.append(Assumption(
-            f"the valves are shut up to |u| = {band / machine.command_unit.factor:.3g} "
-            f"{machine.command_unit.name}, half of what it takes to move or less (--safe-band)",
-            "a valve that opens earlier passes for a leak",
-        ))  # fmt: skip
+        assumptions.append(of_band(band, machine.command_unit))
     if machine.lag_s is None:
         assumptions.append(Assumption(
             f"the spools lag {LAG_MS:g} ms, give or take {LAG_TOLERANCE_MS:g} (--lag)",
@@ -284,6 +280,18 @@ def _of_samples(
             "what happens elsewhere in the record is not seen",
         ))  # fmt: skip
     return assumptions
+
+
+def of_band(
+    band: float, unit: Unit, why: str = "half of what it takes to move or less"
+) -> Assumption:
+    """That the valves are shut up to a command, SI; below 0 they stand open at rest."""
+    size = f"{band / unit.factor:.3g} {unit.name}"
+    where = f"up to |u| = {size}" if band >= 0.0 else f"from {size} of the other direction on"
+    return Assumption(
+        f"the valves are shut {where}, {why} (--safe-band)",
+        "a valve that opens earlier passes for a leak",
+    )
 
 
 def _of_creep(at_rest_mps: float, speed: FloatArray, goes_round: bool) -> Iterator[Assumption]:

@@ -54,7 +54,7 @@ def _edge(
 ) -> Coverage:
     w = edge.direction * samples.column(edge.command)
     ends = [samples.column(n) if n else np.zeros(len(w)) for n in (edge.source, edge.sink)]
-    dp, shut = ends[0] - ends[1], max(edge.safe_band_v, 0.0) if model.has_pressures else -np.inf
+    dp, shut = ends[0] - ends[1], edge.shut_up_to_v if model.has_pressures else -np.inf
     below = is_row & (w < edge.grid.u_v[0]) & (w > edge.safe_band_v)
     opened = is_row & (w > shut)
     w, dp = w[opened], dp[opened]
