@@ -22,6 +22,7 @@ from rtid.diagnose.trials import (
 )
 from rtid.diagnose.verdict import told_doubts
 from rtid.effects.laws.lines import lines_at, stores_at
+from rtid.effects.laws.openings import leaks_at, poppets_at
 from rtid.effects.laws.sensors import sensor_timings
 from rtid.effects.laws.timing import COMMAND
 from rtid.plain import Key
@@ -29,6 +30,7 @@ from rtid.plain import Key
 REFUTED, WITHIN = 3.0, 0.05  # times the best cause's misfit; least misfit, of dof
 FAR = 10.0  # times the misfit that the best cause leaves: as much is not nearly right
 NEAR = 0.5  # of the best gain, that a cause must have to be nearly right where the best is no more
+AT_AN_END = (lines_at, stores_at), (poppets_at, leaks_at)  # causes, and what they are there
 MORE, WEIGHING = 3.0, 0.25  # times what derivatives promise; of chi2: what a fit may still gain
 
 
@@ -156,14 +158,16 @@ def _are_times(trial: Trial, best: Trial) -> bool:
 
 
 def _is_beaten(trial: Trial, others: list[Trial]) -> bool:
-    """True of a line that explains less than what it stores does alone, to the end of both.
+    """True of a form that explains less than what it is at an end of it, to the end of both.
 
-    A line without inertia is a dead volume: with an inertia that the record refuses it is none of
-    those that cannot be told from one.
+    A line without inertia is a dead volume, and a relief valve that never shuts a leak: with an
+    inertia, or an opening pressure, that the record refuses they are none of those that cannot be
+    told from one.
     """
     where = trial.key[1]
-    return trial.key in lines_at(where) and any(
-        other.key in stores_at(where)
+    plain = {key for wide, narrow in AT_AN_END if trial.key in wide(where) for key in narrow(where)}
+    return any(
+        other.key in plain
         and other.n_parameters < trial.n_parameters
         and trial.gain < other.gain - TIE
         for other in others

@@ -115,7 +115,8 @@ def _opened(present: Fit, steps: int) -> Iterator[Fit]:
 def beside_openings(effects: list[AcceptedEffect], present: Fit) -> list[AcceptedEffect]:
     """What was found, with the openings that the record does not tell from a seat's leak.
 
-    Where these are likelier, without what only made up for them.
+    Where these are likelier, without what only made up for them.  What is not told from a seat leak
+    is no opening where nothing speaks for one: the band was declared to be shut.
     """
     leaks = [f for f in effects if any(name in seats() for name, _ in (f.key, *f.alike))]
     opening = likeliest_opening(present) if leaks else None
@@ -123,7 +124,8 @@ def beside_openings(effects: list[AcceptedEffect], present: Fit) -> list[Accepte
         return effects
     if opening.is_likelier:
         effects = [f for f in effects if f in leaks or opening.fit.revision.has(f.key)]
-    return [_with_opening(f) if f in leaks else f for f in effects]
+    likely = leaks if opening.is_likelier else [f for f in leaks if f.key[0] in seats()]
+    return [_with_opening(f) if f in likely else f for f in effects]
 
 
 def _with_opening(seat: AcceptedEffect) -> AcceptedEffect:

@@ -20,6 +20,7 @@ from rtid.diagnose.contest import (
 from rtid.diagnose.revision import Revision
 from rtid.diagnose.trials import TIE, TIE_SHARE, Trial
 from rtid.effects.column import Candidate
+from rtid.effects.laws.openings import leaks_at, poppets_at
 from rtid.plain import Key
 
 DOF = 4000.0
@@ -202,3 +203,20 @@ def test_what_has_outdone_another_one_is_taken_itself() -> None:
     assert chosen.key == delay.key
     chosen, alike = its_turn(state(), present(5000), second, both, finished, {}, {delay.key})
     assert (chosen.key, alike) == (second.key, (delay.key,))
+
+
+@pytest.mark.parametrize(("behind", "is_alike"), [(0.5 * TIE, True), (1.1 * TIE, False)])
+def test_a_relief_valve_that_ends_behind_a_leak_never_shuts(
+    monkeypatch: pytest.MonkeyPatch, behind: float, is_alike: bool
+) -> None:
+    """It is the leak at an end of its form, 13 of chi2 behind: a set of four was told of three."""
+    leak = trial("external_leakage_laminar", 1000.0)
+    poppet = trial("relief_valve", 1000.0 - behind, 2e6, 0.0, 0.0)
+    monkeypatch.setattr(module, "_all_finished", lambda *a: a[2])
+    _, rivals = contest(state(), present(5000), leak, [leak, poppet], {})
+    assert (poppet.key in rivals) is is_alike
+
+
+def test_what_a_poppet_is_that_never_shuts_is_what_its_page_cannot_be_told_from() -> None:
+    assert leaks_at("b") == {("external_leakage_laminar", "b")}
+    assert poppets_at("b") == {("relief_valve", "b")}

@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rtid.diagnose import overlap
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.overlap import (
     SHARE,
+    EarlierOpening,
     beside_openings,
     likeliest_opening,
     opened_earlier,
@@ -71,6 +73,19 @@ def test_what_a_valve_passes_within_its_band_is_an_opening() -> None:
 def test_valves_that_are_shut_within_their_band_have_no_earlier_opening() -> None:
     opening = likeliest_opening(seen())
     assert opening is not None and not opening.is_likelier
+
+
+def test_what_is_not_told_from_a_seat_leak_is_no_opening_of_itself(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Where nothing speaks for one: the band was declared to be shut."""
+    present: Fit = None  # type: ignore[assignment]
+    monkeypatch.setattr(
+        overlap, "likeliest_opening", lambda _: EarlierOpening(1, present, 5.0, 12.0)
+    )
+    leak, seat = ("external_leakage_laminar", "b"), ("valve_seat_leakage", "bt")
+    assert beside_openings([accepted(leak, seat)], present)[0].alike == (seat,)
+    assert beside_openings([accepted(seat)], present)[0].alike == (("deadband_shift", "bt"),)
 
 
 def test_without_a_seat_leak_nothing_is_asked() -> None:

@@ -15,7 +15,7 @@ from rtid.effects.law import BEHIND_MAPS, GAIN_DRIFT, needs_no_pressure, placed_
 from rtid.effects.laws.drift import gain_drift
 from rtid.effects.laws.friction import dahl
 from rtid.effects.laws.lines import lines
-from rtid.effects.laws.openings import opening
+from rtid.effects.laws.openings import POPPET_OUT, opening
 from rtid.effects.laws.response import map_lag
 from rtid.effects.laws.sensors import late_position, late_pressure
 from rtid.effects.laws.storage import SEED, add_echoes, total_softness
@@ -30,7 +30,7 @@ __all__ = ["NAMED", "SEED", "add_echoes", "cause_of", "causes", "total_softness"
 
 Law = Callable[[RecordView, Effect], Iterator[Cause]]
 NAMED: dict[str, Law] = {
-    "poppet_out": partial(opening, sign=1.0),
+    POPPET_OUT: partial(opening, sign=1.0),
     "poppet_in": partial(opening, sign=-1.0),
     "line": lines,
     "pump": supply,

@@ -12,14 +12,32 @@ import numpy as np
 from rtid.effects.column import Cause, of_page
 from rtid.effects.law import Shape, Volumes, lagged
 from rtid.effects.laws.timing import played
-from rtid.effects.page import Effect
+from rtid.effects.page import Effect, catalogue
 from rtid.effects.record_view import RecordView
+from rtid.plain import Key
 
+POPPET_OUT = "poppet_out"  # as a page names the law
 OPENINGS = 8  # opening pressures that are tried, over the range
 OWN_TIMES_S = (0.0, 0.02, 0.06)
 SHUT, RARE = 0.1, 0.998  # quantiles of the pressure: one that never shuts is a leak
 MAKEUP_PA = 6e6  # a make-up valve feeds from the tank line, or from a charge line of some MPa
 HYSTERESIS = 0.04  # of the highest pressure: where the search begins
+
+
+def poppets_at(where: str) -> set[Key]:
+    """The effects of the catalogue that let out above an opening pressure, at a place."""
+    return {(page.name, where) for page in _poppets()}
+
+
+def leaks_at(where: str) -> set[Key]:
+    """What a poppet is that never shuts, at a place: a flow in proportion to the pressure."""
+    sizes = {(page.size.unit, name) for page in _poppets() for name in page.confounders}
+    pages = catalogue().values()
+    return {(p.name, where) for p in pages if p.spills and (p.size.unit, p.name) in sizes}
+
+
+def _poppets() -> list[Effect]:
+    return [page for page in catalogue().values() if page.law == POPPET_OUT]
 
 
 def opening(view: RecordView, effect: Effect, sign: float) -> Iterator[Cause]:
