@@ -47,6 +47,7 @@ from rtid.diagnose.verdict import (
     UNKNOWN,
     can_judge,
     explained,
+    foretells,
     is_slight,
     told_doubts,
     verdict,
@@ -121,6 +122,8 @@ def searched(standing: Standing, progress: Progress = silent) -> Result:
         if judged and not can_judge(last):  # as found, spools pass through blocks that it lacks
             last, judged = _judging(state, present, last)
             before = state.left(first)
+    if judged and present.declared.has_pressures and not (state.found or foretells(last)):
+        before, last = _as_taught(state, first, present) or (before, last)
     state.found = [beside_its_line(state, told_apart(state, effect)) for effect in state.found]
     state.found = beside_openings(state.found, present)
     doubted = told_doubts(present)
@@ -170,6 +173,19 @@ def _judging(state: TrialState, first: Fit, unseen: Residual) -> tuple[Residual,
         state.judges_itself = True
         rest = state.left(first)
     return rest, False
+
+
+def _as_taught(state: TrialState, first: Fit, present: Fit) -> tuple[Residual, Residual] | None:
+    """What the first and the last fit leave of motion like that which taught their maps.
+
+    None where there is too little of that.  A valve that opens in the middle of a block left ten
+    times the floor of a healthy machine, nearly all of it in a quarter of a second below the part
+    of the block that had been visited, and 1.5 times of what was like it.
+    """
+    state.as_taught = True
+    before, last = state.left(first), state.left(present)
+    state.as_taught = can_judge(before) and can_judge(last)
+    return (before, last) if state.as_taught else None
 
 
 def _on_finer_grid(state: TrialState, present: Fit, last: Residual) -> Fit | None:

@@ -14,6 +14,7 @@ import numpy as np
 from rtid.diagnose.commands import transformed
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.sensor_noise import noise_of
+from rtid.diagnose.visited import where_taught
 from rtid.effects.column import Candidate
 from rtid.effects.laws import SEED, cause_of, total_softness
 from rtid.effects.laws.response import behind_s, left_behind
@@ -101,12 +102,17 @@ def effect_values(fit: Fit) -> list[tuple[Candidate, float]]:
 
 
 def residual(
-    fit: Fit, chunk: FloatArray, leave_out: Candidate | None = None, everywhere: bool = False
+    fit: Fit,
+    chunk: FloatArray,
+    leave_out: Candidate | None = None,
+    everywhere: bool = False,
+    as_taught: bool = False,
 ) -> Residual:
     """Hold a fitted revision against a record, chunk (n, 2 + signals), SI, as recorded.
 
     leave_out: an effect whose flow is not counted.  everywhere: on the grid, however well the map
-    is known there: of the record that has taught it.
+    is known there: of the record that has taught it.  as_taught: in those parts of blocks alone
+    that have taught them (`visited`).
     """
     sent = transformed_like(fit, chunk)
     view = RecordView.of(fit.model, sent, fit.weights, fit.map, fit.view)
@@ -118,6 +124,7 @@ def residual(
     ]
     flow_sd = view.flow_sd()
     known = view.inside if everywhere else _is_known(view, flow_sd)
+    known &= where_taught(view) if as_taught else True
     t_s, (moved, left, noise) = through_filter(view, rates, known)
     return Residual(
         t_s, moved, left, noise, fit.model.filter.rows_per_s, _of_maps(view, flow_sd[:, known])

@@ -100,13 +100,14 @@ class TrialState:
     suspects: tuple[Effect, ...] = ()  # effects of the user's, scored beside the catalogue
     judges_itself: bool = False
     ruled_out: set[Key] = field(default_factory=set)
+    as_taught: bool = False  # motion is judged that is like what taught the maps, and no other
     _coarse: Search | None = None
 
     def anew(self, progress: Progress) -> TrialState:
         """The state of a search that has not begun."""
         return replace(
             self, progress=progress, found=[], negligible={}, excess=0.0, judges_itself=False,
-            ruled_out=set(),
+            ruled_out=set(), as_taught=False,
         )  # fmt: skip
 
     def begin(self, model: Machine) -> None:
@@ -116,7 +117,9 @@ class TrialState:
 
     def left(self, fit_: Fit, leave_out: Candidate | None = None) -> Residual:
         """What a fit leaves of the part that judges; leave_out: an effect that is not counted."""
-        return residual(fit_, self.held_out, leave_out, self.judges_itself)
+        return residual(
+            fit_, self.held_out, leave_out, self.judges_itself, as_taught=self.as_taught
+        )
 
     @property
     def coarse(self) -> Search:

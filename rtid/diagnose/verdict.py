@@ -57,6 +57,11 @@ def is_foretold(left_m3s: float, floor_m3s: float, flow_m3s: float, map_sd_m3s: 
     return is_noise or is_immaterial(left_m3s, floor_m3s, flow_m3s)
 
 
+def foretells(after: Residual) -> bool:
+    """The same of what a model leaves of a part."""
+    return is_foretold(after.rms_m3s, after.floor_m3s, after.flow_m3s, after.map_sd_m3s)
+
+
 def filtered_hz(fit: Fit) -> float:
     """Cut-off of the filter, Hz, behind which all chambers' pressures were logged; 0: none is seen.
 
@@ -151,8 +156,7 @@ def _as_it_stands(last: Fit, after: Residual, doubted: tuple[Doubt, ...], is_uns
         is_veiled = is_slight(after) and not doubted and filtered_hz(last) > 0.0
         return INSUFFICIENT if is_veiled else UNKNOWN
     is_judged = is_unseen and last.declared.has_pressures
-    foretells = is_foretold(after.rms_m3s, after.floor_m3s, after.flow_m3s, after.map_sd_m3s)
-    return MATCHES if foretells or not is_judged else INSUFFICIENT
+    return MATCHES if foretells(after) or not is_judged else INSUFFICIENT
 
 
 def explained(state: TrialState, last: Fit) -> float:
