@@ -26,7 +26,7 @@ from rtid.diagnose.fit import Fit
 from rtid.diagnose.rising import NO_BIAS, Rising, SizeBias, given_volumes, risings
 from rtid.units import UNIFORM
 
-MOST_BLOCKS = 600  # that are all halved: a solution's time grows with their cube
+MOST_BLOCKS = 300  # that are all halved: of 395 the solution took 6.5 s and 450 MB
 
 
 def size_biases(fitted: Fit, risen: Mapping[int, Rising]) -> dict[int, SizeBias]:
@@ -51,7 +51,7 @@ def size_biases(fitted: Fit, risen: Mapping[int, Rising]) -> dict[int, SizeBias]
 def _on_finer(fitted: Fit, columns: list[int]) -> dict[int, Believed]:
     """Sizes over the record on half the spacing, by the fit's columns.
 
-    None of blocks that are too many, or too rare.
+    None of blocks that are too many, as of motion that goes everywhere, or too rare.
     """
     finer = on_finer(fitted) if len(fitted.map.cells) <= MOST_BLOCKS else None
     if finer is None:
