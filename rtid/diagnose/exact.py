@@ -154,7 +154,7 @@ def _begun(present: Fit, timings: list[TimingLaw]) -> Iterator[TimingLaw]:
         elif DEAD_BAND not in timing.parameters:
             yield timing
         elif (dead_v := opens_at(present.view)) > 0.0:
-            yield replace(timing, bank=tuple((psi[0], dead_v) for psi in timing.bank))
+            yield replace(timing, bank=tuple((*psi[:-1], dead_v) for psi in timing.bank))
 
 
 def opens_at(view: RecordView) -> float:
@@ -321,7 +321,8 @@ def _from_afar(
         if not anywhere and (seen[timing] < bar or seen[timing] <= 0.0):
             continue
         start = instead.get(timing) or starts.get(timing) or coarse.closed_in(timing, banks[timing])
-        if timing.is_limit and seen[timing] > LIKELY * max(seen.values()):
+        bends = timing.is_limit or DEAD_BAND in timing.parameters
+        if bends and seen[timing] > LIKELY * max(seen.values()):
             psi = coarse.polished(timing, [start[0]], NARROW, POLISHING)
             start = psi, coarse.gain(timing, psi)
         psi, lag_s, gain = coarse.shared(timing, *start)
@@ -345,7 +346,8 @@ def _instead_of_the_lag(
     for timing in (timing for timing in timings if timing.replaces_lag):
         known = [psi for other, (psi, _) in found.items() if other.effect == timing.effect]
         if known:
-            found[timing] = known[0], coarse.gain(timing, known[0])
+            psi = (*known[0], *timing.bank[0][len(known[0]) :])  # a dead band beside them
+            found[timing] = psi, coarse.gain(timing, psi)
         else:
             start = _closed_in(coarse, timing, coarse.bank(timing))
             found[timing] = start if timing.is_limit else coarse.damped(timing, *start)

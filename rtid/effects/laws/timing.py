@@ -29,7 +29,7 @@ COMMAND_RATE = "V/s"
 RATES = "rad/s", COMMAND_RATE  # units of a parameter that does the more the smaller it is
 SHUT = 2e-3  # of the largest command, from which an opening counts for one
 OF_TIME = "s", "rad/s"  # of one that is sought among others where samples are far apart
-LAG_S, MOST_RATE = "time_constant", "rate"
+LAG_S, MOST_RATE, SWING = "time_constant", "rate", ("natural_frequency", "damping")
 DEAD_BAND = "dead_band"  # behind which a lag may sit
 USUAL_STEP_S = 0.01  # up to which the banks are those of the pages
 OF_COMMAND = "V", COMMAND_RATE  # units on the pages of what is in a command's
@@ -185,26 +185,40 @@ def lagged(u: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
     return np.asarray(u + (start - u) * tau / dt_s * (1.0 - fade))
 
 
-def lagged_opening(u: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
-    """A lag behind the opening curve, mean over each interval (n,): time constant, dead band.
+def second_order(u: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
+    """Spool of natural frequency psi[0] rad/s and damping psi[1], mean over each interval (n,)."""
+    wn, zeta = psi
+    start = filtered(*held_second_order(wn, zeta, dt_s), u - u[0]) + u[0]
+    return np.asarray(0.5 * (start + np.append(start[1:], start[-1])))
 
-    What is beyond the dead band lags, and is added to it again: a valve that is told to shut still
-    closes while the command is inside.  u (n,), V: of one sign.
+
+def behind_opening(
+    u: FloatArray, dead_v: float, follow: Callable[[FloatArray], FloatArray]
+) -> FloatArray:
+    """What follows behind the opening curve, mean over each interval (n,), in the unit of u.
+
+    What is beyond the dead band follows, and is added to it again: a valve that is told to shut
+    still closes while the command is inside.  u (n,), V: of one sign; follow: of what is beyond it,
+    which rests at 0 where it swings below.
     """
-    tau_s, dead_v = psi
     size = np.abs(u)
-    opening = lagged(np.maximum(size - dead_v, 0.0), dt_s, (tau_s,))
+    opening = np.maximum(follow(np.maximum(size - dead_v, 0.0)), 0.0)
     shut = max(SHUT * float(size.max()), 1e-300)
     inside = np.maximum(dead_v - size, 0.0) * np.exp(-opening / shut)
     out = dead_v - inside + opening
     return np.asarray(np.copysign(out, u.min() if -u.min() > u.max() else 1.0))
 
 
-def second_order(u: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
-    """Spool of natural frequency psi[0] rad/s and damping psi[1], mean over each interval (n,)."""
-    wn, zeta = psi
-    start = filtered(*held_second_order(wn, zeta, dt_s), u - u[0]) + u[0]
-    return np.asarray(0.5 * (start + np.append(start[1:], start[-1])))
+def lagged_opening(u: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
+    """A lag behind the opening curve (n,), V: time constant, dead band."""
+    tau_s, dead_v = psi
+    return behind_opening(u, dead_v, lambda opening: lagged(opening, dt_s, (tau_s,)))
+
+
+def second_order_opening(u: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
+    """A valve of second order behind its opening curve (n,), V: frequency, damping, dead band."""
+    wn, zeta, dead_v = psi
+    return behind_opening(u, dead_v, lambda opening: second_order(opening, dt_s, (wn, zeta)))
 
 
 def played(u: FloatArray, dt_s: float, psi: Psi) -> FloatArray:
@@ -295,9 +309,19 @@ COMMAND_LAWS: dict[str, tuple[TimingLaw, ...]] = {
         *(of_law("lag", lagged, (LAG_S,), own_spools=its_own) for its_own in (False, True)),
         of_law("lag", lagged_opening, (LAG_S, DEAD_BAND), own_spools=True, is_linear=False),
     ),
-    "second_order": tuple(
-        of_law("second_order", second_order, replaces_lag=True, own_spools=its_own)
-        for its_own in (False, True)
+    "second_order": (
+        *(
+            of_law("second_order", second_order, SWING, replaces_lag=True, own_spools=its_own)
+            for its_own in (False, True)
+        ),
+        of_law(
+            "second_order",
+            second_order_opening,
+            (*SWING, DEAD_BAND),
+            replaces_lag=True,
+            own_spools=True,
+            is_linear=False,
+        ),
     ),
     "play": (of_law("play", played, is_linear=False),),
     "rate_limit": (
