@@ -8,7 +8,7 @@ import numpy as np
 
 from rtid.diagnose.fit import Fit
 from rtid.diagnose.report import OVER, Value
-from rtid.diagnose.sized import physical
+from rtid.diagnose.sized import physical, physical_sd
 from rtid.effects.column import Candidate
 from rtid.effects.law import LENGTH, chambers_by_place, fitted_names
 from rtid.effects.laws.lines import LINE, inertance
@@ -31,10 +31,10 @@ def parameters(fit: Fit, key: Key) -> dict[str, Value]:
     for effect in fit.revision.effects:
         if effect.key == key:
             column = fit.column(effect)
-            value, sd = fit.size_of(column), fit.sd_of(column)
-            scale = physical(fit, effect, 1.0)
+            value = fit.size_of(column)
             if not effect.is_whole:
-                values[effect.parameter] = Value(scale * value, abs(scale) * sd, here(effect.unit))
+                size, sd = physical(fit, effect, value), physical_sd(fit, effect)
+                values[effect.parameter] = Value(size, sd, here(effect.unit))
             free = fit.shape_columns(effect)
             for k, name in enumerate(effect.shape_names):
                 sd = fit.sd_of(free[k]) / abs(value) if k in free else float("nan")

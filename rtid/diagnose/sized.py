@@ -33,6 +33,26 @@ def physical(fit_: Fit, candidate: Candidate, value: float) -> float:
     return value
 
 
+def physical_sd(fit_: Fit, candidate: Candidate) -> float:
+    """Standard deviation of the size of an effect of a fit, as its parameter.
+
+    Where its equation has the oil's modulus, c = c' / m, m being the fitted compliance over that of
+    the column: var c = (var c' - 2 c' / m cov(c', m) + (c' / m)^2 var m) / m^2.  What is stored
+    trades off with the modulus: of 1 L 0.977 +- 0.004 was told, as if the modulus were known.
+    """
+    column = fit_.column(candidate)
+    scale, sd = abs(physical(fit_, candidate, 1.0)), fit_.sd_of(column)
+    if MODULUS not in fitted_names(candidate.law) or column not in fit_.estimate.used:
+        return scale * sd
+    at = list(chambers_by_place(fit_.model)[candidate.where])
+    share = fit_.weights.compliance[at] / fit_.weights.compliance[at].sum()
+    m, cov = float(fit_.held.theta[at] @ share), max(1.0, fit_.rho) * fit_.estimate.cov
+    size = fit_.size_of(column) / m
+    own, beside = cov[np.ix_(at, at)] @ share, cov[at, fit_.estimate.used.index(column)]
+    more = size**2 * float(share @ own) - 2.0 * size * float(share @ beside)
+    return scale * float(np.sqrt(max(sd**2 + more, 0.0)))
+
+
 def about_its_size(fit_: Fit, candidate: Candidate, value: float) -> Candidate:
     """An effect of a fit whose law is linear about its size, about the size that a value means.
 
