@@ -131,16 +131,9 @@ def _at_spools(view: RecordView) -> dict[str, tuple[int, FloatArray]]:
 
 
 def opening_change(view: RecordView, change: dict[str, FloatArray]) -> Volumes:
-    """Volumes (n - 1,), m3, per chamber of a small change of commands (n,), V, in the blocks.
-
-    None where no slope is told: a spool that stood open at rest, 5.3 L/min +- 16.7 through either
-    edge, had 50 L/min/V there, which made a play of 8 mV on a joystick's record 3,400 deviations,
-    and took it for refuted.
-    """
+    """Volumes (n - 1,), m3, per chamber of a small change of commands (n,), V, in the blocks."""
     flows = [
-        np.where(view.tells_slopes[i], view.slope_u(i), 0.0)
-        * edge.direction
-        * change[half_of(edge)][:-1]
+        view.slope_u(i) * edge.direction * change[half_of(edge)][:-1]
         for i, edge in enumerate(view.model.edges)
     ]
     n_c = len(view.model.chambers)

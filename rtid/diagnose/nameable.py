@@ -22,11 +22,11 @@ from rtid.diagnose.consequence import ALIKE, BEND, BENT, HIDDEN_GAIN, OWN, SOFTE
 from rtid.diagnose.evidence import AT_ONCE, Rows, project
 from rtid.diagnose.excuse import counted
 from rtid.diagnose.regression import LIMIT_SD, Score
+from rtid.diagnose.residual import KNOWN
 from rtid.diagnose.verdict import MATERIAL
 from rtid.effects.column import Candidate, Columns
 from rtid.effects.law import Volumes, chambers_by_place
 from rtid.effects.laws.timing import COMMAND
-from rtid.effects.record_view import KNOWN
 from rtid.kernels.explain import filter_rows
 from rtid.plain import BoolArray, FloatArray, Key
 from rtid.units import Z95

@@ -18,10 +18,13 @@ from rtid.diagnose.visited import where_taught
 from rtid.effects.column import Candidate
 from rtid.effects.laws import SEED, cause_of, total_softness
 from rtid.effects.laws.response import behind_s, left_behind
-from rtid.effects.record_view import KNOWN, RecordView
+from rtid.effects.record_view import RecordView
 from rtid.estimator.state import variance
 from rtid.kernels.explain import filter_rows
 from rtid.plain import BoolArray, FloatArray
+
+KNOWN = 4.0  # times what a valid block may be uncertain by: where the map is known worse, nothing
+# is judged
 
 
 @dataclass(frozen=True)

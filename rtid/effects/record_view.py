@@ -21,8 +21,6 @@ from rtid.model import PRESSURE, Edge, Machine
 from rtid.plain import BoolArray, FloatArray, IntArray, give_back
 
 TURNS = 0.05  # share of changes that reverse the one before: 2/3 for noise, next to 0 for motion
-KNOWN = 4.0  # times what a valid block may be uncertain by: where the map is known worse, nothing
-# is judged
 UNKNOWN = 10.0  # standard deviation of the flow in a block that was never visited, rated flows
 NONE = np.zeros(0)
 SMOOTH_S = 0.02  # half width of the window for derivatives of pressures, without delay
@@ -30,8 +28,6 @@ AT_ONCE = 1 << 14  # intervals that are followed in one go
 LONG = 1 << 18  # samples of a record that is read again rather than kept: 4 minutes at 1 kHz
 OPENING, FLOW, SLOPE_U, SLOPE_DP, FLOW_SD = range(5)  # what `follow_map` tells of each
 ALL_BUT_SD = OPENING, FLOW, SLOPE_U, SLOPE_DP  # of a short record in one go
-# what a long record lets go of
-GIVEN_AGAIN = "_said", "inside", "tells_slopes", "_signals", "x_m", "seen", "t_s", "dt_s"
 AT_A_TIME = 2  # of them, of a long record: with one it is followed twice as often
 
 
@@ -215,17 +211,6 @@ class RecordView:
         """Standard deviation of each edge's flow (edges, n - 1), m3/s; 0 where it is shut."""
         return self._followed((FLOW_SD,))[FLOW_SD]
 
-    @cached_property
-    def tells_slopes(self) -> BoolArray:
-        """False (edges, n - 1) where the map knows an edge's flow no better than from none.
-
-        A block that is visited at one command, or at rest beside another open edge, has six terms
-        of which the rows tell a sum: its slopes are what the numbers have left there.
-        """
-        sd, rated = self.flow_sd(), np.array([edge.rated_q_m3s for edge in self.model.edges])
-        is_well_known = sd <= KNOWN * self.model.gates.max_sd_share * rated[:, None]
-        return is_well_known | (sd <= np.abs(self._along(FLOW)))
-
     def share_of_rated(self, flow: FloatArray) -> FloatArray:
         """The largest share (n - 1,) that flows (edges, n - 1), m3/s, are of the rated ones."""
         rated = np.array([edge.rated_q_m3s for edge in self.model.edges])
@@ -234,7 +219,7 @@ class RecordView:
     def rest(self) -> None:
         """Let go of what a long record gives again when it is asked for: 0.3 kB a sample."""
         if self.n >= LONG:
-            for made in GIVEN_AGAIN:
+            for made in ("_said", "inside", "_signals", "x_m", "seen", "t_s", "dt_s"):
                 vars(self).pop(made, None)
             give_back()
 

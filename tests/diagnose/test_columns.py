@@ -8,14 +8,11 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from rtid.diagnose.bank import opening_change
-from rtid.diagnose.commands import half_of
 from rtid.diagnose.fit import first_map, prepare
 from rtid.effects.column import Cause
 from rtid.effects.laws import causes
 from rtid.effects.laws.storage import softness
-from rtid.effects.record_view import MapTerms, RecordView
-from rtid.kernels.layout import TERMS
+from rtid.effects.record_view import RecordView
 from rtid.plain import FloatArray
 from tests.diagnose.records import record
 
@@ -115,30 +112,3 @@ def stored_at(its_own: Cause, shape: tuple[float, ...], k: int, c: int, more_pa:
     other = RecordView.without_map(model, changed, view().compliance)
     like = next(x for x in causes(other) if x.candidate == its_own.candidate)
     return float(like.column(shape)[c][1])
-
-
-def _known_but_for(cell: int, sd: float) -> RecordView:
-    """The record beside its map, of which one cell's flow is so many times itself uncertain by."""
-    model, chunk, _ = record()
-    weights = prepare(model, chunk)
-    known = first_map(model, chunk, weights)
-    cov = np.tile(1e-12 * np.eye(TERMS), (len(known.cells), 1, 1))
-    at = int(np.flatnonzero(known.cells == cell)[0])
-    cov[at] = (sd * float(np.abs(known.terms[at, 0]))) ** 2 * np.diag(np.eye(TERMS)[0])
-    return RecordView.of(model, chunk, weights, MapTerms(known.cells, known.terms, cov))
-
-
-def test_a_command_changes_no_flow_by_slopes_that_nobody_knows() -> None:
-    """A spool that stood open at rest, 5.3 L/min +- 16.7, had 50 L/min/V there."""
-    model, chunk, _ = record()
-    known = first_map(model, chunk, prepare(model, chunk))
-    cell = int(known.cells[np.argmax(np.abs(known.terms[:, 0]))])
-    change = {half_of(edge): np.full(len(chunk), 0.01) for edge in model.edges}
-    well, badly = (opening_change(_known_but_for(cell, sd), change) for sd in (0.5, 3.0))
-    plain = opening_change(view(), change)
-    for c, volumes in plain.items():
-        assert well[c] == pytest.approx(volumes)
-    changed = np.any([badly[c] != plain[c] for c in plain], axis=0)
-    assert 0.0 < np.mean(changed) < 0.5
-    is_told = np.asarray(_known_but_for(cell, 3.0).tells_slopes.all(axis=0))
-    assert not is_told[changed].any()
