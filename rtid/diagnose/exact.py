@@ -35,6 +35,9 @@ NO_HINTS: Mapping[Key, float] = MappingProxyType({})
 # of the best gain from afar, from which a limit and the lag that it is in are found by a simplex of
 # this size, in this many refits: the derivative of one says next to nothing beside maps it has bent
 LIKELY, NARROW, POLISHING = 0.5, 0.15, 24
+OF_SIMPLEX = (
+    6  # refits, times the square of the parameters: with 24 for three it stayed at 36 of 40
+)
 PROMISING = 0.3  # share of the best gain that a timing must reach from afar to be refitted
 # pumps to begin with: droops as shares of that seen, quantiles of the demand, stiffness in Pa/m3.
 # The cost has a valley for each lag: of a supply that took 0.4 s for a droop 1.6 times the one seen
@@ -323,7 +326,8 @@ def _from_afar(
         start = instead.get(timing) or starts.get(timing) or coarse.closed_in(timing, banks[timing])
         bends = timing.is_limit or DEAD_BAND in timing.parameters
         if bends and seen[timing] > LIKELY * max(seen.values()):
-            psi = coarse.polished(timing, [start[0]], NARROW, POLISHING)
+            most = max(POLISHING, OF_SIMPLEX * len(start[0]) ** 2)
+            psi = coarse.polished(timing, [start[0]], NARROW, most)
             start = psi, coarse.gain(timing, psi)
         psi, lag_s, gain = coarse.shared(timing, *start)
         gain -= ahead

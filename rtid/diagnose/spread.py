@@ -59,6 +59,8 @@ def with_spreads(fitted: Fit, unnamed: frozenset[Key] = frozenset()) -> Fit:
     of_delays = chain(_of_delays(fitted), _beside_others(fitted), _about_sizes(fitted))
     for column, more in chain(_of_wholes(fitted), of_delays, _moved_by(fitted, unnamed)):
         spreads[column] = float(np.hypot(spreads.get(column, 0.0), more))
+    for column, more in [*_moved_along(fitted, spreads)]:
+        spreads[column] = float(np.hypot(spreads.get(column, 0.0), more))
     sizes = {"spreads": tuple(spreads.items()), "shifts": tuple(shifts.items())}
     return fitted.knowing(**sizes, known_cov=None)
 
@@ -154,6 +156,21 @@ def _beside_others(fitted: Fit) -> Iterator[tuple[int, float]]:
         column = fitted.timing_columns(k)[0]
         if column in fitted.estimate.used:
             yield column, timing_sd(fitted, k)
+
+
+def _moved_along(fitted: Fit, spreads: dict[int, float]) -> Iterator[tuple[int, float]]:
+    """Column and spread of a timing's other numbers, which its first takes along, in their units.
+
+    Of a valve of 40 rad/s, damped by 0.9, 42.4 +- 0.9 was told with 0.958 +- 0.001: the ratio of
+    the two is what a record tells.
+    """
+    used, cov = fitted.estimate.used, fitted.estimate.cov
+    for k in range(len(fitted.revision.timings)):
+        first, *others = fitted.timing_columns(k)
+        for column in others if first in used else ():
+            if column in used:
+                at, there = used.index(first), used.index(column)
+                yield column, float(abs(cov[there, at] / cov[at, at]) * spreads.get(first, 0.0))
 
 
 def _moved_by(fitted: Fit, unnamed: frozenset[Key]) -> Iterator[tuple[int, float]]:

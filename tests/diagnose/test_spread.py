@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
+from rtid.diagnose import spread as spreading
 from rtid.diagnose.diagnosis import search
 from rtid.diagnose.fit import Fit, fit, one_pass, prepare
 from rtid.diagnose.revision import Revision
@@ -119,3 +123,17 @@ def test_what_nobody_is_told_of_widens_what_it_moves() -> None:
     )
     moved = both.held.value(both.column(leak)) - alone.held.value(alone.column(leak))
     assert told == pytest.approx(np.hypot(known, moved / UNIFORM), rel=0.1) and told > known
+
+
+def test_what_a_timing_s_first_number_is_unsure_of_its_others_are() -> None:
+    """Along the line that the record tells: the damping over the frequency of a spool is known."""
+    slope, radps = 0.0226, 0.87
+    cov = np.array([[1.0, 0.0, 0.0], [0.0, 4e-4, slope * 4e-4], [0.0, slope * 4e-4, 4e-7]])
+    fitted: Any = SimpleNamespace(
+        estimate=SimpleNamespace(used=(1, 4, 5), cov=cov),
+        revision=SimpleNamespace(timings=(None, None)),
+        timing_columns=lambda k: ((4, 5, 6), (7, 8))[k],  # 6 to 8 were not free
+    )
+    ((column, sd),) = spreading._moved_along(fitted, {4: radps, 7: 1.0})
+    assert column == 5
+    assert sd == pytest.approx(slope * radps)
