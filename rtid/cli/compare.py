@@ -25,34 +25,40 @@ if TYPE_CHECKING:
     from rtid.study.study import RecordError
 
 
+Maps = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--map",
+        help="Data sheet (CSV) or map of `rtid export` (.json, .npz) to hold beside the "
+        "learned map; may be given twice.",
+    ),
+]
+Against = Annotated[
+    Path | None,
+    typer.Option(
+        help="Another project (.toml) on this trace, or another trace with this project: "
+        "the same tables and pictures side by side."
+    ),
+]
+Block = Annotated[
+    str | None, typer.Option(help="When was the machine in this block?  EDGE:I,J, from 0.")
+]
+Span = Annotated[str | None, typer.Option(help="Which blocks was it in then?  T0:T1 in s.")]
+Table = Annotated[
+    Path | None, typer.Option(help="Write the residuals here: .csv, .parquet or .mat.")
+]
+Pictures = Annotated[Path | None, typer.Option(help="Folder for pictures.")]
+
+
 def compare(
     trace: TracesArgument,
     project: ProjectOption,
-    maps: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--map",
-            help="Data sheet (CSV) or map of `rtid export` (.json, .npz) to hold beside the "
-            "learned map; may be given twice.",
-        ),
-    ] = None,
-    against: Annotated[
-        Path | None,
-        typer.Option(
-            help="Another project (.toml) on this trace, or another trace with this project: "
-            "the same tables and pictures side by side."
-        ),
-    ] = None,
-    block: Annotated[
-        str | None, typer.Option(help="When was the machine in this block?  EDGE:I,J, from 0.")
-    ] = None,
-    span: Annotated[
-        str | None, typer.Option(help="Which blocks was it in then?  T0:T1 in s.")
-    ] = None,
-    table: Annotated[
-        Path | None, typer.Option(help="Write the residuals here: .csv, .parquet or .mat.")
-    ] = None,
-    pictures: Annotated[Path | None, typer.Option(help="Folder for pictures.")] = None,
+    maps: Maps = None,
+    against: Against = None,
+    block: Block = None,
+    span: Span = None,
+    table: Table = None,
+    pictures: Pictures = None,
     picture_format: PictureFormat = "png",
     as_json: AsJson = False,
     units: UnitsOption = System.DISPLAY,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from rtid.cli.options import NoCache, PriorOption, ProjectOption
+from rtid.cli.options import AsJson, NoCache, PriorOption, ProjectOption
 
 if TYPE_CHECKING:
     from rtid.estimator.flowmap import FlowMap
@@ -41,49 +41,62 @@ def _pair(text: str | None) -> tuple[int, int] | None:
     return int(commands), int(drops)
 
 
+Source = Annotated[Path, typer.Argument(help="Snapshot (.npz) of `rtid replay`, or a trace.")]
+Output = Annotated[
+    Path,
+    typer.Argument(
+        help="File: .csv .json .npz .mat .m .dcm .cdfx .a2l .mo .st .h .fmu .mf4 .mcap."
+    ),
+]
+Force = Annotated[
+    bool, typer.Option("--force", help="Write it even if what was learned is impossible.")
+]
+Fmi = Annotated[int, typer.Option("--fmi", help="Version of FMI of an FMU: 2 or 3.")]
+MapAlone = Annotated[
+    bool, typer.Option("--map", help="An FMU of the maps alone: pressures are its inputs.")
+]
+Tolerance = Annotated[
+    float | None,
+    typer.Option(
+        min=0.01,
+        max=50.0,
+        help="Per cent of the largest flow that a table may miss the map by (0.2).",
+    ),
+]
+Nodes = Annotated[
+    str | None,
+    typer.Option(callback=_nodes, help="Most nodes of a table, commands x drops: 16x12."),
+]
+NBytes = Annotated[
+    int | None,
+    typer.Option("--bytes", min=64, help="Most bytes of all tables, as 16-bit numbers."),
+]
+Axes = Annotated[
+    Path | None, typer.Option(help="Take the axes of these maps: .dcm, .cdfx or .csv.")
+]
+Flashed = Annotated[
+    Path | None, typer.Option(help="Tell the difference to these maps; --axes does it too.")
+]
+Sheet = Annotated[
+    Path | None, typer.Option(help="Write a sheet to be signed (.html) of what is released.")
+]
+
+
 def export(
-    source: Annotated[Path, typer.Argument(help="Snapshot (.npz) of `rtid replay`, or a trace.")],
-    output: Annotated[
-        Path,
-        typer.Argument(
-            help="File: .csv .json .npz .mat .m .dcm .cdfx .a2l .mo .st .h .fmu .mf4 .mcap."
-        ),
-    ],
+    source: Source,
+    output: Output,
     project: ProjectOption,
     prior_map: PriorOption = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="Write it even if what was learned is impossible.")
-    ] = False,
-    fmi: Annotated[int, typer.Option("--fmi", help="Version of FMI of an FMU: 2 or 3.")] = 2,
-    map_alone: Annotated[
-        bool, typer.Option("--map", help="An FMU of the maps alone: pressures are its inputs.")
-    ] = False,
-    tolerance: Annotated[
-        float | None,
-        typer.Option(
-            min=0.01,
-            max=50.0,
-            help="Per cent of the largest flow that a table may miss the map by (0.2).",
-        ),
-    ] = None,
-    nodes: Annotated[
-        str | None,
-        typer.Option(callback=_nodes, help="Most nodes of a table, commands x drops: 16x12."),
-    ] = None,
-    n_bytes: Annotated[
-        int | None,
-        typer.Option("--bytes", min=64, help="Most bytes of all tables, as 16-bit numbers."),
-    ] = None,
-    axes: Annotated[
-        Path | None, typer.Option(help="Take the axes of these maps: .dcm, .cdfx or .csv.")
-    ] = None,
-    flashed: Annotated[
-        Path | None, typer.Option(help="Tell the difference to these maps; --axes does it too.")
-    ] = None,
-    sheet: Annotated[
-        Path | None, typer.Option(help="Write a sheet to be signed (.html) of what is released.")
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print a summary as JSON.")] = False,
+    force: Force = False,
+    fmi: Fmi = 2,
+    map_alone: MapAlone = False,
+    tolerance: Tolerance = None,
+    nodes: Nodes = None,
+    n_bytes: NBytes = None,
+    axes: Axes = None,
+    flashed: Flashed = None,
+    sheet: Sheet = None,
+    as_json: AsJson = False,
     no_cache: NoCache = False,
 ) -> None:
     """Write the learned maps: flow, standard deviation and status over command and pressure drop.

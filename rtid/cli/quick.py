@@ -38,52 +38,59 @@ def _both(text: str) -> tuple[float, float]:
     return 1e-3 * a, 1e-3 * b
 
 
+Files = Annotated[
+    list[Path],
+    typer.Argument(help="Table (.csv .parquet .mat) or CAN log; of several, one project."),
+]
+Dbc = Annotated[Path | None, typer.Option(help="DBC of a CAN log; the built-in one without it.")]
+BoreMm = Annotated[float | None, typer.Option("--bore", min=1.0, help="Piston diameter, mm.")]
+RodMm = Annotated[float | None, typer.Option("--rod", min=0.0, help="Rod, mm.")]
+StrokeMm = Annotated[float | None, typer.Option("--stroke", min=1.0, help="Stroke, mm.")]
+DeadVolumeL = Annotated[
+    str | None,
+    typer.Option(
+        "--dead-volume",
+        callback=_volumes,
+        help="Volume left at the ends, with hoses, L: one, or A,B.",
+    ),
+]
+SafeBand = Annotated[
+    float | None,
+    typer.Option(
+        help="Command up to which the valves are shut for sure, in the unit of its column; "
+        "below 0 where they stand open at rest.",
+    ),
+]
+LagMs = Annotated[
+    float | None, typer.Option("--lag", min=0.0, help="Lag of the spools, data sheet, ms.")
+]
+SupplyMpa = Annotated[
+    float | None,
+    typer.Option("--supply", min=0.01, help="Supply pressure, MPa, where it is not measured."),
+]
+HeldOut = Annotated[
+    list[str] | None,
+    typer.Option("--held-out", help="Name or pattern of records that judge; else the last."),
+]
+Save = Annotated[
+    Path | None,
+    typer.Option("--save", "-o", "--output", help="Write the project file of what was found."),
+]
+
+
 def quick(
-    files: Annotated[
-        list[Path],
-        typer.Argument(help="Table (.csv .parquet .mat) or CAN log; of several, one project."),
-    ],
-    dbc: Annotated[
-        Path | None, typer.Option(help="DBC of a CAN log; the built-in one without it.")
-    ] = None,
-    bore_mm: Annotated[
-        float | None, typer.Option("--bore", min=1.0, help="Piston diameter, mm.")
-    ] = None,
-    rod_mm: Annotated[float | None, typer.Option("--rod", min=0.0, help="Rod, mm.")] = None,
-    stroke_mm: Annotated[
-        float | None, typer.Option("--stroke", min=1.0, help="Stroke, mm.")
-    ] = None,
-    dead_volume_l: Annotated[
-        str | None,
-        typer.Option(
-            "--dead-volume",
-            callback=_volumes,
-            help="Volume left at the ends, with hoses, L: one, or A,B.",
-        ),
-    ] = None,
-    safe_band: Annotated[
-        float | None,
-        typer.Option(
-            help="Command up to which the valves are shut for sure, in the unit of its column; "
-            "below 0 where they stand open at rest.",
-        ),
-    ] = None,
-    lag_ms: Annotated[
-        float | None, typer.Option("--lag", min=0.0, help="Lag of the spools, data sheet, ms.")
-    ] = None,
-    supply_mpa: Annotated[
-        float | None,
-        typer.Option("--supply", min=0.01, help="Supply pressure, MPa, where it is not measured."),
-    ] = None,
+    files: Files,
+    dbc: Dbc = None,
+    bore_mm: BoreMm = None,
+    rod_mm: RodMm = None,
+    stroke_mm: StrokeMm = None,
+    dead_volume_l: DeadVolumeL = None,
+    safe_band: SafeBand = None,
+    lag_ms: LagMs = None,
+    supply_mpa: SupplyMpa = None,
     role: RoleOption = None,
-    held_out: Annotated[
-        list[str] | None,
-        typer.Option("--held-out", help="Name or pattern of records that judge; else the last."),
-    ] = None,
-    save: Annotated[
-        Path | None,
-        typer.Option("--save", "-o", "--output", help="Write the project file of what was found."),
-    ] = None,
+    held_out: HeldOut = None,
+    save: Save = None,
     force: Replace = False,
     as_json: AsJson = False,
     units: UnitsOption = System.DISPLAY,

@@ -50,37 +50,42 @@ HideAt = Annotated[
 ]
 
 
+Motion = Annotated[str, typer.Option(help=" | ".join(MOTIONS))]
+DurationS = Annotated[
+    float | None, typer.Option("--duration", min=0.01, help="Seconds; 80, a record 110.")
+]
+Seed = Annotated[int, typer.Option(min=0, help="Of noise and motion.")]
+Example = Annotated[
+    str | None,
+    typer.Option(
+        help="Another plant: programmable_valve, a boom on five valves, as a log; "
+        "electric_drive | heated_room, as .csv for `rtid refit`."
+    ),
+]
+Bus = Annotated[
+    str | None,
+    typer.Option(
+        help="Send live on INTERFACE or INTERFACE:CHANNEL, as `rtid run` takes it: "
+        "udp_multicast, virtual, or socketcan with vcan."
+    ),
+]
+ChannelOption = Annotated[str, typer.Option(help="Channel of the bus, where --bus names none.")]
+Speed = Annotated[float, typer.Option(help="On the bus: times real time; 0: as fast as possible.")]
+
+
 def simulate(
     trace: TraceFile = None,
     plant: Number = None,
     cross_port: CrossPort = False,
     hide: Hide = None,
     hide_at_s: HideAt = None,
-    motion: Annotated[str, typer.Option(help=" | ".join(MOTIONS))] = "sweep",
-    duration_s: Annotated[
-        float | None, typer.Option("--duration", min=0.01, help="Seconds; 80, a record 110.")
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of noise and motion.")] = 0,
-    example: Annotated[
-        str | None,
-        typer.Option(
-            help="Another plant: programmable_valve, a boom on five valves, as a log; "
-            "electric_drive | heated_room, as .csv for `rtid refit`."
-        ),
-    ] = None,
-    bus: Annotated[
-        str | None,
-        typer.Option(
-            help="Send live on INTERFACE or INTERFACE:CHANNEL, as `rtid run` takes it: "
-            "udp_multicast, virtual, or socketcan with vcan."
-        ),
-    ] = None,
-    channel: Annotated[
-        str, typer.Option(help="Channel of the bus, where --bus names none.")
-    ] = "239.74.163.2",
-    speed: Annotated[
-        float, typer.Option(help="On the bus: times real time; 0: as fast as possible.")
-    ] = 1.0,
+    motion: Motion = "sweep",
+    duration_s: DurationS = None,
+    seed: Seed = 0,
+    example: Example = None,
+    bus: Bus = None,
+    channel: ChannelOption = "239.74.163.2",
+    speed: Speed = 1.0,
     as_json: AsJson = False,
 ) -> str | None:
     """Record a simulated machine: the trace, the truth (.truth.json), a project file (.toml).
